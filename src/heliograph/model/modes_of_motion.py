@@ -14,15 +14,13 @@ import numpy as np
 
 from heliograph.model.over_time import OverTime
 from heliograph.model.plant import AbstractPlant
-from heliograph.model.sensor import AbstractSensor
+from heliograph.model.sensor import SEVERAL_TAKEN_BY, AbstractSensor
 from heliograph.numerics.check import fail, instance, items, show_value
 from heliograph.numerics.module import Module, same
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.chain import MarkovChain
 from heliograph.random_affine.memory import AbstractWithMemory, memories, select_alike
 from heliograph.random_affine.noise import AbstractNoise, Square, Vector
-
-TAKEN_BY = "hg.filters.imm_filter, gpb1_filter and gpb2_filter take several"
 
 
 class ModalPlant(AbstractPlant, AbstractWithMemory):
@@ -81,7 +79,9 @@ class ModalPlant(AbstractPlant, AbstractWithMemory):
         return _ChosenPlant(self.models, jnp.asarray(state)) if same_numbers is None else same_numbers
 
     def _refuse(self) -> NoReturn:
-        raise fail("plant", f"one law of motion here ({TAKEN_BY})", f"a markov_plant of {len(self.models)} modes")
+        raise fail(
+            "plant", f"one law of motion here ({SEVERAL_TAKEN_BY})", f"a markov_plant of {len(self.models)} modes"
+        )
 
 
 class _ChosenPlant(AbstractPlant):
@@ -150,7 +150,7 @@ class ModalSensor(AbstractSensor, AbstractWithMemory):
         return _ChosenSensor(self.models, jnp.asarray(state)) if same_numbers is None else same_numbers
 
     def _refuse(self) -> NoReturn:
-        raise fail("sensor", f"one law of what is measured here ({TAKEN_BY})",
+        raise fail("sensor", f"one law of what is measured here ({SEVERAL_TAKEN_BY})",
                    f"a markov_sensor of {len(self.models)} modes")  # fmt: skip
 
 

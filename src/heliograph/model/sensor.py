@@ -334,6 +334,9 @@ def check_sensor(sensor: AbstractSensor, states: int) -> None:
     sensor.check_states(states)
 
 
+SEVERAL_TAKEN_BY = "hg.linear_filter, hg.filters.imm_filter, gpb1_filter, gpb2_filter and particle_filter take several"
+
+
 def is_linear(plant: AnyPlant, sensor: AnySensor) -> bool:
     """Return whether both are linear, so that but for angles means and covariances propagate without approximation."""
     return isinstance(first(plant), LinearPlant) and isinstance(first(sensor), LinearSensor)
@@ -344,7 +347,7 @@ def check_linear(name: str, plant: AnyPlant, sensor: AnySensor) -> None:
     if not is_linear(plant, sensor):
         got = f"{type(first(plant)).__name__} and {type(first(sensor)).__name__}"
         modal = any(isinstance(first(model), AbstractWithMemory) for model in (plant, sensor))
-        instead = " of one law (imm_filter, gpb1_filter and gpb2_filter take several)" if modal else ""
+        instead = f" of one law ({SEVERAL_TAKEN_BY})" if modal else ""
         raise fail(name, f"a LinearPlant and a LinearSensor{instead}", got)
     refuse_angles(name, plant, sensor)
 

@@ -217,8 +217,8 @@ def test_estimates_of_modes_stand_in_tables_and_go_both_ways():
         (lambda a, b: hg.markov_plant([a, b], [[0.9, 0.2], [0.1, 0.9]]), "transition from mode 0"),
         (lambda a, b: hg.markov_plant([a, b, a], ROWS), "models: expected 2, one for each mode"),
         (lambda a, b: hg.markov_plant([a, b]), "chain of the modes: expected transition="),
-        (lambda a, b: hg.cubature_filter(motion(), SENSOR, LINK), "imm_filter, gpb1_filter and gpb2_filter"),
-        (lambda a, b: hg.linear_filter(motion(), SENSOR, LINK), "of one law .imm_filter"),
+        (lambda a, b: hg.cubature_filter(motion(), SENSOR, LINK), "hg.filters.imm_filter, gpb1_filter, gpb2_filter"),
+        (lambda a, b: hg.polynomial_filter(motion(), SENSOR, LINK, 5), "of one law .hg.linear_filter"),
     ],
 )  # fmt: skip
 def test_what_does_not_fit_is_refused_in_one_line(build, said):

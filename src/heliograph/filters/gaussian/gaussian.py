@@ -34,11 +34,12 @@ from heliograph.model.fading import memory_matters, without_memory
 from heliograph.model.over_time import OverTime, at, at_each_step, first, unstack
 from heliograph.model.plant import AnyPlant, check_plant
 from heliograph.model.premises.premise import Premise, believing
-from heliograph.model.sensor import AbstractSensor, AnySensor, is_linear
+from heliograph.model.sensor import SEVERAL_TAKEN_BY, AbstractSensor, AnySensor, is_linear
 from heliograph.numerics.angle import Angles, nearest
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.types import Array, ArrayLike, Float
+from heliograph.random_affine.memory import is_modal
 from heliograph.random_affine.moments.second_moments import SecondOrder, has_random_gain
 
 
@@ -380,7 +381,9 @@ def kalman_filter(
     """
     if not is_linear(plant, sensor):
         got = f"{type(first(plant)).__name__} and {type(first(sensor)).__name__}"
-        raise fail("Kalman filter", f"a LinearPlant and a LinearSensor{MATRICES}", got)
+        modal = is_modal(first(plant)) or is_modal(first(sensor))
+        instead = f" of one law ({SEVERAL_TAKEN_BY})" if modal else MATRICES
+        raise fail("Kalman filter", f"a LinearPlant and a LinearSensor{instead}", got)
     if has_unknown_start(plant):
         if initial_mean is not None or initial_covariance is not None:
             raise fail("initial law", "none beside a plant whose start is unknown", "one")

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
+from itertools import product
 
 import equinox as eqx
 import jax
@@ -29,6 +30,7 @@ from heliograph.filters.wrappers.told import takes_told
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation, lower_by_noise
 from heliograph.model.fading import memory_matters, uncertain_chain, without_memory
+from heliograph.model.modes_of_motion import models_of
 from heliograph.model.over_time import OverTime, at, first, stacked
 from heliograph.model.plant import AnyPlant
 from heliograph.model.premises.premise import believes, believing
@@ -39,6 +41,7 @@ from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import symmetric
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.base import check_maps
+from heliograph.random_affine.memory import is_modal
 from heliograph.random_affine.moments.second_moments import SecondOrder, has_known_mean
 from heliograph.random_affine.outliers import has_bounded_noise
 from heliograph.random_affine.words.rounded import find_rounded
@@ -162,9 +165,9 @@ def linear_filter(
 ) -> AbstractFilter:
     """Return the best linear filter for a linear plant and sensor behind any channel.
 
-    Behind links with memory the modes are estimated jointly; if such a channel also loses data, what arrives is used as
-    information on the modes (`side_information_filter`). Behind a late link the past signals are estimated jointly,
-    unless the delay is constant.
+    Modes of links, of a `markov_plant` and of a `markov_sensor` are estimated jointly; if a link with memory also loses
+    data, what arrives is used as information on the modes (`side_information_filter`). Behind a late link the past
+    signals are estimated jointly, unless the delay is constant.
 
     Inputs are taken as known in advance. Behind a random gain the noise depends on the second moment of the state, and
     this is that of the plant under such inputs; an input computed from the estimates depends on the gains drawn, so in
@@ -172,9 +175,9 @@ def linear_filter(
     grows without bound.
 
     Args:
-        plant: a linear plant, n states.
-        sensor: a linear sensor, m outputs, with white noise.
-        channel: from the sensor to the filter.
+        plant: a linear plant, n states, or one with modes whose laws are linear.
+        sensor: a linear sensor, m outputs, with white noise, or one with modes.
+        channel: from the sensor to the filter; beside modes of plant or sensor one without losses.
         update: how uncertain probabilities are bounded; `Polytope()` by default, none behind links with memory.
         encoder: `Words` as which the sensor's measurement is sent, where the channel is one of words; none by default.
 
@@ -184,7 +187,8 @@ def linear_filter(
     step or more, "nominal" if not; and "nominal" where overload may change the rms error by more than 1 %.
 
     Raises:
-        ValueError: a plant or sensor that is not linear, or parts that do not fit.
+        ValueError: a plant or sensor that is not linear, parts that do not fit, or, beside modes of plant or sensor,
+            losses or uncertain transitions.
 
     Source: De Koning (1984), for multiplicative noise; Costa (1994), for modes.
     """
@@ -193,10 +197,11 @@ def linear_filter(
     # Delays: the same filter for the system enlarged by past signals.
     if check_maps("channel", [first(channel)])[0].past:
         return build_behind_delays(plant, sensor, channel, partial(linear_filter, update=update))
-    check_linear("linear filter", plant, sensor)
-    check_link(first(sensor), first(channel), len(first(plant).states))
+    for moves, senses in product(models_of(first(plant)), models_of(first(sensor))):
+        check_linear("linear filter", moves, senses)
+        check_link(senses, first(channel), len(moves.states))
     # Memory: the modes are estimated jointly with the state.
-    if first(channel).remembers:
+    if first(channel).remembers or is_modal(first(plant)) or is_modal(first(sensor)):
         if update is not None:
             raise fail("update", "none behind a channel that remembers", type(update).__name__)
         if has_bounded_noise(plant, sensor, channel):
@@ -223,13 +228,26 @@ def linear_filter(
 
 
 def _make_behind_memory(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> AbstractFilter:
-    """Return the filter that estimates the modes of links jointly with the state."""
+    """Return the filter that estimates the modes of links, plant and sensor jointly with the state."""
+    if is_modal(first(plant)) or is_modal(first(sensor)):
+        return _make_of_jump_system(plant, sensor, channel)
     if first(channel).erases:
         return side_information_filter(plant, sensor, channel)
     if uncertain_chain(channel):
         return uncertain_modal_filter(plant, sensor, channel)
     terms = independent_terms(channel)
     return additive_modal_filter(plant, sensor, terms) if len(terms) > 1 else modal_filter(plant, sensor, channel)
+
+
+def _make_of_jump_system(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> AbstractFilter:
+    """Return the filter of a plant or sensor that has modes; what it cannot say of the link is refused."""
+    if first(channel).erases:
+        expected = "a link without losses where plant or sensor has modes (a row that is lost is NaN; imm_filter else)"
+        raise fail("channel of a linear filter", expected, "an erasure")
+    if uncertain_chain(channel):
+        expected = "known transitions where plant or sensor has modes"
+        raise fail("channel of a linear filter", expected, "a radius of uncertainty")
+    return modal_filter(plant, sensor, channel)
 
 
 @believes
@@ -254,6 +272,7 @@ def memoryless_filter(
 
     Source: De Koning (1984), for multiplicative noise that is independent over time.
     """
+    check_linear("memoryless filter", plant, sensor)
     forgets, matters = without_memory(channel), memory_matters(channel)
 
     def make(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> LinearFilter:
@@ -285,6 +304,7 @@ def as_current_filter(
 
     Source: the usual mistake; De Koning (1984), with y_k in place of y_{k-d}.
     """
+    check_linear("filter that takes delayed signals as current", plant, sensor)
     ignoring = linear_filter(plant, sensor, without_memory(deliver_line_as_current(channel)), update)
     assert isinstance(ignoring, LinearFilter)  # a channel without delay or memory has no other
     return _claim_nominal(ignoring) if first(channel).past or memory_matters(channel) else ignoring

@@ -22,19 +22,17 @@ from heliograph.factors.columns import Columns, join_columns, rounding_of, side_
 from heliograph.factors.gaussian import Gaussian, from_columns, from_covariance
 from heliograph.filters.base import Step, corrects, make_sizes, predicts
 from heliograph.filters.gaussian.signal import factor_spread
+from heliograph.filters.modes.linear_by_mode import centred_measurement, centred_transition, pad_with_zeros
 from heliograph.filters.modes.modal import (
     AbstractModalFilter,
     ChannelByMode,
     MeasurementModel,
-    centred_measurement,
-    centred_transition,
     channels_by_mode,
     claim_of_modes,
     concatenate_modes,
     covariance_of_mode,
     kron,
     observe_modes,
-    pad_with_zeros,
     predict_by_mode,
 )
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of

@@ -1,8 +1,8 @@
-"""Best linear filter behind links with memory: it estimates the state jointly with the mode of the links.
+"""Best linear filter of jump systems: it estimates the state jointly with the mode of links, plant and sensor.
 
 With x~ = (x, 1) and modes theta, zeta^j = x~ 1{theta = j}. Its transition and its measurement are linear and their
-noises white, E[zeta+ | past] = F zeta with F[j, i] = Pi[i, j] A~_j, and E[z | zeta, past] = sum_j Hbar_j C~ zeta^j, so
-that a Kalman filter of zeta is the best linear filter of x = sum_j zeta^j. All moments are those of x~ = (x - c, 1),
+noises white, E[zeta+ | past] = F zeta with F[j, i] = Pi[i, j] A~_j, and E[z | zeta, past] = sum_j Hbar_j C~_j zeta^j,
+so that a Kalman filter of zeta is the best linear filter of x = sum_j zeta^j. All moments are those of x~ = (x - c, 1),
 c = E[x] before data: a mean far from zero, which the modes' indicators multiply, would leave no digits for the rest.
 
 The covariance of zeta is carried by factors; the moments before any data, which no measurement diminishes, are plain
@@ -10,8 +10,10 @@ matrices.
 """
 
 from abc import abstractmethod
-from typing import NamedTuple, TypeVar
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,20 +28,32 @@ from heliograph.factors.columns import (
 )
 from heliograph.factors.gaussian import Gaussian, from_columns, from_covariance
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
-from heliograph.filters.gaussian.belief import process_noise, second_moments_at_start
+from heliograph.filters.gaussian.belief import second_moments_at_start
 from heliograph.filters.gaussian.signal import condition_on_measurement, factor_spread
 from heliograph.filters.linear.plan import plan_filter
+from heliograph.filters.modes.linear_by_mode import (
+    MotionByMode,
+    centred_motion,
+    centred_sensing,
+    noise_by_mode,
+    noise_in_mode,
+    pad_with_zeros,
+)
+from heliograph.filters.modes.models_by_mode import find_models
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
+from heliograph.linear.jump_system import mix_modes, propagate_by_mode
 from heliograph.model.channel import Channel
-from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.estimate import Claim, Estimate, Innovation, lower_by_noise
+from heliograph.model.modes_of_motion import models_of
 from heliograph.model.over_time import OverTime, at, first, restack, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant
-from heliograph.model.sensor import AnySensor, LinearSensor
+from heliograph.model.sensor import AnySensor
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import outer
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import stack_parts
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, PyTree
+from heliograph.random_affine.memory import drop_names
 from heliograph.random_affine.modes import JointModes, joint_modes
 from heliograph.random_affine.moments.second_moments import divide_spread, join_gain_and_noise, nominal_spread
 
@@ -135,14 +149,19 @@ class AbstractJointModalFilter(AbstractModalFilter):
 
 
 class ModalFilter(AbstractJointModalFilter):
-    """The linear minimum-mean-square-error filter of a linear plant behind links with memory.
+    """The linear minimum-mean-square-error filter of a linear system whose plant, sensor and links have modes.
 
-    The estimate of zeta includes the modes' probabilities; its covariance is singular, since the modes' indicators
-    sum to 1, which its factors take as it is. Which components arrive must not depend on the modes. The innovation
-    covariance is exact; the innovation is not Gaussian, so its Gaussian likelihood is nominal.
+    The mode of a step moves the plant and measures in it. The estimate of zeta includes the modes' indicators, which
+    are linear estimates and no probabilities; its covariance is singular, since they sum to 1, which its factors take
+    as it is. Which components arrive must not depend on the modes. The innovation covariance is exact; the innovation
+    is not Gaussian, so its Gaussian likelihood is nominal.
 
-    Source: Costa, Linear minimum mean square error estimation for discrete-time Markovian jump linear systems (1994).
+    Source: Costa, Linear minimum mean square error estimation for discrete-time Markovian jump linear systems (1994),
+    whose plant moves with the mode before.
     """
+
+    plant_modes: tuple[int, ...] = eqx.field(static=True)  # which of the plant's models each mode has
+    sensor_modes: tuple[int, ...] = eqx.field(static=True)
 
     @in_float64
     def init(self) -> ModalBelief:
@@ -153,29 +172,27 @@ class ModalFilter(AbstractJointModalFilter):
 
     @predicts
     def predict(self, state: ModalBelief, u: ArrayLike = (), k: Step = 0) -> ModalBelief:
-        """Move x~ by the plant and the mode by the chain; at the first prediction the mode has its initial law.
+        """Move the mode by the chain and x~ by its plant; at the first prediction the mode has its initial law.
 
-        Cov(zeta+ - F zeta)[j, l] = sum_i (delta_jl Pi_ij - Pi_ij Pi_il) A~ E_i A~' + delta_jl P(j) Q~.
+        Cov(zeta+ - F zeta)[j, l] = A~_j sum_i (delta_jl Pi_ij - Pi_ij Pi_il) E_i A~_l' + delta_jl P(j) Q~_j.
         """
-        (move, noise, centre), rows = (
-            centred_transition(at(self.plant, k), u, state.centre),
-            self._transition_matrix(state, k),
-        )
-        law = state.law @ rows
+        rows = self._transition_matrix(state, k)
+        arriving, motion = mix_modes(rows, state.moments), self._motion(state, u, k)
+        law = arriving[:, -1, -1]
         # F zeta about the moving centre.
         centred = state.gaussian.mean - mean_from_centre(state.law, state.centre)
-        mean = predict_by_mode(centred[:, None], move, rows)[:, 0] + mean_from_centre(law, centre)
+        mean = predict_by_mode(centred[:, None], motion.moves, rows)[:, 0] + mean_from_centre(law, motion.centre)
         root, fresh = self._transition_factors(state, u, k)
         after = from_columns(mean, join_columns(Columns(root, state.gaussian.variances), fresh))
-        moments = jnp.einsum("ij,iab->jab", rows, _propagate_moments(state, move)) + law[:, None, None] * noise
-        return ModalBelief(after, moments, centre, jnp.asarray(True))
+        moments = propagate_by_mode(motion.moves, arriving, law[:, None, None] * motion.noises)
+        return ModalBelief(after, moments, motion.centre, jnp.asarray(True))
 
     @corrects
     def correct(self, state: ModalBelief, z: ArrayLike, k: Step = 0) -> tuple[ModalBelief, Innovation]:
         """Correct with the components of z that arrived.
 
-        Cov(z - E[z | zeta]) = sum_j T_j(C~ E_j C~' + P(j) R~) + P(j) (Hbar_j R~ Hbar_j' + Cov n_j), T_j the spread of
-        the gains in mode j.
+        Cov(z - E[z | zeta]) = sum_j T_j(C~_j E_j C~_j' + P(j) R~_j) + P(j) (Hbar_j R~_j Hbar_j' + Cov n_j), T_j the
+        spread of the gains in mode j.
         """
         centred = state.gaussian.mean - mean_from_centre(state.law, state.centre)
         after, innovation = observe_modes(state.gaussian, centred, self._measurement_model(state, k), z)
@@ -187,22 +204,36 @@ class ModalFilter(AbstractJointModalFilter):
 
     def _transition_factors(self, state: ModalBelief, u: ArrayLike, k: Step) -> tuple[jax.Array, Columns]:
         """Return F L of zeta = E zeta + L xi, and columns of Cov(zeta+ - F zeta)."""
-        move, rows = centred_transition(at(self.plant, k), u, state.centre)[0], self._transition_matrix(state, k)
-        own = self.process_noise_by_mode(u, k, Columns(jnp.eye(len(rows)), state.law @ rows))
-        fresh = join_columns(mode_transition_covariance(_propagate_moments(state, move), rows), own)
-        return predict_by_mode(state.gaussian.root, move, rows), fresh
+        rows, moves, plants = self._transition_matrix(state, k), self._motion(state, u, k).moves, self._plants(k)
+        # What the chain draws moves in its mode.
+        among = mode_transition_covariance(state.moments, rows)
+        parts = among.matrix.reshape(*moves.shape[:2], -1)
+        drawn = Columns((moves @ parts).reshape(among.matrix.shape), among.weights)
+        start = second_moments_at_start(self.plant)
+        own = noise_by_mode(plants, self.plant_modes, u, start, state.law @ rows)
+        return predict_by_mode(state.gaussian.root, moves, rows), join_columns(drawn, own)
+
+    def _plants(self, k: Step) -> tuple[LinearPlant, ...]:
+        """Return the laws of motion of a step."""
+        return models_of(at(self.plant, k))
+
+    def _motion(self, state: ModalBelief, u: ArrayLike, k: Step) -> MotionByMode:
+        """Return how the state moves about its centre in each mode of the step."""
+        arriving = mix_modes(self._transition_matrix(state, k), state.moments)
+        return centred_motion(self._plants(k), self.plant_modes, u, state.centre, arriving[:, :, -1])
 
     def _measurement_model(self, state: ModalBelief, k: Step) -> MeasurementModel:
         """Return z = common + H zeta + v, H from the modes' gains, and columns of Cov v."""
-        channel, sensor = at(self.channel, k), at(self.sensor, k)
-        (measure, noise), law = centred_measurement(sensor, state.centre), state.law
-        matrix, common = subtract_mean_output(jnp.asarray(channel.mean) @ measure, law)
+        channel, sensors, law = at(self.channel, k), models_of(at(self.sensor, k)), state.law
+        measure, noise = centred_sensing(sensors, self.sensor_modes, state.centre)
+        gains = jnp.asarray(channel.mean)
+        matrix, common = subtract_mean_output(gains @ measure, law)
         # E[y~ y~' 1{mode j}] of what is sent (M, p + 1, p + 1), and the spread of the gains on it (m, m).
-        sent = jax.vmap(lambda a: measure @ a @ measure.T)(state.moments) + law[:, None, None] * noise
+        sent = propagate_by_mode(measure, state.moments, law[:, None, None] * noise)
         gain_noise = factor_spread(jnp.einsum("jmlab,jab->ml", jnp.asarray(channel.gain_spread), sent))
         # Noise of sensor and links, in the mean over the modes, and rounding.
-        plain = known_noise(channel, sensor.noise.columns, law)
-        rounding = rounding_of_received(jnp.asarray(channel.mean), sent)
+        plain = known_noise(channel, [sensors[mode].noise.columns for mode in self.sensor_modes], law)
+        rounding = rounding_of_received(gains, sent)
         return MeasurementModel(concatenate_modes(matrix), common, join_columns(plain, rounding, gain_noise))
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
@@ -212,29 +243,15 @@ class ModalFilter(AbstractJointModalFilter):
         return smoother_step_of(step, moved, self.claim, projection=projection)
 
 
-def _propagate_moments(state: ModalBelief, move: jax.Array) -> jax.Array:
-    """Carry the moments of each mode through the plant: A~ E_i A~' (M, n + 1, n + 1)."""
-    carried: jax.Array = jax.vmap(lambda a: move @ a @ move.T)(state.moments)
-    return carried
+def predict_by_mode(columns: jax.Array, moves: jax.Array, rows: jax.Array) -> jax.Array:
+    """Multiply columns (N, c) by F, F[j, i] = Pi[i, j] A~_j: mix all parts by the chain, then move each."""
+    parts = (rows.T @ columns.reshape(len(rows), -1)).reshape(rows.shape[1], moves.shape[-1], -1)
+    return jnp.reshape(moves @ parts, columns.shape)
 
 
-def noise_in_mode(plant: LinearPlant, u: ArrayLike, start: jax.Array) -> Columns:
-    """Return the covariance of the process noise of x~, with the rounding of the state and of the mode's indicator."""
-    own = process_noise(plant, jnp.asarray(u), start)
-    one = rounding_of(np.ones(1))
-    return Columns(jax.scipy.linalg.block_diag(own.matrix, one.matrix), jnp.append(own.weights, one.weights))
-
-
-def predict_by_mode(columns: jax.Array, move: jax.Array, rows: jax.Array) -> jax.Array:
-    """Multiply columns (N, c) by F, F[j, i] = Pi[i, j] A~: move each part by the plant, then mix all by the chain."""
-    parts = columns.reshape(len(rows), len(move), -1)
-    moved = jax.vmap(lambda part: move @ part)(parts).reshape(len(rows), -1)
-    return jnp.reshape(rows.T @ moved, columns.shape)
-
-
-def mode_transition_covariance(carried: jax.Array, rows: jax.Array) -> Columns:
-    """Covariance (N, N) of zeta+ by the modes' random transition, sum_i Cov(1{next} | i) x E_i, of E_i (M, s, s)."""
-    return separate_modes(jnp.einsum("ijl,iab->jalb", covariance_of_mode(rows)[:, :-1, :-1], carried))
+def mode_transition_covariance(moments: jax.Array, rows: jax.Array) -> Columns:
+    """Return columns of sum_i Cov(1{next} | i) x E_i (N, N), what the chain draws, from the moments E_i (M, s, s)."""
+    return separate_modes(jnp.einsum("ijl,iab->jalb", covariance_of_mode(rows)[:, :-1, :-1], moments))
 
 
 def covariance_of_mode(rows: jax.Array) -> jax.Array:
@@ -252,11 +269,11 @@ def separate_modes(among: jax.Array) -> Columns:
     return factors.through(np.concatenate([np.eye(others * size), -np.tile(np.eye(size), (1, others))]))
 
 
-def known_noise(channel: ChannelByMode, sent: Columns, law: jax.Array) -> Columns:
-    """Return the columns (m, M columns) of sum_j P(j) (Hbar_j Cov(v) Hbar_j' + Cov n_j), which no signal scales."""
+def known_noise(channel: ChannelByMode, sent: Sequence[Columns], law: jax.Array) -> Columns:
+    """Return the columns of sum_j P(j) (Hbar_j Cov(v_j) Hbar_j' + Cov n_j) (m, m), which no signal scales."""
     gains = jnp.asarray(channel.mean)[:, :, :-1]
-    through = Columns(gains @ sent.matrix, jnp.broadcast_to(sent.weights, (len(law), len(sent.weights))))
-    return join_columns(side_by_side(through, law), side_by_side(channel.noise, law))
+    through = [own.through(gain).times(p) for gain, own, p in zip(gains, sent, law, strict=True)]
+    return join_columns(*through, side_by_side(channel.noise, law))
 
 
 def rounding_of_received(gains: jax.Array, sent: jax.Array) -> Columns:
@@ -284,18 +301,6 @@ def observe_modes(
     return condition_on_measurement(x, output.matrix @ x.root, output.noise, jnp.asarray(z), expected)
 
 
-def transition_with_constant(plant: LinearPlant, u: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return A~ = [[A, B u + E w], [0, 1]] and Q~ = diag(Q, 0) of x~ = (x, 1)."""
-    move = pad_with_zeros(plant.transition_matrix(u)).at[:-1, -1].set(plant.shift(u)).at[-1, -1].set(1.0)
-    return move, pad_with_zeros(plant.noise_covariance(u))
-
-
-def measurement_with_constant(sensor: LinearSensor) -> tuple[jax.Array, jax.Array]:
-    """Return C~ = [[C, E v], [0, 1]] and R~ = diag(R, 0) of y~ = (y, 1)."""
-    measure = pad_with_zeros(jnp.asarray(sensor.matrix)).at[:-1, -1].set(sensor.noise.mean).at[-1, -1].set(1.0)
-    return measure, pad_with_zeros(jnp.asarray(sensor.noise.covariance))
-
-
 def compute_initial_moments(start: LinearPlant, law: Array) -> tuple[Gaussian, jax.Array]:
     """Return the law of zeta at the start, and E[x~ x~'].
 
@@ -319,18 +324,6 @@ def mean_from_centre(law: jax.Array, centre: jax.Array) -> jax.Array:
     return jnp.kron(law, jnp.append(centre, 0.0))
 
 
-def centred_transition(plant: LinearPlant, u: ArrayLike, centre: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return A~ and Q~ of x - c, which no known input moves, and c one step later."""
-    move, noise = transition_with_constant(plant, jnp.asarray(u))
-    return move.at[:-1, -1].set(0.0), noise, move[:-1] @ jnp.append(centre, 1.0)
-
-
-def centred_measurement(sensor: LinearSensor, centre: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return C~ and R~ of the centred state: y = C (x - c) + C c + E v."""
-    measure, noise = measurement_with_constant(sensor)
-    return measure.at[:-1, -1].add(measure[:-1, :-1] @ centre), noise
-
-
 def subtract_mean_output(output: jax.Array, law: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Subtract the mean output over the modes, as the indicators sum to 1; return what is left and the mean output.
 
@@ -345,29 +338,32 @@ def concatenate_modes(output: jax.Array) -> jax.Array:
     return jnp.concatenate(list(output), axis=1)
 
 
-def pad_with_zeros(a: jax.Array) -> jax.Array:
-    """Pad A by a row and a column of zeros: [[A, 0], [0, 0]]."""
-    return jnp.pad(a, ((0, 1), (0, 1)))
-
-
-M = TypeVar("M", bound=AbstractJointModalFilter)
-
-
 def modal_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> ModalFilter:
-    """Return the best linear filter behind links with memory; `linear_filter` has checked that the parts fit."""
-    return build_from_modes(ModalFilter, plant, sensor, channel, claim_of_modes(channel))
+    """Return the best linear filter where links, plant or sensor have modes; `linear_filter` has checked the parts."""
+    models = first(plant), first(sensor)
+    which = joint_modes(first(channel), beside=models).beside
+    claim = lower_by_noise(claim_of_modes(channel), *models_of(models[0]), *models_of(models[1]))
+    return ModalFilter(
+        plant=drop_names(plant),
+        sensor=drop_names(sensor),
+        plant_modes=find_models("plant", plant, [own for own, _ in which]),
+        sensor_modes=find_models("sensor", sensor, [own for _, own in which]),
+        **fields_of_joint_modes(plant, sensor, channel, claim),
+    )
 
 
-def build_from_modes(kind: type[M], plant: AnyPlant, sensor: AnySensor, channel: Channel, claim: Claim) -> M:
-    """Build a filter of this kind with the channel's observation models."""
-    start, (initial, described) = first(plant), channels_by_mode(channel)
-    sizes = make_sizes(claim, start, first(channel).outputs)
-    return kind(plant=plant, sensor=sensor, channel=described, initial=initial, **sizes)
+def fields_of_joint_modes(plant: AnyPlant, sensor: AnySensor, channel: Channel, claim: Claim) -> dict[str, Any]:
+    """Return the channel's observation models by mode, and the sizes, of a filter of joint modes."""
+    initial, described = channels_by_mode(channel, (first(plant), first(sensor)))
+    return {"channel": described, "initial": initial, **make_sizes(claim, first(plant), first(channel).outputs)}
 
 
-def channels_by_mode(channel: Channel) -> tuple[Float[Array, " M"], ChannelByMode | OverTime]:
-    """Law of the modes at the first step, and the observation model of each; links without memory have one mode."""
-    steps = [joint_modes(c) for c in unstack(channel)]
+def channels_by_mode(channel: Channel, beside: PyTree = ()) -> tuple[Float[Array, " M"], ChannelByMode | OverTime]:
+    """Law of the modes at the first step, and the observation model of each; links without memory have one mode.
+
+    `beside`: plant and sensor, whose modes come before the channel's.
+    """
+    steps = [joint_modes(c, beside=beside) for c in unstack(channel)]
     models = [channel_by_mode(step, before) for step, before in zip(steps, [steps[0], *steps[:-1]], strict=True)]
     return steps[0].initial, restack(models, channel)
 

@@ -24,12 +24,10 @@ from heliograph.factors.gaussian import Innovations, from_covariance
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.gaussian.belief import second_moments_at_start
 from heliograph.filters.gaussian.signal import factor_spread, signal_size_at_start
+from heliograph.filters.modes.linear_by_mode import centred_measurement, centred_transition, noise_in_mode
 from heliograph.filters.modes.modal import (
-    centred_measurement,
-    centred_transition,
     concatenate_modes,
     kron,
-    noise_in_mode,
     predict_by_mode,
     subtract_mean_output,
     sum_of_modes,

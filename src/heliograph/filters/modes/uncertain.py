@@ -14,15 +14,14 @@ from heliograph.factors.columns import Columns, join_columns, triangularise
 from heliograph.factors.gaussian import Gaussian, from_columns
 from heliograph.filters.base import Step, corrects, predicts
 from heliograph.filters.gaussian.signal import factor_spread
+from heliograph.filters.modes.linear_by_mode import centred_measurement, centred_transition
 from heliograph.filters.modes.modal import (
     AbstractJointModalFilter,
     MeasurementModel,
-    build_from_modes,
-    centred_measurement,
-    centred_transition,
     claim_of_modes,
     compute_initial_moments,
     concatenate_modes,
+    fields_of_joint_modes,
     mean_from_centre,
     observe_modes,
     predict_by_mode,
@@ -205,4 +204,5 @@ def _largest_payoff(payoff: jax.Array, low: jax.Array, high: jax.Array) -> jax.A
 def uncertain_modal_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> UncertainModalFilter:
     """Build the filter behind a channel with an uncertain chain; `linear_filter` has checked that the parts fit."""
     claim: Claim = "upper" if claim_of_modes(channel) == "exact" else "nominal"
-    return build_from_modes(UncertainModalFilter, plant, sensor, channel, claim)
+    fields = fields_of_joint_modes(plant, sensor, channel, claim)
+    return UncertainModalFilter(plant=plant, sensor=sensor, **fields)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.model.modes_of_motion import models_of
 from heliograph.model.over_time import at, first, stacked
 from heliograph.model.plant import TIME_STEP, AbstractPlant, AnyPlant, LinearPlant, OfInputs, matrix_of
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor
@@ -104,8 +105,9 @@ def _sensors_of_inputs(models: PyTree, names: Sequence[str]) -> Iterator[tuple[A
 
 
 def plants_in(models: PyTree) -> Iterator[AnyPlant]:
-    """Yield the plants that a model object holds."""
-    yield from parts_in(models, AbstractPlant)
+    """Yield the plants that a model object holds; of one with modes its laws of motion."""
+    for plant in parts_in(models, AbstractPlant):
+        yield from models_of(plant)
 
 
 def parts_in(models: PyTree, kind: type) -> Iterator[PyTree]:

@@ -1,0 +1,109 @@
+"""Linear plants and sensors of x~ = (x, 1) about a centre c, mode by mode: the parts of filters of jump systems.
+
+All moments are those of (x - c, 1): a mean far from zero, which the modes' indicators multiply, would leave no digits
+for the rest.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.factors.columns import Columns, rounding_of
+from heliograph.filters.gaussian.belief import process_noise
+from heliograph.model.plant import LinearPlant
+from heliograph.model.sensor import LinearSensor
+from heliograph.numerics.types import ArrayLike
+
+
+def transition_with_constant(plant: LinearPlant, u: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return A~ = [[A, B u + E w], [0, 1]] and Q~ = diag(Q, 0) of x~ = (x, 1)."""
+    move = pad_with_zeros(plant.transition_matrix(u)).at[:-1, -1].set(plant.shift(u)).at[-1, -1].set(1.0)
+    return move, pad_with_zeros(plant.noise_covariance(u))
+
+
+def measurement_with_constant(sensor: LinearSensor) -> tuple[jax.Array, jax.Array]:
+    """Return C~ = [[C, E v], [0, 1]] and R~ = diag(R, 0) of y~ = (y, 1)."""
+    measure = pad_with_zeros(jnp.asarray(sensor.matrix)).at[:-1, -1].set(sensor.noise.mean).at[-1, -1].set(1.0)
+    return measure, pad_with_zeros(jnp.asarray(sensor.noise.covariance))
+
+
+def centred_transition(plant: LinearPlant, u: ArrayLike, centre: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return A~ and Q~ of x - c, which no known input moves, and c one step later."""
+    move, noise = transition_with_constant(plant, jnp.asarray(u))
+    return move.at[:-1, -1].set(0.0), noise, move[:-1] @ jnp.append(centre, 1.0)
+
+
+def centred_measurement(sensor: LinearSensor, centre: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return C~ and R~ of the centred state: y = C (x - c) + C c + E v."""
+    measure, noise = measurement_with_constant(sensor)
+    return measure.at[:-1, -1].add(measure[:-1, :-1] @ centre), noise
+
+
+def noise_in_mode(plant: LinearPlant, u: ArrayLike, start: jax.Array) -> Columns:
+    """Return the covariance of the process noise of x~, with the rounding of the state and of the mode's indicator."""
+    own = process_noise(plant, jnp.asarray(u), start)
+    one = rounding_of(np.ones(1))
+    return Columns(jax.scipy.linalg.block_diag(own.matrix, one.matrix), jnp.append(own.weights, one.weights))
+
+
+def pad_with_zeros(a: jax.Array) -> jax.Array:
+    """Pad A by a row and a column of zeros: [[A, 0], [0, 0]]."""
+    return jnp.pad(a, ((0, 1), (0, 1)))
+
+
+class MotionByMode(NamedTuple):
+    """Transition of x~ about a centre in each mode, A~_j and Q~_j, and the centre one step later.
+
+    Shapes: moves and noises (M, n + 1, n + 1), centre (n,).
+    """
+
+    moves: jax.Array
+    noises: jax.Array
+    centre: jax.Array
+
+
+def centred_motion(
+    plants: Sequence[LinearPlant], modes: Sequence[int], u: ArrayLike, centre: jax.Array, arriving: jax.Array
+) -> MotionByMode:
+    """Return how x - c moves in each mode, and the next centre: E[x+] before any data.
+
+    x+ - c+ = A_j (x - c) + d_j + w_j with d_j = A_j c + B_j u + E w_j - c+. Of one law of motion d is 0: known inputs
+    move the mean alone.
+
+    Args:
+        plants: the laws of motion.
+        modes: which of them each mode has.
+        u: input (inputs,).
+        centre: c (n,).
+        arriving: E[(x - c, 1) 1{mode j}] of the mode that moves (M, n + 1).
+    """
+    parts = [transition_with_constant(plant, jnp.asarray(u)) for plant in plants]
+    moves, noises = (jnp.stack([parts[mode][i] for mode in modes]) for i in range(2))
+    at_centre = moves[:, :-1] @ jnp.append(centre, 1.0)
+    if len(plants) == 1:
+        return MotionByMode(moves.at[:, :-1, -1].set(0.0), noises, at_centre[0])
+    # E[x+ 1{j}] = A_j E[(x - c) 1{j}] + P(j) (A_j c + B_j u + E w_j).
+    law = arriving[:, -1:]
+    means = jnp.einsum("jab,jb->ja", moves[:, :-1, :-1], arriving[:, :-1]) + law * at_centre
+    after = jnp.sum(means, axis=0) / jnp.sum(law)
+    return MotionByMode(moves.at[:, :-1, -1].set(at_centre - after), noises, after)
+
+
+def noise_by_mode(
+    plants: Sequence[LinearPlant], modes: Sequence[int], u: ArrayLike, start: jax.Array, law: jax.Array
+) -> Columns:
+    """Return columns of the process noise and rounding of zeta, P(j) Cov w_j in the block of mode j."""
+    parts = [noise_in_mode(plant, u, start) for plant in plants]
+    matrix = jax.scipy.linalg.block_diag(*(parts[mode].matrix for mode in modes))
+    return Columns(matrix, jnp.concatenate([p * parts[mode].weights for p, mode in zip(law, modes, strict=True)]))
+
+
+def centred_sensing(
+    sensors: Sequence[LinearSensor], modes: Sequence[int], centre: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Return C~_j and R~_j of the centred state in each mode (M, p + 1, n + 1), (M, p + 1, p + 1)."""
+    parts = [centred_measurement(sensor, centre) for sensor in sensors]
+    return jnp.stack([parts[mode][0] for mode in modes]), jnp.stack([parts[mode][1] for mode in modes])
