@@ -33,9 +33,9 @@ def service(program, forecast, *thresholds):
     return Service(fleet, InMemoryStore(), forecast=horizons_in(forecast), thresholds=levels)
 
 
-def message(k, value):
+def message(k, value, plant="p"):
     time = (BEGUN + timedelta(seconds=2 * k)).isoformat()
-    return json.dumps({"plant": "p", "node": "a", "sequence": k, "time": time, "values": [value]}).encode()
+    return json.dumps({"plant": plant, "node": "a", "sequence": k, "time": time, "values": [value]}).encode()
 
 
 def test_a_service_publishes_what_a_timeline_forecasts(program):
@@ -51,6 +51,17 @@ def test_a_service_publishes_what_a_timeline_forecasts(program):
         np.testing.assert_allclose(found["mean"], expected.states.mean[i], rtol=1e-12)
         np.testing.assert_allclose(found["covariance"], expected.states.covariance[i], rtol=1e-12)
         assert found["outputs"]["y"]["deviation"] == pytest.approx(expected.outputs.deviation[i, 0], rel=1e-12)
+
+
+def test_plants_of_a_batch_are_forecast_as_each_alone(program):
+    """Side by side, with their levels; each of its own row."""
+    told = {"p": (0, 1.0), "q": (3, -2.0), "r": (1, 0.2)}
+    together = service(program, "2s,1min", "x>1.5").take([message(*row, plant) for plant, row in told.items()])
+    alone = [service(program, "2s,1min", "x>1.5").take([message(*row, plant)]) for plant, row in told.items()]
+    bodies = {output.plant: output.body for output in together if output.kind == "provisional"}
+    assert bodies == {
+        output.plant: output.body for outputs in alone for output in outputs if output.kind == "provisional"
+    }
 
 
 @pytest.mark.parametrize("text", ["3s", "2026-12-01", "4s,2s", "0s"])

@@ -10,15 +10,24 @@ from heliograph.factors.gaussian import from_covariance
 from heliograph.filters.base import AbstractFilter, FilterAngles
 from heliograph.filters.gaussian.belief import open_loop_filter
 from heliograph.forecasting.horizons import Ahead, Horizons, Inputs, ahead_of, check_ahead
-from heliograph.forecasting.outlook import Outlook, look_ahead, outlook_of, output_claim, prediction_of
+from heliograph.forecasting.origins import Sources, origin_of_sources
+from heliograph.forecasting.outlook import (
+    Outlook,
+    look_ahead,
+    look_ahead_of_each,
+    outlook_of,
+    output_claim,
+    prediction_of,
+)
 from heliograph.forecasting.prediction import Forecast
 from heliograph.model.enlarged.joint import joint_sensor
 from heliograph.model.estimate import Estimate, weakest
-from heliograph.model.origin import HasOrigin, Origin
+from heliograph.model.origin import Origin
 from heliograph.model.over_time import first
 from heliograph.model.plant import LinearPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.numerics.check import fail
+from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node, name_values
@@ -26,49 +35,34 @@ from heliograph.simulation.node import Node, name_values
 Forecasts: TypeAlias = dict[str, dict[str, Forecast]]  # by node and filter
 
 
-def forecast(source: HasOrigin, horizons: Horizons, inputs: Inputs = None) -> Forecast | Forecasts:
+def forecast(source: Sources, horizons: Horizons, inputs: Inputs = None) -> Forecast | Forecasts:
     """Forecast states, what sensors would measure, and what would arrive, from what has arrived so far.
 
     Each filter predicts from its last state as if nothing arrived any more; `source` stays as it is. Modes and
     particles are predicted as mixtures. The claim is the filter's own: a filter that is exact is so ahead.
 
     Args:
-        source: what `filter.run`, `hg.run`, a `Stream` or a `Timeline` is: anything with an `origin`.
+        source: what `filter.run`, `hg.run`, a `Stream` or a `Timeline` is: anything with an `origin`. A list of such
+            sources of one filter or network is forecast side by side, for the cost of their predictions.
         horizons: a number of steps, for each up to it; or a list of how far ahead: in steps, as spans of time or as
             dates. Where the plant has an input dt, numbers in a list are times, which may lie between steps.
         inputs: what the plant will get, (steps up to the last horizon, inputs), where it has an input dt a row up to
-            each horizon and no column of dt; "held" for those of the last step. Needed where the plant has inputs.
+            each horizon and no column of dt; "held" for those of the last step. Needed where the plant has inputs. Of
+            a list of sources the same for all, or (sources, steps, inputs).
 
     Returns:
-        A `Forecast` of a single filter; of a network one for each estimate, by node and filter.
+        A `Forecast` of a single filter; of a network one for each estimate, by node and filter. Of a list of sources
+        its arrays have a leading axis of them; `of_source` is that of one.
 
     Raises:
         ValueError: nothing to forecast from, horizons that are not after the data, inputs that are missing or of
-            another shape, more steps than the model covers.
+            another shape, more steps than the model covers; a list of sources of other models or other steps.
 
     Source: the prediction step of the filter, repeated.
     """
-    origin = origin_of(source)
+    origin = origin_of_sources(source)
     forecasts = forecasts_from(origin, horizons, inputs)
     return forecasts if isinstance(origin.model, Network) else forecasts[""][""]
-
-
-def origin_of(source: object) -> Origin:
-    """Return where a forecast starts.
-
-    Raises:
-        ValueError: something without an origin, or a record whose filters' states were not kept.
-    """
-    origin = getattr(source, "origin", None)
-    if not isinstance(origin, Origin):
-        expected = "a result of filter.run or hg.run, a Stream or a Timeline"
-        got = type(source).__name__
-        raise fail(
-            "forecast",
-            expected,
-            f"a {got} without states, as files and simulations have" if hasattr(source, "origin") else got,
-        )
-    return origin
 
 
 def forecasts_from(origin: Origin, horizons: Horizons, inputs: Inputs) -> Forecasts:
@@ -78,8 +72,8 @@ def forecasts_from(origin: Origin, horizons: Horizons, inputs: Inputs) -> Foreca
     ahead = ahead_of(origin, model.inputs, horizons, inputs)
     forecasts: Forecasts = {}
     for target in targets_of(origin):
-        check_covered(target.outlook.filter, origin.step, len(ahead.u))
-        forecasts.setdefault(target.node, {})[target.filter] = _forecast_one(target, origin.step, ahead)
+        check_covered(target.outlook.filter, origin.step, ahead.u.shape[-2])
+        forecasts.setdefault(target.node, {})[target.filter] = _forecast_one(target, origin, ahead)
     return forecasts
 
 
@@ -122,7 +116,7 @@ def targets_of(origin: Origin) -> list[Target]:
             if (node, name) in model.places:
                 kind, f, i = model.places[node, name]
                 place = f * len(model.groups[model.kinds[kind].group]) + i
-                filter, state = model.nodes[node].filters[name], _entry(kinds[kind], place)
+                filter, state = model.nodes[node].filters[name], _entry(kinds[kind], place, origin.several)
             elif name in central:
                 known = model.fused[name]
                 assert isinstance(known, AbstractFilter)
@@ -134,9 +128,9 @@ def targets_of(origin: Origin) -> list[Target]:
     return found
 
 
-def _entry(stacked: PyTree, place: int) -> PyTree:
-    """Return one of the states of filters that are stacked."""
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[place], stacked)
+def _entry(stacked: PyTree, place: int, several: bool) -> PyTree:
+    """Return one of the states of filters that are stacked, behind the axis of several plants."""
+    return jax.tree.map(lambda leaf: np.take(leaf, place, axis=int(several)), stacked)
 
 
 def _predict_without_nodes(network: Network, estimate: Estimate) -> tuple[AbstractFilter, PyTree]:
@@ -148,7 +142,11 @@ def _predict_without_nodes(network: Network, estimate: Estimate) -> tuple[Abstra
     mean, covariance = np.asarray(estimate.mean), np.asarray(estimate.covariance)
     lowered = replace(filter, claim=claim)
     object.__setattr__(lowered, "kept", filter.kept)
-    return lowered, from_covariance(mean, covariance if claim != "none" else np.zeros_like(covariance))
+    factors = from_covariance if mean.ndim == 1 else _factor_each
+    return lowered, factors(mean, covariance if claim != "none" else np.zeros_like(covariance))
+
+
+_factor_each = compile_in_float64(jax.vmap(lambda mean, covariance: from_covariance(mean, covariance)))
 
 
 def _find_sensor(network: Network, node: str) -> AnySensor | None:
@@ -167,21 +165,21 @@ def _received(network: Network, node: str) -> tuple[str, ...]:
     return tuple(f"{name}_{part}" for name in network.names for part in network.nodes[name].received_names)
 
 
-def check_covered(filter: AbstractFilter, step: int, count: int) -> None:
+def check_covered(filter: AbstractFilter, step: int | np.ndarray, count: int) -> None:
     """Raise ValueError where what varies over time ends before these steps ahead."""
-    if filter.horizon is not None and step + count > filter.horizon:
-        left = max(filter.horizon - step, 0)
+    last = int(np.max(step))
+    if filter.horizon is not None and last + count > filter.horizon:
+        left = max(filter.horizon - last, 0)
         raise fail("horizons", f"at most {left} steps, which the model covers behind the data", count)
 
 
-def _forecast_one(target: Target, step: int, ahead: Ahead) -> Forecast:
+def _forecast_one(target: Target, origin: Origin, ahead: Ahead) -> Forecast:
     """Return the forecast of one filter."""
     outlook, filter = target.outlook, target.outlook.filter
-    check_ahead(filter.inputs, ahead, filter, step)
-    states, outputs, received = (
-        None if part is None else type(part)(*(np.asarray(leaf)[ahead.rows] for leaf in part))
-        for part in look_ahead(outlook, target.state, ahead.u, step)
-    )
+    check_ahead(filter.inputs, ahead, filter, origin.step)
+    look = look_ahead_of_each if origin.several else look_ahead
+    moments = look(outlook, target.state, ahead.u, origin.step)
+    states, outputs, received = jax.tree.map(lambda leaf: np.take(leaf, ahead.rows, axis=int(origin.several)), moments)
     assert states is not None
     angles, sensor = filter.angles_used() or FilterAngles((), ()), first(outlook.sensor)
     claim = filter.claim

@@ -32,9 +32,12 @@ class HasInputs(Protocol):
 
 
 class Ahead(NamedTuple):
-    """Rows to predict over: u (rows, inputs), the number of the row that ends at each horizon, and their times."""
+    """Rows to predict over: u (rows, inputs), the number of the row that ends at each horizon, and their times.
 
-    u: Float[np.ndarray, "rows inputs"]
+    Of several plants u and times have a leading axis.
+    """
+
+    u: Float[np.ndarray, "... rows inputs"]
     rows: np.ndarray
     steps: np.ndarray
     time: np.ndarray
@@ -59,7 +62,7 @@ def ahead_of(origin: Origin, names: Sequence[str], horizons: Horizons, inputs: I
     given, said = _complete_inputs(origin, names, others, inputs, count)
     u = given
     if continuous:
-        u = np.insert(given, list(names).index(TIME_STEP), np.diff(distances, prepend=0.0), axis=1)
+        u = np.insert(given, list(names).index(TIME_STEP), np.diff(distances, prepend=0.0), axis=-1)
     rows = np.arange(count) if continuous else distances.astype(int) - 1
     return Ahead(
         u,
@@ -95,8 +98,7 @@ def _convert_to_steps(origin: Origin, horizons: Horizons) -> np.ndarray:
 
 def _count_months(origin: Origin, date: datetime | np.datetime64) -> float:
     """Return how many steps of whole months a date lies ahead."""
-    assert isinstance(origin.time, np.datetime64)  # as the steps are months
-    apart = np.datetime64(date).astype("datetime64[M]") - origin.time.astype("datetime64[M]")
+    apart = np.datetime64(date).astype("datetime64[M]") - _find_end(origin, date).astype("datetime64[M]")
     steps, left = divmod(int(apart.astype(int)), origin.months)
     if left or not steps:
         raise fail("horizons", f"whole steps of {origin.months} months", f"{show_value(date)}, {apart} ahead")
@@ -140,50 +142,72 @@ def _convert_to_seconds(origin: Origin, one: object) -> float | None:
         return float(np.timedelta64(one, "ns").astype(np.int64)) / SECOND
     if not isinstance(one, datetime | np.datetime64):
         return None
-    if not isinstance(origin.time, np.datetime64):
-        raise fail("horizons", "how far ahead, as the data have no dates", show_value(one))
-    ahead = np.datetime64(one).astype("datetime64[ns]") - origin.time.astype("datetime64[ns]")
+    end = _find_end(origin, one)
+    ahead = np.datetime64(one).astype("datetime64[ns]") - end.astype("datetime64[ns]")
     if ahead <= np.timedelta64(0, "ns"):
-        raise fail("horizons", f"dates after the data, which end at {origin.time}", show_value(one))
+        raise fail("horizons", f"dates after the data, which end at {end}", show_value(one))
     return float(ahead.astype(np.int64)) / SECOND
+
+
+def _find_end(origin: Origin, one: datetime | np.datetime64) -> np.datetime64:
+    """Return the date at which the data end, of several sources all of them.
+
+    Raises:
+        ValueError: data without dates, or sources that end at different ones.
+    """
+    ends = np.unique(np.asarray(origin.time))
+    if ends.dtype.kind != "M":
+        raise fail("horizons", "how far ahead, as the data have no dates", show_value(one))
+    if len(ends) > 1:
+        raise fail("horizons", "how far ahead, as the sources end at different dates", show_value(one))
+    end: np.datetime64 = ends[0]
+    return end
 
 
 def _complete_inputs(
     origin: Origin, names: Sequence[str], others: Sequence[str], inputs: Inputs, count: int
 ) -> tuple[np.ndarray, InputsAhead]:
-    """Return the rows of inputs other than dt, and whether they were given or held."""
+    """Return the rows of inputs other than dt, and whether they were given or held; of several plants for each."""
+    plants = (len(origin.inputs),) if origin.several else ()
     if isinstance(inputs, str) and inputs != "held":
         raise fail("inputs ahead", 'an array, or "held"', repr(inputs))
     if not others:
         if inputs is not None and not isinstance(inputs, str) and np.size(inputs):
             raise fail("inputs ahead", "none, as the plant has none but dt", f"shape {np.shape(inputs)}")
-        return np.zeros((count, 0)), "none"
+        return np.zeros((*plants, count, 0)), "none"
     if inputs is None:
         raise fail("inputs ahead", f'rows of {list(others)} for {count} steps, or "held"', "none")
     if not isinstance(inputs, str):
-        single = len(others) == 1 and rank("inputs ahead", inputs) == 1
-        return array("inputs ahead", np.reshape(inputs, (-1, 1)) if single else inputs, (count, len(others))), "given"
-    held = origin.inputs[[list(names).index(name) for name in others]]
+        axes = rank("inputs ahead", inputs)
+        rows = np.reshape(inputs, (-1, 1)) if len(others) == 1 and axes == 1 else inputs
+        shape = (count, len(others))
+        given = array("inputs ahead", rows, (*plants, *shape) if axes == 3 and plants else shape)
+        return np.broadcast_to(given, (*plants, *shape)), "given"
+    held = origin.inputs[..., [list(names).index(name) for name in others]]
     if np.isnan(held).any():
         raise fail("inputs ahead", "rows, as there is no last step whose inputs could be held", '"held"')
-    return np.tile(held, (count, 1)), "held"
+    return np.repeat(held[..., None, :], count, axis=-2), "held"
 
 
-def check_ahead(names: Sequence[str], ahead: Ahead, models: object, step: int) -> None:
+def check_ahead(names: Sequence[str], ahead: Ahead, models: object, step: int | np.ndarray) -> None:
     """Refuse inputs for which a function of the plant returns what it must not."""
-    check_inputs(names, ahead.u, models, step)
+    count, width = ahead.u.shape[-2:]
+    if width:
+        steps = np.asarray(step)[..., None] + np.arange(count)
+        check_inputs(names, ahead.u.reshape(-1, width), models, np.ravel(steps))
 
 
 def _place_on_clock(origin: Origin, distances: np.ndarray, continuous: bool) -> np.ndarray:
     """Return the time of each horizon on the clock of the data."""
     spacing = 1.0 if continuous else origin.spacing
-    if not isinstance(origin.time, np.datetime64):
-        return np.asarray(origin.time + (1.0 if np.isnan(spacing) else spacing) * distances)
+    end = np.asarray(origin.time)[..., None]
+    if end.dtype.kind != "M":
+        return np.asarray(end + (1.0 if np.isnan(spacing) else spacing) * distances)
     if origin.months and not continuous:
-        last = origin.time.astype("datetime64[M]")
+        last = end.astype("datetime64[M]")
         ahead = (origin.months * distances).astype(int).astype("timedelta64[M]")
         return np.asarray((last + ahead).astype("datetime64[ns]"))
     if np.isnan(spacing):
-        return np.full(len(distances), np.datetime64("NaT", "ns"))
+        return np.full((*end.shape[:-1], len(distances)), np.datetime64("NaT", "ns"))
     ahead = np.round(SECOND * spacing * distances).astype(np.int64).astype("timedelta64[ns]")
-    return np.asarray(origin.time.astype("datetime64[ns]") + ahead)
+    return np.asarray(end.astype("datetime64[ns]") + ahead)

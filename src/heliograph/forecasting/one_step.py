@@ -10,7 +10,8 @@ from heliograph.engine.choice import compute_once
 from heliograph.filters.base import AbstractFilter, FilterAngles
 from heliograph.filters.filter_data import check_data
 from heliograph.forecasting.backtest import filtered_places, measured_by
-from heliograph.forecasting.forecast import Forecasts, origin_of, targets_of
+from heliograph.forecasting.forecast import Forecasts, targets_of
+from heliograph.forecasting.origins import origin_of
 from heliograph.forecasting.outlook import Outlook, outlook_of, output_claim, prediction_of
 from heliograph.forecasting.prediction import Forecast, InputsAhead
 from heliograph.model.over_time import first

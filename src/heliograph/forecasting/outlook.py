@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import compile_on_call, compute_once
+from heliograph.engine.choice import choose_code, compile_on_call, compute_once
 from heliograph.factors.gaussian import Gaussian, from_covariance, take_leading
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.belief import second_moments_at_start
@@ -23,10 +23,12 @@ from heliograph.model.over_time import at, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor, LinearSensor
 from heliograph.numerics.angle import Angles, nearest, wrap_angles
-from heliograph.numerics.float64 import quickly_compiled
+from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.memory import memories
+
+BLOCK = 128  # plants side by side under XLA
 
 
 @runtime_checkable
@@ -125,11 +127,31 @@ def _now(outlook: Outlook, state: PyTree) -> Moments:
     return outlook.mixture(state)
 
 
-def look_ahead(outlook: Outlook, state: PyTree, u: np.ndarray, step: int) -> tuple[Moments | None, ...]:
+def look_ahead(outlook: Outlook, state: PyTree, u: np.ndarray, step: int | np.ndarray) -> tuple[Moments | None, ...]:
     """Return the moments at each row ahead (rows, K, ...), by native code where it supports the filter."""
     arguments = outlook, state, np.asarray(u, dtype=float), np.asarray(step)
     moments: tuple[Moments | None, ...] = compute_once(_look_ahead, _by_xla, arguments)
     return moments
+
+
+def look_ahead_of_each(
+    outlook: Outlook, state: PyTree, u: np.ndarray, step: int | np.ndarray
+) -> tuple[Moments | None, ...]:
+    """Return the moments of several plants (plants, rows, K, ...), side by side: state, u and step lead with them."""
+    arguments = jax.tree.map(np.asarray, (state, np.asarray(u, dtype=float), step))
+    with jax.enable_x64(True):
+        choice = choose_code(_look_ahead, (outlook, *arguments), [False, True, True, True])
+        if choice.code is not None:
+            found: tuple[Moments | None, ...] = choice.results()
+            return found
+        # By XLA in blocks of one size, the last filled up with its last plant.
+        count = len(u)
+        blocks = [
+            to_numpy(_each_by_xla(outlook, *jax.tree.map(lambda a, rows=rows: a[rows], arguments)))
+            for begin in range(0, count, BLOCK)
+            for rows in (np.minimum(np.arange(begin, begin + BLOCK), count - 1),)
+        ]
+    return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *blocks)  # type: ignore[no-any-return]
 
 
 def _look_ahead(outlook: Outlook, state: PyTree, u: jax.Array, step: jax.Array) -> PyTree:
@@ -140,22 +162,27 @@ def _look_ahead(outlook: Outlook, state: PyTree, u: jax.Array, step: jax.Array) 
     return jax.lax.scan(body, jax.tree.map(jnp.asarray, state), rows)[1]
 
 
-_by_xla = quickly_compiled(_look_ahead)
+def _look_ahead_of_each(outlook: Outlook, states: PyTree, u: jax.Array, steps: jax.Array) -> PyTree:
+    return jax.vmap(lambda *plant: _look_ahead(outlook, *plant))(states, u, steps)
+
+
+_by_xla, _each_by_xla = quickly_compiled(_look_ahead), quickly_compiled(_look_ahead_of_each)
 
 
 def prediction_of(moments: Moments, names: tuple[str, ...], claim: Claim, angles: Angles) -> Prediction:
-    """Return the prediction of these moments (horizons, K, ...), its angles between -pi and pi."""
+    """Return the prediction of these moments (..., horizons, K, ...), its angles between -pi and pi."""
     weights, means, covariances = map(np.asarray, moments)
     variances = np.maximum(np.diagonal(covariances, axis1=-2, axis2=-1), 0.0)
-    means = nearest(means, means[:, :1], angles)
+    means = nearest(means, means[..., :1, :], angles)
     # First two moments of the mixture: within its parts, and between their means.
-    mean = np.einsum("hk,hkm->hm", weights, means)
-    apart = means - mean[:, None]
-    covariance = np.einsum("hk,hkij->hij", weights, covariances) + np.einsum("hk,hki,hkj->hij", weights, apart, apart)
+    mean = np.einsum("...k,...km->...m", weights, means)
+    apart = means - mean[..., None, :]
+    within = np.einsum("...k,...kij->...ij", weights, covariances)
+    covariance = within + np.einsum("...k,...ki,...kj->...ij", weights, apart, apart)
     if claim == "none":
         covariance, variances = np.full_like(covariance, np.nan), np.full_like(variances, np.nan)
     near = wrap_angles(mean, angles)
-    return Prediction(names, near, covariance, claim, weights, means + (near - mean)[:, None], variances)
+    return Prediction(names, near, covariance, claim, weights, means + (near - mean)[..., None, :], variances)
 
 
 def output_claim(filter: AbstractFilter, outlook: Outlook) -> Claim:

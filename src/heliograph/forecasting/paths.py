@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.forecasting.forecast import Target, check_covered, origin_of, target_of
+from heliograph.forecasting.forecast import Target, check_covered, target_of
 from heliograph.forecasting.horizons import Horizons, Inputs, ahead_of, check_ahead
+from heliograph.forecasting.origins import origin_of
 from heliograph.model.origin import HasOrigin
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AnyPlant

@@ -1,5 +1,6 @@
 """What a forecast says of several numbers at several horizons: mean, covariance, quantiles, probabilities."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
 
@@ -8,7 +9,7 @@ from scipy.special import ndtr, ndtri
 from typing_extensions import TypeAliasType
 
 from heliograph.model.estimate import Claim
-from heliograph.numerics.check import array, fail, scalar
+from heliograph.numerics.check import array, fail, is_whole, scalar, show_value
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 
@@ -23,7 +24,8 @@ class Prediction:
     """The law of some numbers at each horizon: a Gaussian, or a mixture of K of them, of which each part is Gaussian.
 
     Quantiles and probabilities are of the mixture; mean and covariance are its first two moments. The quantiles of an
-    angle go on from its mean, so that a band about pi stays a band.
+    angle go on from its mean, so that a band about pi stays a band. Of several sources all arrays have one more axis,
+    of sources, before that of horizons.
 
     Args:
         names: of the numbers, m of them.
@@ -46,7 +48,7 @@ class Prediction:
     @property
     def deviation(self) -> Float[np.ndarray, "horizons m"]:
         """Claimed standard deviations (horizons, m)."""
-        variances = np.diagonal(self.covariance, axis1=1, axis2=2)
+        variances = np.diagonal(self.covariance, axis1=-2, axis2=-1)
         return np.sqrt(np.where(variances >= 0, variances, np.nan))
 
     def quantile(self, level: float) -> Float[np.ndarray, "horizons m"]:
@@ -61,8 +63,8 @@ class Prediction:
         means, deviations = self.part_means, np.sqrt(self.part_variances)
         each = means + ndtri(p) * deviations
         # The mixture's lies between the least and the greatest of its parts': halve that interval.
-        low, high = each.min(axis=1), each.max(axis=1)
-        for _ in range(HALVINGS if means.shape[1] > 1 else 0):
+        low, high = each.min(axis=-2), each.max(axis=-2)
+        for _ in range(HALVINGS if means.shape[-2] > 1 else 0):
             middle = (low + high) / 2
             below = self._below(middle) < p
             low, high = np.where(below, middle, low), np.where(below, high, middle)
@@ -88,18 +90,33 @@ class Prediction:
             ValueError: values of another shape.
         """
         numbers = np.asarray(values, dtype=float)
-        if numbers.shape not in ((), self.mean.shape[1:], self.mean.shape):
-            raise fail("values", f"one, or shape {self.mean.shape[1:]} or {self.mean.shape}", f"shape {numbers.shape}")
+        if numbers.shape not in ((), self.mean.shape[-1:], self.mean.shape):
+            raise fail("values", f"one, or shape {self.mean.shape[-1:]} or {self.mean.shape}", f"shape {numbers.shape}")
         limits = np.broadcast_to(array("values", numbers, numbers.shape), self.mean.shape)
         return np.where(np.isnan(self.deviation), np.nan, self._below(limits))
 
+    def map_arrays(self, change: Callable[[np.ndarray, int], np.ndarray]) -> "Prediction":
+        """Return the prediction with each array changed.
+
+        Args:
+            change: function of an array and of its number of axes behind that of horizons.
+        """
+        return replace(
+            self,
+            mean=change(self.mean, 1),
+            covariance=change(self.covariance, 2),
+            weights=change(self.weights, 1),
+            part_means=change(self.part_means, 2),
+            part_variances=change(self.part_variances, 2),
+        )
+
     def _below(self, limits: np.ndarray) -> np.ndarray:
         """Return the sum of weight_k P(part k < limit), a part without variance being its mean."""
-        away = limits[:, None] - self.part_means
+        away = limits[..., None, :] - self.part_means
         spread = np.sqrt(self.part_variances)
         certain = np.where(away > 0, np.inf, np.where(away < 0, -np.inf, 0.0))
         units = np.where(spread > 0, away / np.where(spread > 0, spread, 1.0), certain)
-        total: np.ndarray = np.einsum("hk,hkm->hm", self.weights, ndtr(units))
+        total: np.ndarray = np.einsum("...k,...km->...m", self.weights, ndtr(units))
         return total
 
 
@@ -110,7 +127,8 @@ class Forecast:
 
     Args:
         steps: how far each horizon is: in steps, or in the unit of time where the plant has an input dt.
-        time: of each horizon (horizons,), on the clock of the data: numbers or dates.
+        time: of each horizon (horizons,), on the clock of the data: numbers or dates; of several sources
+            (sources, horizons), as are all arrays of the predictions.
         states: the states.
         outputs: what the sensor would measure; None of a filter that does not say which sensor it is for.
         received: what would arrive of it through the channel, if anything arrives; None of a filter that uses no
@@ -137,16 +155,31 @@ class Forecast:
         kept = np.asarray(rows)
         if kept.shape != self.steps.shape or kept.dtype.kind != "b":
             raise fail("rows", f"{len(self.steps)} of true and false", f"shape {kept.shape} of {kept.dtype}")
+        chosen = self._map_arrays(lambda array, behind: np.compress(kept, array, axis=array.ndim - 1 - behind))
+        return replace(chosen, steps=self.steps[kept])
+
+    def of_source(self, number: int) -> "Forecast":
+        """Return the forecast of one of several sources.
+
+        Args:
+            number: its place in the list, from 0.
+
+        Raises:
+            ValueError: the forecast of a single source, no such place.
+        """
+        if self.time.ndim == 1:
+            raise fail("source", "the forecast of a list of sources", "that of a single one")
+        if not is_whole(number) or not 0 <= number < len(self.time):
+            raise fail("source", f"a number from 0 to {len(self.time) - 1}", show_value(number))
+        return self._map_arrays(lambda array, _: array[number])
+
+    def _map_arrays(self, change: Callable[[np.ndarray, int], np.ndarray]) -> "Forecast":
+        """Return the forecast with each array changed by a function of it and of its axes behind the horizons."""
         states, outputs, received = (
-            part
-            and replace(part, **{
-                name: getattr(part, name)[kept]
-                for name in ("mean", "covariance", "weights", "part_means", "part_variances")
-            })
-            for part in (self.states, self.outputs, self.received)
-        )  # fmt: skip
+            part and part.map_arrays(change) for part in (self.states, self.outputs, self.received)
+        )
         assert states is not None
-        return Forecast(self.steps[kept], self.time[kept], states, outputs, received, self.inputs)
+        return Forecast(self.steps, change(self.time, 0), states, outputs, received, self.inputs)
 
     def named(self, name: str) -> tuple[Prediction, int]:
         """Return the prediction that has a number of this name, states first, and its place there.

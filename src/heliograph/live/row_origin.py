@@ -9,20 +9,24 @@ from heliograph.model.origin import Origin
 from heliograph.model.over_time import first
 
 
-def make_row_origin(fleet: Fleet, slot: int, time: float) -> Origin:
-    """Return where forecasts from the row in a slot start; the pool stays as it is.
+def make_row_origin(fleet: Fleet, slot: int | list[int], time: float | np.ndarray) -> Origin:
+    """Return where forecasts from the row in a slot start, or from those in several; the pool stays as it is.
 
     Args:
-        fleet: the plants, whose pool has the row.
-        slot: of the row.
-        time: of the row, in steps or in the unit of dt.
+        fleet: the plants, whose pool has the rows.
+        slot: of the row, or of each row.
+        time: of the row, or of each row (rows,), in steps or in the unit of dt.
     """
     pool, program = fleet.pool, fleet.program
     row = pool.table[slot].copy()
-    inputs = row[pool.held] if program.dt is None else np.insert(row[pool.held], program.dt, np.nan)
+    held, several = row[..., pool.held], row.ndim > 1
+    inputs = held if program.dt is None else np.insert(held, program.dt, np.nan, axis=-1)
     spacing = float("nan") if program.dt is not None else 1.0
-    state, estimates = program.step_rows.state.tree(row[pool.state]), estimates_by_name(program, row[pool.outputs])
-    return Origin(program.network, state, int(row[pool.at.start]) + 1, inputs, time, spacing, estimates)
+    state = program.step_rows.state.tree(row[..., pool.state])
+    estimates, step = estimates_by_name(program, row[..., pool.outputs]), row[..., pool.at.start].astype(int) + 1
+    return Origin(
+        program.network, state, step if several else int(step), inputs, time, spacing, estimates, several=several
+    )
 
 
 def estimates_by_name(program: NetworkProgram, outputs: np.ndarray) -> dict[str, dict[str, Estimate]]:

@@ -11,7 +11,7 @@ from heliograph.model.estimate import Estimate
 from heliograph.numerics.times.dates import seconds_between
 from heliograph.numerics.types import PyTree
 
-Moment: TypeAlias = "float | np.datetime64"
+Moments: TypeAlias = "float | np.datetime64 | np.ndarray"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -27,16 +27,19 @@ class Origin:
         spacing: usual time between steps, of dates in seconds; NaN where it is not known.
         estimates: of a network, the last ones by node and filter.
         months: of the calendar between steps, of dates that are firsts of months; 0 of all others.
+        several: whether these are the states of several plants side by side: then the leaves of `state`, `step`,
+            `inputs`, `time` and the estimates have a leading axis of plants.
     """
 
     model: object
     state: PyTree
-    step: int
+    step: int | np.ndarray
     inputs: np.ndarray
-    time: Moment
+    time: Moments
     spacing: float = float("nan")
     estimates: Mapping[str, Mapping[str, Estimate]] = field(default_factory=dict)
     months: int = 0
+    several: bool = False
 
 
 KeptOrigin = TypeAliasType("KeptOrigin", Origin | None)  # None where no state was kept

@@ -1,5 +1,6 @@
 """Forecasts that a service publishes beside provisional estimates: of each filter, at each horizon."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import isnan
 
@@ -13,13 +14,15 @@ from heliograph.model.origin import Origin
 from heliograph.numerics.check import fail, show_value
 from heliograph.serving.thresholds import Thresholds, check_names, find_crossings
 
+Ahead = tuple[float, float, dict[str, dict[str, object]]]  # time of a horizon, how far it is, what each filter says
+Bodies = list[list[dict[str, object]]]  # of one filter, by row and horizon
 Spans = int | list[float | np.timedelta64 | np.datetime64]  # how far ahead, as `horizons_in` reads it
 SECOND = np.timedelta64(1, "s")
 
 
 @dataclass(frozen=True)
 class ForecastStart:
-    """A row as `heliograph.forecast` takes it."""
+    """A row, or several side by side, as `heliograph.forecast` takes them."""
 
     origin: Origin
 
@@ -63,31 +66,57 @@ class ForecastPublisher:
             raise fail("--forecast", f"whole steps of {step:g} s", f"{seconds:g} s")
         return int(seconds // step)
 
-    def forecasts(self, row: HeldRow) -> list[tuple[float, float, dict[str, dict[str, object]]]]:
-        """Return of each horizon its time, how far ahead it is, and what each filter says; none behind the last step.
+    def forecasts(self, rows: Sequence[HeldRow]) -> list[list[Ahead]]:
+        """Return of each row and horizon its time, how far ahead it is, and what each filter says.
 
-        How far: in seconds where the messages have dates, else in the unit of their time.
+        The rows of all plants are predicted side by side. Nothing is said of a row whose horizons reach behind the last
+        step. How far: in seconds where the messages have dates, else in the unit of their time.
         """
-        now = float(row.key[0])
-        start = ForecastStart(make_row_origin(self._fleet, row.slot, now))
-        if not self._continuous and start.origin.step + max(self.horizons) - 1 > self._fleet.end_step:
-            return []
+        said: list[list[Ahead]] = [[] for _ in rows]
+        limit = np.inf if self._continuous else self._fleet.end_step - max(self.horizons)
+        covered = [i for i, row in enumerate(rows) if row.key[0] <= limit]
+        if not covered:
+            return said
+        slots, times = [rows[i].slot for i in covered], np.array([float(rows[i].key[0]) for i in covered])
+        start = ForecastStart(make_row_origin(self._fleet, slots, times))
         found = heliograph.forecast(start, self.horizons, inputs="held")
         assert isinstance(found, dict)  # of a network
-        said = {
-            (node, name): _write_forecasts(forecast, self._pass_levels(start, (node, name), forecast))
+        bodies = {
+            node: {name: _write_forecasts(forecast) for name, forecast in filters.items()}
             for node, filters in found.items()
-            for name, forecast in filters.items()
         }
+        for place, i in enumerate(covered):
+            if self._thresholds:
+                self._add_crossings(rows[i], found, bodies, place)
+            said[i] = self._arrange_by_horizon(float(rows[i].key[0]), bodies, place)
+        return said
+
+    def _arrange_by_horizon(self, now: float, bodies: dict[str, dict[str, Bodies]], place: int) -> list[Ahead]:
+        """Return of each horizon its time, how far it is, and what each filter says of one of the rows."""
         unit = 1.0 if self._continuous else self._fleet.options.step or 1.0
         return [
             (
                 now + distance,
                 distance * unit,
-                {node: {name: said[node, name][i] for name in filters} for node, filters in found.items()},
+                {node: {name: of[place][i] for name, of in filters.items()} for node, filters in bodies.items()},
             )
             for i, distance in enumerate(self.horizons)
         ]
+
+    def _add_crossings(
+        self,
+        row: HeldRow,
+        found: "Mapping[str, Mapping[str, heliograph.forecasting.Forecast]]",
+        bodies: dict[str, dict[str, Bodies]],
+        place: int,
+    ) -> None:
+        """Add to what filters say of one of the rows the probabilities to pass levels."""
+        start = ForecastStart(make_row_origin(self._fleet, row.slot, float(row.key[0])))
+        for node, filters in found.items():
+            for name, forecast in filters.items():
+                passed = self._pass_levels(start, (node, name), forecast)
+                for i, body in enumerate(bodies[node][name][place] if passed else []):
+                    body["thresholds"] = {level: said[i] for level, said in passed.items()}
 
     def _pass_levels(
         self, start: ForecastStart, place: tuple[str, str], forecast: "heliograph.forecasting.Forecast"
@@ -102,30 +131,26 @@ class ForecastPublisher:
         }
 
 
-def _write_forecasts(
-    forecast: "heliograph.forecasting.Forecast", crossings: dict[str, list[dict[str, float]]]
-) -> list[dict[str, object]]:
-    """Return what one filter says of each horizon, as it is published, with the probabilities to pass levels."""
-    bodies = [_write_forecast(forecast, i) for i in range(len(forecast.steps))]
-    if not crossings:
-        return bodies
-    return [
-        body | {"thresholds": {level: said[i] for level, said in crossings.items()}} for i, body in enumerate(bodies)
-    ]
+def _write_forecasts(forecast: "heliograph.forecasting.Forecast") -> Bodies:
+    """Return what one filter says of each row and horizon, as it is published: (rows, horizons).
 
-
-def _write_forecast(forecast: "heliograph.forecasting.Forecast", i: int) -> dict[str, object]:
-    """Return what one filter says of one horizon, as it is published."""
+    A covariance that is no number is none, and claims nothing.
+    """
     states, outputs = forecast.states, forecast.outputs
-    body: dict[str, object] = {
-        "mean": states.mean[i].tolist(),
-        "covariance": None if states.claim == "none" else states.covariance[i].tolist(),
-        "claim": states.claim,
-    }
+    known = np.isfinite(states.covariance).all(axis=(-2, -1)) & (states.claim != "none")
+    numbers = known.tolist(), states.mean.tolist(), states.covariance.tolist()
+    bodies: Bodies = [
+        [
+            {"mean": mean, "covariance": covariance if has else None, "claim": states.claim if has else "none"}
+            for has, mean, covariance in zip(*of_row, strict=True)
+        ]
+        for of_row in zip(*numbers, strict=True)
+    ]
     if outputs is not None:
-        deviations = outputs.deviation[i].tolist()
-        body["outputs"] = {
-            name: {"mean": mean, "deviation": None if isnan(deviation) else deviation}
-            for name, mean, deviation in zip(outputs.names, outputs.mean[i].tolist(), deviations, strict=True)
-        }
-    return body
+        rows = zip(bodies, outputs.mean.tolist(), outputs.deviation.tolist(), strict=True)
+        for body, means, deviations in (one for row in rows for one in zip(*row, strict=True)):
+            body["outputs"] = {
+                name: {"mean": mean, "deviation": None if isnan(deviation) else deviation}
+                for name, mean, deviation in zip(outputs.names, means, deviations, strict=True)
+            }
+    return bodies

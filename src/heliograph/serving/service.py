@@ -312,10 +312,11 @@ class Service:
         """Return the provisional estimates after these rows, and what the senders' silence means."""
         outputs = []
         self._silence.note_published(rows)
-        for (plant, row), body in zip(rows, self._write_estimates(b"provisional", rows), strict=True):
-            if self._ahead is not None:
+        aheads = self._ahead.forecasts([row for _, row in rows]) if self._ahead is not None else [None] * len(rows)
+        for (plant, _), body, horizons in zip(rows, self._write_estimates(b"provisional", rows), aheads, strict=True):
+            if horizons is not None:
                 ahead = [{"time": self._time_in_messages(plant, time), "ahead": distance, "estimates": estimates}
-                         for time, distance, estimates in self._ahead.forecasts(row)]  # fmt: skip
+                         for time, distance, estimates in horizons]  # fmt: skip
                 body = b'%b,"forecast":%b}' % (body[:-1], line(ahead))
             if self.fleet.deciding:
                 senders = {name: status._asdict() | {"dead": status.dead}

@@ -72,27 +72,30 @@ def _is_time_step(dt: Array) -> Array:
     return (dt >= 0) & (dt <= LONGEST) & ~wrapped
 
 
-def check_inputs(names: Sequence[str], u: Float[Array, "steps inputs"], models: PyTree, step: int = 0) -> None:
+def check_inputs(
+    names: Sequence[str], u: Float[Array, "steps inputs"], models: PyTree, step: int | np.ndarray = 0
+) -> None:
     """Raise ValueError where a time step is none, or a plant's function of the inputs returns what it must not.
 
     Args:
         names: names of the inputs.
         u: the inputs of consecutive steps (steps, inputs).
         models: a filter, nodes or anything else that holds plants with these inputs.
-        step: number of the first of the steps.
+        step: number of the first of the steps, or of each (steps,).
     """
     if isinstance(u, jax.core.Tracer) or not len(names):
         return
     u = np.asarray(u)
     check_time_step(names, u)
+    steps = np.arange(len(u)) + step if np.ndim(step) == 0 else np.asarray(step)
     known: set[int] = set()
     for plant in plants_in(models):
         if id(plant) not in known and first(plant).inputs == tuple(names):
-            _check_functions(plant, u, step)
+            _check_functions(plant, u, steps)
         known.add(id(plant))
     for sensor, places in _sensors_of_inputs(models, names):
         if id(sensor) not in known:
-            _check_functions(sensor, u[:, places], step)
+            _check_functions(sensor, u[:, places], steps)
         known.add(id(sensor))
 
 
@@ -156,27 +159,29 @@ def _input_matrix(plant: AbstractPlant, u: jax.Array) -> jax.Array:
     return matrix_of(plant.input_matrix, u)
 
 
-def _check_functions(plant: AnyPlant | AnySensor, u: Float[np.ndarray, "steps inputs"], step: int) -> None:
+def _check_functions(plant: AnyPlant | AnySensor, u: Float[np.ndarray, "steps inputs"], steps: np.ndarray) -> None:
     """Raise one line that names the row if a matrix or covariance is no such thing for some inputs u."""
     functions = _list_functions(first(plant))
-    parts = list(_evaluate_in_parts(plant, tuple(functions.values()), u, step)) if functions else []
+    parts = list(_evaluate_in_parts(plant, tuple(functions.values()), u, steps)) if functions else []
     for name, values in zip(functions, map(np.concatenate, zip(*parts, strict=True)), strict=True):
         wrong = find_wrong_covariances(values) if name in COVARIANCES else ~np.isfinite(values).all(axis=(1, 2))
         if wrong.any():
             row = int(np.argmax(wrong))
             given = ", ".join(f"{name} = {x:.6g}" for name, x in zip(first(plant).inputs, u[row], strict=True))
-            where = f"row {row + 1}" if len(u) > 1 else f"step {step}"
+            where = f"row {row + 1}" if len(u) > 1 else f"step {steps[0]}"
             came = f"{_shorten(values[row])} in {where}, for {given}"
             raise fail(name, "a covariance" if name in COVARIANCES else "finite numbers", came)
 
 
 def _evaluate_in_parts(
-    plant: AnyPlant | AnySensor, functions: tuple[MatrixOfInputs, ...], u: Float[np.ndarray, "steps inputs"], step: int
+    plant: AnyPlant | AnySensor,
+    functions: tuple[MatrixOfInputs, ...],
+    u: Float[np.ndarray, "steps inputs"],
+    steps: np.ndarray,
 ) -> Iterator[tuple[np.ndarray, ...]]:
     """Yield what functions return, some steps at a time."""
     for start in range(0, len(u), ROWS):
-        part = u[start : start + ROWS]
-        yield _evaluate(plant, functions, part, step + start + np.arange(len(part)))
+        yield _evaluate(plant, functions, u[start : start + ROWS], steps[start : start + ROWS])
 
 
 @compile_in_float64
