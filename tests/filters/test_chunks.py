@@ -1,5 +1,8 @@
 """A long recording in chunks side by side: the sequential pass, to far less than a deviation."""
 
+import os
+import pickle
+
 import jax
 import numpy as np
 import pytest
@@ -117,6 +120,30 @@ def test_means_alone_move_where_rows_are_complete():
     with jax.enable_x64(True):
         begun = chunks.begin_chunks(rows, chunks.linear_start(item), (FEW_HOLES, u))
     assert np.flatnonzero(~begun.covered).tolist() == [0, 3, 4, 9, 19]
+
+
+def no_such_files(*_):
+    raise OSError("none here")
+
+
+@pytest.mark.parametrize("mapped", [True, False], ids=["mapped", "filled"])
+def test_equal_covariances_are_an_array_as_any_other(monkeypatch, mapped):
+    """Of 130,000 rows, 17 MB, nearly all are one matrix, in memory that the system shows again and again, if it can."""
+    if not mapped:
+        monkeypatch.setattr(os, "memfd_create", no_such_files, raising=False)
+    item = hg.kalman_filter(WALK, PLACES)
+    results, others = (item.run(np.tile(Z, (4, 1))[:130_000]).covariances for _ in range(2))
+    assert results.flags.c_contiguous and results.flags.writeable
+    settled = results[5_000].copy()
+    assert (results[2_048:] == settled).all() and not (results[0] == settled).any()
+    # What is written is seen in its place alone.
+    results[70_000:70_002] *= 2.0
+    assert np.flatnonzero((results[2_048:] != settled).any(axis=(1, 2))).tolist() == [67_952, 67_953]
+    assert (others[2_048:] == settled).all()
+    # A part outlives the whole, and a copy both.
+    part, copied = results[-5:], pickle.loads(pickle.dumps(others[3_000:3_010]))
+    del results, others
+    assert (part == settled).all() and (copied == settled).all()
 
 
 def test_few_rows_stay_sequential():

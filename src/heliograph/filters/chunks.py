@@ -23,9 +23,10 @@ import numpy as np
 from heliograph.engine.choice import choose_code
 from heliograph.filters.recursion import FilterRows, Recursion, end_of_rows, linear_start, scan_chunk
 from heliograph.filters.settled import (
+    CompleteRows,
     Settled,
-    are_complete,
     end_of_settled_rows,
+    find_complete,
     find_settled,
     repeat_state,
     scan_settled,
@@ -63,7 +64,7 @@ class Begun(NamedTuple):
     """The state with which each chunk begins (chunks, ...), its first row (chunks,), and how long chunks are.
 
     `settled`: the state in which chunks of complete rows stay but for their means, None where it was not found, and
-    which chunks it covers (chunks,).
+    which chunks it covers (chunks,); `complete`: which rows lack no number.
     """
 
     states: PyTree
@@ -71,6 +72,7 @@ class Begun(NamedTuple):
     lengths: Lengths
     settled: Settled | None
     covered: Bool[np.ndarray, " chunks"]
+    complete: CompleteRows
 
 
 def filter_in_chunks(filter: Any, z: Array, u: Array, output: Callable[..., PyTree]) -> Pass | None:
@@ -100,14 +102,15 @@ def begin_chunks(recursion: Recursion, start: PyTree, rows: PyTree) -> Begun | N
         if total < CHUNKS * lengths.chunk:
             return None
         first = np.arange(0, total, lengths.chunk)
-        complete = are_complete(take_windows(rows, first, lengths.chunk)) & (first + lengths.chunk <= total)
-        settled = find_settled(recursion, start, rows, lengths.ahead) if np.mean(complete) > 0.5 else None
+        complete = find_complete(rows[0], lengths.ahead)
+        whole = complete.cover(first, lengths.chunk)
+        settled = find_settled(recursion, start, rows, lengths.ahead) if np.mean(whole) > 0.5 else None
         for held in dict.fromkeys([settled is not None, False]):
             law = settled if held else None
-            states = _begin_with(Reach(recursion, rows, lengths.ahead, law), start, first[1:])
+            states = _begin_with(Reach(recursion, rows, complete, law), start, first[1:])
             if states is not None:
-                covered = complete & (False if law is None else law.covers(states))
-                return Begun(states, first, lengths, law, covered)
+                covered = whole & (False if law is None else law.covers(states))
+                return Begun(states, first, lengths, law, covered, complete)
     return None
 
 
@@ -127,12 +130,17 @@ def _predict_blocks(recursion: Recursion, state: PyTree, rows: PyTree, first: Ar
 
 
 class Reach(NamedTuple):
-    """States some rows behind others: of `ahead` rows of a recording, or all of them settled but for the means."""
+    """States some rows behind others: of blocks of a recording's rows, or all of them settled but for the means."""
 
     recursion: Recursion
     rows: PyTree
-    ahead: int
+    complete: CompleteRows
     settled: Settled | None
+
+    @property
+    def ahead(self) -> int:
+        """Rows of a block."""
+        return self.complete.size
 
     def states_before(self, places: Int[np.ndarray, " n"], starts: PyTree, begun: bool = False) -> PyTree | None:
         """Return the states before these rows, begun `ahead` rows before them; None without native code.
@@ -150,7 +158,7 @@ class Reach(NamedTuple):
         if choice.code is None:
             return None
         results = self.settled.repeated(choice.results())
-        others = np.flatnonzero(~are_complete(windows))
+        others = np.flatnonzero(~self.complete.cover(first, self.ahead))
         if len(others):
             replace_chunk(results, others, self._pass(take(states, others), take(windows, others), first[others]))
         return results
@@ -217,8 +225,8 @@ def _scan_all(recursion: Recursion, begun: Begun, rows: PyTree) -> Pass | None:
         return None if choice.code is None else choice.results()
 
     def scan_means(settled: Settled) -> PyTree:
-        arguments = recursion, settled, means_of(begun.states), split, begun.first
-        choice = choose_code(scan_settled, arguments, [False, False, True, True, True])
+        arguments = recursion, settled, means_of(begun.states), split, begun.first, np.asarray(total)
+        choice = choose_code(scan_settled, arguments, [False, False, True, True, True, False])
         if choice.code is None:
             return None
         means, varying = choice.results()
@@ -282,14 +290,18 @@ def replace_chunk(results: PyTree, here: Which, again: PyTree) -> None:
 
 def take_windows(rows: PyTree, begin: Int[np.ndarray, " n"], length: int) -> PyTree:
     """Return windows of rows (n, length, ...), the last row repeated behind the end of the data."""
-    within = len(begin) * length
+    total = len(jax.tree.leaves(rows)[0])
     one_by_one = np.array_equal(begin, np.arange(len(begin)) * length)
+    within = not np.any(begin % length) and bool(np.all(begin + length <= total))
 
     def take_from(leaf: np.ndarray) -> np.ndarray:
         if one_by_one:
-            missing = np.repeat(leaf[-1:], max(within - len(leaf), 0), axis=0)
-            joined = np.concatenate([leaf, missing]) if len(missing) else leaf[:within]
+            missing = np.repeat(leaf[-1:], max(len(begin) * length - total, 0), axis=0)
+            joined = np.concatenate([leaf, missing]) if len(missing) else leaf[: len(begin) * length]
             return joined.reshape(len(begin), length, *leaf.shape[1:])
+        if within:
+            blocks = leaf[: total // length * length].reshape(total // length, length, *leaf.shape[1:])
+            return np.asarray(blocks[begin // length])
         windows: np.ndarray = np.empty((len(begin), length, *leaf.shape[1:]), leaf.dtype)
         for window, place in zip(windows, begin, strict=True):
             part = leaf[place : place + length]

@@ -17,13 +17,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import choose_code, threads
-from heliograph.filters.recursion import Recursion, end_of_rows, number_rows
-from heliograph.filters.states import ROUNDING, agree, means_of, with_means
+from heliograph.engine.choice import choose_code
+from heliograph.filters.recursion import Recursion, number_rows
+from heliograph.filters.states import ROUNDING, agree, means_of, select_state, with_means
+from heliograph.numerics.process.equal_rows import repeat_row
 from heliograph.numerics.types import Array, Bool, Int, PyTree
 from straightline import present
 
-TURNS = 4  # windows of rows after which a state is compared with what it was after half of them
+TURNS = 4  # times as many rows as forget, after which a state is compared with what it was after half of them
 
 
 class Settled(NamedTuple):
@@ -44,7 +45,11 @@ class Settled(NamedTuple):
         """Return what is kept of rows (chunks, rows, ...), of those of its leaves that vary."""
         chunks, rows = varying[0].shape[:2]
         leaves, form = jax.tree.flatten(self.outputs)
-        filled = [leaf if v else _fill_rows(leaf, chunks, rows) for leaf, v in zip(leaves, self.varies, strict=True)]
+
+        def fill(leaf: np.ndarray) -> np.ndarray:
+            return repeat_row(leaf, chunks * rows).reshape(chunks, rows, *leaf.shape)
+
+        filled = [leaf if v else fill(leaf) for leaf, v in zip(leaves, self.varies, strict=True)]
         return self._replace(outputs=jax.tree.unflatten(form, filled)).row_of(varying)
 
     def row_of(self, varying: list[Any]) -> PyTree:
@@ -71,40 +76,60 @@ def find_settled(recursion: Recursion, start: PyTree, rows: PyTree, ahead: int) 
         rows: measurements and inputs (rows, ...).
         ahead: length of a window of rows.
     """
-    quiet = jax.tree.map(lambda leaf: np.zeros((1, ahead, *leaf.shape[1:])), rows)
-    state, first, halfway = repeat_state(start, 1), np.zeros(1, int), None
-    varies = _find_varying(recursion, start, quiet)
+    row = jax.tree.map(lambda leaf: np.zeros_like(leaf[0]), rows)
+    varies = find_varying(recursion, start, row)
     if varies is None:
         return None
-    for turn in range(TURNS):
-        halfway = state if turn == TURNS // 2 else halfway
-        choice = choose_code(end_of_rows, (recursion, state, quiet, first), [False, True, True, True])
-        if choice.code is None:
-            return None
-        state = choice.results()
-    still = [np.zeros_like(mean) for mean in means_of(state)]
-    if not agree(with_means(state, still), with_means(halfway, still), ROUNDING)[0]:
+    arguments = recursion, start, row, np.arange(TURNS * ahead).reshape(2, -1)
+    choice = choose_code(_settle, arguments, [False] * len(arguments))
+    return None if choice.code is None else settled_of(varies, *choice.results())
+
+
+def settled_of(varies: tuple[bool, ...], halves: PyTree, outputs: PyTree) -> Settled | None:
+    """Return the state after two windows of rows if it is the one after the first; None if not.
+
+    Args:
+        varies: which leaves of `outputs` depend on data.
+        halves: states of one run after either window (1, 2, ...).
+        outputs: what is kept of the last row of either (1, 2, ...).
+    """
+    halfway, end = (jax.tree.map(lambda leaf, at=at: leaf[:, at], halves) for at in (0, 1))
+    still = [np.zeros_like(mean) for mean in means_of(end)]
+    if not agree(with_means(end, still), with_means(halfway, still), ROUNDING)[0]:
         return None
-    one = jax.tree.map(lambda leaf: leaf[0, ...], state)
-    outputs = jax.tree.map(lambda leaf: leaf[0, ...], _step_once(recursion, one, quiet).results()[1])
-    return Settled(one, outputs, varies)
+    one, last = jax.tree.map(lambda leaf: leaf[0, ...], end), jax.tree.map(lambda leaf: leaf[0, 1, ...], outputs)
+    return Settled(one, last, varies)
 
 
-def _find_varying(recursion: Recursion, start: PyTree, quiet: PyTree) -> tuple[bool, ...] | None:
+def _settle(recursion: Recursion, start: PyTree, row: PyTree, numbers: Array) -> tuple[PyTree, PyTree]:
+    """Repeat a row over two windows of numbers (2, rows): states, and what is kept of each one's last row (2, ...)."""
+    Now = tuple[PyTree, PyTree]  # a state, and what is kept of the row before it
+
+    def step(now: Now, k: Any) -> tuple[Now, Any]:
+        return step_settled(recursion, now[0], means_of(now[0]), row, k), None
+
+    def scan_window(now: Now, window: Any) -> tuple[Now, Now]:
+        end, _ = jax.lax.scan(step, now, window)
+        return end, end
+
+    state = jax.tree.map(jnp.asarray, start)
+    shapes = jax.eval_shape(lambda: step((state, None), numbers[0, 0])[0][1])
+    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    both: Now = jax.lax.scan(scan_window, (state, nothing), numbers)[1]
+    return both
+
+
+def find_varying(recursion: Recursion, start: PyTree, row: PyTree) -> tuple[bool, ...] | None:
     """Return which leaves of what is kept of a complete row depend on data; None if of the state not means alone do."""
-    choice = _step_once(recursion, start, quiet)
+    rows, means = jax.tree.map(lambda leaf: leaf[None], row), [np.asarray(mean)[None] for mean in means_of(start)]
+    arguments = recursion, start, means, rows, np.zeros(1, int)
+    choice = choose_code(step_settled, arguments, [False, False, True, True, True])
     if choice.code is None:
         return None
     after, outputs = jax.tree.unflatten(choice.code.tree, choice.code.common)
     if not all(jax.tree.leaves(with_means(after, [True] * len(means_of(after))))):
         return None
     return tuple(not common for common in jax.tree.leaves(outputs))
-
-
-def _step_once(recursion: Recursion, state: PyTree, quiet: PyTree) -> Any:
-    """Choose code for a step from a state that all runs share but for its means, over the first of some rows."""
-    row, means = jax.tree.map(lambda leaf: leaf[:, 0], quiet), [np.asarray(mean)[None] for mean in means_of(state)]
-    return choose_code(step_settled, (recursion, state, means, row, np.zeros(1, int)), [False, False, True, True, True])
 
 
 def step_settled(
@@ -116,13 +141,17 @@ def step_settled(
 
 
 def scan_settled(
-    recursion: Recursion, settled: Settled, means: Sequence[Array], rows: PyTree, first: Array
+    recursion: Recursion, settled: Settled, means: Sequence[Array], rows: PyTree, first: Array, count: Array
 ) -> tuple[list[jax.Array], list[jax.Array]]:
-    """Scan complete rows from a settled state with these means; return the last means, and what varies of each row."""
+    """Scan complete rows from a settled state with these means; return the last means, and what varies of each row.
+
+    From row `count` on, behind the end of the data, the means stay.
+    """
 
     def body(means: list[jax.Array], row: tuple[PyTree, Array]) -> tuple[list[jax.Array], list[jax.Array]]:
-        after, outputs = step_settled(recursion, settled.state, means, *row)
-        return means_of(after), settled.varying_of(outputs)
+        data, k = row
+        after, outputs = step_settled(recursion, settled.state, means, data, k)
+        return select_state(k < count, means_of(after), means), settled.varying_of(outputs)
 
     return jax.lax.scan(body, [jnp.asarray(mean) for mean in means], (rows, number_rows(rows, first)))
 
@@ -138,26 +167,29 @@ def end_of_settled_rows(
     return jax.lax.scan(body, [jnp.asarray(mean) for mean in means], (rows, number_rows(rows, first)))[0]
 
 
-def are_complete(rows: PyTree) -> Bool[np.ndarray, " n"]:
-    """Test which windows (n, length, ...) of measurements and inputs lack no number."""
+class CompleteRows(NamedTuple):
+    """Which rows of measurements lack no number: how many blocks of `size` rows, before each and before the end, do."""
+
+    size: int
+    before: Int[np.ndarray, " blocks+1"]
+
+    def cover(self, begin: Int[np.ndarray, " n"], length: int) -> Bool[np.ndarray, " n"]:
+        """Test which windows of rows lack none; begin and length are multiples of the size."""
+        first, end = (np.minimum(at // self.size, len(self.before) - 1) for at in (begin, begin + length))
+        return np.asarray(self.before[end] - self.before[first] == end - first)
+
+
+def find_complete(z: PyTree, size: int) -> CompleteRows:
+    """Find which blocks of rows of measurements (rows, ...) lack no number."""
+    total = len(jax.tree.leaves(z)[0])
+    begin, complete = np.arange(0, total, size), np.ones(-(-total // size), bool)
     with np.errstate(over="ignore", invalid="ignore"):  # a sum of huge numbers is taken for one that lacks some
-        sums = [np.sum(z.reshape(len(z), -1), axis=1) for z in jax.tree.leaves(rows[0])]
-    return np.asarray(np.isfinite(sums).all(axis=0))
+        for leaf in jax.tree.leaves(z):
+            if leaf.size:
+                complete &= np.isfinite(np.add.reduceat(leaf.reshape(-1), begin * (leaf.size // total)))
+    return CompleteRows(size, np.append(0, np.cumsum(complete)))
 
 
 def repeat_state(state: PyTree, count: int) -> PyTree:
     """Return a state `count` times, along a leading axis."""
     return jax.tree.map(lambda leaf: np.repeat(leaf[None], count, axis=0), state)
-
-
-def _fill_rows(leaf: np.ndarray, chunks: int, rows: int) -> np.ndarray:
-    """Return an array (chunks, rows, ...) of equal rows, filled by all cores: most of the memory of results."""
-    filled = np.empty((chunks, rows, *leaf.shape), leaf.dtype)
-    one = np.broadcast_to(leaf, (rows, *leaf.shape)).copy()
-
-    def fill(part: Int[np.ndarray, " chunks"]) -> None:
-        for chunk in part:
-            filled[chunk] = one
-
-    list(threads().map(fill, np.array_split(np.arange(chunks), 16)))
-    return filled

@@ -55,7 +55,7 @@ class HasOrigin(Protocol):
 
 def last_input(u: np.ndarray) -> np.ndarray:
     """Return the inputs of the last of some rows (steps, inputs); NaN without rows."""
-    return np.asarray(u[-1] if len(u) else np.full(u.shape[1], np.nan), dtype=float)
+    return np.array(u[-1] if len(u) else np.full(u.shape[1], np.nan), dtype=float)
 
 
 def usual_spacing(time: np.ndarray) -> float:

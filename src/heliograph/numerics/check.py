@@ -104,7 +104,11 @@ def array(name: str, value: ArrayLike, shape: tuple[int | str | None, ...], miss
     shape alone is checked.
     """
     report_domain(name, value, REAL)
-    numbers = _read_numbers(name, value)
+    return check_numbers(name, _read_numbers(name, value), shape, missing)
+
+
+def check_numbers(name: str, numbers: Any, shape: tuple[int | str | None, ...], missing: bool = False) -> Any:
+    """Return an array of numbers that has the shape, and finite ones as `array` says; not a copy of it."""
     matches = numbers.ndim == len(shape) and all(
         not isinstance(projection, int) or projection == have
         for projection, have in zip(shape, numbers.shape, strict=True)

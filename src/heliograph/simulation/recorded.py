@@ -103,8 +103,9 @@ def run(
     network.check_horizon(steps)
     u = inputs_of(network, inputs, steps)
     true = None if truth is None else array("truth", truth, (steps, len(network.states)), missing=True)
-    clock = _find_clock(measured, {"inputs": inputs, "truth": truth}, time, steps)
-    warn_of_unequal_steps(network.inputs, clock)
+    known = _find_clock(measured, {"inputs": inputs, "truth": truth}, time, steps)
+    warn_of_unequal_steps(network.inputs, known)
+    clock = np.arange(steps, dtype=np.float64) if known is None else known
     refuse_shared_dithers(network, z)
     for name, node in network.nodes.items():
         z[name] = _drop_beyond_limits(name, node, z[name])
@@ -127,17 +128,16 @@ def run(
     said = *warn_wide_in_rows(network, record), *_describe_left_out(network, record), *list_remarks(network, state)
     for line in said:
         warnings.warn(line, stacklevel=2)
-    origin = _make_origin(network, record, state, u)
+    origin = _make_origin(network, record, state, u, usual_spacing(clock if known is not None else clock[:2]))
     return (record if true is None else add_truth(record, network.plant, true, smooth)).with_origin(origin)
 
 
-def _make_origin(network: Network, record: Record, state: PyTree, u: np.ndarray) -> Origin:
+def _make_origin(network: Network, record: Record, state: PyTree, u: np.ndarray, spacing: float) -> Origin:
     """Where forecasts start: behind the last row, whose time between rows is dt where the plant has it."""
     last = {
         node: {name: jax.tree.map(lambda leaf: np.asarray(leaf)[-1], e) for name, e in of.items()}
         for node, of in record.estimates.items()
     }
-    spacing = usual_spacing(record.time)
     if TIME_STEP in network.inputs and len(u) > 1:
         spacing = float(np.median(u[1:, network.inputs.index(TIME_STEP)]))
     months = usual_months(record.time)
@@ -146,12 +146,11 @@ def _make_origin(network: Network, record: Record, state: PyTree, u: np.ndarray)
 
 def _find_clock(
     measured: Mapping[str, ArrayLike], others: Mapping[str, object], time: ArrayLike | None, steps: int
-) -> np.ndarray:
-    """Return the times of the rows: those given, else the dates by which the tables know them, else 0, 1, ..."""
+) -> np.ndarray | None:
+    """Return the times of the rows: those given, else the dates by which the tables know them; None where neither."""
     if time is not None:
         return check_times("time", time, steps)
-    dated = common_dates({**{f"measurements of node {name!r}": z for name, z in measured.items()}, **others})
-    return np.arange(steps, dtype=np.float64) if dated is None else dated
+    return common_dates({**{f"measurements of node {name!r}": z for name, z in measured.items()}, **others})
 
 
 def _drop_beyond_limits(

@@ -25,7 +25,7 @@ from heliograph.filters.chunks import (
     take_windows,
 )
 from heliograph.filters.recursion import linear_start, scan_chunk
-from heliograph.filters.settled import Settled, are_complete
+from heliograph.filters.settled import Settled
 from heliograph.filters.smoother_step import SmootherStep, gaussian_of
 from heliograph.filters.states import agree, select_state
 from heliograph.model.estimate import Estimate
@@ -96,8 +96,8 @@ def _smooth_all(recursion: SmootherRows, begun: Begun, rows: PyTree) -> Smoothed
     def smooth_means(settled: Settled) -> SmoothedChunk | None:
         return smooth_settled_chunks(recursion, settled, begun, windows)
 
-    complete = are_complete(windows) & (begun.first + own + ahead <= total)
-    begun = begun._replace(covered=begun.covered & complete)
+    whole = begun.complete.cover(begun.first, own + ahead) & (begun.first + own + ahead <= total)
+    begun = begun._replace(covered=begun.covered & whole)
     results = scan_chunks(begun, smooth, smooth_means)
     if results is None:
         return None

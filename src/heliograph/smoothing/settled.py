@@ -89,9 +89,9 @@ def _smooth_settled(
     recursion: SmootherRows, back: BackRows, later: Settled, means: Sequence[Array], rows: PyTree, first: Array
 ) -> tuple[PyTree, ...]:
     """Smooth a settled chunk: means at its end, of the laws behind it and ahead, what varies of its estimates, NIS."""
-    own, settled = recursion.own, back.settled
-    after, steps = scan_settled(recursion, settled, means, take(rows, slice(own)), first)
-    last, behind = scan_settled(recursion, settled, after, take(rows, slice(own, None)), first + own)
+    own, settled, end = recursion.own, back.settled, first + len(rows[0])
+    after, steps = scan_settled(recursion, settled, means, take(rows, slice(own)), first, end)
+    last, behind = scan_settled(recursion, settled, after, take(rows, slice(own, None)), first + own, end)
 
     def pass_back(means: list[jax.Array], varying: list[jax.Array]) -> tuple[list[jax.Array], list[jax.Array]]:
         law, estimate = step_settled(back, later.state, means, (varying, jnp.zeros(0)), jnp.zeros((), int))

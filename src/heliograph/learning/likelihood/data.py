@@ -123,7 +123,7 @@ def _split_runs(network: Network, recording: Any, inputs: Any) -> list[tuple[np.
             raise fail("inputs", f"an array ({steps}, {count}) of {list(network.inputs)}", "none")
         u = np.zeros((steps, 0)) if known is None else check_rows("inputs", known, steps, count, missing=False)
         check_inputs(network.inputs, np.asarray(u), (network.plant, network.nodes, network.fused))
-        results.append((np.concatenate(columns, axis=1), np.asarray(u)))
+        results.append((np.concatenate(columns, axis=1), np.array(u)))
     return results
 
 

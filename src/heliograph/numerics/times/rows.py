@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 
-from heliograph.numerics.check import array, fail, show_value
+from heliograph.numerics.check import REAL, check_numbers, fail, report_domain, show_value
 from heliograph.numerics.masked import fill_masked
 from heliograph.numerics.types import Array, ArrayLike, Float
 
@@ -11,7 +11,10 @@ from heliograph.numerics.types import Array, ArrayLike, Float
 def check_rows(
     name: str, value: ArrayLike | None, steps: int | None, length: int | None, missing: bool
 ) -> Float[Array, "steps n"]:
-    """Return an array of `length` numbers a step, one axis standing for one number; NaN where `missing` is allowed."""
+    """Return an array of `length` numbers a step, one axis standing for one number; NaN where `missing` is allowed.
+
+    It is the caller's own where that has the form: only read.
+    """
     if isinstance(value, jax.core.Tracer):
         return value
     if value is None:
@@ -21,5 +24,6 @@ def check_rows(
     except (TypeError, ValueError, OverflowError):
         raise fail(name, "an array of numbers", show_value(value)) from None
     values = values[:, None] if values.ndim == 1 and length in (1, None) else values
-    table: Float[Array, "steps n"] = array(name, values, (steps, length), missing=missing)
+    report_domain(name, values, REAL)
+    table: Float[Array, "steps n"] = check_numbers(name, values, (steps, length), missing=missing)
     return table

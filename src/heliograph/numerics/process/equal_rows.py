@@ -1,0 +1,81 @@
+"""Arrays of equal rows in the memory of a few of them, which the system shows again and again until they are written.
+
+A filter's covariances stand still over most rows of a long recording: a million matrices of four states are 128 MB,
+which take 25 ms to write and 1.3 to map. The array is NumPy's as any other: contiguous, to be read and written; the
+system copies a page of it, for it alone, when it is first written to, and what is written is seen nowhere else.
+"""
+
+import ctypes
+import math
+import mmap
+import os
+from functools import cache
+from typing import Any
+from weakref import WeakSet
+
+import numpy as np
+
+LEAST = 4 << 20  # bytes of an array below which it is filled: by then that takes as long
+PIECE = 2 << 20  # bytes that are filled and mapped again, at least
+PIECES = 32  # of an array at most: the system holds 65,530 for a process
+MOST = 512  # arrays that are held at once, of a process
+
+_held: "WeakSet[mmap.mmap]" = WeakSet()  # memory of the arrays that live, counted since pieces are the system's to give
+
+
+def repeat_row(row: np.ndarray, count: int) -> np.ndarray:
+    """Return an array (count, ...) of equal rows, to be read and written as any other.
+
+    Args:
+        row: the row (...).
+        count: how many there are.
+    """
+    mapped = _map_rows(row, count) if row.nbytes * count >= LEAST else None
+    if mapped is None:
+        mapped = np.empty((count, *row.shape), row.dtype)
+        mapped[...] = row
+    return mapped
+
+
+def _map_rows(row: np.ndarray, count: int) -> np.ndarray | None:
+    """Return the rows as pieces of memory that are mapped again and again; None where the system has no such."""
+    map_memory, size = _system_call(), row.nbytes * count
+    unit = math.lcm(row.nbytes, mmap.PAGESIZE)  # whole rows in whole pages
+    piece = unit * max(-(-PIECE // unit), -(-size // (unit * PIECES)))
+    if map_memory is None or size < 4 * piece or len(_held) >= MOST:
+        return None
+    file = os.memfd_create("heliograph-rows", os.MFD_CLOEXEC)
+    try:
+        os.ftruncate(file, piece)
+        with mmap.mmap(file, piece) as filled:
+            values: np.ndarray = np.frombuffer(filled, row.dtype).reshape(-1, *row.shape)
+            values[...] = row
+            del values  # a view of what is closed
+        # Addresses for all rows, which are given back when the last view of them is gone, and pieces in their place.
+        whole = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE)
+        rows: np.ndarray = np.frombuffer(whole, row.dtype).reshape(count, *row.shape)
+        at, both = rows.ctypes.data, mmap.PROT_READ | mmap.PROT_WRITE
+        for place in range(0, size, piece):
+            length = min(piece, size - place)
+            if map_memory(at + place, length, both, mmap.MAP_PRIVATE | MAP_FIXED, file, 0) != at + place:
+                return None
+    except OSError:  # no such files here, or no more pieces
+        return None
+    finally:
+        os.close(file)
+    _held.add(whole)
+    return rows
+
+
+MAP_FIXED = 0x10  # of Linux: at this address, in the place of what is mapped there
+
+
+@cache
+def _system_call() -> Any:
+    """Return mmap(address, length, protection, flags, file, offset) of the system; None where it is not Linux's."""
+    if not hasattr(os, "memfd_create"):
+        return None
+    call = ctypes.CDLL(None, use_errno=True).mmap
+    call.restype = ctypes.c_void_p
+    call.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int, ctypes.c_int, ctypes.c_int, ctypes.c_int64]
+    return call
