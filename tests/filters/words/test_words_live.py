@@ -57,3 +57,11 @@ def test_exported_c_returns_what_a_run_does(name, tmp_path):
     z[::9, 0] = np.nan
     filtered, device = filter.run(z), Device(filter, tmp_path)
     assert max(apart(device.follow(z, np.zeros((100, 0))), (filtered.means, filtered.covariances))) < 1e-10
+
+
+def test_exported_c_goes_through_the_words_in_loops(tmp_path):
+    """Its length does not grow with the number of words: 256 and 4096 of them in 0.09 and 0.11 MB."""
+    for bits in (8, 12):
+        encoder = hg.Words(bits=bits, low=-REACH, high=REACH)
+        exported = hg.export_c(hg.word_filter(PLANT, SENSOR, LINK, encoder), tmp_path / f"of_{bits}_bits.c")
+        assert exported.source.stat().st_size < 130_000

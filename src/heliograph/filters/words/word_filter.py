@@ -16,8 +16,9 @@ from heliograph.filters.base import Step, corrects, make_sizes
 from heliograph.filters.gaussian.belief import AbstractBeliefFilter, second_moments_at_start
 from heliograph.filters.gaussian.signal import Signal, innovation_covariance, signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
-from heliograph.filters.words.cells import Change, Grid, Prior, change_by_bits, change_by_cell
+from heliograph.filters.words.cells import Change, change_by_bits, change_by_cell
 from heliograph.filters.words.received import LinkOfBits, describe_link, is_free_of_flips
+from heliograph.filters.words.sums import Grid, Prior
 from heliograph.model.channel import Channel, check_link, perfect
 from heliograph.model.estimate import Innovation
 from heliograph.model.fading import without_memory
@@ -109,7 +110,9 @@ class WordFilter(AbstractBeliefFilter):
         index = (z[np.array(rows)] - jnp.asarray(self.low)[places]) / jnp.asarray(self.spacing)[places]
         there = ~jnp.isnan(index) & ~jnp.isnan(d)
         number = jnp.round(jnp.where(there, index, 0.0))
-        tolerance = OFF + 8 * np.finfo(float).eps * jnp.abs(number)
+        # Words are numbers of rounding of their own: (low, low + D i) / D have that of either.
+        size = jnp.abs(number) + jnp.abs(jnp.asarray(self.low) / jnp.asarray(self.spacing))[places]
+        tolerance = OFF + 8 * jnp.finfo(index.dtype).eps * size
         wrong = jnp.abs(jnp.where(there, index, 0.0) - number) > tolerance
         if self.bits:
             wrong = wrong | (number < 0) | (number > 2.0**self.bits - 1)

@@ -1,0 +1,108 @@
+"""A step of a likelihood at an edge between two words, of a normal number: tails, densities, dithers that smooth it."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+ROOT = np.sqrt(2 * np.pi)
+CENTRE = 3.75  # of x = a / root 2, where c is 0
+POWERS = (
+    1.2375126308378275,
+    -0.14024059858554525,
+    0.0035854154854790257,
+    0.08227673848999506,
+    -0.10880393014244462,
+    0.09230432116428125,
+    -0.05869339857664934,
+    0.02836227737211114,
+    -0.009746579683265262,
+    0.0017556261651970652,
+    0.000293714378044958,
+    -0.00029015535246077655,
+    5.164652974177416e-05,
+    2.2387565714911816e-05,
+    -1.1438048033346894e-05,
+    -9.792625707303523e-07,
+    1.7419821586224816e-06,
+    -5.084465378687302e-08,
+    -2.4857126248016745e-07,
+    1.879082322370048e-08,
+    3.197926671666804e-08,
+    -1.9551358868985616e-09,
+    -2.623107347133476e-09,
+)  # of (1 + 2 x) e^(x^2) erfc x
+
+
+class Steps(NamedTuple):
+    """A step from 0 to 1 at t, smoothed by a dither: E of it, of t times it less E of it times 0, and so on.
+
+    beyond: P(t' > a) of a standard normal t' plus dither, a = |t|; density: its derivative; slope: of that, negative.
+    """
+
+    beyond: jax.Array
+    density: jax.Array
+    slope: jax.Array
+
+
+Smooth = Callable[[jax.Array, jax.Array], Steps]
+
+
+def tail_and_density(a: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Q(a) = P(t > a) and phi(a) of a >= 0, with one exponential and one reciprocal; both to 5e-16 of themselves.
+
+    With x = a / root 2 and c = (x - K) / (x + K), (1 + 2 x) e^(x^2) erfc x is smooth in c from -1 to 1.
+
+    Source: Shepherd and Laframboise, Chebyshev approximation of (1 + 2 x) exp(x^2) erfc x (1981), in powers of c.
+    """
+    x = a * np.sqrt(0.5)
+    falling = jnp.exp(-x * x)
+    reciprocal = 1 / ((x + CENTRE) * (1 + 2 * x))
+    c = (x - CENTRE) * (1 + 2 * x) * reciprocal
+    ratio = jnp.full_like(a, POWERS[-1])
+    for power in POWERS[-2::-1]:
+        ratio = ratio * c + power
+    return ratio * ((x + CENTRE) * reciprocal) * (falling / 2), falling * (1 / ROOT)
+
+
+def signed_tail_and_density(a: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Q(a) and phi(a) of any a."""
+    q, density = tail_and_density(jnp.abs(a))
+    return jnp.where(a < 0, 1 - q, q), density
+
+
+def step_as_it_is(a: jax.Array, width: jax.Array) -> Steps:
+    """No dither: Q, phi and a phi."""
+    q, density = tail_and_density(a)
+    return Steps(q, density, a * density)
+
+
+def step_by_uniform(a: jax.Array, width: jax.Array) -> Steps:
+    """A uniform dither of width D: differences over D of I(a) = E(t - a)+ = phi - a Q, of Q and of phi."""
+    low, high = a - width / 2, a + width / 2
+    (q, p), (q_above, p_above) = (signed_tail_and_density(x) for x in (low, high))
+    return Steps((p - low * q - p_above + high * q_above) / width, (q - q_above) / width, (p - p_above) / width)
+
+
+def step_by_triangle(a: jax.Array, width: jax.Array) -> Steps:
+    """A triangular dither: second differences of E((t - a)+)^2 / 2 = ((1 + a^2) Q - a phi)/2, of I and of Q."""
+    q, p = zip(*(signed_tail_and_density(x) for x in (a - width, a, a + width)), strict=True)
+    x = a - width, a, a + width
+
+    def second_difference(values: list[jax.Array]) -> jax.Array:
+        return (values[0] - 2 * values[1] + values[2]) / width**2
+
+    squares = [((1 + x_ * x_) * q_ - x_ * p_) / 2 for x_, q_, p_ in zip(x, q, p, strict=True)]
+    rest = [p_ - x_ * q_ for x_, q_, p_ in zip(x, q, p, strict=True)]
+    return Steps(second_difference(squares), second_difference(rest), second_difference(list(q)))
+
+
+SMOOTH: dict[str, Smooth] = {
+    "none": step_as_it_is,
+    "subtracted": step_as_it_is,
+    "stochastic": step_by_uniform,
+    "triangular": step_by_triangle,
+}
+ADDED = {"none": 0.0, "subtracted": 0.0, "stochastic": 1 / 12, "triangular": 1 / 6}  # variance of a dither, in D^2

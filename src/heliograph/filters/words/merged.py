@@ -1,0 +1,120 @@
+"""Sums over words that are much finer than the deviation of y: their low bits merged to cells."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.words.edges import ROOT, signed_tail_and_density
+from heliograph.filters.words.sums import FINE, REACH, Grid, Prior, Sums, multiply_bits, tabulate
+
+MERGED = 4  # bits of neighbouring cells whose likelihoods are those of the bits above times one table
+BLOCKS = 10  # of cells of an eighth to a quarter of a deviation within the reach, which may begin a block earlier
+Carried = tuple[Sums, jax.Array, jax.Array, jax.Array]
+
+
+def sum_merged(pairs: jax.Array, received: jax.Array, grid: Grid, prior: Prior) -> Sums:
+    """Sum over cells of 2^b fine words, between an eighth and a quarter of a deviation wide, without the overloads.
+
+    Within a merged cell the low bits say that y is about mu with a variance v, a Gaussian as the prior: with
+    pi = l_1 / (l_0 + l_1) of each low bit, mu = first word + D sum 2^j pi and v = D^2 (sum 4^j pi (1 - pi) + 1/12).
+
+    Args:
+        pairs: likelihoods of a zero and a one of each bit, (bits, 2).
+        received: number of the word that was received.
+        grid: the words.
+        prior: of y.
+    """
+    bits = np.arange(grid.bits)
+    level = jnp.floor(jnp.log2(jnp.maximum(prior.deviation * FINE / grid.step, 1.0)))
+    level = jnp.minimum(level, grid.bits - 1.0)
+    size, low = jnp.round(jnp.exp2(level)), bits < level
+    # The low bits, the same in every cell.
+    total = jnp.sum(pairs, axis=1)
+    ones = pairs[:, 1] / total
+    mean = jnp.sum(jnp.where(low, 2.0**bits * ones, 0.0))
+    variance = grid.step**2 * (jnp.sum(jnp.where(low, 4.0**bits * ones * (1 - ones), 0.0)) + 1 / 12)
+    inner = jnp.prod(jnp.where(low, total, 1.0))
+    # Each cell is a Gaussian times the prior's, wide s^2 together: mass e^(-away^2 / (2 wide)).
+    wide = 1 + variance / prior.deviation**2
+    width = size * grid.step / prior.deviation
+    block = 2.0**MERGED
+    start = jnp.floor((prior.mean - REACH * prior.deviation - grid.low) / (grid.step * size * block)) * block
+    start = jnp.maximum(start, 0.0)
+
+    def away_of(cell: jax.Array) -> jax.Array:
+        return (grid.low + (cell * size + mean) * grid.step - prior.mean) / prior.deviation
+
+    upper, home = _shift_bits(pairs, level), jnp.floor(received / size)
+    sums = _sum_blocks(upper, start / block, away_of(start), width, wide)
+    # The cell of the received word, where it is none of them.
+    own = multiply_bits(upper, home) * ((home < start) | (home >= start + BLOCKS * block))
+    own = own * jnp.exp(-(away_of(home) ** 2) / (2 * wide))
+    whole, first, second = (total + own * away_of(home) ** power for power, total in enumerate(sums))
+    scale = inner * grid.step / (prior.deviation * ROOT * jnp.sqrt(wide))
+    first, second = first / wide, second / wide**2
+    return Sums(scale * whole, scale * first, scale * (second + whole * (1 - 1 / wide)))
+
+
+def _sum_blocks(pairs: jax.Array, number: jax.Array, away: jax.Array, width: jax.Array, wide: jax.Array) -> Sums:
+    """Sum the likelihoods of cells, times e^(-a^2 / (2 wide)), that times a, and that times a^2, block after block.
+
+    Of the cell j of a block, whose first is at a, e^(-(a + j w)^2 / (2 v)) is e^(-a^2 / (2 v)) r^j e^(-(j w)^2 / (2 v))
+    with r = e^(-a w / v): a polynomial in r with the same coefficients in all blocks. From block to block the first
+    factor changes by r^J e^(-(J w)^2 / (2 v)), and r by e^(-J w^2 / v), J cells.
+
+    Args:
+        pairs: likelihoods of a zero and a one of each bit of the cells' numbers (bits, 2).
+        number: of the first block.
+        away: a of its first cell, in deviations of the prior.
+        width: w of a cell, likewise.
+        wide: v.
+    """
+    # e^(-(j w)^2 / (2 v)) is the product of e^(-(2 i + 1) w^2 / (2 v)) over i < j.
+    factor = jnp.exp(-(width**2) / (2 * wide))
+    bell, step = [jnp.ones(())], factor
+    for _ in range(2**MERGED - 1):
+        bell.append(bell[-1] * step)
+        step = step * factor**2
+    places = np.arange(2.0**MERGED)
+    table = tabulate(pairs[:MERGED]) * jnp.stack(bell)
+    coefficients = jnp.stack([table, table * places, table * places**2], axis=1)
+    once = bell[-1] * step  # e^(-(J w)^2 / (2 v))
+    shrink = jnp.exp(-(2**MERGED) * width**2 / wide)
+
+    def add_block(carried: Carried, block: jax.Array) -> tuple[Carried, None]:
+        sums, density, ratio, a = carried
+        inside = coefficients[-1]
+        for row in range(2**MERGED - 2, -1, -1):
+            inside = inside * ratio + coefficients[row]
+        inside = inside * (density * multiply_bits(pairs[MERGED:], number + block))
+        first, second = inside[1] * width, inside[2] * width**2
+        sums = sums.plus(Sums(inside[0], a * inside[0] + first, a * (a * inside[0] + 2 * first) + second))
+        power = ratio
+        for _ in range(MERGED):
+            power = power**2
+        return (sums, density * power * once, ratio * shrink, a + 2**MERGED * width), None
+
+    start = Sums(*jnp.zeros(3)), jnp.exp(-(away**2) / (2 * wide)), jnp.exp(-away * width / wide), away
+    (sums, *_), _ = jax.lax.scan(add_block, start, jnp.arange(BLOCKS, dtype=float))
+    return sums
+
+
+def _shift_bits(pairs: jax.Array, count: jax.Array) -> jax.Array:
+    """Return the likelihoods of the bits from number `count` on (bits, 2), above the last ones of a sure zero."""
+    shifted, rest, step = pairs, count, 1
+    while step < len(pairs):
+        half = jnp.floor(rest / 2)
+        sure = jnp.tile(jnp.array([1.0, 0.0]), (step, 1))
+        shifted = jnp.where(rest > 2 * half, jnp.concatenate([shifted[step:], sure]), shifted)
+        rest, step = half, 2 * step
+    return shifted
+
+
+def sum_overloads(pair: jax.Array, grid: Grid, prior: Prior) -> Sums:
+    """Sum over y beyond both ends of the range, where all bits are zeros or ones."""
+    ends = jnp.array([0.0, 2.0**grid.bits - 1])
+    outwards = jnp.array([-1.0, 1.0])
+    t = (grid.low + (ends + outwards / 2) * grid.step - prior.mean) / prior.deviation
+    a, likelihood = t * outwards, jnp.prod(pair, axis=0)
+    mass, density = (likelihood * part for part in signed_tail_and_density(a))
+    return Sums(jnp.sum(mass), jnp.sum(outwards * density), jnp.sum(mass + a * density))

@@ -1,0 +1,59 @@
+"""What is known of a Gaussian number y by sums over words: their words, the prior, and products over their bits."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+REACH = 8.5  # deviations to each side, beyond which 2e-17 lies
+FINE = 0.25  # of a deviation: finer words are merged
+
+
+class Sums(NamedTuple):
+    """M, E[t L] and E[t^2 L]."""
+
+    mass: jax.Array
+    first: jax.Array
+    second: jax.Array
+
+    def plus(self, other: "Sums") -> "Sums":
+        """Add those of other words."""
+        return Sums(self.mass + other.mass, self.first + other.first, self.second + other.second)
+
+
+class Grid(NamedTuple):
+    """Words of one component: the lowest, the step, and their number."""
+
+    low: jax.Array
+    step: jax.Array
+    bits: int
+
+
+class Prior(NamedTuple):
+    """Mean and deviation of y before the word."""
+
+    mean: jax.Array
+    deviation: jax.Array
+
+
+def multiply_bits(pairs: jax.Array, numbers: jax.Array) -> jax.Array:
+    """Return the likelihoods of words by their numbers, the products of those of their bits; 0 of what is no word.
+
+    Args:
+        pairs: likelihoods of a zero and a one of each bit, the lowest first, (bits, 2).
+        numbers: whole numbers from 0 (...,).
+    """
+    rest, likelihood = numbers, jnp.ones(numbers.shape)
+    for zero, one in pairs:
+        half = jnp.floor(rest / 2)
+        likelihood = likelihood * jnp.where(rest > 2 * half, one, zero)
+        rest = half
+    return jnp.where(rest > 0, 0.0, likelihood)
+
+
+def tabulate(pair: jax.Array) -> jax.Array:
+    """Return the likelihoods of all words, the product of those of their bits (2^bits,)."""
+    table = jnp.ones(1)
+    for bit in range(len(pair)):
+        table = jnp.concatenate([table * pair[bit, 0], table * pair[bit, 1]])
+    return table
