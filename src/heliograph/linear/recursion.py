@@ -37,6 +37,33 @@ class RecursionStep(NamedTuple):
     root: Float[np.ndarray, "N N"]
 
 
+class CarriedRounding(NamedTuple):
+    """What rounding of the system's own covariances adds to that of the error, and its largest share of a claimed one.
+
+    `worst` is that share of a claimed variance, of all steps so far, and `when` its step.
+    """
+
+    covariance: Float[np.ndarray, "N N"]
+    worst: float
+    when: int
+
+    def after_step(self, system: LinearSystem, k: int, s: Steps, gains: Gains) -> "CarriedRounding":
+        """Return F X F' + (I - G C) D (I - G C)' + G R G' of the rounding X before, with that of Cov(w) and Cov(v).
+
+        An error D in Cov(w) adds as much to the error's covariance; a gain that minimises has no part in it.
+        """
+        keep = np.eye(len(gains.gain)) - gains.gain @ s.output
+        rounding = gains.transition @ self.covariance @ gains.transition.T
+        rounding += (keep * system.rounding[k]) @ keep.T
+        rounding += (gains.gain * system.received_rounding[k]) @ gains.gain.T
+        # Its share of each claimed variance.
+        error = np.diag(system.projection @ rounding @ system.projection.T)
+        claimed = np.maximum(np.diag(gains.covariance), error)
+        share = np.divide(error, claimed, out=np.zeros_like(error), where=error > 0)
+        worst, when = max((self.worst, self.when), (float(np.max(share, initial=0.0)), k))
+        return CarriedRounding(rounding, worst, when)
+
+
 def take_noise_roots(s: Steps, size: Float[np.ndarray, " N"]) -> NoiseRoots:
     """Return roots of Cov(w) and Cov(v), beside those of the rounding of a state with second moments `size` before."""
     reach = np.abs(s.output) @ np.sqrt(size)
@@ -74,46 +101,47 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
     Source: Kalman (1960), with the second moments of random coefficients in the noises.
     """
     instance("system", system, LinearSystem, "a LinearSystem")
-    root, projection, parts = roots_of(system.covariance), system.projection, []
+    root, steps = roots_of(system.covariance), list[Gains]()
     size = system.mean**2 + np.diag(system.covariance)
     noises = take_noise_roots(system.step(0), size)
-    rounding, worst, when = np.diag(system.start_rounding), 0.0, 0
-    steady, transition = system.steady_from, np.eye(len(root))
-    last: tuple[np.ndarray, np.ndarray] | None = None
+    rounding = CarriedRounding(np.diag(system.start_rounding), 0.0, 0)
+    steady, last = system.steady_from, None
     for k in range(system.horizon):
+        # From `steady` on the system is the same: stop where the recursion has come to rest.
         if k > steady and (k - steady) % SPAN == 0:
-            if last is not None and _has_converged((covariance_of_root(root), rounding), last, transition):
+            now = covariance_of_root(root), rounding.covariance
+            if last is not None and _has_converged(now, last, steps[-1].transition):
                 break  # what follows is the same, to rounding
-            last = covariance_of_root(root), rounding
+            last = now
         s = system.step(k)
         noises = take_noise_roots(s, size) if 0 < k <= steady else noises
-        gain, predicted, root = covariance_step(root, s, noises)
-        keep = np.eye(len(root)) - gain @ s.output
-        transition, offset = keep @ s.transition, keep @ s.drift - gain @ s.offset
-        expected = s.output @ s.transition, s.output @ s.drift + s.offset
-        estimate = projection @ transition, projection @ gain, projection @ offset
-        claimed = covariance_of_root(projection @ root)
-        innovation = covariance_of_root(s.output @ predicted) + s.noise
-        parts.append(
-            (
-                transition,
-                gain,
-                offset,
-                *estimate,
-                *expected,
-                claimed,
-                covariance_of_root(projection @ predicted),
-                innovation,
-            )
-        )
-        # what an error diag(rounding) in Cov(w) adds to the error's covariance: a gain that minimises has no part in it
-        rounding = transition @ rounding @ transition.T + (keep * system.rounding[k]) @ keep.T
-        rounding += (gain * system.received_rounding[k]) @ gain.T
-        error = np.diag(projection @ rounding @ projection.T)
-        share = np.divide(error, np.maximum(np.diag(claimed), error), out=np.zeros_like(error), where=error > 0)
-        worst, when = max((worst, when), (float(np.max(share, initial=0.0)), k))
-    gains = Gains(*(repeat_last(values, system.horizon) for values in zip(*parts, strict=True)))
-    return believing(Schedule(gains, system.mean, _support_claim(claim, worst, when)), system.kept.premise)
+        step = covariance_step(root, s, noises)
+        gains, root = _make_gains(system, s, step), step.root
+        rounding = rounding.after_step(system, k, s, gains)
+        steps.append(gains)
+    gains = Gains(*(repeat_last(values, system.horizon) for values in zip(*steps, strict=True)))
+    claim = _support_claim(claim, rounding.worst, rounding.when)
+    return believing(Schedule(gains, system.mean, claim), system.kept.premise)
+
+
+def _make_gains(system: LinearSystem, s: Steps, step: RecursionStep) -> Gains:
+    """Return the gains of one step: y+ = (I - G C) A y + ... + G z, of which W y+ is the estimate, and covariances."""
+    projection, gain = system.projection, step.gain
+    keep = np.eye(len(gain)) - gain @ s.output
+    transition, offset = keep @ s.transition, keep @ s.drift - gain @ s.offset
+    return Gains(
+        transition,
+        gain,
+        offset,
+        output=projection @ transition,
+        direct=projection @ gain,
+        output_offset=projection @ offset,
+        expected=s.output @ s.transition,
+        expected_offset=s.output @ s.drift + s.offset,
+        covariance=covariance_of_root(projection @ step.root),
+        predicted=covariance_of_root(projection @ step.predicted),
+        innovation=covariance_of_root(s.output @ step.predicted) + s.noise,
+    )
 
 
 def _has_converged(after: Pair, before: Pair, loop: Float[np.ndarray, "N N"]) -> bool:

@@ -11,13 +11,14 @@ j = (b' a)^2 / (a' D a + N), a generalised Rayleigh quotient:
 Of several states amplitudes are searched. No information is above B' (D + N T / P)^-1 B (Cauchy and Schwarz).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import scipy
 
 from heliograph.factors.roots import observe_information, roots_of
+from heliograph.model.plant import LinearPlant
 from heliograph.model.sensor import LinearSensor
 from heliograph.numerics.check import check_count, check_seed, fail, scalar
 from heliograph.numerics.types import Bool, Float
@@ -28,6 +29,7 @@ from heliograph.planning.problem import Certificate, DesignProblem, PowerDesign
 from heliograph.planning.transmitters import amplify_transmitter, compute_sent_powers, find_free, transmitter_names
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.moments.second_moments import second_order
+from heliograph.random_affine.noise import AbstractNoise
 from heliograph.random_affine.superposed import Superposed
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
@@ -163,27 +165,13 @@ def design_added(problem: DesignProblem, network: Network) -> PowerDesign:
     plant, process = check_constant_noise(check_design_plant(network.plant))
     links, unit_channel = links_of(node, np.asarray(measurement_moment(node.sensor, steady_moment(plant))))
     names = tuple(f"{name}.{hop}" for hop in transmitter_names(node.channel))
-    free = find_free(names, problem.free)
-    sent = links.present**2 * links.unit
-    limits = make_unlimited(1, int(free.sum()))
-    if problem.budget is not None:
-        limits = make_power_limits(check_budget(problem.budget), names, free, sent[None])
-    moves, noise = np.asarray(plant.matrix), np.asarray(process.covariance)
-    criterion = error.criterion(network.states)
-    task = SumTask(
-        links,
-        limits,
-        free,
-        lambda information: steady_error(moves, noise, information),
-        lambda covariance: criterion.exact(covariance[None]),
-        check_count("starts", problem.starts),
-        check_seed("seed", problem.seed),
-    )
+    task = _make_task(problem, plant, process, links, names)
     chosen, certificate = (
-        _least_error(task, limits.total)
+        _least_error(task, task.limits.total)
         if problem.target_error is None
         else _least_power(task, float(scalar("target error", problem.target_error, 0.0)))
     )
+    # The network with these amplitudes.
     channel: AbstractRandomAffine = unit_channel
     for hop, amplitude in zip(transmitter_names(node.channel), chosen, strict=True):
         channel = amplify_transmitter(channel, hop, float(amplitude))
@@ -198,6 +186,28 @@ def design_added(problem: DesignProblem, network: Network) -> PowerDesign:
         price=float("nan"),
         numbers={},
         realised=Network(network.plant, {name: add_best_filter(network.plant, node, channel)}),
+    )
+
+
+def _make_task(
+    problem: DesignProblem, plant: LinearPlant, process: AbstractNoise, links: SummedLinks, names: Sequence[str]
+) -> SumTask:
+    """Return what is searched: which links are free, the limits of their powers, and the error of an information."""
+    free = find_free(names, problem.free)
+    limits = make_unlimited(1, int(free.sum()))
+    if problem.budget is not None:
+        sent = links.present**2 * links.unit
+        limits = make_power_limits(check_budget(problem.budget), names, free, sent[None])
+    moves, noise = np.asarray(plant.matrix), np.asarray(process.covariance)
+    criterion = problem.criterion.criterion(plant.states)
+    return SumTask(
+        links,
+        limits,
+        free,
+        covariance=lambda information: steady_error(moves, noise, information),
+        error=lambda covariance: criterion.exact(covariance[None]),
+        starts=check_count("starts", problem.starts),
+        seed=check_seed("seed", problem.seed),
     )
 
 
