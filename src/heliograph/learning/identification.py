@@ -14,12 +14,15 @@ from heliograph.learning.likelihood.objective import Objective, join_world, make
 from heliograph.learning.likelihood.surface import Surface
 from heliograph.learning.parameters import Parameters
 from heliograph.learning.unidentified import WEAK, Confounded, Rank, find_confounded, product_text, rank_of, sum_text
+from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, first
+from heliograph.model.sensor import AbstractSensor
 from heliograph.numerics.check import check_count, check_seed, fail
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.linalg import cholesky, contract
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
+from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.moments.second_moments import second_order
 
 if TYPE_CHECKING:
@@ -228,32 +231,17 @@ def describe_routes(solution: "Solution") -> list[str]:
     """Sentences on the identified mean gain, gain variance and noise of each output, the sensor's noise included."""
     description = solution.surface.objective.description
     _, sensor, channel = join_world(description.start)
-    if (
-        isinstance(channel, OverTime)
-        or isinstance(sensor, OverTime)
-        or first(sensor).inputs
-        or channel.remembers
-        or channel.past
-    ):
+    if isinstance(sensor, OverTime) or not _is_route_constant(sensor, channel):
         return []
 
-    # mean gain, gain variance, and M R M' + spread of the constant part, of each output
     def totals(x: Array) -> jax.Array:
-        world = join_world(description.at(description.parameters.values(x)))
-        sensor_now, link = first(world[1]), first(world[2])
-        moments, r = second_order(link), jnp.asarray(sensor_now.noise.covariance)
-        mean, p = jnp.asarray(moments.mean_gain), moments.mean_gain.shape[1]
-        spread = jnp.asarray(moments.nominal.center)
-        whole = jnp.zeros((p + 1, p + 1)).at[:p, :p].set(r).at[p, p].set(1.0)
-        noise = jnp.diagonal(mean @ r @ mean.T + contract(spread, whole))
-        reached = jnp.argmax(jnp.abs(mean), axis=1)
-        rows = jnp.arange(len(mean))
-        return jnp.stack([mean[rows, reached], spread[rows, rows, reached, reached], noise], axis=1)
+        _, sensor, channel = join_world(description.at(description.parameters.values(x)))
+        return _measure_route(first(sensor), first(channel))
 
     with jax.enable_x64(True):
         x = jnp.asarray(solution.x)
         values, slopes = np.asarray(totals(x)), np.asarray(jax.jacfwd(totals)(x))
-    # intervals by the derivatives, for what is identified
+    # Intervals by the derivatives, for what is identified.
     covariance, freedom = solution.covariance()
     lines = []
     for i, name in enumerate(sensor.outputs if len(sensor.outputs) == len(values) else range(len(values))):
@@ -267,3 +255,24 @@ def describe_routes(solution: "Solution") -> list[str]:
             label = name if isinstance(name, str) else f"z{name}"
             lines.append(f"The received {label} has {', '.join(report)}, 95 %, the sensor's noise included.")
     return lines
+
+
+def _is_route_constant(sensor: AbstractSensor, channel: Channel) -> bool:
+    """Decide whether a channel is the same at each step, and it and the sensor depend on no input and nothing past."""
+    return not (isinstance(channel, OverTime) or sensor.inputs or channel.remembers or channel.past)
+
+
+def _measure_route(sensor: AbstractSensor, link: AbstractRandomAffine) -> jax.Array:
+    """Return mean gain, gain variance and noise of each output, (outputs, 3).
+
+    The noise is that of the sensor and of the channel together: the diagonal of M R M' + spread of the constant part.
+    """
+    moments, r = second_order(link), jnp.asarray(sensor.noise.covariance)
+    mean, p = jnp.asarray(moments.mean_gain), moments.mean_gain.shape[1]
+    spread = jnp.asarray(moments.nominal.center)
+    whole = jnp.zeros((p + 1, p + 1)).at[:p, :p].set(r).at[p, p].set(1.0)
+    noise = jnp.diagonal(mean @ r @ mean.T + contract(spread, whole))
+    # Of each output the gain of what it hears most.
+    reached = jnp.argmax(jnp.abs(mean), axis=1)
+    rows = jnp.arange(len(mean))
+    return jnp.stack([mean[rows, reached], spread[rows, rows, reached, reached], noise], axis=1)

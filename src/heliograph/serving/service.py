@@ -22,7 +22,7 @@ from heliograph.numerics.process.collector import no_collector
 from heliograph.serving.ahead import ForecastPublisher, Spans
 from heliograph.serving.estimate_writer import EstimateWriter, line
 from heliograph.serving.exchange import Exchange
-from heliograph.serving.intake import Using, plant_of
+from heliograph.serving.intake import Outcome, Using, plant_of
 from heliograph.serving.message import AnyMessage, Message, Payload, Read, UnreadMessage, read_messages
 from heliograph.serving.output import Output
 from heliograph.serving.silence import Silence, find_dead_senders
@@ -208,13 +208,34 @@ class Service:
 
     def _take_messages(self, messages: Sequence[Read], payloads: Sequence[Payload]) -> tuple[list[Output], float]:
         """Use messages and commit; return the outputs to publish, and the seconds of the commit."""
-        entries, malformed, known = list[Entry](), 0, 0
         outcomes = self._using.use(messages, self._damage, datetime.now(UTC))
         touched = {plant.name: plant for plant, _, _, _ in outcomes if plant is not None}
         used = {plant.name for plant, verdict, _, _ in outcomes if plant is not None and verdict == "used"}
         if self._doubt is not None:
             for name, line in self._angles.said_of(list(touched.values())):
                 self._doubt(f"warning: plant {name!r}, {line}; not said again, nor of other plants")
+        entries, malformed, known = self._refuse_unused(messages, payloads, outcomes)
+        # Step what is due; estimates of final rows are committed, provisional ones and messages only published.
+        sent = self._exchange.messages(touched.values())
+        finalised = self.fleet.finalise(touched.values())
+        withdrawn = [*self._using.replaced, *((row_set.plant, row_set.withdrawn) for row_set in finalised)]
+        entries += [entry for plant, events in withdrawn for entry in self._write_withdrawn(plant, events)]
+        entries += self._write_finals(finalised)
+        newest = [(row_set.plant, row_set.newest) for row_set in finalised if row_set.plant.name in used]
+        provisional = self._write_provisional(newest)
+        self.fleet.forget(finalised)
+        begun = perf_counter()
+        outputs = self._commit(touched, entries, malformed)
+        committed = perf_counter() - begun
+        self.malformed += malformed
+        self.known += known
+        return outputs + sent + provisional, committed
+
+    def _refuse_unused(
+        self, messages: Sequence[Read], payloads: Sequence[Payload], outcomes: Sequence[Outcome]
+    ) -> tuple[list[Entry], int, int]:
+        """Return entries on messages that were not used, or not wholly, and counts of malformed and known ones."""
+        entries, malformed, known = list[Entry](), 0, 0
         # All but those that were used as they are, as most were.
         for i in [i for i, (_, verdict, _, notes) in enumerate(outcomes) if notes or verdict != "used"]:
             message, payload, (_, verdict, why, notes) = messages[i], payloads[i], outcomes[i]
@@ -234,21 +255,7 @@ class Service:
             entries += [_refuse(message, "implausible", note) for note in notes]
             if verdict == "implausible" or notes:
                 self._warn(message, why or notes[0])
-        # Step what is due; estimates of final rows are committed, provisional ones and messages only published.
-        sent = self._exchange.messages(touched.values())
-        finalised = self.fleet.finalise(touched.values())
-        withdrawn = [*self._using.replaced, *((row_set.plant, row_set.withdrawn) for row_set in finalised)]
-        entries += [entry for plant, events in withdrawn for entry in self._write_withdrawn(plant, events)]
-        entries += self._write_finals(finalised)
-        newest = [(row_set.plant, row_set.newest) for row_set in finalised if row_set.plant.name in used]
-        provisional = self._write_provisional(newest)
-        self.fleet.forget(finalised)
-        begun = perf_counter()
-        outputs = self._commit(touched, entries, malformed)
-        committed = perf_counter() - begun
-        self.malformed += malformed
-        self.known += known
-        return outputs + sent + provisional, committed
+        return entries, malformed, known
 
     def _warn(self, message: AnyMessage, why: str) -> None:
         """Report the first implausible message, once."""

@@ -38,6 +38,17 @@ from heliograph.random_affine.noise import AbstractNoise, Gaussian, Shaped
 
 Modes = TypeVar("Modes", SideInformation, ChannelByMode)  # a channel at one step, mode by mode
 
+# Filters that hold the plant and the sensor at the ends of a channel.
+WithEnds = (
+    LinearFilter
+    | ModalFilter
+    | UncertainModalFilter
+    | AdditiveModalFilter
+    | SideInformationFilter
+    | MultipleModelFilter
+)
+Ended = TypeVar("Ended", bound=WithEnds)
+
 
 class InUnits(Module):
     """A function of vectors in other units: out f(x / into_1, ...). Functions in all units share one program."""
@@ -67,50 +78,57 @@ def rescale_filter(filter: AbstractFilter, units: Units) -> AbstractFilter:
     Raises:
         ValueError: a filter of an unknown kind.
     """
-    s = units.states
-    # x -> S x: mean S m, covariance S P S; plant, sensor and channel in the new units.
     match filter:
         case GaussianFilter() | OpenLoop():
-            plant, mean = rescale_plant(filter.plant, units), s * filter.initial_mean
-            covariance = np.outer(s, s) * filter.initial_covariance
-            moved = replace(filter, plant=plant, initial_mean=mean, initial_covariance=covariance)
-            if isinstance(moved, OpenLoop):
-                return moved
-            return replace(moved, sensor=rescale_sensor(moved.sensor, units), channel=_channel(moved.channel, units))
+            return _rescale_gaussian(filter, units)
         case LinearFilter():
-            plant, sensor = rescale_plant(filter.plant, units), rescale_sensor(filter.sensor, units)
-            return replace(filter, plant=plant, sensor=sensor, channel=_channel(filter.channel, units))
+            return replace(_rescale_ends(filter, units), channel=_rescale_moments(filter.channel, units))
         case MixtureFilter():
-            return replace(
-                filter,
-                plant=rescale_plant(filter.plant, units),
-                components=_rescale_combinations(filter.components, units),
-            )
+            components = _rescale_combinations(filter.components, units)
+            return replace(filter, plant=rescale_plant(filter.plant, units), components=components)
         case PolynomialFilter(inner=LinearSystemFilter()):
             assert isinstance(filter.inner, LinearSystemFilter)
             # A filter of products x x' ...: its monomials are scaled by products of the factors.
             inner = _rescale_system(filter.inner, filter.degree, units)
             return PolynomialFilter(inner, filter.degree, filter.endless, _rescale_centre(filter.centre, units))
         case ModalFilter() | UncertainModalFilter():
-            plant, sensor = rescale_plant(filter.plant, units), rescale_sensor(filter.sensor, units)
-            return replace(filter, plant=plant, sensor=sensor, channel=_rescale_by_mode(filter.channel, units))
+            return replace(_rescale_ends(filter, units), channel=_rescale_by_mode(filter.channel, units))
         case AdditiveModalFilter():
-            plant, sensor = rescale_plant(filter.plant, units), rescale_sensor(filter.sensor, units)
-            return replace(
-                filter, plant=plant, sensor=sensor, terms=tuple(_rescale_by_mode(t, units) for t in filter.terms)
-            )
+            return replace(_rescale_ends(filter, units), terms=tuple(_rescale_by_mode(t, units) for t in filter.terms))
         case SideInformationFilter(flagged=False) | MultipleModelFilter():
-            plant, sensor = rescale_plant(filter.plant, units), rescale_sensor(filter.sensor, units)
-            return replace(filter, plant=plant, sensor=sensor, channel=_rescale_by_mode(filter.channel, units))
+            return replace(_rescale_ends(filter, units), channel=_rescale_by_mode(filter.channel, units))
         case PredictionFilter():
-            return PredictionFilter(_gaussian(rescale_filter(filter.base, units)))
+            return PredictionFilter(_require_gaussian(rescale_filter(filter.base, units)))
         case SequentialFilter():
-            return replace(filter, filters=tuple(_gaussian(f) for f in _rescale_in_turn(filter, units)))
+            return replace(filter, filters=tuple(_require_gaussian(f) for f in _rescale_in_turn(filter, units)))
         case _:
             raise fail("filter to rescale", "one of the package's that computes covariances", type(filter).__name__)
 
 
-def _gaussian(filter: AbstractFilter) -> GaussianFilter:
+def _rescale_ends(filter: Ended, units: Units) -> Ended:
+    """Return the filter with its plant and its sensor in other units, what is between them as it was."""
+    return replace(filter, plant=rescale_plant(filter.plant, units), sensor=rescale_sensor(filter.sensor, units))
+
+
+def _rescale_gaussian(filter: GaussianFilter | OpenLoop, units: Units) -> GaussianFilter | OpenLoop:
+    """Return a Gaussian filter, or a prediction alone, of S x: initial mean S m, covariance S P S."""
+    s = units.states
+    started = replace(
+        filter,
+        plant=rescale_plant(filter.plant, units),
+        initial_mean=s * filter.initial_mean,
+        initial_covariance=np.outer(s, s) * filter.initial_covariance,
+    )
+    if isinstance(started, OpenLoop):
+        return started
+    return replace(
+        started,
+        sensor=rescale_sensor(started.sensor, units),
+        channel=_rescale_moments(started.channel, units),
+    )
+
+
+def _require_gaussian(filter: AbstractFilter) -> GaussianFilter:
     assert isinstance(filter, GaussianFilter)
     return filter
 
@@ -128,7 +146,8 @@ def _rescale_in_turn(filter: SequentialFilter, units: Units) -> list[AbstractFil
     return parts
 
 
-def _noise(law: AbstractNoise, factors: Float[np.ndarray, " n"]) -> AbstractNoise:
+def _rescale_noise(law: AbstractNoise, factors: Float[np.ndarray, " n"]) -> AbstractNoise:
+    """Return the law of S w: mean S m, covariance S Q S."""
     if isinstance(law, Gaussian):
         return Gaussian(np.outer(factors, factors) * law.covariance, factors * law.mean)
     return Shaped(np.diag(factors), law)
@@ -143,10 +162,12 @@ def rescale_plant(plant: AnyPlant, units: Units) -> AnyPlant:
 def _rescale_plant(plant: AbstractPlant, units: Units) -> AbstractPlant:
     """Return the plant whose states and inputs are counted in other units: S f(S^-1 x, U^-1 u), S Q S."""
     s, u = units.states, units.inputs
-    law = _noise(plant.deviation, s) if plant.deviation is not None else np.outer(s, s) * plant.initial_covariance
+    law = (
+        _rescale_noise(plant.deviation, s) if plant.deviation is not None else np.outer(s, s) * plant.initial_covariance
+    )
     center = s * (plant.initial_mean - (plant.deviation.mean if plant.deviation is not None else 0.0))
     given = plant.noise
-    noise = _noise(given, s) if isinstance(given, AbstractNoise) else InUnits(given, np.outer(s, s), (u,))
+    noise = _rescale_noise(given, s) if isinstance(given, AbstractNoise) else InUnits(given, np.outer(s, s), (u,))
     size = dict(zip(plant.states, s, strict=True))
     limits = {name: (size[name] * low, size[name] * high) for name, (low, high) in plant.limits}
     names = plant.states, plant.inputs, plant.circular
@@ -167,13 +188,17 @@ def rescale_sensor(sensor: AnySensor, units: Units) -> AnySensor:
 
 
 def _rescale_sensor(sensor: AbstractSensor, units: Units) -> AbstractSensor:
+    """Return the sensor whose states and outputs are counted in other units: R h(S^-1 x), R V R."""
     s, r = units.states, units.outputs
     if isinstance(sensor, LinearSensor):
-        return LinearSensor(r[:, None] * sensor.matrix / s, _noise(sensor.noise, r), sensor.outputs, sensor.circular)
-    return Sensor(InUnits(sensor.measure, r, (s,)), _noise(sensor.noise, r), sensor.outputs, sensor.circular)
+        return LinearSensor(
+            r[:, None] * sensor.matrix / s, _rescale_noise(sensor.noise, r), sensor.outputs, sensor.circular
+        )
+    return Sensor(InUnits(sensor.measure, r, (s,)), _rescale_noise(sensor.noise, r), sensor.outputs, sensor.circular)
 
 
-def _channel(channel: SecondOrder | OverTime, units: Units) -> SecondOrder | OverTime:
+def _rescale_moments(channel: SecondOrder | OverTime, units: Units) -> SecondOrder | OverTime:
+    """Return the description of z = Q G R^-1 y + Q n, at each step."""
     rescaled: SecondOrder | OverTime = at_each_step(lambda step: rescale_channel(step, units), channel)
     return rescaled
 
@@ -239,7 +264,11 @@ def _rescale_centre(centre: MeanBeforeData | None, units: Units) -> MeanBeforeDa
 
 def _rescale_system(filter: LinearSystemFilter, degree: int, units: Units) -> LinearSystemFilter:
     """Return the filter of a linear system with state and measurements in other units: monomials by powers of these."""
-    y, z, s = _powers(units.states, degree), _powers(units.received, degree), filter.steps.values
+    y, z, s = (
+        _scale_monomials(units.states, degree),
+        _scale_monomials(units.received, degree),
+        filter.steps.values,
+    )
     if s.transition.shape[-1] != len(y):  # monomials and 1, mode after mode, behind links that remember
         y = np.tile(np.append(y, 1.0), s.transition.shape[-1] // (len(y) + 1))
     steps = Steps(
@@ -255,7 +284,7 @@ def _rescale_system(filter: LinearSystemFilter, degree: int, units: Units) -> Li
     return LinearSystemFilter(system, filter.claim, filter.states)
 
 
-def _powers(factors: Float[np.ndarray, " n"], degree: int) -> Float[np.ndarray, " N"]:
+def _scale_monomials(factors: Float[np.ndarray, " n"], degree: int) -> Float[np.ndarray, " N"]:
     """Return factors of the monomials up to `degree`."""
     table = np.array(exponents(len(factors) + 1, degree))[:-1, :-1]
     return np.asarray(np.prod(factors**table, axis=1))
