@@ -1,6 +1,7 @@
 """Index of a network: nodes and filters of one structure together, and where each estimate stands."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import accumulate
 from typing import NamedTuple
 
 from heliograph.model.over_time import structure
@@ -37,3 +38,22 @@ def group_by_structure(items: Iterable[tuple[str, object]]) -> tuple[tuple[str, 
     for name, described in items:
         results.setdefault(structure(described), []).append(name)
     return tuple(tuple(names) for names in results.values())
+
+
+def list_kinds(groups: Sequence[Sequence[str]], filters: Mapping[str, Mapping[str, object]]) -> tuple[Kind, ...]:
+    """Return the kinds of filters, group after group; `filters` are those of each node, which are alike in a group."""
+    return tuple(
+        Kind(g, alike) for g, names in enumerate(groups) for alike in group_by_structure(filters[names[0]].items())
+    )
+
+
+def list_mesh_kinds(groups: Sequence[Sequence[str]], meshes: Mapping[str, Sequence[str]]) -> tuple[Kind, ...]:
+    """Return the kinds of fusions between neighbours, sorted as in compiled code; `meshes` are those of each node."""
+    every = sorted({mesh for of_node in meshes.values() for mesh in of_node})
+    return tuple(Kind(g, (mesh,)) for mesh in every for g, names in enumerate(groups) if mesh in meshes[names[0]])
+
+
+def join_rows(received: Mapping[str, int]) -> dict[str, range]:
+    """Return where each node's measurements stand among all, joined in this order; `received` says how many it has."""
+    ends = accumulate(received.values())
+    return {name: range(end - size, end) for (name, size), end in zip(received.items(), ends, strict=True)}

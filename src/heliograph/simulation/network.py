@@ -3,7 +3,6 @@
 from collections.abc import Iterable, Mapping
 from copy import copy
 from functools import cached_property
-from itertools import accumulate
 from typing import ClassVar
 from zlib import crc32
 
@@ -40,7 +39,15 @@ from heliograph.simulation.claims import (
     nominal_nodes,
 )
 from heliograph.simulation.description.diagram import short_text_of, table_of, text_of
-from heliograph.simulation.index import Kind, Place, group_by_structure, places_of
+from heliograph.simulation.index import (
+    Kind,
+    Place,
+    group_by_structure,
+    join_rows,
+    list_kinds,
+    list_mesh_kinds,
+    places_of,
+)
 from heliograph.simulation.node import FUSED as FUSED
 from heliograph.simulation.node import (
     Common,
@@ -123,24 +130,15 @@ class Network(Module):
             raise fail("network", "at least one node", "none")
         self.states, self.inputs = first(plant).states, first(plant).inputs
         self._check_nodes()
-        ends = accumulate(node.received for node in self.nodes.values())
-        self.rows = FrozenMapping(
-            {name: range(end - self.nodes[name].received, end) for name, end in zip(self.names, ends, strict=True)}
-        )
+        self.rows = FrozenMapping(join_rows({name: node.received for name, node in self.nodes.items()}))
         self.nodes = nodes_alike(judge_nodes(self))
         # Groups of nodes and kinds of filters, by structure.
         meshes = {name: tuple(m for m in self.meshes if name in self.mesh_nodes(m)) for name in self.names}
         self.groups = group_by_structure(
             (name, without_output_names((_world(n), n.filters, meshes[name]))) for name, n in self.nodes.items()
         )
-        self.kinds = tuple(
-            Kind(g, alike)
-            for g, names in enumerate(self.groups)
-            for alike in group_by_structure(self.nodes[names[0]].filters.items())
-        )
-        self.mesh_kinds = tuple(
-            Kind(g, (m,)) for m in sorted(self.meshes) for g, names in enumerate(self.groups) if m in meshes[names[0]]
-        )
+        self.kinds = list_kinds(self.groups, {name: node.filters for name, node in self.nodes.items()})
+        self.mesh_kinds = list_mesh_kinds(self.groups, meshes)
         self.places = FrozenMapping(places_of(self.groups, self.kinds))
         self._check_links()
         self._check_fused()

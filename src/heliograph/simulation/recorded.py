@@ -13,6 +13,7 @@ from heliograph.engine.choice import compute_once
 from heliograph.filters.chunks import scan_in_chunks
 from heliograph.filters.recursion import Recursion
 from heliograph.model.checks.row_times import common_dates, warn_of_unequal_steps
+from heliograph.model.limits import Limits
 from heliograph.model.origin import Origin, last_input, usual_months, usual_spacing
 from heliograph.model.plant import TIME_STEP
 from heliograph.model.stuck import Repeats
@@ -107,33 +108,30 @@ def run(
     warn_of_unequal_steps(network.inputs, known)
     clock = np.arange(steps, dtype=np.float64) if known is None else known
     refuse_shared_dithers(network, z)
-    for name, node in network.nodes.items():
-        z[name] = _drop_beyond_limits(name, node, z[name])
-        _warn_of_forbidden(name, node, z[name])
-    for line in warn_beyond_a_turn(network, z):
+    z, said = _screen_measurements(network, z)
+    for line in (*said, *warn_beyond_a_turn(network, z)):
         warnings.warn(line, stacklevel=2)
     # Filters, on what a recording without implausible data has.
     smoothing = None if smooth is None else select_smoothed_part(network, smooth, steps)
     filters = AllFilters(network, smoothing and smoothing.kinds, judges=True)
     with jax.enable_x64(True):
-        arrivals = _name_reports(
-            filters, {} if reports is None else table("reports", reports, "reports by fusion"), steps
-        )
+        sent = {} if reports is None else table("reports", reports, "reports by fusion")
+        arrivals = _collect_arrivals(filters, sent, steps)
         outputs = _filter_plausible(network, z, (filters, smoothing and smoothing.smoother(filters), u, arrivals))
     state = outputs.pop("state")
     record = make_record(network, smoothing, outputs, clock)
     if time is not None and (unit := units_in(network.inputs).get(TIME_STEP)):
         record = replace(record, units=record.units | {"time": unit})
     warn_of_no_numbers(record)
-    said = *warn_wide_in_rows(network, record), *_describe_left_out(network, record), *list_remarks(network, state)
-    for line in said:
+    weighed = _describe_left_out(network, record)
+    for line in (*warn_wide_in_rows(network, record), *weighed, *list_remarks(network, state)):
         warnings.warn(line, stacklevel=2)
     origin = _make_origin(network, record, state, u, usual_spacing(clock if known is not None else clock[:2]))
     return (record if true is None else add_truth(record, network.plant, true, smooth)).with_origin(origin)
 
 
 def _make_origin(network: Network, record: Record, state: PyTree, u: np.ndarray, spacing: float) -> Origin:
-    """Where forecasts start: behind the last row, whose time between rows is dt where the plant has it."""
+    """Return where forecasts start: behind the last row, whose time between rows is dt where the plant has it."""
     last = {
         node: {name: jax.tree.map(lambda leaf: np.asarray(leaf)[-1], e) for name, e in of.items()}
         for node, of in record.estimates.items()
@@ -153,22 +151,36 @@ def _find_clock(
     return common_dates({**{f"measurements of node {name!r}": z for name, z in measured.items()}, **others})
 
 
-def _drop_beyond_limits(
-    name: str, node: Node | ReceivingNode, z: Float[np.ndarray, "steps m"]
-) -> Float[np.ndarray, "steps m"]:
-    """Drop measurements beyond their node's limits, and those that are stuck, and warn of either."""
-    if node.limits is None:
-        return z
-    screened, came = node.limits.screen(z, Repeats()), int(np.count_nonzero(~np.isnan(z)))
-    nothing = np.zeros_like(screened.stuck[0])
+def _screen_measurements(network: Network, z: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Drop values that are beyond their node's limits, or stuck; return the others.
+
+    Return also a line on those of each node, and on values that the rule of their sender forbids, which stay.
+    """
+    kept, said = dict[str, np.ndarray](), list[str]()
+    for name, node in network.nodes.items():
+        kept[name], lines = (z[name], []) if node.limits is None else _drop_beyond(node.limits, z[name], node)
+        if rows := forbidden_rows(node, kept[name]):
+            lines.append(
+                f"{len(rows)} values came that the rule of their sender forbids; row {rows[0] + 1}: "
+                "within delta of the value before, and no heartbeat due"
+            )
+        said += [f"node {name!r}: {line}" for line in lines]
+    return kept, said
+
+
+def _drop_beyond(
+    limits: Limits, z: Float[np.ndarray, "steps m"], node: Node | ReceivingNode
+) -> tuple[Float[np.ndarray, "steps m"], list[str]]:
+    """Drop values beyond limits and those that are stuck; return the others, and a line on each of these."""
+    screened, came = limits.screen(z, Repeats()), int(np.count_nonzero(~np.isnan(z)))
+    nothing, lines = np.zeros_like(screened.stuck[0]), list[str]()
     for dropped, stuck in ((screened.outside, nothing), (screened.stuck, screened.stuck)):
         if dropped.any():
             row = int(np.argmax(dropped.any(axis=1)))
             at_row = np.where(dropped[row], z[row], np.nan)
-            said = node.limits.why(at_row, node.received_names, np.broadcast_to(stuck, dropped.shape)[row])
-            counted = f"{int(dropped.sum())} of {came} values count as not arrived"
-            warnings.warn(f"node {name!r}: {counted}; row {row + 1}: {said}", stacklevel=3)
-    return screened.values
+            why = limits.why(at_row, node.received_names, np.broadcast_to(stuck, dropped.shape)[row])
+            lines.append(f"{int(dropped.sum())} of {came} values count as not arrived; row {row + 1}: {why}")
+    return screened.values, lines
 
 
 def _describe_left_out(network: Network, record: Record) -> Iterator[str]:
@@ -183,16 +195,7 @@ def _describe_left_out(network: Network, record: Record) -> Iterator[str]:
                 yield from summary.describe_left_out(f"{node}/{filter}", name)
 
 
-def _warn_of_forbidden(name: str, node: Node | ReceivingNode, z: Float[np.ndarray, "steps m"]) -> None:
-    if rows := forbidden_rows(node, z):
-        warnings.warn(
-            f"node {name!r}: {len(rows)} values came that the rule of their sender forbids; row {rows[0] + 1}: "
-            "within delta of the value before, and no heartbeat due",
-            stacklevel=3,
-        )
-
-
-def _name_reports(filters: AllFilters, reports: Reports, steps: int) -> dict[str, PyTree]:
+def _collect_arrivals(filters: AllFilters, reports: Reports, steps: int) -> dict[str, PyTree]:
     """Return what arrived of reports and between neighbours, by fusion."""
     centre_arrivals: dict[str, PyTree] = {
         name: centre.uplinks.recorded(name, centre.nodes, reports.get(name), steps)
