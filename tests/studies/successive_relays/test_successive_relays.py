@@ -8,8 +8,9 @@ import pytest
 from heliograph.relays.design import given_design
 from heliograph_studies import successive_relays
 from heliograph_studies.successive_relays import setting, statements, z_limit
-from heliograph_studies.successive_relays.compute import by_filter, recursion
+from heliograph_studies.successive_relays.compute import by_filter
 from heliograph_studies.successive_relays.misprints import used_before_known
+from heliograph_studies.successive_relays.recursion import recursion
 from tests.oracles import successive_relays as oracle
 from tests.studies.readme import said_of
 from tests.studies.verdicts import both, check_verdicts
