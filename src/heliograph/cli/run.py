@@ -1,34 +1,25 @@
 """`heliograph run`: the filters of a network over measured data."""
 
 import sys
-import warnings
 from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
-from urllib.parse import quote
 
 from cyclopts import Parameter
 
-import heliograph
 from heliograph.cli.app import estimates_option, measured_option, path_option
-from heliograph.cli.reading import Measured, ReadingOptions, read_measured
+from heliograph.cli.filtered_plant import FilteredPlant, filter_plant, place_of_plant, write_plant
+from heliograph.cli.reading import ReadingOptions, read_measured
 from heliograph.files.stores.address import StoreAddress
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Sequence
 
-    import numpy as np
-
-    from heliograph.files.estimates.forecasts import ByFilter
-    from heliograph.files.recording import Recording
     from heliograph.model.estimate import Estimate
     from heliograph.report.progress import Advance
     from heliograph.simulation.network import Network
     from heliograph.simulation.results.record import Record
     from heliograph.smoothing import FixedInterval, FixedLag
-
-    Write = Callable[[Record, Path | StoreAddress], None]
-    Horizons = int | list[float | np.timedelta64 | np.datetime64]
 
 
 BAGS = {".mcap", ".db3", ".bag"}
@@ -65,8 +56,6 @@ def run(
         A Python file or module that holds a heliograph.Network: my_network.py, or my_network.py:name where it
         holds several. The name may be that of a function that returns one.
     """
-    from dataclasses import replace
-
     from heliograph.numerics.check import fail
     from heliograph.numerics.times.dates import horizons_in
     from heliograph.report.progress import progress
@@ -75,9 +64,9 @@ def run(
     later, options = _parse_smoothing(smooth), reading or ReadingOptions()
     _check_options(measurements, out, report, lag, options)
     ahead = horizons_in(forecast) if forecast else None
-    asked = [option for option, used in {"--forecast": ahead is not None, "--predicted": predicted}.items() if used]
-    if asked and isinstance(out, Path) and out.suffix.lower() == ".mcap":
-        raise fail(asked[0], "a table of estimates (--out FILE.csv or FILE.parquet)", str(out))
+    if isinstance(out, Path) and out.suffix.lower() == ".mcap" and (forecast or predicted):
+        option = "--forecast" if forecast else "--predicted"
+        raise fail(option, "a table of estimates (--out FILE.csv or FILE.parquet)", str(out))
     with progress(4) as advance:
         advance("starting")
         from heliograph.files.network_file import load_module
@@ -89,30 +78,21 @@ def run(
         if lag is not None and measured[0].events is None:
             raise fail("--lag", "messages or events", f"rows of time in {measurements}")
         # Each plant by itself.
-        done = []
+        done = list[tuple[FilteredPlant, Path | StoreAddress | None]]()
         for data in measured:
             advance(f"filtering {len(data.recording.time)} rows")
-            record, doubts = _filter_rows(loaded, data.recording, later)
-            if data.events is not None and data.events.dated and record.origin is not None:
-                record = replace(record, units={"time": "s"} | record.units).with_origin(record.origin)
-            place = out and _place(out, data.plant, len(measured) > 1)
-            written = _select_rows(record, data.rows)
-            lines = [*_describe_doubted(loaded, record), *data.summary]
-            future = _make_forecasts(record, ahead, lines)
-            each_row = heliograph.forecasting.predict_record(record, data.recording.inputs) if predicted else {}
+            plant = filter_plant(loaded, data, later, ahead, predicted)
+            place = out and place_of_plant(out, data.plant, len(measured) > 1)
             if place is not None:
                 advance(f"writing {place}")
-                write = _choose_writer(data, module)
-                _write_rows(write, written, (future, _select_predicted(each_row, data.rows)), place, data)
-                lines += _write_lagged(loaded, data, lag, options, place, write)
-            doubted = [*data.warnings, *record.failures(), *doubts]
-            done.append((data, record, written, place, doubted, lines, (future, each_row)))
+                plant.said.extend(write_plant(plant, place, loaded, module, lag, options))
+            done.append((plant, place))
     # Report, then warnings and a summary.
     if report is not None:
-        plants = {data.plant: (record, data.recording, *ahead_of_each) for data, record, *_, ahead_of_each in done}
-        _write_report(network, loaded, plants, report)
-    for _, _, written, place, doubts, lines, _ in done:
-        _print_lines(list(dict.fromkeys(doubts)), [*_describe_results(written, place, report), *lines])
+        _write_report(network, loaded, [plant for plant, _ in done], report)
+    for plant, place in done:
+        lines = [*_describe_results(plant.written, place, report), *plant.said]
+        _print_lines(list(dict.fromkeys(plant.doubted)), lines)
 
 
 def _parse_smoothing(word: str) -> "FixedInterval | FixedLag | None":
@@ -127,119 +107,6 @@ def _parse_smoothing(word: str) -> "FixedInterval | FixedLag | None":
     if not (word.isascii() and word.isdecimal()):
         raise fail("--smooth", "all, or how many later rows", repr(word))
     return FixedLag(int(word))
-
-
-def _place(out: Path | StoreAddress, plant: str, several: bool) -> Path | StoreAddress:
-    """Return where a plant's estimates go: of several, each has a file of its name."""
-    if isinstance(out, StoreAddress):
-        return out
-    return out.with_name(f"{out.stem}.{quote(plant, safe='')}{out.suffix}") if several else out
-
-
-def _select_rows(record: "Record", rows: "np.ndarray | None") -> "Record":
-    """Return some of the rows of a record, and of what is smoothed, whose rows are the last ones."""
-    from dataclasses import replace
-
-    import numpy as np
-
-    if rows is None or rows.all():
-        return record
-    estimates = {
-        node: {
-            name: replace(
-                e,
-                mean=np.asarray(e.mean)[rows],
-                covariance=np.asarray(e.covariance)[rows],
-                modes=None if e.modes is None else np.asarray(e.modes)[rows],
-            )
-            for name, e in filters.items()
-        }
-        for node, filters in record.estimates.items()
-    }
-    measurements = {node: z[rows] for node, z in record.measurements.items()}
-    later = None if record.smoothed is None else _select_rows(record.smoothed, rows[-len(record.smoothed.time) :])
-    truth = None if record.truth is None else np.asarray(record.truth)[rows]
-    return replace(
-        record,
-        time=record.time[rows],
-        truth=truth,
-        measurements=measurements,
-        estimates=estimates,
-        smoothed=later,
-        reports={},
-        uplinks={},
-        weighed={},
-    )
-
-
-def _make_forecasts(record: "Record", ahead: "Horizons | None", lines: list[str]) -> "ByFilter":
-    """Forecast each estimate from the last row, and add a line on how far and with which inputs; {} unless asked."""
-    if ahead is None:
-        return {}
-    forecasts = heliograph.forecast(record, ahead, inputs="held")
-    assert isinstance(forecasts, dict)  # of a network
-    some = next(forecast for filters in forecasts.values() for forecast in filters.values())
-    held = "" if some.inputs == "none" else ", inputs held at those of the last row"
-    lines.append(f"forecast: {len(some.steps)} rows behind the data, to {some.time[-1]}{held}")
-    return forecasts
-
-
-def _select_predicted(predicted: "ByFilter", rows: "np.ndarray | None") -> "ByFilter":
-    """Return what was predicted of some of the rows."""
-    if rows is None or rows.all():
-        return predicted
-    return {
-        node: {name: forecast.select(rows) for name, forecast in filters.items()} for node, filters in predicted.items()
-    }
-
-
-def _write_rows(
-    write: "Write", record: "Record", ahead: "tuple[ByFilter, ByFilter]", place: Path | StoreAddress, data: "Measured"
-) -> None:
-    """Write estimates, with rows of forecasts below them and columns of what was predicted where there are any."""
-    forecasts, predicted = ahead
-    if not forecasts and not predicted:
-        write(record, place)
-        return
-    from heliograph.files.estimates.forecasts import forecast_columns
-    from heliograph.files.estimates.table import estimate_columns
-    from heliograph.files.stores.tables import write_columns
-    from heliograph.files.table import write_table
-
-    columns = forecast_columns(record, forecasts, predicted) if forecasts else estimate_columns(record, predicted)
-    if isinstance(place, Path):
-        write_table(columns, place)
-    else:
-        write_columns(place, columns, data.plant, _find_origin(data))
-
-
-def _write_lagged(
-    network: "Network",
-    data: "Measured",
-    lag: float | None,
-    options: ReadingOptions,
-    place: Path | StoreAddress,
-    write: "Write",
-) -> list[str]:
-    """Write the estimates of a lag later beside the others, and say so; nothing without a lag."""
-    if lag is None or data.events is None:
-        return []
-    from heliograph.live.recorded import play
-    from heliograph.model.plant import TIME_STEP
-
-    window, ahead = options.limits
-    start = float(data.recording.time[0]) if TIME_STEP in network.inputs else 0.0  # the initial law is of that moment
-    capacity = max(1000, len(data.events))
-    played = play(network, data.events.sort_events(), window, lag, start, ahead, capacity).lagged
-    if played is None:
-        return []
-    path = (
-        place.with_suffix(f".lagged{place.suffix}")
-        if isinstance(place, Path)
-        else place.named(f"{place.written_table}_lagged")
-    )
-    write(played, path)
-    return [f"{path}: {len(played.time)} rows, each given what came {lag:g} later"]
 
 
 def _print_lines(warnings: list[str], summary: list[str]) -> None:
@@ -273,41 +140,6 @@ def _check_options(
     _check_places(measurements, out, report)
 
 
-def _find_origin(data: "Measured") -> "np.datetime64 | None":
-    """Return the date of time 0, of messages whose times are dates."""
-    messages = data.events
-    return None if messages is None or messages.steps or messages.numbers else messages.date
-
-
-def _choose_writer(data: "Measured", module: "Mapping[str, object]") -> "Write":
-    """Return what writes estimates: to a store, a table, or to MCAP with the pose that the network's file names."""
-    from heliograph.files.bags.output import write_bag
-    from heliograph.files.estimates.table import estimate_columns, write_estimates
-    from heliograph.files.stores.tables import write_columns
-
-    origin = _find_origin(data)
-
-    def write(record: "Record", path: Path | StoreAddress) -> None:
-        if isinstance(path, StoreAddress):
-            write_columns(path, estimate_columns(record), data.plant, origin)
-        elif path.suffix.lower() == ".mcap":
-            write_bag(record, path, origin, module.get("pose"))  # type: ignore[arg-type]  # it says what it expects
-        else:
-            write_estimates(record, path)
-
-    return write
-
-
-def _filter_rows(
-    network: "Network", recording: "Recording", smooth: "FixedInterval | FixedLag | None"
-) -> tuple["Record", list[str]]:
-    """Filter rows; return the record, and what the filters doubted in lines."""
-    with warnings.catch_warnings(record=True) as doubts:
-        warnings.simplefilter("always", UserWarning)
-        record = heliograph.run(network, *recording, smooth=smooth)
-    return record, [str(doubt.message) for doubt in doubts]
-
-
 def _describe_results(record: "Record", out: Path | StoreAddress | None, report: Path | None) -> list[str]:
     """Describe what was written where in a line, and the errors of each filter."""
     filters = [
@@ -331,13 +163,6 @@ def _describe_errors(record: "Record") -> list[str]:
         size = "" if isnan(errors.nees) else f"; NEES per state {errors.nees:.3g}"
         lines.append(f"{errors.node}/{errors.filter}: RMSE {rmse}{size}")
     return lines
-
-
-def _describe_doubted(network: "Network", record: "Record") -> list[str]:
-    """Say of each output how many of its values the filters that weigh them doubted, and their bias, a line each."""
-    from heliograph.report.outputs import weighed_outputs
-
-    return [str(output) for output in weighed_outputs(network, record)]
 
 
 def _claim(estimate: "Estimate") -> str:
@@ -373,9 +198,7 @@ def _check_places(measurements: Path | StoreAddress, out: Path | StoreAddress | 
         check_replaceable(report, SUMMARY)
 
 
-def _write_report(
-    name: str, network: "Network", plants: "Mapping[str, tuple[Record, Recording, ByFilter, ByFilter]]", report: Path
-) -> None:
+def _write_report(name: str, network: "Network", plants: "Sequence[FilteredPlant]", report: Path) -> None:
     """Examine the records of all plants and write the report, a page for each plant and one of all."""
     from dataclasses import replace
 
@@ -384,8 +207,12 @@ def _write_report(
 
     def examined(advance: "Advance") -> dict[str, Health]:
         return {
-            plant: replace(examine(network, record, recording.inputs, advance), forecasts=future, predicted=each_row)
-            for plant, (record, recording, future, each_row) in plants.items()
+            plant.data.plant: replace(
+                examine(network, plant.record, plant.data.recording.inputs, advance),
+                forecasts=plant.forecasts,
+                predicted=plant.predicted,
+            )
+            for plant in plants
         }
 
     def results_of(health: dict[str, Health]) -> Results:

@@ -14,6 +14,7 @@ from heliograph.model.estimate import Innovation
 from heliograph.numerics.types import PyTree
 
 ROUNDING = {"double": 1e-9, "float": 1e-4}  # of an expectation after many steps
+PRECISION = {"double": np.float64, "float": np.float32}
 
 
 class Part(NamedTuple):
@@ -38,30 +39,50 @@ def parts_of_step(filter: AbstractFilter, real: str, apart: bool) -> list[Part]:
     """
     leaves, tree = jax.tree.flatten(filter.init())
     z, u, k = np.zeros(filter.received), np.zeros(len(filter.inputs)), np.asarray(0)
-    precision = np.float64 if real == "double" else np.float32
+    if not apart:
+        return [Part("step", ("z", "u"), _make_step(filter, tree, real), (leaves, z, u, k), ("implausible", "spoilt"))]
+    weighs = filter.correct(filter.predict(filter.init(), u, 0), z, 0)[1].weight is not None
+    told = ("implausible", "value", "nis", "arrived", *(("weight",) if weighs else ()))
+    return [
+        Part("predict", ("u",), _make_prediction(filter, tree, real), (leaves, u, k), ("implausible", "spoilt")),
+        Part("correct", ("z",), _make_correction(filter, tree, real), (leaves, z, k), told),
+    ]
 
-    def restore(arrays: list[jax.Array]) -> PyTree:
-        return jax.tree.unflatten(tree, arrays)
+
+def _make_step(filter: AbstractFilter, tree: PyTree, real: str) -> Callable[..., list[jax.Array]]:
+    """Return the function of a whole step; `tree` is the structure of a state, of which C has the arrays."""
 
     @jax.jit
     def step(arrays: list[jax.Array], z: jax.Array, u: jax.Array, k: jax.Array) -> list[jax.Array]:
-        after, estimate, judgement, innovation = filter.judge_step(restore(arrays), z, u, k)
+        after, estimate, judgement, innovation = filter.judge_step(jax.tree.unflatten(tree, arrays), z, u, k)
         implausible = find_implausible(innovation, z, ROUNDING[real]) | (judgement.input > 0)
-        spoilt = do_inputs_spoil(filter, filter.inputs, u, k, precision)
+        spoilt = do_inputs_spoil(filter, filter.inputs, u, k, PRECISION[real])
         return [*jax.tree.leaves(after), estimate.mean, estimate.covariance, implausible, spoilt]
+
+    return step
+
+
+def _make_prediction(filter: AbstractFilter, tree: PyTree, real: str) -> Callable[..., list[jax.Array]]:
+    """Return the function of the prediction alone."""
 
     @jax.jit
     def predict(arrays: list[jax.Array], u: jax.Array, k: jax.Array) -> list[jax.Array]:
-        before = restore(arrays)
+        before = jax.tree.unflatten(tree, arrays)
         prior = filter.predict(before, u, k)
         estimates = filter.estimate(before), filter.estimate(prior)
-        spoilt = do_inputs_spoil(filter, filter.inputs, u, k, precision)
+        spoilt = do_inputs_spoil(filter, filter.inputs, u, k, PRECISION[real])
         judgement = Judgement.judge_prediction(filter.claim, (before, prior), estimates, spoilt)
         return [*jax.tree.leaves(prior), estimates[1].mean, estimates[1].covariance, judgement.input > 0, spoilt]
 
+    return predict
+
+
+def _make_correction(filter: AbstractFilter, tree: PyTree, real: str) -> Callable[..., list[jax.Array]]:
+    """Return the function of the correction alone, which tells innovation, distance and weights as well."""
+
     @jax.jit
     def correct(arrays: list[jax.Array], z: jax.Array, k: jax.Array) -> list[jax.Array]:
-        prior = restore(arrays)
+        prior = jax.tree.unflatten(tree, arrays)
         after, innovation = filter.correct(prior, z, k)
         expected, estimate = filter.estimate(prior), filter.after_step(after, k)
         judgement = Judgement.judge_correction(
@@ -72,14 +93,7 @@ def parts_of_step(filter: AbstractFilter, real: str, apart: bool) -> list[Part]:
         weight = [] if innovation.weight is None else [innovation.weight]
         return [*jax.tree.leaves(after), estimate.mean, estimate.covariance, implausible, *told, *weight]
 
-    if not apart:
-        return [Part("step", ("z", "u"), step, (leaves, z, u, k), ("implausible", "spoilt"))]
-    weighs = filter.correct(filter.predict(filter.init(), u, 0), z, 0)[1].weight is not None
-    told = ("implausible", "value", "nis", "arrived", *(("weight",) if weighs else ()))
-    return [
-        Part("predict", ("u",), predict, (leaves, u, k), ("implausible", "spoilt")),
-        Part("correct", ("z",), correct, (leaves, z, k), told),
-    ]
+    return correct
 
 
 def find_implausible(innovation: Innovation, z: jax.Array, rounding: float) -> jax.Array:

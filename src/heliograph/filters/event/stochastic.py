@@ -98,27 +98,17 @@ class StochasticEventFilter(AbstractSizedFilter):
         came = merge_groups(GaussianSum(safe_log(weight), posteriors, jnp.eye(len(weight))[:, None]))
         # Nothing: silence, or a link that is down.
         log_silent, quiet = self._condition_on_silence(prior, signal, state.reference, k)
-        nothing = self._mix_silence_and_outage(
-            prior, _sum_of_one_gaussian(log_silent, quiet, state.law), state.law, channel, down
-        )
+        silent = _sum_of_one_gaussian(log_silent, quiet, state.law)
+        nothing = self._mix_silence_and_outage(prior, silent, state.law, channel, down)
         # Which of the two it is, with its likelihood.
+        if isinstance(self.trigger, StochasticTrigger):
+            link = self._average_link(channel, state.law)
+            innovation = self._condition_on_sending(innovation, link, signal, state.reference, log_silent)
         arrived = jnp.any(~jnp.isnan(values))
         log_nothing = jnp.maximum(nothing.log_weight[0], np.log(FLOOR))  # of what the rule forbids
-        value, covariance = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
-        log_came = innovation.log_likelihood
-        if isinstance(self.trigger, StochasticTrigger):
-            # Given that it was sent, where no component of it is missing.
-            link, is_complete = self._average_link(channel, state.law), ~jnp.any(jnp.isnan(value))
-            shift, change = self._change_by_sending(link, signal, state.reference, log_silent)
-            complete = jnp.where(is_complete, value, 0.0), jnp.where(is_complete, covariance, jnp.eye(len(value)))
-            log_sent = self._log_probability_sent(link[0], signal, state.reference, *complete)
-            log_came = log_came + jnp.where(is_complete, log_sent, 0.0)
-            value, covariance = (
-                jnp.where(is_complete, value - shift, value),
-                jnp.where(is_complete, covariance + change, covariance),
-            )
-        total = jnp.where(arrived, log_came, log_nothing)
         after = jax.tree.map(lambda a, b: jnp.where(arrived, a, b), came, nothing)
+        value, covariance = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
+        total = jnp.where(arrived, innovation.log_likelihood, log_nothing)
         if len(down):
             flag_innovation, covariance = append_flag(covariance, down[0])
             value = jnp.append(value, flag_innovation)
@@ -126,10 +116,30 @@ class StochasticEventFilter(AbstractSizedFilter):
         following = StochasticBelief(x, after.label[0, 0], state.reference, state.moved)
         return following, Innovation(value, covariance, total)
 
+    def _condition_on_sending(
+        self,
+        innovation: Innovation,
+        link: tuple[jax.Array, jax.Array],
+        signal: Signal,
+        reference: jax.Array,
+        log_silent: jax.Array,
+    ) -> Innovation:
+        """Return a value's innovation given that it was sent, where no component of it is missing."""
+        value, covariance = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
+        is_complete = ~jnp.any(jnp.isnan(value))
+        shift, change = self._change_by_sending(link, signal, reference, log_silent)
+        complete = jnp.where(is_complete, value, 0.0), jnp.where(is_complete, covariance, jnp.eye(len(value)))
+        log_sent = self._log_probability_sent(link[0], signal, reference, *complete)
+        return Innovation(
+            jnp.where(is_complete, value - shift, value),
+            jnp.where(is_complete, covariance + change, covariance),
+            innovation.log_likelihood + jnp.where(is_complete, log_sent, 0.0),
+        )
+
     def _mix_silence_and_outage(
         self, prior: Gaussian, silent: GaussianSum, law: jax.Array, channel: SideInformation, down: jax.Array
     ) -> GaussianSum:
-        """No value came: mix the update by silence (link up) with the prior (link down) by posterior weights."""
+        """Mix the update by silence (link up) with the prior (link down), by their weights given that no value came."""
         lost = jnp.asarray(channel.chance) @ (~jnp.any(jnp.asarray(channel.present), axis=1)).astype(float)
         parts = [silent.relabel_sender(0, law[None] * (1 - lost))]
         if self.loses:
@@ -143,7 +153,7 @@ class StochasticEventFilter(AbstractSizedFilter):
         return merge_groups(concatenate(parts))
 
     def _average_link(self, channel: SideInformation, law: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Mean gain (m, p) and spread (m, m, p + 1, p + 1) of the link, averaged over modes in which all arrives."""
+        """Return mean gain (m, p) and spread (m, m, p+1, p+1) of the link, means over modes in which all arrives."""
         whole = jnp.asarray(channel.chance) * jnp.all(jnp.asarray(channel.present), axis=1) * law[:, None]
         gain, spread = (
             jnp.tensordot(whole, jnp.asarray(moment), 2) / jnp.sum(whole) for moment in (channel.mean, channel.spread)
@@ -153,7 +163,7 @@ class StochasticEventFilter(AbstractSizedFilter):
     def _change_by_sending(
         self, link: tuple[jax.Array, jax.Array], signal: Signal, reference: jax.Array, log_silent: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Change of z's predicted mean and covariance given that it was sent: values far from r are sent more often.
+        """Return the change of z's predicted mean and covariance as it was sent: values far from r are, more often.
 
         Of y ~ N(m, S) the share s is silent, with mean m + d and covariance S_s, so that of what is sent the mean is
         m - s d / (1 - s) and the second moment about m is (S - s (S_s + d d')) / (1 - s).
