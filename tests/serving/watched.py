@@ -34,6 +34,7 @@ class Scripted:
     nodes: int = 1
     waiting: int = 0
     senders: dict[str, dict[str, object]] = field(default_factory=dict)
+    forecast: list[dict[str, object]] = field(default_factory=list)
     plants: dict[str, OnePlant] = field(default_factory=dict)
     malformed: int = 0
     last: Last = field(default_factory=Last)
@@ -69,6 +70,6 @@ class Scripted:
             }
             if i < len(payloads) - self.waiting:
                 results.append(Output(i, self.plant, "final", to_json(body | {"kind": "final"})))
-            newest = body | {"kind": "provisional", "senders": self.senders}
+            newest = body | {"kind": "provisional", "senders": self.senders, "forecast": self.forecast}
             results.append(Output(None, self.plant, "provisional", to_json(newest)))
         return results

@@ -218,6 +218,15 @@ SENDERS = {
 }
 
 
+def passing(ahead, by, then):
+    """What is forecast at one horizon of a level of the velocity."""
+    said = {"then": then, "by": by, "by_error": 0.01}
+    return {"ahead": ahead, "estimates": {"node 0": {"cubature": {"thresholds": {"<b>v>1": said}}}}}
+
+
+FORECAST = [passing(5.0, 0.034, 0.02), passing(60.0, 0.95, 0.4)]
+
+
 def test_a_fusion_of_estimates_is_judged_by_what_it_fuses_and_a_dead_sender_is_a_warning():
     assert watch_of(stepping(), "tank").fused == {"both": ("upper", [("a", "linear"), ("b", "linear")])}
     parts = [("node 0", "cubature"), ("node 1", "cubature")]
@@ -260,8 +269,13 @@ def test_a_browser_draws_axes_with_units_what_is_not_final_and_the_state_of_send
             and ">silent for 5 steps</td>" in text
             and ">dead: 9 heartbeats missed</td>" in text
         )
+        # Levels, with how far ahead in the unit of time; what is likely stands out.
+        levels = text[text.index('id="passing"') : text.index('id="links-title"')]
+        assert re.findall(r"<th scope=\"col\">([^<]*)</th>", levels) == ["level", "filter", "in 5 s", "in 60 s"]
+        assert '<th scope="row">&lt;b&gt;v&gt;1</th><td>node 0/cubature</td><td>3.4 % (2.0 %)</td>' in levels
+        assert '<td class="doubt">95 % (40 %)</td>' in levels
 
-    looked(look, Scripted(nodes=14, waiting=4, senders=SENDERS), watch=watch)
+    looked(look, Scripted(nodes=14, waiting=4, senders=SENDERS, forecast=FORECAST), watch=watch)
 
 
 @pytest.mark.real("browser")

@@ -102,7 +102,7 @@ class Watch:
         self._tests: OrderedDict[str, dict[tuple[str, str], RunningNis]] = OrderedDict()
         self._points: OrderedDict[str, deque[Point]] = OrderedDict()
         self.totals, self._overview, self._dead = Totals(), Overview(), dict[str, list[str]]()
-        self._passing: OrderedDict[str, dict[tuple[str, ...], float]] = OrderedDict()
+        self._passing: OrderedDict[str, dict[tuple[str, ...], Mapping[str, float]]] = OrderedDict()
         self._begun: float | None = None  # of the batch that is being taken
         self._senders: OrderedDict[str, dict[str, dict[str, Any]]] = OrderedDict()
         self.registry = CollectorRegistry()
@@ -182,8 +182,8 @@ class Watch:
 
     def _keep_passing(self, plant: str, horizons: Sequence[Mapping[str, Any]]) -> None:
         """Keep the probabilities that a plant's levels are passed, by node, filter, level and how far ahead."""
-        passing: dict[tuple[str, ...], float] = {
-            (node, name, level, f"{horizon['ahead']:g}"): said["by"]
+        passing: dict[tuple[str, ...], Mapping[str, float]] = {
+            (node, name, level, f"{horizon['ahead']:g}"): said
             for horizon in horizons
             for node, filters in horizon["estimates"].items()
             for name, body in filters.items()
@@ -199,8 +199,9 @@ class Watch:
         Of so many plants, those in which one is most probable.
         """
         with self._noting:
-            first = sorted(self._passing, key=lambda plant: -max(self._passing[plant].values()))[:most]
-            return [((plant, *key), value) for plant in first for key, value in self._passing[plant].items()]
+            of_each = {plant: max(said["by"] for said in levels.values()) for plant, levels in self._passing.items()}
+            first = sorted(of_each, key=lambda plant: -of_each[plant])[:most]
+            return [((plant, *key), said["by"]) for plant in first for key, said in self._passing[plant].items()]
 
     def plants(self) -> Iterator[tuple[str, WatchedPlant]]:
         """Yield all plants of all services."""
@@ -274,6 +275,10 @@ class Watch:
                 "senders": senders,
                 "tests": [_make_test_row(*key, test) for key, test in tests.items()] + self.fused_rows(tests),
                 "outputs": [make_output_row(output) for output in health],
+                "levels": [
+                    {**dict(zip(("node", "filter", "level", "ahead"), key, strict=True)), **said}
+                    for key, said in self._passing.get(name, {}).items()
+                ],
                 "warnings": list(self._yield_warnings(told.links, tests, senders))[:WARNINGS],
                 "malformed": told.malformed,
                 "all": self.links(),

@@ -91,6 +91,7 @@ function show(view) {
   at("warnings").replaceChildren(...view.warnings.map((text) => made("li", text)));
   keys(view);
   charts(view);
+  levels(view);
   links(view);
   tests(view);
   outputs(view);
@@ -221,6 +222,36 @@ function status_of(sender) {
   if (sender.dead) return made("td", "dead: " + sender.missed + " heartbeats missed", "doubt");
   if (sender.last === null) return made("td", "nothing yet");
   return made("td", sender.silent ? "silent for " + sender.silent + (sender.silent === 1 ? " step" : " steps") : "sends", "fine");
+}
+
+// How far ahead, in words: of messages with dates in seconds, else in the unit of their time.
+function distance(ahead, view) {
+  const value = Number(ahead), dated = points.length && typeof points[points.length - 1].time === "string";
+  if (!dated) return short(value) + " " + (view.time_unit || "ahead");
+  const [size, unit] = [[86400, "d"], [3600, "h"], [60, "min"], [1, "s"]].find(([size]) => value >= size && value % size === 0) || [1, "s"];
+  return short(value / size) + " " + unit;
+}
+
+const LIKELY = 0.9; // as the rule of integrations/monitoring
+const percent = (value) => (100 * value).toFixed(value > 0 && value < 0.1 ? 1 : 0) + " %";
+
+function levels(view) {
+  at("passing").hidden = !view.levels.length;
+  const horizons = [...new Set(view.levels.map((one) => one.ahead))];
+  const heads = ["level", "filter", ...horizons.map((ahead) => "in " + distance(ahead, view))];
+  at("horizons").replaceChildren(...heads.map((text) => { const head = made("th", text); head.scope = "col"; return head; }));
+  const rows = new Map();
+  for (const one of view.levels) {
+    const key = JSON.stringify([one.level, one.node + "/" + one.filter]);
+    rows.set(key, (rows.get(key) || new Map()).set(one.ahead, one));
+  }
+  at("levels").replaceChildren(...[...rows].map(([key, said]) => {
+    const [level, filter] = JSON.parse(key);
+    return row(level, [filter, ...horizons.map((ahead) => {
+      const one = said.get(ahead);
+      return one ? made("td", percent(one.by) + " (" + percent(one.then) + ")", one.by > LIKELY ? "doubt" : "") : "";
+    })]);
+  }));
 }
 
 function links(view) {
