@@ -29,6 +29,7 @@ ORDER = [
         "filters.vector",
         "filters.calls",
         "filters.base",
+        "filters.sizes",
         "filters.plausibility",
         "filters.states",
         "filters.recursion",

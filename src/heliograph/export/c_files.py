@@ -128,7 +128,9 @@ def make_text(filter: AbstractFilter, received: Sequence[str], prefix: str, real
         raise fail("single precision", expected, type(filter).__name__)
     try:
         with use_precision(np.float64 if real == "double" else np.float32):
-            program = write_step_program(filter, real, prefix, apart)
+            program = write_step_program(
+                filter if real == "double" else filter.for_single_precision(), real, prefix, apart
+            )
         return write_c_text(program, Form(prefix, real, received, kind))
     except ValueError as error:
         raise InputError(str(error)) from None  # a number of the filter beyond single precision

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.export.parts import Part, parts_of_step
+from heliograph.factors.centred import CentredGaussian, centred_from_covariance
 from heliograph.factors.gaussian import Gaussian, from_covariance
 from heliograph.filters.base import AbstractFilter
 from heliograph.numerics.check import InputError, fail
@@ -81,7 +82,8 @@ def write_step_program(filter: AbstractFilter, real: Real, prefix: str, apart: b
         computes = [_write_part(part, symmetric, prefix, real, kept, (read, members)) for part in parts]
         names, starts = [m.name for m in members], [m.start for m in members]
         initial = to_c(lambda: starts, name=f"{prefix}_initial", single=real == "float", names=((), names))
-        at = _write_start(filter, kept, names, prefix, real) if isinstance(state, Gaussian) and apart else None
+        set_anew = isinstance(state, Gaussian | CentredGaussian) and apart
+        at = _write_start(filter, kept, names, prefix, real) if set_anew else None
     except Unsupported as error:
         raise no_c(error.operation, error.where) from None
     mean, covariance = (named[n].name for n in places)
@@ -135,13 +137,15 @@ def _write_start(filter: AbstractFilter, kept: list[int], names: list[str], pref
     A covariance whose factors do not give it back is none: elimination keeps each pivot at zero or above.
     """
 
+    make = centred_from_covariance if isinstance(filter.init(), CentredGaussian) else from_covariance
+
     @jax.jit
     def begin(mean: jax.Array, covariance: jax.Array) -> list[jax.Array]:
-        state = from_covariance(mean, covariance)
+        state = make(mean, covariance)
         estimate = filter.estimate(state)
         results = [*jax.tree.leaves(state), estimate.mean, estimate.covariance]
         deviations = jnp.sqrt(jnp.abs(jnp.diagonal(covariance)))
-        apart = jnp.abs(jnp.asarray(state.covariance) - covariance)
+        apart = jnp.abs(jnp.asarray(estimate.covariance) - covariance)
         same = jnp.all(apart <= SAME * jnp.outer(deviations, deviations))
         right = same & jnp.all(jnp.isfinite(mean)) & jnp.all(jnp.isfinite(covariance))
         return [*(results[n] for n in kept), ~right]

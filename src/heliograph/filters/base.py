@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import wraps
-from typing import TYPE_CHECKING, NamedTuple, NoReturn, ParamSpec, Protocol, TypedDict, TypeVar, cast
+from typing import TYPE_CHECKING, NamedTuple, NoReturn, ParamSpec, TypeVar, cast
 
 import equinox as eqx
 import jax
@@ -13,6 +13,7 @@ from heliograph.engine.choice import compile_on_call
 from heliograph.filters.calls import call_with_inputs, call_with_state
 from heliograph.filters.filter_data import Filtered, run_over_data, scan_inside_jit
 from heliograph.filters.plausibility import Judgement, judge_step
+from heliograph.filters.sizes import make_sizes
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, add_nis
 from heliograph.filters.vector import check_vector
 from heliograph.model.checks.inputs import check_time_step, do_inputs_spoil
@@ -27,7 +28,7 @@ from heliograph.numerics.names import refuse_attribute
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 
 __all__ = ["AbstractFilter", "AbstractSizedFilter", "Step", "believes", "corrects", "estimates", "in_float64",
-           "predicts", "step_number"]  # fmt: skip
+           "make_sizes", "predicts", "step_number"]  # fmt: skip
 
 Step = TypeAliasType("Step", int | np.integer | Int[Array, ""])
 
@@ -236,6 +237,13 @@ class AbstractFilter(Module):
         """Return a planned filter that can be smoothed, given the smoother `steps` of the original filter over time."""
         return self
 
+    def for_single_precision(self) -> "AbstractFilter":
+        """Return the same filter with a mean that keeps its digits in single precision, however far it is from 0.
+
+        By default itself.
+        """
+        return self
+
     def as_large_as(self, others: Sequence["AbstractFilter"]) -> "AbstractFilter":
         """Return the same filter with arrays as long as the longest of the others, so that one program steps all."""
         return self
@@ -281,32 +289,6 @@ class AbstractSizedFilter(AbstractFilter):
     def angles_used(self) -> FilterAngles | None:
         """Return no angles: what is given models with angles says so itself, or refuses them."""
         return FilterAngles((), ())
-
-
-class Sizes(TypedDict):
-    """Claim and sizes of a filter, as its class takes them."""
-
-    claim: Claim
-    states: tuple[str, ...]
-    inputs: tuple[str, ...]
-    received: int
-
-
-class HasStates(Protocol):
-    """A plant, a filter or a network, with the names of its states and inputs."""
-
-    @property
-    def states(self) -> tuple[str, ...]:
-        """Names of the states."""
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """Names of the inputs."""
-
-
-def make_sizes(claim: Claim, like: HasStates, received: int) -> Sizes:
-    """Return claim, and the sizes of a filter of the states and inputs of a plant, which receives so many numbers."""
-    return Sizes(claim=claim, states=like.states, inputs=like.inputs, received=received)
 
 
 @compile_on_call

@@ -14,6 +14,7 @@ from heliograph.filters.base import (
     make_sizes,
 )
 from heliograph.filters.gaussian.belief import AbstractBeliefFilter, prior_of, second_moments_at_start
+from heliograph.filters.gaussian.centred import center_filter
 from heliograph.filters.gaussian.diffuse import DiffuseFilter, diffuse_filter, has_unknown_start
 from heliograph.filters.gaussian.signal import (
     ArrivedInnovation,
@@ -114,6 +115,10 @@ class GaussianFilter(AbstractBeliefFilter):
     def is_linear(self) -> bool:
         """True where the gains depend on no data."""
         return self.linear
+
+    def for_single_precision(self) -> AbstractFilter:
+        """Return the filter about an origin that moves."""
+        return center_filter(self)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains, where they do not depend on data."""

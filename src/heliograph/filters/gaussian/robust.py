@@ -8,11 +8,13 @@ import numpy as np
 from heliograph.factors.columns import Columns, columns_of, zero_covariance
 from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.base import (
+    AbstractFilter,
     FilterAngles,
     Step,
     corrects,
 )
 from heliograph.filters.gaussian.belief import AbstractBeliefFilter, second_moments_at_start
+from heliograph.filters.gaussian.centred import center_filter
 from heliograph.filters.gaussian.scores import (
     AbstractWeights,
     PredictedMeasurement,
@@ -191,6 +193,10 @@ class RobustFilter(AbstractBeliefFilter):
             return after.state, _innovation_about_mean(before, z, center, jnp.diag(variance), after, True)
         after = update_weighted(before, z, noise.center, columns_of(noise.covariance), self.rule)
         return after.state, _innovation_about_mean(before, z, noise.center, noise.covariance, after)
+
+    def for_single_precision(self) -> AbstractFilter:
+        """Return the filter about an origin that moves."""
+        return center_filter(self)
 
     def predict_received(self, state: Gaussian, k: Step) -> tuple[PredictedMeasurement, jax.Array]:
         """Predict what would arrive without the noise that may hold outliers; return the sensor's mean signal too."""

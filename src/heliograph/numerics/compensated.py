@@ -1,0 +1,286 @@
+"""Functions evaluated with what rounding takes from them: f(c + e) as a high part and a low one.
+
+Let fl(a . b) be an operation as it is rounded. Of a sum, a product, a quotient and a root the rounding error d is
+itself a number, or nearly, and is computed; of what was lost before, l, a derivative hands on f'(a) l. So the low part
+of each number is l+ = f'(a) l + d, the first-order correction of all roundings before it: what is left is of order
+eps^2, beside the roundings of functions that have no formula for d (a sine, a logarithm), which are eps of their own
+value. For a sum that is what matters: x + v cos(heading) dt far from the origin is rounded at |x| otherwise.
+
+Source: Langlois, Automatic linear correction of rounding errors (2001), with the derivatives forwards; Dekker, A
+floating-point technique for extending the available precision (1971), for the errors of sums and products.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import partial, reduce
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var
+
+CALLS = frozenset((
+    "jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr",
+    "checkpoint", "remat", "remat2",
+))  # fmt: skip
+
+
+class Compensated(NamedTuple):
+    """A number as high + low, of one shape; `low` is None where nothing was lost."""
+
+    high: Any
+    low: Any = None
+
+
+def split_sum(a: jax.Array, b: jax.Array) -> Compensated:
+    """Return fl(a + b) and its rounding error, whichever is larger.
+
+    Source: Knuth, The art of computer programming, volume 2, theorem B of section 4.2.2.
+    """
+    total = a + b
+    back = total - a
+    return Compensated(total, (a - (total - back)) + (b - back))
+
+
+def compensate(function: Callable[[jax.Array], jax.Array], unit: float) -> Callable[[Compensated], Compensated]:
+    """Return x -> f(high + low), compensated, of a JAX function f of one array.
+
+    Loops hand on what was lost before them, and their own roundings stay. Where a low part is no number,
+    as behind the derivative of a root at 0, there is none.
+
+    Args:
+        function: f, of operations with derivatives.
+        unit: eps of the precision in which it will be computed; constants are divided in it too.
+    """
+
+    def evaluate(x: Compensated) -> Compensated:
+        program = jax.make_jaxpr(function)(x.high)
+        result = _Evaluation(unit).inline(program, [x])[0]
+        low = jnp.zeros_like(result.high) if result.low is None else result.low
+        return Compensated(jnp.asarray(result.high), jnp.where(jnp.isfinite(low), low, 0.0))
+
+    return evaluate
+
+
+class _Evaluation:
+    """Evaluation of a traced program in numbers that are high + low."""
+
+    def __init__(self, unit: float):
+        bits = 1 - round(np.log2(unit))  # of a fraction
+        self.splitter = 2.0 ** ((bits + 1) // 2) + 1
+        self.stored = np.float32 if bits <= 24 else np.float64
+        self.rules: dict[str, Callable[..., Compensated]] = {
+            "add": self._add, "add_any": self._add, "sub": self._subtract, "mul": self._multiply, "div": self._divide,
+            "sqrt": self._take_root, "square": self._square, "integer_pow": self._raise_to_integer,
+            "reduce_sum": self._sum, "cumsum": self._accumulate, "dot_general": self._contract,
+        }  # fmt: skip
+
+    def inline(self, program: ClosedJaxpr | Jaxpr, inputs: Sequence[Compensated]) -> list[Compensated]:
+        """Return the results of a traced program."""
+        jaxpr: Any = program.jaxpr if isinstance(program, ClosedJaxpr) else program
+        consts = program.consts if isinstance(program, ClosedJaxpr) else []
+        values: dict[Var, Compensated] = dict(zip(jaxpr.constvars, map(self._divide_known, consts), strict=True))
+        values |= zip(jaxpr.invars, inputs, strict=True)
+
+        def read(v: Any) -> Compensated:
+            return self._divide_known(v.val) if isinstance(v, Literal) else values[v]
+
+        for equation in jaxpr.eqns:
+            values |= zip(equation.outvars, self._apply(equation, list(map(read, equation.invars))), strict=True)
+        return list(map(read, jaxpr.outvars))
+
+    def _divide_known(self, number: Any) -> Compensated:
+        """Divide a known real number into what the precision holds of it and the rest."""
+        if isinstance(number, jax.core.Tracer) or not np.issubdtype(np.asarray(number).dtype, np.floating):
+            return Compensated(number)
+        whole = np.asarray(number, np.float64)
+        high = whole.astype(self.stored).astype(np.float64)
+        rest = np.subtract(whole, high, out=np.zeros_like(whole), where=np.isfinite(high))
+        return Compensated(high, rest if np.any(rest) else None)
+
+    def _apply(self, equation: JaxprEqn, inputs: list[Compensated]) -> list[Compensated]:
+        """Return the results of one operation."""
+        name, params = equation.primitive.name, equation.params
+        if name in CALLS:
+            inner = next(params[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in params)
+            return self.inline(inner, inputs)
+        if name == "cond":
+            return self._branch(inputs, params["branches"])
+        if name in self.rules and all(jnp.issubdtype(jnp.result_type(x.high), jnp.floating) for x in inputs):
+            return [self.rules[name](*inputs, **params)]
+        return _differentiate(partial(_bind, equation), inputs, equation.primitive.multiple_results)
+
+    def _branch(self, inputs: list[Compensated], branches: Sequence[ClosedJaxpr]) -> list[Compensated]:
+        """Take one of several programs, each evaluated so."""
+
+        def evaluate(branch: ClosedJaxpr, given: list[Compensated]) -> list[Compensated]:
+            """Return its results, each with a low part if it is a real number, as those of the others."""
+            results = self.inline(branch, given)
+            real = [jnp.issubdtype(jnp.result_type(x.high), jnp.floating) for x in results]
+            return [
+                Compensated(jnp.asarray(x.high), _or_zero(x.low) + jnp.zeros_like(x.high)) if is_real else x
+                for x, is_real in zip(results, real, strict=True)
+            ]
+
+        index = jnp.asarray(inputs[0].high, np.int32)
+        results: list[Compensated] = lax.switch(index, [partial(evaluate, branch) for branch in branches], inputs[1:])
+        return results
+
+    def _add(self, a: Compensated, b: Compensated, **_: Any) -> Compensated:
+        total, error = split_sum(a.high, b.high)
+        return Compensated(total, _add_up(error, a.low, b.low))
+
+    def _subtract(self, a: Compensated, b: Compensated, **_: Any) -> Compensated:
+        return self._add(a, Compensated(-b.high, None if b.low is None else -b.low))
+
+    def _multiply(self, a: Compensated, b: Compensated, **_: Any) -> Compensated:
+        lost = [x.low * y.high for x, y in ((a, b), (b, a)) if x.low is not None]
+        return Compensated(a.high * b.high, _add_up(self._find_product_error(a.high, b.high), *lost))
+
+    def _divide(self, a: Compensated, b: Compensated, **_: Any) -> Compensated:
+        """Divide: the remainder a - q b, and what was lost of it, over b."""
+        quotient = a.high / b.high
+        back = quotient * b.high
+        lost = None if b.low is None else -quotient * b.low
+        rest = _add_up((a.high - back) - _or_zero(self._find_product_error(quotient, b.high)), a.low, lost)
+        return Compensated(quotient, rest / b.high)
+
+    def _take_root(self, a: Compensated, **_: Any) -> Compensated:
+        """Take a root: the remainder a - r^2, and what was lost of a, over 2 r."""
+        root = jnp.sqrt(a.high)
+        rest = _add_up((a.high - root * root) - _or_zero(self._find_product_error(root, root)), a.low)
+        return Compensated(root, rest / (2 * root))
+
+    def _square(self, a: Compensated, **_: Any) -> Compensated:
+        return self._multiply(a, a)
+
+    def _raise_to_integer(self, a: Compensated, y: int, **_: Any) -> Compensated:
+        if y < 1:
+            return self._divide(Compensated(np.ones(())), self._raise_to_integer(a, y=-y)) if y else _one_like(a)
+        return reduce(self._multiply, [a] * y)
+
+    def _sum(self, a: Compensated, axes: tuple[int, ...], **_: Any) -> Compensated:
+        """Add the entries along axes, one after another."""
+        for axis in sorted(axes, reverse=True):
+            if not jnp.shape(a.high)[axis]:
+                return Compensated(jnp.sum(a.high, axis=axes))
+            a = reduce(self._add, _take_apart(a, axis))
+        return a
+
+    def _accumulate(self, a: Compensated, axis: int, reverse: bool) -> Compensated:
+        parts = _take_apart(a, axis)
+        for i in range(1, len(parts)):
+            parts[i] = self._add(parts[i - 1], parts[i]) if not reverse else parts[i]
+        for i in reversed(range(len(parts) - 1)):
+            parts[i] = self._add(parts[i + 1], parts[i]) if reverse else parts[i]
+        highs, lows = [p.high for p in parts], [_or_zero(p.low) + jnp.zeros_like(p.high) for p in parts]
+        return Compensated(jnp.stack(highs, axis), jnp.stack(lows, axis))
+
+    def _contract(self, a: Compensated, b: Compensated, dimension_numbers: Any, **_: Any) -> Compensated:
+        """Multiply matrices by the products of entries, added one after another."""
+        (over_a, over_b), (same_a, same_b) = dimension_numbers
+        left, right = (_arrange(*part) for part in ((a, same_a, over_a, True), (b, same_b, over_b, False)))
+        shape = [jnp.shape(x.high)[n] for x, same in ((a, same_a),) for n in same]
+        shape += [n for x, gone in ((a, (*same_a, *over_a)), (b, (*same_b, *over_b)))
+                  for i, n in enumerate(jnp.shape(x.high)) if i not in gone]  # fmt: skip
+        products = [self._multiply(x, y) for x, y in zip(_take_apart(left, 1), _take_apart(right, 1), strict=True)]
+        if not products:
+            return Compensated(jnp.zeros(shape))
+        total = reduce(self._add, products)
+        return Compensated(*(None if part is None else jnp.reshape(part, shape) for part in total))
+
+    def _find_product_error(self, a: Any, b: Any) -> Any:
+        """Return a b - fl(a b) of numbers whose halves have exact products; None where one is 0 or a power of two."""
+        if _is_scaling(a) or _is_scaling(b):
+            return None
+        (a1, a2), (b1, b2) = self._halve(a), self._halve(b)
+        return ((a1 * b1 - a * b) + a1 * b2 + a2 * b1) + a2 * b2
+
+    def _halve(self, a: Any) -> tuple[Any, Any]:
+        """Return a as a sum of two numbers of half as many digits."""
+        if not isinstance(a, jax.Array):
+            whole: Any = np.asarray(a, self.stored)
+            far = whole * self.stored(self.splitter)
+            high = far - (far - whole)
+            return high.astype(np.float64), (whole - high).astype(np.float64)
+        far = a * self.splitter
+        high = far - (far - a)
+        return high, a - high
+
+
+def _bind(equation: JaxprEqn, *arguments: Any) -> Any:
+    """Apply an operation as it is."""
+    primitive: Any = equation.primitive
+    return primitive.bind(*arguments, **equation.params)
+
+
+def _differentiate(function: Callable[..., Any], inputs: Sequence[Compensated], several: bool) -> list[Compensated]:
+    """Return f of the high parts, and as low parts its derivative by them times what was lost of each."""
+    lost = [i for i, x in enumerate(inputs) if x.low is not None]
+
+    def of_lost(*some: Any) -> Any:
+        arguments = [x.high for x in inputs]
+        for i, value in zip(lost, some, strict=True):
+            arguments[i] = value
+        return function(*arguments)
+
+    if not lost:
+        results, lows = of_lost(), None
+    else:
+        given = [jnp.asarray(inputs[i].high) for i in lost]
+        moves = [jnp.broadcast_to(inputs[i].low, x.shape) for i, x in zip(lost, given, strict=True)]
+        results, lows = jax.jvp(of_lost, given, moves)
+    if not several:
+        results, lows = [results], [lows]
+    real = [jnp.issubdtype(jnp.result_type(x), jnp.floating) for x in results]
+    return [Compensated(x, low if is_real else None)
+            for x, low, is_real in zip(results, lows or [None] * len(results), real, strict=True)]  # fmt: skip
+
+
+def _is_scaling(a: Any) -> bool:
+    """Return whether a known number multiplies without rounding: each entry is 0 or a power of two."""
+    if isinstance(a, jax.Array | jax.core.Tracer):
+        return False
+    return bool(np.all((np.abs(np.frexp(a)[0]) == 0.5) | (np.asarray(a) == 0)))
+
+
+def _take_apart(a: Compensated, axis: int) -> list[Compensated]:
+    """Return the entries along an axis."""
+    count = jnp.shape(a.high)[axis]
+    parts = [[None] * count if x is None else [_take(x, i, axis) for i in range(count)] for x in a]
+    return [Compensated(high, low) for high, low in zip(*parts, strict=True)]
+
+
+def _take(x: Any, i: int, axis: int) -> Any:
+    """Return entry i along an axis; of a known array a known one."""
+    return lax.index_in_dim(x, i, axis, False) if isinstance(x, jax.Array) else np.take(x, i, axis)
+
+
+def _arrange(a: Compensated, same: Sequence[int], over: Sequence[int], left: bool) -> Compensated:
+    """Arrange a factor as (batch, summed, rows, 1) or (batch, summed, 1, columns)."""
+    shape = jnp.shape(a.high)
+    rest = [i for i in range(len(shape)) if i not in (*same, *over)]
+    sizes = [int(np.prod([shape[i] for i in some], dtype=int)) for some in (same, over, rest)]
+    sizes = [*sizes, 1] if left else [*sizes[:2], 1, sizes[2]]
+    order = [*same, *over, *rest]
+    parts = [None if x is None else x.transpose(order).reshape(sizes) for x in map(_as_array, a)]
+    return Compensated(*parts)
+
+
+def _as_array(x: Any) -> Any:
+    return x if x is None or isinstance(x, jax.Array) else np.asarray(x)
+
+
+def _add_up(*terms: Any) -> Any:
+    """Return the sum of those terms that are not None."""
+    given = [x for x in terms if x is not None]
+    return reduce(lambda a, b: a + b, given) if given else None
+
+
+def _or_zero(x: Any) -> Any:
+    return 0.0 if x is None else x
+
+
+def _one_like(a: Compensated) -> Compensated:
+    return Compensated(jnp.ones_like(a.high))
