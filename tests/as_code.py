@@ -13,6 +13,7 @@ import jax
 import numpy as np
 
 import heliograph as hg
+from tests.map import BORDERS
 
 HELD = {  # arguments that an object holds otherwise than under their names
     "limits": lambda node: None if node.limits is None else np.stack([node.limits.low, node.limits.high], -1),
@@ -82,7 +83,8 @@ def _name(kind: type, modules: set[str]) -> str:
 
 @cache
 def _public() -> dict[Any, str]:
-    rooms = [stub.parent.name for stub in Path(hg.__file__).parent.glob("*/__init__.pyi")]
+    stubs = Path(hg.__file__).parent.glob("*/__init__.pyi")
+    rooms = [stub.parent.name for stub in stubs if stub.parent.name not in BORDERS]
     places = {"hg": hg} | {f"hg.{room}": import_module(f"heliograph.{room}") for room in rooms}
     return {getattr(place, name): f"{prefix}.{name}" for prefix, place in reversed(places.items())
             for name in place.__all__ if inspect.isclass(getattr(place, name))}  # fmt: skip

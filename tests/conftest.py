@@ -119,7 +119,7 @@ def keep_contexts():
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_protocol(item, nextitem):
     """Tests trace from deep within pytest: they have room on the interpreter's stack."""
-    from heliograph.numerics.process.stack import make_room
+    from heliograph.numerics import make_room
 
     return make_room(item.config.pluginmanager.getplugin("runner").pytest_runtest_protocol)(item, nextitem)
 

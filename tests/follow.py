@@ -13,7 +13,7 @@ import numpy as np
 from heliograph.engine.choice import choose_code, compute_once
 from heliograph.filters.base import AbstractFilter
 from heliograph.model import Estimate, Innovation
-from heliograph.numerics.float64 import compile_in_float64
+from heliograph.numerics import compile_in_float64
 
 ROWS = 64  # what is compiled serves every number of rows up to the next multiple of it, and rows cost next to nothing
 ROWS_OF_EACH = 16  # of thousands of filters side by side they do cost

@@ -1,7 +1,8 @@
 """The map of the library, made from its code: `python -m tests.map` writes it into the READMEs of the source.
 
 A room is a folder of `heliograph`. What it imports is read from its files, what it is from the first line of its
-README, and its floor from the order in which imports may go (tests/test_structure.py).
+README, and its floor from the order in which imports may go (tests/test_structure.py). What crosses the border of a
+folder that is no public room is listed in its `__init__.pyi`, written by the same command.
 """
 
 import ast
@@ -37,21 +38,50 @@ ROOMS = {
     "application": ["live", "export", "files", "report", "campaign", "serving", "cli"],
 }
 BESIDE = "straightline"  # a package of its own in the same wheel, which knows nothing of heliograph
+# Folders with a border of their own, which users do not see: other folders, and tests, take what it lists.
+BORDERS = [
+    "numerics",
+    "disk",
+    "factors",
+    "random_affine/moments",
+    "learning/likelihood",
+    "live/stored",
+    "filters/event",
+    "fusion/mesh",
+    "simulation/centres",
+    "planning/paths",
+    "simulation/runs",
+    "files/bags",
+    "files/sources",
+    "serving/brokers",
+    "serving/storage",
+    "serving/observation",
+]
 BEGIN, END = "<!-- made by python -m tests.map -->", "<!-- end -->"
+
+
+@cache
+def imported_names() -> list[tuple[Path, str, str]]:
+    """Every import of the library: the file, the module and the name."""
+    return [
+        (path, node.module, alias.name)
+        for path in SOURCE.rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.ImportFrom) and node.module
+        for alias in node.names
+    ]
 
 
 @cache
 def taken() -> dict[tuple[str, str], set[str]]:
     """Names that one room imports from another: {(who, of whom): {module.name}}."""
     names = defaultdict(set)
-    for path in SOURCE.rglob("*.py"):
+    for path, module, name in imported_names():
         room, *inside = path.relative_to(SOURCE).parts
-        for node in ast.walk(ast.parse(path.read_text())) if inside else ():
-            if isinstance(node, ast.ImportFrom) and node.module:
-                package, _, rest = node.module.partition(".")
-                other = rest.partition(".")[0] if package == "heliograph" else package
-                if package in ("heliograph", BESIDE) and other != room:
-                    names[room, other] |= {f"{node.module}.{alias.name}" for alias in node.names}
+        package, _, rest = module.partition(".")
+        other = rest.partition(".")[0] if package == "heliograph" else package
+        if inside and package in ("heliograph", BESIDE) and other != room:
+            names[room, other].add(f"{module}.{name}")
     return names
 
 
@@ -93,8 +123,39 @@ def imports_line(room: str) -> str:
     return f"**Imports:** {', '.join(f'`{other}`' for other in imports_of(room)) or 'no other room'}."
 
 
+def border_of(folder: str) -> str:
+    """The stub of a folder: by file, the names that the library takes from outside it.
+
+    A name that is that of a file beside it is taken from the file: the folder's attribute would be either.
+    """
+    here, package = SOURCE / folder, f"heliograph.{folder.replace('/', '.')}"
+    names = defaultdict(set)
+    for path, module, name in imported_names():
+        if here not in path.parents and module.startswith(f"{package}."):
+            names[module.removeprefix(package)].add(name)
+    lines = ['"""Names that other folders take; the package loads them when first used."""', ""]
+    for module in sorted(names):
+        for name in sorted(names[module]):
+            if not (here / f"{name}.py").exists() and not (here / module.lstrip(".") / f"{name}.py").exists():
+                lines.append(f"from {module} import {name} as {name}")
+    return "\n".join(lines) + "\n"
+
+
+def at_borders() -> set[str]:
+    """Names that stand at a border, as `heliograph.factors.Gaussian`."""
+    return {
+        f"heliograph.{folder.replace('/', '.')}.{alias.name}"
+        for folder in BORDERS
+        for node in ast.parse((SOURCE / folder / "__init__.pyi").read_text()).body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+
+
 def write() -> None:
-    """Write the map, and what each room imports."""
+    """Write the map, what each room imports, and what crosses the borders of folders."""
+    for folder in BORDERS:
+        (SOURCE / folder / "__init__.pyi").write_text(border_of(folder))
     page = SOURCE / "README.md"
     text = page.read_text()
     page.write_text(text[: text.index(BEGIN)] + map_of_rooms() + text[text.index(END) + len(END) :])

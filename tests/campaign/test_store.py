@@ -17,7 +17,8 @@ from heliograph.campaign import engines
 from heliograph.campaign.engines import run_in_processes
 from heliograph.campaign.run import run_campaign
 from heliograph.campaign.work import Job
-from heliograph.disk.whole_file import only_here, try_lock
+from heliograph.disk import only_here
+from heliograph.disk.whole_file import try_lock
 from tests.campaign.example import CAMPAIGN, CHUNKS, NETWORK, contents, write
 
 LOCK = ".lock"

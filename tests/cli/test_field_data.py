@@ -12,7 +12,7 @@ from heliograph.live.network_program import NetworkProgram
 from heliograph.serving import LineReader
 from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.service import Service
-from heliograph.serving.storage.store_protocol import InMemoryStore
+from heliograph.serving.storage import InMemoryStore
 from tests.cli.walk import WALK, agrees, kalman, run
 from tests.files.module import load_module
 

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from heliograph.disk.whole_file import check_replaceable, clear_left, whole_folder
+from heliograph.disk import check_replaceable, clear_left, whole_folder
 
 
 def test_new_folder_appears_at_the_end(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from matplotlib.figure import Figure
 
 import heliograph as hg
-from heliograph.disk.quoting import quote_for_cell, unquote_cell, visible
+from heliograph.disk import quote_for_cell, unquote_cell, visible
 
 matplotlib.use("agg")
 

@@ -6,7 +6,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from heliograph.filters import gaussian_innovation
-from heliograph.numerics.linalg import cholesky, psd_solve
+from heliograph.numerics import cholesky, psd_solve
 from straightline.compiled import compile
 
 RANDOM = np.random.default_rng(6)

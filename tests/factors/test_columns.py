@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 import straightline
-from heliograph.factors.columns import (
+from heliograph.factors import (
     Columns,
     columns_of,
     decorrelate,
     eliminate,
     join_columns,
-    root_of,
     rounding_of,
     triangularise,
     unit_lower,
 )
+from heliograph.factors.columns import root_of
 
 # One program for each size, not one for each of its hundred operations.
 triangularise, eliminate = jax.jit(triangularise), jax.jit(eliminate)

@@ -8,24 +8,27 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from heliograph.factors.columns import Columns, columns_of, rounding_of, triangularise, zero_covariance
-from heliograph.factors.gaussian import (
-    Gaussian,
+from heliograph.factors import (
+    Columns,
     add_noise_to_image,
     append_rows,
+    columns_of,
     condition_on_next_state,
     condition_on_observation,
     from_columns,
     from_covariance,
-    from_summed_covariance,
     gain_of,
     image_by_slopes,
     impose_moments_of_combination,
     merge_mixture,
     predict_affine,
+    rounding_of,
     rts_step,
     take_leading,
+    triangularise,
+    zero_covariance,
 )
+from heliograph.factors.gaussian import Gaussian, from_summed_covariance
 from tests.factors.exact import after, congruence, exactly, total
 
 # One program for each size, not one for each of its hundred operations.

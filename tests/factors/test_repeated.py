@@ -7,9 +7,17 @@ import pytest
 
 import straightline
 from heliograph import LinearPlant, LinearSensor, Stream, linear_filter
-from heliograph.factors.columns import Columns, columns_of, join_columns, rounding_of, triangularise
-from heliograph.factors.gaussian import condition_on_observation, from_covariance, gain_of
-from heliograph.factors.repeated import triangularise_noise
+from heliograph.factors import (
+    Columns,
+    columns_of,
+    condition_on_observation,
+    from_covariance,
+    gain_of,
+    join_columns,
+    rounding_of,
+    triangularise,
+    triangularise_noise,
+)
 from heliograph.random_affine import Constant, GainAndNoise
 from tests.factors.exact import after, exactly
 

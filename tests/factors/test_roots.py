@@ -4,9 +4,15 @@ import jax
 import numpy as np
 import pytest
 
-from heliograph.factors.columns import columns_of
-from heliograph.factors.gaussian import condition_on_observation, from_covariance
-from heliograph.factors.roots import covariance_of_root, observe_information, observe_root, roots_of
+from heliograph.factors import (
+    columns_of,
+    condition_on_observation,
+    covariance_of_root,
+    from_covariance,
+    observe_information,
+    observe_root,
+    roots_of,
+)
 from tests.factors.exact import after, congruence, exactly
 
 

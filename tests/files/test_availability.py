@@ -7,10 +7,10 @@ import pytest
 
 import heliograph as hg
 from heliograph import cli
-from heliograph.files.sources.sources import Sources
+from heliograph.files.sources import Sources
 from heliograph.serving import LineReader
 from heliograph.serving.brokers.translator import Translator
-from heliograph.serving.storage.store import Store
+from heliograph.serving.storage import Store
 from heliograph.serving.words import LastWordsService
 
 json_field, Available = hg.files.json_field, hg.files.Available

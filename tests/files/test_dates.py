@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import heliograph as hg
 from heliograph.files.table import read_table, write_table
-from heliograph.numerics.times.dates import dates, format_dates
+from heliograph.numerics import dates, format_dates
 from heliograph.serving import Message
 
 PLANT = hg.Plant(lambda x, u: x + u[0], 0.1, [0.0], [[1.0]], states=["p"], inputs=["dt"])

@@ -8,7 +8,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.files import Covariance, json_field
-from heliograph.files.sources.sources import Sources, Unread
+from heliograph.files.sources import Sources, Unread
 from tests.files import bags
 
 PLANT = hg.Plant(lambda x, u: x, 0.1 * np.eye(2), [0.0, 0.0], np.eye(2), states=["east", "north"], inputs=["dt"])

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.files.sources.fields import at, convert_time, decode_json, match_topic
-from heliograph.files.sources.sources import Sources, Unread
+from heliograph.files.sources import Sources, Unread, convert_time, decode_json, match_topic
+from heliograph.files.sources.fields import at
 
 json_field = hg.files.json_field
 PLANT = hg.Plant(

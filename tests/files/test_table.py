@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import heliograph.files.table
-from heliograph.disk.whole_file import check_output, check_output_folder, naming
+from heliograph.disk import check_output, check_output_folder, naming
 from heliograph.files.table import read_table, write_table
 
 COLUMNS = {

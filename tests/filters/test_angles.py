@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.numerics.angle import nearest, wrap_angles
+from heliograph.numerics import nearest, wrap_angles
 
 STEPS = 30
 CHAIN = hg.random_affine.MarkovChain([[0.9, 0.1], [0.3, 0.7]])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.factors.gaussian import from_covariance
+from heliograph.factors import from_covariance
 from heliograph.filters.gaussian.signal import Signal
 from heliograph.filters.gaussian.transform import PolynomialMoments, Transformed, image_of_moments
 from tests import machine

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.numerics.angle import wrap_angles
+from heliograph.numerics import wrap_angles
 
 STEPS, PROCESS, NOISE = 150, 0.01, 0.04
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.learning.likelihood.data import gather_data
-from heliograph.learning.likelihood.surface import Surface
+from heliograph.learning.likelihood import Surface, gather_data
 from heliograph.learning.likelihood.trust_region import maximise
 from tests.oracles.learning_links import likelihood
 

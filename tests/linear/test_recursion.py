@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.numerics.lapack import pseudo_solve
+from heliograph.numerics import pseudo_solve
 from heliograph_studies.quadratic_bias import compute
 from tests.oracles import quadratic_bias as oracle
 from tests.relay_bias import model, two_sensors

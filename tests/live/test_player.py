@@ -7,7 +7,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.live.network_program import NetworkProgram
-from heliograph.simulation.runs.side_by_side import StackedFilters
+from heliograph.simulation.runs import StackedFilters
 from tests.live import worlds
 
 SEEN = 1  # program, of the test: the filters begin by native code; there were 136

@@ -9,8 +9,8 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 import heliograph as hg
+from heliograph.live.stored import unpack
 from heliograph.live.stored.plant_codec import HEAD
-from heliograph.live.stored.snapshot import unpack
 from tests.live import worlds
 
 WORLDS = {

@@ -11,8 +11,8 @@ from scipy import special
 
 import heliograph as hg
 from heliograph.engine.choice import compute_once
-from heliograph.factors.columns import Columns
-from heliograph.random_affine.moments.push import push_moments
+from heliograph.factors import Columns
+from heliograph.random_affine.moments import push_moments
 
 STEPS = 6
 LOST = 2  # the step of which nothing arrives

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 import heliograph as hg
 from heliograph.filters.gaussian.transform import Cubature, Linearization, PolynomialMoments
-from heliograph.numerics.angle import continue_angles, nearest, wrap_angles
+from heliograph.numerics import continue_angles, nearest, wrap_angles
 
 TURN = 2 * np.pi
 ANGLE = st.floats(-1e3, 1e3)

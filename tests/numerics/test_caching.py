@@ -9,8 +9,8 @@ import jax
 import numpy as np
 import pytest
 
-from heliograph.numerics.caching import cache_by_object, share_by_object
-from heliograph.random_affine.moments.monomials import symmetric_power
+from heliograph.numerics import cache_by_object, share_by_object
+from heliograph.random_affine.moments import symmetric_power
 
 CALLS: list[float] = []
 

@@ -4,7 +4,8 @@ import jax
 import pytest
 
 from heliograph.numerics import float64 as compiler
-from heliograph.numerics.float64 import LEVEL, fully_optimised, quickly_compiled, understood
+from heliograph.numerics import fully_optimised, quickly_compiled, understood
+from heliograph.numerics.float64 import LEVEL
 
 
 @pytest.mark.parametrize("least", [False, True])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from heliograph.numerics.times.dates import horizons_in
+from heliograph.numerics import horizons_in
 
 
 def test_steps_spans_and_dates_are_read():

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from heliograph.numerics.linalg import cholesky, psd_solve
+from heliograph.numerics import cholesky, psd_solve
 
 WRITTEN = 24  # rows up to which a matrix is written out
 FACTOR = jax.jit(cholesky)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.numerics.traced import find_rounded_to_single
+from heliograph.numerics import find_rounded_to_single
 from heliograph.simulation.description.doubts import doubts_before_data
 
 TABLE = jnp.asarray([0.1, 0.25])  # as in a user's file: 0.1 is 0.1000000015

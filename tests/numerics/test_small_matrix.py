@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from heliograph.numerics.linalg import cholesky, psd_solve
+from heliograph.numerics import cholesky, psd_solve
 
 RUNS, NODES = 5, 3
 ROUNDING = 1e-12  # of a few hundred operations on well conditioned matrices

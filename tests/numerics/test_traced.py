@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from heliograph.numerics.traced import block_diagonal, is_traced
+from heliograph.numerics import block_diagonal, is_traced
 
 
 @pytest.mark.parametrize("hold", [lambda x: x, lambda x: [1.0, x], lambda x: {"a": (np.ones(2), x)}])

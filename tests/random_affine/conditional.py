@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from heliograph.random_affine.moments.monomials import monomials
+from heliograph.random_affine.moments import evaluate_monomials
 
 
 def conditional_moments(channel, y, order):
     """E[mono_order(z) | y] for a given point y (inputs,)."""
-    return channel.moments(order).expect(monomials(np.asarray(y, dtype=float), order))
+    return channel.moments(order).expect(evaluate_monomials(np.asarray(y, dtype=float), order))

@@ -8,7 +8,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.moments.push import push_moments
+from heliograph.random_affine.moments import push_moments
 from heliograph.testing import check_random_affine
 
 GAINS = np.array([0.2, 1.0])

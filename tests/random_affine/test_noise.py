@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.random_affine.moments.monomials import exponents
+from heliograph.random_affine.moments import exponents
 from heliograph.random_affine.noise import noise_vector
 
 COVARIANCE = np.array([[1.0, 0.3, 0.0], [0.3, 0.5, -0.2], [0.0, -0.2, 0.8]])

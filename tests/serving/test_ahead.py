@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.numerics.times.dates import horizons_in
+from heliograph.numerics import horizons_in
 from heliograph.serving import Fleet, InMemoryStore, NetworkProgram, Options, Service, parse_threshold
 from heliograph.serving.observation.page import Tallies
 from heliograph.serving.observation.watch import Watch

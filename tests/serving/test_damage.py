@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.live.stored.migration import Carrier
+from heliograph.live.stored import Carrier
 from heliograph.serving.service import Service
-from heliograph.serving.storage.store import Store
-from heliograph.serving.storage.store_protocol import Damage, identity, report_damage
+from heliograph.serving.storage import Store, identity, report_damage
+from heliograph.serving.storage.store_protocol import Damage
 from tests.serving.worlds import fleet, lines, messages, stepping
 
 SENT = lines(messages(2, 24, seed=11, whole=True))

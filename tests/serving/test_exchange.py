@@ -22,7 +22,7 @@ from heliograph.serving.brokers.url import parse_address
 from heliograph.serving.message import Message
 from heliograph.serving.service import Service
 from heliograph.serving.settings import ServiceSettings, settings_of_node
-from heliograph.serving.storage.store_protocol import InMemoryStore
+from heliograph.serving.storage import InMemoryStore
 from heliograph.simulation.centres.node_filter import node_network
 from tests.serving.neighbours import PLANT, chain
 

@@ -10,7 +10,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.serving.service import Service
-from heliograph.serving.storage.store_protocol import InMemoryStore
+from heliograph.serving.storage import InMemoryStore
 from tests.serving.test_service import finals, served
 from tests.serving.worlds import HOP, SENSOR, fleet, lines, messages, moving, stepping
 

@@ -147,8 +147,7 @@ def test_a_leap_that_cannot_be_used_changes_nothing(program):
 
 
 def test_a_leap_waits_for_its_confirmation_over_a_restart(program, tmp_path):
-    from heliograph.serving.storage.store import Store
-    from heliograph.serving.storage.store_protocol import identity
+    from heliograph.serving.storage import Store, identity
 
     fleet = Fleet(program, Options(window=5.0))
     for i, (wrong, then, future) in enumerate(

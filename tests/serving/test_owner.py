@@ -13,9 +13,7 @@ import pytest
 
 from heliograph.serving.patience import WaitingService, retry_while_away
 from heliograph.serving.service import Service
-from heliograph.serving.storage.owner import own_store
-from heliograph.serving.storage.store import Store
-from heliograph.serving.storage.store_protocol import AwayError, identity
+from heliograph.serving.storage import AwayError, Store, identity, own_store
 from tests.postgres import Postgres
 from tests.serving.worlds import fleet, lines, messages, stepping
 

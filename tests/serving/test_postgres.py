@@ -7,9 +7,7 @@ import pytest
 from sqlalchemy import text
 
 from heliograph.serving.service import Service
-from heliograph.serving.storage.database import open_database
-from heliograph.serving.storage.store import Store
-from heliograph.serving.storage.store_protocol import identity
+from heliograph.serving.storage import Store, identity, open_database
 from tests.postgres import Postgres
 from tests.serving import test_sharing
 from tests.serving.storage.test_store import by_plant, journal, states

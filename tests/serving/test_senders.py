@@ -10,7 +10,7 @@ from heliograph.live.fleet import Fleet, Options
 from heliograph.live.network_program import NetworkProgram
 from heliograph.serving.output import Estimates
 from heliograph.serving.service import Service
-from heliograph.serving.storage.store_protocol import InMemoryStore
+from heliograph.serving.storage import InMemoryStore
 
 PLANT, SENSOR, LINK = hg.LinearPlant([[0.98]], 0.04, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.01), hg.perfect()
 

@@ -14,11 +14,11 @@ import heliograph as hg
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.network_program import NetworkProgram
 from heliograph.live.plant import LinkCounts
+from heliograph.serving.observation import watch_of
 from heliograph.serving.observation.page import Tallies
-from heliograph.serving.observation.watch import watch_of
 from heliograph.serving.output import Estimates, Refused
 from heliograph.serving.service import Service
-from heliograph.serving.storage.store_protocol import InMemoryStore
+from heliograph.serving.storage import InMemoryStore
 from tests.losing import Losing
 from tests.serving.worlds import WINDOW, fleet, lines, messages, moving, stepping
 

@@ -21,10 +21,7 @@ from sqlalchemy import Engine, update
 import heliograph
 from heliograph.serving.brokers.transport import encode_name
 from heliograph.serving.service import Service
-from heliograph.serving.storage import leases
-from heliograph.serving.storage.database import open_database
-from heliograph.serving.storage.leases import Leases
-from heliograph.serving.storage.store_protocol import InMemoryStore
+from heliograph.serving.storage import InMemoryStore, Leases, leases, open_database
 from heliograph_studies.live.server import Server
 from tests.serving.worlds import WINDOW, fleet, lines, messages, stepping
 

@@ -7,10 +7,9 @@ from pathlib import Path
 import pytest
 
 import heliograph as hg
-from heliograph.live.stored.plant_codec import pack_plant, unpack_plant
+from heliograph.live.stored import pack_plant, unpack_plant
 from heliograph.serving import Fleet, NetworkProgram, Options, Service
-from heliograph.serving.storage.store import Store
-from heliograph.serving.storage.store_protocol import identity
+from heliograph.serving.storage import Store, identity
 
 BEGUN = datetime(2026, 11, 25, 12, 0, 0, tzinfo=UTC)
 DAY = 86_400

@@ -8,7 +8,7 @@ import heliograph as hg
 from heliograph.serving import LineReader
 from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.service import Service
-from heliograph.serving.storage.store_protocol import InMemoryStore
+from heliograph.serving.storage import InMemoryStore
 from tests.serving.worlds import fleet, lines, moving
 
 BROKEN = [

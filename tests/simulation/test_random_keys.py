@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from heliograph.numerics.keys import seed_key
+from heliograph.numerics import seed_key
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2**31 - 1, 2**31, 2**32 - 1])

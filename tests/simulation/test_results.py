@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import heliograph as hg
-from heliograph.disk.quoting import quote_for_file, unquote_file
+from heliograph.disk import quote_for_file, unquote_file
 from heliograph.simulation import ErrorStatistics, StatisticsByName, Uplink
 
 matplotlib.use("Agg")

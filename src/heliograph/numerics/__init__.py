@@ -1,1 +1,10 @@
 """Arithmetic and checks that know nothing of estimation."""
+
+
+def __getattr__(name: str) -> object:
+    """Load a name that other folders take; nothing is imported before, as in `heliograph` itself."""
+    from heliograph.numerics.names import lazy_names
+
+    here = globals()
+    here["__getattr__"], here["__dir__"], here["__all__"] = lazy_names(__name__, __file__)
+    return here[name] if name in here else here["__getattr__"](name)

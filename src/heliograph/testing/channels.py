@@ -10,7 +10,7 @@ from heliograph.numerics.types import PyTree
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.memory import memories
 from heliograph.random_affine.modes import JointModes, joint_modes
-from heliograph.random_affine.moments.monomials import exponents, monomials
+from heliograph.random_affine.moments.monomials import evaluate_monomials, exponents
 from heliograph.simulation.runs.over_runs import over_runs
 
 FALSE_ALARM = 1e-6  # probability that a correct object fails, shared by all numbers compared (Bonferroni)
@@ -53,7 +53,7 @@ def check_random_affine(channel: AbstractRandomAffine, seed: int = 0, samples: i
     for y in points:
         z = first[:, :-1] @ np.append(y, 1.0)
         for order in range(1, highest + 1):
-            expected = channel.moments(order).expect(monomials(y, order))
+            expected = channel.moments(order).expect(evaluate_monomials(y, order))
             worst = max(worst, _compare(f"order {order}", expected, _raise_rows(z, order)))
     return worst
 
@@ -72,7 +72,7 @@ def _compare_modes(
     """Compare moments of two successive draws, each and jointly."""
     begin, rows, worst = np.asarray(modes.initial), np.asarray(modes.transition), 0.0
     given = {
-        order: [modes.moments(order) @ monomials(y, order) for y in points] for order in range(1, highest + 1)
+        order: [modes.moments(order) @ evaluate_monomials(y, order) for y in points] for order in range(1, highest + 1)
     }  # E[mono(z) | mode], (mode, monomials)
     for order, (at_first, at_second) in given.items():
         worst = max(worst, _compare(f"order {order}, first draw", begin @ at_first, _raise_rows(now, order)))

@@ -10,7 +10,7 @@ pytest.importorskip("mcap")
 from mcap.writer import CompressionType, Writer
 from rosbags.highlevel import AnyReader
 
-from heliograph.files.bags.mcap_chunks import read_messages_in_order
+from heliograph.files.bags import read_messages_in_order
 from tests.files.bags import ACCEL, ODOMETRY, START, STORE, acceleration, odometry
 
 

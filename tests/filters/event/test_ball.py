@@ -8,7 +8,7 @@ import pytest
 from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.event.ball import ball_moments, truncate_to_ball
 from heliograph.filters.event.gaussian_sum import GaussianSum
-from heliograph.numerics.float64 import compile_in_float64
+from heliograph.numerics import compile_in_float64
 
 # One program for each side and number of components, whatever the numbers.
 moments_in_ball = {side: compile_in_float64(partial(ball_moments, inside=side)) for side in (True, False)}

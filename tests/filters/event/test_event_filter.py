@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.numerics.float64 import compile_in_float64
+from heliograph.numerics import compile_in_float64
 from heliograph.testing import check_filter
 from tests.follow import follow
 from tests.oracles.event_grid import Link, Scalar, forgetful, posterior

@@ -6,8 +6,9 @@ import jax
 import numpy as np
 import pytest
 
-from heliograph.filters.event.truncated_normal import truncated_normal, upper_tail
-from heliograph.numerics.float64 import compile_in_float64
+from heliograph.filters.event import upper_tail
+from heliograph.filters.event.truncated_normal import truncated_normal
+from heliograph.numerics import compile_in_float64
 
 moments = compile_in_float64(truncated_normal)
 # Of a Gauss-Legendre rule with 40 nodes over 17 deviations or less: 1.2e-13 is what 1,500 random intervals showed.

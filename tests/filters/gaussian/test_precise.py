@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.factors.columns import Columns
-from heliograph.factors.gaussian import Gaussian, condition_on_observation, from_covariance
+from heliograph.factors import Columns, condition_on_observation, from_covariance
+from heliograph.factors.gaussian import Gaussian
 from tests.follow import follow
 
 A, C = [[1, 1], [0, 1]], [[1, 0]]

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.random_affine.moments.moment_noise import AboutMean, about_mean
+from heliograph.random_affine.moments import about_mean
+from heliograph.random_affine.moments.moment_noise import AboutMean
 from heliograph.testing import check_filter
 from tests.follow import last
 

@@ -7,7 +7,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.engine.choice import compute_once
-from heliograph.numerics.float64 import compile_in_float64
+from heliograph.numerics import compile_in_float64
 
 STEPS = 7
 PLANT = hg.LinearPlant([[0.95, 0.2], [-0.2, 0.9]], 0.05, [1.0, -0.5], [[0.5, 0.1], [0.1, 0.4]], [[0.0], [1.0]])

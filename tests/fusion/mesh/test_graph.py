@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.fusion.mesh.graph import graph_of, upstream
+from heliograph.fusion.mesh import graph_of, upstream
 
 
 def neighbours_of(table):

@@ -10,8 +10,8 @@ import heliograph as hg
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.network_program import NetworkProgram
 from heliograph.serving.service import Service
-from heliograph.serving.storage.store_protocol import InMemoryStore
-from heliograph.simulation.centres.mesh import build_mesh
+from heliograph.serving.storage import InMemoryStore
+from heliograph.simulation.centres import build_mesh
 from tests.fusion.mesh.worlds import LINK, RING, RULES, network
 
 BURSTS = hg.gilbert_elliott(hg.perfect(), hg.erasure(hg.perfect(), 0.1), 0.05, 0.3)

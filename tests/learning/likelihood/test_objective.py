@@ -7,8 +7,8 @@ import pytest
 
 import heliograph as hg
 from heliograph.learning.description import describe
-from heliograph.learning.likelihood.data import Data
-from heliograph.learning.likelihood.objective import _by_xla, evaluate_at_points, make_objectives
+from heliograph.learning.likelihood import Data, make_objectives
+from heliograph.learning.likelihood.objective import _by_xla, evaluate_at_points
 
 STEPS, RECORDINGS = 157, 2
 TOLERANCE = 1e-10  # of the largest entry: what rounding is given that 157 steps add it up, and information squares it

@@ -5,14 +5,8 @@ import pytest
 
 import heliograph as hg
 from heliograph.factors.gaussian import Gaussian
-from heliograph.live.stored.old_layout import (
-    can_read,
-    describe_old_layout,
-    factorise,
-    place_flags,
-    relocate_parts,
-    split_by_path,
-)
+from heliograph.live.stored import can_read, describe_old_layout, factorise, relocate_parts, split_by_path
+from heliograph.live.stored.old_layout import place_flags
 
 NEW = {
     ".mean": [2, 3],

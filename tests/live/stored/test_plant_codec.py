@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import heliograph as hg
+from heliograph.live.stored import pack, unpack
 from heliograph.live.stored.plant_codec import HEAD
-from heliograph.live.stored.snapshot import pack, unpack
 
 SENSOR = hg.LinearSensor([[1.0]], 0.5)
 PLANT = hg.LinearPlant([[1.0]], 0.1, [0.0], 1.0)

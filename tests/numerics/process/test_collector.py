@@ -3,7 +3,7 @@ import threading
 
 import pytest
 
-from heliograph.numerics.process.collector import no_collector
+from heliograph.numerics import no_collector
 
 
 @pytest.fixture(autouse=True)

@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from heliograph.numerics.process.stack import make_room
+from heliograph.numerics import make_room
 
 CALLS = 200
 

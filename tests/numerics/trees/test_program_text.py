@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from heliograph.numerics.trees.program_text import text_of
+from heliograph.numerics import text_of
 from straightline import operation
 
 

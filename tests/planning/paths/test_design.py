@@ -7,7 +7,7 @@ from scipy.optimize import minimize
 import heliograph as hg
 from heliograph.planning import Budget, Error, independent_paths, paths_of
 from heliograph.planning.budget import make_power_limits
-from heliograph.planning.paths.design import make_power_task
+from heliograph.planning.paths import make_power_task
 from heliograph.planning.paths.relaxation import SplitPaths
 from heliograph.planning.paths.water_filling import water_filling
 from tests.planning.example import (

@@ -4,8 +4,15 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.random_affine.moments.monomials import count_monomials, exponents, monomials
-from heliograph.random_affine.moments.push import Tabulated, products_of_monomials, push_known, push_moments
+from heliograph.random_affine.moments import (
+    Tabulated,
+    count_monomials,
+    evaluate_monomials,
+    exponents,
+    products_of_monomials,
+    push_known,
+    push_moments,
+)
 from heliograph.random_affine.noise import noise_vector
 from tests.random_affine.test_contract import CHANNELS
 
@@ -14,7 +21,7 @@ def atoms_moments(dimension, order, seed=0):
     """Moments of a law of three points, so that they belong together."""
     g = np.random.default_rng(seed)
     points, chance = g.normal(size=(3, dimension)), g.dirichlet(np.ones(3))
-    return chance @ np.array([monomials(p, order) for p in points])
+    return chance @ np.array([evaluate_monomials(p, order) for p in points])
 
 
 @pytest.mark.parametrize("order", [1, 2, 3, 4])
@@ -30,8 +37,8 @@ def test_pushed_moments_are_those_of_the_matrix(name, order):
 
 def test_lifted_maps_are_pushed_by_their_matrix():
     square = hg.random_affine.square(CHANNELS["discrete"])
-    point = monomials(np.array([0.3, -0.7]), 2)[:-1]
-    before = monomials(point, 2)
+    point = evaluate_monomials(np.array([0.3, -0.7]), 2)[:-1]
+    before = evaluate_monomials(point, 2)
     np.testing.assert_allclose(push_moments(square, 2, before), square.moments(2).expect(before), rtol=1e-14)
 
 
@@ -39,14 +46,16 @@ def test_a_known_map_moves_points():
     matrix = np.array([[1.0, 2.0, 0.5], [0.0, -1.0, 3.0], [0.0, 0.0, 1.0]])
     y = np.array([0.4, -0.2])
     for order in (1, 2, 3, 4):
-        pushed = push_known(matrix, order, monomials(y, order))
-        np.testing.assert_allclose(pushed, monomials((matrix @ [*y, 1.0])[:-1], order), rtol=1e-13)
+        pushed = push_known(matrix, order, evaluate_monomials(y, order))
+        np.testing.assert_allclose(pushed, evaluate_monomials((matrix @ [*y, 1.0])[:-1], order), rtol=1e-13)
 
 
 def test_second_moments_are_gathered_from_the_vector():
     y = np.array([0.4, -0.2, 1.5])
-    lifted = monomials(y, 2)
-    np.testing.assert_allclose(products_of_monomials(monomials(y, 4), 4, 2), np.outer(lifted, lifted), rtol=1e-14)
+    lifted = evaluate_monomials(y, 2)
+    np.testing.assert_allclose(
+        products_of_monomials(evaluate_monomials(y, 4), 4, 2), np.outer(lifted, lifted), rtol=1e-14
+    )
 
 
 def test_a_table_knows_what_the_law_knows():

@@ -14,7 +14,7 @@ from heliograph.serving.brokers.pipe import Pipe
 from heliograph.serving.loop import keep_running
 from heliograph.serving.output import Output
 from heliograph.serving.service import Service
-from heliograph.serving.storage.store_protocol import InMemoryStore
+from heliograph.serving.storage import InMemoryStore
 from tests.serving.worlds import fleet, lines, messages, stepping
 
 LONGEST = 1 << 20  # bytes of a message

@@ -10,7 +10,7 @@ from heliograph.files.recording import Recording, write_recording
 from heliograph.live.event import Event
 from heliograph.serving.brokers.replay import Link, delay_as_traced, encode_messages, recorded, simulate_link
 from heliograph.serving.service import Service
-from heliograph.serving.storage.store_protocol import InMemoryStore
+from heliograph.serving.storage import InMemoryStore
 from tests.serving.worlds import fleet, moving, stepping
 
 ROWS = 20

@@ -15,11 +15,12 @@ from scipy.stats import chi2
 import heliograph as hg
 
 pytest.importorskip("uvicorn")
-from heliograph.files.sources.sources import Sources
+from heliograph.files.sources import Sources
 from heliograph.live.plant import LinkCounts
-from heliograph.serving.observation.page import PageAddress, Tallies, parse_page_address, serve_page
+from heliograph.serving.observation import parse_page_address, serve_page, watch_of
+from heliograph.serving.observation.page import PageAddress, Tallies
 from heliograph.serving.observation.running_nis import RunningNis
-from heliograph.serving.observation.watch import Watch, watch_of
+from heliograph.serving.observation.watch import Watch
 from tests.serving.watched import Scripted
 from tests.serving.worlds import stepping
 from tests.widths import program

@@ -9,11 +9,9 @@ import pytest
 import heliograph as hg
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.network_program import NetworkProgram
-from heliograph.live.stored.migration import Carrier
-from heliograph.live.stored.plant_codec import unpack_plant
+from heliograph.live.stored import Carrier, unpack_plant
 from heliograph.serving.service import Service
-from heliograph.serving.storage.store import Store
-from heliograph.serving.storage.store_protocol import identity
+from heliograph.serving.storage import Store, identity
 from tests.serving.worlds import fleet as world
 from tests.serving.worlds import lines as written
 from tests.serving.worlds import messages as messages_of

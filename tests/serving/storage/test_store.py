@@ -5,10 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from heliograph.live.stored.plant_codec import pack_plant, unpack_plant
+from heliograph.live.stored import pack_plant, unpack_plant
 from heliograph.serving.service import Service
-from heliograph.serving.storage.store import Store
-from heliograph.serving.storage.store_protocol import identity
+from heliograph.serving.storage import Store, identity
 from tests.serving.worlds import fleet, lines, messages, moving, stepping
 
 

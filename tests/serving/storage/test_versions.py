@@ -19,10 +19,9 @@ import pytest
 import heliograph as hg
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.network_program import NetworkProgram
-from heliograph.live.stored.migration import Carrier
+from heliograph.live.stored import Carrier
 from heliograph.serving.service import Service
-from heliograph.serving.storage.store import Store
-from heliograph.serving.storage.store_protocol import identity
+from heliograph.serving.storage import Store, identity
 
 WRITTEN = Path(__file__).parents[2] / "version_0_2"
 OPTIONS = Options(2.0, 0.1)

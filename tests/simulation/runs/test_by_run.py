@@ -8,7 +8,7 @@ import pytest
 import heliograph as hg
 from heliograph.files.recording import read_recording
 from heliograph.relays.design import local_error_design, relay_schedules
-from heliograph.simulation.runs.by_run import simulate_trajectories
+from heliograph.simulation.runs import simulate_trajectories
 from tests.relays.relay_problems import example
 
 STEPS = 7

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.numerics.keys import seed_key
+from heliograph.numerics import seed_key
 from heliograph.relays.design import local_error_design
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Trajectories
 from heliograph.simulation.runs.native import compile_runs

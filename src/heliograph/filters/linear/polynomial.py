@@ -30,7 +30,7 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, check_maps
 from heliograph.random_affine.moments.moment_noise import about_mean
-from heliograph.random_affine.moments.monomials import count_monomials, monomials, position
+from heliograph.random_affine.moments.monomials import count_monomials, evaluate_monomials, position
 from heliograph.random_affine.noise import AbstractNoise, Gaussian
 from heliograph.random_affine.outliers import has_bounded_noise
 
@@ -153,7 +153,7 @@ class PolynomialFilter(AbstractSizedFilter):
     def correct(self, state: CentredState, z: ArrayLike, k: Step = 0) -> tuple[CentredState, Innovation]:
         """Lift z and correct the inner filter."""
         z = _subtract_mean(self.centre, z, state.mean, k)
-        after, innovation = self.inner.correct(state.inner, monomials(z, self.degree)[:-1], k)
+        after, innovation = self.inner.correct(state.inner, evaluate_monomials(z, self.degree)[:-1], k)
         return CentredState(after, state.mean), _select_degree_one(innovation, z, self.degree)
 
     @estimates
@@ -167,7 +167,7 @@ class PolynomialFilter(AbstractSizedFilter):
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the smoother step of the lifted system, about the mean."""
-        z = monomials(_subtract_mean(self.centre, step.z, step.prior.mean, step.k), self.degree)[:-1]
+        z = evaluate_monomials(_subtract_mean(self.centre, step.z, step.prior.mean, step.k), self.degree)[:-1]
         inner = step.map_states(lambda state: state.inner)._replace(z=z)
         return replace(self.inner.smoother_step(inner), shift=jnp.asarray(step.after.mean))
 
@@ -329,7 +329,7 @@ class MemoryFilter(AbstractSizedFilter):
         """Correct the linear filter, then give (z, squares, products of z and its estimate) to the other."""
         z = _subtract_mean(self.centre, z, state.mean, k)
         linear, _ = self.linear.correct(state.linear, z, k)
-        lifted = jnp.concatenate([monomials(z, 2)[:-1], jnp.outer(z, linear.mean).reshape(-1)])
+        lifted = jnp.concatenate([evaluate_monomials(z, 2)[:-1], jnp.outer(z, linear.mean).reshape(-1)])
         products, innovation = self.products.correct(state.products, lifted, k)
         return MemoryState(linear, products, state.mean), _select_degree_one(innovation, z, 2)
 

@@ -12,8 +12,8 @@ from heliograph.random_affine.composite import AbstractWrapper
 from heliograph.random_affine.moments.monomials import (
     Moments,
     count_monomials,
+    evaluate_monomials,
     exponents,
-    monomials,
     position,
     refuse_if_too_large,
     symmetric_power,
@@ -72,7 +72,7 @@ class Lift(AbstractWrapper):
 
     def example_input(self, generator: np.random.Generator) -> np.ndarray:
         """Return a lifted point: the monomials of an input of the base map."""
-        lifted: np.ndarray = monomials(self.base.example_input(generator), self.degree)[:-1]
+        lifted: np.ndarray = evaluate_monomials(self.base.example_input(generator), self.degree)[:-1]
         return lifted
 
 

@@ -80,7 +80,7 @@ def refuse_if_too_large(rows: int, columns: int, what: str) -> None:
         raise fail(what, f"at most {MEMORY_LIMIT_ENTRIES:,} entries of a moment matrix", got)
 
 
-def monomials(y: Numbers, degree: int) -> Numbers:
+def evaluate_monomials(y: Numbers, degree: int) -> Numbers:
     """Return all monomials of (y, 1) of total degree `degree`, for y of shape (p,)."""
     values: list[Numbers] = [*y, 1.0]
     terms = [prod((v**e for v, e in zip(values, powers, strict=True) if e), start=1.0)

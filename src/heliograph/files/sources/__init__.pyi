@@ -1,0 +1,16 @@
+"""Names that other folders take; the package loads them when first used."""
+
+from .derived import Computed as Computed
+from .fields import TimeUnit as TimeUnit
+from .fields import at as at
+from .fields import convert_name as convert_name
+from .fields import convert_time as convert_time
+from .fields import decode_json as decode_json
+from .fields import match_topic as match_topic
+from .fields import parse_arrival as parse_arrival
+from .fields import parse_number as parse_number
+from .json_field import Source as Source
+from .sources import Reading as Reading
+from .sources import SECOND as SECOND
+from .sources import Sources as Sources
+from .sources import Unread as Unread

@@ -1,0 +1,21 @@
+"""Names that other folders take; the package loads them when first used."""
+
+from .gains import NeighbourEstimates as NeighbourEstimates
+from .gains import NeighbourWeights as NeighbourWeights
+from .gains import NodeGains as NodeGains
+from .gains import NodeStep as NodeStep
+from .gains import correct as correct
+from .gains import gains_of as gains_of
+from .gains import information_of as information_of
+from .graph import Graph as Graph
+from .graph import Neighbours as Neighbours
+from .graph import graph_of as graph_of
+from .graph import neighbours_of as neighbours_of
+from .graph import upstream as upstream
+from .joint import blocks_of as blocks_of
+from .joint import error_transitions as error_transitions
+from .joint import joint_after as joint_after
+from .joint import measurement_weights as measurement_weights
+from .joint import scatter_blocks as scatter_blocks
+from .neighbour_rules import DiffusionWeights as DiffusionWeights
+from .neighbour_rules import FrozenWeights as FrozenWeights

@@ -1,0 +1,23 @@
+"""Names that other folders take; the package loads them when first used."""
+
+from .migration import Carrier as Carrier
+from .migration import DESCRIPTION as DESCRIPTION
+from .migration import LISTED as LISTED
+from .migration import SAME as SAME
+from .migration import describe_network as describe_network
+from .migration import list_changes as list_changes
+from .old_layout import LOWER as LOWER
+from .old_layout import VARIANCES as VARIANCES
+from .old_layout import can_read as can_read
+from .old_layout import describe_old_layout as describe_old_layout
+from .old_layout import factorise as factorise
+from .old_layout import relocate_parts as relocate_parts
+from .old_layout import split_by_path as split_by_path
+from .plant_codec import pack_plant as pack_plant
+from .plant_codec import unpack_plant as unpack_plant
+from .snapshot import Identity as Identity
+from .snapshot import check_same as check_same
+from .snapshot import network_identity as network_identity
+from .snapshot import pack as pack
+from .snapshot import unpack as unpack
+from .snapshot import versions as versions
