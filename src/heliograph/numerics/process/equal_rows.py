@@ -44,7 +44,10 @@ def _map_rows(row: np.ndarray, count: int) -> np.ndarray | None:
     piece = unit * max(-(-PIECE // unit), -(-size // (unit * PIECES)))
     if map_memory is None or size < 4 * piece or len(_held) >= MOST:
         return None
-    file = os.memfd_create("heliograph-rows", os.MFD_CLOEXEC)
+    try:
+        file = os.memfd_create("heliograph-rows", os.MFD_CLOEXEC)
+    except OSError:  # no such files here
+        return None
     try:
         os.ftruncate(file, piece)
         with mmap.mmap(file, piece) as filled:
@@ -59,7 +62,7 @@ def _map_rows(row: np.ndarray, count: int) -> np.ndarray | None:
             length = min(piece, size - place)
             if map_memory(at + place, length, both, mmap.MAP_PRIVATE | MAP_FIXED, file, 0) != at + place:
                 return None
-    except OSError:  # no such files here, or no more pieces
+    except OSError:  # no memory for it
         return None
     finally:
         os.close(file)
