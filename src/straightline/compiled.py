@@ -43,6 +43,7 @@ class Compiled:
         self.operations, self.divisions = self.code.operations, self.code.divisions
         self.blocks = Tiers(self.code.blocks, (width or narrow(self.width), self.width))
         self.once = None if self.code.once is None else Tiers(self.code.once, (1, 1))
+        self.single = Tiers(self.code.blocks, (1, 1))
         self._why: str | None = None
         self._first: list[np.ndarray] = []
         self._spread = self.differs.index(True) if True in self.differs else None  # an argument that each run has
@@ -57,6 +58,10 @@ class Compiled:
         new._addresses, new._shared = addresses(new._first), None
         return new
 
+    def for_one(self) -> "OneRun":
+        """Return the same code for one run at a time, with memory of its own: no call of it makes an array."""
+        return OneRun(self)
+
     def prepare(self, arrays: Sequence[Any] = ()) -> str:
         """Generate what a first call of these arrays takes, else of one run; return "", or why LLVM makes no code."""
         if self._why is None:
@@ -64,11 +69,16 @@ class Compiled:
                 if self.once is not None:
                     self.once.prepare(1)
                 if not all(self.code.common):
-                    self.blocks.prepare(-(-self._runs(arrays) // self.width))
+                    tiers, width = self._tiers(self._runs(arrays))
+                    tiers.prepare(-(-self._runs(arrays) // width))
                 self._why = ""
             except Unsupported as error:
                 self._why = str(error)
         return self._why
+
+    def _tiers(self, runs: int) -> tuple[Tiers, int]:
+        """Return the code for so many runs, and the most runs of its vectors: one run fills no lanes."""
+        return (self.single, 1) if runs == 1 else (self.blocks, self.width)
 
     def _runs(self, arrays: Sequence[Any]) -> int:
         return 1 if self._spread is None or self._spread >= len(arrays) else len(arrays[self._spread])
@@ -111,8 +121,8 @@ class Compiled:
                 self._shared = shared if all(self.differs[given:]) else None
             self._copy_common(outputs, shared)
         if not all(code.common):
-            memory = arrays, code.tables, outputs, shared
-            self._compute_blocks(Call(self.blocks.machine(-(-runs // self.width)), pointers, memory, runs), cores)
+            (tiers, width), memory = self._tiers(runs), (arrays, code.tables, outputs, shared)
+            self._compute_blocks(Call(tiers.machine(-(-runs // width)), pointers, memory, runs), cores)
         return jax.tree.unflatten(self.tree, outputs)
 
     def _compute_blocks(self, call: "Call", cores: int | None) -> None:
@@ -150,6 +160,32 @@ class Call(NamedTuple):
         """Compute blocks of runs in this thread, with so many bytes of its own."""
         own = aligned(scratch)
         self.machine.run(self.pointers.ctypes.data, own.ctypes.data, begin, end, self.runs)
+
+
+class OneRun:
+    """Code of a `Compiled` for one run at a time, in arrays of its own: a call computes `outputs` from `inputs`.
+
+    What all runs share has to be among the first arguments, which calls leave out. Bits are those of many runs.
+    """
+
+    def __init__(self, compiled: Compiled):
+        code, given = compiled.code, len(compiled._first)
+        if not all(compiled.differs[given:]):
+            raise ValueError("one run: expected all arguments that runs share to be given first")
+        self.inputs = [np.zeros((1, *s), t) for s, t in zip(compiled.shapes, compiled.types, strict=True)][given:]
+        self.outputs = [in_lines((1, *b.shape), DTYPES[b.type]) for b in code.outputs]
+        self._memory = *compiled._first, *self.inputs, *code.tables, *self.outputs, aligned(code.shared)
+        self._pointers = np.array(addresses(self._memory), dtype=np.uint64)
+        self._scratch, self._tiers, self._is_common = aligned(code.scratch), compiled.single, all(code.common)
+        self._at = self._pointers.ctypes.data, self._scratch.ctypes.data
+        if compiled.once is not None:
+            compiled.once.machine(1).run(self._at[0], 0, 0, 1, 1)
+            compiled._copy_common(self.outputs, self._memory[-1])
+
+    def __call__(self) -> None:
+        """Compute `outputs` from `inputs`."""
+        if not self._is_common:
+            self._tiers.machine(1).run(*self._at, 0, 1, 1)
 
 
 class Alone:

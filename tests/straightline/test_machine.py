@@ -197,3 +197,26 @@ def test_calls_go_on_with_first_arguments_that_are_held():
     assert np.array_equal(code.with_first(np.eye(2), 0.5)(x), code(np.eye(2), 0.5, x))
     with pytest.raises(ValueError, match="array 0 of the arguments: expected shape"):
         code.with_first(np.eye(3))
+
+
+def test_one_run_has_the_bits_of_many_in_memory_of_its_own():
+    """A step as of a filter: what all share is computed once, roots and products of it and of the run's own numbers."""
+
+    def step(shared, x):
+        root = jnp.sqrt(shared @ shared.T)
+        return root @ jnp.sin(x) / (1.0 + x[0] ** 2), root
+
+    rng = np.random.default_rng(0)
+    shared, x = rng.uniform(size=(3, 3)), rng.normal(size=(9, 3))
+    code = compile(step, shared, x[0], shared=[0]).with_first(shared)
+    one, other = code.for_one(), code.for_one()
+    moved, root = code(x)
+    for run in range(9):
+        one.inputs[0][0] = x[run]
+        one()
+        assert one.outputs[0][0].tobytes() == moved[run].tobytes()
+        assert code(x[run : run + 1])[0].tobytes() == moved[run].tobytes()
+    assert one.outputs[1][0].tobytes() == root[0].tobytes()
+    assert not other.inputs[0].any()
+    with pytest.raises(ValueError, match="one run: expected all arguments that runs share to be given first"):
+        compile(step, shared, x[0], shared=[0]).for_one()

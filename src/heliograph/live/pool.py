@@ -1,6 +1,7 @@
 """The table of the rows of all plants, and the steps between rows: due rows are stepped for all plants at once."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import cached_property
 from itertools import pairwise
 from typing import NamedTuple, TypeAlias
 
@@ -32,6 +33,11 @@ class Pool:
         )
         self.table = np.zeros((FEWEST, int(ends[-1])))
         self._free = list(range(FEWEST - 1, -1, -1))
+
+    @cached_property
+    def _one(self) -> Callable[..., np.ndarray]:
+        """Return the step of one row at a time, with memory of this pool's own."""
+        return self.step_rows.for_one()
 
     @property
     def used(self) -> int:
@@ -68,8 +74,8 @@ class Pool:
         u = u if dt is None else _insert_time_step(u, dt, np.ones(len(u)))
         k = np.minimum(table[before, self.at.start] + 1, last)
         nothing = np.full((len(before), self.program.received), np.nan)
-        done = self.step_rows(np.concatenate([table[before, self.state], nothing, u, k[:, None]], axis=1), self._alone)
-        return done[:, self.step_rows.state.size :]
+        done = self._step_parts(table[before, self.state], nothing, u, k[:, None])
+        return done[:, self.step_rows.state.size :].copy()
 
     def step(self, before: np.ndarray, after: np.ndarray, at: np.ndarray) -> None:
         """Step from the rows in the slots `before` into those in `after`; `at`: the step number in discrete time.
@@ -88,9 +94,15 @@ class Pool:
         else:
             u = _insert_time_step(held, dt, numbers[:, -1] - table[before, -1])
             k = table[before, self.at.start] + 1
-        done = self.step_rows(np.concatenate([table[before, self.state], received, u, k[:, None]], axis=1), self._alone)
+        done = self._step_parts(table[before, self.state], received, u, k[:, None])
         table[after, : self.outputs.stop] = done
         table[after, self.held], table[after, self.at.start] = now_held, k
+
+    def _step_parts(self, *parts: np.ndarray) -> np.ndarray:
+        """Step rows, given in parts that stand side by side; of a single row the next call overwrites the result."""
+        if len(parts[0]) == 1 and (self._alone or self.step_rows.is_native):
+            return self._one(*parts)
+        return self.step_rows(np.concatenate(parts, axis=1))
 
     def led(self, before: int, after: int) -> tuple[Float[np.ndarray, " inputs"], int]:
         """Return the inputs that led from the row in one slot to that in another, and the number of the step there."""
@@ -108,8 +120,7 @@ class Pool:
 
         def step(states: Float[np.ndarray, "row state"], k: int) -> Float[np.ndarray, "row state"]:
             rest = np.broadcast_to(np.concatenate([nothing, held, [k]]), (len(states), len(nothing) + len(held) + 1))
-            rows = np.concatenate([states, rest], axis=1)
-            return self.step_rows(rows, self._alone and len(states) == 1)[:, : self.step_rows.state.size]
+            return self._step_parts(states, rest)[:, : self.step_rows.state.size].copy()
 
         flat = self.step_rows.state
         places = factors_in(flat.tree(np.arange(float(flat.size))))

@@ -116,6 +116,11 @@ class RowStep:
         return self._choice.explained
 
     @property
+    def is_native(self) -> bool:
+        """Return whether native code steps the filters, whose bits are the same for one row and for many."""
+        return self._code is not None
+
+    @property
     def _block(self) -> tuple[int, int]:
         """Return the number of rows of a call of XLA's program, and of those of a turn; the layout alone decides."""
         longest = max(self._layout.size, self.state.size + self.outputs.size)
@@ -127,6 +132,10 @@ class RowStep:
     def program(self) -> str:
         """Return the step as text, which two processes compare to see that they compute the same."""
         return _text(self._layout, self._like)
+
+    def for_one(self) -> "OneRowStep":
+        """Return the step of one row at a time, which has memory of its own."""
+        return OneRowStep(self, None if self._code is None else self._code.for_one())
 
     def __call__(self, rows: Float[np.ndarray, "row column"], alone: bool = False) -> Float[np.ndarray, "row column"]:
         """Step each row; `alone`: calls with a single row, for which XLA needs no loop."""
@@ -143,6 +152,27 @@ class RowStep:
                 stepped = run(self._numbers, filled, np.int32(-(-count // together)))
             done[begin : begin + count] = np.asarray(stepped)[:count]
         return done
+
+
+class OneRowStep:
+    """A network's step of one row at a time, in memory of its own where native code has it: the bits of `RowStep`.
+
+    Args:
+        steps: the step of many rows.
+        code: native code for one run, None where XLA steps the filters.
+    """
+
+    def __init__(self, steps: RowStep, code: Any):
+        self._steps, self._code = steps, code
+
+    def __call__(self, *parts: Float[np.ndarray, "1 columns"]) -> Float[np.ndarray, "1 column"]:
+        """Step a row, given in parts that stand side by side; the result is overwritten by the next call."""
+        if self._code is None:
+            return self._steps(np.concatenate(parts, axis=1), True)
+        np.concatenate(parts, axis=1, out=self._code.inputs[0])
+        self._code()
+        stepped: np.ndarray = self._code.outputs[0]
+        return stepped
 
 
 def _check_reports(filters: AllFilters) -> None:
