@@ -7,9 +7,10 @@ from urllib.parse import parse_qs, urlsplit
 
 
 class Answering(ThreadingHTTPServer):
-    """Answers: to a query a list of series, or (status, body); to a write by the statuses given, then 204.
+    """Answers: to a query a list of series, a body, or (status, body); to a write by the statuses given, then 204.
 
-    The form of each answer is the one that InfluxDB documents for /query and /write of versions 1, 2 and 3.
+    The form of each answer is the one that InfluxDB documents: for /query and /write of versions 1, 2 and 3, for
+    /api/v2/query (Flux), and for /api/v3/query_sql.
     """
 
     daemon_threads = True
@@ -39,6 +40,8 @@ class _Handler(BaseHTTPRequestHandler):
         self.server.asked.append((path.path, parse_qs(path.query), self.headers.get("Authorization"), b""))
         if path.path == "/ping":
             self.say(204, b"")
+        elif isinstance(self.server.answer, bytes):
+            self.say(200, self.server.answer)
         elif isinstance(self.server.answer, tuple) and len(self.server.answer) == 2:
             self.say(*self.server.answer)
         else:
@@ -48,6 +51,9 @@ class _Handler(BaseHTTPRequestHandler):
     def do_POST(self):
         path, body = urlsplit(self.path), self.rfile.read(int(self.headers["Content-Length"]))
         self.server.asked.append((path.path, parse_qs(path.query), self.headers.get("Authorization"), body))
+        if path.path == "/api/v2/query":
+            self.say(*(self.server.answer if isinstance(self.server.answer, tuple) else (200, self.server.answer)))
+            return
         status, said = self.server.writes.pop(0) if self.server.writes else (204, b"")
         self.say(status, said)
 

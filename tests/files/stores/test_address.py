@@ -18,8 +18,10 @@ def test_secrets_are_not_printed():
 @pytest.mark.parametrize(
     "url",
     [
-        "mysql://host/db?table=t", "influx:///db", "influx://host", "postgresql://host", "influx://host/db?org=me",
-        "influx://host/db?table=t&query=SELECT", "influx://host/db?query=", "influx://host:port/db", "tank",
+        "mysql://host/db?table=t", "influx:///db", "influx://host", "postgresql://host", "influx://host/db?orga=me",
+        "influx://host/db?table=t&query=SELECT", "influx://host/db?table=t&flux=from()", "influx://host/db?sql=",
+        "postgresql://host/db?flux=from()", "postgresql://host/db?sql=SELECT 1",
+        "influx://host/db?query=", "influx://host:port/db", "tank",
         "postgresql://host/db?table=a&table=b",
     ],
 )  # fmt: skip

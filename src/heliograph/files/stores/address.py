@@ -1,13 +1,17 @@
 """Addresses of stores: a URL with a query or a table; secrets are never printed."""
 
 import os
+import re
 from dataclasses import dataclass, field, replace
+from typing import Literal, cast
 from urllib.parse import unquote, urlsplit, urlunsplit
 
 SHAPE = "influx://HOST:PORT/DATABASE or postgresql://HOST/DATABASE, with ?table=NAME or ?query=SELECT..."
 INFLUX, POSTGRES = ("influx", "influxs"), ("postgresql",)
 USER, PASSWORD = "HELIOGRAPH_STORE_USER", "HELIOGRAPH_STORE_PASSWORD"
 ESTIMATES = "estimates"  # the table that is written, unless the URL names another
+Language = Literal["query", "flux", "sql"]  # InfluxQL, or the SQL of PostgreSQL; Flux; the SQL of InfluxDB 3
+ASKS = re.compile(r"(?<=[?&])(query|flux|sql)=")  # begins a statement, which goes to the end of the URL
 
 
 @dataclass(frozen=True)
@@ -20,6 +24,8 @@ class StoreAddress:
         database: name of the database; of InfluxDB 2 that of a bucket.
         table: table (of InfluxDB a measurement) that is read or written; "" if the URL names none.
         query: statement that is asked instead; "" if the URL has none.
+        language: of the statement, as the URL names it.
+        organisation: of InfluxDB 2, in which Flux is asked; "" if the URL names none.
     """
 
     kind: str
@@ -27,6 +33,8 @@ class StoreAddress:
     database: str
     table: str
     query: str = field(repr=False)
+    language: Language = "query"
+    organisation: str = ""
 
     def __str__(self) -> str:
         parts = urlsplit(self.url)
@@ -58,8 +66,8 @@ def is_store(location: object) -> bool:
 def parse_store(url: str) -> StoreAddress:
     """Read the URL of a store: SCHEME://user:password@host:port/database?table=NAME, or ...?query=SELECT ....
 
-    What follows `query=` is the statement to its end, & included; a % in it is written %25. Of PostgreSQL other
-    parameters, as sslmode=require, are the server's.
+    What follows `query=`, of InfluxDB also `flux=` or `sql=`, is the statement to its end, & included; a % in it is
+    written %25. Of PostgreSQL other parameters, as sslmode=require, are the server's; of InfluxDB 2 org=NAME is known.
 
     Raises:
         ValueError: another kind of URL, no database, both table and query; one line without the password.
@@ -67,7 +75,7 @@ def parse_store(url: str) -> StoreAddress:
     from heliograph.numerics.check import fail, text  # not before a command needs it
 
     text("store", url)
-    before, asks, query = url.partition("query=")
+    before, asks, query = [*ASKS.split(url, maxsplit=1), "", ""][:3]
     try:
         parts = urlsplit(before)
         host, _ = parts.hostname, parts.port
@@ -77,11 +85,21 @@ def parse_store(url: str) -> StoreAddress:
     influx = parts.scheme in INFLUX
     if parts.scheme not in (*INFLUX, *POSTGRES) or not database or (influx and not host):
         raise fail("store", SHAPE, f"{parts.scheme}://{host or ''}{parts.path}")
-    options = [option for option in parts.query.split("&") if option]
-    tables = [unquote(option.removeprefix("table=")) for option in options if option.startswith("table=")]
+    options = [unquote(option) for option in parts.query.split("&") if option]
+    tables = [option.removeprefix("table=") for option in options if option.startswith("table=")]
     others = [option for option in options if not option.startswith("table=")]
+    organisation = ""
+    if influx and len(others) == 1 and others[0].startswith("org="):
+        organisation = others.pop().removeprefix("org=")
     if (influx and others) or len(tables) > 1 or (asks and (tables or not query.strip())):
         came = others[0].split("=")[0] if influx and others else "both, or one without a value" if asks else "several"
         raise fail(f"store {parts.scheme}://{host or ''}/{database}", "one of table=NAME and query=SELECT...", came)
-    plain = urlunsplit((parts.scheme, parts.netloc, parts.path, "&".join(others), ""))
-    return StoreAddress(parts.scheme, plain, database, tables[0] if tables else "", unquote(query))
+    if not influx and asks not in ("", "query"):
+        raise fail(
+            f"store {parts.scheme}://{host or ''}/{database}", "query=SELECT..., as InfluxDB alone has others", asks
+        )
+    kept = "" if influx else "&".join(option for option in parts.query.split("&") if not option.startswith("table="))
+    plain = urlunsplit((parts.scheme, parts.netloc, parts.path, kept, ""))
+    language = cast(Language, asks or "query")
+    table = tables[0] if tables else ""
+    return StoreAddress(parts.scheme, plain, database, table, unquote(query), language, organisation)

@@ -1,7 +1,7 @@
 """InfluxDB over HTTP: InfluxQL in, line protocol out, by the two endpoints that versions 1, 2 and 3 all have.
 
 Those are /query and /write (of 2 and 3 their "1.x compatibility"): a bucket or database by its name, a token as
-`Authorization: Token`, or user and password.
+`Authorization: Token`, or user and password. Flux is asked at version 2's own endpoint, SQL at that of version 3.
 """
 
 import json
@@ -16,12 +16,12 @@ from urllib.parse import urlencode, urlsplit
 import numpy as np
 
 from heliograph.files.stores.address import StoreAddress
+from heliograph.files.stores.influx_answers import read_flux, read_influxql, read_rows, shorten
 from heliograph.numerics.check import InputError, fail
 
 PORT = 8086
 SECONDS = 60.0  # until a server must answer
 BATCH = 4 * 2**20  # bytes of one request: a server may refuse more than ten million
-SAID = 200  # characters of what a server says
 
 
 def ask_influx(address: StoreAddress) -> tuple[str, dict[str, Any]]:
@@ -33,37 +33,22 @@ def ask_influx(address: StoreAddress) -> tuple[str, dict[str, Any]]:
         ValueError: the server is away or refuses, or nothing came; one line.
     """
     query = address.query or f'SELECT * FROM "{_escape(address.table, chr(34))}"'
+    match address.language:
+        case "flux":
+            return read_flux(address, _send(address, "POST", *_ask_flux(address)))
+        case "sql":
+            target = urlencode({"db": address.database, "q": query, "format": "json"})
+            return read_rows(address, _send(address, "GET", f"/api/v3/query_sql?{target}"))
     answer = _send(address, "GET", f"/query?{urlencode({'db': address.database, 'q': query, 'epoch': 'ns'})}")
-    try:
-        results = json.loads(answer)["results"]
-    except (ValueError, KeyError, TypeError):
-        raise fail(str(address), "an answer of InfluxDB in JSON", repr(answer[:40])) from None
-    refused = next((each["error"] for each in results if "error" in each), None)
-    if refused is not None:
-        raise fail(str(address), "a query that it answers", _shorten(str(refused)))
-    series = [part for each in results for part in each.get("series", ())]
-    if any(part.get("partial") for part in (*results, *series)):
-        raise fail(str(address), "all rows of the query", "a part of them, as the server limits their number")
-    if not series:
-        raise fail(str(address), "a query with rows", "none")
-    return str(series[0].get("name", address.table)), _join_series(address, series)
+    return read_influxql(address, answer)
 
 
-def _join_series(address: StoreAddress, series: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return series as the columns of one table, in the order of time where there are several."""
-    rows = [
-        {**part.get("tags", {}), **dict(zip(part["columns"], values, strict=True))}
-        for part in series
-        for values in part["values"]
-    ]
-    names = list(dict.fromkeys(name for part in series for name in (*part["columns"], *part.get("tags", {}))))
-    if "time" not in names:
-        raise fail(str(address), "a query that returns time", f"the columns {', '.join(names)}")
-    if len(series) > 1:
-        rows.sort(key=lambda row: row["time"])
-    columns: dict[str, Any] = {name: [row.get(name) for row in rows] for name in names}
-    columns["time"] = np.array(columns["time"], dtype=np.int64).view("datetime64[ns]")
-    return columns
+def _ask_flux(address: StoreAddress) -> tuple[str, bytes]:
+    """Return where Flux is asked, and the request: tables of CSV that say of which type each column is."""
+    organisation = f"?{urlencode({'org': address.organisation})}" if address.organisation else ""
+    dialect = {"header": True, "delimiter": ",", "annotations": ["datatype"]}
+    body = {"query": address.query, "type": "flux", "dialect": dialect}
+    return f"/api/v2/query{organisation}", json.dumps(body).encode()
 
 
 def write_influx(address: StoreAddress, columns: Mapping[str, np.ndarray], moments: np.ndarray, plant: str) -> None:
@@ -132,12 +117,12 @@ def _send(address: StoreAddress, method: str, target: str, body: bytes | None = 
     kind = HTTPSConnection if address.kind == "influxs" else HTTPConnection
     connection = kind(parts.hostname or "", parts.port or PORT, timeout=SECONDS)
     try:
-        connection.request(method, target, body, _authorize(address))
+        connection.request(method, target, body, _make_headers(address))
         answer = connection.getresponse()
         content, status = answer.read(), answer.status
     except (OSError, HTTPException) as error:
         why = getattr(error, "strerror", None) or str(error) or type(error).__name__
-        raise fail(str(address), "a server that answers", _shorten(why)) from None
+        raise fail(str(address), "a server that answers", shorten(why)) from None
     finally:
         connection.close()
     if status >= 300:
@@ -145,12 +130,17 @@ def _send(address: StoreAddress, method: str, target: str, body: bytes | None = 
     return content
 
 
-def _authorize(address: StoreAddress) -> dict[str, str]:
-    """Return the header that names who asks: a user with his password, or a token alone."""
+def _make_headers(address: StoreAddress) -> dict[str, str]:
+    """Return the headers that name who asks: a user with his password, or a token alone; and of Flux what is sent."""
     user, password = address.login
+    if address.language == "flux":
+        token = f"{user}:{password}" if user else password  # version 1 takes both as one
+        kinds = {"Content-Type": "application/json", "Accept": "application/csv"}
+        return kinds | ({"Authorization": f"Token {token}"} if token else {})
     if user:
         return {"Authorization": "Basic " + b64encode(f"{user}:{password}".encode()).decode()}
-    return {"Authorization": f"Token {password}"} if password else {}
+    scheme = "Bearer" if address.language == "sql" else "Token"
+    return {"Authorization": f"{scheme} {password}"} if password else {}
 
 
 def _explain_refusal(content: bytes) -> str:
@@ -159,10 +149,5 @@ def _explain_refusal(content: bytes) -> str:
     try:
         found = json.loads(said)
     except ValueError:
-        return _shorten(said)
-    return _shorten(str(found.get("error") or found.get("message") or said) if isinstance(found, dict) else said)
-
-
-def _shorten(said: str) -> str:
-    line = " ".join(said.split())
-    return line if len(line) <= SAID else f"{line[:SAID]}..."
+        return shorten(said)
+    return shorten(str(found.get("error") or found.get("message") or said) if isinstance(found, dict) else said)

@@ -123,10 +123,11 @@ def read_store(url: str) -> dict[str, np.ndarray]:
     """Read a table of InfluxDB or PostgreSQL: the rows of a query, or of a whole table.
 
     `influx://host:8086/database?query=SELECT ...` asks in InfluxQL, over HTTP (`influxs://` over TLS), by the endpoint
-    that versions 1, 2 (a bucket by its name) and 3 have; `postgresql://user@host/database?query=SELECT ...` in SQL, in
-    a transaction that only reads; `?table=NAME` is all of a table, or measurement. What follows `query=` is the
-    statement to its end, with % as %25. User and password, or a token alone as password, of InfluxDB stand in the URL
-    or in HELIOGRAPH_STORE_USER and HELIOGRAPH_STORE_PASSWORD; of PostgreSQL also where libpq looks.
+    that versions 1, 2 (a bucket by its name) and 3 have; `?org=NAME&flux=from(...` of version 2 in Flux, `?sql=SELECT`
+    of version 3 in SQL; `postgresql://user@host/database?query=SELECT ...` in SQL, in a transaction that only reads;
+    `?table=NAME` is all of a table, or measurement. What follows `query=`, `flux=` or `sql=` is the statement to its
+    end, with % as %25. User and password, or a token alone as password, of InfluxDB stand in the URL or in
+    HELIOGRAPH_STORE_USER and HELIOGRAPH_STORE_PASSWORD; of PostgreSQL also where libpq looks.
 
     Args:
         url: where to ask, and what.

@@ -1,0 +1,149 @@
+"""Answers of InfluxDB as the columns of one table: of InfluxQL and SQL in JSON, of Flux in annotated CSV."""
+
+import csv
+import json
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from heliograph.files.stores.address import StoreAddress
+from heliograph.numerics.check import InputError, fail
+
+SAID = 200  # characters of what a server says
+Answer = tuple[str, dict[str, Any]]  # the measurement's name and its columns: lists, and `time` as datetime64[ns]
+Row = Mapping[str, Any]
+
+
+def read_influxql(address: StoreAddress, answer: bytes) -> Answer:
+    """Read the answer to InfluxQL. Several series, as of GROUP BY, are one table, with their tags as columns.
+
+    Raises:
+        ValueError: no answer of InfluxDB, a refusal, a part of the rows, none; one line.
+    """
+    try:
+        results = json.loads(answer)["results"]
+    except (ValueError, KeyError, TypeError):
+        raise fail(str(address), "an answer of InfluxDB in JSON", repr(answer[:40])) from None
+    refused = next((each["error"] for each in results if "error" in each), None)
+    if refused is not None:
+        raise fail(str(address), "a query that it answers", shorten(str(refused)))
+    series = [part for each in results for part in each.get("series", ())]
+    if any(part.get("partial") for part in (*results, *series)):
+        raise fail(str(address), "all rows of the query", "a part of them, as the server limits their number")
+    rows = [
+        {**part.get("tags", {}), **dict(zip(part["columns"], values, strict=True))}
+        for part in series
+        for values in part["values"]
+    ]
+    names = [name for part in series for name in (*part["columns"], *part.get("tags", {}))]
+    name = str(series[0].get("name", address.table)) if series else ""
+    return name, _make_columns(address, names, rows, lambda time: int(time), len(series) > 1)
+
+
+def read_rows(address: StoreAddress, answer: bytes) -> Answer:
+    """Read the answer of version 3 to SQL: a list of rows, each an object of JSON.
+
+    Raises:
+        ValueError: no such answer, no rows; one line.
+    """
+    try:
+        rows = json.loads(answer)
+    except ValueError:
+        rows = None
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        raise fail(str(address), "rows of InfluxDB 3 in JSON", repr(answer[:40]))
+    names = [name for row in rows for name in row]
+    return address.database, _make_columns(address, names, rows, _read_moment, False)
+
+
+def read_flux(address: StoreAddress, answer: bytes) -> Answer:
+    """Read the answer to Flux: tables of CSV, each with its header, below it a value of one field at one time a row.
+
+    Values of one time and the same tags are one row, as after `pivot`, which a query may do itself. `_time` is the
+    time, `_measurement` the name; `result`, `table`, `_start` and `_stop` tell how the answer was made: left out.
+
+    Raises:
+        ValueError: no such answer, an error in it, no rows; one line.
+    """
+    joined: dict[tuple[object, ...], dict[str, Any]] = {}
+    measurement = ""
+    try:
+        for number, row in enumerate(_yield_flux_rows(answer.decode())):
+            if "error" in row:
+                raise fail(str(address), "a query that it answers", shorten(str(row["error"])))
+            measurement = measurement or str(row.pop("_measurement", ""))
+            for left in ("result", "table", "_start", "_stop", "_measurement"):
+                row.pop(left, None)
+            if "_time" in row:
+                row["time"] = row.pop("_time")
+            if "_field" not in row or "_value" not in row:  # pivoted, or fields of a query's own
+                joined[(number,)] = row
+                continue
+            name, value = str(row.pop("_field")), row.pop("_value")
+            joined.setdefault(tuple(sorted(row.items())), row.copy())[name] = value
+    except InputError:
+        raise
+    except (ValueError, KeyError, csv.Error):
+        raise fail(str(address), "tables of InfluxDB in annotated CSV", repr(answer[:40])) from None
+    rows = list(joined.values())
+    names = [name for row in rows for name in row]
+    return measurement or address.database, _make_columns(address, names, rows, _read_moment, True)
+
+
+def _yield_flux_rows(text: str) -> Iterable[dict[str, Any]]:
+    """Yield the rows of all tables, with values of their types; empty ones are None."""
+    kinds: list[str] = []
+    names: list[str] = []
+    for cells in csv.reader(text.splitlines()):
+        if not any(cells):  # between tables
+            names = []
+        elif cells[0].startswith("#"):
+            kinds, names = (cells, []) if cells[0] == "#datatype" else (kinds, names)
+        elif not names:
+            names = cells
+        else:
+            known = kinds if len(kinds) == len(names) else [""] * len(names)
+            yield {
+                name: None if cell == "" else READ.get(kind, str)(cell)
+                for name, kind, cell in zip(names, known, cells, strict=True)
+                if name
+            }
+
+
+READ: dict[str, Callable[[str], Any]] = {
+    "double": float,
+    "long": int,
+    "unsignedLong": int,
+    "boolean": lambda cell: cell == "true",
+}
+
+
+def _read_moment(time: object) -> int:
+    """Return the nanoseconds of a date of UTC, as 2026-11-29T10:00:00.123456789Z."""
+    return int(np.datetime64(str(time).removesuffix("Z"), "ns").astype(np.int64))
+
+
+def _make_columns(
+    address: StoreAddress, names: Iterable[str], rows: list[Any], read_time: Callable[[Any], int], sorts: bool
+) -> dict[str, Any]:
+    """Return rows as the columns of one table, in the order of time where they are of several series."""
+    if not rows:
+        raise fail(str(address), "a query with rows", "none")
+    known = list(dict.fromkeys(names))
+    if "time" not in known:
+        raise fail(str(address), "a query that returns time", f"the columns {', '.join(known)}")
+    try:
+        moments = np.array([read_time(row["time"]) for row in rows], dtype=np.int64)
+    except (KeyError, ValueError, TypeError):
+        raise fail(str(address), "a time in each row", "one that is none") from None
+    order = np.argsort(moments, kind="stable") if sorts else np.arange(len(rows))
+    columns: dict[str, Any] = {name: [rows[i].get(name) for i in order] for name in known}
+    columns["time"] = moments[order].view("datetime64[ns]")
+    return columns
+
+
+def shorten(said: str) -> str:
+    """Return what a server says as one line of at most 200 characters."""
+    line = " ".join(said.split())
+    return line if len(line) <= SAID else f"{line[:SAID]}..."
