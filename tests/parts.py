@@ -48,6 +48,9 @@ PARTS = {
     "MQTT": Part(lambda: broker("paho"), LIVE),
     "NATS": Part(lambda: broker("nats"), LIVE),
     "OPC UA": Part(lambda: find_spec("asyncua") is not None, LIVE.replace("live", "opcua")),
+    "rattler-build": Part(
+        lambda: find_spec("rattler_build") is not None, f"{Path(sys.executable).name} -m pip install py-rattler-build"
+    ),
     "browser": Part(lambda: program() is not None, "apt-get install chromium"),
 }
 

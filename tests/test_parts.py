@@ -47,5 +47,6 @@ def test_what_another_process_started_counts_and_the_last_line_names_every_part(
         "MQTT left out",
         "NATS left out",
         "OPC UA left out",
+        "rattler-build left out",
         "browser skipped (apt-get install chromium)",
     ]
