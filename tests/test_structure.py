@@ -199,3 +199,14 @@ def test_eigenvalues_of_a_batch_are_taken_one_after_another():
     """A batch at once is dealt out to threads by calls that wait on them: two filters side by side wait for ever."""
     direct = [p.relative_to(SOURCE).as_posix() for p in SOURCE.rglob("*.py") if "jnp.linalg.eigh(" in p.read_text()]
     assert direct == ["numerics/lapack.py"]
+
+
+def test_no_function_has_forty_lines():
+    """Counted without signature and docstring: a longer one has steps that have names."""
+    lengths = {}
+    for path in (path for package in PACKAGES for path in package.rglob("*.py")):
+        for node in ast.walk(tree(path)):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                start = node.body[0].end_lineno if ast.get_docstring(node) else node.body[0].lineno - 1
+                lengths[f"{path}: {node.name}"] = node.end_lineno - start
+    assert lengths and not {name: length for name, length in lengths.items() if length >= 40}
