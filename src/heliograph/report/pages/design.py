@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
 from heliograph.disk.quoting import quote_for_figure, visible
+from heliograph.numerics.shares import round_to
 from heliograph.planning.comparisons import ChangeWorth, Front, SiteMap
 from heliograph.planning.problem import PowerDesign
 from heliograph.report.figures import AMBER, BLUE, GREEN, INK, PALE, STYLE, VERMILION, WIDTH
@@ -211,7 +212,11 @@ def _map_section(drawings: Mapping[str, bytes]) -> Section:
 def _make_changes_section(results: DesignResults) -> Section:
     """Return what one more transmitter, relay or place would save."""
     unit = results.design.certificate.unit
-    rows = [[visible(change.name), f"{change.value:.4g}", f"{change.saved:+.3g}"] for change in results.changes]
+    # A saving has two digits of a thousandth of the error: what is beyond them is the search's, and no saving.
+    rows = [
+        [visible(change.name), f"{change.value:.4g}", round_to(change.saved, 1e-3 * change.value)]
+        for change in results.changes
+    ]
     caption = (
         f"The {unit} of the design made again after each change, and how much of it that saves. A relay halfway is put "
         "in where the exponent of the path loss is given."
