@@ -82,11 +82,12 @@ def to_c(
     Args:
         function: of trees of arrays; any that JAX traces.
         examples: arguments, of which shapes and types count alone.
-        name: name of the function in C, with which names of tables begin.
+        name: name of the function in C, and beginning of the names of its tables.
         single: whether numbers are float; double unless so.
         names: of the arguments' arrays and of the results'; by default from the parameters and fields.
-        finite: numbers of the arguments' arrays that have no NaN, so that zero times an entry is zero; none by default.
-        symmetric: numbers of the arguments' arrays that are symmetric, of which one triangle is read; none by default.
+        finite: which of the arguments' arrays, counted from 0, never hold NaN, so that zero times an entry is zero;
+            none by default.
+        symmetric: which of them, counted in the same way, are symmetric, so that one triangle is read; none by default.
 
     Raises:
         Unsupported: random numbers, or an operation that C does not have, with the line that it comes from.
@@ -101,7 +102,7 @@ def to_c(
     graph, buffers, outputs = lower_for_c(program, finite, symmetric)
     real: Real = "float" if single else "double"
     read, written = _name_arrays(function, examples, tree, names)
-    # Arguments without axes are passed by value.
+    # The body: statements in the order of the graph. Arguments without axes are passed by value.
     flat = [scalars(x) for x in outputs]
     arguments = [CArray(n, _stored(b.type, real), b.size, bool(b.shape)) for n, b in zip(read, buffers, strict=True)]
     places = {b: _place(x) for b, x in zip(buffers, arguments, strict=True)}
@@ -110,6 +111,7 @@ def to_c(
         body = source.statements(graph.top)
     except Unsupported as error:
         raise Unsupported(error.operation, error.where or _line_of(error.operation, equations)) from None
+    # The end: every result is written, after all arguments are read.
     arguments = [x._replace(used=b in source.needed) for x, b in zip(arguments, buffers, strict=True)]
     results = _describe_results(written, program, outputs, flat, real)
     ends = [

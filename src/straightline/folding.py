@@ -298,7 +298,7 @@ def _fold_comparison(op: str) -> Callable[..., Node | None]:
 
     def rule(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
         """Simplify a comparison of a flag with a constant to the flag, and one of a number with itself."""
-        if a is b and (a.type not in REAL or a in graph.numbers or is_finite(a)):
+        if a is b and (a.type not in REAL or a in graph.never_nan or is_finite(a)):
             return graph.constant(op == "eq", "bool")
         if a.op == "constant":
             a, b = b, a

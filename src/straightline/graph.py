@@ -14,14 +14,17 @@ from straightline.nodes import REAL, Block, Buffer, Node, Number, Store, Type, U
 
 
 class Graph:
-    """A program under construction, of `most` nodes. Nodes are made in `current`, the innermost open block."""
+    """A program under construction, of at most `max_nodes` nodes, made in `current`, the innermost open block.
 
-    def __init__(self, most: int = 2 * LONGEST) -> None:
-        self.most = most
+    `serial` is that of the last node; `never_nan` has the nodes that are known not to be NaN.
+    """
+
+    def __init__(self, max_nodes: int = 2 * LONGEST) -> None:
+        self.max_nodes = max_nodes
         self.top = Block(None)
         self.current = self.top
         self.serial = 0
-        self.numbers: set[Node] = set()  # known not to be NaN
+        self.never_nan: set[Node] = set()
 
     def node(self, op: str, type: Type, *args: Node, value: Any = None) -> Node:
         """Return a node of an operation: a constant, an existing equal node, or a new one."""
@@ -44,19 +47,19 @@ class Graph:
     def fresh(self, op: str, type: Type, args: tuple[Node, ...], block: Block, value: Any) -> Node:
         """Make a node that equals no other, and that no block contains yet."""
         self.serial += 1
-        if self.serial > self.most:
-            raise Unsupported(f"a program of more than {self.most} operations")
+        if self.serial > self.max_nodes:
+            raise Unsupported(f"a program of more than {self.max_nodes} operations")
         return Node(op, type, args, block, value, self.serial)
 
     @contextmanager
     def at_most(self, count: int) -> Iterator[None]:
         """Allow so many more nodes; if there are more, which is refused, the block that was open is open again."""
-        most, block = self.most, self.current
-        self.most = min(most, self.serial + count)
+        before, block = self.max_nodes, self.current
+        self.max_nodes = min(before, self.serial + count)
         try:
             yield
         finally:
-            self.most, self.current = most, block
+            self.max_nodes, self.current = before, block
 
     def load(self, buffer: Buffer, offset: int, strides: Sequence[int] = (), indices: Sequence[Node] = ()) -> Node:
         """Load buffer[offset + sum strides * indices], after the buffer is filled."""

@@ -64,6 +64,13 @@ def test_plants_of_a_batch_are_forecast_as_each_alone(program):
     }
 
 
+def test_horizons_of_whole_steps_are_taken_where_no_binary_number_is_one(program):
+    """0.3 s are three steps of 0.1 s, though 0.3 % 0.1 is 0.09999 in floating point."""
+    fleet = Fleet(program, Options(window=5.0, step=0.1))
+    *_, output = Service(fleet, InMemoryStore(), forecast=horizons_in("300ms,700ms")).take([message(0, 1.0)])
+    assert [horizon["ahead"] for horizon in json.loads(output.body)["forecast"]] == pytest.approx([0.3, 0.7], rel=1e-12)
+
+
 @pytest.mark.parametrize("text", ["3s", "2026-12-01", "4s,2s", "0s"])
 def test_horizons_that_a_service_cannot_keep_are_refused(program, text):
     with pytest.raises(ValueError, match="--forecast: expected"):

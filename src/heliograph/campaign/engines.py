@@ -205,7 +205,7 @@ def _submit_jobs(
     flying = collect(loop=client.loop)
     while waiting or jobs:
         # Submit a few jobs more than the cluster has threads, so that none of them waits.
-        room = max(LOOK_AHEAD * sum(_ask_cluster(client, client.nthreads).values()), 1) - len(jobs)
+        room = max(LOOK_AHEAD * sum(_ask_cluster(client.nthreads).values()), 1) - len(jobs)
         for _ in range(min(room, len(waiting))):
             job = waiting.popleft()
             future = client.submit(perform, campaign, store, job.setting, job.chunk, pure=False)
@@ -230,10 +230,11 @@ def _wait_for_next(client: Untyped, flying: Untyped, timeout: float) -> Untyped:
             return None
         time.sleep(LOOK)
         waited += LOOK
-    return _ask_cluster(client, lambda: next(flying))
+    return _ask_cluster(lambda: next(flying))
 
 
-def _ask_cluster(client: Untyped, ask: Callable[[], Untyped]) -> Untyped:
+def _ask_cluster(ask: Callable[[], Untyped]) -> Untyped:
+    """Return the answer of a cluster; if it fails, say in one line that the cluster was lost."""
     try:
         return ask()
     except (OSError, RuntimeError, TimeoutError):

@@ -85,8 +85,8 @@ def _compute_details(
 ) -> list[Detail]:
     """Return RMSE, claimed deviation and NEES with standard errors, by node, filter, state and step of one setting.
 
-
-    `sums` are the number of runs by filter, and the sums over runs of values and of their squares.
+    `sums` are the number of runs (node, filter), and the sums over these of values and of their squares, both
+    (value, step, node, filter, state) with the values squared error, claimed variance and the quotient of the two.
     """
     count, first, second = sums
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -18,11 +18,11 @@ from heliograph.campaign.store import (
     create,
     done_chunks,
     find_described,
-    join,
     labels_from,
     read_labels,
     remove_damaged,
     remove_partial,
+    unite_labels,
     write_claims,
 )
 from heliograph.campaign.summary import SUMMARY, write_summary
@@ -197,7 +197,7 @@ def _make_store(
     # The axes of a new store are the union of all settings; later settings must fit into them.
     labels = {setting: labels_from(results[setting]["labels"]) for setting in sorted(results)}
     if new:
-        create(store, campaign, join(labels))
+        create(store, campaign, unite_labels(labels))
     for setting, label in labels.items():
         check_within(label, read_labels(store), setting)
         write_claims(store, setting, results[setting]["claims"])

@@ -70,7 +70,7 @@ def labels_from(table: Table) -> Labels:
     return Labels(tuple(table["states"]), tuple(table["nodes"]), tuple(table["filters"]), table["received"])
 
 
-def join(parts: Mapping[int, Labels]) -> Labels:
+def unite_labels(parts: Mapping[int, Labels]) -> Labels:
     """Return the union of the labels of all settings, in order of first appearance."""
     first, labels = next(iter(parts.items()))
     for setting, other in parts.items():

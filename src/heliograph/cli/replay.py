@@ -81,14 +81,17 @@ def replay(
 def _read_events(
     location: Path | StoreAddress, reference: str, options: ReadingOptions
 ) -> "Iterator[tuple[str, list[Event], np.datetime64 | None]]":
-    """Yield the events of each plant with its name, and the date of time 0, which is that of all."""
+    """Yield the events of each plant with its name, and the date of time 0, None where times are no dates.
+
+    A recording is a table of events, or one of rows (`read_events` finds none then), which are those of one plant.
+    """
     from heliograph.disk.quoting import visible
     from heliograph.files.network_file import load_module
     from heliograph.serving.brokers.replay import events_of_recording
 
     network, module = load_module(reference)
     path = open_measured(location)
-    table = read_events(path, reference, network, module, options, lambda *_: None)
+    table = read_events(path, reference, network, module, options, lambda *_: None)  # a pipe shows no progress
     if table is None:
         rows = read_rows(path, network, options)
         for line in [*rows.warnings, *_describe_finer(path, rows.recording.time)]:

@@ -250,7 +250,10 @@ _precision: ContextVar[type[np.floating[Any]]] = ContextVar("precision", default
 
 @contextmanager
 def use_precision(precision: type[np.floating[Any]]) -> Iterator[None]:
-    """Take the rounding of a precision that is not the arrays' own: of a program that is written for a device."""
+    """Take numbers to be rounded to another precision than the arrays' own within the block.
+
+    C in single precision is written from functions that are traced in double precision.
+    """
     token = _precision.set(precision)
     try:
         yield

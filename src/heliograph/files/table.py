@@ -339,7 +339,8 @@ def _write_csv(columns: Mapping[str, np.ndarray], path: Path) -> None:
 def _format_cells(column: np.ndarray) -> list[str]:
     """Write each value as Python does, a float with all digits that it takes to read it back.
 
-    JSON has the same digits, and is written in a tenth of the time; what it says otherwise is written by Python.
+    Floats are written as JSON, in a tenth of the time and with the same digits, and made what Python writes where the
+    two differ: in exponents of one digit, where only one of them has an exponent at all, of NaN and of infinity.
     """
     if column.dtype.kind != "f":
         return list(map(str, _plain(column).tolist()))
@@ -347,9 +348,9 @@ def _format_cells(column: np.ndarray) -> list[str]:
     text = msgspec.json.encode(values).decode().replace("]", ",")
     for digit in "6789":  # of an exponent Python writes two digits
         text = text.replace(f"e-{digit},", f"e-0{digit},")
-    otherwise = (size >= WITH_EXPONENT[0]) & (size < WITH_EXPONENT[1]) | ~(size < LARGE)
+    differs = (size >= WITH_EXPONENT[0]) & (size < WITH_EXPONENT[1]) | ~(size < LARGE)
     texts = text[1:-1].split(",")
-    for row in np.flatnonzero(otherwise).tolist():
+    for row in np.flatnonzero(differs).tolist():
         texts[row] = repr(values[row])
     return texts
 

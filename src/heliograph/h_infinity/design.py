@@ -236,7 +236,7 @@ class _Recursion:
 
     def _find_problem(self, k: int, start: Float[np.ndarray, "w w"] | None) -> StepProblem:
         """Return the step's problem, the one compiled before where its matrices and sizes are the same."""
-        step, sizes = self.steps[k], self.coordinates.ratio(k + 1)
+        step, sizes = self.steps[k], self.coordinates.sizes(k + 1)
         coupling = _coupled_initial_weight(start, self.system.states)
         for matrices, single, coupled, problem in self.compiled:
             if all(map(np.array_equal, matrices, step)) and single == sizes and coupled is coupling is None:

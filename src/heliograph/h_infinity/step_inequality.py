@@ -226,11 +226,14 @@ class Coordinates(NamedTuple):
     received: Float[np.ndarray, "steps m"]
     forms: Float[np.ndarray, "steps multipliers"]
     unit: float
-    plain: bool
+    nothing_grows: bool
 
-    def ratio(self, k: int) -> tuple[float, float]:
-        """Return sizes of x and e, the larger one 1, where they are numbers; (1, 1) where S1 and S2 are matrices."""
-        if self.plain:
+    def sizes(self, k: int) -> tuple[float, float]:
+        """Return by what state x and error e are scaled before step k, the larger one 1.
+
+        (1, 1) where nothing grows: S1 and S2 are matrices then, and the inequality has no norms of x and e to weigh.
+        """
+        if self.nothing_grows:
             return 1.0, 1.0
         x, e = float(self.states[k, 0, 0]), float(self.states[k, -1, -1])
         return x / max(x, e), e / max(x, e)
@@ -263,11 +266,11 @@ def scale_steps(
     system: GrowthSystem, steps: list[StepMatrices], gains: Float[np.ndarray, "steps n m"] | None = None
 ) -> tuple[list[StepMatrices], Coordinates]:
     """Transform the steps to coordinates of order one, near the best predictor's gains or the given `gains`."""
-    n, plain = system.states, system.growth.absent and system.output_growth.absent
+    n, nothing_grows = system.states, system.growth.absent and system.output_growth.absent
     initial = np.diag(1 / np.diagonal(system.initial_weight))
     # covariances of x_0 and e_0 from the initial weight
     x, e = initial[:n, :n], initial[n:, n:]
-    sizes, received, forms, scaled, target = [_choose_error_scales(x, e, plain)], [], [], [], 0.0
+    sizes, received, forms, scaled, target = [_choose_error_scales(x, e, nothing_grows)], [], [], [], 0.0
     nominal = steps[0].nominal
     # covariances of (x, e) propagated with the nominal gain, and sizes from these
     for k, step in enumerate(steps):
@@ -275,7 +278,7 @@ def scale_steps(
         target = max(target, float(np.trace(step.target @ spread)))
         x, e, measured, best = _propagate(step, spread, None if gains is None else gains[k])
         nominal = best if gains is not None or k == 0 else _steady_gain(nominal, best, measured, e)
-        sizes.append(_choose_error_scales(x, e, plain))
+        sizes.append(_choose_error_scales(x, e, nothing_grows))
         received.append(_powers_of_four_near(np.sqrt(np.diagonal(measured))))
         unit = _choose_eta_scales(system, k, step, sizes[k])
         form = np.max(np.abs(step.growth) * np.diagonal(unit) ** 2, axis=1, initial=0.0)  # with growth, T is diagonal
@@ -286,7 +289,7 @@ def scale_steps(
     # levels in units of the largest E |M e|^2
     level = float(_nearest_power_of_four(np.sqrt(target)))
     scaled = [s._replace(target=s.target / level**2) for s in scaled]
-    return scaled, Coordinates(np.array(sizes), np.array(received), np.array(forms), level, plain)
+    return scaled, Coordinates(np.array(sizes), np.array(received), np.array(forms), level, nothing_grows)
 
 
 def _nearest_power_of_four(size: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
@@ -294,9 +297,9 @@ def _nearest_power_of_four(size: Float[np.ndarray, "*n"] | float) -> Float[np.nd
     return np.asarray(4.0 ** np.round(np.log(size) / np.log(4.0)))
 
 
-def _choose_error_scales(x: np.ndarray, e: np.ndarray, plain: bool) -> Float[np.ndarray, "w w"]:
+def _choose_error_scales(x: np.ndarray, e: np.ndarray, nothing_grows: bool) -> Float[np.ndarray, "w w"]:
     """Return scales diag(S1, S2): factors of the covariances, or where growth is a ratio of norms a number for each."""
-    if plain:
+    if nothing_grows:
         return np.asarray(block_diag(_factor_with_floor(x), _factor_with_floor(e)))
     return np.diag(
         np.concatenate([_powers_of_four_near(np.full(len(s), np.sqrt(np.trace(s) / len(s)))) for s in (x, e)])

@@ -220,13 +220,13 @@ class Fit:
         )
 
     def __str__(self) -> str:
-        """Return the estimates at once: intervals of `rows` where they were asked for, else errors in haste."""
-        late = [f"{node}: {delays}" for node, delays in self.delays.items()]
+        """Return the estimates without more work: with intervals if `rows` were asked for, else standard errors."""
+        delays = [f"{node}: {found}" for node, found in self.delays.items()]
         if not self.best.has_rows:
-            return "\n".join([*self.best.describe_in_haste(), *late, *self._sentences_at_once(), IN_HASTE])
+            return "\n".join([*self.best.describe_in_haste(), *delays, *self._sentences_at_once(), IN_HASTE])
         width = max(len(row.name) for row in self.table)
         lines = [f"{row.name:{width}}  {row.value:>10}  ({row.interval})  ({row.form})" for row in self.table]
-        return "\n".join([*lines, *late, *self.sentences])
+        return "\n".join([*lines, *delays, *self.sentences])
 
     def _sentences_at_once(self) -> tuple[str, ...]:
         """Return the sentences that need no interval."""

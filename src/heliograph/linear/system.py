@@ -78,6 +78,7 @@ class LinearSystem(Module):
         instance("steps of a system", steps, Steps, "Steps")
         time, n = np.shape(steps.drift)
         m = np.shape(steps.offset)[-1]
+        # A, a, Cov w of the state and C, c, Cov v of what is received, as `Steps` has them.
         one_step: tuple[tuple[int, ...], ...] = ((n, n), (n,), (n, n), (m, n), (m,), (m, m))
         named = zip(Steps._fields, steps, one_step, strict=True)
         checked = [array(f"system {name}", value, (time, *shape)) for name, value, shape in named]

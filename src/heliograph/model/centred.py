@@ -100,10 +100,11 @@ def _predict_outputs(plant: AnyPlant, sensor: AnySensor, inputs: Float[Array, "h
     """Return E[y_k] over the steps of a plant that moves by its mean alone, with these inputs."""
 
     def step(x: jax.Array, row: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        """Move the mean over a step, and return it with that of the measurement there."""
         k, u = row
-        moves, senses = at(plant, k), at(sensor, k)
-        x = moves.transition(x, u) + moves.noise_mean()
-        return x, senses.measure(x) + senses.noise.mean
+        plant_k, sensor_k = at(plant, k), at(sensor, k)
+        x = plant_k.transition(x, u) + plant_k.noise_mean()
+        return x, sensor_k.measure(x) + sensor_k.noise.mean
 
     start = jnp.asarray(at(plant, 0).initial_mean)
     expected: jax.Array = jax.lax.scan(step, start, (jnp.arange(len(inputs)), jnp.asarray(inputs)))[1]

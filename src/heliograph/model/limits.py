@@ -121,17 +121,19 @@ class Limits(Module):
     def why(self, z: Float[np.ndarray, " m"], names: Sequence[str], stuck: Bool[np.ndarray, " m"] | None = None) -> str:
         """Describe in words the components of a measurement that count as missing; "" if there are none.
 
+        A code is a value of `invalid` that stands for no reading, such as -999.
+
         `stuck`: which of them have repeated for too long; none by default.
         """
         said, outside = [], self.outside(z)
         for i in np.flatnonzero(outside if stuck is None else outside | stuck).tolist():
             code = is_code(z[i], self.invalid)
             if outside[i]:
-                why = "is a code" if code else f"is outside {self.low[i]:g} to {self.high[i]:g}"
+                reason = "is a code" if code else f"is outside {self.low[i]:g} to {self.high[i]:g}"
             else:
                 assert self.stuck is not None
-                why = f"is stuck: {self.stuck[i]:g} equal readings in a row or more"
-            said.append(f"{names[i]} {z[i]:g} {why}")
+                reason = f"is stuck: {self.stuck[i]:g} equal readings in a row or more"
+            said.append(f"{names[i]} {z[i]:g} {reason}")
         return ", ".join(said)
 
 

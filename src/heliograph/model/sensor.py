@@ -297,9 +297,9 @@ def _find_shape(measure: Callable[[jax.Array], ArrayLike]) -> tuple[int, ...]:
 
 
 def without_output_names(model: T) -> T:
-    """Return a model with sensors, such as a filter, whose outputs are named y0, y1, ...: no number depends on names.
+    """Return a model with sensors, such as a filter, whose outputs are named y0, y1, ..., on which no number depends.
 
-    Models that differ in these names alone are then of one structure, and one program is for all of them.
+    Models that differ in names alone are then of one structure, and one program is for all.
     """
     unnamed: T = jax.tree.map(_drop_names, model, is_leaf=_is_sensor)
     return unnamed
@@ -310,7 +310,7 @@ def _is_sensor(model: object) -> bool:
 
 
 def _drop_names(model: Any) -> Any:
-    """Return the sensor with outputs called y0, y1, ..., so that sensors that differ in names alone are equal."""
+    """Return the sensor with outputs called y0, y1, ..., and so all of which it is made."""
     if not _is_sensor(model) or "outputs" not in vars(model):
         return model
     parts, tree = jax.tree.flatten(model, is_leaf=lambda part: part is not model and _is_sensor(part))

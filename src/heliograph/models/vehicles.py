@@ -48,7 +48,7 @@ class TurnNoise(Step):
     turn_intensity: Any
 
     def __call__(self, u: jax.Array) -> jax.Array:
-        """Return Q (5, 5)."""
+        """Return the covariance (5, 5) of a step's noise: position and velocity of either axis, then the rate."""
         dt = jnp.asarray(self.length(u))
         axis = self.intensity * jnp.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
         rate = jnp.reshape(self.turn_intensity * dt, (1, 1))

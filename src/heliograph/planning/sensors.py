@@ -162,7 +162,8 @@ def _list_cases(
 
 def _filter_of_all(network: Network, nodes: Mapping[str, Node]) -> AbstractFilter:
     """Return the filter of all that the nodes receive."""
-    # A filter skips what is lost, and is given the channel of what arrives.
+    # Where losses are independent a filter skips what is lost, and needs the channel of what arrives; where they have
+    # memory a loss says something of the next one.
     plant = network.plant
     channels = [
         node.channel if first(node.channel).remembers else at_each_step(_given_arrival, node.channel)

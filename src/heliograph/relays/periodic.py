@@ -267,12 +267,16 @@ def periodic_relays_for_best_receiver(
 def _minimise_over_gains(
     network: RelayNetwork, start: Float[np.ndarray, "slots Fn R"], cost: Cost, power_limit: ArrayLike | None
 ) -> Float[np.ndarray, "slots Fn R"]:
-    """Minimise a cost over the free entries of the gains by descent, those of each filter in units of its largest."""
+    """Minimise a cost over the free entries of the gains by descent, those of each filter in units of its largest.
+
+    A limit of power is kept by an augmented Lagrangian: with g_s = power_s / limit_s - 1 in slot s the cost is that of
+    `_penalise`, and after each descent lambda_s = max(0, lambda_s + STIFFNESS g_s).
+    """
     steps = periodic_steps(network)
     check_slots(network, start)
     # Free entries: those that multiply a received number.
     used = gain_mask(steps) & (steps.receives_in_slot[:, None, :] > 0)
-    if cost is _behind_cost:
+    if cost is _behind_cost:  # the receiver, whose columns are the last, is the best one whatever the relays do
         used[:, :, -network.received[-1] :] = False
     where = np.nonzero(used)
     unit = _find_largest_entries(network, start)[where]
@@ -289,6 +293,7 @@ def _minimise_over_gains(
     for _ in range(ROUNDS if power_limit is not None else 1):
 
         def function(x: np.ndarray, multipliers: np.ndarray = multipliers) -> tuple[float, np.ndarray]:
+            # Within the limit by a margin, since the multipliers only come near it.
             value, gradient, _ = cost(x, steps, start, where, unit, limit * (1 - MARGIN), multipliers)
             return float(value), np.asarray(gradient)
 

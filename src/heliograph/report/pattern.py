@@ -103,18 +103,24 @@ class LossLaw(NamedTuple):
 def _bound_log_chance(places: Bool[np.ndarray, " length"], law: LossLaw, count: int) -> float:
     """Bound the probability, by its logarithm, that losses in bursts let nothing arrive outside of these places.
 
-    A place moves as a Markov chain on the rows of one pattern, and the probability that it has left none after N
-    intervals is at most the largest row sum of M^N, where M are the probabilities between the places.
+    The row of an arrival, modulo the pattern's length, moves as a Markov chain. The probability that N moves all end in
+    `places` is at most the largest row sum of M^N, where M has the probabilities of moves between these places alone.
+
+    Args:
+        places: which rows of the pattern are due.
+        law: of the intervals between arrivals.
+        count: N, how many intervals were seen.
     """
     length = len(places)
-    # Probability of each interval modulo the length: a geometric law, all turns of it added up.
+    # P(interval = 1) = follows, P(interval = k) = (1 - follows) ends (1 - ends)^(k - 2) for k = 2, 3, ...; a move by an
+    # interval modulo the length is the geometric series over k, k + length, k + 2 length, ...
     interval = np.arange(2, length + 2)
-    step: Float[np.ndarray, " length"] = np.zeros(length)
-    turns = 1 - (1 - law.ends) ** length
-    step[interval % length] = (1 - law.follows) * law.ends * (1 - law.ends) ** (interval - 2) / turns
-    step[1 % length] += law.follows
-    at = np.flatnonzero(places)
-    return _compute_log_row_sum(step[(at[None, :] - at[:, None]) % length], count)
+    move: Float[np.ndarray, " length"] = np.zeros(length)
+    series = 1 / (1 - (1 - law.ends) ** length)
+    move[interval % length] = (1 - law.follows) * law.ends * (1 - law.ends) ** (interval - 2) * series
+    move[1 % length] += law.follows
+    due = np.flatnonzero(places)
+    return _compute_log_row_sum(move[(due[None, :] - due[:, None]) % length], count)
 
 
 def _compute_log_row_sum(matrix: Float[np.ndarray, "n n"], exponent: int) -> float:

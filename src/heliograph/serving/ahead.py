@@ -18,6 +18,7 @@ Ahead = tuple[float, float, dict[str, dict[str, object]]]  # time of a horizon, 
 Bodies = list[list[dict[str, object]]]  # of one filter, by row and horizon
 Spans = int | list[float | np.timedelta64 | np.datetime64]  # how far ahead, as `horizons_in` reads it
 SECOND = np.timedelta64(1, "s")
+OFF = 1e-6  # of a step: a horizon of 300 ms is three steps of 0.1 s, which no binary number is
 
 
 @dataclass(frozen=True)
@@ -49,11 +50,11 @@ class ForecastPublisher:
                 raise fail("--forecast", "spans of time, such as 5s,1min, as no step is usual", horizons)
             self.horizons: list[float] = list(range(1, horizons + 1))
         else:
-            self.horizons = [self._measure_distance(horizon) for horizon in horizons]
+            self.horizons = [self._convert_horizon(horizon) for horizon in horizons]
         if not self.horizons or min(self.horizons) <= 0 or sorted(set(self.horizons)) != self.horizons:
             raise fail("--forecast", "horizons ahead, each later than the one before", show_value(horizons))
 
-    def _measure_distance(self, horizon: float | np.timedelta64 | np.datetime64) -> float:
+    def _convert_horizon(self, horizon: float | np.timedelta64 | np.datetime64) -> float:
         """Return how far ahead a horizon is, in the unit of dt or in steps."""
         if isinstance(horizon, np.datetime64):
             raise fail("--forecast", "spans of time or steps ahead of each message", str(horizon))
@@ -62,9 +63,10 @@ class ForecastPublisher:
         seconds, step = float(horizon / SECOND), self._fleet.options.step or 1.0
         if self._continuous:
             return seconds
-        if seconds % step:
+        count = round(seconds / step)
+        if abs(seconds - count * step) > OFF * step:
             raise fail("--forecast", f"whole steps of {step:g} s", f"{seconds:g} s")
-        return int(seconds // step)
+        return count
 
     def forecasts(self, rows: Sequence[HeldRow]) -> list[list[Ahead]]:
         """Return of each row and horizon its time, how far ahead it is, and what each filter says.

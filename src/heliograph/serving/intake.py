@@ -55,8 +55,8 @@ class Using:
         self._anew: dict[str, int] = {}  # versions of plants that began anew in this batch
         self.replaced: list[tuple[PlantState, list[Withdrawn]]] = []  # these as they were, with their events
 
-    def use(self, messages: Sequence[Read], damaged: Container[str], wall: datetime) -> list[Outcome]:
-        """Give messages to their plants, but for damaged ones, and step these; return the outcome of each message.
+    def apply_batch(self, messages: Sequence[Read], damaged: Container[str], wall: datetime) -> list[Outcome]:
+        """Give a batch of messages to their plants, but for damaged ones, and step these; return each one's outcome.
 
         `wall` is the time by this machine's clock. Afterwards the plants are as if the messages refused as implausible
         had never arrived.

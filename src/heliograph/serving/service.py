@@ -176,7 +176,10 @@ class Service:
         return outputs
 
     def dead_senders(self) -> dict[str, int]:
-        """Count the plants in memory that have a dead sender, by node whose sender decides when to send."""
+        """Count, for each node whose sender decides when to send, the plants in memory of which that sender is dead.
+
+        Dead is one that was silent for longer than its rule allows.
+        """
         dead = dict.fromkeys(self.fleet.deciding, 0)
         for nodes in self.dead_by_plant().values():
             for node in nodes:
@@ -208,7 +211,7 @@ class Service:
 
     def _take_messages(self, messages: Sequence[Read], payloads: Sequence[Payload]) -> tuple[list[Output], float]:
         """Use messages and commit; return the outputs to publish, and the seconds of the commit."""
-        outcomes = self._using.use(messages, self._damage, datetime.now(UTC))
+        outcomes = self._using.apply_batch(messages, self._damage, datetime.now(UTC))
         touched = {plant.name: plant for plant, _, _, _ in outcomes if plant is not None}
         used = {plant.name for plant, verdict, _, _ in outcomes if plant is not None and verdict == "used"}
         if self._doubt is not None:

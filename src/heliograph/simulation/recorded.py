@@ -290,10 +290,13 @@ class NetworkRows(Recursion):
 
 def _filter_in_chunks(
     filters: AllFilters, later: Smoother | None, u: np.ndarray, arrivals: dict[str, Drawn], z: tuple[np.ndarray, ...],
-    without: bool,
+    judged: bool,
 ) -> PyTree | None:  # fmt: skip
-    """Filter rows in chunks side by side; None where a part is not linear, is smoothed or fused, or rows are few."""
-    if without or later is not None or not filters.are_linear:
+    """Filter rows in chunks side by side, given the arguments of `_run_filters`; None where that cannot be.
+
+    All filters must be linear, and take each measurement as it is; results are not smoothed, and rows are many.
+    """
+    if judged or later is not None or not filters.are_linear:
         return None
     whole = scan_in_chunks(NetworkRows(filters), to_numpy(initial_states(filters)), (z, u))
     return None if whole is None else _results(later, z, *whole)
@@ -301,7 +304,7 @@ def _filter_in_chunks(
 
 def _scan_in_parts(
     filters: AllFilters, later: Smoother | None, u: np.ndarray, arrivals: dict[str, Drawn], z: tuple[np.ndarray, ...],
-    without: bool,
+    judged: bool,
 ) -> PyTree:  # fmt: skip
     """Scan over some rows at a time, with the weights between neighbours of these computed ahead."""
     count = -(-len(u) // ROWS)
@@ -313,7 +316,7 @@ def _scan_in_parts(
         k, u_k, z_k, drawn = jax.tree.map(lambda leaf, now=now: np.asarray(leaf)[now], rows)
         drawn |= {name: (drawn[name], mesh.ahead(drawn[name])) for name, mesh in filters.meshes.items()}
         counts = np.arange(start, start + size) < len(u)
-        states, results = _scanned_by_xla(filters, states, (k, u_k, z_k, drawn), without, counts)
+        states, results = _scanned_by_xla(filters, states, (k, u_k, z_k, drawn), judged, counts)
         parts.append(to_numpy(results))
     whole = jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(u)], *parts)
     return to_numpy(_results(later, z, states, whole))
@@ -321,20 +324,20 @@ def _scan_in_parts(
 
 def _run_filters(
     filters: AllFilters, later: Smoother | None, u: np.ndarray, arrivals: dict[str, Drawn], z: tuple[np.ndarray, ...],
-    without: bool,
+    judged: bool,
 ) -> PyTree:  # fmt: skip
-    """Filter all rows; `without` implausible data."""
-    return _results(later, z, *_scan(filters, filters.init(), (jnp.arange(len(u)), u, z, arrivals), without))
+    """Filter all rows in one scan; `judged`: what is implausible is found before it is used, and left out."""
+    return _results(later, z, *_scan(filters, filters.init(), (jnp.arange(len(u)), u, z, arrivals), judged))
 
 
 def _scan(
-    filters: AllFilters, states: PyTree, rows: tuple[PyTree, ...], without: bool, counts: np.ndarray | None = None
+    filters: AllFilters, states: PyTree, rows: tuple[PyTree, ...], judged: bool, counts: np.ndarray | None = None
 ) -> tuple[PyTree, dict[str, PyTree]]:
     """Step over rows; the states stay as they are at those that do not count."""
 
     def body(states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
         (k, u_k, z_k, drawn), row_counts = row
-        step = step_plausibly if without else AllFilters.step
+        step = step_plausibly if judged else AllFilters.step
         after, results = step(filters, states, z_k, u_k, k, drawn)
         if row_counts is not None:
             after = jax.tree.map(lambda new, old: jnp.where(row_counts, new, old), after, states)
@@ -348,7 +351,7 @@ def _results(later: Smoother | None, z: tuple[np.ndarray, ...], state: PyTree, r
     """Return what the filters judged, their last state, and their results, smoothed if there is a smoother."""
     results = {"measurements": z, **results}
     judged = {name: results.pop(name) for name in ("judged", "judged_centrally")}
-    return (results if later is None else later.both(results)) | judged | {"state": state}
+    return (results if later is None else later.smooth_run(results)) | judged | {"state": state}
 
 
 _by_xla, _scanned_by_xla = quickly_compiled(_run_filters), quickly_compiled(_scan)

@@ -46,17 +46,18 @@ class Smoother(Module):
     kinds: tuple[int, ...] = eqx.field(static=True)
     groups: tuple[int, ...] = eqx.field(static=True)
 
-    def both(self, outputs: PyTree) -> PyTree:
+    def smooth_run(self, outputs: PyTree) -> PyTree:
         """Return filtered and smoothed results of a run (time, ...), as a reducer takes them, and sums of the NIS."""
         steps_by_kind = [outputs["smoother_steps"][k] for k in self.kinds]
         filtered = {name: values for name, values in outputs.items() if name not in ("smoother_steps", "central_steps")}
         # Smoothed estimates of nodes and central filters, then their fusions.
+        # Of one kind they are (time, filter, node, ...): each filter of each node is swept back over time by itself.
         sweep = jax.vmap(jax.vmap(self.smoothing.sweep, in_axes=1, out_axes=1), in_axes=1, out_axes=1)
         estimates = tuple(sweep(steps) for steps in steps_by_kind)
         fused = {name: self.smoothing.sweep(steps) for name, steps in outputs["central_steps"].items()}
         for fusion in self.fusions:
             fused |= _fuse_at_each_time(fusion, estimates)
-        # As of the steps that are smoothed.
+        # The filtered values that stand beside them: a smoothing may leave out the first steps of a run.
         length = len(jax.tree.leaves((estimates, fused))[0])
         smoothed = {
             "measurements": tuple(outputs["measurements"][g][-length:] for g in self.groups),
@@ -72,8 +73,8 @@ class Smoother(Module):
                 **self._turn_to_truth(truth, smoothed, [steps.angles for steps in steps_by_kind]),
             }
         # Sums of the NIS, for the test of consistency.
-        surprised = jax.vmap(jax.vmap(nis_sums, in_axes=1), in_axes=1)
-        nis = tuple(surprised(steps) for steps in steps_by_kind)
+        sum_nis = jax.vmap(jax.vmap(nis_sums, in_axes=1), in_axes=1)
+        nis = tuple(sum_nis(steps) for steps in steps_by_kind)
         centrally = {name: nis_sums(steps) for name, steps in outputs["central_steps"].items()}
         return {"filtered": filtered, "smoothed": smoothed, "nis": {"estimates": nis, "fused": centrally}}
 
@@ -102,7 +103,7 @@ def reduce_run(reducer: AbstractReducer[Result], later: Smoother | None, outputs
     """Reduce the results of a run (time, ...); with a smoother pairs of filtered and smoothed ones, and its NIS."""
     if later is None:
         return reduce_rows(reducer, outputs)
-    both = later.both(outputs)
+    both = later.smooth_run(outputs)
     filtered, smoothed = reduce_rows(reducer, both["filtered"]), reduce_rows(reducer, both["smoothed"])
     return OfStep(
         (filtered.sums, smoothed.sums, both["nis"]),

@@ -80,7 +80,12 @@ def smooth_chunk(
 
 
 def _smooth_all(recursion: SmootherRows, begun: Begun, rows: PyTree) -> SmoothedRows | None:
-    """Smooth all chunks, and again those that the one before them, or the one behind them, contradicts."""
+    """Smooth all chunks side by side, and again those that a neighbour contradicts.
+
+    A chunk has `own` rows. It filters `ahead` rows more and passes back over these, begun by the filter's own law at
+    their end, which they forget: so it enters its own rows by the law that all later data give. Where the next chunk's
+    first row has another law, it is smoothed once more, from that one; the last such chunk first.
+    """
     total, (own, ahead) = len(rows[0]), begun.lengths
     windows = take_windows(rows, begun.first, own + ahead)
     ends = np.minimum(begun.first + own + ahead, total)
@@ -103,12 +108,13 @@ def _smooth_all(recursion: SmootherRows, begun: Begun, rows: PyTree) -> Smoothed
         return None
     mend_chunks(smooth, begun.states, lambda results: results.end, results)
     # The states with which chunks begin are those in which the ones before them end.
-    wrong = ~agree(take(results.behind, slice(None, -1)), take(results.ahead, slice(1, None)))
+    wrong = ~agree(take(results.entered, slice(None, -1)), take(results.left, slice(1, None)))
     for c in range(len(wrong) - 1, -1, -1):
         if wrong[c]:
-            here, law = slice(c, c + 1), take(results.ahead, slice(c + 1, c + 2))
+            here, law = slice(c, c + 1), take(results.left, slice(c + 1, c + 2))
             state = take(results.end, slice(c - 1, c)) if c else take(begun.states, here)
             replace_chunk(results, here, smooth(state, here, law))
-            wrong[c - 1] = c and not agree(take(results.behind, slice(c - 1, c)), take(results.ahead, here))[0]
+            if c:
+                wrong[c - 1] = not agree(take(results.entered, slice(c - 1, c)), take(results.left, here))[0]
     estimate, nis, received = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:total], results[3:])
     return SmoothedRows(estimate, np.asarray(sum_blocks(nis, received)))

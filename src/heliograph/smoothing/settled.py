@@ -39,11 +39,14 @@ class SmootherRows(Recursion):
 
 
 class SmoothedChunk(NamedTuple):
-    """Results of a chunk: the filter's state behind it, the smoothed laws behind it and ahead of it, and its rows."""
+    """Results of a chunk: the filter's state behind it, and what is smoothed of each row.
+
+    The pass back entered it by one smoothed law, of the row behind it, and left it by another, of its first row.
+    """
 
     end: PyTree
-    behind: Gaussian
-    ahead: Gaussian
+    entered: Gaussian
+    left: Gaussian
     estimate: Estimate
     nis: Array
     received: Array

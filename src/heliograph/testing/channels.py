@@ -59,7 +59,11 @@ def check_random_affine(channel: AbstractRandomAffine, seed: int = 0, samples: i
 
 
 def _compare_lagged(modes: JointModes, now: np.ndarray, later: np.ndarray) -> float:
-    """Compare E[(G, n)_1 x (G, n)_2] of two successive draws."""
+    """Compare the joint mean of two successive draws M = (G, n) with E = sum_ij p_i T_ij E[M | i] x E[M | j].
+
+    Returns:
+        The largest deviation of the samples' mean from it, in standard errors.
+    """
     means = np.array([m.moments(1).mean[:-1] for m in modes.maps])
     expected = np.einsum("i,ij,iab,jcd->abcd", modes.initial, modes.transition, means, means)
     seen = np.einsum("sab,scd->sabcd", now, later)

@@ -70,7 +70,7 @@ def operation(node: Node, names: list[str], emit: Emit) -> str:
     if op in CALLED:
         typed = ", ".join(f"{vector(a.type)} {n}" for a, n in zip(node.args, names, strict=True))
         return emit(f"call {result_type} @hg_{called(node)}({typed})")
-    return (_write_real if source in REAL else _write_integer)(node, names, operand_type, emit)
+    return (_write_float_operation if source in REAL else _write_integer_operation)(node, names, operand_type, emit)
 
 
 def called(node: Node) -> str:
@@ -86,7 +86,7 @@ def _write_comparison(op: str, type: Type) -> str:
     return f"icmp {'u' if type in ('u32', 'u64', 'bool') else 's'}{op}"
 
 
-def _write_real(node: Node, names: list[str], text: str, emit: Emit) -> str:
+def _write_float_operation(node: Node, names: list[str], text: str, emit: Emit) -> str:
     """Write an operation on vectors of real numbers; return the name of its result."""
     op, type, first = node.op, node.args[0].type, f"{text} {names[0]}"
     if op == "neg":
@@ -109,7 +109,7 @@ def _write_real(node: Node, names: list[str], text: str, emit: Emit) -> str:
     raise Unsupported(op)
 
 
-def _write_integer(node: Node, names: list[str], text: str, emit: Emit) -> str:
+def _write_integer_operation(node: Node, names: list[str], text: str, emit: Emit) -> str:
     """Write an operation on vectors of integers or flags; return the name of its result."""
     op, type, first = node.op, node.args[0].type, f"{text} {names[0]}"
     if op in INTEGER:

@@ -58,7 +58,7 @@ def _lower_loop(
         if kept == halves:
             break
         halves = kept
-        graph.most += graph.serial - begun
+        graph.max_nodes += graph.serial - begun
     loop.following = _entries(following, halves)
     outer.items.append(loop)
     # After the loop the carry is a result.

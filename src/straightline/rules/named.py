@@ -60,26 +60,28 @@ def operation(native: Callable[P, R]) -> Callable[[Callable[P, R]], Callable[P, 
 
         @cache
         def trace(tree: Any, kinds: tuple[Any, ...], x64: bool) -> tuple[_Program, Any]:
-            """Trace the plain function for arguments of these kinds; return it with its result's structure."""
-            form: list[Any] = []
+            """Trace the plain function for arguments of these shapes and types; return it and its results' tree."""
+            result_tree: list[Any] = []
 
             def leaves_of(function: Callable[..., R], *leaves: Any) -> list[Any]:
                 args, kwargs = jax.tree.unflatten(tree, leaves)
                 results, structure = jax.tree.flatten(function(*args, **kwargs))
-                form[:] = [structure]
+                result_tree[:] = [structure]
                 return results
 
             traced = jax.make_jaxpr(partial(leaves_of, plain))(*(like(*kind) for kind in kinds))
             name = f"{plain.__module__}.{plain.__qualname__}"
-            return _Program(name, traced, partial(leaves_of, native), x64), form[0]
+            return _Program(name, traced, partial(leaves_of, native), x64), result_tree[0]
 
         @wraps(plain)
         def call(*args: P.args, **kwargs: P.kwargs) -> R:
+            """Bind the function as one primitive of JAX, which is traced once for arguments of one kind."""
             leaves, tree = jax.tree.flatten((args, kwargs))
             leaves = [jnp.asarray(leaf) for leaf in leaves]
             kinds = tuple((leaf.shape, leaf.dtype) for leaf in leaves)
-            this, form = trace(tree, kinds, bool(jnp.result_type(float) == np.float64))
-            results: R = jax.tree.unflatten(form, _primitive.bind(*leaves, program=this, levels=(), sizes=()))
+            program, result_tree = trace(tree, kinds, bool(jnp.result_type(float) == np.float64))
+            flat = _primitive.bind(*leaves, program=program, levels=(), sizes=())  # under no vmap yet
+            results: R = jax.tree.unflatten(result_tree, flat)
             return results
 
         return call
@@ -96,6 +98,7 @@ def _apply_plain(*leaves: Any, program: _Program, levels: tuple[Axes, ...], size
 
 
 def _shapes(*_: Any, program: _Program, levels: tuple[Axes, ...], sizes: tuple[int, ...]) -> list[Any]:
+    """Return shapes and types of the results: those of the plain function, behind an axis for each level of vmap."""
     return [jax.core.ShapedArray((*sizes, *aval.shape), aval.dtype) for aval in program.plain.out_avals]
 
 

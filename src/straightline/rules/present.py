@@ -32,7 +32,7 @@ def present(x: Shaped[jax.Array | np.ndarray, "*shape"]) -> Shaped[jax.Array, "*
 
 
 def _rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    lowering.graph.numbers.update(inputs[0].ravel().tolist())
+    lowering.graph.never_nan.update(inputs[0].ravel().tolist())
     return inputs
 
 

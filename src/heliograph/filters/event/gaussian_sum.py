@@ -160,10 +160,11 @@ def _merge_cheapest_pair(parts: GaussianSum, ends: tuple[int, int]) -> GaussianS
     # The two joined; the others keep their places.
     merged = merge_groups(parts._replace(log_weight=jnp.where(is_first | is_second, parts.log_weight, -jnp.inf)))
 
-    def replace_pair(values: jax.Array, new: jax.Array) -> jax.Array:
-        shape = (-1, *[1] * (values.ndim - 1))
-        moved = jnp.where(is_second.reshape(shape), values[-1:], values)
-        return jnp.where(is_first.reshape(shape), new, moved)[:-1]
+    def replace_pair(values: jax.Array, joined: jax.Array) -> jax.Array:
+        """Put the pair joined in the first one's place and the last Gaussian in the second one's: one fewer."""
+        one_each = (-1, *[1] * (values.ndim - 1))  # a mask of Gaussians, beside their numbers
+        last_moved = jnp.where(is_second.reshape(one_each), values[-1:], values)
+        return jnp.where(is_first.reshape(one_each), joined, last_moved)[:-1]
 
     fewer: GaussianSum = jax.tree.map(replace_pair, parts, merged)
     return fewer

@@ -102,7 +102,11 @@ class WordFilter(AbstractBeliefFilter):
         return signal_of(plant, sensor, self.transform, state, second_moments_at_start(self.plant, self))
 
     def _read(self, z: jax.Array, link: LinkOfBits) -> "Received":
-        """Read which words were received, and what their bits say of those that were sent."""
+        """Read which words were received, and what their bits say of those that were sent.
+
+        z has the received words, and flags of modes among them, as `places` says; behind these, where dither is
+        subtracted, the dither of each word. A word is the number i of low + i spacing.
+        """
         outputs = len(self.places)
         rows = [i for i, place in enumerate(self.places) if place != FLAG]
         places = np.array([self.places[i] for i in rows])
@@ -110,7 +114,7 @@ class WordFilter(AbstractBeliefFilter):
         index = (z[np.array(rows)] - jnp.asarray(self.low)[places]) / jnp.asarray(self.spacing)[places]
         there = ~jnp.isnan(index) & ~jnp.isnan(d)
         number = jnp.round(jnp.where(there, index, 0.0))
-        # Words are numbers of rounding of their own: (low, low + D i) / D have that of either.
+        # What arrives must be a word, up to the rounding of low and of low + i D, both in units of D.
         size = jnp.abs(number) + jnp.abs(jnp.asarray(self.low) / jnp.asarray(self.spacing))[places]
         tolerance = OFF + 8 * jnp.finfo(index.dtype).eps * size
         wrong = jnp.abs(jnp.where(there, index, 0.0) - number) > tolerance
@@ -122,6 +126,7 @@ class WordFilter(AbstractBeliefFilter):
         first_copy = [_pick_first([(there[j], number[j], d[j]) for j in of]) for of in copies]
         present = jnp.stack([came for came, _, _ in first_copy])
         numbers, dithers = (jnp.stack([one[part] for one in first_copy]) for part in (1, 2))
+        # P(received | sent 0) and P(received | sent 1) of each bit, by each route of the link, and the routes' weights.
         pairs, weights = list[jax.Array](), jnp.ones(1)
         if not self.certain:
             bit = jnp.mod(jnp.floor(number[:, None] / 2.0 ** np.arange(self.bits)), 2.0)

@@ -110,14 +110,18 @@ class HeldFilter(AbstractWrapper):
 
 
 def _receive_at(state: LinearBelief, link: SecondOrder, start: int, length: int, position: int) -> LinearBelief:
-    """Receive r = G l + n and put it at `position`; l is the line of `length` from `start` on."""
+    """Receive r = G l + n and put it at `position` of the state.
+
+    l is the part of the state, `length` numbers from `start` on, that has the signals under way to this link, at the
+    relay before it or at the sensor.
+    """
     # x+ = matrix x + shift: the received signal replaces what stands at its place.
     gain, offset = jnp.asarray(link.mean_gain), jnp.asarray(link.offset)
     total, m = len(state.gaussian.mean), len(offset)
     line, place = slice(start, start + length), slice(position, position + m)
     matrix = jnp.eye(total).at[place, :].set(0.0).at[place, line].set(gain)
     shift = jnp.zeros(total).at[place].set(offset)
-    # Cov(r | l) at the unconditional moments of l.
+    # E Cov(r | l): its random gain makes noise as large as l itself, of which no data are known here.
     mean, covariance = state.state_mean[line], state.state_covariance[line, line]
     spread = link_noise(link, covariance + jnp.outer(mean, mean), mean)
     noise = Columns(jnp.zeros((total, spread.matrix.shape[1])).at[place].set(spread.matrix), spread.weights)

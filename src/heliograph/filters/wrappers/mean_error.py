@@ -118,7 +118,7 @@ def _list_contexts(filter: ToldFilter) -> Contexts:
         return Contexts(numbers, np.ones((modes, 1)), np.asarray(chains[0].initial), np.asarray(chains[0].transition))
     values, weights = np.zeros((1, 0)), np.ones(1)
     for memory in memories:
-        more, chances = _nodes_of(memory)
+        more, chances = _find_quadrature(memory)
         if len(values) * len(more) > MOST:
             raise fail("numbers told", f"at most {MOST} combinations of nodes", len(values) * len(more))
         values = np.concatenate([np.repeat(values, len(more), axis=0), np.tile(more, (len(values), 1))], axis=1)
@@ -126,7 +126,7 @@ def _list_contexts(filter: ToldFilter) -> Contexts:
     return Contexts(values[None], weights[None], np.ones(1), np.ones((1, 1)))
 
 
-def _nodes_of(memory: AbstractMemory) -> tuple[Float[np.ndarray, "nodes told"], Float[np.ndarray, " nodes"]]:
+def _find_quadrature(memory: AbstractMemory) -> tuple[Float[np.ndarray, "nodes told"], Float[np.ndarray, " nodes"]]:
     """Return numbers that are drawn anew at each step, with their probabilities."""
     if isinstance(memory, FreshReading):
         return reading_nodes(memory.law, float(memory.variance))

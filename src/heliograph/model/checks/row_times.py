@@ -15,7 +15,7 @@ ONE_STEP = "a plant without the input dt takes each for one; insert the rows tha
 
 
 def common_dates(tables: Mapping[str, object]) -> np.ndarray | None:
-    """Return the dates by which the rows of tables are known (datetime64[ns], UTC); None where those of none are.
+    """Return the dates in the index of tables (datetime64[ns], UTC), which must agree; None where no table has any.
 
     Args:
         tables: measurements and inputs by what they are called in errors.

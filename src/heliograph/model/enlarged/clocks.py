@@ -66,9 +66,9 @@ def with_clocks(
 ) -> "tuple[LinearPlant | Plant, dict[str, LinearSensor | Stamped]]":
     """Return the plant with an offset and a drift for each clock as states, and the sensors of all nodes for it.
 
-    A node of `clocks` stamps its values by its own clock, s = t + o, and a value is taken as one of its stamp. The
-    sensor then measures the plant o before that time, h = y - o dy/dt. The new states are "NODE_offset" and
-    "NODE_drift".
+    A node of `clocks` measures y at the true time t and stamps the value with its own clock, s = t + o, where the
+    offset o grows by its drift. The filter takes the value for one of time s; it is that of s - o, so that to first
+    order it reads y(s) - o dy/dt. The new states are "NODE_offset" and "NODE_drift".
 
     Args:
         plant: the plant, constant over time.

@@ -127,7 +127,10 @@ def instant(text: str) -> datetime:
 
 
 def seconds_between(time: np.ndarray) -> np.ndarray:
-    """Return the seconds since the row before, 0 in the first; of dates from whole nanoseconds."""
+    """Return the time since the row before, 0 in the first row: seconds between dates, else in the numbers' unit.
+
+    Dates are subtracted as whole nanoseconds, since in double precision they are known to some hundreds of these.
+    """
     if time.dtype.kind != "M":
         return np.diff(time, prepend=time[:1])
     whole = time.astype("datetime64[ns]").astype(np.int64)
@@ -139,9 +142,9 @@ SPANS = {"years": 365.25 * 86400, "months": 30.4375 * 86400, "days": 86400.0, "h
 
 
 def unequal_steps(time: np.ndarray) -> str:
-    """Say that steps between times differ, "steps of 1 and 21 years"; "" where none is half as long again as usual."""
+    """Return "steps of 1 and 21 years" where the longest step is more than LONGER times the median one, else ""."""
     steps = seconds_between(time)[1:]
-    if steps.size and 0 < steps.max() <= LONGER * steps.min():  # without a median, of which none is half as long again
+    if steps.size and 0 < steps.max() <= LONGER * steps.min():  # nor then more than the median, which takes a sort
         return ""
     steps = steps[steps > 0]
     if not steps.size or steps.max() <= LONGER * np.median(steps):

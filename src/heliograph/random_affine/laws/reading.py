@@ -69,8 +69,8 @@ def gain_given_reading(law: AbstractLaw, reading: Float[Array, ""], variance: Fl
     known = ~jnp.isnan(reading)
     a = jnp.where(known, reading, 0.0)
     if isinstance(law, Discrete):
-        nats = jnp.log(law.probabilities) - jnp.square(a - law.values) / (2 * variance)
-        return Discrete(law.values, jnp.where(known, jax.nn.softmax(nats), law.probabilities))
+        log_density = jnp.log(law.probabilities) - jnp.square(a - law.values) / (2 * variance)
+        return Discrete(law.values, jnp.where(known, jax.nn.softmax(log_density), law.probabilities))
     mean, spread = _integrate_posterior(law, a, jnp.asarray(variance))
     own = law.moment(1), law.moment(2)
     return GivenReading(jnp.where(known, mean, own[0]), jnp.where(known, spread, own[1] - own[0] ** 2))
@@ -89,7 +89,7 @@ def _integrate_posterior(law: AbstractLaw, a: jax.Array, variance: jax.Array) ->
     def place_of(g: Float[Array, ""]) -> jax.Array:
         return jnp.log(jnp.maximum(g, np.finfo(float).tiny)) if law.logarithmic else jnp.maximum(g, 0.0) ** 0.25
 
-    def nats(t: jax.Array) -> jax.Array:
+    def log_density(t: jax.Array) -> jax.Array:
         """Return log p(t | a) but for a constant: the law's density in t, and the reading's."""
         g = gain_at(t)
         stretch = t if law.logarithmic else 3 * jnp.log(t)
@@ -99,28 +99,28 @@ def _integrate_posterior(law: AbstractLaw, a: jax.Array, variance: jax.Array) ->
     low, high = law.bulk()
     low = place_of(jnp.minimum(low, a - 9 * deviation))
     high = place_of(jnp.maximum(high, a + 9 * deviation))
-    top = _find_top(nats, low, high)
-    least = nats(top) - NATS
-    left, right = _find_end(nats, low, top, least), _find_end(nats, high, top, least)
+    top = _find_top(log_density, low, high)
+    least = log_density(top) - NATS
+    left, right = _find_end(log_density, low, top, least), _find_end(log_density, high, top, least)
     # Weights p(t | a) dt at the nodes, normalised; the variance about the mean, so that nothing cancels.
     x, w = np.polynomial.legendre.leggauss(NODES)
     t = (left + right) / 2 + (right - left) / 2 * x
-    weights = jax.nn.softmax(np.log(w) + jax.vmap(nats)(t))
+    weights = jax.nn.softmax(np.log(w) + jax.vmap(log_density)(t))
     g = gain_at(t)
     mean = weights @ g
     return mean, weights @ jnp.square(g - mean)
 
 
-Nats = Callable[[jax.Array], jax.Array]
+LogDensity = Callable[[jax.Array], jax.Array]
 
 
-def _find_top(nats: Nats, low: jax.Array, high: jax.Array) -> jax.Array:
-    """Return the place of the largest value: the best point of a grid, and again between its neighbours."""
+def _find_top(log_density: LogDensity, low: jax.Array, high: jax.Array) -> jax.Array:
+    """Return where a density with one mode in [low, high] is largest: at a grid's best point, refined about it."""
     steps = np.linspace(0.0, 1.0, GRID)
 
     def zoom(_: int, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         points = ends[0] + (ends[1] - ends[0]) * steps
-        best = jnp.argmax(jax.vmap(nats)(points))
+        best = jnp.argmax(jax.vmap(log_density)(points))
         return points[jnp.maximum(best - 1, 0)], points[jnp.minimum(best + 1, GRID - 1)]
 
     left, right = jax.lax.fori_loop(0, ZOOMS, zoom, (low, high))
@@ -128,13 +128,13 @@ def _find_top(nats: Nats, low: jax.Array, high: jax.Array) -> jax.Array:
     return middle
 
 
-def _find_end(nats: Nats, outer: jax.Array, top: jax.Array, least: jax.Array) -> jax.Array:
+def _find_end(log_density: LogDensity, outer: jax.Array, top: jax.Array, least: jax.Array) -> jax.Array:
     """Return a place between `outer` and the mode beyond which the density is below `least`, and shortly before not."""
     steps = np.linspace(0.0, 1.0, GRID)
 
     def zoom(_: int, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         points = ends[0] + (ends[1] - ends[0]) * steps
-        counts = (jax.vmap(nats)(points) > least).at[-1].set(True)
+        counts = (jax.vmap(log_density)(points) > least).at[-1].set(True)
         first = jnp.argmax(counts)  # from outside
         return points[jnp.maximum(first - 1, 0)], points[first]
 
@@ -166,8 +166,8 @@ def gain_nodes(
         t = ends.mean() + (ends[1] - ends[0]) / 2 * x
         g = np.exp(t) if law.logarithmic else t**4
         # log(p g'), g' = e^t or 4 t^3, up to a constant that the sum of the weights takes off.
-        nats = np.asarray(jax.vmap(law.log_density)(jnp.asarray(g))) + (t if law.logarithmic else 3 * np.log(t))
-    weights = w * np.exp(nats - nats.max())
+        log_density = np.asarray(jax.vmap(law.log_density)(jnp.asarray(g))) + (t if law.logarithmic else 3 * np.log(t))
+    weights = w * np.exp(log_density - log_density.max())
     return g[:, None], weights / weights.sum()
 
 

@@ -80,22 +80,22 @@ def check_moments(moments: np.ndarray) -> None:
     sequence = np.concatenate([[1.0], moments])
     scale = max(float(sequence[2]) ** 0.5, np.finfo(float).tiny) if sequence[2] > 0 else 1.0
     size = scale ** np.arange(len(sequence))
-    in_range = np.cumprod((size > np.finfo(float).tiny) & np.isfinite(size), dtype=bool)
-    m = sequence[in_range] / size[in_range]  # unit second moment, so that one tolerance serves all orders
+    representable = np.cumprod((size > np.finfo(float).tiny) & np.isfinite(size), dtype=bool)
+    m = sequence[representable] / size[representable]  # unit second moment, so that one tolerance serves all orders
     # Range condition: h = E[V n^j] lies in the range of H = E[V V'].
     for j in range(1, len(m) // 2 + 1):
-        hankel = np.array([[m[a + b] for b in range(j)] for a in range(j)])
-        known = np.array([m[a + j] for a in range(j) if a + j < len(m)])
-        if len(known) < j:
+        H = np.array([[m[a + b] for b in range(j)] for a in range(j)])
+        h = np.array([m[a + j] for a in range(j) if a + j < len(m)])
+        if len(h) < j:  # higher moments are not given
             return
-        solution = np.linalg.lstsq(hankel, known, rcond=MOMENT_TOLERANCE)[0]
-        gap = np.max(np.abs(hankel @ solution - known))
-        if gap > np.sqrt(MOMENT_TOLERANCE) * np.max(np.abs(known), initial=1.0):
+        solution = np.linalg.lstsq(H, h, rcond=MOMENT_TOLERANCE)[0]
+        gap = np.max(np.abs(H @ solution - h))
+        if gap > np.sqrt(MOMENT_TOLERANCE) * np.max(np.abs(h), initial=1.0):
             expected = "a law of the atoms that the lower moments imply"
             raise fail("noise moments", expected, f"E[n^{2 * j - 1}] = {moments[2 * j - 2]:.10g}, which no law has")
         # Schur complement: E[n^2j] >= h' H^-1 h.
-        if 2 * j < len(m) and m[2 * j] < known @ solution - MOMENT_TOLERANCE * max(abs(m[2 * j]), 1.0):
-            least = float(known @ solution) * scale ** (2 * j)
+        if 2 * j < len(m) and m[2 * j] < h @ solution - MOMENT_TOLERANCE * max(abs(m[2 * j]), 1.0):
+            least = float(h @ solution) * scale ** (2 * j)
             raise fail("noise moments", f"E[n^{2 * j}] of at least {least:.10g}, which the lower moments imply",
                        f"{moments[2 * j - 1]:.10g}, which no distribution has")  # fmt: skip
 

@@ -47,10 +47,10 @@ def check_transport(broker: Broker, messages: int = 100, patience: float = 20.0)
     Raises:
         AssertionError: naming the promise that does not hold.
     """
-    return asyncio.run(_Check(broker, messages, patience).all())
+    return asyncio.run(_Examination(broker, messages, patience).all())
 
 
-class _Check:
+class _Examination:
     """State of one examination of a broker."""
 
     def __init__(self, broker: Broker, messages: int, patience: float):

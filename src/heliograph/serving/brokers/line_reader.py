@@ -14,7 +14,7 @@ from heliograph.files.sources.fields import decode_json
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, file_path, flag, instance
 from heliograph.serving.brokers.arrival_order import ArrivalOrder
-from heliograph.serving.brokers.table_lines import TableLines, read_own
+from heliograph.serving.brokers.table_lines import TableMessages, read_own
 from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.message import LONGEST, Message, Payload, Read, UnreadMessage, read_messages
 from heliograph.simulation.network import Network
@@ -55,7 +55,7 @@ class LineReader:
         self._translator = translator
         self._topic = None if translator is None else translator.topic_of(path)
         self._own = OwnReader(network, self.source, ignore_unknown, table=False)
-        self._table = TableLines(network, translator, path, ignore_unknown)
+        self._table = TableMessages(network, translator, path, ignore_unknown)
         self._is_table: bool | None = None  # known once a message or the names of columns came
         self._document: list[bytes] | None = None  # lines of a document that has not ended
         self._number = 0

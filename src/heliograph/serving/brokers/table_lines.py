@@ -26,7 +26,7 @@ from heliograph.simulation.network import Network
 SECOND = np.timedelta64(1_000_000_000, "ns")
 
 
-class TableLines:
+class TableMessages:
     """Lines of a table, to messages. What the table has is said by its header, as of a file.
 
     Args:

@@ -123,7 +123,16 @@ class Translator:
     def _read(
         self, topic: str, payload: object, arrival: datetime | None, stored: bool, again: bool, where: str
     ) -> list[Message | UnreadMessage | str]:
-        """Read a payload; `again`: a message may be sent again."""
+        """Read a payload: the readings that it has, or why one, or all of it, cannot be used.
+
+        Args:
+            topic: where it came from.
+            payload: as the broker gave it.
+            arrival: when it came, None for now.
+            stored: the broker had kept it, so that it is left out where it has no time of its own.
+            again: whether a copy of it may come again, so that its number is made from what it says.
+            where: place that an error names.
+        """
         results: list[Message | UnreadMessage | str] = []
         try:
             if self.sources.hear(topic, payload, where):

@@ -147,6 +147,8 @@ def fused_covariances(
 ) -> dict[str, Float[np.ndarray, "time n n"]]:
     """Return the covariances (time, n, n) of the network's informed fusions, by name, for complete data.
 
+    An informed fusion is one that knows how the errors of its estimates are correlated.
+
     Args:
         network: a network with informed fusions of linear filters.
         horizon: number of steps.

@@ -139,11 +139,12 @@ class Mesh(Module):
     ) -> tuple[MeshState, tuple[Estimate, ...]]:  # fmt: skip
         """Exchange, fuse, predict and correct at step k: next state, and estimates (1, node, ...) by group of nodes.
 
-        `ahead` has weights that were computed before.
+        xhat+ = A xhat + b + sum_j M_j (xhat_j - xhat) + W (s - S (A xhat + b)), M_j `gains.front` `gains.parts`,
+        W `gains.gain`, S `parts.information`. `arrived`: (node, round, neighbour); `ahead`: weights computed before.
         """
-        there = jnp.concatenate([self._rows(rows) for rows in z])[self.observation_model.order]
+        measured = jnp.concatenate([self._rows(rows) for rows in z])[self.observation_model.order]
         blocks = None if state.joint is None else blocks_of(state.joint, self.senders)
-        present = ~jnp.isnan(there)
+        present = ~jnp.isnan(measured)
         messages = self._keep_messages(state, jnp.asarray(arrived))
         arrived = arrived if messages is None else messages.fresh
         parts = self.parts(state.covariance, blocks, state.plant, present, arrived, u, k, ahead, messages)
@@ -158,21 +159,20 @@ class Mesh(Module):
         predicted = mean @ motion.matrix.T + motion.shift
         common = jnp.mean(predicted, axis=0)
         observation = parts.data.observation
-        off = jnp.where(present, there - observation.offset - observation.gain @ common, 0.0)
+        off = jnp.where(present, measured - observation.offset - observation.gain @ common, 0.0)
         weighted = jnp.einsum("inm,im->in", parts.data.weighted, off)
         sums = self._collect_sums(weighted, arrived)
-        # xhat+ = A xhat + b + sum M_j (xhat_j - xhat) + W (s - S (A xhat + b)).
         innovation = sums - jnp.einsum("iab,ib->ia", parts.information, predicted - common)
         pulled = self._pull_to_neighbours(gains.front, gains.parts, mean, sent)
         mean = predicted + pulled + jnp.einsum("iab,ib->ia", gains.gain, innovation)
         # Covariance of all errors where the rule needs it; it is then what is claimed.
         joint = None if state.joint is None else self._propagate_joint(state.joint, parts, jnp.asarray(arrived[:, -1]))
         claimed = gains.covariance if joint is None else jnp.einsum("iaib->iab", joint)
-        held = None if state.sent is None else sent @ motion.matrix.T + motion.shift
-        after = MeshState(mean, gains.covariance, joint, parts.plant, held, None)
+        moved_on = None if state.sent is None else sent @ motion.matrix.T + motion.shift
+        after = MeshState(mean, gains.covariance, joint, parts.plant, moved_on, None)
         if messages is not None and state.way is not None:
-            on = step_way(messages, state.way, motion, common, weighted, parts.data.information)
-            after = after._replace(way=on)
+            under_way = step_way(messages, state.way, motion, common, weighted, parts.data.information)
+            after = after._replace(way=under_way)
         return after, self._split_by_group(mean, claimed)
 
     def _keep_messages(self, state: MeshState, arrived: jax.Array) -> Messages | None:

@@ -263,7 +263,10 @@ class FilterLabels:
         return self.fill(name, self.place(value))
 
     def claims(self) -> np.ndarray:
-        """Return the claim of each filter, at its place; empty elsewhere."""
+        """Return what each filter claims of its covariance (node, filter): exact, upper, nominal or none.
+
+        Empty where a node has no filter of the name.
+        """
         claims = np.full((len(self.nodes), len(self.filters)), "", dtype="U7")
         for position, claim in self.place(lambda result: result.claim):
             claims[position] = claim

@@ -77,7 +77,13 @@ class Statistics(AbstractReducer[StatisticsByName]):
         return OfStep(sums, bad)
 
     def summed(self, sums: OfStep, common: OfStep, count: np.ndarray) -> Sums:
-        """Return the carry after all runs, with the covariances that all runs share last."""
+        """Return the carry after all runs: filters with a covariance of their own in each run first, the others last.
+
+        Args:
+            sums: what was summed over runs, by batch, (time, filter, ..., batch); without a last axis where `common`.
+            common: for each of these whether all runs share it, so that it is the value of one run.
+            count: number of runs in each batch.
+        """
         # Values that all runs share count once per run.
         shared = common.sums["claimed"]
         totals, ever = jax.tree.map(
@@ -85,27 +91,27 @@ class Statistics(AbstractReducer[StatisticsByName]):
             (sums.sums | {"claimed": ()}, sums.ever),
             (common.sums | {"claimed": ()}, common.ever),
         )
-        # Order of the parts: covariances by run first.
+        # Order of the filters' parts: those whose claimed covariance differs between runs come first.
         claimed = sums.sums["claimed"]
         order = tuple(sorted(range(len(shared)), key=shared.__getitem__))
         sizes = [values.shape[1] for values in claimed]
         places = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
-        into = np.concatenate([places[i] for i in order])
-        # Claimed covariances of both kinds.
+        in_order = np.concatenate([places[i] for i in order])
+        # Claimed covariances of both kinds, each begun by none, for there may be none of a kind.
         steps, _, pairs, _ = totals["pairs"].shape
         by_batch: Any = count
-        mine: list[Any] = [np.zeros((steps, 0, pairs, BATCHES)), *(claimed[i] for i in order if not shared[i])]
-        others: list[Any] = [np.zeros((steps, 0, pairs)), *(claimed[i] * count.sum() for i in order if shared[i])]
-        varying: Any = np.concatenate(mine, axis=1)
-        common_to_all: Any = np.concatenate(others, axis=1)
+        by_run: list[Any] = [np.zeros((steps, 0, pairs, BATCHES)), *(claimed[i] for i in order if not shared[i])]
+        of_all: list[Any] = [np.zeros((steps, 0, pairs)), *(claimed[i] * count.sum() for i in order if shared[i])]
+        claimed_by_run: Any = np.concatenate(by_run, axis=1)
+        claimed_by_all: Any = np.concatenate(of_all, axis=1)
         return Sums(
             runs=by_batch,
-            pairs=totals["pairs"][:, into],
-            nees=totals["nees"][:, into],
-            claimed=varying,
-            shared=common_to_all,
-            failed=np.sum(totals["failed"], axis=-1)[:, :, into],
-            failed_runs=np.sum(ever, axis=-1)[:, None, into],
+            pairs=totals["pairs"][:, in_order],
+            nees=totals["nees"][:, in_order],
+            claimed=claimed_by_run,
+            shared=claimed_by_all,
+            failed=np.sum(totals["failed"], axis=-1)[:, :, in_order],
+            failed_runs=np.sum(ever, axis=-1)[:, None, in_order],
             uplinks=jax.tree.map(lambda leaf: np.sum(leaf, axis=-1), totals["uplinks"]),
             order=order,
             by_run=shared.count(False),
