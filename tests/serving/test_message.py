@@ -57,6 +57,32 @@ def test_bytes_that_are_no_text_and_lines_that_are_too_long_are_refused():
     assert read_messages([line, long, "a reason"]) == [by_pydantic(line), by_pydantic(long), "a reason"]
 
 
+DOUBLED = (
+    ('{"node": "a", "sequence": 1, "time": 1, "values": [20], "values": [30]}', "values", True),
+    ('{"node":"a","sequence":1,"time":1,"values":[20],"v\\u0061lues":[30]}', "values", True),
+    ('{"plant": "values", "node": "a", "sequence": 1, "time": 1, "inputs": null, "inputs": [2]}', "inputs", True),
+    ('{"node": "a", "sequence": 1, "time": "2026-11-21T23:25:00Z", "values": [], "values": [1]}', "values", True),
+    ('{"node": "a", "sequence": 1, "sequence": 2, "time": 1, "values": [20]}', "sequence", False),
+    ('{"node": "b", "node": "a", "sequence": 1, "time": 1}', "node", False),
+)
+
+
+@pytest.mark.parametrize(("line", "field", "named"), DOUBLED)
+def test_a_field_that_is_there_twice_is_refused(line, field, named):
+    """Of which decoders use the last; the message is named by its node and count, unless one of these is doubled."""
+    (read,) = read_messages([line.encode()])
+    why = f"message: expected distinct fields, got {field!r} more than once"
+    assert (read.why, read.read.node, read.read.sequence) == (why, "a", 1) if named else read == why
+    with pytest.raises(hg.InputError, match=why):
+        read_message(line.encode())
+
+
+def test_names_of_fields_in_texts_double_nothing():
+    line = '{"plant": "\\"values\\"", "node": "values", "sequence": 1, "time": 1.5, "values": [], "inputs": null}'
+    (read,) = read_messages([line.encode()])
+    assert isinstance(read, NumberedMessage) and (read.plant, read.node) == ('"values"', "values")
+
+
 def test_numbers_are_read_to_the_last_bit():
     generator = np.random.default_rng(0)
     bits = generator.integers(0, 2**63, 5_000).view(np.float64)
