@@ -45,6 +45,8 @@ NO_COUNT = '{"node": "a", "time": 0, "values": [1]}\n'
 WORDS = "NA", "null", "None", "-", "nan", "-nan(ind)", "1.#QNAN"
 FIRST, REST = TABLE.split("\n", 1)
 STATE = 'field("state", node="a", time="last_changed")'
+DOCUMENT = json.dumps([HISTORY], indent=1)
+TWICE = f'{{"node": "a", "sequence": 9, "time": "{DATES[3]}", "values": [99], "values": [98]}}\n'
 QUOTED = '{"log.json": field("state", node="a", time="last_changed", quoted=True)}'
 FORMS = {
     # name: (name of the file, what is in it, sources of the network, how many rows or messages cannot be read)
@@ -118,9 +120,14 @@ FORMS = {
     "lines of the topic of their file": (
         "log.jsonl", "".join(f"{body}\n" for body in UPLINK),
         '{"log.jsonl": field("v", node="a", time="at"), "other.jsonl": field("w", node="a", time="at")}', 0),
-    "a document of JSON": ("log.json", json.dumps([HISTORY], indent=1), QUOTED, 1),
+    "a document of JSON": ("log.json", DOCUMENT, QUOTED, 1),
     "a document of JSON in a line": ("log.json", json.dumps([HISTORY]), QUOTED, 1),
+    "a document of JSON with a field twice in one message, and a bare nan": (
+        "log.json", DOCUMENT.replace('"entity_id": "s"', '"entity_id": nan', 1).replace('"gone"', '99, "state": 98'),
+        QUOTED, 1),
     "our own messages": ("log.jsonl", OWN, "{}", 0),
+    "our own messages of which one has its values twice": ("log.jsonl", OWN + TWICE, "{}", 1),
+    "a document of our own messages": ("log.json", f"[{','.join(OWN.splitlines())}, {TWICE}]", "{}", 1),
     "our own messages with names, a bare nan, and one without a count": (
         "log.jsonl", NAMED + NO_VALUE + NO_COUNT, "{}", 1),
 }  # fmt: skip

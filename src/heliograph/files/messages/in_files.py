@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from heliograph.files.sources.fields import decode_json, parse_number
+from heliograph.files.sources.fields import decode_items, decode_json, fail_of_doubled, parse_number
 from heliograph.files.text.csv_text import CsvRow, csv_rows, read_csv_header
 from heliograph.files.text.dialects import check_distinct
 from heliograph.files.text.text_file import is_text, kind_of, open_text, until_cut_off
@@ -133,12 +133,10 @@ def _read_lines(path: Path) -> Iterator[FileMessage | InputError]:
         if kind_of(path) == ".json":  # one document, of any number of lines, or one a line
             text = file.read()
             try:
-                whole = json.loads(text)
-            except (ValueError, RecursionError):
-                lines = enumerate(text.splitlines(), 1)
-            else:
-                yield from (convert_object(f"{path}, message {n}", item) for n, item in enumerate(flatten(whole), 1))
+                yield from decode_document(text, str(path))
                 return
+            except InputError:
+                lines = enumerate(text.splitlines(), 1)
         else:
             lines = enumerate(file, 1)
         for number, line in lines:
@@ -146,10 +144,16 @@ def _read_lines(path: Path) -> Iterator[FileMessage | InputError]:
                 yield from convert_line(f"{path}, line {number}", line)
 
 
-def flatten(content: object) -> Iterator[object]:
-    """Yield what is in a list, and in lists of lists."""
-    for item in content if isinstance(content, list) else [content]:
-        yield from flatten(item) if isinstance(item, list) else [item]
+def decode_document(text: str | bytes, name: str) -> list[FileMessage | InputError]:
+    """Return the messages of a document of JSON, in lists or lists of lists; an error in place of a bad one.
+
+    Raises:
+        ValueError: no JSON; one line.
+    """
+    return [
+        _convert_item(f"{name}, message {n}", item, doubled)
+        for n, (item, doubled) in enumerate(decode_items(text, name), 1)
+    ]
 
 
 def convert_line(where: str, line: str) -> list[FileMessage | InputError]:
@@ -158,14 +162,19 @@ def convert_line(where: str, line: str) -> list[FileMessage | InputError]:
     if not is_text(line):
         return [fail(where, "a text in UTF-8", show_value(line))]
     try:
-        return [convert_object(where, item) for item in flatten(decode_json(line, where))]
+        return [_convert_item(where, *item) for item in decode_items(line, where)]
     except InputError as error:
         parts = log_line(line)
         return [error if parts is None else FileMessage(where, *parts)]
 
 
-def convert_object(where: str, content: object) -> FileMessage:
-    """Return the message of decoded JSON: of a log that names its topic, or of the topic of its file."""
+def _convert_item(where: str, content: object, doubled: str | None) -> FileMessage | InputError:
+    """Return the message of decoded JSON: of a log that names its topic, or of the topic of its file.
+
+    An error in place of one that has a field twice.
+    """
+    if doubled is not None:
+        return fail_of_doubled(where, doubled)
     logged = read_log_entry(content)
     if logged is None:
         return FileMessage(where, None, content, content.get("arrival") if isinstance(content, dict) else None)

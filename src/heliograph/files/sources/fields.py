@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from decimal import Decimal
 from functools import lru_cache
@@ -32,45 +32,76 @@ class MissingFieldError(InputError):
     """A message has no field at a path."""
 
 
-class DoubledFieldError(ValueError):
-    """An object of JSON has a field twice."""
-
-
-def _refuse_doubled(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return the fields of an object of JSON by name; raise where one is there twice.
-
-    Raises:
-        DoubledFieldError: a field that is there twice, of which the last would win.
-    """
-    fields = dict(pairs)
-    if len(fields) < len(pairs):
-        names = [name for name, _ in pairs]
-        raise DoubledFieldError(next(name for name in names if names.count(name) > 1))
-    return fields
-
-
 def decode_json(text: str | bytes, name: str) -> Any:
     """Decode JSON, in which a bare nan or inf, as printf writes them, is null.
 
     Raises:
         ValueError: no JSON, or a field that is there twice; one line.
     """
+    content, doubled = _decode(text, name)
+    if doubled:
+        raise fail_of_doubled(name, doubled[0][1])
+    return content
+
+
+def decode_items(text: str | bytes, name: str) -> list[tuple[Any, str | None]]:
+    """Decode JSON as `decode_json` does; return what is in its lists, and in lists of these, each alone.
+
+    Returns:
+        Each item, and a field that is there twice within it, None if none is.
+
+    Raises:
+        ValueError: no JSON; one line.
+    """
+    content, doubled = _decode(text, name)
+    return [(item, _find_doubled(item, doubled)) for item in _flatten(content)]
+
+
+def fail_of_doubled(name: str, field: str) -> InputError:
+    """Return the error of an object of JSON that has a field twice, of which decoders use the last."""
+    return fail(name, "distinct fields", f"{field!r} more than once")
+
+
+def _decode(text: str | bytes, name: str) -> tuple[Any, list[tuple[dict[str, Any], str]]]:
+    """Decode JSON; return its content, and the objects in it that have a field twice with the field."""
+    doubled: list[tuple[dict[str, Any], str]] = []
+
+    def collect(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        fields = dict(pairs)
+        if len(fields) < len(pairs):
+            names = [name for name, _ in pairs]
+            doubled.append((fields, next(name for name in names if names.count(name) > 1)))
+        return fields
+
     try:
-        return json.loads(text, object_pairs_hook=_refuse_doubled)
-    except DoubledFieldError as error:
-        raise fail(name, "distinct fields", f"{error.args[0]!r} more than once") from None
+        return json.loads(text, object_pairs_hook=collect), doubled
     except ValueError:
-        pass
+        doubled.clear()
     except RecursionError:
         raise fail(name, "JSON", "brackets nested too deeply") from None
     try:
         words = text.decode() if isinstance(text, bytes) else text
         words = NO_NUMBERS.sub(lambda match: match[0] if match[0][0] == '"' else "null", words)
-        return json.loads(words, object_pairs_hook=_refuse_doubled)
-    except DoubledFieldError as error:
-        raise fail(name, "distinct fields", f"{error.args[0]!r} more than once") from None
+        return json.loads(words, object_pairs_hook=collect), doubled
     except (ValueError, RecursionError):  # also bytes that are no text
         raise fail(name, "JSON", show_value(text)) from None
+
+
+def _find_doubled(content: Any, doubled: list[tuple[dict[str, Any], str]]) -> str | None:
+    """Return the doubled field of an object in `content`, of those that have one."""
+    if not doubled or not isinstance(content, dict | list):
+        return None
+    own = next((field for fields, field in doubled if fields is content), None)
+    if own is not None:
+        return own
+    parts = content.values() if isinstance(content, dict) else content
+    return next((field for part in parts if (field := _find_doubled(part, doubled)) is not None), None)
+
+
+def _flatten(content: object) -> Iterator[object]:
+    """Yield what is in a list, and in lists of lists."""
+    for item in content if isinstance(content, list) else [content]:
+        yield from _flatten(item) if isinstance(item, list) else [item]
 
 
 def match_topic(topic: str, pattern: str) -> bool:

@@ -8,9 +8,8 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from heliograph.files.messages.in_files import FileMessage, convert_line, convert_object, flatten
+from heliograph.files.messages.in_files import FileMessage, convert_line, decode_document
 from heliograph.files.messages.own import OwnReader, is_own
-from heliograph.files.sources.fields import decode_json
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, file_path, flag, instance
 from heliograph.serving.brokers.arrival_order import ArrivalOrder
@@ -108,9 +107,7 @@ class LineReader:
         """Return the messages of a document of several lines; of its lines, where these are none together."""
         self._document = None
         with suppress(InputError):
-            content = decode_json(b"\n".join(lines), self.source)
-            items = enumerate(flatten(content), 1)
-            found = [convert_object(f"{self.source}, message {number}", item) for number, item in items]
+            found = decode_document(b"\n".join(lines), self.source)
             return [payload for message in found for payload in self._message(message, None)]
         self._is_table, self._number = False, self._number - len(lines)
         payloads = list[Payload]()
