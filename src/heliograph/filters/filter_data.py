@@ -181,7 +181,7 @@ def check_data(
     z = check_rows("measurements", measurements, None, filter.received or None, missing=True)
     z = z if filter.received else z[:, :0]
     given = np.zeros((len(z), 0)) if inputs is None and not filter.inputs else inputs
-    u = check_rows("inputs", given, len(z), len(filter.inputs), missing=False)
+    u = check_rows("inputs", given, len(z), len(filter.inputs), missing=False, names=filter.inputs)
     check_inputs(filter.inputs, u, filter)
     if filter.horizon is not None and len(z) > filter.horizon:
         raise fail("measurements", f"at most {filter.horizon} steps, which the filter covers", len(z))

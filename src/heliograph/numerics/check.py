@@ -138,9 +138,25 @@ def _describe_shape(shape: tuple[int | str | None, ...], dimensions: int) -> str
     return f"shape ({lengths}){example}"
 
 
+def check_columns(name: str, table: object, names: Sequence[str] = ()) -> None:
+    """Raise where names of a table's columns contradict an array's: one twice, or just `names` in another order.
+
+    Names are texts; an array, or a table whose columns have numbers, has none.
+    """
+    columns = getattr(table, "columns", None)
+    shown = [] if columns is None or callable(columns) else [c for c in columns if isinstance(c, str)]
+    twice = next((c for c in shown if shown.count(c) > 1), None)
+    if twice is not None:
+        raise fail(name, "distinct columns", f"{twice!r} more than once")
+    if shown != list(names) and sorted(shown) == sorted(names):
+        raise fail(name, f"columns in the order {', '.join(names)}", ", ".join(shown))
+
+
 def _read_numbers(name: str, value: ArrayLike) -> Any:
     """Return real numbers as an array of doubles, traced ones as they are; raise one line of anything else."""
     traced = is_traced(value)
+    if not traced:
+        check_columns(name, value)
     try:
         numbers = jnp.asarray(value) if traced else np.asarray(fill_masked(value))
         if numbers.dtype.kind in "USmM":  # text and dates are no numbers, though they may read as such

@@ -8,10 +8,11 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.model.checks.inputs import check_inputs
-from heliograph.numerics.check import array, check_seed, fail, rank, show_value
+from heliograph.numerics.check import array, check_columns, check_seed, fail, rank, show_value
 from heliograph.numerics.keys import seed_key
 from heliograph.numerics.types import ArrayLike
 from heliograph.simulation.network import Network
+from heliograph.simulation.node import Node, ReceivingNode
 
 Precision = TypeAliasType("Precision", Literal["float64", "float32"])  # of the numbers that a run computes
 
@@ -30,6 +31,7 @@ def inputs_of(network: Network, inputs: ArrayLike | None, horizon: int) -> np.nd
     count = len(network.inputs)
     if inputs is None and count:
         raise fail("inputs", f"an array ({horizon}, {count}) of {list(network.inputs)}", "none")
+    check_columns("inputs", inputs, network.inputs)
     u: np.ndarray = np.zeros((horizon, 0)) if inputs is None else array("inputs", inputs, (horizon, count))
     check_inputs(network.inputs, u, (network.plant, network.nodes, network.fused))
     return u
@@ -42,12 +44,13 @@ def check_precision(precision: object) -> None:
         raise fail("precision", f"one of {', '.join(known)}", show_value(precision))
 
 
-def measurement_of(name: str, value: ArrayLike, steps: int, received: int) -> np.ndarray:
+def measurement_of(name: str, value: ArrayLike, steps: int, node: Node | ReceivingNode) -> np.ndarray:
     """Return a node's measurements (steps, received), NaN where nothing arrived.
 
-    (steps,) is accepted for one component.
+    (steps,) is accepted for one component; columns of a table that have the names of its components have their order.
     """
-    what = f"measurements of node {name!r}"
+    what, received = f"measurements of node {name!r}", node.received
+    check_columns(what, value, node.received_names)
     flat = received == 1 and rank(what, value) == 1
     values: np.ndarray = array(what, value, (steps,) if flat else (steps, received), missing=True)
     return values[:, None] if flat else values

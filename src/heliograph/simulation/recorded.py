@@ -17,7 +17,7 @@ from heliograph.model.limits import Limits
 from heliograph.model.origin import Origin, last_input, usual_months, usual_spacing
 from heliograph.model.plant import TIME_STEP
 from heliograph.model.stuck import Repeats
-from heliograph.numerics.check import array, fail, instance, rank, table
+from heliograph.numerics.check import array, check_columns, fail, instance, rank, table
 from heliograph.numerics.float64 import check_process, quickly_compiled, to_numpy
 from heliograph.numerics.times.row_times import check_times
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree, units_in
@@ -100,9 +100,10 @@ def run(
     if steps == 0:
         raise fail("measurements", "at least one row", "none")
     # Measurements, inputs and times of one length.
-    z = {name: measurement_of(name, measurements[name], steps, node.received) for name, node in network.nodes.items()}
+    z = {name: measurement_of(name, measurements[name], steps, node) for name, node in network.nodes.items()}
     network.check_horizon(steps)
     u = inputs_of(network, inputs, steps)
+    check_columns("truth", truth, network.states)
     true = None if truth is None else array("truth", truth, (steps, len(network.states)), missing=True)
     known = _find_clock(measured, {"inputs": inputs, "truth": truth}, time, steps)
     warn_of_unequal_steps(network.inputs, known)

@@ -7,7 +7,7 @@ import numpy as np
 
 from heliograph.model.checks.inputs import check_inputs
 from heliograph.model.checks.row_times import judge_dates, warn_of_unequal_steps
-from heliograph.numerics.check import array, fail, show_value
+from heliograph.numerics.check import array, check_columns, fail, show_value
 from heliograph.numerics.masked import fill_masked
 from heliograph.numerics.times.rows import check_rows
 from heliograph.numerics.types import Float
@@ -110,6 +110,8 @@ def _split_runs(network: Network, recording: Any, inputs: Any) -> list[tuple[np.
         tables = {f"measurements of {name!r}": z for name, z in held.items()} | {"inputs": known}
         judge_dates(network.inputs, tables)
     # each run: the nodes' columns side by side, and the inputs
+    for name, z in held.items():
+        check_columns(f"measurements of {name!r}", z, network.nodes[name].received_names)
     runs = _list_runs([np.asarray(fill_masked(held[name])) for name in network.names])
     results = []
     for run in runs:
@@ -121,7 +123,7 @@ def _split_runs(network: Network, recording: Any, inputs: Any) -> list[tuple[np.
         steps, count = len(columns[0]), len(network.inputs)
         if known is None and count:
             raise fail("inputs", f"an array ({steps}, {count}) of {list(network.inputs)}", "none")
-        u = np.zeros((steps, 0)) if known is None else check_rows("inputs", known, steps, count, missing=False)
+        u = np.zeros((steps, 0)) if known is None else check_rows("inputs", known, steps, count, False, network.inputs)
         check_inputs(network.inputs, np.asarray(u), (network.plant, network.nodes, network.fused))
         results.append((np.concatenate(columns, axis=1), np.array(u)))
     return results
