@@ -95,7 +95,7 @@ from .filters.gaussian.unscented import (
 from .filters.linear.linear import (
     linear_filter as linear_filter,
 )
-from .filters.words.word_filter import (
+from .filters.words.factory import (
     word_filter as word_filter,
 )
 from .filters.linear.polynomial import (

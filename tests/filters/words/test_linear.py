@@ -114,6 +114,34 @@ def test_claims_hold_of_true_bits(encoder, channel):
     assert low < 1 < high, nees
 
 
+def told():
+    """Error rates of a mode that is told."""
+    chain = hg.random_affine.MarkovChain([[0.95, 0.05], [0.2, 0.8]])
+    links = [hg.decode_and_forward([0.001]), hg.decode_and_forward([0.1])]
+    return hg.model.with_flag(hg.random_affine.Modes(chain, links))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("dither", "claim"), [("subtracted", "exact"), ("triangular", "exact"), ("stochastic", "upper")]
+)
+def test_claims_hold_of_modes_that_are_told(dither, claim):
+    """The dither is taken off by the gain of the mode; a filter of modes bounds that of stochastic rounding."""
+    network = world(words(3, dither, 6.6), told())
+    errors = hg.monte_carlo(network, 40, 20_000, 3, keep=hg.Statistics())["a"]["linear"]
+    assert network.claims()["a"]["linear"] == claim
+    nees, low, high = errors.nees_per_dimension(0.999)
+    assert low < 1 < high or (claim == "upper" and nees < 1), nees
+
+
+def test_words_whose_dither_cannot_be_taken_off_are_not_used():
+    """Nobody told the mode, on which the gain depends."""
+    filter = hg.linear_filter(PLANT, SENSOR, told(), encoder=words(5, "subtracted"))
+    assert filter.received == 3
+    z = np.array([[words(5, "subtracted").low, np.nan, 0.1]])
+    assert filter.run(z).covariances[0, 0, 0] == pytest.approx(A**2 * X + Q, rel=1e-12)
+
+
 @pytest.mark.slow
 def test_claims_hold_of_several_components_and_one_fade_for_a_message():
     plant = hg.LinearPlant([[0.9, 0.2], [-0.1, 0.8]], [[0.1, 0.02], [0.02, 0.2]], [0.5, 0.0], np.eye(2))

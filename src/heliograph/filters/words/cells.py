@@ -27,11 +27,13 @@ def sum_by_edges(t: jax.Array, jumps: jax.Array, here: jax.Array, width: jax.Arr
     """Sum over the edges at t, across which L jumps upwards by `jumps`; L is `here` at t = 0.
 
     M = L(0) + sum_{t >= 0} J Q(t) - sum_{t < 0} J Q(-t), E[t L] = sum J phi(t), E[t^2 L] = M + sum J t phi(t).
+
+    Shapes: t (edges,), jumps (..., edges), here (...), of several likelihoods at once.
     """
     sign = jnp.where(t < 0, -1.0, 1.0)
     step = smooth(jnp.abs(t), jnp.maximum(width, LEAST))
-    mass = here + jnp.sum(jumps * sign * step.beyond)
-    return Sums(mass, jnp.sum(jumps * step.density), mass + jnp.sum(jumps * sign * step.slope))
+    mass = here + jumps @ (sign * step.beyond)
+    return Sums(mass, jumps @ step.density, mass + jumps @ (sign * step.slope))
 
 
 def sum_neighbours(
@@ -43,7 +45,7 @@ def sum_neighbours(
 
     Args:
         pairs: likelihoods of a zero and a one of each bit (bits, 2), for each combination of error rates.
-        weights: probabilities of the combinations.
+        weights: probabilities of the combinations, (..., combinations) of several likelihoods at once.
         start: number of the first word, with which a block begins.
         blocks: how many.
         grid: the words.
@@ -61,17 +63,17 @@ def sum_neighbours(
         following = weigh_bits_above(block + 1)
         likelihood = above @ tables
         # No edge is beyond the last word, and none before the first.
-        after = jnp.where(block < blocks - 1, following @ tables[:, 0], likelihood[-1])
-        jumps = jnp.append(likelihood[1:], after) - likelihood
+        after = jnp.where(block < blocks - 1, following @ tables[:, 0], likelihood[..., -1])
+        jumps = jnp.concatenate([likelihood[..., 1:], after[..., None]], axis=-1) - likelihood
         edges = start + size * block + np.arange(-0.5, size)
         t = (grid.low + edges * grid.step - prior.mean) / prior.deviation
         begun = (t[:-1] < 0) | ((block == 0) & (np.arange(size) == 0))
         ended = (t[1:] < 0) & ((block < blocks - 1) | (np.arange(size) < size - 1))
-        here = jnp.sum(jnp.where(begun & ~ended, likelihood, 0.0))
+        here = jnp.sum(jnp.where(begun & ~ended, likelihood, 0.0), axis=-1)
         sums = sum_by_edges(t[1:], jumps, here, grid.step / prior.deviation, SMOOTH[dither])
         return (total.plus(sums), following), None
 
-    none = Sums(*jnp.zeros(3))
+    none = Sums(*jnp.zeros((3, *weights.shape[:-1])))
     (sums, _), _ = jax.lax.scan(add_block, (none, weigh_bits_above(jnp.zeros(()))), jnp.arange(blocks, dtype=float))
     return sums
 
@@ -96,7 +98,7 @@ def sum_cell(likelihood: jax.Array, index: jax.Array, grid: Grid, prior: Prior, 
     if grid.bits:  # overloads: the end words have one edge
         t = jnp.where(jnp.array([True, False]) & (index <= 0), -40.0, t)
         t = jnp.where(jnp.array([False, True]) & (index >= 2.0**grid.bits - 1), 40.0, t)
-    jumps = likelihood * jnp.array([1.0, -1.0])
+    jumps = likelihood[..., None] * jnp.array([1.0, -1.0])
     here = likelihood * ((t[0] < 0) & (t[1] >= 0))
     return sum_by_edges(t, jumps, here, grid.step / prior.deviation, SMOOTH[dither])
 
@@ -164,7 +166,7 @@ def change_by_bits(
 
     Args:
         pairs: likelihoods of a zero and a one of each bit (bits, 2), for each combination of error rates.
-        weights: probabilities of the combinations.
+        weights: probabilities of the combinations, (..., combinations) of several likelihoods at once.
         received: number of the word that came.
         grid: the words.
         prior: of y.
@@ -180,10 +182,8 @@ def change_by_bits(
 
     def fine_words() -> Change:
         wider, wide = widen(prior, grid, dither)
-        merged = Sums(*jnp.zeros(3))
-        for a, pair in enumerate(pairs):
-            sums = sum_merged(pair, received, grid, wider).plus(sum_overloads(pair, grid, wider))
-            merged = merged.plus(Sums(*(weights[a] * one for one in sums)))
+        sums = [sum_merged(pair, received, grid, wider).plus(sum_overloads(pair, grid, wider)) for pair in pairs]
+        merged = Sums(*(weights @ jnp.stack(terms) for terms in zip(*sums, strict=True)))
         return narrow(change_by_sums(merged), wide)
 
     change: Change = jax.lax.cond(grid.step >= FINE * prior.deviation, wide_words, fine_words)

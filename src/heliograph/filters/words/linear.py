@@ -15,6 +15,7 @@ from heliograph.filters.base import (
 )
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.filters.words.overload import Overload, bound_overload, refuse_overload
+from heliograph.filters.words.received import list_told_modes
 from heliograph.filters.wrappers.wrapper import AbstractWrapper
 from heliograph.model.channel import Channel, check_sent
 from heliograph.model.estimate import Claim, Innovation, lower_by_noise, weakest
@@ -36,13 +37,15 @@ MakeFilter = Callable[[AnyPlant, AnySensor, Channel], AbstractFilter]
 class LinearWordsFilter(AbstractWrapper):
     """A linear filter of the numbers z = q' - c - E[g] d, with q' the received words and d the dithers to take off.
 
-    Of a number that is no word nothing is taken.
+    Of a number that is no word nothing is taken, nor of words whose dither is to be taken off by a mode that nobody
+    told.
 
     Args:
         base: the filter of z.
         centres: c of each output of the channel, 0 of a flag.
-        gains: E[g] of each word whose dither is taken off; none without.
+        gains: E[g] of each word whose dither is taken off, of each mode that is told (modes, words); none without.
         words: outputs that are words.
+        flag: output at which the mode is told on which gains depend; None without one.
         overload: of the words, before any data.
     """
 
@@ -50,6 +53,7 @@ class LinearWordsFilter(AbstractWrapper):
     centres: Array
     gains: Array
     words: tuple[int, ...] = eqx.field(static=True)
+    flag: int | None = eqx.field(static=True)
     overload: Overload
 
     @corrects
@@ -70,7 +74,10 @@ class LinearWordsFilter(AbstractWrapper):
         values = z[: len(self.centres)] - jnp.asarray(self.centres)
         if self.received == len(self.centres):
             return values
-        return values.at[np.array(self.words)].add(-jnp.asarray(self.gains) * z[len(self.centres) :])
+        gains = jnp.asarray(self.gains)
+        gain = gains[0] if self.flag is None else jnp.where(z[self.flag] == jnp.arange(len(gains)), 1.0, 0.0) @ gains
+        gain = gain if self.flag is None else jnp.where(jnp.isnan(z[self.flag]), jnp.nan, gain)
+        return values.at[np.array(self.words)].add(-gain * z[len(self.centres) :])
 
 
 def build_behind_words(
@@ -88,27 +95,37 @@ def build_behind_words(
     instance("encoder", encoder, Words, "Words").check_outputs(outputs)
     check_sent(first(sensor), first(channel))
     places, numbers = find_places(channel), about_centres(encoder, channel)
+    # Laws of the words: of each mode where modes are told, of each step else.
+    told = [about_centres(encoder, link) for link in list_told_modes(first(channel))]
+    laws = [first(law) for law in told or unstack(numbers)]
     remembers = first(channel).remembers
-    if remembers and encoder.dither in ("stochastic", "subtracted"):
-        raise fail("encoder behind a channel that remembers", 'dither="triangular" (or "none")', repr(encoder.dither))
+    fades = (remembers and not told) or any(has_random_gain(law, second_order(law)) for law in laws)
+    if encoder.dither in ("stochastic", "subtracted") and remembers and fades:
+        expected = 'dither="triangular" (or "none"), or modes with one error rate each, told last (hg.model.with_flag)'
+        raise fail("encoder behind a channel that remembers", expected, repr(encoder.dither))
     if find_rounded(sensor):
         raise fail(
             "sensor of a node with an encoder", "one without resolution, as words have their own", "a resolution"
         )
     # The sensor of y - c with rounding, and the filter of numbers behind it.
-    gaussian = _is_gaussian(plant, sensor) and not first(channel).past
-    rounded = at_each_step(lambda one: _round_sensor(one, encoder, gaussian, remembers or _fades(numbers)), sensor)
+    gaussian = _is_gaussian(plant, sensor) and not first(channel).past and not remembers  # filters of modes use bounds
+    rounded = at_each_step(lambda one: _round_sensor(one, encoder, gaussian, fades), sensor)
     base = make(plant, rounded, numbers)
     overload = bound_overload(plant, rounded, numbers, encoder, places)
     refuse_overload(overload)
     words = tuple(i for i, place in enumerate(places) if place != FLAG)
     centres = np.array([0.0 if place == FLAG else encoder.each(encoder.centre, outputs)[place] for place in places])
-    gains = _mean_gains(numbers)[list(words)] if encoder.subtracts else np.zeros(0)
+    gains = _gains_by_mode(laws if told else [numbers], words) if encoder.subtracts else np.zeros((1, 0))
     late: Claim = "upper" if first(channel).past else "exact"  # before the first word its noise is none, and claimed
     claim = weakest([lower_by_noise(base.claim, rounded), late, _claim_of(overload)])
-    received = len(places) + len(gains)
     return LinearWordsFilter(
-        base=base, centres=centres, gains=gains, words=words, overload=overload, **make_sizes(claim, start, received)
+        base=base,
+        centres=centres,
+        gains=gains,
+        words=words,
+        flag=len(places) - 1 if told else None,
+        overload=overload,
+        **make_sizes(claim, start, len(places) + gains.shape[1]),
     )
 
 
@@ -124,9 +141,9 @@ def _round_sensor(sensor: LinearSensor, encoder: Words, gaussian: bool, matters:
     return LinearSensor(sensor.matrix, noise, sensor.outputs)
 
 
-def _fades(numbers: Channel) -> bool:
-    """Test whether the gain of words is random."""
-    return any(has_random_gain(link, second_order(link)) for link in unstack(numbers))
+def _gains_by_mode(laws: list[Channel], words: tuple[int, ...]) -> np.ndarray:
+    """Return the mean gain of each word in each mode, (modes, words)."""
+    return np.stack([_mean_gains(law)[list(words)] for law in laws])
 
 
 def _mean_gains(numbers: Channel) -> np.ndarray:

@@ -67,25 +67,33 @@ def describe_link(channel: AbstractRandomAffine) -> LinkOfBits:
         fixed = _fix_rates(channel)
         weights = np.array([[share for share, _ in fixed]], dtype=float)
         return LinkOfBits(tuple(link for _, link in fixed), weights, None)
-    parts = channel.in_parallel
-    flags = [part for part in parts if isinstance(part, ModeOutput)]
-    chains = {link.memory.identity: link.memory for link in _list_modes(channel)}
-    told = len(flags) == 1 and set(chains) == {flags[0].memory.identity}
-    if not told or parts[-1] is not flags[0] or len(parts) < 2:
+    told = list_told_modes(channel)
+    if not told:
         expected = "one without memory, or with modes of one chain that are told last: hg.model.with_flag(link)"
         raise fail("channel of a word filter", expected, "modes that are not told")
-    modes = next(iter(chains.values())).modes
     links, rows = list[AbstractRandomAffine](), list[np.ndarray]()
-    for mode in range(modes):
-        fixed = _fix_rates(Stack([_choose_mode(part, mode) for part in parts[:-1]]))
+    for given in told:
+        fixed = _fix_rates(given)
         links += [link for _, link in fixed]
         rows.append(np.array([share for share, _ in fixed], dtype=float))
-    weights = np.zeros((modes, len(links)))
+    weights = np.zeros((len(told), len(links)))
     start = 0
     for mode, row in enumerate(rows):
         weights[mode, start : start + len(row)] = row
         start += len(row)
     return LinkOfBits(tuple(links), weights, channel.outputs - 1)
+
+
+def list_told_modes(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
+    """Return the channel, without what is told, in each mode of its chain, where this is told last; else nothing."""
+    parts = channel.in_parallel
+    flags = [part for part in parts if isinstance(part, ModeOutput)]
+    chains = {link.memory.identity: link.memory for link in _list_modes(channel)}
+    told = len(flags) == 1 and set(chains) == {flags[0].memory.identity}
+    if not told or parts[-1] is not flags[0] or len(parts) < 2:
+        return []
+    modes = next(iter(chains.values())).modes
+    return [Stack([_choose_mode(part, mode) for part in parts[:-1]]) for mode in range(modes)]
 
 
 def _list_modes(link: AbstractRandomAffine) -> list[Modes]:

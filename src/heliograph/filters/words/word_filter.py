@@ -1,7 +1,5 @@
 """The filter behind words that knows what a rounded number and a flipped bit are: exact moments of a Gaussian prior."""
 
-from copy import copy
-from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -12,29 +10,20 @@ import numpy as np
 from heliograph.factors.columns import Columns, join_columns, rounding_of
 from heliograph.factors.gaussian import Gaussian, append_rows, impose_moments_of_combination, take_leading
 from heliograph.factors.repeated import triangularise_noise
-from heliograph.filters.base import Step, corrects, make_sizes
+from heliograph.filters.base import Step, corrects
 from heliograph.filters.gaussian.belief import AbstractBeliefFilter, second_moments_at_start
 from heliograph.filters.gaussian.signal import Signal, innovation_covariance, signal_of
-from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
 from heliograph.filters.words.cells import Change, change_by_bits, change_by_cell
-from heliograph.filters.words.received import LinkOfBits, describe_link, is_free_of_flips
+from heliograph.filters.words.received import LinkOfBits
 from heliograph.filters.words.sums import Grid, Prior
-from heliograph.model.channel import Channel, check_link, perfect
 from heliograph.model.estimate import Innovation
-from heliograph.model.fading import without_memory
-from heliograph.model.over_time import OverTime, at, at_each_step, first, unstack
-from heliograph.model.plant import AnyPlant, check_plant
-from heliograph.model.premises.premise import Premise, believing
-from heliograph.model.sensor import AbstractSensor, AnySensor, check_sensor, refuse_angles
-from heliograph.model.words.encoder import Dither, Words
-from heliograph.model.words.route import FLAG, about_centres, find_places
-from heliograph.numerics.check import fail, instance
+from heliograph.model.over_time import OverTime, at
+from heliograph.model.sensor import AnySensor
+from heliograph.model.words.encoder import Dither
+from heliograph.model.words.route import FLAG
 from heliograph.numerics.types import Array, ArrayLike
-from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.combine import Stack
-from heliograph.random_affine.modes import ModeOutput
-from heliograph.random_affine.moments.second_moments import SecondOrder, second_order
-from heliograph.random_affine.words.rounded import LARGEST, Rounded, find_rounded
+from heliograph.random_affine.moments.second_moments import SecondOrder
+from heliograph.random_affine.words.rounded import LARGEST
 
 OFF = 1e-6  # steps by which a received number may miss a word
 
@@ -75,13 +64,12 @@ class WordFilter(AbstractBeliefFilter):
     def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
         """Correct with the words that arrived, one component of y after another."""
         z, n = jnp.asarray(z), len(self.states)
-        signal = self._measure(state, k)
+        signal = self.measure(state, k)
         noise = triangularise_noise(join_columns(signal.noise, rounding_of(signal.size)))
         joint, total = append_rows(state, signal.mean, signal.slopes, noise), jnp.zeros(())
-        words = self._read(z, at(self.links, k))
+        words = self.read(z, at(self.links, k))
         for i in range(len(self.low)):
-            row = joint.root[n + i]
-            prior = Prior(joint.mean[n + i], jnp.sqrt(row**2 @ joint.variances))
+            row, prior = joint.root[n + i], self.prior_of(joint, i)
             change = self._condition(i, words, prior)
             there = words.present[i] & jnp.isfinite(change.log_mass) & (prior.deviation > 0)
             row = jnp.where(there, row, 0.0)
@@ -89,19 +77,19 @@ class WordFilter(AbstractBeliefFilter):
             joint = impose_moments_of_combination(joint, row, shift * prior.deviation, ratio)
             total = total + jnp.where(words.present[i], change.log_mass, 0.0)
         total = jnp.where(words.are_words, total, -jnp.inf)
-        return take_leading(joint, n), self._innovation(signal, words, z, at(self.numbers, k), total)
+        return take_leading(joint, n), self.innovation(signal, words, z, at(self.numbers, k), total)
 
     @property
     def of_atoms(self) -> bool:
         """Always True: a number that is no word is excluded."""
         return True
 
-    def _measure(self, state: Gaussian, k: Step) -> Signal:
+    def measure(self, state: Gaussian, k: Step) -> Signal:
         """Return the moments of y before it is rounded."""
         plant, sensor = at(self.plant, k), at(self.sensor, k)
         return signal_of(plant, sensor, self.transform, state, second_moments_at_start(self.plant, self))
 
-    def _read(self, z: jax.Array, link: LinkOfBits) -> "Received":
+    def read(self, z: jax.Array, link: LinkOfBits) -> "Received":
         """Read which words were received, and what their bits say of those that were sent.
 
         z has the received words, and flags of modes among them, as `places` says; behind these, where dither is
@@ -116,7 +104,7 @@ class WordFilter(AbstractBeliefFilter):
         number = jnp.round(jnp.where(there, index, 0.0))
         # What arrives must be a word, up to the rounding of low and of low + i D, both in units of D.
         size = jnp.abs(number) + jnp.abs(jnp.asarray(self.low) / jnp.asarray(self.spacing))[places]
-        tolerance = OFF + 8 * jnp.finfo(index.dtype).eps * size
+        tolerance = OFF + 8 * np.finfo(index.dtype).eps * size
         wrong = jnp.abs(jnp.where(there, index, 0.0) - number) > tolerance
         if self.bits:
             wrong = wrong | (number < 0) | (number > 2.0**self.bits - 1)
@@ -135,15 +123,36 @@ class WordFilter(AbstractBeliefFilter):
             weights = link.weigh(z[:outputs])
         return Received(numbers, dithers, present, pairs, weights, ~jnp.any(wrong & there))
 
+    def prior_of(self, joint: Gaussian, i: int) -> Prior:
+        """Return the law of y_i in that of the state and y."""
+        place = len(self.states) + i
+        return Prior(joint.mean[place], jnp.sqrt(joint.root[place] ** 2 @ joint.variances))
+
+    def condition_by_leading_bits(self, i: int, words: "Received", prior: Prior, leading: int) -> Change:
+        """Condition y_i on its word and on whether the word was right in its `leading` bits: (right, not)."""
+        pairs, bits = [one[i] for one in words.pairs], np.arange(self.bits)
+        bit = jnp.mod(jnp.floor(words.numbers[i] / 2.0**bits), 2.0)
+        as_received = jnp.stack([1 - bit, bit], axis=-1)
+        sure = jnp.where((bits >= self.bits - leading)[:, None], as_received, 1.0)
+        # Both answers from the same sums: of all likelihoods, and of those that are right.
+        both = [*pairs, *(pair * sure for pair in pairs)]
+        right, wrong = jnp.append(0 * words.weights, words.weights), jnp.append(words.weights, -words.weights)
+        weights = jnp.stack([right, wrong])
+        return change_by_bits(both, weights, words.numbers[i], self._grid(i, words), prior, self.dither)
+
     def _condition(self, i: int, words: "Received", prior: Prior) -> Change:
         """Condition y_i on what was received of its word."""
-        grid = Grid(jnp.asarray(self.low)[i] - words.dithers[i], jnp.asarray(self.spacing)[i], self.bits)
+        grid = self._grid(i, words)
         if self.certain:
             return change_by_cell(words.numbers[i], grid, prior, self.dither)
         pairs = [one[i] for one in words.pairs]
         return change_by_bits(pairs, words.weights, words.numbers[i], grid, prior, self.dither)
 
-    def _innovation(
+    def _grid(self, i: int, words: "Received") -> Grid:
+        """Return the words of y_i, less the dither."""
+        return Grid(jnp.asarray(self.low)[i] - words.dithers[i], jnp.asarray(self.spacing)[i], self.bits)
+
+    def innovation(
         self, signal: Signal, words: "Received", z: jax.Array, numbers: SecondOrder, total: jax.Array
     ) -> Innovation:
         """Return the innovation of the words as numbers about their centres, flags and dithers as not received."""
@@ -186,113 +195,3 @@ def _pick_first(copies: list[tuple[jax.Array, ...]]) -> tuple[jax.Array, ...]:
     for came, number, d in reversed(copies):
         chosen = came | chosen[0], jnp.where(came, number, chosen[1]), jnp.where(came, d, chosen[2])
     return chosen
-
-
-class Alphabet(NamedTuple):
-    """The words of each component: a word, the step and the centre, bits (0 without end), and the dither."""
-
-    low: np.ndarray
-    step: np.ndarray
-    centre: np.ndarray
-    bits: int
-    dither: Dither
-
-
-def _alphabet_of(sensor: AbstractSensor, encoder: Words | None) -> Alphabet:
-    """Return the words of an encoder, or of a sensor that reports multiples of its resolution."""
-    m = len(sensor.outputs)
-    rounded = find_rounded(sensor)
-    if encoder is not None:
-        instance("encoder", encoder, Words, "Words").check_outputs(m)
-        if rounded:
-            expected = "one without resolution, as words have their own"
-            raise fail("sensor of a node with an encoder", expected, "a resolution")
-        low, step, centre = (encoder.each(end, m) for end in (encoder.low, encoder.step, encoder.centre))
-        return Alphabet(low, step, centre, encoder.bits, encoder.dither)
-    if not isinstance(sensor.noise, Rounded):
-        raise fail("word filter", "an encoder (Words), or a sensor with a resolution", "neither")
-    return Alphabet(np.zeros(m), np.asarray(sensor.noise.step), np.zeros(m), 0, "none")
-
-
-def _take_off_rounding(sensor: AbstractSensor) -> AbstractSensor:
-    """Return the sensor with the noise that it has before it rounds."""
-    if not isinstance(sensor.noise, Rounded):
-        return sensor
-    twin = copy(sensor)
-    object.__setattr__(twin, "noise", sensor.noise.source)
-    return twin
-
-
-def _describe_numbers(encoder: Words | None, channel: AbstractRandomAffine) -> SecondOrder:
-    """Return the second moments of the words that arrive as numbers about their centres, modes averaged over."""
-    words = [part for part in channel.in_parallel if not isinstance(part, ModeOutput)]
-    link = words[0] if len(words) == 1 else Stack(words)
-    numbers = link if encoder is None else about_centres(encoder, link)
-    forgets = without_memory(first(numbers).condition_on_arrival())
-    return second_order(first(forgets))
-
-
-def word_filter(
-    plant: AnyPlant,
-    sensor: AnySensor,
-    channel: Channel | None = None,
-    encoder: Words | None = None,
-    transform: AbstractTransform | None = None,
-) -> WordFilter:
-    """Return the filter that knows what a rounded number is, and what a flipped bit does.
-
-    Given the Gaussian prior its update has the exact mean and covariance: of words of at most 6 bits, and of all whose
-    step is a quarter of the deviation of y or more, to rounding; finer words are merged to cells of an eighth to a
-    quarter of it, which changes the mean by 1e-4 deviations and the variance by .6 %. At p = .01 and 8 bits it has half
-    the error of the best linear filter, and is as good as with a checksum that costs no bit.
-
-    One word over several paths is used as one: the bits of all that came are weighed together. Error rates that are
-    drawn are averaged over. Modes that are told with each message (`hg.model.with_flag`) have their own rates.
-
-    Args:
-        plant: linear or not; n states.
-        sensor: linear or not; with a `resolution` if there is no encoder.
-        channel: of words, from the sensor to the filter: all arrives by default.
-        encoder: `Words` of the sender; None for a sensor that reports multiples of its resolution.
-        transform: moments of a plant or sensor that is not linear, `Cubature()` by default.
-
-    Claim: "nominal": the prior is not Gaussian after the first word. The squared error is as claimed within a tenth
-    where a step is at most three deviations of y, and everywhere with a dither that is taken off.
-
-    Raises:
-        ValueError: parts that do not fit, angles, neither encoder nor resolution or both, a channel that is late, modes
-            that are not told, words without end behind more than losses.
-
-    Source: Curry, Estimation and control with quantized measurements (1970), the Gaussian fit, for any word channel.
-    """
-    start = check_plant(plant)
-    check_sensor(first(sensor), len(start.states))
-    channel = perfect(len(first(sensor).outputs)) if channel is None else channel
-    check_link(first(sensor), first(channel), len(start.states), late=True)
-    refuse_angles("word filter", plant, sensor)
-    words = _alphabet_of(first(sensor), encoder)
-    places = find_places(channel)
-    links = at_each_step(describe_link, channel)
-    certain = all(is_free_of_flips(link) for link in unstack(links))
-    if encoder is None and not certain:
-        raise fail("encoder", "Words, whose bits the channel flips", "none")
-    rule = Cubature() if transform is None else instance("transform", transform, AbstractTransform, "a transform")
-    dithers = sum(place != FLAG for place in places) if words.dither == "subtracted" else 0
-    filter = WordFilter(
-        plant=plant,
-        transform=rule,
-        initial_mean=start.initial_mean,
-        initial_covariance=start.initial_covariance,
-        sensor=at_each_step(_take_off_rounding, sensor),
-        links=links,
-        numbers=at_each_step(partial(_describe_numbers, encoder), channel),
-        low=words.low,
-        spacing=words.step,
-        centre=words.centre,
-        places=places,
-        bits=words.bits,
-        dither=words.dither,
-        certain=certain,
-        **make_sizes("nominal", start, len(places) + dithers),
-    )
-    return believing(filter, Premise(plant, sensor, channel, encoder=encoder, order=None))

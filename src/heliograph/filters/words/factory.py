@@ -1,0 +1,150 @@
+"""The filter behind words, built for a plant, a sensor and a channel of words."""
+
+from copy import copy
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter, make_sizes
+from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
+from heliograph.filters.words.received import describe_link, is_free_of_flips
+from heliograph.filters.words.two_hypotheses import keep_two_hypotheses
+from heliograph.filters.words.word_filter import WordFilter
+from heliograph.filters.wrappers.delay import late_filter
+from heliograph.model.channel import Channel, check_link, perfect
+from heliograph.model.fading import without_memory
+from heliograph.model.over_time import at_each_step, first, unstack
+from heliograph.model.plant import AnyPlant, check_plant
+from heliograph.model.premises.premise import Premise, believing
+from heliograph.model.sensor import AbstractSensor, AnySensor, check_sensor, refuse_angles
+from heliograph.model.words.encoder import Dither, Words
+from heliograph.model.words.route import FLAG, about_centres, find_places
+from heliograph.numerics.check import fail, instance, show_value
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.combine import Stack
+from heliograph.random_affine.delay import Delayed
+from heliograph.random_affine.modes import ModeOutput
+from heliograph.random_affine.moments.second_moments import SecondOrder, second_order
+from heliograph.random_affine.words.rounded import Rounded, find_rounded
+
+
+class Alphabet(NamedTuple):
+    """The words of each component: a word, the step and the centre, bits (0 without end), and the dither."""
+
+    low: np.ndarray
+    step: np.ndarray
+    centre: np.ndarray
+    bits: int
+    dither: Dither
+
+
+def _alphabet_of(sensor: AbstractSensor, encoder: Words | None) -> Alphabet:
+    """Return the words of an encoder, or of a sensor that reports multiples of its resolution."""
+    m = len(sensor.outputs)
+    rounded = find_rounded(sensor)
+    if encoder is not None:
+        instance("encoder", encoder, Words, "Words").check_outputs(m)
+        if rounded:
+            expected = "one without resolution, as words have their own"
+            raise fail("sensor of a node with an encoder", expected, "a resolution")
+        low, step, centre = (encoder.each(end, m) for end in (encoder.low, encoder.step, encoder.centre))
+        return Alphabet(low, step, centre, encoder.bits, encoder.dither)
+    if not isinstance(sensor.noise, Rounded):
+        raise fail("word filter", "an encoder (Words), or a sensor with a resolution", "neither")
+    return Alphabet(np.zeros(m), np.asarray(sensor.noise.step), np.zeros(m), 0, "none")
+
+
+def _take_off_rounding(sensor: AbstractSensor) -> AbstractSensor:
+    """Return the sensor with the noise that it has before it rounds."""
+    if not isinstance(sensor.noise, Rounded):
+        return sensor
+    twin = copy(sensor)
+    object.__setattr__(twin, "noise", sensor.noise.source)
+    return twin
+
+
+def _describe_numbers(encoder: Words | None, channel: AbstractRandomAffine) -> SecondOrder:
+    """Return the second moments of the words that arrive as numbers about their centres, modes averaged over."""
+    words = [part for part in channel.in_parallel if not isinstance(part, ModeOutput)]
+    link = words[0] if len(words) == 1 else Stack(words)
+    numbers = link if encoder is None else about_centres(encoder, link)
+    forgets = without_memory(first(numbers).condition_on_arrival())
+    return second_order(first(forgets))
+
+
+def word_filter(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel | None = None,
+    encoder: Words | None = None,
+    transform: AbstractTransform | None = None,
+    hypotheses: int = 2,
+) -> AbstractFilter:
+    """Return the filter that knows what a rounded number is, and what a flipped bit does.
+
+    Given a Gaussian prior its update has the exact mean and covariance: of words of at most 6 bits, and of all whose
+    step is a quarter of the deviation of y or more, to rounding; finer words are merged to cells of an eighth to a
+    quarter of it, which changes the mean by 1e-4 deviations and the variance by .6 %. At p = .01 and 8 bits it has half
+    the error of the best linear filter, and is as good as with a checksum that costs no bit.
+
+    Where bits flip it carries two Gaussians, by whether the last word was right in its leading bits. One of both, at a
+    third of the cost, takes a place that wrong bits made probable for certain, now and then for tens of steps.
+
+    One word over several paths is used as one: the bits of all that came are weighed together. Error rates that are
+    drawn are averaged over. Modes that are told with each message (`hg.model.with_flag`) have their own rates. Words
+    that are late by a constant delay are used for the past, which is predicted to the present.
+
+    Args:
+        plant: linear or not; n states.
+        sensor: linear or not; with a `resolution` if there is no encoder.
+        channel: of words, from the sensor to the filter: all arrives by default.
+        encoder: `Words` of the sender; None for a sensor that reports multiples of its resolution.
+        transform: moments of a plant or sensor that is not linear, `Cubature()` by default.
+        hypotheses: 2, Gaussians that are carried where bits flip; or 1 (default 2).
+
+    Claim: "nominal": the prior is not Gaussian after the first word. The squared error is as claimed within a tenth
+    where a step is at most three deviations of y, and everywhere with a dither that is taken off.
+
+    Raises:
+        ValueError: parts that do not fit, angles, neither encoder nor resolution or both, a channel that is late by
+            chance, modes that are not told, words without end behind more than losses.
+
+    Source: Curry, Estimation and control with quantized measurements (1970), the Gaussian fit, for any word channel.
+    """
+    if not isinstance(hypotheses, int) or hypotheses not in (1, 2):
+        raise fail("hypotheses", "1 or 2", show_value(hypotheses))
+    start = check_plant(plant)
+    check_sensor(first(sensor), len(start.states))
+    if isinstance(channel, Delayed) and channel.constant and not channel.timestamped:
+        return late_filter(word_filter(plant, sensor, channel.link, encoder, transform, hypotheses), channel.past)
+    channel = perfect(len(first(sensor).outputs)) if channel is None else channel
+    check_link(first(sensor), first(channel), len(start.states), late=True)
+    refuse_angles("word filter", plant, sensor)
+    words = _alphabet_of(first(sensor), encoder)
+    places = find_places(channel)
+    links = at_each_step(describe_link, channel)
+    certain = all(is_free_of_flips(link) for link in unstack(links))
+    if encoder is None and not certain:
+        raise fail("encoder", "Words, whose bits the channel flips", "none")
+    rule = Cubature() if transform is None else instance("transform", transform, AbstractTransform, "a transform")
+    dithers = sum(place != FLAG for place in places) if words.dither == "subtracted" else 0
+    one = WordFilter(
+        plant=plant,
+        transform=rule,
+        initial_mean=start.initial_mean,
+        initial_covariance=start.initial_covariance,
+        sensor=at_each_step(_take_off_rounding, sensor),
+        links=links,
+        numbers=at_each_step(partial(_describe_numbers, encoder), channel),
+        low=words.low,
+        spacing=words.step,
+        centre=words.centre,
+        places=places,
+        bits=words.bits,
+        dither=words.dither,
+        certain=certain,
+        **make_sizes("nominal", start, len(places) + dithers),
+    )
+    filter: AbstractFilter = one if certain or hypotheses == 1 else keep_two_hypotheses(one)
+    return believing(filter, Premise(plant, sensor, channel, encoder=encoder, order=None))
