@@ -237,6 +237,19 @@ def test_a_table_of_numbers_alone_reads_as_row_by_row(tmp_path):
             assert one[name].tobytes() == other[name].tobytes()
 
 
+@pytest.mark.parametrize(
+    "header", ['"a","b"', '"a",b', '"a\n","b"', '"a ""b""",b'], ids=["both", "one", "line", "quotes"]
+)
+def test_names_in_quotes_stand_above_a_table_of_numbers_alone(tmp_path, header):
+    """As pyarrow writes them; a name of two lines is for the reader of rows."""
+    lines = "\n".join(["1,2", "3,", ",4"])
+    plain = read_table(text_file(tmp_path, f"{header}\n{lines}\n", "plain.csv"))
+    beside = read_table(text_file(tmp_path, f"{header}\n{lines}\n".replace("3,", '"3",'), "beside.csv"))
+    assert list(plain) == list(beside)
+    for name, values in plain.items():
+        assert values.tobytes() == beside[name].tobytes()
+
+
 @pytest.mark.parametrize("row", ["1", "1,2,3", "1,x", "1,1-2", '1,"2', "# 1,2"])
 def test_a_row_of_a_table_of_numbers_that_is_none_is_named(tmp_path, row):
     with pytest.raises(ValueError, match="row 2"):

@@ -22,6 +22,15 @@ def test_a_claim_holds_where_mean_and_covariance_are_numbers(claim):
     assert alone == list(result.claims)  # a stream's claim is lowered so, below
 
 
+def test_covariances_that_repeat_are_judged_as_each_by_itself():
+    """As of a long recording: most are the one before, few are not, and some of these are none."""
+    rng = np.random.default_rng(0)
+    which = np.where(rng.random(3_000) < 0.9, 0, rng.integers(4, size=3_000))
+    which[[1_500, -1]] = 0  # of equal ends
+    of_rows = Estimate(np.zeros((3_000, 2)), COVARIANCE[which], "exact").claims
+    assert of_rows.tolist() == Estimate(MEAN, COVARIANCE, "exact").claims[which].tolist()
+
+
 def test_of_no_covariance_nothing_is_claimed():
     assert Estimate(MEAN, COVARIANCE, "none").claims.tolist() == ["none"] * 4
 

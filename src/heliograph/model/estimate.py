@@ -137,10 +137,24 @@ def is_sound(estimate: Estimate) -> np.ndarray:
     finite = ~find_lost(np.asarray(estimate.mean), 1)
     if estimate.claim == "none":
         return finite
-    bound = np.asarray(estimate.covariance)
-    finite &= ~find_lost(bound, 2)
+    return np.asarray(finite & _are_covariances(np.asarray(estimate.covariance)))
+
+
+def _are_covariances(bound: np.ndarray) -> np.ndarray:
+    """Mask of the matrices (..., n, n) that are finite and positive semidefinite to rounding."""
+    # Of a long recording most are the matrix of the row before, and judged with it.
+    if bound.ndim == 3 and len(bound) > 2 and np.array_equal(bound[-1], bound[len(bound) // 2]):
+        rows = bound.reshape(len(bound), -1)
+        changes = np.append(True, (rows[1:] != rows[:-1]).any(axis=1))
+        return np.asarray(_judge_covariances(bound[changes])[np.cumsum(changes) - 1])
+    return _judge_covariances(bound)
+
+
+def _judge_covariances(bound: np.ndarray) -> np.ndarray:
+    """Return the same mask, of each matrix by itself."""
+    finite = ~find_lost(bound, 2)
     if finite.all() and _are_definite((bound + np.swapaxes(bound, -1, -2)) / 2):
-        return finite
+        return np.asarray(finite)
     safe = np.where(finite[..., None, None], bound, np.eye(bound.shape[-1]))
     unit = standard_deviations(safe)
     correlations = (safe + np.swapaxes(safe, -1, -2)) / (2 * unit[..., :, None] * unit[..., None, :])

@@ -26,7 +26,7 @@ def read_plain_numbers(path: Path) -> tuple[list[str], Float[np.ndarray, "rows c
     blocks = list[np.ndarray]()
     with path.open("rb") as file:
         start = file.readline(BLOCK)
-        if not start.isascii() or b"\0" in start or b'"' in start:
+        if not start.isascii() or b"\0" in start or start.count(b'"') % 2:  # a name that goes on in the next line
             return None
         text = CsvText(str(path), path, marked=False)
         text.add(start.decode())
