@@ -24,6 +24,7 @@ FILTERS = {
     "the Kalman filter, 4 states, 2 outputs, a gain of its own in each run and step": ("kalman", "kalman_heliograph"),
     "the same, smoothed": ("smoothing", "smoothing_heliograph"),
     "multiple models (IMM), 2 modes, 4 states, 2 outputs": ("modes", "modes_heliograph"),
+    "the same of a plant with 2 laws of motion": ("motion", "motion_heliograph"),
     "the cubature filter behind relays, 5 states, 2 outputs": ("cubature", "cubature_heliograph"),
 }
 STEPS = 20

@@ -84,6 +84,26 @@ def modes(runs: int = 10_000, steps: int = 100) -> Problem:
     return Problem(title, arrays, modes_flops(n, m, 2), 8 * (m + n))
 
 
+def motion(runs: int = 10_000, steps: int = 100) -> Problem:
+    """The Kalman problem's plant that is slower and five times as noisy for a while, two laws of one Markov chain."""
+    draw = np.random.default_rng(23)
+    p = kalman(1, 1).arrays
+    laws, noises = np.array([p["A"], 0.8 * p["A"]]), np.array([p["Q"], 5.0 * p["Q"]])
+    chain = np.array([[0.95, 0.05], [0.1, 0.9]])
+    n, m = 4, 2
+    z, x = np.empty((runs, steps, m)), draw.normal(size=(runs, n))
+    mode = draw.integers(2, size=runs)
+    for k in range(steps):
+        mode = (draw.random(runs) > chain[mode, 0]).astype(int)
+        moved = np.einsum("rij,rj->ri", laws[mode], x)
+        x = moved + np.sqrt(noises[mode][:, 0, 0])[:, None] * draw.normal(size=(runs, n))
+        z[:, k] = x @ p["C"].T + np.sqrt(0.2) * draw.normal(size=(runs, m))
+    arrays = {name: p[name] for name in ("C", "R", "mean", "covariance")}
+    arrays |= {"laws": laws, "noises": noises, "chain": chain, "law": np.array([0.5, 0.5]), "z": z}
+    title = f"Interacting multiple models, 2 laws of motion, {n} states, {m} measurements"
+    return Problem(title, arrays, modes_flops(n, m, 2), 8 * (m + n))
+
+
 def modes_flops(n: int, m: int, count: int) -> int:
     """A Kalman step for each mode, its likelihood, and the moments of `count` mixtures of `count` Gaussians."""
     mixture = count * (2 * n + n + n * (n + 1))  # means, what is apart, their squares and covariances
