@@ -248,3 +248,18 @@ def test_a_model_that_ends_is_not_forecast_beyond():
     assert hg.forecast(found, 2).outputs is not None
     with pytest.raises(ValueError, match="at most 2 steps, which the model covers"):
         hg.forecast(found, 3)
+
+
+def test_ahead_of_a_start_that_nobody_knows_variances_are_infinite_until_enough_was_measured():
+    plant = hg.LinearPlant([[1.0, 1.0], [0.0, 1.0]], np.diag([100.0, 1.0]), [0.0, 0.0], hg.diffuse)
+    filter = hg.kalman_filter(plant, hg.LinearSensor([[1.0, 0.0]], 15.0))
+    one, two = (hg.forecast(filter.run(rows), 2) for rows in ([[5.0]], [[5.0], [7.0]]))
+    np.testing.assert_array_equal(one.outputs.covariance, np.full((2, 1, 1), np.inf))  # the slope is not known
+    np.testing.assert_array_equal(one.received.covariance, one.outputs.covariance)
+    # Of two rows the level is the last and the slope their difference: that of y_4 - y_2 and twice y_2 - y_1.
+    np.testing.assert_allclose(two.outputs.mean[:, 0], [9.0, 11.0], rtol=1e-12)
+    F, P = plant.matrix, filter.run([[5.0], [7.0]]).covariances[-1]
+    for k in range(2):
+        P = F @ P @ F.T + np.diag([100.0, 1.0])
+        np.testing.assert_allclose(two.states.covariance[k], P, rtol=1e-12)
+        np.testing.assert_allclose(two.outputs.covariance[k], P[:1, :1] + 15.0, rtol=1e-12)

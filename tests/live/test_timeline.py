@@ -190,3 +190,24 @@ def test_its_estimates_are_those_of_run(world):
             expected = record.estimates[node][name]
             np.testing.assert_allclose(estimate.mean, expected.mean[-1], rtol=1e-10, atol=1e-12)
             np.testing.assert_allclose(estimate.covariance, expected.covariance[-1], rtol=1e-10, atol=1e-12)
+
+
+def test_a_start_that_nobody_knows_goes_on_row_by_row_and_is_kept():
+    plant = hg.LinearPlant([[1.0, 1.0], [0.0, 1.0]], np.diag([100.0, 1.0]), [0.0, 0.0], hg.diffuse)
+    sensor = hg.LinearSensor([[1.0, 0.0]], 15.0)
+    filter = hg.kalman_filter(plant, sensor)
+    network = hg.Network(plant, {"node": hg.Node(sensor, hg.perfect(1), {"f": filter})})
+    z, timeline = [5.0, 7.0, 8.0], hg.Timeline(network, window=10)
+    run = filter.run(z)
+    for k in (0, 2, 1):  # out of order
+        timeline.push("node", k, k, [z[k]])
+    estimate = timeline.estimates()["node"]["f"]
+    np.testing.assert_allclose(estimate.mean, run.means[-1], rtol=1e-12)
+    np.testing.assert_allclose(estimate.covariance, run.covariances[-1], rtol=1e-12)
+    again = hg.Timeline.restore(network, timeline.save()).estimates()["node"]["f"]
+    np.testing.assert_array_equal(again.mean, estimate.mean)
+    first = hg.Timeline(network, window=10)
+    first.push("node", 0, 0, [5.0])
+    early = first.estimates()["node"]["f"]
+    np.testing.assert_allclose(np.diagonal(early.covariance), [15.0, np.inf], rtol=1e-12)
+    assert early.claim == "none"  # of a slope that nobody knows it claims nothing yet

@@ -199,3 +199,40 @@ def test_a_stationary_process_is_fitted():
 def test_what_is_no_component_is_refused_in_one_line(call, words):
     with pytest.raises(hg.InputError, match=words):
         call()
+
+
+def test_components_may_start_where_nobody_knows_beside_others_that_are_known():
+    """As the same matrices by hand, and the limit of ever wider starts: 1e8 leaves 1e-8 of itself."""
+    y = np.cumsum(np.random.default_rng(0).normal(size=12)) + np.tile([1.0, -2.0, 0.5, 0.5], 3)
+
+    def structural(start):
+        parts = [
+            hg.models.trend(1.0, 0.1, initial_variance=start),
+            hg.models.seasonal(4, 0.05, initial_variance=start),
+            hg.models.arma([0.5], [], 1.0),
+        ]
+        return hg.models.structural(parts, noise=0.1)
+
+    model = structural(hg.diffuse)
+    by_hand = hg.LinearPlant(
+        model.plant.matrix, model.plant.noise, np.zeros(6), hg.diffuse(model.plant.states[:5], np.eye(6) / 0.75),
+        states=model.plant.states,
+    )  # fmt: skip
+    filter = hg.kalman_filter(model.plant, model.sensor)
+    run, same = filter.run(y), hg.kalman_filter(by_hand, model.sensor).run(y)
+    np.testing.assert_allclose(run.means, same.means, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(run.log_likelihood, same.log_likelihood, rtol=1e-12)
+    wide = structural(1e8)
+    near = hg.kalman_filter(wide.plant, wide.sensor).run(y)
+    np.testing.assert_allclose(run.means[-1], near.means[-1], atol=1e-5)
+    np.testing.assert_allclose(run.covariances[-1], near.covariances[-1], atol=1e-5)
+    smoothed, right = (hg.rts_smoother(one, y) for one in (filter, hg.kalman_filter(wide.plant, wide.sensor)))
+    np.testing.assert_allclose(smoothed.means[0], right.means[0], atol=1e-5)
+
+
+def test_a_law_of_the_start_that_is_not_gaussian_is_refused_beside_one_that_nobody_knows():
+    skew = hg.LinearPlant(
+        [[1.0]], 1.0, [0.0], hg.random_affine.FiniteSupport([[-1.0], [1.0]], [0.5, 0.5]), states=["s"]
+    )
+    with pytest.raises(ValueError, match="law of x_0 of a joined plant: expected a Gaussian one"):
+        hg.models.join([skew, hg.LinearPlant([[1.0]], 1.0, [0.0], hg.diffuse, states=["d"])])

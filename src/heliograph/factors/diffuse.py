@@ -43,9 +43,21 @@ class Diffuse(NamedTuple):
     @property
     def covariance(self) -> jax.Array:
         """Covariance (n, n): of what is unknown infinite on the diagonal and 0 beside it."""
-        root, unknown = self.root, self.unknown
-        finite = (root * self.variances) @ root.T
-        return jnp.where(unknown[:, None] | unknown, jnp.diag(jnp.where(unknown, jnp.inf, 0.0)), finite)
+        root = self.root
+        return mark_unknown((root * self.variances) @ root.T, self.unknown)
+
+
+def mark_unknown(covariance: jax.Array, unknown: jax.Array) -> jax.Array:
+    """Return the covariance (m, m), of unknown components infinite on the diagonal and 0 beside it."""
+    infinite = jnp.diag(jnp.where(unknown, jnp.inf, 0.0))
+    return jnp.where(unknown[:, None] | unknown, infinite, covariance)
+
+
+def project_diffuse(x: Diffuse, matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return the covariance of H x (m, m) by what is known, and which components hear an unknown direction (m,)."""
+    slopes, reach = matrix @ x.root, jnp.abs(matrix) @ jnp.abs(x.root)
+    unknown = jnp.any((jnp.abs(slopes) > DEAF * reach) & (x.infinite > 0), axis=1)
+    return (slopes * x.variances) @ slopes.T, unknown
 
 
 class Levels(NamedTuple):

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import choose_code, compile_on_call, compute_once
+from heliograph.factors.diffuse import Diffuse, mark_unknown, project_diffuse
 from heliograph.factors.gaussian import Gaussian, from_covariance, take_leading
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.belief import second_moments_at_start
@@ -84,6 +85,11 @@ class Outlook(Module):
             return Moments(weights, signal.mean, jax.vmap(lambda each: each.covariance)(signal))
         plant, start = at(self.plant, k), second_moments_at_start(self.plant)
         sensor = at(self.sensor, k).under(plant.inputs, u)
+        if isinstance(prior, Diffuse):  # of a linear sensor, which may hear what nobody knows
+            covariance, unknown = project_diffuse(prior, jnp.asarray(sensor.matrix))
+            noise = jnp.asarray(sensor.noise.covariance)
+            mean = jnp.asarray(sensor.matrix) @ prior.mean + jnp.asarray(sensor.noise.mean)
+            return Moments(jnp.ones(1), mean[None], mark_unknown(covariance + noise, unknown)[None])
 
         def of_part(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
             signal = signal_of(plant, sensor, self.transform, from_covariance(mean, covariance), start)
@@ -103,7 +109,10 @@ class Outlook(Module):
         """Predict over step k; return the state there, and the moments of states, outputs and received numbers."""
         prior = self.filter.predict(state, u, k)
         states = self.mixture(prior)
-        return prior, (states, self.measured(prior, states, u, k), self.received(prior, k))
+        outputs = self.measured(prior, states, u, k)
+        # From an unknown start the sensor is received as it is, and there is no innovation of what nobody knows.
+        received = outputs if isinstance(prior, Diffuse) else self.received(prior, k)
+        return prior, (states, outputs, received)
 
 
 def outlook_of(filter: AbstractFilter, sensor: AnySensor | None = None, plant: AnyPlant | None = None) -> Outlook:

@@ -11,6 +11,7 @@ import numpy as np
 
 from heliograph.model.plant import AbstractPlant, JointNoise, LinearPlant, OfInputs, Plant, matrix_of
 from heliograph.model.sensor import LinearSensor
+from heliograph.model.unknown_start import DiffuseStart, UnknownStart
 from heliograph.models.series import Component
 from heliograph.numerics.check import array, fail, instance, items
 from heliograph.numerics.module import Module, readable
@@ -88,9 +89,7 @@ def join(plants: "Sequence[AbstractPlant]") -> LinearPlant | Plant:
     inputs = list(dict.fromkeys(name for plant in parts for name in plant.inputs))
     places = tuple(tuple(inputs.index(name) for name in plant.inputs) for plant in parts)
     # Laws of the initial state and of the noises.
-    laws = [plant.deviation or Gaussian(plant.initial_covariance) for plant in parts]
-    centers = [plant.initial_mean - law.mean for plant, law in zip(parts, laws, strict=True)]
-    center, start = library(*centers).concatenate(centers), Independent(laws)
+    center, start = _join_starts(parts)
     noises = [plant.noise for plant in parts if isinstance(plant.noise, AbstractNoise)]
     noise = Independent(noises) if len(noises) == len(parts) else JointNoise(tuple(parts), places)
     circular = [name for plant in parts for name in plant.circular]
@@ -101,6 +100,30 @@ def join(plants: "Sequence[AbstractPlant]") -> LinearPlant | Plant:
         return Plant(move, noise, center, start, states, inputs, circular, attitude, limits)
     matrix, driven = _matrices(parts, places, len(inputs))
     return LinearPlant(matrix, noise, center, start, driven, states, inputs, circular, limits)
+
+
+def _join_starts(parts: list[Any]) -> tuple[Any, "NoiseLike | DiffuseStart"]:
+    """Return centre and law of the initial state of plants side by side; where some is unknown, of the others.
+
+    Raises:
+        ValueError: a law of x_0 that is not Gaussian beside a start that nobody knows.
+    """
+    spreads = [plant.initial_covariance for plant in parts]
+    if not any(isinstance(spread, UnknownStart) for spread in spreads):
+        laws = [plant.deviation or Gaussian(spread) for plant, spread in zip(parts, spreads, strict=True)]
+        centers = [plant.initial_mean - law.mean for plant, law in zip(parts, laws, strict=True)]
+        return library(*centers).concatenate(centers), Independent(laws)
+    for plant in parts:
+        if plant.deviation is not None:
+            expected = "a Gaussian one (a covariance) beside a start that nobody knows"
+            raise fail("law of x_0 of a joined plant", expected, type(plant.deviation).__name__)
+    names, known = list[str](), []
+    for plant, spread in zip(parts, spreads, strict=True):
+        unknown = spread.unknown if isinstance(spread, UnknownStart) else ()
+        names += [name for name, nobody_knows in zip(plant.states, unknown, strict=False) if nobody_knows]
+        known.append(spread.known if isinstance(spread, UnknownStart) else spread)
+    means = [plant.initial_mean for plant in parts]
+    return library(*means).concatenate(means), DiffuseStart()(names, block_diagonal(known))
 
 
 def _matrices(parts: list[Any], places: tuple[tuple[int, ...], ...], count: int) -> tuple[Any, Any]:

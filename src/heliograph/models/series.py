@@ -7,6 +7,7 @@ import equinox as eqx
 import numpy as np
 
 from heliograph.model.plant import LinearPlant
+from heliograph.model.unknown_start import DiffuseStart
 from heliograph.models.motion import WIDE
 from heliograph.numerics.check import array, check_count, fail, instance, items, name_list, scalar, text
 from heliograph.numerics.module import Module, readable
@@ -49,7 +50,7 @@ class Component(Module):
 def level(
     variance: "Float[ArrayLike, '']",
     initial_mean: "Float[ArrayLike, '']" = 0.0,
-    initial_variance: "Float[ArrayLike, '']" = WIDE,
+    initial_variance: "Float[ArrayLike, ''] | DiffuseStart" = WIDE,
     name: str = "level",
 ) -> Component:
     """Return a level that wanders: a random walk, the local level model.
@@ -57,7 +58,8 @@ def level(
     Args:
         variance: of a step of the level; 0 for a constant.
         initial_mean: before the first step; 0 by default.
-        initial_variance: of that; 1e8 by default: give more where data are larger than 1,000.
+        initial_variance: of that, or `hg.diffuse` where nobody knows it; 1e8 by default: give more where data are
+            larger than 1,000.
         name: of the component and its state; "level" by default.
 
     Raises:
@@ -68,7 +70,7 @@ def level(
     q, mean, start = (
         scalar("variance of the level", variance, 0.0),
         scalar("initial mean", initial_mean),
-        scalar("initial variance", initial_variance, 0.0),
+        _read_start(initial_variance),
     )
     xp = library(mean)
     return Component(name, LinearPlant([[1.0]], q, xp.reshape(mean, (1,)), start, states=[name]), [1.0])
@@ -78,7 +80,7 @@ def trend(
     level_variance: "Float[ArrayLike, '']",
     slope_variance: "Float[ArrayLike, '']",
     initial_mean: "Float[ArrayLike, '2']" = (0.0, 0.0),
-    initial_variance: "Float[ArrayLike, '']" = WIDE,
+    initial_variance: "Float[ArrayLike, ''] | DiffuseStart" = WIDE,
     name: str = "trend",
 ) -> Component:
     """Return a trend: a level that grows by a slope, both of which wander: the local linear trend.
@@ -90,7 +92,7 @@ def trend(
         level_variance: of w; 0 for a smooth trend.
         slope_variance: of s; 0 for a straight one.
         initial_mean: level and slope before the first step; 0 by default.
-        initial_variance: of both; 1e8 by default.
+        initial_variance: of both, or `hg.diffuse`; 1e8 by default.
         name: of the component; "trend" by default.
 
     Raises:
@@ -104,7 +106,7 @@ def trend(
     ]
     named = text("name of a component", name)
     prefix = "" if named == "trend" else f"{named}_"
-    start = scalar("initial variance", initial_variance, 0.0)
+    start = _read_start(initial_variance)
     plant = LinearPlant(
         [[1.0, 1.0], [0.0, 1.0]],
         _diagonal(variances),
@@ -118,7 +120,7 @@ def trend(
 def seasonal(
     period: int,
     variance: "Float[ArrayLike, '']",
-    initial_variance: "Float[ArrayLike, '']" = WIDE,
+    initial_variance: "Float[ArrayLike, ''] | DiffuseStart" = WIDE,
     name: str = "season",
 ) -> Component:
     """Return a season of dummies: what it adds over a period sums to a noise, s+ = -(s + ... + s_(period-2) ago) + w.
@@ -128,7 +130,7 @@ def seasonal(
     Args:
         period: steps after which it returns, at least 2.
         variance: of w; 0 for a season that is always the same.
-        initial_variance: of each state before the first step; 1e8 by default.
+        initial_variance: of each state before the first step, or `hg.diffuse`; 1e8 by default.
         name: of the component; "season" by default.
 
     Raises:
@@ -137,7 +139,7 @@ def seasonal(
     Source: Harvey, Forecasting, structural time series models and the Kalman filter (1989), 2.3.4.
     """
     n = check_count("period", period, 2) - 1
-    q, start = scalar("variance of the season", variance, 0.0), scalar("initial variance", initial_variance, 0.0)
+    q, start = scalar("variance of the season", variance, 0.0), _read_start(initial_variance)
     matrix = np.eye(n, k=-1)
     matrix[0] = -1.0
     only_first = np.zeros((n, n))
@@ -151,7 +153,7 @@ def trigonometric_seasonal(
     period: float,
     variance: "Float[ArrayLike, '']",
     harmonics: int | None = None,
-    initial_variance: "Float[ArrayLike, '']" = WIDE,
+    initial_variance: "Float[ArrayLike, ''] | DiffuseStart" = WIDE,
     name: str = "season",
 ) -> Component:
     """Return a season as a sum of waves of period, period / 2, ..., each of which wanders.
@@ -163,7 +165,7 @@ def trigonometric_seasonal(
         period: steps after which it returns, above 1; it need not be whole.
         variance: of each wave's noise.
         harmonics: number of waves; by default all that differ at whole steps.
-        initial_variance: of each state before the first step; 1e8 by default.
+        initial_variance: of each state before the first step, or `hg.diffuse`; 1e8 by default.
         name: of the component; "season" by default.
 
     Raises:
@@ -176,7 +178,7 @@ def trigonometric_seasonal(
     count = most if harmonics is None else check_count("harmonics", harmonics)
     if not 1 <= count <= most:
         raise fail("harmonics", f"from 1 to {most}, which differ at whole steps", count)
-    q, start = scalar("variance of the season", variance, 0.0), scalar("initial variance", initial_variance, 0.0)
+    q, start = scalar("variance of the season", variance, 0.0), _read_start(initial_variance)
     named, blocks, states, loading = text("name of a component", name), [], [], []
     for j in range(1, count + 1):
         alone = 2 * j == length  # cos(pi t), of which the shifted wave is 0
@@ -256,7 +258,7 @@ def arma(
 def regression(
     regressors: Names,
     variance: "Float[ArrayLike, '']" = 0.0,
-    initial_variance: "Float[ArrayLike, '']" = WIDE,
+    initial_variance: "Float[ArrayLike, ''] | DiffuseStart" = WIDE,
     name: str = "regression",
 ) -> Component:
     """Return a regression on inputs: y = sum of coefficient times input, and the coefficients may wander.
@@ -266,7 +268,7 @@ def regression(
     Args:
         regressors: names of the inputs.
         variance: of each coefficient's step; 0 by default: constants.
-        initial_variance: of each coefficient before the first step; 1e8 by default.
+        initial_variance: of each coefficient before the first step, or `hg.diffuse`; 1e8 by default.
         name: of the component; "regression" by default.
 
     Raises:
@@ -278,7 +280,7 @@ def regression(
     if not inputs:
         raise fail("regressors", "at least one name", "none")
     n = len(inputs)
-    q, start = scalar("variance of the coefficients", variance, 0.0), scalar("initial variance", initial_variance, 0.0)
+    q, start = scalar("variance of the coefficients", variance, 0.0), _read_start(initial_variance)
     states = [f"{regressor}_coefficient" for regressor in inputs]
     plant = LinearPlant(np.eye(n), q, np.zeros(n), start, np.zeros((n, n)), states, inputs)
     return Component(name, plant, np.ones(n), inputs)
@@ -313,6 +315,11 @@ def stationary_covariance(matrix: Any, noise: Any) -> Any:
     pairs = np.eye(n * n) - xp.kron(matrix, matrix)
     found = xp.reshape(xp.linalg.solve(pairs, xp.reshape(noise, (n * n,))), (n, n))
     return (found + found.T) / 2
+
+
+def _read_start(variance: object) -> Any:
+    """Return the variance of states before the first step, checked; or `hg.diffuse`."""
+    return variance if isinstance(variance, DiffuseStart) else scalar("initial variance", variance, 0.0)
 
 
 def _rotation(angle: Any) -> Any:

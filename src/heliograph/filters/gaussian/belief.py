@@ -28,6 +28,7 @@ from heliograph.model.modes_of_motion import ModalPlant
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant, check_plant
 from heliograph.model.premises.premise import believes
+from heliograph.model.unknown_start import UnknownStart
 from heliograph.numerics.angle import Angles, wrap_angles
 from heliograph.numerics.check import array, covariance
 from heliograph.numerics.float64 import in_float64
@@ -85,15 +86,17 @@ class HasStart(Protocol):
 def second_moments_at_start(plant: AnyPlant, start: HasStart | None = None) -> Float[jax.Array, " n"]:
     """Return E[x_i^2] at the start plus Var w_i of a step, (n,): how large the numbers are that rounding acts on.
 
-    Of the plant's first step, and of its law at the start or of another one; a noise that depends on inputs counts
-    where it is added.
+    Of the plant's first step, and of its law at the start or of another one, of an unknown one what is known; a noise
+    that depends on inputs counts where it is added.
     """
     first_step = at(plant, 0)
     if isinstance(first_step, ModalPlant):  # the largest of the models
         return reduce(jnp.maximum, [second_moments_at_start(model, start) for model in first_step.models])
     start = first_step if start is None else start
     mean = jnp.asarray(start.initial_mean)
-    size = mean * mean + jnp.diagonal(jnp.asarray(start.initial_covariance))
+    spread = start.initial_covariance
+    known = spread.known if isinstance(spread, UnknownStart) else spread
+    size = mean * mean + jnp.diagonal(jnp.asarray(known))
     if isinstance(first_step.noise, AbstractNoise):
         size = size + jnp.diagonal(jnp.asarray(first_step.noise.covariance))
     return jnp.asarray(size)

@@ -1,8 +1,7 @@
 """The Kalman filter from a start that nobody knows, exactly: factors of two levels, finite and infinite."""
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -14,10 +13,11 @@ from heliograph.factors.diffuse import (
     condition_on_next_diffuse,
     observe_diffuse,
     predict_diffuse,
+    project_diffuse,
     start_diffuse,
 )
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
-from heliograph.filters.gaussian.belief import process_noise
+from heliograph.filters.gaussian.belief import process_noise, second_moments_at_start
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.model.channel import perfect
 from heliograph.model.estimate import Estimate, Innovation, lower_by_noise
@@ -56,7 +56,7 @@ class DiffuseFilter(AbstractSizedFilter):
     def predict(self, state: Diffuse, u: ArrayLike = (), k: Step = 0) -> Diffuse:
         """Predict x over x+ = A x + B u + w."""
         plant, u = at(self.plant, k), jnp.asarray(u)
-        noise = process_noise(plant, u, _sizes_at_start(first(self.plant)))
+        noise = process_noise(plant, u, second_moments_at_start(self.plant))
         return predict_diffuse(state, plant.transition_matrix(u), plant.shift(u), noise)
 
     @corrects
@@ -66,13 +66,11 @@ class DiffuseFilter(AbstractSizedFilter):
         matrix, noise = jnp.asarray(sensor.matrix), sensor.noise.columns
         value = z - matrix @ state.mean - jnp.asarray(sensor.noise.mean)
         after, heard = observe_diffuse(state, matrix, value, noise)
-        slopes = matrix @ state.root
-        reach = jnp.abs(matrix) @ jnp.abs(state.root)
-        deaf = jnp.all((jnp.abs(slopes) <= 1e-9 * reach) | (state.infinite <= 0), axis=1)
-        shown = jnp.where(deaf, value, jnp.nan)
-        total = (slopes * state.variances) @ slopes.T + noise.covariance
+        covariance, unknown = project_diffuse(state, matrix)
+        shown = jnp.where(unknown, jnp.nan, value)
         there = ~jnp.isnan(shown)
-        return after, Innovation(shown, jnp.where(there[:, None] & there, total, jnp.nan), heard.log_likelihood)
+        total = jnp.where(there[:, None] & there, covariance + noise.covariance, jnp.nan)
+        return after, Innovation(shown, total, heard.log_likelihood)
 
     @estimates
     def estimate(self, state: Diffuse) -> Estimate:
@@ -82,16 +80,10 @@ class DiffuseFilter(AbstractSizedFilter):
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return Rauch's way back at two levels."""
         plant, u = at(self.plant, step.k), jnp.asarray(step.u)
-        noise = triangularise(process_noise(plant, u, _sizes_at_start(first(self.plant))))
+        noise = triangularise(process_noise(plant, u, second_moments_at_start(self.plant)))
         ahead = jnp.asarray(step.prior.mean)
         back = condition_on_next_diffuse(step.before, plant.transition_matrix(u), ahead, noise)
         return SmootherStep(as_gaussian(step.after), back, claim=self.claim)
-
-
-def _sizes_at_start(plant: Any) -> jax.Array:
-    """Return E[x_i^2] of what is known at the start, on which rounding acts."""
-    mean = jnp.asarray(plant.initial_mean)
-    return jnp.asarray(mean**2 + jnp.diagonal(jnp.asarray(plant.initial_covariance.known)))
 
 
 def has_unknown_start(plant: AnyPlant) -> bool:

@@ -110,13 +110,15 @@ def make_fused_innovations(network: Network, alike: Sequence[StackedFilters]) ->
     if network.common is not None or network.relays is not None or network.shared:
         return tests
     places, plant = network.places, at(network.plant, 0)
-    start = in_float64(from_covariance)(np.asarray(plant.initial_mean), np.asarray(plant.initial_covariance))
-    start = jax.tree.map(np.asarray, start)  # on no device: no program
     claims = network.claims()
     for name, fusion in network.fused.items():
         if isinstance(fusion, Fusion) and claims[FUSED][name] != "none":
             sources, _ = sources_of(network, places, network.nodes_with(fusion.filter), fusion.filter)
             beliefs = [eqx.filter_eval_shape(alike[kind].init) for kind, _ in sources]
             if all(isinstance(b, WHOLE) and gaussian_of(b).mean.shape[-1] == len(network.states) for b in beliefs):
-                tests[name] = FusedInnovation(start, sources)
+                start = in_float64(from_covariance)(
+                    np.asarray(plant.initial_mean), np.asarray(plant.initial_covariance)
+                )
+                # On no device: no program.
+                tests[name] = FusedInnovation(jax.tree.map(np.asarray, start), sources)
     return tests
