@@ -49,11 +49,28 @@ def mixed_innovation(
         total: its innovation covariance (parts, m, m).
         density: log-likelihood of z under the mixture.
     """
+    return innovation_of_means(weight, value, jnp.einsum("a,aij->ij", weight, total), density)
+
+
+def innovation_of_means(
+    weight: "Float[Array, ' parts']",
+    value: "Float[Array, 'parts m']",
+    within: "Float[Array, 'm m']",
+    density: "Float[Array, '']",
+) -> "Innovation":
+    """Return the innovation of a mixture, by the mean covariance within its components.
+
+    Args:
+        weight: prior probability (parts,) of each component.
+        value: its innovation (parts, m).
+        within: mean over the components of their innovation covariances (m, m).
+        density: log-likelihood of z under the mixture.
+    """
     # About the first: of values so large that all are equal nothing is left, and no rounding to be squared.
     apart = value - value[0]
     mean = value[0] + weight @ apart
     apart = apart - weight @ apart
-    covariance = jnp.einsum("a,aij->ij", weight, total) + jnp.einsum("a,ai,aj->ij", weight, apart, apart)
+    covariance = within + jnp.einsum("a,ai,aj->ij", weight, apart, apart)
     nothing = jnp.all(jnp.isnan(mean))  # then the density is 1, to rounding
     return Innovation(mean, covariance, jnp.where(nothing, 0.0, density))
 

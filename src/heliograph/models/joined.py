@@ -102,7 +102,7 @@ def join(plants: "Sequence[AbstractPlant]") -> LinearPlant | Plant:
     return LinearPlant(matrix, noise, center, start, driven, states, inputs, circular, limits)
 
 
-def _join_starts(parts: list[Any]) -> tuple[Any, "NoiseLike | DiffuseStart"]:
+def _join_starts(parts: list[Any]) -> tuple[Any, Any]:
     """Return centre and law of the initial state of plants side by side; where some is unknown, of the others.
 
     Raises:

@@ -317,7 +317,7 @@ def stationary_covariance(matrix: Any, noise: Any) -> Any:
     return (found + found.T) / 2
 
 
-def _read_start(variance: object) -> Any:
+def _read_start(variance: "ArrayLike | DiffuseStart") -> Any:
     """Return the variance of states before the first step, checked; or `hg.diffuse`."""
     return variance if isinstance(variance, DiffuseStart) else scalar("initial variance", variance, 0.0)
 

@@ -16,6 +16,7 @@ import numpy as np
 from jax.extend.core import JaxprEqn
 
 from straightline.graph import Graph
+from straightline.limits import LOADED
 from straightline.lowering import RULES, Lowering, array_of, keys_of, result_shape
 from straightline.nodes import Key, Node, Unsupported
 from straightline.rules.elementwise import broadcast
@@ -117,7 +118,9 @@ def _same(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> l
 
 
 def _counters(graph: Graph, shape: tuple[int, ...]) -> list[tuple[Node, Node]]:
-    """Return 0, 1, 2, ... as two words each."""
+    """Return 0, 1, 2, ... as two words each; hashes of so many that no program would hold them are refused at once."""
+    if math.prod(shape) > LOADED:
+        raise Unsupported(f"{math.prod(shape):,} random numbers at once")
     return [(graph.constant(i >> 32, "u32"), graph.constant(i & 0xFFFFFFFF, "u32")) for i in range(math.prod(shape))]
 
 

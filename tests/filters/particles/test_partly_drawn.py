@@ -44,14 +44,16 @@ def by_all_paths(z, variance=0.5):
 @pytest.mark.parametrize("drawn", [[], ["v"], None])
 def test_modes_of_motion_are_those_of_all_paths(drawn):
     mean, covariance, modes, total = by_all_paths(Z)
-    filter = hg.filters.particle_filter(MOTION, hg.LinearSensor([[1.0, 0.0]], 0.5), hg.perfect(), 4000, drawn=drawn)
-    run = filter.run(Z)
-    # 4,000 particles: .016 deviations of a mean; four of those. Second moments by root 2 more, probabilities by .008.
-    assert np.all(np.abs(run.means[-1] - mean) < 0.065 * np.sqrt(np.diagonal(covariance)))
+    parts = MOTION, hg.LinearSensor([[1.0, 0.0]], 0.5), hg.perfect(), 4000
+    runs = [hg.filters.particle_filter(*parts, seed=seed, drawn=drawn).run(Z) for seed in range(6)]
+    # Of 4,000 particles 1,600 count at the third row: of one seed a mean errs by .02 deviations, a second moment by
+    # .04, a probability by .008 and log p by .025, as 24 seeds tell; of six by root 6 less. Five of those or more.
+    apart = np.mean([run.means[-1] for run in runs], axis=0) - mean
+    assert np.all(np.abs(apart) < 0.045 * np.sqrt(np.diagonal(covariance)))
     scale = np.sqrt(np.outer(np.diagonal(covariance), np.diagonal(covariance)))
-    assert np.all(np.abs(run.covariances[-1] - covariance) < 0.09 * scale)
-    assert np.all(np.abs(run.modes[-1] - modes) < 0.032)
-    assert abs(run.log_likelihood - total) < 0.05  # weights vary by less than one, in three rows: .03
+    assert np.all(np.abs(np.mean([run.covariances[-1] for run in runs], axis=0) - covariance) < 0.09 * scale)
+    assert np.all(np.abs(np.mean([run.modes[-1] for run in runs], axis=0) - modes) < 0.018)
+    assert abs(np.mean([run.log_likelihood for run in runs]) - total) < 0.05
 
 
 def test_modes_are_summed_before_one_is_drawn():

@@ -21,8 +21,9 @@ from heliograph.factors.gaussian import (
     from_covariance,
     moments_of_mixture,
 )
-from heliograph.filters.base import AbstractSizedFilter, FilterAngles, Step, corrects, estimates, predicts
+from heliograph.filters.base import Step, corrects, estimates, predicts
 from heliograph.filters.innovation import mixed_innovation
+from heliograph.filters.particles.base import AbstractStateParticleFilter, keep_unused, relative_to_largest
 from heliograph.filters.particles.draws import (
     condition_on_draw,
     condition_on_leading,
@@ -31,13 +32,12 @@ from heliograph.filters.particles.draws import (
     slopes_given,
 )
 from heliograph.filters.particles.proposal import SAFE, noise_columns
-from heliograph.filters.particles.received_density import ReceivedDensity
-from heliograph.filters.particles.resampling import effective_number, fold_in_bits, resample_systematically
+from heliograph.filters.particles.resampling import draw_normals, effective_number, fold_in_bits
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.modes_of_motion import models_of
-from heliograph.model.over_time import OverTime, at, first
-from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant
-from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor
+from heliograph.model.over_time import at, first
+from heliograph.model.plant import AbstractPlant, LinearPlant
+from heliograph.model.sensor import AbstractSensor, LinearSensor
 from heliograph.numerics.angle import Angles, nearest, wrap_angles
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, Bool, Float, Int
@@ -91,36 +91,15 @@ class Received(NamedTuple):
     overall: tuple[jax.Array, jax.Array, Columns]
 
 
-class PartlyDrawnFilter(AbstractSizedFilter):
-    """Particles draw modes and named states, the other states are Gaussian given these. Built by `particle_filter`.
+class PartlyDrawnFilter(AbstractStateParticleFilter):
+    """Particles draw modes and named states, the other states are Gaussian given these. Built by `particle_filter`."""
 
-    Its random numbers come from the seed and from the data, so that runs draw independently and the same data give the
-    same estimate. A measurement that no particle can produce is not used: its log-likelihood is -inf, the state stays.
-    """
-
-    plant: AnyPlant
-    sensor: AnySensor
-    density: ReceivedDensity | OverTime
     initial: Float[Array, " M"]
     transition: Float[Array, "M M"]
-    resample: Array
-    observed_angles: Angles = eqx.field(static=True)
     plant_modes: tuple[int, ...] = eqx.field(static=True)
     sensor_modes: tuple[int, ...] = eqx.field(static=True)
     order: tuple[int, ...] = eqx.field(static=True)  # places of the states, drawn ones first
     drawn: int = eqx.field(static=True)  # how many are drawn
-    particles: int = eqx.field(static=True)
-    optimal: bool = eqx.field(static=True)
-    seed: Int[Array, ""]  # a number, so that filters of all seeds are one program
-
-    def angles_used(self) -> FilterAngles:
-        """Return the angles of its plant, and those that its channel delivers."""
-        return FilterAngles(models_of(first(self.plant))[0].angles, self.observed_angles)
-
-    @property
-    def of_atoms(self) -> bool:
-        """True: a value of likelihood 0 under every particle is excluded by its model."""
-        return True
 
     @in_float64
     def init(self) -> PartlyDrawn:
@@ -147,13 +126,8 @@ class PartlyDrawnFilter(AbstractSizedFilter):
         x = self._draw_states(held, own)
         if self._is_linear(plants):
             x = jax.tree.map(lambda new, old: jnp.where(state.moved, new, old), x, held)
-        # Resampling.
-        weight = state.weight
-        poor = effective_number(weight) < jnp.asarray(self.resample) * self.particles
-        chosen = resample_systematically(weight, jax.random.uniform(choice, (), weight.dtype))
-        which = jnp.where(poor, chosen, every)
+        which, log_weight = self.resampled(state.log_weight, choice)
         x, mode = jax.tree.map(lambda leaf: leaf[which], (x, mode))
-        log_weight = jnp.where(poor, 0.0, state.log_weight)
         # The law after the step in each mode that may follow.
         by_model = [jax.vmap(lambda one, plant=plant: self._move(plant, one, u))(x) for plant in plants]
         moved: Gaussian = jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=1)[:, self.plant_modes, ...], *by_model)
@@ -166,7 +140,7 @@ class PartlyDrawnFilter(AbstractSizedFilter):
 
     def _draw_states(self, x: Gaussian, key: jax.Array) -> Gaussian:
         """Draw the drawn states of Gaussians (N, n): x given them."""
-        draws = jax.random.normal(key, (self.particles, self.drawn), dtype=float)
+        draws = draw_normals(key, (self.particles, self.drawn))
         return jax.vmap(condition_on_draw)(x, draws)
 
     def _move(self, plant: AbstractPlant, x: Gaussian, u: jax.Array) -> Gaussian:
@@ -202,22 +176,21 @@ class PartlyDrawnFilter(AbstractSizedFilter):
         before = jax.nn.logsumexp(jax.nn.log_softmax(state.log_weight)[:, None] + log_mode)
         key = fold_in_bits(state.key, z)
         own, of_choice = jax.random.split(jax.random.fold_in(key, 2))
-        draws = jax.random.normal(own, (self.particles, self.drawn), dtype=float)
+        draws = draw_normals(own, (self.particles, self.drawn))
         uniform = jax.random.uniform(of_choice, (self.particles, 3), dtype=float)
         x, mode, log_ratio = jax.vmap(partial(self._weigh, sensors, received))(state.gaussian, log_mode, draws, uniform)
         log_weight = state.log_weight + log_ratio
         density_of_z = jax.nn.logsumexp(jax.nn.log_softmax(state.log_weight) + log_ratio) - before
         # All weights zero: the row is not used.
         plant = models_of(at(self.plant, k))[0]
-        largest = jnp.max(log_weight)
-        log_weight = log_weight - jnp.where(jnp.isfinite(largest), largest, 0.0)
+        log_weight = relative_to_largest(log_weight)
         x = x._replace(mean=wrap_angles(x.mean, self._angles_in_order(plant)))
         modes = len(self.initial)
         certain = jnp.where(jnp.arange(modes) == mode[:, None], 0.0, -jnp.inf)
         updated = PartlyDrawn(_repeat_for_modes(x, modes), certain, log_weight, key, state.moved)
         used = (modes > 1) | ~jnp.all(jnp.isnan(z))
         used = used & (density_of_z > -jnp.inf)
-        after = jax.tree.map(lambda new, old: jnp.where(used, new, old), updated, state._replace(key=key))
+        after = keep_unused(used, updated, state._replace(key=key))
         return after, self._innovation(sensors, received, state.gaussian, state.weight, log_mode, density_of_z)
 
     def _angles_in_order(self, plant: AbstractPlant) -> Angles:

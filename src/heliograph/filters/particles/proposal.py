@@ -21,13 +21,15 @@ LOG_TURN = float(np.log(2 * np.pi))
 
 
 class Moved(NamedTuple):
-    """Law of x+ before the measurement, of each particle: m + G e with e ~ N(0, I).
+    """Law of x+ before the measurement, of each particle: m + G e with e ~ N(0, I), and a draw of e.
 
-    Shapes: center m (N, n), root G (n, n), the same of all particles; zero once it was drawn with a measurement.
+    Shapes: center m (N, n), root G (n, n), the same of all particles, zero once x+ was drawn with a measurement; draws
+    (N, n), of which the prior's positions and those that know z are made.
     """
 
     center: jax.Array
     root: jax.Array
+    draws: jax.Array
 
 
 class Proposed(NamedTuple):
@@ -49,8 +51,8 @@ def propose(
     gain, offset, noise = atoms.moments()
     arrived = ~jnp.isnan(z)
     noise = jnp.where(arrived[:, None] & arrived, noise, jnp.eye(len(z)))
-    draws = jax.random.normal(key, moved.center.shape, dtype=float)
-    chosen = jax.random.uniform(jax.random.fold_in(key, 1), moved.center.shape[:1], dtype=float) < safe
+    count = moved.center.shape[:1]
+    chosen = jax.random.uniform(key, count, dtype=float) < safe if safe else jnp.zeros(count, bool)
 
     def one(center: jax.Array, draw: jax.Array, from_prior: jax.Array) -> tuple[jax.Array, jax.Array]:
         slope = jnp.asarray(sensor.matrix) if isinstance(sensor, LinearSensor) else jax.jacfwd(sensor.measure)(center)
@@ -71,7 +73,7 @@ def propose(
         log_q = log_told if not safe else jnp.logaddexp(jnp.log(1 - safe) + log_told, jnp.log(safe) + log_prior)
         return center + moved.root @ e, jnp.where(jnp.isfinite(log_q), log_prior - log_q, 0.0)
 
-    return Proposed(*jax.vmap(one)(moved.center, draws, chosen))
+    return Proposed(*jax.vmap(one)(moved.center, moved.draws, chosen))
 
 
 def noise_columns(plant: AbstractPlant, u: jax.Array) -> Columns:

@@ -2,34 +2,26 @@
 
 from typing import Literal, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from heliograph.factors.columns import Columns, columns_of, join_columns, square_root, triangularise
-from heliograph.filters.base import (
-    AbstractSizedFilter,
-    FilterAngles,
-    Step,
-    corrects,
-    estimates,
-    make_sizes,
-    predicts,
-)
-from heliograph.filters.innovation import mixed_innovation
+from heliograph.filters.base import Step, corrects, estimates, make_sizes, predicts
+from heliograph.filters.innovation import innovation_of_means
+from heliograph.filters.particles.base import AbstractStateParticleFilter, keep_unused, relative_to_largest
 from heliograph.filters.particles.proposal import Moved, noise_columns, propose
-from heliograph.filters.particles.received_density import Atoms, ReceivedDensity, find_received_density
-from heliograph.filters.particles.resampling import effective_number, fold_in_bits, resample_systematically
+from heliograph.filters.particles.received_density import Atoms, find_received_density
+from heliograph.filters.particles.resampling import draw_normals, effective_number, fold_in_bits
 from heliograph.model.channel import Channel, check_link, find_received_angles
 from heliograph.model.estimate import Estimate, Innovation
-from heliograph.model.over_time import OverTime, at, first, list_steps, restack, steps_covered, unstack
+from heliograph.model.over_time import at, first, list_steps, restack, steps_covered, unstack
 from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor
-from heliograph.numerics.angle import Angles, nearest, wrap_angles
+from heliograph.numerics.angle import nearest, wrap_angles
 from heliograph.numerics.check import check_count, fail, instance, scalar
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
+from heliograph.numerics.types import ArrayLike, Bool, Float, Int
 from heliograph.random_affine.noise import AbstractNoise, Gaussian
 
 Proposal = Literal["optimal", "prior"]
@@ -40,16 +32,15 @@ MANY = 1000
 class StateParticles(NamedTuple):
     """Positions of N particles, their log weights, and the key of the next random numbers.
 
-    `center` and `root` are those of the last move, x+ = center + root e: a proposal that knows z draws e anew. `moved`
-    is true from the first prediction on.
+    `law` is that of the last move, of which a proposal that knows z makes other positions; None where there is no such
+    proposal. `moved` is true from the first prediction on.
 
-    Shapes: position, center (N, n), log_weight (N,), the largest 0, root (n, n), key (2,).
+    Shapes: position (N, n), log_weight (N,), the largest 0, key (2,).
     """
 
     position: Float[jax.Array, "N n"]
     log_weight: Float[jax.Array, " N"]
-    center: Float[jax.Array, "N n"]
-    root: Float[jax.Array, "n n"]
+    law: Moved | None
     key: Int[jax.Array, " 2"]
     moved: Bool[jax.Array, ""]
 
@@ -66,30 +57,8 @@ class StateParticles(NamedTuple):
         return effective_number(self.weight)
 
 
-class StateParticleFilter(AbstractSizedFilter):
-    """Weighted particles of the whole state, resampled at the start of a step. Built by `particle_filter`.
-
-    Its random numbers come from the seed and from the data, so that runs draw independently and the same data give the
-    same estimate. A measurement that no particle can produce is not used: its log-likelihood is -inf, the state stays.
-    """
-
-    plant: AnyPlant
-    sensor: AnySensor
-    density: ReceivedDensity | OverTime
-    resample: Array
-    observed_angles: Angles = eqx.field(static=True)
-    particles: int = eqx.field(static=True)
-    optimal: bool = eqx.field(static=True)
-    seed: Int[Array, ""]  # a number, so that filters of all seeds are one program
-
-    def angles_used(self) -> FilterAngles:
-        """Return the angles of its plant, and those that its channel delivers."""
-        return FilterAngles(first(self.plant).angles, self.observed_angles)
-
-    @property
-    def of_atoms(self) -> bool:
-        """True: a value of likelihood 0 under every particle is excluded by its model."""
-        return True
+class StateParticleFilter(AbstractStateParticleFilter):
+    """Weighted particles of the whole state, which are drawn from the prior or with z. Built by `particle_filter`."""
 
     @in_float64
     def init(self) -> StateParticles:
@@ -97,37 +66,40 @@ class StateParticleFilter(AbstractSizedFilter):
         plant, n = at(self.plant, 0), self.particles
         key, own = jax.random.split(jax.random.PRNGKey(self.seed))
         x = jax.vmap(plant.sample_initial)(jax.random.split(own, n))
-        return StateParticles(x, jnp.zeros(n), x, jnp.zeros((x.shape[1],) * 2), key, jnp.asarray(False))
+        size = x.shape[1]
+        law = Moved(x, jnp.zeros((size, size)), jnp.zeros((n, size))) if self.optimal else None
+        return StateParticles(x, jnp.zeros(n), law, key, jnp.asarray(False))
 
     @predicts
     def predict(self, state: StateParticles, u: ArrayLike = (), k: Step = 0) -> StateParticles:
         """Resample where the effective number is too small, then move each particle with a noise of its own."""
         plant, u = at(self.plant, k), jnp.asarray(u)
         key, choice, own = jax.random.split(jax.random.fold_in(state.key, 0), 3)
-        weight = state.weight
-        poor = effective_number(weight) < jnp.asarray(self.resample) * self.particles
-        chosen = resample_systematically(weight, jax.random.uniform(choice, (), weight.dtype))
-        x = state.position[jnp.where(poor, chosen, jnp.arange(self.particles))]
-        log_weight = jnp.where(poor, 0.0, state.log_weight)
-        center = jax.vmap(lambda one: plant.transition(one, u))(x)
-        noise = _draw_noise(plant, own, u, self.particles)
-        law = self._moved(plant, state, center, u) if self.optimal else Moved(center, state.root)
-        position = wrap_angles(center + noise, plant.angles)
-        return StateParticles(position, log_weight, *law, key, jnp.asarray(True))
+        which, log_weight = self.resampled(state.log_weight, choice)
+        center = jax.vmap(lambda one: plant.transition(one, u))(state.position[which])
+        if isinstance(plant.noise, AbstractNoise) and not isinstance(plant.noise, Gaussian):
+            noise = jax.vmap(lambda one: plant.sample_noise(one, u))(jax.random.split(own, self.particles))
+            position = wrap_angles(center + noise, plant.angles)
+            return StateParticles(position, log_weight, None, key, jnp.asarray(True))
+        draws = draw_normals(own, center.shape)
+        center, root = center + plant.noise_mean(), _root_of(noise_columns(plant, u))
+        position = wrap_angles(center + draws @ root.T, plant.angles)
+        law = self._law(plant, state, Moved(center, root, draws), u) if self.optimal else None
+        return StateParticles(position, log_weight, law, key, jnp.asarray(True))
 
-    def _moved(self, plant: AbstractPlant, state: StateParticles, center: jax.Array, u: jax.Array) -> Moved:
+    def _law(self, plant: AbstractPlant, state: StateParticles, moved: Moved, u: jax.Array) -> Moved:
         """Return the law of x+ of each particle; at the first step of a linear plant that of x_0 and w together.
 
         So a first measurement that is far more precise than x_0 leaves more than few of the particles.
         """
-        own = noise_columns(plant, u)
-        root, center = _root_of(own), center + plant.noise_mean()
         if not isinstance(plant, LinearPlant) or plant.deviation is not None or plant.circular:
-            return Moved(center, root)
+            return moved
         start = at(self.plant, 0)
-        both = join_columns(columns_of(start.initial_covariance).through(plant.transition_matrix(u)), own)
+        both = columns_of(start.initial_covariance).through(plant.transition_matrix(u))
         mean = plant.transition(jnp.asarray(start.initial_mean), u) + plant.noise_mean()
-        return Moved(jnp.where(state.moved, center, mean), jnp.where(state.moved, root, _root_of(both)))
+        center = jnp.where(state.moved, moved.center, mean)
+        root = jnp.where(state.moved, moved.root, _root_of(join_columns(both, noise_columns(plant, u))))
+        return moved._replace(center=center, root=root)
 
     @corrects
     def correct(self, state: StateParticles, z: ArrayLike, k: Step = 0) -> tuple[StateParticles, Innovation]:
@@ -135,18 +107,20 @@ class StateParticleFilter(AbstractSizedFilter):
         z, sensor = jnp.asarray(z), at(self.sensor, k)
         atoms = jax.tree.map(lambda leaf: leaf[0], at(self.density, k).given_arrivals(z)[0])
         key = fold_in_bits(state.key, z)
-        predicted = jax.vmap(sensor.measure)(state.position)
+        predicted = received = jax.vmap(sensor.measure)(state.position)
         position, correction = state.position, jnp.zeros(self.particles)
-        if self.optimal:
-            angles = self.observed_angles
-            drawn = propose(Moved(state.center, state.root), sensor, atoms, z, angles, jax.random.fold_in(key, 2))
+        if state.law is not None:
+            drawn = propose(state.law, sensor, atoms, z, self.observed_angles, jax.random.fold_in(key, 2))
             position, correction = wrap_angles(drawn.position, at(self.plant, k).angles), drawn.correction
-        received = predicted if not self.optimal else jax.vmap(sensor.measure)(position)
+            received = jax.vmap(sensor.measure)(position)
         likelihood = jax.vmap(lambda y: atoms.log_density(y, z, self.observed_angles))(received) + correction
         density = jax.nn.logsumexp(jax.nn.log_softmax(state.log_weight) + likelihood)
-        updated = _weighted(state, position, state.log_weight + likelihood, key)
+        # Nothing is left to draw.
+        law = None if state.law is None else state.law._replace(center=position, root=jnp.zeros_like(state.law.root))
+        log_weight = relative_to_largest(state.log_weight + likelihood)
         used = ~jnp.all(jnp.isnan(z)) & (density > -jnp.inf)
-        after = jax.tree.map(lambda new, old: jnp.where(used, new, old), updated, state._replace(key=key))
+        before = state._replace(key=key)
+        after = keep_unused(used, StateParticles(position, log_weight, law, key, state.moved), before)
         return after, self._innovation(state.weight, atoms, predicted, z, density)
 
     def _innovation(
@@ -164,9 +138,9 @@ class StateParticleFilter(AbstractSizedFilter):
         value = nearest(z - expected, jnp.zeros(len(z)), self.observed_angles).reshape(-1, len(z))
         value = nearest(value, value[jnp.argmax(weight)], self.observed_angles)
         both = (weight[:, None] * jnp.asarray(atoms.weight)).ravel()
-        noise = jnp.where(present[:, None] & present, jnp.asarray(atoms.noise), jnp.nan)
-        total = jnp.broadcast_to(noise, (self.particles, *noise.shape)).reshape(-1, *noise.shape[1:])
-        return mixed_innovation(both, value, total, density)
+        within = jnp.einsum("a,aij->ij", jnp.asarray(atoms.weight), jnp.asarray(atoms.noise))
+        within = jnp.where(present[:, None] & present, within, jnp.nan)
+        return innovation_of_means(both, value, within, density)
 
     @estimates
     def estimate(self, state: StateParticles) -> Estimate:
@@ -177,21 +151,6 @@ class StateParticleFilter(AbstractSizedFilter):
             mean = mean.at[i].set(jnp.arctan2(weight @ jnp.sin(x[:, i]), weight @ jnp.cos(x[:, i])))
         apart = wrap_angles(x - mean, angles)
         return Estimate(mean, (apart * weight[:, None]).T @ apart, self.claim)
-
-
-def _weighted(state: StateParticles, position: jax.Array, log_weight: jax.Array, key: jax.Array) -> StateParticles:
-    """Return the particles with new positions and log weights, of which the largest is 0; nothing left to draw."""
-    largest = jnp.max(log_weight)
-    relative = log_weight - jnp.where(jnp.isfinite(largest), largest, 0.0)
-    return StateParticles(position, relative, position, jnp.zeros_like(state.root), key, state.moved)
-
-
-def _draw_noise(plant: AbstractPlant, key: jax.Array, u: jax.Array, count: int) -> jax.Array:
-    """Draw w for each of so many particles, (count, n); Gaussian noise in one piece."""
-    if not isinstance(plant.noise, Gaussian):
-        return jax.vmap(lambda own: plant.sample_noise(own, u))(jax.random.split(key, count))
-    draws = jax.random.normal(key, (count, len(plant.states)), dtype=float)
-    return plant.noise_mean() + draws @ _root_of(noise_columns(plant, u)).T
 
 
 def _root_of(columns: Columns) -> jax.Array:
