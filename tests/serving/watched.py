@@ -61,7 +61,7 @@ class Scripted:
             nis = self.scale * float(np.random.default_rng(i).chisquare(2))
             covariance = [[0.04 * (1 + 4 / (1 + i)), 0.0], [0.0, 0.01]]
             message = {"mean": [np.sin(i / 20), np.cos(i / 20)], "covariance": covariance}
-            message |= {"claim": "nominal", "nis": nis, "received": 2}
+            message |= {"claim": "nominal", "nis": nis, "received": 2, "modes": [0.75, 0.25]}
             body = {
                 "id": i,
                 "plant": self.plant,

@@ -315,3 +315,20 @@ def test_numbers_are_rounded_by_their_standard_error():
         (np.nan, 1.0, "nan"), (1.0, np.inf, "1"),
     ]:  # fmt: skip
         assert round_to(value, error) == text
+
+
+def test_probabilities_of_modes_have_a_figure_of_their_own_filtered_and_smoothed():
+    laws = [hg.LinearPlant([[1.0, 1.0], [0.0, a]], 0.1, [0.0, 0.0], 1.0, states=["x", "v"]) for a in (0.9, 0.5)]
+    plant, sensor = hg.markov_plant(laws, [[0.9, 0.1], [0.2, 0.8]]), hg.LinearSensor([[1.0, 0.0]], 1.0)
+    parts = plant, sensor, hg.perfect(1)
+    filters = {"imm": hg.filters.imm_filter(*parts), "linear": hg.linear_filter(*parts)}
+    network = hg.Network(plant, {"radar": hg.Node(sensor, hg.perfect(1), filters)})
+    z = np.random.default_rng(0).normal(size=(30, 1))
+    record = hg.run(network, {"radar": z}, smooth=hg.smoothing.FixedInterval())
+    figures = run_figures(examine(network, record, np.zeros((30, 0))))
+    assert {"modes_estimates_0", "modes_smoothed_0"} <= set(figures)
+    lines = figures["modes_estimates_0"].axes[0].get_lines()
+    assert len(lines) == 2  # the linear filter weighs none
+    np.testing.assert_allclose(sum(line.get_ydata() for line in lines), 1.0, rtol=1e-12)
+    page = run_page(examine(network, record, np.zeros((30, 0))), "net", dict.fromkeys(figures, b"<svg></svg>"))
+    assert "radar: probability of each mode, given later data too." in page.html()

@@ -118,6 +118,7 @@ def test_the_page_shows_what_was_said_and_brings_all_it_needs():
         assert view["states"][0] == "<i>x</i>" and view["plants"] == ["</script><b>x"] and len(view["points"]) == 600
         point = view["points"][-1]["estimates"]["<b>node"]["cubature"]
         assert point["mean"][0] == np.sin(299 / 20) and point["deviation"][1] == pytest.approx(0.1)
+        assert point["modes"] == [0.75, 0.25]
         assert view["links"]["<b>node"]["used"] == 300 and view["tests"][0]["doubt"]
         assert "times what its covariance says" in view["warnings"][0]
 
@@ -285,7 +286,8 @@ def test_a_browser_draws_it_and_runs_nothing_that_came_from_outside(fits):
         await asyncio.to_thread(fits, f"{url}/")
         text = await drawn(url)
         body = text[text.index("<main>") : text.index("</main>")]
-        assert body.count("<svg") == 2 and 'class="area"' in body
+        assert body.count("<svg") == 4 and 'class="area"' in body  # of two states and two modes
+        assert "<b>probability of mode 1</b>" in body and "0.25, nominal" in body
         assert "&lt;b&gt;node" in body and "&lt;i&gt;x" in body and "<b>node" not in body and "<i>" not in body
         assert ">doubtful</td>" in body and "400" in body
 

@@ -27,6 +27,7 @@ from heliograph.report.innovations import (
     say_not_drawn,
     tested_by_figure,
 )
+from heliograph.report.mode_probabilities import PREFIX, draw_modes_of_nodes
 from heliograph.report.outputs import compare_with_truth, round_to
 from heliograph.report.pages.page import Choice, KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
 from heliograph.report.pages.predicted import predicted_figures, predicted_sections
@@ -98,6 +99,7 @@ def run_figures(health: Health) -> dict[str, Figure]:
             drawn[_map_name(kind)] = draw_position_map(record, node, list(record.estimates[node])[: len(COLOURS)])
     for kind, record in _collect_estimates(health):
         drawn |= {f"{kind}_{i}": _draw_estimates(health, record, node) for i, node in enumerate(_nodes_to_draw(record))}
+        drawn |= draw_modes_of_nodes(record, kind, _nodes_to_draw(record))
     drawn |= {name: draw_innovations(health, tested) for name, tested in tested_by_figure(health).items()}
     drawn |= predicted_figures(health)
     if health.links:
@@ -246,6 +248,11 @@ def _list_pictures(health: Health, drawings: Mapping[str, bytes]) -> list[Pictur
                           f"{visible(node)}: estimates with bands of {BAND:g} claimed standard deviations on each "
                           f"side{added}.")
             for i, node in enumerate(_nodes_to_draw(record)) if f"{kind}_{i}" in drawings
+        })  # fmt: skip
+        pictures += choose_picture({
+            node: Picture(drawings[f"{PREFIX}{kind}_{i}"], f"Modes at {visible(node)} over time{added}",
+                          f"{visible(node)}: probability of each mode{added}.")
+            for i, node in enumerate(_nodes_to_draw(record)) if f"{PREFIX}{kind}_{i}" in drawings
         })  # fmt: skip
         absent = [node for i, node in enumerate(_nodes_to_draw(record)) if f"{kind}_{i}" not in drawings]
         pictures += say_not_drawn(absent, f"Their figures are files beside this page ({kind}_0.svg and on).")

@@ -342,10 +342,11 @@ def _move_to_newest(newest: OrderedDict[str, T], plant: str, make: Callable[[], 
 
 
 def _means_and_deviations(message: Mapping[str, Any]) -> dict[str, object]:
-    """Return means, and standard deviations where the filter claims a covariance."""
+    """Return means, standard deviations where the filter claims a covariance, and the modes' probabilities if any."""
     rows = message["covariance"]
     claimed = rows and [_deviation_of(row[i]) for i, row in enumerate(rows)]
-    return {"mean": message["mean"], "deviation": claimed, "claim": message["claim"]}
+    modes = {"modes": message["modes"]} if message.get("modes") is not None else {}
+    return {"mean": message["mean"], "deviation": claimed, "claim": message["claim"], **modes}
 
 
 def _deviation_of(variance: float | None) -> float | None:

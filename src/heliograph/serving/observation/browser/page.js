@@ -131,10 +131,16 @@ function charts(view) {
   // What became final since it was provisional is not drawn twice.
   const end = Math.max(...points.filter((point) => point.final).map((point) => seconds(point.time)));
   const drawn = points.filter((point) => point.final || !(seconds(point.time) <= end));
-  at("charts").replaceChildren(...view.states.map((state, i) => chart(state, view.units[i], view.time_unit, drawn.map((point) => {
+  const rows = drawn.flatMap((point) => {
     const estimate = point.estimates[node] && point.estimates[node][filter];
-    return estimate ? { time: point.time, final: point.final, mean: estimate.mean[i], wide: estimate.deviation ? 2 * estimate.deviation[i] : 0, claim: estimate.claim } : null;
-  }).filter((point) => point && Number.isFinite(point.mean)))));
+    return estimate ? [{ time: point.time, final: point.final, estimate }] : [];
+  });
+  const over = (name, unit, of) => chart(name, unit, view.time_unit, rows.map((row) => ({ ...row, ...of(row.estimate), claim: row.estimate.claim })).filter((row) => Number.isFinite(row.mean)));
+  // Of a filter that weighs modes, their probabilities too.
+  const modes = rows.length ? rows[rows.length - 1].estimate.modes || [] : [];
+  at("charts").replaceChildren(
+    ...view.states.map((state, i) => over(state, view.units[i], (estimate) => ({ mean: estimate.mean[i], wide: estimate.deviation ? 2 * estimate.deviation[i] : 0 }))),
+    ...modes.map((_, j) => over("probability of mode " + j, "", (estimate) => ({ mean: estimate.modes ? estimate.modes[j] : NaN, wide: 0 }))));
 }
 
 function drawing(width, height) {

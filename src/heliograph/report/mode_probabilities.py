@@ -1,0 +1,27 @@
+"""Probabilities of the modes over time, of filters that weigh modes: their figure, and its words on a page."""
+
+from collections.abc import Sequence
+
+import matplotlib
+from matplotlib.figure import Figure
+
+from heliograph.report.figures import place_legend_above, stacked_panels
+from heliograph.report.innovations import LOOK, label_time_axis
+from heliograph.simulation.results.record import Record
+
+PREFIX = "modes_"  # of the names of figures, before that of a node's estimates
+
+
+def draw_modes_of_nodes(record: Record, kind: str, nodes: Sequence[str]) -> dict[str, Figure]:
+    """Return a figure of each node with a filter that weighs modes, by name: "modes_", `kind` and the node's number."""
+    weigh = [any(e.modes is not None for e in record.estimates[node].values()) for node in nodes]
+    return {f"{PREFIX}{kind}_{i}": _draw(record, node) for i, node in enumerate(nodes) if weigh[i]}
+
+
+@matplotlib.rc_context(LOOK)
+def _draw(record: Record, node: str) -> Figure:
+    figure, grid = stacked_panels(1, 2.2, 0.8)
+    record.plot_modes(node, axes=grid[0])
+    place_legend_above(figure, grid[0], columns=3)
+    label_time_axis(record, grid[0])
+    return figure
