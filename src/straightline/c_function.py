@@ -72,6 +72,7 @@ def to_c(
     names: tuple[Sequence[str], Sequence[str]] = ((), ()),
     finite: Collection[int] = (),
     symmetric: Collection[int] = (),
+    short: bool = False,
 ) -> CFunction:
     """Write a JAX function of small arrays as C99, for a device.
 
@@ -88,6 +89,7 @@ def to_c(
         finite: which of the arguments' arrays, counted from 0, never hold NaN, so that zero times an entry is zero;
             none by default.
         symmetric: which of them, counted in the same way, are symmetric, so that one triangle is read; none by default.
+        short: whether each loop stays a loop, so that the text is short; by default short loops are written out.
 
     Raises:
         Unsupported: random numbers, or an operation that C does not have, with the line that it comes from.
@@ -99,7 +101,7 @@ def to_c(
     for equation in equations:
         if equation.primitive.name.startswith(RANDOM):
             raise Unsupported(equation.primitive.name, code_line(equation))
-    graph, buffers, outputs = lower_for_c(program, finite, symmetric)
+    graph, buffers, outputs = lower_for_c(program, finite, symmetric, short)
     real: Real = "float" if single else "double"
     read, written = _name_arrays(function, examples, tree, names)
     # The body: statements in the order of the graph. Arguments without axes are passed by value.

@@ -84,14 +84,15 @@ class CLowering(Lowering):
 
 
 def lower_for_c(
-    program: ClosedJaxpr, finite: Collection[int], symmetric: Collection[int]
+    program: ClosedJaxpr, finite: Collection[int], symmetric: Collection[int], short: bool = False
 ) -> tuple[FiniteGraph, list[Buffer], list[np.ndarray]]:
     """Return a traced program's graph, a buffer for each argument and the nodes of each result.
 
-    `finite` arguments have no NaN; of `symmetric` ones the upper triangle alone is read.
+    `finite` arguments have no NaN; of `symmetric` ones the upper triangle alone is read. `short`: each loop stays one.
     """
     lowering, buffers, values = CLowering(), list[Buffer](), list[Any]()
     graph = lowering.graph
+    lowering.written_out = 0 if short else lowering.written_out
     for number, variable in enumerate(program.jaxpr.invars):
         aval: Any = variable.aval
         buffer = Buffer("input", type_of(aval), tuple(aval.shape), graph.top)

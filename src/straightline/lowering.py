@@ -19,7 +19,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var
 from jaxtyping import PyTree
 
 from straightline.graph import Graph
-from straightline.limits import LONGEST, TABLE
+from straightline.limits import LONGEST, TABLE, WRITTEN_OUT
 from straightline.memory import InMemory
 from straightline.nodes import TYPES, Buffer, Key, Node, Type, Unsupported
 
@@ -39,6 +39,7 @@ class Lowering:
         self.graph = Graph(most)
         self.kernels: dict[Any, ClosedJaxpr] = {}  # traced for one run, once for equal shapes
         self.sizes: dict[Jaxpr, int] = {}  # of programs within loops and branches
+        self.written_out = WRITTEN_OUT  # executions of a loop's operations up to which its turns are written out
         self.products: dict[Any, tuple[np.ndarray, np.ndarray]] = {}  # entries of A B' -> A and B, of each product
 
     def inline(self, program: ClosedJaxpr | Jaxpr, inputs: Sequence[Value], consts: Sequence[Any] = ()) -> list[Value]:

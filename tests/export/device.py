@@ -21,9 +21,9 @@ class Device:
     """One filter as it runs on a device; `state` is its memory."""
 
     def __init__(
-        self, filter_, folder: Path, name: str = "step", precision: str = "double", of=None, node=None, apart=False
+        self, filter_, folder: Path, name="step", precision="double", of=None, node=None, apart=False, size=False
     ):
-        self.exported = export_c(filter_, folder / f"{name}.c", precision, of, node, apart)
+        self.exported = export_c(filter_, folder / f"{name}.c", precision, of, node, apart, size)
         library = folder / f"{name}_{precision}.so"
         command = [COMPILER, *FLAGS, "-shared", "-fPIC", self.exported.source.name, "-o", library.name, "-lm"]
         subprocess.run(command, cwd=folder, check=True)

@@ -3,12 +3,16 @@
 import shutil
 import subprocess
 
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import heliograph as hg
 from tests.export.device import FLAGS
 from tests.export.test_apart import MAKERS, SENSOR, VEHICLE
+from tests.export.test_far_origin import CAR
 
+CAR_SENSOR = hg.Sensor(lambda x: jnp.stack([x[0], x[1], x[2], x[4]]), np.diag([1.0, 1.0, 0.01, 1e-4]))
 CROSS = "arm-none-eabi"
 CORTEX = ("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16", "-Os")
 needs_cross_compiler = pytest.mark.skipif(
@@ -27,3 +31,16 @@ def test_single_precision_stays_single_on_a_device(name, tmp_path):
     listed = subprocess.run([f"{CROSS}-nm", "-u", "step.o"], cwd=tmp_path, capture_output=True, text=True, check=True)
     called = set(listed.stdout.split()) - {"U"}
     assert called <= {"sinf", "cosf", "sqrtf", "hypotf", "nearbyintf", "memcpy", "memset"}, called
+
+
+@pytest.mark.slow
+@needs_cross_compiler
+@pytest.mark.parametrize(("name", "most"), [("extended", 12_000), ("cubature", 24_000)])
+def test_a_car_fits(name, most, tmp_path):
+    """Bytes of code and constants of one step of five states and four outputs, at -Os (31,000 unrolled)."""
+    written = hg.export_c(MAKERS[name](CAR, CAR_SENSOR), tmp_path / "step.c", "float", size=True)
+    subprocess.run([f"{CROSS}-gcc", *FLAGS[:-1], *CORTEX, "-c", "step.c", "-o", "step.o"], cwd=tmp_path, check=True)
+    command = [f"{CROSS}-size", "step.o"]
+    listed = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+    code, data = listed.stdout.split()[6:8]
+    assert int(code) + int(data) < most and written.state_bytes < 300

@@ -19,6 +19,7 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.scheduled import ScheduledFilter
 from heliograph.model.over_time import first
 from heliograph.numerics.check import InputError, fail, instance, show_value
+from heliograph.numerics.short_programs import write_short_programs
 from heliograph.simulation.centres.named_filter import find_filter_by_name
 from heliograph.simulation.network import Network
 
@@ -30,7 +31,7 @@ REPEATS = 5
 
 
 class Exported(NamedTuple):
-    """Result of an export: the files, the number of each operation in a step, and bytes of the state."""
+    """Result of an export: the files, the number of each operation in a step (in a loop once), bytes of the state."""
 
     header: Path
     source: Path
@@ -45,6 +46,7 @@ def export_c(
     name: str | None = None,
     node: str | None = None,
     apart: bool = False,
+    size: bool = False,
 ) -> Exported:
     """Write one step of a filter as C99, for a device: `step.h` and `step.c` where `path` is "step.c".
 
@@ -65,6 +67,8 @@ def export_c(
             "double").
         apart: whether prediction and correction are functions of their own beside the step, so that each sensor is used
             when it comes, and the innovation is told; False by default.
+        size: whether the code is to be small rather than fast: points are taken one after another in loops, where
+            that is shorter; False by default.
 
     Returns:
         The two files, the number of each operation in a step, and the bytes of the state.
@@ -78,12 +82,12 @@ def export_c(
     """
     if isinstance(filter, Network):
         named = find_filter_by_name(filter, "" if name is None else name, node)
-        return write_filter(named.filter, named.received, path, precision, apart)
+        return write_filter(named.filter, named.received, path, precision, apart, size)
     if name is not None or node is not None:
         raise fail("export by name", "a network", show_value(filter))
     what = "a filter, or a network and the name of its filter or fusion"
     checked: AbstractFilter = instance("export", filter, AbstractFilter, what)
-    return write_filter(checked, _name_received(checked), path, precision, apart)
+    return write_filter(checked, _name_received(checked), path, precision, apart, size)
 
 
 def _name_received(filter: AbstractFilter) -> tuple[str, ...]:
@@ -93,13 +97,18 @@ def _name_received(filter: AbstractFilter) -> tuple[str, ...]:
 
 
 def write_filter(
-    filter: AbstractFilter, received: Sequence[str], path: str | Path, precision: str, apart: bool = False
+    filter: AbstractFilter,
+    received: Sequence[str],
+    path: str | Path,
+    precision: str,
+    apart: bool = False,
+    size: bool = False,
 ) -> Exported:
     """Write as `export_c`, with names for the components of z."""
     source = check_place(path)
     if precision not in PRECISIONS:
         raise fail("precision", " or ".join(PRECISIONS), show_value(precision))
-    text = make_text(filter, received, source.stem, PRECISIONS[precision], apart)
+    text = make_text(filter, received, source.stem, PRECISIONS[precision], apart, size)
     header = source.with_suffix(".h")
     with whole_files([header, source]) as partials:
         for partial, content in zip(partials, (text.header, text.source), strict=True):
@@ -120,20 +129,24 @@ def check_place(path: str | Path) -> Path:
     return source
 
 
-def make_text(filter: AbstractFilter, received: Sequence[str], prefix: str, real: Real, apart: bool = False) -> CText:
-    """Return the text of both files of a filter."""
+def make_text(
+    filter: AbstractFilter, received: Sequence[str], prefix: str, real: Real, apart: bool = False, size: bool = False
+) -> CText:
+    """Return the text of both files of a filter; for its `size` the shorter of those in loops and written out."""
     kind = f"a {type(filter).__name__} in {'double' if real == 'double' else 'single'} precision"
     if real == "float" and not (isinstance(filter, ScheduledFilter) or carries_factors(filter)):
         expected = "a filter that carries its covariance as factors L D L', or a schedule of gains"
         raise fail("single precision", expected, type(filter).__name__)
+    exported, form = filter if real == "double" else filter.for_single_precision(), Form(prefix, real, received, kind)
+    texts = list[CText]()
     try:
-        with use_precision(np.float64 if real == "double" else np.float32):
-            program = write_step_program(
-                filter if real == "double" else filter.for_single_precision(), real, prefix, apart
-            )
-        return write_c_text(program, Form(prefix, real, received, kind))
+        for short in (True, False) if size else (False,):
+            with use_precision(np.float64 if real == "double" else np.float32), write_short_programs(short):
+                program = write_step_program(exported, real, prefix, apart, short)
+            texts.append(write_c_text(program, form))
     except ValueError as error:
         raise InputError(str(error)) from None  # a number of the filter beyond single precision
+    return min(texts, key=lambda text: len(text.source))
 
 
 def carries_factors(filter: AbstractFilter) -> bool:

@@ -60,8 +60,12 @@ class StepProgram(NamedTuple):
         return {op: sum(count.get(op, 0) for count in counts) for every in counts for op in every}
 
 
-def write_step_program(filter: AbstractFilter, real: Real, prefix: str, apart: bool = False) -> StepProgram:
+def write_step_program(
+    filter: AbstractFilter, real: Real, prefix: str, apart: bool = False, size: bool = False
+) -> StepProgram:
     """Write `step` of a filter as a function of C, for numbers of this type; `apart`: as two, predict and correct.
+
+    `size`: in loops, where it is traced within `write_short_programs`.
 
     Raises:
         ValueError: random numbers, or operations that are not supported; with the operation and its place.
@@ -74,12 +78,12 @@ def write_step_program(filter: AbstractFilter, real: Real, prefix: str, apart: b
     named += [Member("estimate_covariance", np.asarray(estimate.covariance))]
     try:
         symmetric = _find_symmetric(parts)
-        wholes = [_write_part(part, symmetric, prefix, real) for part in parts]
+        wholes = [_write_part(part, symmetric, prefix, real, size) for part in parts]
         # The estimate is a member of its own only if it is no array of the state.
         places = [max(_place(n, whole, named) for whole in wholes) for n in (len(leaves), len(leaves) + 1)]
         kept = [*range(len(leaves)), *(n for n in places if n >= len(leaves))]
         members = [named[n] for n in kept]
-        computes = [_write_part(part, symmetric, prefix, real, kept, (read, members)) for part in parts]
+        computes = [_write_part(part, symmetric, prefix, real, size, kept, (read, members)) for part in parts]
         names, starts = [m.name for m in members], [m.start for m in members]
         initial = to_c(lambda: starts, name=f"{prefix}_initial", single=real == "float", names=((), names))
         set_anew = isinstance(state, Gaussian | CentredGaussian) and apart
@@ -103,6 +107,7 @@ def _write_part(
     symmetric: set[int],
     prefix: str,
     real: Real,
+    size: bool = False,
     kept: Sequence[int] | None = None,
     names: tuple[Sequence[Member], Sequence[Member]] = ((), ()),
 ) -> Any:
@@ -128,6 +133,7 @@ def _write_part(
         else ((), ()),
         finite={*range(count), *data, count + len(part.data)},
         symmetric=symmetric,
+        short=size,
     )
 
 

@@ -134,7 +134,7 @@ def _lower_scan(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> 
     (consts, carried), length = _counts(params), params["length"]
     fixed, carry, rows = inputs[:consts], inputs[consts : consts + carried], inputs[consts + carried :]
     # Short loops are written out.
-    if length * size_of(lowering, params["jaxpr"].jaxpr) <= WRITTEN_OUT or length <= 1:
+    if length * size_of(lowering, params["jaxpr"].jaxpr) <= lowering.written_out or length <= 1:
         return _write_out_scan(lowering, equation, fixed, [lowering.nodes(x) for x in carry], rows)
     jaxpr = params["jaxpr"].jaxpr
     # A carried number that the body returns unchanged is a constant of the loop; a long array is carried in memory.

@@ -13,6 +13,7 @@ from heliograph.factors.columns import Columns, decorrelate, eliminate, reciproc
 from heliograph.factors.gaussian import Gaussian, Image, from_covariance, image_by_slopes
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.module import Module, readable, unwritten
+from heliograph.numerics.short_programs import evaluate_at_points
 from heliograph.numerics.types import Array
 
 POINT_LIMIT = 20_000  # points of a tensor rule: more is refused with the number
@@ -86,7 +87,7 @@ def evaluate_beside_mean(function: Function, x: Gaussian, steps: jax.Array) -> t
     """Return f at m + step_j L_j and at m - step_j L_j, as columns (p, n) each."""
     offsets = x.root @ jnp.diag(steps)  # a matrix product: the zeros of L stay zeros
     points = jnp.concatenate([x.mean[:, None] + offsets, x.mean[:, None] - offsets], axis=1)
-    values = jax.vmap(function, in_axes=1, out_axes=1)(points)
+    values = evaluate_at_points(function, points.T).T
     ahead, behind = jnp.split(values, 2, axis=1)
     return ahead, behind
 
@@ -138,7 +139,7 @@ class PolynomialMoments(AbstractTransform):
         if self.degree == 2:
             return _quadratic_image(function, x.mean, factor, deviations)
         points, weights = map(jnp.asarray, _hermite_grid(x.mean.shape[0], self.degree + 1))
-        values = jax.vmap(function)(x.mean + points @ factor.T).T
+        values = evaluate_at_points(function, x.mean + points @ factor.T).T
         center = values @ weights
         slopes = (values * weights) @ points  # in units of each deviation
         rest = values - center[:, None] - slopes @ points.T
@@ -155,7 +156,7 @@ def _quadratic_image(function: Function, mean: jax.Array, factor: jax.Array, dev
     n, center = mean.shape[0], mean[:, None]
     rows, columns = np.triu_indices(n, 1)
     points = [center, center + factor, center - factor, center + factor[:, rows] + factor[:, columns]]
-    values = jax.vmap(function, in_axes=1, out_axes=1)(jnp.concatenate(points, axis=1))
+    values = evaluate_at_points(function, jnp.concatenate(points, axis=1).T).T
     start, ahead, behind, both = jnp.split(values, [1, n + 1, 2 * n + 1], axis=1)
     slopes, squares = (ahead - behind) / 2, (ahead + behind) / 2 - start
     mixed = both - ahead[:, rows] - ahead[:, columns] + start
