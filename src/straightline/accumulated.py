@@ -156,6 +156,7 @@ class Begun:
         return [(buffer, summed and not common) for buffer, summed, common in parts]
 
     def _pointers(self, numbers: np.ndarray, results: Sequence[np.ndarray]) -> np.ndarray:
+        """Return the addresses of inputs, tables, results and the memory that all runs share."""
         position = self.program.summed.number
         inputs = [*self.arguments[:position], numbers, *self.arguments[position:]]
         every = [*inputs, *self.program.code.tables, *results, self.memory]

@@ -137,6 +137,7 @@ class Compiled:
         list(threads().map(lambda start: call.compute(start, min(start + share, blocks), scratch), starts))
 
     def _copy_common(self, outputs: list[np.ndarray], shared: np.ndarray) -> None:
+        """Copy the outputs that all runs share from where they were computed."""
         for array, common, offset, buffer in zip(
             outputs, self.code.common, self.code.places, self.code.outputs, strict=True
         ):

@@ -83,6 +83,7 @@ class Lowering:
             raise failed(name, error, code_line(equation)) from error
 
     def _apply_rule(self, equation: JaxprEqn, name: str, inputs: list[Value]) -> Sequence[Value]:
+        """Apply the rule of an operation: in memory if an input is there, else on its entries."""
         if name in IN_MEMORY and (name not in RULES or any(isinstance(x, InMemory) for x in inputs)):
             return IN_MEMORY[name](self, equation, inputs)
         if name not in RULES:

@@ -139,6 +139,7 @@ class Tiers:
             return machine
 
     def _first(self, executions: float) -> Machine:
+        """Return the code that is made at the first call, at a level for so many executions."""
         if self._machine is None:
             level = self._level(executions)
             self._machine = generate(self._source, level, self._widths[level])

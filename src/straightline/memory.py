@@ -75,6 +75,7 @@ class InMemory:
         return self.loaded[1]
 
     def _load(self, graph: Graph) -> np.ndarray:
+        """Return a node for each entry, which loads it."""
         strides, indices = [s for s, _ in self.moves], [i for _, i in self.moves]
         nodes = np.empty(self.shape, dtype=object)
         for index in product(*map(range, self.shape)):

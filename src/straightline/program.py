@@ -111,7 +111,7 @@ def list_needed(roots: Iterable[Node | Buffer]) -> dict[Any, None]:
         node = waiting.pop()
         if node not in results:
             results[node] = None
-            waiting += node.args if is_plain(node) else _needs(node)
+            waiting += node.args if is_plain(node) else _list_needs(node)
     return results
 
 
@@ -123,7 +123,8 @@ def is_plain(node: Any) -> bool:
     return type(node) is Node and node.block.parent is None and node.op not in REFERRING
 
 
-def _needs(node: Any) -> list[Any]:
+def _list_needs(node: Any) -> list[Any]:
+    """Return what a node, a buffer or a statement needs: arguments, memory, and the block around it."""
     if isinstance(node, Buffer):
         within = [] if node.inside is None else [node.inside[0]]
         return [*node.stores, *node.parts, *within]

@@ -146,6 +146,7 @@ class _Worker:
 
 
 def _say(process: subprocess.Popen[str], line: str) -> None:
+    """Send a line to a worker; one that is dead is noticed by its answer, which does not come."""
     assert process.stdin is not None
     with suppress(OSError):  # it is dead: the answer, which does not come, will say so
         process.stdin.write(line + "\n")

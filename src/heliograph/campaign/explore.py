@@ -179,6 +179,7 @@ MEANING = (
 
 
 def _describe_cut(settings: int, campaign: Campaign, shown: Sequence[Score], scores: Sequence[Score]) -> str:
+    """Say how many of the settings and rows are on the page, and where all are."""
     if len(shown) == len(scores):
         return f"{len(shown)} rows, one for each setting, node and filter."
     return (

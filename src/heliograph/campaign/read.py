@@ -44,7 +44,7 @@ def load_campaign(path: str | Path) -> Campaign:
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
         raise fail(f"campaign {path}", "a TOML file in UTF-8", str(error)) from None
-    table = _parse(text, path.name)
+    table = _parse_toml(text, path.name)
     file = path.parent / _read_network(table, path.name).rpartition(":")[0]
     if not file.is_file():
         raise fail(f"{path.name}, network", f"a Python file in {path.parent}", f"{file.name}: nothing of that name")
@@ -60,7 +60,7 @@ def read_campaign(text: str, source: str, path: Path) -> Campaign:
         ValueError: as `load_campaign`, except for settings that the function does not take.
     """
     name = path.name
-    table = _parse(text, name)
+    table = _parse_toml(text, name)
     # An unknown key is most likely misspelt: name the closest one.
     for key in table:
         if key not in KEYS:
@@ -77,7 +77,7 @@ def read_campaign(text: str, source: str, path: Path) -> Campaign:
         horizon=horizon,
         runs=runs,
         seed=check_seed(f"{name}, seed", table.get("seed", 0)),
-        chunk=min(_chunk(table.get("chunk", CHUNK), name), BLOCK * -(-runs // BLOCK)),
+        chunk=min(_read_chunk(table.get("chunk", CHUNK), name), BLOCK * -(-runs // BLOCK)),
         keep=_one_of(table.get("keep", KEEP[0]), KEEP, f"{name}, keep"),
         inputs=_read_inputs(table.get("inputs", {}), horizon, name),
         settings=_read_settings(table, name),
@@ -86,7 +86,8 @@ def read_campaign(text: str, source: str, path: Path) -> Campaign:
     )
 
 
-def _parse(text: str, name: str) -> dict[str, object]:
+def _parse_toml(text: str, name: str) -> dict[str, object]:
+    """Return the tables of a campaign's TOML, under its name in errors."""
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -110,7 +111,8 @@ def _count(table: Mapping[str, object], key: str, name: str) -> int:
     return check_count(f"{name}, {key}", table.get(key, "none"))
 
 
-def _chunk(value: object, name: str) -> int:
+def _read_chunk(value: object, name: str) -> int:
+    """Return the runs of a chunk, a multiple of those simulated side by side."""
     count = check_count(f"{name}, chunk", value)
     if count % BLOCK:
         raise fail(f"{name}, chunk", f"a multiple of {BLOCK}, the runs simulated side by side", count)

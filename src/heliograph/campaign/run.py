@@ -123,7 +123,7 @@ def _compute_missing(
         return CampaignRun(out, already, 0, [], [])
     failed: dict[Job, Reply] = {}
     if missing or damaged:
-        count = _count(workers, len(missing) or 1)
+        count = _count_workers(workers, len(missing) or 1)
         with start_engine(campaign.as_json(), store, count, scheduler, campaign.timeout) as engine:
             (out / SUMMARY).unlink(missing_ok=True)  # it would not hold for what follows
             failed = _compute_settings(engine, campaign, store, missing, already, progress)
@@ -166,7 +166,8 @@ def _list_jobs(campaign: Campaign, only: Sequence[tuple[int, int]] | None) -> li
     return chosen
 
 
-def _count(workers: int | None, jobs: int) -> int:
+def _count_workers(workers: int | None, jobs: int) -> int:
+    """Return how many processes work: as asked, else one for each processor, and no more than jobs."""
     if workers is None:
         cpus = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         return min(cpus, jobs)

@@ -107,7 +107,7 @@ def summarize(store: Path, campaign: Campaign) -> list[Score]:
             for j, name in enumerate(labels.filters):
                 if claims[setting, i, j]:
                     label = setting, node, name, str(claims[setting, i, j])
-                    scores.append(_score(label, squared[:, i, j], nees[:, i, j]))
+                    scores.append(_make_score(label, squared[:, i, j], nees[:, i, j]))
     return scores
 
 
@@ -125,7 +125,8 @@ def _read(group: zarr.Group, name: str, setting: int, runs: slice) -> np.ndarray
     return np.asarray(array[setting, runs])
 
 
-def _score(label: tuple[int, str, str, str], squared: np.ndarray, nees: np.ndarray) -> Score:
+def _make_score(label: tuple[int, str, str, str], squared: np.ndarray, nees: np.ndarray) -> Score:
+    """Return RMSE and NEES of a filter with their standard errors, from squared errors and NEES of each run."""
     finite = np.isfinite(squared)
     mse, mse_error = _mean(squared[finite])
     rmse = float(np.sqrt(mse))

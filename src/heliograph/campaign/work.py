@@ -171,7 +171,7 @@ class Errors(AbstractReducer[dict[str, PyTree]]):
         """Collect the errors of one step."""
         recorded = {
             kind: jax.tree.map(
-                lambda estimate: _errors(step["truth"], estimate),
+                lambda estimate: _measure_errors(step["truth"], estimate),
                 step[kind],
                 is_leaf=lambda leaf: isinstance(leaf, Estimate),
             )
@@ -197,7 +197,8 @@ class Errors(AbstractReducer[dict[str, PyTree]]):
         return {"estimates": estimates, "truth": collected["truth"], "measurements": measurements}
 
 
-def _errors(truth: jax.Array, estimate: Estimate) -> dict[str, jax.Array]:
+def _measure_errors(truth: jax.Array, estimate: Estimate) -> dict[str, jax.Array]:
+    """Return error, claimed variances and NEES per state, of one estimate or of each step's."""
     error, covariance = estimate.error(truth), jnp.asarray(estimate.covariance)
     variance = jnp.broadcast_to(jnp.diagonal(covariance, axis1=-2, axis2=-1), error.shape)
     nees = jnp.vectorize(squared_distance, signature="(n,n),(n)->()")(covariance, error)

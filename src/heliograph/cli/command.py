@@ -129,6 +129,8 @@ def _output_is_lost() -> bool:
 
 
 def _refuse(message: str) -> int:
+    """Print an error as one line, and return the exit status of bad input."""
+
     from heliograph.disk.quoting import visible
 
     print("heliograph:", visible(" ".join(message.split())), file=sys.stderr)

@@ -110,6 +110,8 @@ def _parse_smoothing(word: str) -> "FixedInterval | FixedLag | None":
 
 
 def _print_lines(warnings: list[str], summary: list[str]) -> None:
+    """Print warnings to the standard error, and the summary to the standard output."""
+
     from heliograph.disk.quoting import visible
 
     for line in warnings:

@@ -67,6 +67,7 @@ def _clear(numbers: jax.Array, least: jax.Array) -> jax.Array:
 
 
 def _triangularise_row_by_row(rows: jax.Array, weights: jax.Array) -> Columns:
+    """Write Gram-Schmidt out row by row: L and d with L diag(d) L' = A W A', A's `rows` and W's `weights`."""
     m, share, size = len(rows), max(UNITS * rows.shape[1] * unit_of(rows), RANK), jnp.abs(rows)
     lower, variances = list[jax.Array](), list[jax.Array]()
     for j in range(m):
@@ -84,6 +85,7 @@ def _triangularise_row_by_row(rows: jax.Array, weights: jax.Array) -> Columns:
 
 @operation(_triangularise_row_by_row)
 def _triangularise_in_loop(rows: jax.Array, weights: jax.Array) -> Columns:
+    """Do the same as `_triangularise_row_by_row` in a loop, for so many rows that a long program would be slow."""
     m, share = len(rows), max(UNITS * rows.shape[1] * unit_of(rows), RANK)
 
     def body(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:

@@ -72,8 +72,8 @@ def read_design(path: Path) -> DesignFile:
     problem = DesignProblem(
         network=network,
         free=None if free is None else tuple(free),
-        error=Error(**_table(path, table, "error")) if "error" in table else None,
-        budget=_budget(path, table),
+        error=Error(**_read_table(path, table, "error")) if "error" in table else None,
+        budget=_read_budget(path, table),
         target_error=_number(path, table, "target_error"),
         starts=check_count(f"{path.name}, starts", table.get("starts", 64)),
         seed=check_seed(f"{path.name}, seed", table.get("seed", 0)),
@@ -95,7 +95,8 @@ def _number(path: Path, table: Mapping[str, Any], key: str) -> float | None:
     return float(scalar(f"{path.name}, {key}", table[key], 0.0)) if key in table else None
 
 
-def _budget(path: Path, table: Mapping[str, Any]) -> Budget | None:
+def _read_budget(path: Path, table: Mapping[str, Any]) -> Budget | None:
+    """Return the budget: a table of limits, a number for the total, or None."""
     value = table.get("budget")
     if value is None:
         return None
@@ -104,7 +105,7 @@ def _budget(path: Path, table: Mapping[str, Any]) -> Budget | None:
 
 def _read_map(path: Path, table: Mapping[str, object]) -> MapPlaces:
     """Return the places of the map that a design file asks for: the network's function of x and y, and the grid."""
-    values = _table(path, table, "map")
+    values = _read_table(path, table, "map")
     file, name = _find_function(path, values.get("network"), "map.network")
     if not name:
         raise fail(f"{path.name}, map.network", 'a file and a function of x and y, as "my_network.py:at"', file.name)
@@ -127,7 +128,8 @@ def _find_function(path: Path, value: object, key: str) -> tuple[Path, str]:
     return file, name
 
 
-def _table(path: Path, table: Mapping[str, object], key: str) -> dict[str, Any]:
+def _read_table(path: Path, table: Mapping[str, object], key: str) -> dict[str, Any]:
+    """Return the table under a key; raise if something else stands there."""
     value = table[key]
     if not isinstance(value, dict):
         raise fail(f"{path.name}, {key}", f"a table of {', '.join(TABLES[key])}", repr(value))
@@ -135,6 +137,7 @@ def _table(path: Path, table: Mapping[str, object], key: str) -> dict[str, Any]:
 
 
 def _check_keys(where: str, table: Mapping[str, object], known: tuple[str, ...]) -> None:
+    """Raise at a key that is not known, with the one most like it."""
     for key in table:
         if key not in known:
             close = get_close_matches(key, known, 1)

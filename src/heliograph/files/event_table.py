@@ -96,9 +96,10 @@ class EventTable:
         if len(self._plants) > 1:
             names = ", ".join(map(repr, list(self._plants)[:8]))
             raise fail("events", f"those of one plant, as events.of({next(iter(self._plants))!r}) has", names)
-        return next(iter(self._plants.values()), {}) or self._columns("")
+        return next(iter(self._plants.values()), {}) or self._columns_of("")
 
-    def _columns(self, plant: str) -> dict[str, Columns]:
+    def _columns_of(self, plant: str) -> dict[str, Columns]:
+        """Return the columns of a plant by node, and of its inputs; empty ones where it is new."""
         if plant not in self._plants:
             sizes = {INPUTS: len(self.network.inputs) - (not self.steps)}
             sizes |= {name: self.network.nodes[name].received for name in self.network.names}
@@ -110,7 +111,7 @@ class EventTable:
 
         Without a time it is of that moment.
         """
-        columns = self._columns(reading.plant)[reading.node]
+        columns = self._columns_of(reading.plant)[reading.node]
         time = arrival if reading.time is None else reading.time
         columns.time.append(time)
         columns.arrival.append(time if self._at_once else arrival)
@@ -128,7 +129,7 @@ class EventTable:
         period: int,
     ) -> None:
         """Append readings of a node as `add` does one after another; without a time (`NONE`) or a count (-1)."""
-        columns = self._columns("")[node]
+        columns = self._columns_of("")[node]
         time = np.where(time == NONE, arrival, time)
         for column, moments in ((columns.time, time), (columns.arrival, time if self._at_once else arrival)):
             column.frombytes(moments.tobytes())
@@ -138,7 +139,7 @@ class EventTable:
 
     def note_unread(self, reading: Reading, arrival: float | None) -> None:
         """Note a message of a node that came with its count and could not be read."""
-        self._columns(reading.plant)[reading.node].note_unread(reading, arrival)
+        self._columns_of(reading.plant)[reading.node].note_unread(reading, arrival)
 
     def refuse(self, error: InputError, strict: bool) -> None:
         """Count a message that cannot be read, with the reason.

@@ -247,14 +247,16 @@ def _read_cells(columns: Mapping[str, np.ndarray], network: Network, checks: _Ro
     expected = [(TIME,), *((name,) for name in inputs), *(a for node in received.values() for a in node)]
     true = _truth_columns(network)
     _refuse_unknown(columns, [*expected, *((name,) for name in true.values())], source)
-    time = _read_times(columns, _find(columns, (TIME,), source), checks)
+    time = _read_times(columns, _find_column(columns, (TIME,), source), checks)
     measurements = {
-        node: np.stack([_read_measurements(columns, _find(columns, a, source), checks) for a in components], axis=1)
+        node: np.stack(
+            [_read_measurements(columns, _find_column(columns, a, source), checks) for a in components], axis=1
+        )
         for node, components in received.items()
     }
     # An input dt may be left out.
     given = {
-        name: _complete(columns, _find(columns, (name,), source), checks)
+        name: _complete(columns, _find_column(columns, (name,), source), checks)
         for name in inputs
         if name != TIME_STEP or name in columns
     }
@@ -307,7 +309,8 @@ def _refuse_unknown(columns: Mapping[str, np.ndarray], expected: list[tuple[str,
             raise fail(f"{source}, header", f"only the columns {listed}", f"the unknown {column!r}{closest}")
 
 
-def _find(columns: Mapping[str, np.ndarray], names: tuple[str, ...], source: str) -> str:
+def _find_column(columns: Mapping[str, np.ndarray], names: tuple[str, ...], source: str) -> str:
+    """Return which of these names a column has; raise unless exactly one does."""
     present = [name for name in names if name in columns]
     if len(present) != 1:
         came = f"both {' and '.join(map(repr, present))}" if present else f"only {', '.join(columns)}"

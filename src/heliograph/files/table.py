@@ -236,6 +236,7 @@ class CsvColumns:
         return Rows(columns, np.array(numbers, dtype=np.int64), refused)
 
     def _check_header(self, row: CsvRow) -> None:
+        """Raise if a row stands under another header than the rows before it."""
         if not self.header:
             self.header = row.header
         if row.header != self.header:
@@ -266,6 +267,7 @@ class CsvColumns:
         return not cell or NO_VALUE.fullmatch(cell) is not None
 
     def _read_moment(self, row: CsvRow, name: str, cell: str) -> int:
+        """Return a date as nanoseconds; raise where dates of one column differ in having a zone."""
         where = f"{row.where}, column {name!r}"
         moment, zoned = moment_of(cell, where)
         if self._zoned.setdefault(name, zoned) != zoned:
@@ -284,6 +286,7 @@ class CsvColumns:
 
 
 def _read_csv(path: Path, only: Container[str] | None, strict: bool) -> "Rows":
+    """Return rows of a CSV file: of plain numbers all at once, else cell by cell, which names what is wrong."""
     plain = read_plain_numbers(path)
     if plain is not None and np.nanmax(np.abs(plain[1]), initial=0.0) < EXACT:
         header, numbers = plain
@@ -328,6 +331,7 @@ def _read_parquet(path: Path, only: Container[str] | None) -> Rows:
 
 
 def _write_csv(columns: Mapping[str, np.ndarray], path: Path) -> None:
+    """Write columns as CSV, a block of rows at a time."""
     with path.open("x", newline="", encoding="utf-8") as file:
         check_distinct(f"columns of {path}", [read_back_name(name) for name in columns])
         csv.writer(file).writerow(map(quote_for_cell, columns))
@@ -367,6 +371,8 @@ def _plain(column: np.ndarray) -> np.ndarray:
 
 
 def _write_parquet(columns: Mapping[str, np.ndarray], path: Path) -> None:
+    """Write columns as Parquet, dates as nanoseconds of UTC."""
+
     import pyarrow as pa
     import pyarrow.parquet as pq
 

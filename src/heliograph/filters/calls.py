@@ -50,6 +50,8 @@ def call_with_inputs(filter: Any, state: PyTree, function: Callable[..., R], *da
 
 @cache
 def _judge_inputs_too(function: Callable[..., R]) -> Callable[..., tuple[R, Array]]:
+    """Return the function that also says whether the inputs spoil a step."""
+
     @compile_on_call
     def call(filter: Any, state: PyTree, *data: PyTree) -> tuple[R, Array]:
         return function(filter, state, *data), do_inputs_spoil(filter, filter.inputs, *data[-2:])

@@ -33,6 +33,7 @@ def agree(states: PyTree, others: PyTree, tolerance: float = TOLERANCE) -> Bool[
 
 
 def _are_near(a: np.ndarray, b: np.ndarray, within: np.ndarray) -> Bool[np.ndarray, "..."]:
+    """Return which entries differ by no more than is allowed, or are both NaN."""
     with np.errstate(invalid="ignore"):  # of numbers that overflowed
         near: np.ndarray = np.abs(a - b) <= within + ROUNDING * np.abs(b)
     near |= np.isnan(a) & np.isnan(b)

@@ -76,14 +76,14 @@ def ahead_of(origin: Origin, names: Sequence[str], horizons: Horizons, inputs: I
 def _convert_to_steps(origin: Origin, horizons: Horizons) -> np.ndarray:
     """Return the horizons as numbers of steps."""
     if is_whole(horizons):
-        return np.arange(1.0, _count(horizons) + 1)
+        return np.arange(1.0, _check_steps(horizons) + 1)
     steps = []
     for one in _list_horizons(horizons):
         if origin.months and isinstance(one, datetime | np.datetime64) and _convert_to_seconds(origin, one):
             steps.append(_count_months(origin, one))
             continue
         if (seconds := _convert_to_seconds(origin, one)) is None:
-            steps.append(float(_count(one)))
+            steps.append(float(_check_steps(one)))
             continue
         if not origin.spacing > 0:
             raise fail("horizons", "numbers of steps, where the time between them is not known", show_value(one))
@@ -110,14 +110,15 @@ def _convert_to_times(origin: Origin, horizons: Horizons) -> np.ndarray:
     if is_whole(horizons):
         if not origin.spacing > 0:
             raise fail("horizons", "times ahead, such as [1.0, 5.0], where no step is usual", horizons)
-        return origin.spacing * np.arange(1, _count(horizons) + 1)
+        return origin.spacing * np.arange(1, _check_steps(horizons) + 1)
     listed = [(one, _convert_to_seconds(origin, one)) for one in _list_horizons(horizons)]
     return np.array(
         [float(array("horizon", cast(ArrayLike, one), ())) if seconds is None else seconds for one, seconds in listed]
     )
 
 
-def _count(value: object) -> int:
+def _check_steps(value: object) -> int:
+    """Return a count of steps ahead; raise if there are too many."""
     count = check_count("horizons", value)
     if count > LONGEST:
         raise fail("horizons", f"at most {LONGEST:,} steps", count)

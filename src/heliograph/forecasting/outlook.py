@@ -164,6 +164,8 @@ def look_ahead_of_each(
 
 
 def _look_ahead(outlook: Outlook, state: PyTree, u: jax.Array, step: jax.Array) -> PyTree:
+    """Return the moments of each step ahead, from a state, under inputs `u` (steps, inputs)."""
+
     def body(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
         return outlook.step(state, *row)
 

@@ -96,7 +96,7 @@ def _apply_operation(equation: Any, x: list[Interval], continuous: bool) -> Inte
                 raise UnknownError("a number made whole")
             return Interval(x[0].low.astype(kind), x[0].high.astype(kind))
         case "reduce_sum":
-            return _sum(x[0], tuple(params["axes"]))
+            return _sum_intervals(x[0], tuple(params["axes"]))
         case "dot_general":
             return _bound_contraction(x[0], x[1], params["dimension_numbers"])
         case "iota":
@@ -225,7 +225,8 @@ def _bound_cosine(a: Interval) -> Interval:
     return Interval(np.maximum(low, -1.0), np.minimum(high, 1.0))
 
 
-def _sum(a: Interval, axes: tuple[int, ...]) -> Interval:
+def _sum_intervals(a: Interval, axes: tuple[int, ...]) -> Interval:
+    """Return an interval that holds the sum over some axes, rounding included."""
     count = int(np.prod([a.low.shape[i] for i in axes]))
     size = np.sum(np.maximum(np.abs(a.low), np.abs(a.high)), axis=axes)
     room = 2 * (count + 2) * np.finfo(float).eps * size
@@ -248,7 +249,7 @@ def _bound_contraction(a: Interval, b: Interval, dimensions: Contraction) -> Int
     wide.append(Interval(*(laid(end, right, right_batch, free_a, 0) for end in b)))
     product = round_outward(*_product(*wide))
     axes = tuple(range(product.low.ndim - len(left), product.low.ndim))
-    return _sum(product, axes)
+    return _sum_intervals(product, axes)
 
 
 ARITHMETIC: dict[str, Callable[..., Interval]] = {

@@ -73,6 +73,8 @@ def _make_sums(density: np.ndarray) -> "xr.Dataset":
 
 
 def _make_dataset(content: dict[str, Any], more: dict[str, Any] | None = None) -> "xr.Dataset":
+    """Return arrays (chain, draw, ...) as a dataset with these coordinates."""
+
     import xarray as xr
 
     draws = next(iter(content.values()))[1].shape[1]

@@ -334,6 +334,7 @@ class Fleet:
 
 
 def _check_options(options: Options) -> Options:
+    """Return the options as numbers of their kinds; raise at one that is out of range."""
     step = None if options.step is None else float(scalar("step", options.step, TINY))
     leap = options.leap if options.leap == np.inf else scalar("leap", options.leap, 0)
     window, ahead = (float(scalar(name, getattr(options, name), 0)) for name in ("window", "ahead"))

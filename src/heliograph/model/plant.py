@@ -318,6 +318,7 @@ class LinearPlant(AbstractPlant):
         check_turns("plant", self.transition, self.initial_mean, self.manifold, self.manifold, u)
 
     def _matrix(self, name: str, value: MatrixLike, shape: tuple[int, int]) -> Any:
+        """Return an array, or a function of the inputs, after a check of its shape."""
         if not callable(value):
             return array(name, value, shape)
         check_shape(f"{name}(u)", value, (np.zeros(len(self.inputs)),), shape)

@@ -244,6 +244,7 @@ def _check_listener(network: RelayNetwork, number: int, listener: str, links: Li
 
 
 def _check_reached(network: RelayNetwork, name: str) -> None:
+    """Raise if nobody ever transmits to a relay, or to the receiver."""
     received = {sender for slot in network.slots for sender in slot.get(name, {})}
     if name == RECEIVER and not received:
         raise fail("slots", "one in which somebody transmits to the receiver", "a schedule in which nobody does")

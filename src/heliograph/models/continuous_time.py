@@ -139,6 +139,7 @@ def _double_where(count: Any) -> Callable[[Any, tuple[Any, ...]], tuple[Any, ...
 
 
 def _read_continuous(A: ArrayLike, intensity: ArrayLike, B: ArrayLike | None) -> Continuous:
+    """Return A, B and the noise intensity as arrays of shapes that fit."""
     a = array("matrix of the motion", A, (None, None))
     n = a.shape[0]
     a = array("matrix of the motion", a, (n, n))

@@ -169,6 +169,7 @@ class _Evaluation:
         return a
 
     def _accumulate(self, a: Compensated, axis: int, reverse: bool) -> Compensated:
+        """Return the running sums along an axis, from its first entry on or from its last."""
         parts = _take_apart(a, axis)
         for i in range(1, len(parts)):
             parts[i] = self._add(parts[i - 1], parts[i]) if not reverse else parts[i]

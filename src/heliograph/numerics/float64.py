@@ -88,6 +88,7 @@ def understood() -> Options:
 
 
 def _is_understood(name: str) -> bool:
+    """Return whether this version of XLA knows an option."""
     try:
         jax.jit(lambda: jnp.zeros(()), compiler_options={name: OPTIONS[name]})()
     except jax.errors.JaxRuntimeError:

@@ -52,6 +52,7 @@ def _rest(x: object, y: object) -> bool:
 
 
 def _same_array(value: Any, other: Any) -> bool:
+    """Return whether arrays have the same entries and type, NaN as NaN; keys by their data."""
     if value.shape != other.shape or value.dtype != other.dtype:
         return False
     if jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
@@ -111,7 +112,7 @@ def _write_repr(self: object) -> str:
 
 def _html(self: object) -> str:
     """Return a table of the parts; what has parts itself opens where it stands."""
-    return _table(self, DEPTH)
+    return _format_table(self, DEPTH)
 
 
 def _equal(self: object, other: object) -> bool:
@@ -124,7 +125,7 @@ def _equal(self: object, other: object) -> bool:
 def line(value: object, depth: int) -> str:
     """Return any value on one line: arrays by their size, what lies deeper than `depth` by its class name."""
     if isinstance(value, np.ndarray | np.generic | jax.Array):
-        return _array(value)
+        return _format_array(value)
     # Containers, item by item.
     if isinstance(value, Mapping) and not _ours(value):
         return _join_some(
@@ -159,7 +160,8 @@ def _list_parts(value: object) -> Iterable[tuple[str, object]]:
     return ((name, entry) for name, entry in named if not name.startswith("_"))
 
 
-def _array(value: np.ndarray | np.generic | jax.Array) -> str:
+def _format_array(value: np.ndarray | np.generic | jax.Array) -> str:
+    """Return a few numbers as text, of more than that their type and shape."""
     if isinstance(value, jax.core.Tracer) or value.size > FEW or value.dtype.kind not in "fiub":
         return f"{value.dtype}[{','.join(map(str, value.shape))}]"
     numbers = np.asarray(value).tolist()
@@ -173,6 +175,7 @@ def _round_numbers(numbers: object) -> str:
 
 
 def _join_some(start: str, items: Iterable[E], count: int, depth: int, of: Callable[[E], str], end: str) -> str:
+    """Join the first items as text, with the number of those left out; none below the last depth."""
     if count and depth <= 0:
         return f"{start}…{end}"
     more = [f"… {count - SOME} more"] if count > SOME else []
@@ -184,7 +187,8 @@ def cut(text: str) -> str:
     return text if len(text) <= WIDTH else f"{text[: WIDTH - 1]}…"
 
 
-def _table(value: object, depth: int) -> str:
+def _format_table(value: object, depth: int) -> str:
+    """Return an object as a table of HTML, a row for each of its parts."""
     rows = [
         f"<tr><th>{escape(name)}</th><td>{_cell(entry, depth - 1)}</td></tr>" for name, entry in _list_entries(value)
     ]
@@ -192,6 +196,7 @@ def _table(value: object, depth: int) -> str:
 
 
 def _list_entries(value: object) -> Iterable[tuple[str, object]]:
+    """Yield the parts of an object by name, and how many more there are."""
     entries = _list_parts(value)
     yield from islice(entries, LARGE)
     left = sum(1 for _ in entries)
@@ -202,4 +207,4 @@ def _list_entries(value: object) -> Iterable[tuple[str, object]]:
 def _cell(value: object, depth: int) -> str:
     text = escape(cut(line(value, depth)))
     opens = _ours(value) or (isinstance(value, Mapping) and value)
-    return f"<details><summary>{text}</summary>{_table(value, depth)}</details>" if opens and depth > 0 else text
+    return f"<details><summary>{text}</summary>{_format_table(value, depth)}</details>" if opens and depth > 0 else text

@@ -59,6 +59,7 @@ def check_budget(value: object) -> Budget:
 
 
 def _check_limit(name: str, value: ArrayLike | Mapping[str, float] | None) -> PerTransmitter:
+    """Return a limit of powers: a number for all transmitters, or one for each of some by name."""
     if value is None:
         return None
     if isinstance(value, Mapping):
@@ -152,6 +153,7 @@ def make_power_limits(
 
 
 def _list_by_name(what: str, limit: PerTransmitter, names: Sequence[str]) -> Float[np.ndarray, "hop"]:
+    """Return a limit for each transmitter in order, infinite where there is none."""
     if not isinstance(limit, dict):
         return np.full(len(names), np.inf if limit is None else limit)
     unknown = sorted(set(limit) - set(names))

@@ -87,7 +87,7 @@ def steady_moment(plant: AnyPlant) -> Float[Array, "n1 n1"]:
     spread = steady_covariance(start.matrix, noise.covariance)
     xp = library(start.matrix, noise.mean)
     mean = xp.linalg.solve(np.eye(len(start.states)) - start.matrix, noise.mean)
-    return _second_moment(mean, spread)
+    return _make_second_moment(mean, spread)
 
 
 def moments_over(plant: AnyPlant, horizon: int, inputs: ArrayLike | None = None) -> list[Float[Array, "n1 n1"]]:
@@ -114,7 +114,7 @@ def moments_over(plant: AnyPlant, horizon: int, inputs: ArrayLike | None = None)
         added.append(library(noise).pad(noise, ((0, 1), (0, 1))))
     xp = library(maps, added)
     system = JumpSystem(np.ones((horizon, 1, 1)), xp.stack(maps)[:, None], xp.stack(added)[:, None])
-    return [one for (one,) in system.after(_second_moment(start.initial_mean, start.initial_covariance)[None])]
+    return [one for (one,) in system.after(_make_second_moment(start.initial_mean, start.initial_covariance)[None])]
 
 
 def _read_noise(plant: LinearPlant, u: Float[np.ndarray, "inputs"]) -> tuple[Array, Array]:
@@ -142,7 +142,8 @@ def _extend(matrix: Float[Array, "m n"], shift: Float[Array, "m"]) -> Float[Arra
     return extended
 
 
-def _second_moment(mean: Float[Array, "n"], covariance: Float[Array, "n n"]) -> Float[Array, "n1 n1"]:
+def _make_second_moment(mean: Float[Array, "n"], covariance: Float[Array, "n n"]) -> Float[Array, "n1 n1"]:
+    """Return E[(x, 1) (x, 1)'] from mean and covariance of x."""
     xp = library(mean, covariance)
     extended = xp.append(mean, 1.0)
     second: Array = xp.outer(extended, extended) + xp.pad(covariance, ((0, 1), (0, 1)))

@@ -192,6 +192,7 @@ class Series(AbstractCombination):
 
 
 def _join_in_series(x: Outcome, y: Outcome) -> tuple[AbstractRandomAffine, np.ndarray]:
+    """Return y behind x, and which of its outputs arrive: those that use nothing that x lost."""
     received = known(np.diag(x.arrived.astype(float)))
     power = np.asarray(y.map.moments(2).second)[..., :-1, :-1]
     uses = np.einsum("iiaa->ia", power) > 0  # E[G_ia^2]

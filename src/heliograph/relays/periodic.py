@@ -375,7 +375,8 @@ def _receiver_traces(steps: RelaySteps, gains: jax.Array) -> tuple[jax.Array, ja
     return jnp.trace(last, axis1=1, axis2=2), is_covariance(end.moments), jnp.sum(end.power[:, 1:], axis=1)
 
 
-def _behind_traces(steps: RelaySteps, gains: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _trace_receiver_errors(steps: RelaySteps, gains: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return the traces of the receiver's error, whether its covariances are sound, and the relays' powers."""
     end, n = steady_moments(steps, gains), steps.transition.shape[-1]
     spread = steady_receiver_covariance(steps, gains)
     sound = is_covariance(end.moments[:, :-n, :-n]) & is_covariance(spread)
@@ -383,4 +384,4 @@ def _behind_traces(steps: RelaySteps, gains: jax.Array) -> tuple[jax.Array, jax.
 
 
 _receiver_cost = _make_penalised_cost(_receiver_traces)
-_behind_cost = _make_penalised_cost(_behind_traces)
+_behind_cost = _make_penalised_cost(_trace_receiver_errors)

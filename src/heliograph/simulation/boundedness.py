@@ -114,7 +114,7 @@ def _join_links(network: Network, states: int) -> JointLinks:
     nodes = [node for node in network.nodes.values() if isinstance(node, Node)]
     matrices, noises = zip(*(sensor_matrices(node.sensor, states) for node in nodes), strict=True)
     means = [np.asarray(first(node.sensor).noise.mean) for node in nodes]
-    channels = [_constant(node.channel) for node in nodes]
+    channels = [_require_constant(node.channel) for node in nodes]
     # Channels in parallel, as one chain of modes.
     joint = parallel(channels) if len(channels) > 1 else channels[0]
     for memory in memories(joint).values():
@@ -130,7 +130,8 @@ def _join_links(network: Network, states: int) -> JointLinks:
     return JointLinks(*links, np.concatenate(matrices), np.concatenate(means), noise)
 
 
-def _constant(channel: Channel) -> AbstractRandomAffine:
+def _require_constant(channel: Channel) -> AbstractRandomAffine:
+    """Return a channel that neither varies nor delays; raise at another."""
     if isinstance(channel, OverTime):
         raise fail("channel", "one that does not vary", "one that varies")
     if channel.past:

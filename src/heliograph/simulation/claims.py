@@ -169,6 +169,7 @@ def list_other_beliefs(network: HasNodes) -> Iterator[Belief]:
 
 
 def _collect_beliefs(node: str, own: Premise, filters: Mapping[str, AbstractFilter]) -> Iterator[Belief]:
+    """Yield the filters of a node that claim something and were made for another world, with what differs."""
     for label, filter in filters.items():
         says = filter.premise is not None or filter.kept.lowered
         if filter.claim != "none" and says and (parts := parts_apart(own, filter)):

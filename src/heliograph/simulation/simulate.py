@@ -150,6 +150,7 @@ def _warn_beyond_limits(record: Record, network: Network) -> None:
 
 
 def _check_counts(horizon: int, runs: int, chunk: int, first_run: int) -> None:
+    """Raise at counts that are none, and at a first run amid a block."""
     for name, count in (("horizon", horizon), ("runs", runs), ("chunk", chunk)):
         check_count(name, count)
     if check_count("first_run", first_run, 0) % BLOCK:

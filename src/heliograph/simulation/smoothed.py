@@ -158,6 +158,7 @@ def select_smoothed_part(network: Network, smoothing: AbstractSmoothing, horizon
 
 
 def _find_claim_of_smoother(filter: AbstractFilter) -> Claim:
+    """Return the claim of a filter's smoothed estimates, from the shape of a step, without computing one."""
     u, z = np.zeros(len(filter.inputs)), np.zeros(filter.received)
     with jax.enable_x64(True):
         state = jax.tree.map(np.asarray, filter.init())

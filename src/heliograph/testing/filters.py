@@ -54,7 +54,7 @@ def check_filter(filter: AbstractFilter, inputs: ArrayLike = (), steps: int = 5,
         for belief in (following, corrected):
             assert str(jax.tree.structure(belief)) == structure, "step: expected a state of init's structure"
         _check_estimate(estimate, len(filter.states), k)
-        _same(f"step {k}: the prediction, corrected", known, estimate)
+        _check_same(f"step {k}: the prediction, corrected", known, estimate)
         _check_innovation(innovation, z, filter, k)
         gap = np.abs(side_by_side - estimate.mean).max()
         scale = 1 + np.abs(estimate.mean).max()
@@ -156,7 +156,8 @@ def _check_innovation(innovation: Innovation, z: np.ndarray, filter: AbstractFil
         assert np.array_equal(np.isnan(covariance), unknown), f"step {k}: expected a covariance where z arrived"
 
 
-def _same(what: str, estimate: Estimate, expected: Estimate) -> None:
+def _check_same(what: str, estimate: Estimate, expected: Estimate) -> None:
+    """Raise unless estimates are equal to rounding."""
     for name in ("mean", "covariance"):
         a, b = np.asarray(getattr(estimate, name)), np.asarray(getattr(expected, name))
         same = np.allclose(a, b, rtol=ROUNDING, atol=ROUNDING * np.nanmax(np.abs(b), initial=0.0), equal_nan=True)

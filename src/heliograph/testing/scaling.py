@@ -190,6 +190,7 @@ def _ends(quadratic: QuadraticMap) -> np.ndarray:
 
 
 def _rescale_fusion(name: str, fusion: Fusion | AbstractFilter, units: Units) -> Fusion | AbstractFilter:
+    """Return a fusion or a central filter in other units; a rule of fusion has none."""
     if isinstance(fusion, AbstractFilter):
         return rescale_filter(fusion, units)
     if fusion.quantizer is not None:

@@ -79,6 +79,7 @@ def called(node: Node) -> str:
 
 
 def _write_comparison(op: str, type: Type) -> str:
+    """Return LLVM's instruction for a comparison of numbers of this type."""
     if type in REAL:
         return "fcmp une" if op == "ne" else f"fcmp o{op}"
     if op in ("eq", "ne"):

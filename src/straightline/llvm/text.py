@@ -160,7 +160,7 @@ class Writer:
         if node in self.mine or any(node in scope for scope in self.scopes):
             name = self.add(f"extractelement {vector(node.type)} {self.operand(node)}, i64 0")
         elif node.op == "load" and all(self._is_scalar(i) for i in node.args):
-            name = self._scalar_load(node)
+            name = self._write_scalar_load(node)
         else:
             name = self.slots.load(self, node)
         self.scopes[-1][key] = name
@@ -220,13 +220,14 @@ class Writer:
         if not all(self._is_scalar(i) for i in node.args):
             return self._write_gather(node)
         if buffer.owner[0] not in self.spread:
-            return self.everywhere(self._scalar_load(node), node.type)
+            return self.everywhere(self._write_scalar_load(node), node.type)
         address = self._address(buffer, offset, strides, node.args, f"%i{BITS[node.type]}")
         if node.type == "bool":
             return self.add(f"icmp ne %i8 {self.add(f'load %i8, ptr {address}, align 1')}, zeroinitializer")
         return self.add(f"load {vector(node.type)}, ptr {address}, align {BITS[node.type] // 8}")
 
-    def _scalar_load(self, node: Node) -> str:
+    def _write_scalar_load(self, node: Node) -> str:
+        """Load a number that all lanes share."""
         buffer, offset, strides = node.value
         self.read.add(buffer.owner[0])
         address = self._address(buffer, offset, strides, node.args, f"i{BITS[node.type]}")

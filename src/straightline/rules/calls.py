@@ -127,6 +127,7 @@ def _size(block: Block) -> int:
 
 
 def _dissolve(block: Block, outer: Block) -> None:
+    """Move the statements of a block into the one around it."""
     for statement in block.items:
         statement.block = outer  # type: ignore[union-attr]
     outer.items += block.items

@@ -124,6 +124,7 @@ def _exchange(values: list[jax.Array], columns: list[list[jax.Array]], i: int) -
 
 
 def _eigh(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    """Write eigenvalues and eigenvectors of small symmetric matrices out."""
     avals: list[Any] = [v.aval for v in equation.invars]
     shape = avals[0].shape
     if shape[-1] > FEW or equation.params.get("subset_by_index") is not None:
@@ -192,6 +193,7 @@ def permutation(pivots: jax.Array, size: int) -> jax.Array:
 
 
 def _lu(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    """Write the factors of small square matrices out."""
     avals: list[Any] = [v.aval for v in equation.invars]
     shape = avals[0].shape
     if shape[-2] != shape[-1] or shape[-1] > FEW:

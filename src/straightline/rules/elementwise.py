@@ -35,6 +35,8 @@ def broadcast(arrays: Sequence[np.ndarray], shape: tuple[int, ...]) -> list[list
 
 
 def _elementwise(op: str) -> Rule:
+    """Return the rule of an operation that is applied to each entry."""
+
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
         shape, type, node = result_shape(equation), result_type(equation), lowering.graph.node
         return [array_of([node(op, type, *nodes) for nodes in zip(*broadcast(inputs, shape), strict=True)], shape)]
@@ -61,6 +63,7 @@ def select(graph: Graph, condition: Node, a: Any, b: Any) -> Any:
 
 
 def _select_n(graph: Graph, type: Type, params: Any, which: Node, *cases: Any) -> Any:
+    """Return the case whose number is `which`, by one selection after another."""
     if len(cases) == 2 and which.type == "bool":
         return select(graph, which, cases[1], cases[0])
     chosen = cases[-1]

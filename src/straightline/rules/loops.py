@@ -88,7 +88,7 @@ def _stack(
     lowering: Lowering, length: int, value: np.ndarray, counter: Node, backwards: bool, outer: Block
 ) -> InMemory:
     """Store one turn's array as one row of memory."""
-    flat = _numbers(value)
+    flat = _list_numbers(value)
     type: Type = flat[0].type if flat else "f64"
     buffer = Buffer("scratch", type, (length, *value.shape), outer)
     size, places = len(flat), {node: place for place, node in reversed(list(enumerate(flat)))}
@@ -99,7 +99,8 @@ def _stack(
     return InMemory.whole(buffer)
 
 
-def _numbers(value: np.ndarray) -> list[Node]:
+def _list_numbers(value: np.ndarray) -> list[Node]:
+    """Return the nodes of an array in order; raise if they are keys of random numbers."""
     flat: list[Node] = value.ravel().tolist()
     if any(isinstance(x, Key) for x in flat):
         raise Unsupported("keys of random numbers in memory")
@@ -234,7 +235,7 @@ def in_memory(lowering: Lowering, value: Value) -> InMemory:
     """Store an array of nodes in memory."""
     if isinstance(value, InMemory):
         return value
-    flat = _numbers(value)
+    flat = _list_numbers(value)
     graph = lowering.graph
     type: Type = flat[0].type if flat else "f64"
     if all(n.op == "constant" for n in flat):
@@ -272,6 +273,7 @@ def _lower_while(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
 
 
 def _where_active(graph: Graph, active: np.ndarray, new: np.ndarray, old: np.ndarray) -> np.ndarray:
+    """Return new entries where a loop goes on, and the old ones elsewhere."""
     going = np.repeat(active.ravel(), new.size // active.size).tolist()
     return array_of(
         [select(graph, a, x, y) for a, x, y in zip(going, new.ravel().tolist(), old.ravel().tolist(), strict=True)],

@@ -154,6 +154,8 @@ def _trace_in_loops(lowering: Lowering, equation: JaxprEqn, function: Callable[.
 
 
 def _one_by_one(function: Callable[..., list[Any]], axes: Axes, *leaves: Any) -> list[Any]:
+    """Apply a function to one entry of a batch after another; `axes` says which leaves have a batch."""
+
     def of_one(moving: list[Any]) -> list[Any]:
         rest = iter(moving)
         return function(*(x if axis is None else next(rest) for x, axis in zip(leaves, axes, strict=True)))

@@ -41,6 +41,7 @@ def _is_table(x: Value) -> bool:
 
 
 def _are_written_out(inputs: list[Value], count: int) -> bool:
+    """Return whether arrays are nodes already, or constants, so that a result is written out as nodes too."""
     arrays = [x for x in inputs if not isinstance(x, InMemory)]
     return any(x.size >= count for x in arrays) or all(
         isinstance(n, Node) and n.op == "constant" for x in arrays for n in x.ravel().tolist()

@@ -22,6 +22,7 @@ def _moved(function: Callable[[np.ndarray, Any, tuple[int, ...]], np.ndarray]) -
 
 
 def _broadcast_in_dim(x: np.ndarray, params: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Place the axes of an array among those of a shape, and repeat it along the others."""
     placed = [1] * len(shape)
     for size, axis in zip(x.shape, params["broadcast_dimensions"], strict=True):
         placed[axis] = size

@@ -185,7 +185,7 @@ def _inline_in_double(
     if avals[0].dtype not in (np.float64, np.float32):
         raise Unsupported(f"{equation.primitive.name} of numbers of type {avals[0].dtype}")
     results = lowering.inline(
-        _program(function, len(avals), avals[0].shape), [_of_type(lowering, "f64", x) for x in inputs]
+        _trace_over(function, len(avals), avals[0].shape), [_of_type(lowering, "f64", x) for x in inputs]
     )
     return [_of_type(lowering, type_of(avals[0]), x) for x in results]
 
@@ -196,7 +196,8 @@ def _of_type(lowering: Lowering, type: Type, value: Value) -> Value:
 
 
 @cache
-def _program(function: Callable[..., Any], count: int, shape: tuple[int, ...]) -> ClosedJaxpr:
+def _trace_over(function: Callable[..., Any], count: int, shape: tuple[int, ...]) -> ClosedJaxpr:
+    """Return the program of a function of scalars over arrays of a shape."""
     over = function
     for _ in shape:
         over = jax.vmap(over)

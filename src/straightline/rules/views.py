@@ -49,7 +49,8 @@ def _reshape(x: InMemory, params: Any, shape: tuple[int, ...]) -> InMemory | Non
     return x.reshaped(shape)
 
 
-def _broadcast(x: InMemory, params: Any, shape: tuple[int, ...]) -> InMemory:
+def _broadcast_view(x: InMemory, params: Any, shape: tuple[int, ...]) -> InMemory:
+    """Return a view that repeats an array in memory along new axes: strides of zero."""
     strides = [0] * len(shape)
     for size, stride, axis in zip(x.shape, x.strides, params["broadcast_dimensions"], strict=True):
         strides[axis] = 0 if size == 1 else stride
@@ -57,6 +58,7 @@ def _broadcast(x: InMemory, params: Any, shape: tuple[int, ...]) -> InMemory:
 
 
 def _split(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    """Return views of an array's parts along an axis."""
     x, axis, parts, start = inputs[0], equation.params["axis"], [], 0
     for size in equation.params["sizes"]:
         shape = [size if a == axis else n for a, n in enumerate(x.shape)]
@@ -174,7 +176,7 @@ def join_arrays(lowering: Lowering, parts: list[Value], shape: tuple[int, ...]) 
         if isinstance(x, InMemory) and _is_alone(x, graph.current):
             buffer.take_in(x.buffer, start)
         else:
-            _copy(lowering, x, buffer, start)
+            _copy_into(lowering, x, buffer, start)
         start += x.size
     return InMemory.whole(buffer)
 
@@ -186,7 +188,8 @@ def _is_alone(x: InMemory, block: Any) -> bool:
     return whole and buffer.kind == "scratch" and buffer.inside is None and buffer.block is block
 
 
-def _copy(lowering: Lowering, x: Value, buffer: Buffer, start: int) -> None:
+def _copy_into(lowering: Lowering, x: Value, buffer: Buffer, start: int) -> None:
+    """Store an array into a buffer from a place on: entry by entry if short, else by a loop."""
     graph = lowering.graph
     if x.size <= TABLE or not isinstance(x, InMemory):
         for index, node in enumerate(lowering.nodes(x).ravel().tolist()):
@@ -197,7 +200,7 @@ def _copy(lowering: Lowering, x: Value, buffer: Buffer, start: int) -> None:
 
 VIEWS: dict[str, View] = {
     "slice": _slice, "rev": _reverse, "transpose": _transpose, "reshape": _reshape, "squeeze": _reshape,
-    "expand_dims": _reshape, "broadcast_in_dim": _broadcast,
+    "expand_dims": _reshape, "broadcast_in_dim": _broadcast_view,
 }  # fmt: skip
 IN_MEMORY |= {name: _make_view_rule(name, view) for name, view in VIEWS.items()}
 RULES |= {"dynamic_slice": _dynamic_slice_of_nodes}

@@ -61,7 +61,9 @@ def _operator(real: str, whole: str, turned: bool = False) -> Callable[["Vector"
     return apply
 
 
-def _comparison(real: str, whole: str) -> Callable[["Vector", Operand], "Vector"]:
+def _make_comparison(real: str, whole: str) -> Callable[["Vector", Operand], "Vector"]:
+    """Return the method that compares vectors, of reals or of whole numbers."""
+
     def compare(self: "Vector", other: Operand) -> "Vector":
         how = f"fcmp {real}" if self.scalar in REALS else f"icmp {whole}"
         return self.body.add("i1", f"{how} {self.type} {self.name}, {self.like(other).name}")
@@ -92,9 +94,9 @@ class Vector:
     __truediv__, __rtruediv__ = _operator("fdiv", "sdiv"), _operator("fdiv", "sdiv", turned=True)
     __and__, __or__, __xor__ = _operator("and", "and"), _operator("or", "or"), _operator("xor", "xor")
     __lshift__, __rshift__ = _operator("shl", "shl"), _operator("ashr", "ashr")  # the second arithmetically
-    __lt__, __le__ = _comparison("olt", "slt"), _comparison("ole", "sle")
-    __gt__, __ge__ = _comparison("ogt", "sgt"), _comparison("oge", "sge")
-    equals = _comparison("oeq", "eq")  # false for NaN
+    __lt__, __le__ = _make_comparison("olt", "slt"), _make_comparison("ole", "sle")
+    __gt__, __ge__ = _make_comparison("ogt", "sgt"), _make_comparison("oge", "sge")
+    equals = _make_comparison("oeq", "eq")  # false for NaN
 
     def __neg__(self) -> "Vector":
         return self.body.add(self.scalar, f"fneg {self.type} {self.name}")

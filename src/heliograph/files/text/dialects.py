@@ -42,7 +42,7 @@ def check_header(source: str, header: Sequence[str], path: Path | None, marked: 
         raise fail(f"{source}, header", "names of columns", f"a comment, {show_value(line)}{remedy}")
     mark = separator_of(header)
     if mark is not None:
-        remedy = "" if path is None else f": {_rewriting_separated(path, mark)}"
+        remedy = "" if path is None else f": {_suggest_rewriting(path, mark)}"
         came = f"{SEPARATORS[mark]} in {show_value(line)}{remedy}"
         raise fail(f"{source}, header", "names separated by commas", came)
     check_distinct(source, [name for name in header if name])
@@ -91,7 +91,8 @@ def hint_of_cell(cell: str, name: str, path: Path | None) -> str:
     return ""
 
 
-def _rewriting_separated(path: Path, mark: str) -> str:
+def _suggest_rewriting(path: Path, mark: str) -> str:
+    """Say how to rewrite a table with another separator, from the first lines of the file."""
     with open_text(path) as file:
         start = file.read(SEEN)
     if start.lstrip().startswith(COMMENTS):

@@ -194,6 +194,7 @@ def _about_zero(base: Any) -> Any:
 
 
 def _plant_about(model: AbstractPlant, center: Array, level: Array, unit: float) -> PlantAboutCenter:
+    """Return the plant of deviations from a center, whose state starts at zero."""
     return PlantAboutCenter(
         model=model, center=center, level=level, unit=unit, noise=model.noise, deviation=None,
         initial_mean=np.zeros(np.shape(model.initial_mean)), initial_covariance=model.initial_covariance,
@@ -202,6 +203,7 @@ def _plant_about(model: AbstractPlant, center: Array, level: Array, unit: float)
 
 
 def _sensor_about(model: AbstractSensor, center: Array, level: Array, unit: float) -> SensorAboutCenter:
+    """Return the sensor of deviations from a center."""
     return SensorAboutCenter(
         model=model, center=center, level=level, unit=unit, noise=model.noise, outputs=model.outputs,
         circular=model.circular,

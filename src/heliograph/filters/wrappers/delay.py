@@ -332,6 +332,7 @@ def deliver_line_as_current(channel: Channel) -> Channel:
 
 
 def _deliver_at_once(channel: AbstractRandomAffine) -> AbstractRandomAffine:
+    """Return the channel as if nothing were late: the present signal stands on every place of its delay line."""
     check_maps("channel", [channel])
     if isinstance(channel, Relayed):
         return Series([_deliver_at_once(stage) for stage in channel.stages])

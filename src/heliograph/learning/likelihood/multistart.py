@@ -97,14 +97,14 @@ class Search:
         their domains; at an end the likelihood does not rise inwards.
         """
         none = np.zeros(climbed.x.shape[1])
-        top = _top(climbed, none)
+        top = _take_best(climbed, none)
         for _ in range(ROUNDS):
             top = self._move_to_limits(top)
             again, reason = self._choose_restarts(top) if top.converged else (None, top.reason)
             if again is None:
                 reason = self._say_that_it_grows(top) or reason
                 return top._replace(converged=not reason, reason=reason)
-            top = _top(self._climb(again, none), none)
+            top = _take_best(self._climb(again, none), none)
         return top._replace(converged=False, reason="the search went to and fro between two points")
 
     def _draw_around(self, top: Top, count: int, seed: int) -> Float[np.ndarray, "points p"]:
@@ -128,7 +128,7 @@ class Search:
         """Maximise from each start, coordinates at an end held there, and keep the best point seen so far."""
 
         def seen(now: Maximum) -> None:
-            here = _top(now, ends)
+            here = _take_best(now, ends)
             if self.best is None or not here.total < self.best.total:
                 self.best = here._replace(converged=False, reason="")
             self.watch(now)
@@ -148,7 +148,7 @@ class Search:
                 x, total, ends[index] = moved, float(at.total[0]), side
         if np.array_equal(ends, top.ends):
             return top
-        return _top(self._climb(x[None], ends), ends)
+        return _take_best(self._climb(x[None], ends), ends)
 
     def _choose_restarts(self, top: Top) -> tuple[np.ndarray | None, str]:
         """Points from which to climb again where the end of a climb is no maximum, or why it is none and nothing helps.
@@ -184,7 +184,8 @@ class Search:
         return points, np.nan_to_num(self.surface.evaluations(points).total - top.total, nan=-np.inf)
 
 
-def _top(climbed: Maximum, ends: np.ndarray) -> Top:
+def _take_best(climbed: Maximum, ends: np.ndarray) -> Top:
+    """Return the best of the climbs, with why it stopped if it did not converge."""
     lane = int(climbed.order[0])
     converged, remaining = bool(climbed.converged[lane]), float(climbed.remaining[lane])
     reason = "" if converged else _why(remaining)

@@ -25,7 +25,7 @@ def map_to_line(name: str, domain: Domain, value: Float[np.ndarray, "..."]) -> F
         logs: np.ndarray = np.log(value[..., :-1] / value[..., -1:])
         return logs.reshape(-1)
     if domain.kind == "covariance":
-        factor = _factor(name, value)
+        factor = _factorise_start(name, value)
         return np.asarray(
             np.where(np.eye(len(value)), np.log(np.abs(factor) + (factor == 0)), factor)[np.tril_indices(len(value))]
         )
@@ -103,7 +103,8 @@ def size(domain: Domain, shape: tuple[int, ...]) -> int:
     return shape[0] * (shape[0] + 1) // 2 if domain.kind == "covariance" else count
 
 
-def _factor(name: str, value: np.ndarray) -> np.ndarray:
+def _factorise_start(name: str, value: np.ndarray) -> np.ndarray:
+    """Return L of a start L L'; raise if it is not positive definite."""
     try:
         return np.linalg.cholesky(value)
     except np.linalg.LinAlgError:

@@ -172,6 +172,7 @@ class MarkovLosses(AbstractLossLaw):
         return probabilities
 
     def _arrives_again(self, steps: int) -> float:
+        """Return P(arrived after so many steps | arrived now), in closed form for order one."""
         if self.order > 1:
             return super()._arrives_again(steps)
         a, b = self.predicted(np.array([0.0, np.nan]))[1], 1 - self.predicted(np.array([1.0, np.nan]))[1]

@@ -116,6 +116,7 @@ def _test_all_steps(agree: Callable[..., bool], a: object, b: object, order: int
 
 
 def _same_noise(a: AbstractNoise, b: AbstractNoise, order: int | None) -> bool:
+    """Return whether noises agree in what a filter uses of them: all of their law, or mean and covariance."""
     if same(a, b):
         return True
     if order != MEAN_AND_COVARIANCE or has_bounded_noise(a) != has_bounded_noise(b):
@@ -142,6 +143,7 @@ def _same_plant(a: AbstractPlant, b: AbstractPlant, order: int | None) -> bool:
 
 
 def _same_motion(a: AbstractPlant, b: AbstractPlant) -> bool:
+    """Return whether plants move a state alike: by equal matrices, or by the same function."""
     linear = [plant for plant in (a, b) if isinstance(plant, LinearPlant)]
     if len(linear) == 2 and not any(isinstance(m, OfInputs) for p in linear for m in (p.matrix, p.input_matrix)):
         return equal_to_rounding(linear[0].matrix, linear[1].matrix) and equal_to_rounding(
@@ -199,10 +201,11 @@ def _measure_given(sensor: AbstractSensor) -> Callable[[jax.Array, jax.Array], o
 
 def _states_of(*sensors: AbstractSensor) -> list[int]:
     """Return the numbers of states that both sensors take, among the first few."""
-    return [n for n in range(1, 33) if all(_takes(sensor, n) for sensor in sensors)][:1]
+    return [n for n in range(1, 33) if all(_takes_states(sensor, n) for sensor in sensors)][:1]
 
 
-def _takes(sensor: AbstractSensor, states: int) -> bool:
+def _takes_states(sensor: AbstractSensor, states: int) -> bool:
+    """Return whether a sensor measures plants with so many states."""
     try:
         sensor.check_states(states)
     except ValueError:

@@ -70,6 +70,7 @@ def _same_atoms(names: tuple[dict[Any, int], dict[Any, int]], a: Sequence[Any], 
 
 
 def _same_atom(names: tuple[dict[Any, int], dict[Any, int]], x: Any, y: Any) -> bool:
+    """Return whether operands are equal constants, or the same variables by the names of both programs."""
     if isinstance(x, core.Literal) and isinstance(y, core.Literal):
         return same(np.asarray(x.val), np.asarray(y.val))
     if isinstance(x, core.Literal) or isinstance(y, core.Literal):

@@ -126,6 +126,7 @@ def _route(link: AbstractRandomAffine, places: Places, form: Form) -> Routed:
 
 
 def _route_selection(link: GainAndNoise, places: Places, form: Form) -> Routed:
+    """Return the route of a wire that selects components; words pass no other gain."""
     matrix, gain = np.asarray(link.matrix), link.law.constant
     still = not np.any(np.asarray(link.noise.covariance)) and not np.any(np.asarray(link.noise.mean))
     one_each = np.isin(matrix, (0, 1)).all() and (matrix.sum(axis=1) == 1).all()
@@ -135,6 +136,7 @@ def _route_selection(link: GainAndNoise, places: Places, form: Form) -> Routed:
 
 
 def _route_series(link: Series, places: Places, form: Form) -> Routed:
+    """Return the route through maps one after another."""
     maps = []
     for part in link.maps:
         routed = _route(part, places, form)
@@ -144,6 +146,7 @@ def _route_series(link: Series, places: Places, form: Form) -> Routed:
 
 
 def _route_choice(link: AbstractUniform, places: Places, form: Form) -> Routed:
+    """Return the route through one of several maps, all of which deliver the same components."""
     parts = [_route(part, places, form) for part in link.maps]
     if len({part.places for part in parts}) > 1:
         raise fail("channel of words", "choices and modes that deliver the same components", "others")

@@ -41,6 +41,7 @@ def handlers(handler: Callable[[int, FrameType | None], object]) -> Iterator[Non
 
 
 def _imports_in_c(frame: FrameType | None) -> bool:
+    """Return whether a module in C is being loaded, which an exception would leave half initialised."""
     while frame is not None:
         if frame.f_code.co_filename == IMPORTS and isinstance(frame.f_locals.get("self"), ExtensionFileLoader):
             return True

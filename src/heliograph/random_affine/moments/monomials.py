@@ -132,6 +132,7 @@ def symmetric_power(h: Numbers, degree: int) -> Numbers:
 
 
 def _append_zero_column(a: Numbers) -> Numbers:
+    """Return the matrix with a column of zeros more, by NumPy or JAX."""
     if isinstance(a, np.ndarray):
         return np.pad(a, ((0, 0), (0, 1)))
     import jax.numpy as jnp

@@ -128,6 +128,7 @@ def products_of_monomials(moments: Array1, variables: int, degree: int) -> Array
 
 
 def _check_moments(channel: AbstractRandomAffine, order: int, moments: Array1) -> Array1:
+    """Return the moments; raise unless they are those of the channel's inputs up to the order."""
     check_forgets("channel of a lift", channel)
     expected = count_monomials(channel.inputs + 1, order)
     if np.shape(moments) != (expected,):

@@ -154,6 +154,7 @@ class _Reader(Connection):
                 self._loop.call_soon_threadsafe(self._came.set)
 
     def connected(self, client: Client, data: object, flags: ConnectFlags, code: ReasonCode, more: object) -> None:
+        """Subscribe to our topics and to those of the sources, after each connection anew."""
         super().connected(client, data, flags, code, more)
         self._connection += 1
         if not code.is_failure:

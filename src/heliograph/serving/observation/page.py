@@ -119,6 +119,7 @@ def _collect_dead_senders(watch: Watch) -> Metric:
 
 
 def _count_doubted_fused(watch: Watch) -> Metric:
+    """Return the metric of filters under fusions whose claims are doubted."""
     what = "1 if a filter whose estimates a fusion without a test of itself takes is doubted."
     doubted = GaugeMetricFamily("heliograph_fusion_doubted", what, labels=["filter"])
     for row in watch.fused_rows(watch.nis):
@@ -227,6 +228,7 @@ def parse_page_address(
 
 
 def _is_loopback(host: str) -> bool:
+    """Return whether a host is this machine."""
     try:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:

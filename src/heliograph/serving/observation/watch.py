@@ -132,6 +132,7 @@ class Watch:
             self._record(outputs, last)
 
     def _record(self, outputs: Sequence[Output], last: Taken | None) -> None:
+        """Take in what a batch published: its times, each plant's counts, points to draw, and tests of claims."""
         if last is not None:
             self.took.observe(last.took)
             self.committed.observe(last.committed)

@@ -68,7 +68,7 @@ class CrossCovariances:
 
     def matrix_weights(self) -> tuple[Float[np.ndarray, "n node n"], Float[np.ndarray, "n n"]]:
         """Best unbiased weights W and the covariance W P W' of their error; linear in nodes where P allows it."""
-        weights = _weights(self._sources)
+        weights = _choose_weights(self._sources)
         shared, independent = self._sources.weigh(weights)
         return weights, np.asarray(shared @ shared.T + independent)
 
@@ -100,13 +100,14 @@ class CrossCovariances:
         for names in relays.values():
             mine = [index[name] for name in names]
             received = ErrorSources(self.shared[mine], self.independent[mine])
-            parts.append(received.weigh(_weights(received)))
+            parts.append(received.weigh(_choose_weights(received)))
         shared, independent = (np.stack(leaves) for leaves in zip(*parts, strict=True))
         bias = np.zeros((len(relays), len(self.mean)))
         return CrossCovariances(tuple(relays), self.states, self.mean, self.state, bias, shared, independent)
 
 
-def _weights(errors: ErrorSources) -> Float[np.ndarray, "n node n"]:
+def _choose_weights(errors: ErrorSources) -> Float[np.ndarray, "n node n"]:
+    """Return the best weights, by factors where the errors' independent parts are regular enough."""
     scale = np.sqrt(np.einsum("iaa->ia", errors.covariances()))
     scale = np.where(scale > 0, scale, 1.0)
     least = np.linalg.eigvalsh(errors.independent / (scale[:, :, None] * scale[:, None]))[:, 0].min()

@@ -261,6 +261,7 @@ def along_estimates(nodes: Parts) -> bool:
 
 
 def _check_along_estimates(rule: str, nodes: Parts, shared: bool) -> None:
+    """Raise unless all filters are cubature or extended ones, of nodes that share nothing but the plant."""
     for name, (_, _, filter) in nodes.items():
         if not isinstance(filter, GaussianFilter) or filter.linear:
             raise fail(f"fusion by {rule}: node {name!r}", "a cubature or extended filter, as other nodes have", filter)

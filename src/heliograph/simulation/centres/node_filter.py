@@ -114,6 +114,7 @@ class NodeFilter(AbstractSizedFilter):
         return sensed, before._replace(mean=jnp.stack(means), covariance=jnp.stack(covariances))
 
     def _make_state(self, before: MeshState, z: jax.Array, u: Array, k: Step) -> NodeState:
+        """Return the state after a measurement: what was before it, the input, and the estimates of all nodes now."""
         sensed, all_nodes = self._gather_measurements(z, before)
         everything = jnp.ones((1, 1, len(sensed)), dtype=bool)
         now, _ = self.mesh.step(all_nodes, [x[None] for x in sensed], everything, jnp.asarray(u), jnp.asarray(k))

@@ -101,7 +101,7 @@ def relay_tree(
     """
     check_count("degree of a tree", degree, 2)
     function("node", node, "the numbers of one leaf that returns a Node")
-    count, steps = _count(numbers), check_count("horizon", horizon)
+    count, steps = _count_leaves(numbers), check_count("horizon", horizon)
     with jax.enable_x64(True):
         # One leaf stands for the structure of all.
         leaf = instance("leaf", node(_slice(numbers, 0)), Node, "a Node")
@@ -190,7 +190,8 @@ def _slice(numbers: PyTree, which: int | slice) -> PyTree:
     return jax.tree.map(lambda leaf: leaf[which], numbers)
 
 
-def _count(numbers: PyTree) -> int:
+def _count_leaves(numbers: PyTree) -> int:
+    """Return how many nodes the arrays have along their leading axis; raise if they differ."""
     lengths = {np.shape(leaf)[0] if np.ndim(leaf) else None for leaf in jax.tree.leaves(numbers)}
     if len(lengths) != 1 or lengths & {None, 0}:
         raise fail("numbers of the leaves", "arrays with one leading axis of nodes", sorted(map(str, lengths)))

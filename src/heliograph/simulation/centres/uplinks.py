@@ -137,6 +137,7 @@ class Uplinks(Module):
         return Drawn(np.zeros((steps, count, m, self.n)), values, delay)
 
     def _check_delay(self, name: str, value: ArrayLike, steps: int, node: int) -> np.ndarray:
+        """Return the delays of a node's reports (steps,); raise at one that its uplink does not have."""
         delays: np.ndarray = array(name, value, (steps,))
         possible = np.flatnonzero(self.delay[node] > 0)
         if not np.all(np.isin(delays, possible)):
@@ -210,6 +211,7 @@ def _model_links(
 
 
 def _read_links(known: Sequence[PyTree], received: Sequence[int], error: np.ndarray) -> ReportModel:
+    """Return the moments of all uplinks as arrays, with zeros for what a node receives less than others."""
     more = [(0, max(received) - size) for size in received]
     gain = np.stack([np.pad(link.mean_gain, (a, (0, 0))) for link, a in zip(known, more, strict=True)])
     offset = np.stack([np.pad(link.offset, a) for link, a in zip(known, more, strict=True)])

@@ -352,6 +352,7 @@ def _judgement(
 
 
 def _say_bias(bias: DeclaredBias, unit: str) -> list[str]:
+    """Return lines on how large a bias is, how long it lasts, and what to do."""
     lines = []
     if bias.times_white_low > np.sqrt(LEAST):
         bounded = bias.times_white < 2 * bias.times_white_low

@@ -133,6 +133,7 @@ def list_declaring(filter: ToldFilter) -> list[int]:
 
 @in_float64
 def _declares(affine: Told) -> bool:
+    """Return whether a map takes its Gaussian noise from the number that it is told."""
     if isinstance(affine.make, GainTold):
         return False
     typical = np.asarray(affine.typical)

@@ -107,6 +107,7 @@ def _keep_labels(columns: Sequence[Column]) -> Any:
 
 
 def _label_estimate(node: str, name: str, estimate: Estimate, states: Sequence[str]) -> dict[Column, np.ndarray]:
+    """Return the columns of an estimate: means, covariances with their claim, and probabilities of modes."""
     mean, covariance = np.asarray(estimate.mean), np.asarray(estimate.covariance)
     # Of an attitude's numbers, which one: "0", "1", "2" of the first, and so on.
     order = {place: str(i) for i, place in enumerate(estimate.attitude)}

@@ -149,6 +149,7 @@ def _texts(dataset: "xr.Dataset") -> list[tuple[object, "xr.DataArray"]]:
 
 
 def _map_names(change: Callable[[str], str], names: "xr.DataArray") -> np.ndarray:
+    """Return changed names, for files as texts of fixed length and else as objects."""
     changed = [change(str(name)) for name in names.values]
     if change is quote_for_file:
         return np.array(changed, dtype="U")

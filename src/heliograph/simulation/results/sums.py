@@ -130,7 +130,7 @@ class Statistics(AbstractReducer[StatisticsByName]):
         statistics = StatisticsByName({}, network.states)
         for node, claims in network.claims().items():
             statistics[node] = {
-                name: _statistics(count, [v[node][name] for v in items], claim) for name, claim in claims.items()
+                name: _make_statistics(count, [v[node][name] for v in items], claim) for name, claim in claims.items()
             }
         for name, uplink in uplinks_by_name(network, carry.uplinks).items():
             fused = statistics[FUSED][name]
@@ -155,7 +155,8 @@ class Statistics(AbstractReducer[StatisticsByName]):
         return filtered
 
 
-def _statistics(count: np.ndarray, sums: Sequence[np.ndarray], claim: Claim) -> ErrorStatistics:
+def _make_statistics(count: np.ndarray, sums: Sequence[np.ndarray], claim: Claim) -> ErrorStatistics:
+    """Return the statistics of one filter from its sums over runs."""
     pairs, nees, claimed, failed, failed_runs = sums
     which = 0 if claim == "none" else slice(None)  # no distance where no covariance is claimed
     by_step, runs = np.max(np.atleast_2d(failed[which]), axis=0), float(np.max(failed_runs[which]))
@@ -222,7 +223,7 @@ def error_statistics(record: Record, node: str, name: str) -> ErrorStatistics:
     count, (parts,) = _split(Statistics().summed(OfStep(sums, ever), common, count), [])
     sent = record.uplinks.get(name) if node == FUSED else None
     uplink = None if sent is None else Uplink(sent.nodes, sent.saturated.mean(axis=0), sent.symbols.mean(axis=0))
-    return replace(_statistics(count, parts, estimate.claim), uplink=uplink)
+    return replace(_make_statistics(count, parts, estimate.claim), uplink=uplink)
 
 
 def _reduce_run(truth: Array, mean: Array, covariance: Array, attitude: tuple[int, ...]) -> OfStep:

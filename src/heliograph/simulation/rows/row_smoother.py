@@ -155,6 +155,8 @@ def sweep_back(static: Static, dt: int | None) -> tuple[Callable[..., PyTree], C
 
 
 def _into_row(dt: int) -> Into:
+    """Return what computes the smoother step into a row from the one before it, `dt` the place of the interval in u."""
+
     def into(sweep: Sweep, history: RowHistory, at: StepOfRow) -> NetworkSmootherStep:
         row, _ = at
         state, received = sweep.start(history, row - 1), history.parts(row)[0]
@@ -164,6 +166,7 @@ def _into_row(dt: int) -> Into:
 
 
 def _earlier_row(history: RowHistory, at: StepOfRow) -> StepOfRow:
+    """Return the row before."""
     return at[0] - 1, history.step[at[0] - 1]
 
 

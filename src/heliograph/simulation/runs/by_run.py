@@ -20,7 +20,7 @@ def simulate_trajectories(
 
     The axis of runs is the last one of every array inside: a processor works through them contiguously.
     """
-    start, varies, tree = _start(init, keys)
+    start, varies, tree = _start_runs(init, keys)
     example = jax.tree.map(lambda leaf: leaf[0], rows)
     example_carry = [leaf[..., 0] if v else leaf for leaf, v in zip(start, varies, strict=True)]
     # One run's step, without operations that no result needs.
@@ -82,7 +82,8 @@ def _any_of(varies: Sequence[bool], used: Sequence[bool]) -> bool:
     return any(v and u for v, u in zip(varies, used, strict=True))
 
 
-def _start(init: Callable[[jax.Array], PyTree], keys: jax.Array) -> tuple[list[jax.Array], list[bool], PyTree]:
+def _start_runs(init: Callable[[jax.Array], PyTree], keys: jax.Array) -> tuple[list[jax.Array], list[bool], PyTree]:
+    """Return the leaves of each run's first state, which of them differ between runs, and their structure."""
     traced, shape = jax.make_jaxpr(init, return_shape=True)(keys[0])
     varies = _dependent(traced, [True])
     start = jax.vmap(jaxpr_as_fun(traced), out_axes=_axes(varies))(keys)

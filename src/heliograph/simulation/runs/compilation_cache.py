@@ -40,6 +40,7 @@ def keep_compilations(folder: str | Path | None = None) -> Path:
 
 
 def _find_default_folder() -> Path:
+    """Return the folder of compiled programs in the user's cache."""
     if os.environ.get("XDG_CACHE_HOME"):
         return Path(os.environ["XDG_CACHE_HOME"]) / "heliograph" / "compilations"
     try:
