@@ -106,7 +106,9 @@ def to_c(
     read, written = _name_arrays(function, examples, tree, names)
     # The body: statements in the order of the graph. Arguments without axes are passed by value.
     flat = [scalars(x) for x in outputs]
-    arguments = [CArray(n, _stored(b.type, real), b.size, bool(b.shape)) for n, b in zip(read, buffers, strict=True)]
+    arguments = [
+        CArray(n, _name_stored_type(b.type, real), b.size, bool(b.shape)) for n, b in zip(read, buffers, strict=True)
+    ]
     places = {b: _place(x) for b, x in zip(buffers, arguments, strict=True)}
     source = CSource([node for nodes in flat for node in nodes], places, real, name)
     try:
@@ -116,13 +118,9 @@ def to_c(
     # The end: every result is written, after all arguments are read.
     arguments = [x._replace(used=b in source.needed) for x, b in zip(arguments, buffers, strict=True)]
     results = _describe_results(written, program, outputs, flat, real)
-    ends = [
-        f"    {x.name}[{i}] = {'(unsigned char)' if node.type == 'bool' else ''}{source.name(node)};"
-        for x, nodes in zip(results, flat, strict=True)
-        for i, node in enumerate(nodes)
-    ]
+    ends = _write_assignments(source, results, flat)
     unread = [f"    (void){x.name};" for x in (*arguments, *results) if not x.used or not x.size]
-    head = _declared(name, arguments, results)
+    head = _declare_function(name, arguments, results)
     lines = [f"{head}\n{{", *unread, *source.declarations(), *body, *ends, "}"]
     definition = "\n\n".join([*source.table_definitions(), "\n".join(lines)])
     return CFunction(
@@ -141,7 +139,7 @@ def _check_name(name: str) -> None:
         raise ValueError(f"name: expected one that C takes for a function, got {name!r}")
 
 
-def _stored(type: Type, real: Real) -> str:
+def _name_stored_type(type: Type, real: Real) -> str:
     """Return the type in which a number is stored: a flag is a byte."""
     return "unsigned char" if type == "bool" else c_type(type, real)
 
@@ -150,7 +148,16 @@ def _place(array: CArray) -> Place:
     return (lambda index: f"{array.name}[{index}]") if array.is_array else (lambda index: array.name)
 
 
-def _declared(name: str, arguments: Sequence[CArray], results: Sequence[CArray]) -> str:
+def _write_assignments(source: CSource, results: Sequence[CArray], flat: Sequence[Sequence[Node]]) -> list[str]:
+    """Return the lines that write every result, `flat` its nodes; a flag is written as a byte."""
+    return [
+        f"    {x.name}[{i}] = {'(unsigned char)' if node.type == 'bool' else ''}{source.name(node)};"
+        for x, nodes in zip(results, flat, strict=True)
+        for i, node in enumerate(nodes)
+    ]
+
+
+def _declare_function(name: str, arguments: Sequence[CArray], results: Sequence[CArray]) -> str:
     """Return the head of the function."""
     every = [*(x.argument for x in arguments), *(x.result for x in results)]
     line = f"void {name}({', '.join(every)})"
@@ -165,7 +172,9 @@ def _describe_results(
     for n, (name, variable, value, nodes) in enumerate(zip(names, program.jaxpr.outvars, outputs, flat, strict=True)):
         aval: Any = variable.aval
         same = next(k for k in range(n + 1) if flat[k] == nodes)
-        results.append(CArray(name, _stored(type_of(aval), real), len(nodes), True, True, same, _is_symmetric(value)))
+        results.append(
+            CArray(name, _name_stored_type(type_of(aval), real), len(nodes), True, True, same, _is_symmetric(value))
+        )
     return results
 
 

@@ -26,9 +26,9 @@ DTYPES: dict[str, Any] = {
 
 
 class Graph(Protocol):
-    """A program that makes nodes; `numbers` are those that are known not to be NaN."""
+    """A program that makes nodes; `never_nan` are those that are known not to be NaN."""
 
-    numbers: set[Node]
+    never_nan: set[Node]
 
     def node(self, op: str, type: Type, *args: Node, value: Any = None) -> Node:
         """Return the node of an operation."""
@@ -60,7 +60,7 @@ def _shift_right_signed(a: Any, b: Any) -> Any:
     return wrapped(signed >> (int(b) if 0 <= b <= last else last), a)
 
 
-def _divided(a: Any, b: Any) -> Any:
+def _divide(a: Any, b: Any) -> Any:
     """Divide; integers toward zero, by 0 to all bits set, the least one by -1 to itself."""
     if isinstance(a, np.floating):
         return np.divide(a, b)
@@ -114,7 +114,7 @@ def _convert_number(a: Any, kind: Any) -> Any:
 
 # Operations whose numbers of known numbers are computed here; others wait for the run.
 EVALUATED: dict[str, Callable[..., Any]] = {
-    "add": np.add, "sub": np.subtract, "mul": np.multiply, "div": _divided, "rem": _remainder, "neg": np.negative,
+    "add": np.add, "sub": np.subtract, "mul": np.multiply, "div": _divide, "rem": _remainder, "neg": np.negative,
     "abs": np.abs, "sqrt": np.sqrt, "exp": np.exp, "log": np.log, "log1p": np.log1p, "expm1": np.expm1,
     "sin": np.sin, "cos": np.cos, "tan": np.tan, "tanh": np.tanh, "atan2": np.arctan2, "pow": _power,
     "round_even": np.rint, "round_away": _round_away,

@@ -110,7 +110,7 @@ class _Worker:
         self._kill()
         if late.is_set():
             return _too_late(self.timeout)
-        return Reply(error=f"WorkerDied: the worker process ended with {_ending(code)}")
+        return Reply(error=f"WorkerDied: the worker process ended with {_describe_exit(code)}")
 
     def _ensure_running(self) -> subprocess.Popen[str]:
         """Return the worker's process, started again where it has died."""
@@ -157,7 +157,7 @@ def _too_late(timeout: float) -> Reply:
     return Reply(error=f"TimedOut: no answer within {timeout:g} s, the campaign's timeout", late=True)
 
 
-def _ending(code: int) -> str:
+def _describe_exit(code: int) -> str:
     return f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
 
 

@@ -220,7 +220,7 @@ def _make_tables(campaign: Campaign, scores: Sequence[Score], look: Look | None)
 def _table_scores(campaign: Campaign, rows: Sequence[Detail]) -> Explored:
     """Make the table of the page that shows each filter's scores over all steps, and how to draw it at first."""
     columns, parameters = _make_columns(campaign, rows, SCORED), list(campaign.parameters)
-    x = _axis(columns, parameters)
+    x = _choose_axis(columns, parameters)
     panel = next((name for name in ("node", *parameters) if name != x and len(set(columns[name])) > 1), "")
     whole = {"setting", "node", "filter", x, panel, *(parameters if x == "setting" else ())} - {""}
     dimensions = ["setting", *parameters, *NAMES]
@@ -245,19 +245,19 @@ def _make_columns(campaign: Campaign, rows: Sequence[Detail], fields: Sequence[s
     parameters = {name: parameter_values(campaign, name).tolist() for name in campaign.parameters}
     return {
         "setting": [row.setting for row in rows],
-        **{name: [_value(values[row.setting]) for row in rows] for name, values in parameters.items()},
-        **{name: [_value(getattr(row, name)) for row in rows] for name in (*NAMES, *fields)},
+        **{name: [_round_value(values[row.setting]) for row in rows] for name, values in parameters.items()},
+        **{name: [_round_value(getattr(row, name)) for row in rows] for name in (*NAMES, *fields)},
     }
 
 
-def _axis(columns: dict[str, list[Value]], parameters: Sequence[str]) -> str:
+def _choose_axis(columns: dict[str, list[Value]], parameters: Sequence[str]) -> str:
     """Return the first numeric parameter with several values, else any parameter with several, else the setting."""
     several = [name for name in parameters if len(set(columns[name])) > 1]
     numbers = [name for name in several if {type(value) for value in columns[name]} <= {int, float}]
     return next(iter([*numbers, *several]), "setting")
 
 
-def _value(value: object) -> Value:
+def _round_value(value: object) -> Value:
     if isinstance(value, float):
         return float(f"{value:.{DIGITS}g}") if math.isfinite(value) else None
     return value if isinstance(value, int | bool) else str(value)

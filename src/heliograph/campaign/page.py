@@ -152,11 +152,11 @@ def _is_axis(campaign: Campaign, name: str) -> bool:
     values = parameter_values(campaign, name)
     if values.dtype.kind not in "if" or not np.all(np.isfinite(values)):
         return False
-    rests = [canonical(_rest(setting, name)) for setting in campaign.settings]
+    rests = [canonical(_drop_parameter(setting, name)) for setting in campaign.settings]
     return len(set(rests)) < len(rests)
 
 
-def _rest(setting: Setting, name: str) -> Setting:
+def _drop_parameter(setting: Setting, name: str) -> Setting:
     return {key: value for key, value in setting.items() if key != name}
 
 
@@ -170,19 +170,19 @@ def plot_by_parameter(campaign: Campaign, scores: Sequence[Score], parameter: st
     # Panels: scores with equal node and equal other parameters.
     panels: dict[str, list[Score]] = {}
     for score in scores:
-        rest = _rest(campaign.settings[score.setting], parameter)
+        rest = _drop_parameter(campaign.settings[score.setting], parameter)
         title = ", ".join([score.node, *(f"{name} = {value}" for name, value in rest.items())])
         panels.setdefault(title, []).append(score)
     shown = dict(list(panels.items())[:PANELS])
     figure, grid = _make_panels(len(shown), 2.5)
-    colours = _colours(scores)
+    colours = _assign_colours(scores)
     # A curve for each filter, in order of the parameter, with +- 2 standard errors.
     for axes, (title, of_panel) in zip(grid, shown.items(), strict=False):
         for name in dict.fromkeys(score.filter for score in of_panel):
             curve = [score for score in of_panel if score.filter == name]
             curve.sort(key=lambda score: float(values[score.setting]))
             x = [values[score.setting] for score in curve]
-            y, error = _columns(curve, quantity)
+            y, error = _list_values(curve, quantity)
             label = quote_for_figure(name)
             axes.errorbar(x, y, 2 * error, color=colours[name], marker="o", markersize=4, linewidth=1.4, label=label)
         axes.set_title(fill(quote_for_figure(title), TITLE))
@@ -199,12 +199,12 @@ def plot_by_setting(campaign: Campaign, scores: Sequence[Score], quantity: Quant
     nodes = list(dict.fromkeys(score.node for score in scores))[:PANELS]
     settings = list(dict.fromkeys(score.setting for score in scores))[:SETTINGS]
     figure, grid = _make_panels(len(nodes), 0.9 + 0.3 * len(settings), columns=1)
-    colours = _colours(scores)
+    colours = _assign_colours(scores)
     # Rows are settings; the filters of a row are shifted so that error bars do not overlap.
     for axes, node in zip(grid, nodes, strict=False):
         for shift, name in zip(np.linspace(-0.2, 0.2, len(colours)), colours, strict=True):
             curve = [s for s in scores if s.filter == name and s.node == node and s.setting in settings]
-            y, error = _columns(curve, quantity)
+            y, error = _list_values(curve, quantity)
             rows = [settings.index(score.setting) + shift for score in curve]
             axes.errorbar(
                 y, rows, xerr=2 * error, color=colours[name], fmt="o", markersize=4, label=quote_for_figure(name)
@@ -238,12 +238,12 @@ def _make_panels(count: int, height: float, columns: int = 2) -> tuple[Figure, l
     return figure, grid
 
 
-def _colours(scores: Sequence[Score]) -> dict[str, str]:
+def _assign_colours(scores: Sequence[Score]) -> dict[str, str]:
     names = dict.fromkeys(score.filter for score in scores)
     return {name: COLOURS[i % len(COLOURS)] for i, name in enumerate(names)}
 
 
-def _columns(scores: Sequence[Score], quantity: Quantity) -> tuple[np.ndarray, np.ndarray]:
+def _list_values(scores: Sequence[Score], quantity: Quantity) -> tuple[np.ndarray, np.ndarray]:
     values = np.array([getattr(score, quantity.value) for score in scores])
     return values, np.nan_to_num(np.array([getattr(score, quantity.error) for score in scores]))
 

@@ -129,11 +129,11 @@ def parse_campaign(text: str) -> Campaign:
 def versions() -> dict[str, str]:
     """Return what the stored bytes depend on in addition to the campaign: packages, and configuration of JAX."""
     settings = {name: str(jax.config.values[name]) for name in SETTINGS}
-    return _packages() | {"XLA_FLAGS": os.environ.get("XLA_FLAGS", ""), "device": jax.default_backend()} | settings
+    return _list_versions() | {"XLA_FLAGS": os.environ.get("XLA_FLAGS", ""), "device": jax.default_backend()} | settings
 
 
 @cache
-def _packages() -> dict[str, str]:
+def _list_versions() -> dict[str, str]:
     return {name: version(name) for name in BITWISE}  # each read from a file: every job of a campaign asks
 
 

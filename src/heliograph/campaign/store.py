@@ -78,8 +78,8 @@ def unite_labels(parts: Mapping[int, Labels]) -> Labels:
             raise fail(f"setting {setting}", f"the states of setting {first}, {labels.states}", other.states)
     return Labels(
         states=labels.states,
-        nodes=_union([of_setting.nodes for of_setting in parts.values()]),
-        filters=_union([of_setting.filters for of_setting in parts.values()]),
+        nodes=_unite_names([of_setting.nodes for of_setting in parts.values()]),
+        filters=_unite_names([of_setting.filters for of_setting in parts.values()]),
         received=max(of_setting.received for of_setting in parts.values()),
     )
 
@@ -91,7 +91,7 @@ def check_within(labels: Labels, known: Labels, setting: int) -> None:
         raise fail(f"setting {setting}", f"states, nodes and filters of the store, {known}", labels)
 
 
-def _union(names: Sequence[Sequence[str]]) -> tuple[str, ...]:
+def _unite_names(names: Sequence[Sequence[str]]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(name for axis in names for name in axis))
 
 

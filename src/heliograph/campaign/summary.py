@@ -174,9 +174,9 @@ def write_summary(store: Path, campaign: Campaign, path: Path) -> None:
         for score in summarize(store, campaign):
             setting = campaign.settings[score.setting]
             values = [setting.get(name, "") for name in campaign.parameters]
-            writer.writerow(map(_cell, [score.setting, *values, *astuple(score)[1:]]))
+            writer.writerow(map(_format_cell, [score.setting, *values, *astuple(score)[1:]]))
     replace(partial, path)
 
 
-def _cell(value: object) -> object:
+def _format_cell(value: object) -> object:
     return value if isinstance(value, int | float) else quote_for_cell(str(value))

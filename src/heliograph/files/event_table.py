@@ -88,11 +88,7 @@ class EventTable:
 
     @property
     def columns(self) -> dict[str, Columns]:
-        """Return the events by node, and of "inputs", of the single plant.
-
-        Raises:
-            ValueError: several plants.
-        """
+        """Return the events of the single plant by node, its inputs under "inputs"; ValueError if there are more."""
         if len(self._plants) > 1:
             names = ", ".join(map(repr, list(self._plants)[:8]))
             raise fail("events", f"those of one plant, as events.of({next(iter(self._plants))!r}) has", names)

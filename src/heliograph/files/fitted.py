@@ -53,7 +53,7 @@ def as_json(fitted: Fit, **more: Any) -> dict[str, Any]:
         **more,
         "values": {name: np.asarray(value).tolist() for name, value in fitted.values.items()},
         "table": [{key: _plain(value) for key, value in row._asdict().items()} for row in fitted.table],
-        "delays": {node: _delays(delays) for node, delays in fitted.delays.items()},
+        "delays": {node: _tabulate_delays(delays) for node, delays in fitted.delays.items()},
         "sentences": list(fitted.sentences),
         "log_likelihood": dict(fitted.log_likelihoods),
         "ends": [_plain(float(end)) for end in fitted.ends],
@@ -71,8 +71,8 @@ def write_fitted(content: Mapping[str, object], reference: str, measurements: st
     else:
         way = Path(os.path.relpath(path.resolve(), target.resolve())).as_posix()
         source = f'f"{{HERE}}/{way}{colon}{name}"'
-    text = SOURCE.format(network=_docstring(reference), measurements=_docstring(measurements), fitted=FITTED,
-                         file=NETWORK, reference=source)  # fmt: skip
+    named = {"network": _quote_in_docstring(reference), "measurements": _quote_in_docstring(measurements)}
+    text = SOURCE.format(**named, fitted=FITTED, file=NETWORK, reference=source)
     (folder / NETWORK).write_text(text, encoding="utf-8")
 
 
@@ -98,7 +98,7 @@ def load_fitted(reference: str | Path, fitted: str | Path) -> Network:
     return description.at({name: np.asarray(v) if np.ndim(v) else float(v) for name, v in values.items()})
 
 
-def _delays(delays: Delays) -> dict[str, Any]:
+def _tabulate_delays(delays: Delays) -> dict[str, Any]:
     shares = [{"steps": steps, **share._asdict()} for steps, share in delays.shares.items()]
     return {"step": delays.step, "counted": delays.counted, "early": delays.early, "shares": shares}
 
@@ -116,5 +116,5 @@ def _split_reference(reference: str) -> tuple[Path | None, str, str]:
     return (Path(module) if is_file else None), colon, name
 
 
-def _docstring(text: str) -> str:
+def _quote_in_docstring(text: str) -> str:
     return Path(text).name.replace("\\", "/").replace('"', "'")

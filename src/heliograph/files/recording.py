@@ -256,7 +256,7 @@ def _read_cells(columns: Mapping[str, np.ndarray], network: Network, checks: _Ro
     }
     # An input dt may be left out.
     given = {
-        name: _complete(columns, _find_column(columns, (name,), source), checks)
+        name: _read_complete(columns, _find_column(columns, (name,), source), checks)
         for name in inputs
         if name != TIME_STEP or name in columns
     }
@@ -322,7 +322,7 @@ def _read_times(columns: Mapping[str, np.ndarray], name: str, checks: _RowChecks
     """Return the times of the rows, dates where the column holds dates."""
     values = np.asarray(columns[name])
     if values.dtype.kind != "M":
-        return _complete(columns, name, checks)
+        return _read_complete(columns, name, checks)
     checks.refuse(np.isnat(values), name, "a date", lambda row: "an empty cell")
     return values.astype("datetime64[ns]")
 
@@ -339,19 +339,19 @@ def _warn_of_equal_times(time: np.ndarray, source: str) -> None:
         )
 
 
-def _complete(columns: Mapping[str, np.ndarray], name: str, checks: _RowChecks) -> np.ndarray:
-    values = columns[name] if columns[name].dtype.kind == "i" else _numbers(columns, name, checks.source)
+def _read_complete(columns: Mapping[str, np.ndarray], name: str, checks: _RowChecks) -> np.ndarray:
+    values = columns[name] if columns[name].dtype.kind == "i" else _read_numbers(columns, name, checks.source)
     checks.refuse(~np.isfinite(values), name, "a finite number", _describe_cell(values))
     return values
 
 
 def _read_measurements(columns: Mapping[str, np.ndarray], name: str, checks: _RowChecks) -> np.ndarray:
-    values = _numbers(columns, name, checks.source)
+    values = _read_numbers(columns, name, checks.source)
     checks.refuse(np.isinf(values), name, "a finite number, or none where it did not arrive", _describe_cell(values))
     return values
 
 
-def _numbers(columns: Mapping[str, np.ndarray], name: str, source: str) -> np.ndarray:
+def _read_numbers(columns: Mapping[str, np.ndarray], name: str, source: str) -> np.ndarray:
     if columns[name].dtype.kind == "M":
         raise fail(f"{source}, column {name!r}", "numbers", "dates")
     return np.asarray(columns[name], dtype=np.float64)

@@ -125,7 +125,7 @@ def residuals(
     return Residuals(law.names, values, predicted, correlations, band, white, normal, steady)
 
 
-def _pairs(e: np.ndarray, lag: int) -> np.ndarray:
+def _multiply_pairs(e: np.ndarray, lag: int) -> np.ndarray:
     """Return the products of residuals this far apart, of which both came."""
     products = e[lag:] * e[: len(e) - lag]
     return np.asarray(products[~np.isnan(products)])
@@ -135,7 +135,7 @@ def _autocorrelation(e: np.ndarray, lags: int) -> np.ndarray:
     """Return r_l = sum e_t e_(t+l) / sum e_t^2 over the pairs that came."""
     e = e - np.nanmean(e) if np.any(~np.isnan(e)) else e
     total = np.nansum(e**2)
-    return np.array([_pairs(e, lag).sum() / total if total > 0 else np.nan for lag in range(1, lags + 1)])
+    return np.array([_multiply_pairs(e, lag).sum() / total if total > 0 else np.nan for lag in range(1, lags + 1)])
 
 
 def _test_correlation(e: np.ndarray, lags: int) -> float:
@@ -143,7 +143,7 @@ def _test_correlation(e: np.ndarray, lags: int) -> float:
     n = int(np.sum(~np.isnan(e)))
     if n < LEAST:
         return float("nan")
-    counts = np.array([max(len(_pairs(e, lag)), 1) for lag in range(1, lags + 1)])
+    counts = np.array([max(len(_multiply_pairs(e, lag)), 1) for lag in range(1, lags + 1)])
     return float(chi2.sf(n * (n + 2) * np.sum(_autocorrelation(e, lags) ** 2 / counts), lags))
 
 

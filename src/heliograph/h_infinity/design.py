@@ -103,7 +103,7 @@ def recursive_design(
     target = None if level is None else float(scalar("level", level, TINY, LARGEST))
     check_choice("objective", objective, Objective)
     check_choice("solver", solver, Solver)
-    start = None if initial is None else _checked_weight(initial, system.states)
+    start = None if initial is None else _check_initial_weight(initial, system.states)
     recursion = _Recursion(system, objective, solver, flag("separate", separate))
     search = flag("search", search)
     # at the given level, or by bisection
@@ -156,7 +156,7 @@ def horizon_design(
     steps, coordinates = scale_steps(system, step_matrices(system, flag("separate", separate)), given_gains)
     given_correction = None if given_gains is None else np.zeros((n, m))  # as a correction of the given ones
     layouts = [UnknownsLayout(n, m, len(s.growth), given_correction) for s in steps]
-    start = None if initial is None else coordinates.initial_weight(_checked_weight(initial, n))
+    start = None if initial is None else coordinates.initial_weight(_check_initial_weight(initial, n))
     allowed = coordinates.unit**2 * coordinates.initial_weight(system.initial_weight)
     # one convex problem in all weights, gains, multipliers and the level squared
     problem = HorizonProblem(steps, layouts, allowed, start)
@@ -251,7 +251,7 @@ def _coupled_initial_weight(start: Float[np.ndarray, "w w"] | None, n: int) -> F
     return None if start is None or not np.any(start[:n, n:]) else start
 
 
-def _checked_weight(initial: ArrayLike, n: int) -> Float[np.ndarray, "w w"]:
+def _check_initial_weight(initial: ArrayLike, n: int) -> Float[np.ndarray, "w w"]:
     """Return the initial weight diag(P1, P2) of these sizes; raise ValueError for another shape."""
     return symmetric_weight("initial weight P_0", array("initial weight P_0", initial, (2 * n, 2 * n)))
 

@@ -29,28 +29,28 @@ class OverTime(Module):
 
     def __init__(self, values: object):
         self.values = jax.tree.map(_convert_leaf, values)
-        steps = {leaf.shape[0] if leaf.ndim else None for leaf in _arrays(self.values)}
+        steps = {leaf.shape[0] if leaf.ndim else None for leaf in _list_arrays(self.values)}
         if len(steps) != 1 or None in steps:
             raise fail("OverTime", "arrays that share one leading time axis", f"lengths {sorted(map(str, steps))}")
 
     @property
     def steps(self) -> int:
         """Number of time steps covered."""
-        return int(_arrays(self.values)[0].shape[0])
+        return int(_list_arrays(self.values)[0].shape[0])
 
 
 def _convert_leaf(leaf: object) -> object:
     return np.asarray(leaf, dtype=np.float64) if isinstance(leaf, int | float | list) else leaf
 
 
-def _arrays(tree: object) -> list[PyTree]:
+def _list_arrays(tree: object) -> list[PyTree]:
     return [leaf for leaf in jax.tree.leaves(tree) if eqx.is_array(leaf)]
 
 
 def stack(models: Sequence[T]) -> T:
     """Stack model objects of one structure into one object whose arrays have a new leading axis."""
     flat = [jax.tree.flatten(model) for model in models]
-    if len({_structure(*parts) for parts in flat}) != 1:
+    if len({_describe_structure(*parts) for parts in flat}) != 1:
         raise fail("stack", "objects of one structure and one set of shapes", "objects that differ")
     pieces = zip(*(leaves for leaves, _ in flat), strict=True)
     stacked = [_stack_leaves(*same) if eqx.is_array(same[0]) else same[0] for same in pieces]
@@ -60,10 +60,10 @@ def stack(models: Sequence[T]) -> T:
 
 def structure(model: object) -> Hashable:
     """Return a key that is equal for model objects which differ in nothing but the values of their arrays."""
-    return _structure(*jax.tree.flatten(model))
+    return _describe_structure(*jax.tree.flatten(model))
 
 
-def _structure(leaves: Sequence[Any], tree: Hashable) -> Hashable:
+def _describe_structure(leaves: Sequence[Any], tree: Hashable) -> Hashable:
     return tree, tuple(("array", leaf.shape) if eqx.is_array(leaf) else leaf for leaf in leaves)
 
 
@@ -107,12 +107,12 @@ def at(tree: PyTree, k: int | np.integer | Int[np.ndarray | Array, ""]) -> PyTre
         if not isinstance(leaf, OverTime):
             return leaf
         values, rest = eqx.partition(leaf.values, eqx.is_array)
-        return eqx.combine(jax.tree.map(lambda v: _entry(v, k), values), rest)
+        return eqx.combine(jax.tree.map(lambda v: _take_entry(v, k), values), rest)
 
     return jax.tree.map(read, tree, is_leaf=lambda leaf: isinstance(leaf, OverTime))
 
 
-def _entry(values: PyTree, k: PyTree) -> object:
+def _take_entry(values: PyTree, k: PyTree) -> object:
     if isinstance(k, jax.Array):
         return jax.lax.dynamic_index_in_dim(jnp.asarray(values), k, keepdims=False, allow_negative_indices=False)
     return values[k, ...]  # the dots keep a number an array

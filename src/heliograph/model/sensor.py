@@ -140,7 +140,7 @@ class Sensor(AbstractSensor):
         if self.inputs:
             self.function = function("measure of a sensor", measure, "(x, u)")
             self.outputs, self.noise = read_noise_of_inputs(noise, outputs, None, self.inputs)
-            self.circular = _circular(self.outputs, circular)
+            self.circular = _select_circular(self.outputs, circular)
             self.noise = _round_to(self.noise, resolution, self.circular)
             return
         self.function, law = _take_state_alone(measure), _constant("sensor noise", noise)
@@ -152,7 +152,7 @@ class Sensor(AbstractSensor):
         if shape != (1,):
             expected = "one output, as a variance without names means (outputs=[...] names more)"
             raise fail("measure of a sensor", expected, f"shape {shape}")
-        self.circular = _circular(self.outputs, circular)
+        self.circular = _select_circular(self.outputs, circular)
         self.noise = _round_to(self.noise, resolution, self.circular)
 
     def measure(self, x: jax.Array) -> jax.Array:
@@ -201,13 +201,13 @@ class LinearSensor(AbstractSensor):
             self.outputs, self.noise = read_noise_of_inputs(noise, outputs, rows, self.inputs)
             named: Any = OfInputs(matrix, "sensor matrix", self.inputs) if callable(matrix) else matrix
             self.matrix = named if callable(matrix) else array("sensor matrix", named, ("outputs", "states"))
-            self.circular = _circular(self.outputs, circular)
+            self.circular = _select_circular(self.outputs, circular)
             self.noise = _round_to(self.noise, resolution, self.circular)
             return
         self.matrix = array("sensor matrix", _constant("sensor matrix", matrix), ("outputs", "states"))
         self.noise = as_noise("sensor noise", _constant("sensor noise", noise), self.matrix.shape[-2])
         self.outputs = names("sensor outputs", outputs, self.matrix.shape[-2], "y")
-        self.circular = _circular(self.outputs, circular)
+        self.circular = _select_circular(self.outputs, circular)
         self.noise = _round_to(self.noise, resolution, self.circular)
 
     def measure(self, x: jax.Array) -> jax.Array:
@@ -320,7 +320,7 @@ def _drop_names(model: Any) -> Any:
     return bare
 
 
-def _circular(outputs: tuple[str, ...], circular: Sequence[str]) -> tuple[str, ...]:
+def _select_circular(outputs: tuple[str, ...], circular: Sequence[str]) -> tuple[str, ...]:
     return tuple(outputs[i] for i in angles_named("circular outputs", circular, outputs))
 
 

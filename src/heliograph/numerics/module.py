@@ -32,7 +32,7 @@ def same(x: Any, y: Any) -> bool:
         return False
     # Containers and dataclasses, part by part.
     if isinstance(x, Mapping):
-        return x.keys() == y.keys() and all(same(x[key], y[key]) for key in x) and _rest(x, y)
+        return x.keys() == y.keys() and all(same(x[key], y[key]) for key in x) and _same_attributes(x, y)
     if isinstance(x, tuple | list):
         return len(x) == len(y) and all(map(same, x, y))
     if isinstance(x, partial):
@@ -46,7 +46,7 @@ def same(x: Any, y: Any) -> bool:
     return bool(x == y) or (isinstance(x, float) and x != x and y != y)
 
 
-def _rest(x: object, y: object) -> bool:
+def _same_attributes(x: object, y: object) -> bool:
     """Compare the attributes that a subclass of dict has in addition to its entries."""
     return same(getattr(x, "__dict__", None), getattr(y, "__dict__", None))
 
@@ -93,7 +93,7 @@ def readable(kind: T) -> T:
     """
     if not hasattr(kind, "__getattr__"):
         kind.__getattr__ = refuse_attribute  # type: ignore[attr-defined]
-    for name, method in (("__repr__", _write_repr), ("_repr_html_", _html), ("__eq__", _equal)):
+    for name, method in (("__repr__", _write_repr), ("_repr_html_", _html), ("__eq__", _are_equal)):
         if name != "_repr_html_" or name not in vars(kind):
             setattr(kind, name, method)
     return kind
@@ -115,7 +115,7 @@ def _html(self: object) -> str:
     return _format_table(self, DEPTH)
 
 
-def _equal(self: object, other: object) -> bool:
+def _are_equal(self: object, other: object) -> bool:
     """Return whether both are of the same class and equal in every part; NaN equals NaN."""
     if type(self) is type(other) and not (is_dataclass(self) or isinstance(self, Mapping | tuple)):
         return same(self.__getstate__(), other.__getstate__())
@@ -127,15 +127,15 @@ def line(value: object, depth: int) -> str:
     if isinstance(value, np.ndarray | np.generic | jax.Array):
         return _format_array(value)
     # Containers, item by item.
-    if isinstance(value, Mapping) and not _ours(value):
+    if isinstance(value, Mapping) and not _is_ours(value):
         return _join_some(
             "{", value.items(), len(value), depth, lambda pair: f"{pair[0]!r}: {line(pair[1], depth - 1)}", "}"
         )
-    if isinstance(value, tuple | list) and not _ours(value):
+    if isinstance(value, tuple | list) and not _is_ours(value):
         marks = "[]" if isinstance(value, list) else ("(", ",)" if len(value) == 1 else ")")
         return _join_some(marks[0], value, len(value), depth, lambda entry: line(entry, depth - 1), marks[1])
     # Objects with fields.
-    if _ours(value) or is_dataclass(value):
+    if _is_ours(value) or is_dataclass(value):
         name, parts = type(value).__name__, list(islice(_list_parts(value), LARGE))
         return _join_some(f"{name}(", parts, len(parts), depth, lambda p: f"{p[0]}={line(p[1], depth - 1)}", ")")
     if isinstance(value, partial):
@@ -145,7 +145,7 @@ def line(value: object, depth: int) -> str:
     return " ".join(repr(value).split())
 
 
-def _ours(value: object) -> bool:
+def _is_ours(value: object) -> bool:
     return getattr(type(value), "__repr__", None) is _write_repr
 
 
@@ -190,7 +190,8 @@ def cut(text: str) -> str:
 def _format_table(value: object, depth: int) -> str:
     """Return an object as a table of HTML, a row for each of its parts."""
     rows = [
-        f"<tr><th>{escape(name)}</th><td>{_cell(entry, depth - 1)}</td></tr>" for name, entry in _list_entries(value)
+        f"<tr><th>{escape(name)}</th><td>{_format_cell(entry, depth - 1)}</td></tr>"
+        for name, entry in _list_entries(value)
     ]
     return f"<table><caption>{escape(type(value).__name__)}</caption>{''.join(rows)}</table>"
 
@@ -204,7 +205,7 @@ def _list_entries(value: object) -> Iterable[tuple[str, object]]:
         yield "…", f"{left} more"
 
 
-def _cell(value: object, depth: int) -> str:
+def _format_cell(value: object, depth: int) -> str:
     text = escape(cut(line(value, depth)))
-    opens = _ours(value) or (isinstance(value, Mapping) and value)
+    opens = _is_ours(value) or (isinstance(value, Mapping) and value)
     return f"<details><summary>{text}</summary>{_format_table(value, depth)}</details>" if opens and depth > 0 else text

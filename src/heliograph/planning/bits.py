@@ -74,7 +74,7 @@ def design_bits(network: Network, total: int) -> BitsDesign:
     senders = _describe_senders(instance("network", network, Network, "a Network"))
     budget, names = check_count("total bits", total), list(network.names)
     bits = _add_greedily(senders, budget)
-    error = _find_error(senders, _information_of(senders, bits))
+    error = _find_error(senders, _take_information(senders, bits))
     nodes = [node for node in network.nodes.values() if isinstance(node, Node)]
     encoders = {
         name: Words(int(count), node.encoder.low, node.encoder.high, "subtracted")
@@ -121,7 +121,7 @@ def _gain_of(name: str, node: Node) -> float:
                type(link).__name__)  # fmt: skip
 
 
-def _information_of(senders: _Senders, bits: Sequence[int] | np.ndarray) -> Float[np.ndarray, " senders"]:
+def _take_information(senders: _Senders, bits: Sequence[int] | np.ndarray) -> Float[np.ndarray, " senders"]:
     found: np.ndarray = senders.information[np.arange(len(senders.rows)), np.asarray(bits)]
     return found
 
@@ -157,14 +157,14 @@ def _find_slopes(senders: _Senders, j: Float[np.ndarray, " senders"]) -> Float[n
 def _add_greedily(senders: _Senders, total: int) -> Float[np.ndarray, " senders"]:
     """Add bits, several at once to one sender, by the decrease of the error for each bit, while there are some left."""
     bits = np.zeros(len(senders.rows), dtype=int)
-    error = _find_error(senders, _information_of(senders, bits))
+    error = _find_error(senders, _take_information(senders, bits))
     while (left := total - bits.sum()) > 0:
         best = (0.0, 0, 0, error)
         for i in range(len(bits)):
             for more in range(1, min(left, MOST - bits[i]) + 1):
                 tried = bits.copy()
                 tried[i] += more
-                lower = _find_error(senders, _information_of(senders, tried))
+                lower = _find_error(senders, _take_information(senders, tried))
                 best = max(best, ((error - lower) / more, i, more, lower))
         if best[0] <= 0:
             return bits

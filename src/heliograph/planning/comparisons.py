@@ -27,7 +27,7 @@ SITE_STARTS, CHANGE_STARTS = 8, 16  # descents at each place, and after each cha
 Advance = TypeAliasType("Advance", Callable[[str], None])
 
 
-def _silent(what: str) -> None:
+def _report_nothing(what: str) -> None:
     """No word of progress."""
 
 
@@ -43,7 +43,7 @@ class Front(NamedTuple):
     bounds: Float[np.ndarray, "points"]
 
 
-def error_over_power(problem: DesignProblem, totals: Sequence[float], advance: Advance = _silent) -> Front:
+def error_over_power(problem: DesignProblem, totals: Sequence[float], advance: Advance = _report_nothing) -> Front:
     """Return the least error at each of several total powers.
 
     Args:
@@ -94,7 +94,7 @@ def error_over_sites(
     build: "Callable[[float, float], Network]",
     x: "Float[ArrayLike, ' columns']",
     y: "Float[ArrayLike, ' rows']",
-    advance: Advance = _silent,
+    advance: Advance = _report_nothing,
 ) -> "SiteMap":
     """Return the least error at a design's total power, with its network standing elsewhere.
 
@@ -139,7 +139,9 @@ class ChangeWorth(NamedTuple):
     saved: float
 
 
-def worth_of_changes(best: PowerDesign, exponent: float | None = None, advance: Advance = _silent) -> list[ChangeWorth]:
+def worth_of_changes(
+    best: PowerDesign, exponent: float | None = None, advance: Advance = _report_nothing
+) -> list[ChangeWorth]:
     """Worth of each sensor once more, of each left out, and of a relay halfway of each hop: the design made again.
 
     A relay halfway makes two hops of one, each with 2^exponent times its power gain E g^2 and the same kappa and noise.
@@ -180,20 +182,20 @@ def _list_changes(problem: DesignProblem, network: Network, exponent: float | No
     for name, node in bare.items():
         twin = f"{name} again"
         changed[f"one more {name}"] = with_nodes({**bare, twin: node}, None if free is None else (*free, twin))
-        rest = None if free is None else tuple(free_name for free_name in free if _node(free_name) != name)
+        rest = None if free is None else tuple(free_name for free_name in free if _name_node(free_name) != name)
         if len(bare) > 1 and rest != () and problem.target_error is None:
             left = {other: node_left for other, node_left in bare.items() if other != name}
             changed[f"without {name}"] = with_nodes(left, rest)
         if exponent is not None and isinstance(node.channel, AbstractRandomAffine):
             # Hops are counted anew behind a relay that is put between: nodes are free as a whole.
-            whole = None if free is None else tuple(dict.fromkeys(_node(free_name) for free_name in free))
+            whole = None if free is None else tuple(dict.fromkeys(_name_node(free_name) for free_name in free))
             for hop in transmitter_names(node.channel):
                 nearer = Node(node.sensor, _insert_relay(node.channel, hop, exponent), {})
                 changed[f"a relay halfway of {name}.{hop}"] = with_nodes({**bare, name: nearer}, whole)
     return changed
 
 
-def _node(transmitter: str) -> str:
+def _name_node(transmitter: str) -> str:
     return transmitter.partition(".")[0]
 
 

@@ -97,7 +97,7 @@ def power(
     if network.relays is not None:
         sent = _compute_relay_powers(network, horizon)
         return SentPower(sent, {name: np.zeros_like(power) for name, power in sent.items()}, rate)
-    sources = _sources(network)
+    sources = _list_sources(network)
     covered = steps_covered((network.plant, sources))
     if horizon is None and covered is not None:
         raise fail("steady power", "a network that does not vary (give a horizon)", "parts that are OverTime")
@@ -120,7 +120,7 @@ def power(
     # What the hops make of it.
     power, error = {}, {}
     for name, (_, channel) in sources.items():
-        batches = [[_powers_at(channel, k, now, horizon) for k, now in enumerate(batch)] for batch in y[name]]
+        batches = [[_compute_powers_at(channel, k, now, horizon) for k, now in enumerate(batch)] for batch in y[name]]
         for hop in batches[0][0]:
             values = np.array([[now[hop] for now in batch] for batch in batches])
             power[f"{name}.{hop}"] = values.mean(axis=0)
@@ -129,12 +129,12 @@ def power(
     return SentPower(power, error, rate)
 
 
-def _powers_at(channel: Channel, k: int, moment: np.ndarray, horizon: int | None) -> dict[str, float]:
+def _compute_powers_at(channel: Channel, k: int, moment: np.ndarray, horizon: int | None) -> dict[str, float]:
     """Return the powers sent at step k for `moment` = E (y, 1)(y, 1)', or in the long run if there is no horizon."""
     return steady_powers(at(channel, k), moment) if horizon is None else compute_sent_powers(at(channel, k), moment, k)
 
 
-def _sources(network: Network) -> Sources:
+def _list_sources(network: Network) -> Sources:
     if network.common is not None:
         return {"common": (network.common.sensor, network.common.channel)}
     return {name: (node.sensor, node.channel) for name, node in network.nodes.items() if isinstance(node, Node)}

@@ -220,7 +220,10 @@ class Told(AbstractTold):
             return super().give_law(numbers)
         link, usual = self.believed(numbers), self.believed(jnp.asarray(self.typical))
         finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(link) if eqx.is_array(leaf)]
-        noises = [_is_covariance(b, t) for b, t in zip(_covariances(link), _covariances(usual), strict=True)]
+        noises = [
+            _is_covariance(b, t)
+            for b, t in zip(_list_noise_covariances(link), _list_noise_covariances(usual), strict=True)
+        ]
         return jnp.all(jnp.stack([*finite, *noises]))
 
     def in_words(self) -> str:
@@ -346,7 +349,7 @@ def _share_out(channel: object, numbers: Numbers) -> dict[str, Numbers]:
     return parts
 
 
-def _covariances(link: AbstractRandomAffine) -> list[jax.Array | np.ndarray]:
+def _list_noise_covariances(link: AbstractRandomAffine) -> list[jax.Array | np.ndarray]:
     leaves = jax.tree.leaves(link, is_leaf=lambda leaf: isinstance(leaf, AbstractNoise))
     return [leaf.covariance for leaf in leaves if isinstance(leaf, AbstractNoise)]
 

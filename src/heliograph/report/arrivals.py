@@ -71,7 +71,7 @@ class Arrivals:
         Declared, or found: it has a rate of its own, or nearly all intervals between arrivals are whole multiples of
         their median. Losses of a sender that is due in each row leave intervals of all lengths, and no such period.
         """
-        clock = _clock(self.time)
+        clock = _read_clock(self.time)
         spacing = float(np.median(np.diff(clock))) if len(clock) > 1 else 0.0
         if self.declared_period is not None:
             return self.declared_period * spacing if self.declared_period > 1 else None
@@ -94,7 +94,7 @@ class Arrivals:
         """
         if self.period is None:
             return None if self.of_messages and not self.arrived.all() else self.arrived
-        clock = _clock(self.time)
+        clock = _read_clock(self.time)
         came = clock[self.arrived]
         if not len(came):
             return np.zeros(max(int((clock[-1] - clock[0]) / self.period), 1), dtype=bool)
@@ -140,7 +140,7 @@ class Arrivals:
         lost = np.flatnonzero(~self.slots & due)
         if self.period is None:
             return self.time[lost]
-        clock, came = _clock(self.time), np.flatnonzero(self.slots)
+        clock, came = _read_clock(self.time), np.flatnonzero(self.slots)
         times = clock[self.arrived]
         if len(came) != len(times):  # several that came in one slot
             times = np.interp(came, [came[0], max(came[-1], came[0] + 1)], [times[0], times[-1]])
@@ -195,7 +195,7 @@ def rows_are_messages(arrived: Mapping[str, Bool[np.ndarray, " time"]]) -> bool:
     return len(arrived) > 1 and bool(np.all(together > 0) and np.median(together) <= 1)
 
 
-def _clock(time: np.ndarray) -> Float[np.ndarray, " time"]:
+def _read_clock(time: np.ndarray) -> Float[np.ndarray, " time"]:
     """Return the times as numbers: dates in seconds after the first."""
     if time.dtype.kind == "M":
         return np.asarray((time - time[0]) / np.timedelta64(1, "s"), dtype=float)

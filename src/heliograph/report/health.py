@@ -269,7 +269,7 @@ def examine(
         lost = np.any(record.estimates[node][name].claims == "none")
         claim = "none" if lost else filter.claim
         declared = () if test is None else judge_declared_links(filter, z, u)
-        unit = _time_unit(record) if TIME_STEP in network.inputs else "steps"
+        unit = _name_time_unit(record) if TIME_STEP in network.inputs else "steps"
         mean = float(np.nanmean(expected))
         filters.append(FilterHealth(node, name, claim, white, test, listener.trusted, declared, unit, mean))
     others = tuple(belief.words for belief in network.beliefs())
@@ -314,7 +314,7 @@ def _say_declared(health: FilterHealth) -> list[str]:
     ]
 
 
-def _time_unit(record: Record) -> str:
+def _name_time_unit(record: Record) -> str:
     """Return the unit of the times of a record, in words."""
     return record.units.get("time", "s" if record.time.dtype.kind == "M" else "of the unit of time")
 

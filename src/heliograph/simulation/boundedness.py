@@ -92,7 +92,7 @@ def certify_boundedness(network: Network) -> Boundedness:
     a, q = plant_matrices(network.plant)
     links = _join_links(network, len(a))
     # Rows of known gain on all of x, or on the modes that do not decay.
-    growing = _unstable(a)
+    growing = _find_unstable_modes(a)
     for space in (np.eye(len(a)), growing):
         known = _group_losses(a, q, links, space)
         gains = find_gains(known.system)
@@ -139,7 +139,7 @@ def _require_constant(channel: Channel) -> AbstractRandomAffine:
     return channel
 
 
-def _unstable(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n d"]:
+def _find_unstable_modes(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n d"]:
     """Return the orthonormal basis of the plant's modes that do not decay."""
     _, basis, count = scipy.linalg.schur(matrix / BELOW_ONE, sort="ouc")
     return np.asarray(basis[:, :count])

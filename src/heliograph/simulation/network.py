@@ -135,7 +135,8 @@ class Network(Module):
         # Groups of nodes and kinds of filters, by structure.
         meshes = {name: tuple(m for m in self.meshes if name in self.mesh_nodes(m)) for name in self.names}
         self.groups = group_by_structure(
-            (name, without_output_names((_world(n), n.filters, meshes[name]))) for name, n in self.nodes.items()
+            (name, without_output_names((_describe_received(n), n.filters, meshes[name])))
+            for name, n in self.nodes.items()
         )
         self.kinds = list_kinds(self.groups, {name: node.filters for name, node in self.nodes.items()})
         self.mesh_kinds = list_mesh_kinds(self.groups, meshes)
@@ -389,7 +390,7 @@ Network.__repr__ = short_text_of  # type: ignore[method-assign, assignment]
 Network._repr_html_ = table_of  # type: ignore[attr-defined]
 
 
-def _world(node: Node | ReceivingNode) -> object:
+def _describe_received(node: Node | ReceivingNode) -> object:
     """Return the parts of a node that determine its measurements."""
     if isinstance(node, Node):
         places = None if node.encoder is None else find_places(node.channel)

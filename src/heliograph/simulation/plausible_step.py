@@ -117,12 +117,12 @@ def find_refused_rows(
     judges, refused = Judges(network), dict[str, dict[int, str]]()
     shared = judges.without_own
     for name in network.names:
-        if name not in shared and (why := _reasons(judges.of_node(outcome, name))):
+        if name not in shared and (why := _list_reasons(judges.of_node(outcome, name))):
             refused[name] = why
-    return refused, _reasons(judges.of_node(outcome, shared[0])) if shared else {}
+    return refused, _list_reasons(judges.of_node(outcome, shared[0])) if shared else {}
 
 
-def _reasons(votes: Float[np.ndarray, "steps filters 4"]) -> dict[int, str]:
+def _list_reasons(votes: Float[np.ndarray, "steps filters 4"]) -> dict[int, str]:
     return {k: said for k in _find_flagged(votes, "reason") if (said := Judgement.why_values(votes[k]))}
 
 
@@ -139,7 +139,7 @@ def describe_doubts(
     for node, by_row in refused.items():
         row, why = next(iter(by_row.items()))
         fault = next((said for name in network.nodes[node].filters if (said := faults.of(node, name, row))), "")
-        lines.append(f"node {node!r}: {_rows(list(by_row))} implausible, as if not arrived: {why}{fault}")
+        lines.append(f"node {node!r}: {_format_rows(list(by_row))} implausible, as if not arrived: {why}{fault}")
     # Rows that a single filter skips.
     at_nodes = {(node, name): [field[:, f, i] for field in outputs["judged"][kind]]
             for (node, name), (kind, f, i) in network.places.items()}  # fmt: skip
@@ -150,12 +150,12 @@ def describe_doubts(
         rows = [int(k) for k in np.flatnonzero(reason > 0) if k not in reported]
         if rows:
             why = Judgement.describe(reason[rows[0]], distance[rows[0]]) + faults.of(node, name, rows[0])
-            lines.append(f"filter {name!r} of {node!r} alone: {_rows(rows)} implausible, left out: {why}")
+            lines.append(f"filter {name!r} of {node!r} alone: {_format_rows(rows)} implausible, left out: {why}")
     # Inputs, judged by all filters.
     if network.inputs:
         votes = Judges(network).of_all(outputs)
         rows = [k for k in _find_flagged(votes, "input") if Judgement.why_inputs(votes[k])]
-        lines += [f"inputs: {_rows(rows)} implausible: {INPUT}"] if rows else []
+        lines += [f"inputs: {_format_rows(rows)} implausible: {INPUT}"] if rows else []
     return lines
 
 
@@ -191,7 +191,7 @@ def _find_flagged(votes: Float[np.ndarray, "steps filters 4"], field: str) -> li
     return flagged
 
 
-def _rows(rows: Sequence[int]) -> str:
+def _format_rows(rows: Sequence[int]) -> str:
     """Write rows as text, counted from 1: the first few."""
     listed = ", ".join(str(k + 1) for k in rows[:5]) + (", ..." if len(rows) > 5 else "")
     return f"{len(rows)} rows ({listed}) are" if len(rows) > 1 else f"row {listed} is"

@@ -300,7 +300,7 @@ def _filter_in_chunks(
     if judged or later is not None or not filters.are_linear:
         return None
     whole = scan_in_chunks(NetworkRows(filters), to_numpy(initial_states(filters)), (z, u))
-    return None if whole is None else _results(later, z, *whole)
+    return None if whole is None else _collect_results(later, z, *whole)
 
 
 def _scan_in_parts(
@@ -320,7 +320,7 @@ def _scan_in_parts(
         states, results = _scanned_by_xla(filters, states, (k, u_k, z_k, drawn), judged, counts)
         parts.append(to_numpy(results))
     whole = jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(u)], *parts)
-    return to_numpy(_results(later, z, states, whole))
+    return to_numpy(_collect_results(later, z, states, whole))
 
 
 def _run_filters(
@@ -328,7 +328,7 @@ def _run_filters(
     judged: bool,
 ) -> PyTree:  # fmt: skip
     """Filter all rows in one scan; `judged`: what is implausible is found before it is used, and left out."""
-    return _results(later, z, *_scan(filters, filters.init(), (jnp.arange(len(u)), u, z, arrivals), judged))
+    return _collect_results(later, z, *_scan(filters, filters.init(), (jnp.arange(len(u)), u, z, arrivals), judged))
 
 
 def _scan(
@@ -348,7 +348,9 @@ def _scan(
     return states, results
 
 
-def _results(later: Smoother | None, z: tuple[np.ndarray, ...], state: PyTree, results: dict[str, PyTree]) -> PyTree:
+def _collect_results(
+    later: Smoother | None, z: tuple[np.ndarray, ...], state: PyTree, results: dict[str, PyTree]
+) -> PyTree:
     """Return what the filters judged, their last state, and their results, smoothed if there is a smoother."""
     results = {"measurements": z, **results}
     judged = {name: results.pop(name) for name in ("judged", "judged_centrally")}

@@ -182,7 +182,7 @@ def _run_chunks(job: _Job, first_run: int, runs: int, chunk: int, progress: Prog
     """Return the sums over all runs, and what is collected of them, chunk by chunk."""
     with jax.enable_x64(True):
         lanes = RunLanes(
-            lambda blocks, carry: _lane((job, blocks), carry),
+            lambda blocks, carry: _simulate_lane((job, blocks), carry),
             partial(_all_lanes, job),
             partial(_initial, job),
             first_run,
@@ -206,7 +206,7 @@ def _initial(job: _Job) -> PyTree:
 
 
 @partial(quickly_compiled, donate="all-except-first")
-def _lane(todo: tuple[_Job, PyTree], carry: PyTree) -> tuple[PyTree, PyTree]:
+def _simulate_lane(todo: tuple[_Job, PyTree], carry: PyTree) -> tuple[PyTree, PyTree]:
     return _simulate_blocks(*todo, carry)
 
 
@@ -248,7 +248,7 @@ def _simulate_outputs(job: _Job, runs: jax.Array) -> PyTree:
     if job.precision == "float64":
         return _trajectories(job.world, job.inputs, job.key, runs)
     with jax.enable_x64(False):
-        world, inputs = jax.tree.map(_single, (job.world, job.inputs))
+        world, inputs = jax.tree.map(_convert_to_single, (job.world, job.inputs))
         outputs = _trajectories(world, inputs, job.key, runs)
     return jax.tree.map(lambda leaf: leaf.astype(float) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, outputs)
 
@@ -284,7 +284,7 @@ def group_by_batch(values: jax.Array, start: jax.Array | int) -> jax.Array:
     return jax.lax.dynamic_update_slice(begin, begin[..., : runs - 1] + beyond, (*zero, 0))
 
 
-def _single(leaf: PyTree) -> PyTree:
+def _convert_to_single(leaf: PyTree) -> PyTree:
     """Convert an array to the type that JAX has for it without enable_x64."""
     halved = {"float64": "float32", "int64": "int32", "uint64": "uint32"}
     return leaf.astype(halved.get(str(leaf.dtype), leaf.dtype)) if eqx.is_array(leaf) else leaf

@@ -21,14 +21,14 @@ def _sort(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> l
         rows = [x[index] for x in moved]
         for turn in range(count):
             for i in range(turn % 2, count - 1, 2):
-                wrong = _wrong(graph, rows[0][i], rows[0][i + 1])
+                wrong = _is_behind(graph, rows[0][i], rows[0][i + 1])
                 for row in rows:
                     a, b = row[i], row[i + 1]
                     row[i], row[i + 1] = select(graph, wrong, b, a), select(graph, wrong, a, b)
     return [np.moveaxis(x, -1, axis) for x in moved]
 
 
-def _wrong(graph: Graph, a: Node, b: Node) -> Node:
+def _is_behind(graph: Graph, a: Node, b: Node) -> Node:
     """Return whether a belongs behind b."""
     larger = graph.node("gt", "bool", a, b)
     if a.type not in REAL:

@@ -53,8 +53,8 @@ def gamma_masses(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     def continue_fraction(state: Quotients) -> Quotients:
         n, c, d, fraction, _ = state
         numerator, b = n * (a - n), x + 2 * n + 1 - a
-        c, d = b + numerator / c, 1 / _apart(b + numerator * d)
-        return n + 1, _apart(c), d, fraction * c * d, jnp.abs(c * d - 1)
+        c, d = b + numerator / c, 1 / _keep_from_zero(b + numerator * d)
+        return n + 1, _keep_from_zero(c), d, fraction * c * d, jnp.abs(c * d - 1)
 
     start = 1 / jnp.where(above, x + 1 - a, 1.0)
     state = (jnp.ones_like(x), jnp.full_like(x, 1 / TINY), start, start, jnp.where(above, 1.0, 0.0))
@@ -121,7 +121,7 @@ def expansion() -> list[list[float]]:
     return [[float(c) for c in one[:TERMS]] for one in series]
 
 
-def _apart(x: jax.Array) -> jax.Array:
+def _keep_from_zero(x: jax.Array) -> jax.Array:
     """Return x, a tiny number for zero."""
     return jnp.where(x == 0, TINY, x)
 

@@ -135,7 +135,7 @@ def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list
             moves.append((x.strides[axis], first))
     left = [a for a in range(x.ndim) if a not in numbers.collapsed_slice_dims]
     view = x.view([sizes[a] for a in left], [x.strides[a] for a in left], offset, *moves)
-    row = view.view(result_shape(equation), _matched(view, result_shape(equation)))
+    row = view.view(result_shape(equation), _match_strides(view, result_shape(equation)))
     if not fills(equation) or (flag.op == "constant" and flag.value):
         return [row]
     # A row that is not inside is filled with a value.
@@ -143,7 +143,7 @@ def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list
     return [array_of([select(lowering.graph, flag, n, missing) for n in nodes.ravel().tolist()], nodes.shape)]
 
 
-def _matched(view: InMemory, shape: tuple[int, ...]) -> list[int]:
+def _match_strides(view: InMemory, shape: tuple[int, ...]) -> list[int]:
     """Return strides of the same entries with axes of length 1 added."""
     rest = [s for n, s in zip(view.shape, view.strides, strict=True) if n != 1]
     items = iter(rest)

@@ -131,7 +131,7 @@ def _open_reader(path: Path, readable: Path) -> "Iterator[AnyReader]":
         reader = AnyReader([readable], default_typestore=get_typestore(Stores.LATEST))
         reader.open()
     except Exception as error:  # whatever a damaged file makes a reader do
-        raise fail(str(path), "a bag that can be opened", _reason(error)) from None
+        raise fail(str(path), "a bag that can be opened", _format_reason(error)) from None
     try:
         yield reader
     finally:
@@ -154,7 +154,7 @@ def read_raw_messages(path: Path, reader: "AnyReader", topics: list[str]) -> Ite
             return
         except Exception as error:
             after = f"after message {count} of its topics, logged at {moment(last)}" if count else "before any message"
-            raise DamageError(str(fail(f"{path}, {after}", "a bag without damage", _reason(error)))) from None
+            raise DamageError(str(fail(f"{path}, {after}", "a bag without damage", _format_reason(error)))) from None
         # Of the type that its topic had before.
         connection, last = message.connection, message.logged
         kind = connection.msgtype
@@ -202,7 +202,7 @@ def _append_messages(
             content = reader.deserialize(data, kind)
         except Exception as error:
             where = f"{path}, {topic}, logged at {moment(logged)}"
-            table.refuse(fail(where, f"a message of {kind}", _reason(error)), strict)
+            table.refuse(fail(where, f"a message of {kind}", _format_reason(error)), strict)
             continue
         for reading in sources.read(topic, content, topic):
             if isinstance(reading, Unread):
@@ -263,7 +263,7 @@ def _has_field(fields: dict[str, str], path: str) -> bool:
     )
 
 
-def _reason(error: Exception) -> str:
+def _format_reason(error: Exception) -> str:
     return " ".join(show_error(error).split()).rstrip(".")
 
 

@@ -106,7 +106,7 @@ def write_bag(record: Record, path: str | Path, origin: np.datetime64 | None = N
     pose.places(record.states)
     from rosbags.rosbag2 import StoragePlugin, Writer
 
-    store = _types()
+    store = _load_types()
     times = _convert_times(record.time, origin)
     # The writer makes a folder; the file in it is complete in itself.
     with whole_file(path) as partial, tempfile.TemporaryDirectory(dir=path.parent) as folder:
@@ -116,7 +116,9 @@ def write_bag(record: Record, path: str | Path, origin: np.datetime64 | None = N
                 topic: (writer.add_connection(topic, kind, typestore=store), kind)
                 for node, filters in record.estimates.items()
                 for name, estimate in filters.items()
-                for topic, kind in _name_topics(f"/{_word(node)}/{_word(name)}", record.states, estimate.claim, pose)
+                for topic, kind in _name_topics(
+                    f"/{_make_topic_word(node)}/{_make_topic_word(name)}", record.states, estimate.claim, pose
+                )
             }
             for stamp, topic, message in _yield_messages(record, times, pose, store.types):
                 connection, kind = topics[topic]
@@ -124,7 +126,7 @@ def write_bag(record: Record, path: str | Path, origin: np.datetime64 | None = N
         shutil.move(bag / f"{bag.name}.mcap", partial)
 
 
-def _types() -> Any:
+def _load_types() -> Any:
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS2_HUMBLE)
@@ -138,7 +140,7 @@ def _convert_times(time: np.ndarray, origin: np.datetime64 | None) -> list[int]:
     return [begun + round(at * 1e9) for at in time.tolist()]
 
 
-def _word(name: str) -> str:
+def _make_topic_word(name: str) -> str:
     """Return a name as a word of a topic."""
     return re.sub(r"\W", "_", name)
 
@@ -148,9 +150,9 @@ def _name_topics(prefix: str, states: tuple[str, ...], claim: Claim, pose: Pose)
     if any(state is not None for places in pose.places(states) for state in places):
         yield f"{prefix}/odometry", ODOMETRY
     for state in states:
-        yield f"{prefix}/{_word(state)}", NUMBER
+        yield f"{prefix}/{_make_topic_word(state)}", NUMBER
         if claim != "none":
-            yield f"{prefix}/{_word(state)}/sd", NUMBER
+            yield f"{prefix}/{_make_topic_word(state)}/sd", NUMBER
 
 
 def _yield_messages(record: Record, times: list[int], pose: Pose, types: Any) -> Iterator[tuple[int, str, object]]:
@@ -159,7 +161,13 @@ def _yield_messages(record: Record, times: list[int], pose: Pose, types: Any) ->
     number, places = types[NUMBER], pose.places(record.states)
     moves = any(state is not None for axes in places for state in axes)
     parts = [
-        (f"/{_word(node)}/{_word(name)}", np.asarray(e.mean), np.asarray(e.covariance), _claims(e), is_sound(e))
+        (
+            f"/{_make_topic_word(node)}/{_make_topic_word(name)}",
+            np.asarray(e.mean),
+            np.asarray(e.covariance),
+            _claims(e),
+            is_sound(e),
+        )
         for node, filters in record.estimates.items()
         for name, e in filters.items()
     ]
@@ -172,9 +180,13 @@ def _yield_messages(record: Record, times: list[int], pose: Pose, types: Any) ->
                 bound = None if claims[k] == "none" else covariance[k]
                 yield stamp, f"{prefix}/odometry", _make_odometry(stamp, mean[k], bound, places, pose, types)
             for i, state in enumerate(record.states):
-                yield stamp, f"{prefix}/{_word(state)}", number(float(mean[k, i]))
+                yield stamp, f"{prefix}/{_make_topic_word(state)}", number(float(mean[k, i]))
                 if claims[k] != "none":
-                    yield stamp, f"{prefix}/{_word(state)}/sd", number(float(np.sqrt(max(covariance[k, i, i], 0.0))))
+                    yield (
+                        stamp,
+                        f"{prefix}/{_make_topic_word(state)}/sd",
+                        number(float(np.sqrt(max(covariance[k, i, i], 0.0)))),
+                    )
 
 
 def _claims(estimate: Estimate) -> np.ndarray:

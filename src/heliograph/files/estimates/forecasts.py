@@ -34,7 +34,7 @@ def forecast_columns(record: Record, forecasts: ByFilter, predicted: ByFilter | 
     }
     above = estimate_columns(record, predicted)
     below = estimate_columns(replace(record, time=one.time, truth=None, estimates=estimates, smoothed=None))
-    columns = {name: _joined(values, below.get(name), len(one.time)) for name, values in above.items()}
+    columns = {name: _append_rows(values, below.get(name), len(one.time)) for name, values in above.items()}
     ahead = np.arange(len(record.time) + len(one.time)) >= len(record.time)
     columns = {"time": columns.pop("time"), FORECAST: ahead, **columns}
     several = len(forecasts) > 1, any(len(filters) > 1 for filters in forecasts.values())
@@ -69,7 +69,7 @@ def write_forecast(record: Record, forecasts: ByFilter, path: str | Path, predic
     write_table(forecast_columns(record, forecasts, predicted), path)
 
 
-def _joined(above: np.ndarray, below: np.ndarray | None, rows: int) -> np.ndarray:
+def _append_rows(above: np.ndarray, below: np.ndarray | None, rows: int) -> np.ndarray:
     """Put rows below a column; of one that has none they are NaN, or false."""
     if below is None:
         below = np.full(rows, np.nan if above.dtype.kind == "f" else False)

@@ -218,7 +218,7 @@ def _read_values(row: Mapping[str, Any], names: Sequence[str], where: str, numbe
     """Return the values of one event; where it is `numbered` the last, of what was lost, may be left to its count."""
     if row.get(VALUES) not in (None, ""):
         cell = row[VALUES]
-        parts: list[Any] = cell.replace(";", " ").split() if isinstance(cell, str) else _items(cell)
+        parts: list[Any] = cell.replace(";", " ").split() if isinstance(cell, str) else _list_items(cell)
         if numbered and len(parts) == len(names) - 1:
             parts.append("nan" if isinstance(cell, str) else np.nan)
         if len(parts) != len(names):
@@ -228,7 +228,7 @@ def _read_values(row: Mapping[str, Any], names: Sequence[str], where: str, numbe
     return np.array([_parse_number(row.get(name), f"{where}, column {name!r}", True) for name in names])
 
 
-def _items(cell: Any) -> list[Any]:
+def _list_items(cell: Any) -> list[Any]:
     return list(cell) if isinstance(cell, list | tuple | np.ndarray) else [cell]
 
 

@@ -131,9 +131,9 @@ class Sources:
         for counts, why in ((self.excluded, "left out by where="), (self.offline, "left out, of devices offline")):
             if counts:
                 named = ", ".join(f"{topic} ({number})" for topic, number in counts.most_common(LISTED))
-                lines.append(f"messages {why}: {named}{_more(len(counts))}")
+                lines.append(f"messages {why}: {named}{_count_more(len(counts))}")
         if silent := self.words.unheard:
-            lines.append(f"no word of online or offline came: {', '.join(silent[:LISTED])}{_more(len(silent))}")
+            lines.append(f"no word of online or offline came: {', '.join(silent[:LISTED])}{_count_more(len(silent))}")
         return lines
 
     @property
@@ -255,7 +255,7 @@ class Sources:
         if node in self.others:
             return None
         if node not in places:
-            raise fail(f"{where}, node", f"one of {', '.join(places)}", _near(node, places))
+            raise fail(f"{where}, node", f"one of {', '.join(places)}", _suggest_name(node, places))
         source.check_valid(message, where)
         sequence, missing = self._find_count(source, pattern, message, where)
         # Values; of a message that has its count they may be absent.
@@ -322,7 +322,7 @@ class Sources:
             raise fail(f"{name}, plant", f"{remedy}, since a wildcard stands for several sensors", "neither")
         if isinstance(node, str):
             if node not in self.names:
-                raise fail(f"{name}, node", f"one of {', '.join(self.names)}", _near(node, self.names))
+                raise fail(f"{name}, node", f"one of {', '.join(self.names)}", _suggest_name(node, self.names))
             found = {node: self._index_outputs(name, source, node)}
         else:  # of the nodes that have these outputs
             wanted = set(source.outputs)
@@ -357,7 +357,7 @@ class Sources:
             raise fail(f"{name}, path", f"{len(known)} paths, for {', '.join(known)}, or output=", len(source.paths))
         for output in outputs:
             if output not in known:
-                raise fail(f"{name}, output", f"one of {', '.join(known)}", _near(output, known))
+                raise fail(f"{name}, output", f"one of {', '.join(known)}", _suggest_name(output, known))
         return np.array([known.index(output) for output in outputs])
 
 
@@ -377,7 +377,7 @@ def _read_time(source: Source, message: object, where: str) -> int | None:
     return time + round(stamp.offset * SECOND)
 
 
-def _more(count: int) -> str:
+def _count_more(count: int) -> str:
     return "" if count <= LISTED else f" and {count - LISTED} more"
 
 
@@ -395,6 +395,6 @@ def _read_value(message: object, path: str | Computed, where: str, quoted: bool)
     return convert_number(value, f"{where}, field {path!r}", quoted)
 
 
-def _near(name: str, names: Sequence[str] | Mapping[str, object]) -> str:
+def _suggest_name(name: str, names: Sequence[str] | Mapping[str, object]) -> str:
     close = get_close_matches(name, list(names), 1)
     return f"{name!r}{f' (closest: {close[0]!r})' if close else ''}"

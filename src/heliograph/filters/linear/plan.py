@@ -89,7 +89,7 @@ class PlannedFilter(AbstractSizedFilter):
     def predict(self, state: PlannedMean, u: ArrayLike = (), k: Step = 0) -> PlannedMean:
         """Return F m + f; the input is in f."""
         step: LinearStep = at(self.steps, k)
-        return PlannedMean(step.predict(state.mean), _stage(state, 2 * k + 1))
+        return PlannedMean(step.predict(state.mean), _convert_stage(state, 2 * k + 1))
 
     @corrects
     def correct(self, state: PlannedMean, z: ArrayLike, k: Step = 0) -> tuple[PlannedMean, Innovation]:
@@ -97,7 +97,7 @@ class PlannedFilter(AbstractSizedFilter):
         step: LinearStep = at(self.steps, k)
         z, expected = jnp.asarray(z), step.expect(state.mean)
         mean = step.correct(state.mean, z - expected)
-        return PlannedMean(mean, _stage(state, 2 * k + 2)), gaussian_innovation(z, expected, step.innovation)
+        return PlannedMean(mean, _convert_stage(state, 2 * k + 2)), gaussian_innovation(z, expected, step.innovation)
 
     @estimates
     def estimate(self, state: PlannedMean) -> Estimate:
@@ -124,7 +124,7 @@ class PlannedFilter(AbstractSizedFilter):
         return Estimate(x, jnp.asarray(self.covariances)[stage], self.claim)
 
 
-def _stage(state: PlannedMean, stage: Step) -> jax.Array:
+def _convert_stage(state: PlannedMean, stage: Step) -> jax.Array:
     return jnp.asarray(stage, dtype=jnp.asarray(state.stage).dtype)
 
 
@@ -151,14 +151,17 @@ def _record_matrices(filter: AbstractFilter, inputs: Array, projection: Array | 
 
     def body(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, tuple[LinearStep, jax.Array]]:
         step, prior, after = plan_step(filter, state, quiet, row[1], row[0])
-        return after, (step, jnp.stack([_seen(prior, projection), _seen(after, projection)]))
+        return after, (
+            step,
+            jnp.stack([_project_covariance(prior, projection), _project_covariance(after, projection)]),
+        )
 
     start = filter.init()
     start = jax.tree.map(jnp.asarray, start)
     _, (steps, covariances) = jax.lax.scan(body, start, (jnp.arange(len(inputs)), jnp.asarray(inputs)))
     # Covariances in the order of `PlannedMean.stage`.
     in_order = covariances.reshape(-1, *covariances.shape[2:])
-    by_stage = jnp.concatenate([_seen(start, projection)[None], in_order])
+    by_stage = jnp.concatenate([_project_covariance(start, projection)[None], in_order])
     return PlannedFilter(
         steps=OverTime(steps),
         covariances=by_stage,
@@ -257,7 +260,7 @@ def linearise_step(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.A
     return Linearised(x.mean, jnp.where(present, gain, 0.0), output, total - output @ x.covariance @ output.T)
 
 
-def _seen(state: PyTree, projection: Array | None) -> jax.Array:
+def _project_covariance(state: PyTree, projection: Array | None) -> jax.Array:
     """Return the covariance of the plant's state, by the projection if there is one."""
     covariance = jnp.asarray(gaussian_of(state).covariance)
     return covariance if projection is None else jnp.asarray(projection) @ covariance @ jnp.asarray(projection).T

@@ -63,7 +63,9 @@ def centre_of(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> MeanBefor
     count = max(len(sensors), len(channels))
     pairs = zip(_repeat(sensors, count), _repeat(channels, count), strict=False)
     received = [np.asarray(c.moments(1).mean[:-1, :-1]) @ _matrix(s) for s, c in pairs]
-    return MeanBeforeData(start, _series([_matrix(p) for p in plants]), _series(drifts), _series(received))
+    return MeanBeforeData(
+        start, _stack_over_time([_matrix(p) for p in plants]), _stack_over_time(drifts), _stack_over_time(received)
+    )
 
 
 def centre_plant(plant: AnyPlant) -> AnyPlant:
@@ -90,7 +92,7 @@ def _repeat(items: list[T], count: int) -> list[T]:
     return items * count if len(items) == 1 else items
 
 
-def _series(values: list[np.ndarray]) -> Array | OverTime:
+def _stack_over_time(values: list[np.ndarray]) -> Array | OverTime:
     return values[0] if len(values) == 1 else OverTime(np.array(values))
 
 

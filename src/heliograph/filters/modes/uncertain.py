@@ -100,7 +100,7 @@ class UncertainModalFilter(AbstractJointModalFilter):
         # Bounds on Cov(1{next} | i) and on Delta_i Delta_i', over all laws of the mode.
         carried = move @ state.second @ move.T
         chosen, wandering = (
-            _bound_mean(matrices, *_middle_law(state.low, state.high)) for matrices in _bound_moves(rows, radius)
+            _bound_mean(matrices, *_find_middle_law(state.low, state.high)) for matrices in _bound_moves(rows, radius)
         )
         # Young's inequality, b = root(tr D / tr F Sigma F').
         root, weights = predict_by_mode(state.gaussian.root, move, rows), state.gaussian.variances
@@ -119,7 +119,7 @@ class UncertainModalFilter(AbstractJointModalFilter):
         gains, (measure, noise) = jnp.asarray(channel.mean), centred_measurement(sensor, state.centre)
         second = measure @ state.second @ measure.T + noise
         random = jnp.einsum("jmlab,ab->jml", jnp.asarray(channel.spread), second)
-        added = _bound_mean(random + gains @ noise @ gains.swapaxes(1, 2), *_middle_law(state.low, state.high))
+        added = _bound_mean(random + gains @ noise @ gains.swapaxes(1, 2), *_find_middle_law(state.low, state.high))
         matrix, common = subtract_mean_output(gains @ measure, state.law)
         rounding = rounding_of_received(gains, state.law[:, None, None] * second)
         centred = state.gaussian.mean - mean_from_centre(state.law, state.centre)
@@ -154,7 +154,7 @@ def _bound_moves(rows: jax.Array, radius: jax.Array) -> tuple[jax.Array, jax.Arr
     return chosen, jnp.einsum("aj,ij,jb->iab", centred, sizes, centred)
 
 
-def _middle_law(low: jax.Array, high: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _find_middle_law(low: jax.Array, high: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return a law between the ends (its sum is 1), and the largest deviation of a possible law from it."""
     middle = (low + high) / 2
     middle = middle + (1 - jnp.sum(middle)) / len(low)
@@ -175,7 +175,7 @@ def _bound_diagonal(low: jax.Array, high: jax.Array) -> jax.Array:
     diag(delta) = P diag(delta) P + u d' + d u' with d = delta / root M, and u d' + d u' <= e u u' + d d' / e.
     P diag(delta) P is 0 for two modes.
     """
-    modes, (middle, reach) = len(low), _middle_law(low, high)
+    modes, (middle, reach) = len(low), _find_middle_law(low, high)
     centred, total = jnp.eye(modes) - 1 / modes, jnp.sum(reach)
     share = total / modes / 2
     safe = jnp.where(share > 0, share, 1.0)

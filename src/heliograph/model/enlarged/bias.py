@@ -81,7 +81,7 @@ def _make_gauss_markov(
     sizes = [
         scalar("deviation of a bias", x, 0.0) for x in _broadcast_to_biases("deviation of a bias", deviation, count)
     ]
-    rates = [_rate(x) for x in _broadcast_to_biases("time of a bias", time, count)]
+    rates = [_compute_rate(x) for x in _broadcast_to_biases("time of a bias", time, count)]
     size, rate = (library(values).stack([library(x).asarray(x) for x in values]) for values in (sizes, rates))
     # With a step that is a number, or as functions of the input that says it.
     xp = library(size, rate)
@@ -194,7 +194,7 @@ def _broadcast_to_biases(name: str, value: ArrayLike, count: int) -> list[Any]:
     return values
 
 
-def _rate(time: Any) -> Any:
+def _compute_rate(time: Any) -> Any:
     """Return 1 / T, 0 of an infinite one."""
     constant = not is_traced(time) and isinstance(time, float | np.floating) and time == np.inf
     return 0.0 if constant else 1 / scalar("time of a bias", time, TINY)

@@ -56,7 +56,7 @@ class Words(Module):
         dither: Dither = "none",
         resolution: "Float[ArrayLike, ''] | None" = None,
     ):
-        self.low, self.high = (np.asarray(_end(name, v)) for name, v in (("low", low), ("high", high)))
+        self.low, self.high = (np.asarray(_read_end(name, v)) for name, v in (("low", low), ("high", high)))
         if not np.all(self.high > self.low):
             raise fail("range of words", "low below high", f"{self.low.tolist()} and {self.high.tolist()}")
         if (bits is None) == (resolution is None):
@@ -173,7 +173,7 @@ class Words(Module):
         return self.each(self.step, outputs) * (uniform - 0.5)
 
 
-def _end(name: str, value: ArrayLike) -> Float[np.ndarray, "..."]:
+def _read_end(name: str, value: ArrayLike) -> Float[np.ndarray, "..."]:
     """Return an end of the range, of all components or one for each."""
     return cast(np.ndarray, array(f"{name} of the words", value, (None,) if rank(name, value) else ()))
 

@@ -88,7 +88,7 @@ def _match_date(text: str) -> tuple[re.Match[str], bool]:
 
 def _convert_to_nanoseconds(match: re.Match[str], leap: bool) -> int:
     """Return the nanoseconds since 1970 in UTC."""
-    nanoseconds, zone = int(np.datetime64(_local(match), "ns").astype(np.int64)), _offset(match["zone"])
+    nanoseconds, zone = int(np.datetime64(_format_local(match), "ns").astype(np.int64)), _format_offset(match["zone"])
     if zone != "Z":
         hours, minutes = int(zone[1:3]), int(zone[-2:]) if len(zone) > 3 else 0
         if hours > 23 or minutes > 59:
@@ -104,12 +104,12 @@ def _convert_to_nanoseconds(match: re.Match[str], leap: bool) -> int:
     return after
 
 
-def _local(match: re.Match[str]) -> str:
+def _format_local(match: re.Match[str]) -> str:
     """Return day and clock of a date, of which the fraction of a second may have a comma, with a point."""
     return f"{match['day']}T{(match['clock'] or '00:00').replace(',', '.')}"
 
 
-def _offset(zone: str | None) -> str:
+def _format_offset(zone: str | None) -> str:
     """Return the zone of a date as an offset, Z for UTC and for none."""
     return "Z" if zone in (None, "Z", "UTC", "GMT") else str(zone).removeprefix("Z")
 
@@ -122,8 +122,8 @@ def instant(text: str) -> datetime:
     if leap:
         nanoseconds = _convert_to_nanoseconds(match, leap)
         return datetime.fromtimestamp(0, UTC) + timedelta(microseconds=nanoseconds // 1000)
-    zone = _offset(match["zone"]).replace("Z", "+00:00")
-    return datetime.fromisoformat(f"{_local(match)}{zone}")
+    zone = _format_offset(match["zone"]).replace("Z", "+00:00")
+    return datetime.fromisoformat(f"{_format_local(match)}{zone}")
 
 
 def seconds_between(time: np.ndarray) -> np.ndarray:

@@ -215,7 +215,7 @@ def least_power(task: PowerTask, target: float) -> tuple[Powers, Certificate]:
     _check_reachable(task, target)
     limits = task.problem.limits
     free_total = task._replace(problem=task.problem._replace(limits=limits._replace(total=np.inf)))
-    powers = _reach(free_total.problem, task.starts, target)
+    powers = _find_least_powers(free_total.problem, task.starts, target)
     if powers is None:
         raise fail("target error", "one that some start reaches (give more starts)", f"{target:.6g}")
     total = float(powers.mean(axis=0).sum())
@@ -227,7 +227,7 @@ def least_power(task: PowerTask, target: float) -> tuple[Powers, Certificate]:
     stationarity = 1 - problem.least_total(near, target) / total if total > 0 else 0.0
     if not task.convex:
         problem, near = free_total.relax(), task.of_paths(powers)
-        lower = _reach(problem, [near], target)
+        lower = _find_least_powers(problem, [near], target)
         near = near if lower is None else lower
     bound = min(problem.least_total(near, target), total)
     fixed = float(task.fixed[:, ~task.free].mean(axis=0).sum())
@@ -236,7 +236,7 @@ def least_power(task: PowerTask, target: float) -> tuple[Powers, Certificate]:
     )
 
 
-def _reach(problem: PathProblem, starts: list[Powers], target: float) -> Powers | None:
+def _find_least_powers(problem: PathProblem, starts: list[Powers], target: float) -> Powers | None:
     """Return the least powers that reach a target, from starts each raised until it does; None where none can."""
     nothing = np.zeros_like(starts[0])
     if problem.criterion.smooth(problem.covariances(nothing))[0] <= target:

@@ -54,11 +54,11 @@ def explore_html(page: Page, tables: Sequence[Explored]) -> str:
         .render(
             page=page,
             data=Markup(data.replace("<", "\\u003c")),  # no text can end the script
-            library=Markup("\n".join(_library(name) for name in LIBRARY)),
+            library=Markup("\n".join(_read_library(name) for name in LIBRARY)),
             program=Markup(files("heliograph.report.pages").joinpath("explore.js").read_text(encoding="utf-8")),
         )
     )
 
 
-def _library(name: str) -> str:
+def _read_library(name: str) -> str:
     return files("bokeh").joinpath("server", "static", "js", name).read_text(encoding="utf-8")

@@ -137,7 +137,7 @@ def make_fit_page(learned: Learned, drawings: Mapping[str, bytes]) -> Page:
     """Return the report; `drawings` holds each figure as SVG."""
     return Page(
         kicker="Heliograph fit",
-        title=_headline(learned),
+        title=_write_headline(learned),
         lead=_summarise_gain(learned),
         sections=[
             Section("At a glance", _list_key_figures(learned)),
@@ -152,7 +152,7 @@ def make_fit_page(learned: Learned, drawings: Mapping[str, bytes]) -> Page:
     )  # fmt: skip
 
 
-def _headline(learned: Learned) -> str:
+def _write_headline(learned: Learned) -> str:
     """Return the title: how many numbers were learned."""
     rows = learned.fit.rows()
     return f"{sum(row.identified for row in rows)} of {len(rows)} free numbers learned from {learned.learned:,} rows"

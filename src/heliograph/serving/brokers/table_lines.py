@@ -163,13 +163,13 @@ def read_own(reader: OwnReader, where: str, content: dict[str, object]) -> list[
     payloads = list[Payload]()
     for reading, arrival in found:
         if not isinstance(reading, Unread):
-            payloads.append(_message(reader, reading, arrival))
+            payloads.append(_make_message(reader, reading, arrival))
         elif reading.counted is not None:
-            payloads.append(UnreadMessage(_message(reader, reading.counted, arrival), str(reading.error)))
+            payloads.append(UnreadMessage(_make_message(reader, reading.counted, arrival), str(reading.error)))
     return payloads
 
 
-def _message(reader: OwnReader, reading: Reading, arrival: float) -> Message:
+def _make_message(reader: OwnReader, reading: Reading, arrival: float) -> Message:
     """Return the message of an event; where it arrived when it was measured, as far as is known, it says no arrival."""
     assert reading.time is not None
     moments = [reading.time, *([] if arrival == reading.time else [arrival])]

@@ -62,13 +62,13 @@ def _judge_rows(
         states = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], before[name])
         arguments = filter, states, z, u[rows], rows
         with jax.enable_x64(True):
-            code = choose_code(_judgement, arguments, (False, True, True, True, True))
+            code = choose_code(_judge_filter_step, arguments, (False, True, True, True, True))
             judgement = to_numpy(_all_by_xla(*arguments, len(rows)) if code.code is None else code.results())
         votes.append(np.stack([np.broadcast_to(field, len(rows)) for field in judgement], axis=-1))
     return np.stack(votes, axis=1)
 
 
-def _judgement(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: jax.Array) -> Judgement:
+def _judge_filter_step(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: jax.Array) -> Judgement:
     judgement = filter_step(filter, state, z, u, k, False, True)[1].judgement
     assert judgement is not None  # as it judges
     return judgement
@@ -76,4 +76,4 @@ def _judgement(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array
 
 @quickly_compiled
 def _all_by_xla(filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree, count: int) -> PyTree:
-    return map_all(lambda *row: _judgement(filter, *row), count)(state, z, u, k)
+    return map_all(lambda *row: _judge_filter_step(filter, *row), count)(state, z, u, k)

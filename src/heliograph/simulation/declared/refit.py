@@ -122,7 +122,7 @@ class ScaledNoise(eqx.Module):
 
 def declared_noises(link: AbstractRandomAffine) -> jax.Array:
     """Return the variances of a link's noises, one after another."""
-    return jnp.concatenate([jnp.diagonal(jnp.asarray(noise.covariance)) for noise in _noises(link)])
+    return jnp.concatenate([jnp.diagonal(jnp.asarray(noise.covariance)) for noise in _list_noises(link)])
 
 
 def list_declaring(filter: ToldFilter) -> list[int]:
@@ -137,12 +137,12 @@ def _declares(affine: Told) -> bool:
     if isinstance(affine.make, GainTold):
         return False
     typical = np.asarray(affine.typical)
-    noises, moved = (_noises(affine.believed(numbers)) for numbers in (typical, typical * (1 + ALMOST)))
+    noises, moved = (_list_noises(affine.believed(numbers)) for numbers in (typical, typical * (1 + ALMOST)))
     changes = any(not np.array_equal(a.covariance, b.covariance) for a, b in zip(noises, moved, strict=True))
     return changes and all(isinstance(noise, Gaussian) for noise in noises)
 
 
-def _noises(link: AbstractRandomAffine) -> list[AbstractNoise]:
+def _list_noises(link: AbstractRandomAffine) -> list[AbstractNoise]:
     return [leaf for leaf in jax.tree.leaves(link, is_leaf=_is_noise) if _is_noise(leaf)]
 
 

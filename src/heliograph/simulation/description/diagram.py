@@ -68,10 +68,10 @@ def _describe_node(network: HasNodes, name: str, claims: Mapping[str, str]) -> s
     if network.common is not None:
         rows = network.rows[name]
         return ARROW.join([f"numbers {rows.start + 1} to {rows.stop} of the common channel", filters])
-    return ARROW.join([f"{node.received} numbers from {_senders(network.relays, name)}", filters])
+    return ARROW.join([f"{node.received} numbers from {_list_senders(network.relays, name)}", filters])
 
 
-def _senders(relays: RelayNetwork | None, name: str) -> str:
+def _list_senders(relays: RelayNetwork | None, name: str) -> str:
     slots = () if relays is None else relays.slots
     return join_names(list(dict.fromkeys(sender for slot in slots for sender in slot.get(name, {}))))
 
@@ -102,24 +102,24 @@ def list_rounded(network: HasNodes) -> list[str]:
 
 def text_of(network: HasNodes) -> str:
     """Return the whole diagram as lines of text."""
-    return "\n".join(_lines(network))
+    return "\n".join(_format_lines(network))
 
 
 def short_text_of(network: HasNodes) -> str:
     """Return the diagram in as many and as long lines as any object is shown in; … stands for what is left out."""
-    lines = _lines(network)
+    lines = _format_lines(network)
     left = len(lines) - LINES
     lines = [*lines[: LINES - 1], f"… {left + 1} more lines (heliograph check shows all)"] if left > 0 else lines
     return "\n".join(cut(line) for line in lines)
 
 
-def _lines(network: HasNodes) -> list[str]:
+def _format_lines(network: HasNodes) -> list[str]:
     parts = diagram(network)
     width = max(len(line.name) for line in parts)
-    return [_title(network), *(f"{line.name:{width}}  {line.words}" for line in parts)]
+    return [_make_title(network), *(f"{line.name:{width}}  {line.words}" for line in parts)]
 
 
-def _title(network: HasNodes) -> str:
+def _make_title(network: HasNodes) -> str:
     return f"Network of {len(network.nodes)} node{'s' * (len(network.nodes) > 1)}"
 
 
@@ -130,7 +130,7 @@ def table_of(network: HasNodes) -> str:
         f'<td style="text-align:left">{escape(line.words)}</td></tr>'
         for line in diagram(network)
     )
-    return f"<table><caption>{_title(network)}</caption>{''.join(rows)}</table>"
+    return f"<table><caption>{_make_title(network)}</caption>{''.join(rows)}</table>"
 
 
 def link_in_words(channel: Channel) -> str:

@@ -20,13 +20,15 @@ def list_remarks(network: Network, state: PyTree) -> Iterator[str]:
     for (node, name), place in network.places.items():
         filter = network.nodes[node].filters[name]
         row = place.filter * len(network.groups[network.kinds[place.kind].group]) + place.node
-        if _remarks(filter) and (said := filter.remark(jax.tree.map(lambda leaf, r=row: leaf[r], alike[place.kind]))):
+        if _can_remark(filter) and (
+            said := filter.remark(jax.tree.map(lambda leaf, r=row: leaf[r], alike[place.kind]))
+        ):
             yield f"{node}/{name}: {said}"
     for name, fusion in network.fused.items():
-        if isinstance(fusion, AbstractFilter) and _remarks(fusion) and (said := fusion.remark(central[name])):
+        if isinstance(fusion, AbstractFilter) and _can_remark(fusion) and (said := fusion.remark(central[name])):
             yield f"{FUSED}/{name}: {said}"
 
 
-def _remarks(filter: AbstractFilter) -> bool:
+def _can_remark(filter: AbstractFilter) -> bool:
     """Ask whether a filter ever says anything."""
     return type(filter).remark is not AbstractFilter.remark

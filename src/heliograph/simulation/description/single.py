@@ -21,7 +21,7 @@ def find_rounded_parts(network: HasNodes) -> dict[tuple[float, float], list[str]
     seen: dict[int, tuple[float, float] | None] = {}  # of models, which nodes may share
     for name, model, functions in _yield_models(network):
         if id(model) not in seen:
-            seen[id(model)] = next(filter(None, map(find_rounded_to_single, _arrays(model, functions))), None)
+            seen[id(model)] = next(filter(None, map(find_rounded_to_single, _list_arrays(model, functions))), None)
         rounded = seen[id(model)]
         if rounded is not None:
             parts.setdefault(rounded, []).append(name)
@@ -47,7 +47,7 @@ def _yield_models(network: HasNodes) -> Iterator[tuple[str, object, list[Traced]
         yield "relays", network.relays, []
 
 
-def _arrays(model: object, functions: list[Traced]) -> Iterator[Any]:
+def _list_arrays(model: object, functions: list[Traced]) -> Iterator[Any]:
     yield from (x for x in jax.tree.leaves(model) if isinstance(x, jax.Array | np.ndarray) and not is_traced(x))
     for function, arguments in functions:
         yield from _collect_arrays(function, *arguments)

@@ -130,13 +130,13 @@ def _normalise_square(
     both = there[..., :, None] & there[..., None, :]
     filled = np.where(both, covariance, np.eye(n) * ~there[..., None, :])
     parts = filled.reshape(-1, n, n), np.where(there, x, 0.0).reshape(-1, n), np.nan_to_num(size).reshape(-1, n)
-    value = np.asarray(_distances(*parts)).reshape(x.shape[:-1])
+    value = np.asarray(_measure_distances(*parts)).reshape(x.shape[:-1])
     # Each missing component added nothing: 0^2 / 1.
     return np.asarray(np.where(there.any(axis=-1), value, np.nan))
 
 
 @compile_on_call
-def _distances(a: Array, x: Array, size: Array) -> Array:
+def _measure_distances(a: Array, x: Array, size: Array) -> Array:
     return jax.vmap(squared_distance)(jnp.asarray(a), jnp.asarray(x), jnp.asarray(size))
 
 
@@ -186,8 +186,8 @@ def consistency(
     count = present.sum(axis=0)
     by_step = np.divide(total.sum(axis=0), count, out=np.full(len(count), np.nan), where=count > 0)
     quantiles = np.array([(1 - level) / 2, (1 + level) / 2])
-    ends = _interval(freedom.sum(), present.sum(), quantiles)
-    every = np.stack([_interval(f, c, quantiles) for f, c in zip(freedom.sum(axis=0), count, strict=True)])
+    ends = _bound_mean(freedom.sum(), present.sum(), quantiles)
+    every = np.stack([_bound_mean(f, c, quantiles) for f, c in zip(freedom.sum(axis=0), count, strict=True)])
     apart = np.where(present, rows - total.sum() / present.sum(), 0.0)
     correlation = _autocorrelation(apart, min(check_count("lags", lags), len(count) - 1))
     return Consistency(
@@ -201,7 +201,7 @@ def consistency(
     )
 
 
-def _interval(degrees: float, count: int, quantiles: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
+def _bound_mean(degrees: float, count: int, quantiles: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
     """Return the quantiles of the mean of `count` values with so many degrees of freedom together."""
     return np.asarray(2 * scipy.special.gammaincinv(degrees / 2, quantiles) / count) if count else np.full(2, np.nan)
 

@@ -105,7 +105,7 @@ def _draw_panel(record: Trajectories, filters: Mapping[str, Estimate], state: in
     parts = []
     for colour, (mean, lower, upper) in zip(COLOURS, curves, strict=False):
         parts += [f'<path d="{d}" fill="{colour}" fill-opacity="0.2" stroke="none"/>'
-                  for d in _outline(scaled(lower), scaled(upper))]  # fmt: skip
+                  for d in _draw_outlines(scaled(lower), scaled(upper))]  # fmt: skip
         parts.append(_draw_line(scaled(mean), colour))
     if truth is not None:
         parts.append(_draw_line(scaled(truth), "currentColor", ' stroke-dasharray="4 3"'))
@@ -148,7 +148,7 @@ def _places(count: int) -> np.ndarray:
     return WIDE * (np.arange(count) + 0.5) / count if count == 1 else np.linspace(0, WIDE, count)
 
 
-def _pieces(finite: np.ndarray) -> Iterator[np.ndarray]:
+def _split_at_gaps(finite: np.ndarray) -> Iterator[np.ndarray]:
     """Yield the numbers of points that follow one another without a gap."""
     numbers = np.flatnonzero(finite)
     yield from (piece for piece in np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1) if len(piece))
@@ -157,17 +157,17 @@ def _pieces(finite: np.ndarray) -> Iterator[np.ndarray]:
 def _draw_line(y: np.ndarray, colour: str, more: str = "") -> str:
     """Return a curve, broken where there is no value."""
     x = _places(len(y))
-    d = "".join("M" + "L".join(f"{x[k]:.1f} {y[k]:.2f}" for k in piece) for piece in _pieces(np.isfinite(y)))
+    d = "".join("M" + "L".join(f"{x[k]:.1f} {y[k]:.2f}" for k in piece) for piece in _split_at_gaps(np.isfinite(y)))
     return (
         f'<path d="{d}" fill="none" stroke="{colour}" stroke-width="1.5" vector-effect="non-scaling-stroke"'
         f' stroke-linecap="round"{more}/>'
     )
 
 
-def _outline(lower: np.ndarray, upper: np.ndarray) -> Iterator[str]:
+def _draw_outlines(lower: np.ndarray, upper: np.ndarray) -> Iterator[str]:
     """Yield the outlines of a band, one for each piece without a gap."""
     x = _places(len(lower))
-    for piece in _pieces(np.isfinite(lower) & np.isfinite(upper)):
+    for piece in _split_at_gaps(np.isfinite(lower) & np.isfinite(upper)):
         ends = [f"{x[k]:.1f} {upper[k]:.2f}" for k in piece] + [f"{x[k]:.1f} {lower[k]:.2f}" for k in piece[::-1]]
         yield f"M{'L'.join(ends)}Z"
 
