@@ -1,6 +1,7 @@
 """The transformer for sktime, where that is installed: sktime's own checks, and the numbers of the filter alone."""
 
 import re
+import tracemalloc
 from importlib import import_module
 from pathlib import Path
 
@@ -37,6 +38,22 @@ def test_each_series_has_the_estimates_of_the_filter_alone(module, monkeypatch):
 def test_a_panel_of_other_columns_is_one_line(module):
     with pytest.raises(ValueError, match="X: expected 1 columns, as the filter receives, got 2"):
         module.FilterTransformer(TREND)._transform(np.zeros((3, 2, 5)))
+
+
+@pytest.mark.slow
+def test_memory_beyond_panel_and_estimates_does_not_grow_with_the_series(module):
+    """Of a hundred thousand, as of five thousand: a few blocks of 1,024 at the peak."""
+    beyond = {}
+    for count in (5_000, 100_000):
+        panel = np.random.default_rng(0).normal(size=(count, 1, 50))
+        module.FilterTransformer(TREND)._transform(panel[:2048])  # compiled
+        tracemalloc.start()
+        states = module.FilterTransformer(TREND)._transform(panel)
+        beyond[count] = tracemalloc.get_traced_memory()[1] - states.nbytes
+        tracemalloc.stop()
+        assert states.shape == (count, 2, 50)
+    block = 1024 * 50 * (1 + 2) * 8
+    assert beyond[100_000] < 6 * block and beyond[100_000] < 1.5 * beyond[5_000]
 
 
 @pytest.mark.slow

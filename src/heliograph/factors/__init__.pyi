@@ -26,8 +26,10 @@ from .columns import zero_covariance as zero_covariance
 from .diffuse import Diffuse as Diffuse
 from .diffuse import as_gaussian as as_gaussian
 from .diffuse import condition_on_next_diffuse as condition_on_next_diffuse
+from .diffuse import mark_unknown as mark_unknown
 from .diffuse import observe_diffuse as observe_diffuse
 from .diffuse import predict_diffuse as predict_diffuse
+from .diffuse import project_diffuse as project_diffuse
 from .diffuse import start_diffuse as start_diffuse
 from .gaussian import BackwardGain as BackwardGain
 from .gaussian import Gaussian as Gaussian

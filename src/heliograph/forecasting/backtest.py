@@ -259,6 +259,7 @@ def _score_number(
     law, came = Law(*(part[first:-horizon] for part in law)), values[first + horizon :]
     # An angle within half a turn of what was expected.
     came = law.mean + wrap_angles((came - law.mean)[:, None], (0,) if is_angle else ())[:, 0]
+    came = np.where(np.isfinite(law.variances).all(axis=1), came, np.nan)  # of what nothing was heard yet: none
     error, chance = came - law.mean, below(law, came)
     known = np.where(np.isnan(error), np.nan, 0.0)
     coverage = tuple(overlapping_mean((np.abs(chance - 0.5) <= level / 2) + known, horizon) for level in LEVELS)

@@ -173,16 +173,13 @@ def _smooth(
 
     Backward with r, N = Cov(r) behind a row: S = C P C' + R, K = P C' S^-1; of the outputs R (S^-1 e - K' r), of the
     states Q r before the row, where r <- C' S^-1 e + (I - K C)' r, and then r <- A' r. Rows of C that did not arrive
-    are left out.
+    are left out, and what lies before the first row at which all of an unknown start had been heard.
     """
     steps, m = e.shape
     n = len(A)
-    noise, motion = (
-        (np.full((steps, m), np.nan), np.full((steps, m, m), np.nan)),
-        (np.zeros((steps, n)), np.zeros_like(P)),
-    )
-    r, N = np.zeros(n), np.zeros((n, n))
-    for k in reversed(range(steps)):
+    noise, motion = ((np.full((steps, size), np.nan), np.full((steps, size, size), np.nan)) for size in (m, n))
+    r, N, known = np.zeros(n), np.zeros((n, n)), np.isfinite(P).all(axis=(1, 2))
+    for k in reversed(range(int(np.argmax(known)) if known.any() else steps, steps)):
         came = np.flatnonzero(~np.isnan(e[k]))
         H, W = C[came], R[np.ix_(came, came)]
         S = H @ P[k] @ H.T + W

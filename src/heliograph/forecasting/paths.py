@@ -66,7 +66,7 @@ def draw_paths(
 
     Raises:
         ValueError: what `hg.forecast` refuses; several filters and no name; a filter that does not say what its plant
-            is, or that claims no covariance.
+            is, or that claims no covariance; an unknown start (`hg.diffuse`) of which not all has been heard.
     """
     origin = origin_of(source)
     target = target_of(origin, node, filter)
@@ -90,6 +90,8 @@ def _draw_starts(target: Target, draws: int, generator: np.random.Generator) -> 
     if filter.claim == "none":
         raise fail("paths", "a filter that claims a covariance", f"{type(filter).__name__}, which claims none")
     weights, means, covariances = (np.asarray(part) for part in target.outlook.moments(target.state))
+    if not np.isfinite(covariances).all():
+        raise fail("paths", "a state that is known", "one of which not all has been heard yet (hg.diffuse)")
     part = generator.choice(len(weights), size=draws, p=weights / weights.sum())
     values, vectors = np.linalg.eigh(covariances)
     roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]

@@ -25,7 +25,8 @@ class Prediction:
 
     Quantiles and probabilities are of the mixture; mean and covariance are its first two moments. The quantiles of an
     angle go on from its mean, so that a band about pi stays a band. Of several sources all arrays have one more axis,
-    of sources, before that of horizons.
+    of sources, before that of horizons. Of what nothing has been heard yet (`hg.diffuse`) the deviation is infinite,
+    and so are the ends of intervals; a probability there is none, NaN.
 
     Args:
         names: of the numbers, m of them.
@@ -61,7 +62,8 @@ class Prediction:
         if not 0 < p < 1:
             raise fail("level of a quantile", "a probability between 0 and 1", level)
         means, deviations = self.part_means, np.sqrt(self.part_variances)
-        each = means + ndtri(p) * deviations
+        with np.errstate(invalid="ignore"):  # no median of what is unknown
+            each = means + ndtri(p) * deviations
         # The mixture's lies between the least and the greatest of its parts': halve that interval.
         low, high = each.min(axis=-2), each.max(axis=-2)
         for _ in range(HALVINGS if means.shape[-2] > 1 else 0):
@@ -93,7 +95,7 @@ class Prediction:
         if numbers.shape not in ((), self.mean.shape[-1:], self.mean.shape):
             raise fail("values", f"one, or shape {self.mean.shape[-1:]} or {self.mean.shape}", f"shape {numbers.shape}")
         limits = np.broadcast_to(array("values", numbers, numbers.shape), self.mean.shape)
-        return np.where(np.isnan(self.deviation), np.nan, self._below(limits))
+        return np.where(np.isfinite(self.deviation), self._below(limits), np.nan)
 
     def map_arrays(self, change: Callable[[np.ndarray, int], np.ndarray]) -> "Prediction":
         """Return the prediction with each array changed.

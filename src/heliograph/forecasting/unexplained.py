@@ -115,7 +115,8 @@ def residuals(
     if law is None or law.claim == "none":
         raise fail("residuals", "a filter that claims a covariance of what arrives", type(filter).__name__)
     angles = (filter.angles_used() or FilterAngles((), ())).received
-    values = (nearest(np.asarray(rows), law.mean, angles) - law.mean) / law.deviation
+    known = np.where(np.isfinite(law.deviation), law.deviation, np.nan)  # of what nothing was heard yet: none
+    values = (nearest(np.asarray(rows), law.mean, angles) - law.mean) / known
     columns = [values[:, i] for i in range(values.shape[1])]
     correlations = np.stack([_autocorrelation(e, count) for e in columns], axis=1)
     came = np.maximum([int(np.sum(~np.isnan(e))) for e in columns], 1)

@@ -22,6 +22,7 @@ from .check import SIMPLEX as SIMPLEX
 from .check import SYMMETRY_TOLERANCE as SYMMETRY_TOLERANCE
 from .check import TINY as TINY
 from .check import array as array
+from .check import check_columns as check_columns
 from .check import check_count as check_count
 from .check import check_horizon as check_horizon
 from .check import check_progress as check_progress

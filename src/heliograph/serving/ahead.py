@@ -116,8 +116,9 @@ class ForecastPublisher:
         start = ForecastStart(make_row_origin(self._fleet, row.slot, float(row.key[0])))
         for node, filters in found.items():
             for name, forecast in filters.items():
-                passed = self._pass_levels(start, (node, name), forecast)
-                for i, body in enumerate(bodies[node][name][place] if passed else []):
+                of_row = bodies[node][name][place]
+                passed = {} if of_row[0]["claim"] == "none" else self._pass_levels(start, (node, name), forecast)
+                for i, body in enumerate(of_row if passed else []):
                     body["thresholds"] = {level: said[i] for level, said in passed.items()}
 
     def _pass_levels(

@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 import subprocess
+from importlib.util import find_spec
 
 import pytest
 
@@ -32,6 +33,29 @@ def test_the_dashboard_has_each_metric_by_its_name():
     assert all(re.search("_(sum|count)$", name) for name in missing)  # of histograms, whose quantiles are drawn
     places = [(panel["gridPos"]["x"], panel["gridPos"]["y"]) for panel in content["panels"]]
     assert len(set(places)) == len(places) > 15
+
+
+@pytest.mark.skipif(
+    find_spec("grafana_foundation_sdk") is None, reason="no types of Grafana here: pip install grafana-foundation-sdk"
+)
+def test_the_types_of_grafana_know_all_of_the_dashboard():
+    """Read by the classes that Grafana makes of its schema, and written again, nothing of it is lost or changed."""
+    from grafana_foundation_sdk.cog.encoder import JSONEncoder
+    from grafana_foundation_sdk.cog.plugins import register_default_plugins
+    from grafana_foundation_sdk.models.dashboard import Dashboard
+
+    register_default_plugins()
+    content = json.loads(monitoring.DASHBOARD.read_text())
+    again = json.loads(JSONEncoder().encode(Dashboard.from_json(content)))
+
+    def kept(part, other):
+        if isinstance(part, dict):
+            return all(key in other and kept(value, other[key]) for key, value in part.items())
+        if isinstance(part, list):
+            return len(part) == len(other) and all(map(kept, part, other))
+        return part == other
+
+    assert kept(content, again) and len(content["panels"]) > 15
 
 
 def test_the_rules_ask_for_metrics_that_are_there():

@@ -5,7 +5,9 @@ from .fields import TimeUnit as TimeUnit
 from .fields import at as at
 from .fields import convert_name as convert_name
 from .fields import convert_time as convert_time
+from .fields import decode_items as decode_items
 from .fields import decode_json as decode_json
+from .fields import fail_of_doubled as fail_of_doubled
 from .fields import match_topic as match_topic
 from .fields import parse_arrival as parse_arrival
 from .fields import parse_number as parse_number
