@@ -107,6 +107,15 @@ def test_too_few_runs_are_refused(runs):
         Setting(runs=runs)
 
 
+@pytest.mark.parametrize(("segments", "odd"), [(20, 21), (21, 21), (40, 41)])
+def test_quantizers_have_the_levels_of_the_setting_and_an_odd_number_where_zero_is_one(segments, odd):
+    made = example.quantizers(Setting(runs=100, segments=segments))
+    levels_of = {name: int(getattr(q, "uniform", q).levels) for name, q in made.items() if q is not None}
+    assert levels_of == {
+        "dynamic": segments, "static": segments, "dynamic_decodable": odd, "static_odd": odd,
+    }  # fmt: skip
+
+
 def test_a_folder_of_somebody_else_is_left_alone(tmp_path):
     (tmp_path / "h-infinity-fusion").mkdir()
     (tmp_path / "h-infinity-fusion" / "thesis.tex").write_text("mine")
