@@ -96,14 +96,14 @@ def certify_level(
         np.array([_largest_eigenvalue(phi) for phi in matrices]),
         np.array([is_negative(phi) for phi in matrices]),
     )
-    # initial condition: level^2 W - P_0 > 0
+    # Initial condition: level^2 W - P_0 > 0.
     allowed = level**2 * system.initial_weight
     initial = float(np.linalg.eigvalsh(allowed - P[0])[0])
     initial_margin = smallest_eigenvalue(allowed - P[0], np.sqrt(np.diagonal(allowed)))
-    # distance from failing, free of units
+    # Distance from failing, free of units.
     definite = np.array([smallest_eigenvalue(p) for p in P])
     margin = min(initial_margin, *(-_find_scaled_largest(phi) for phi in matrices))
-    # every condition that fails, in words
+    # Every condition that fails, in words.
     reasons = [f"step {k}: the largest eigenvalue is {tops[k]:.3g}, not negative" for k in np.flatnonzero(~negative)]
     if not initial_margin > ROUNDING:
         reasons.append(f"initial condition: the smallest eigenvalue of level^2 W - P_0 is {initial:.3g}, not positive")

@@ -55,7 +55,7 @@ def _run_riccati(system: GrowthSystem, level: float, multipliers: Float[np.ndarr
     gains, weights = np.full((steps, n, m), np.nan), np.full((steps + 1, 2 * n, 2 * n), np.nan)
     weights[0] = np.diag(np.repeat([state, start], n))
     design = HInfinityDesign(level, gains, weights, np.full((steps, 4), np.nan), False, "")
-    # step by step: K and P2 in closed form, P1 small enough that it does no harm
+    # Step by step: K and P2 in closed form, P1 small enough that it does no harm.
     for k, step in enumerate(step_matrices(system, separate=True)):
         gain_and_error = _compute_best_gain(system, step, weights[k, n:, n:], inner, multipliers[k])
         if gain_and_error is None:

@@ -106,7 +106,7 @@ def recursive_design(
     start = None if initial is None else _check_initial_weight(initial, system.states)
     recursion = _Recursion(system, objective, solver, flag("separate", separate))
     search = flag("search", search)
-    # at the given level, or by bisection
+    # At the given level, or by bisection.
     design = None if target is None else recursion.run(target, start)
     if design is not None and (design.feasible or not search):
         return design
@@ -152,13 +152,13 @@ def horizon_design(
     check_choice("solver", solver, Solver)
     n, m = system.states, system.received
     given_gains = None if gains is None else np.asarray(array("gains", gains, (system.steps, n, m)))
-    # coordinates of order one, and the unknowns of every step
+    # Coordinates of order one, and the unknowns of every step.
     steps, coordinates = scale_steps(system, step_matrices(system, flag("separate", separate)), given_gains)
     given_correction = None if given_gains is None else np.zeros((n, m))  # as a correction of the given ones
     layouts = [UnknownsLayout(n, m, len(s.growth), given_correction) for s in steps]
     start = None if initial is None else coordinates.initial_weight(_check_initial_weight(initial, n))
     allowed = coordinates.unit**2 * coordinates.initial_weight(system.initial_weight)
-    # one convex problem in all weights, gains, multipliers and the level squared
+    # One convex problem in all weights, gains, multipliers and the level squared.
     problem = HorizonProblem(steps, layouts, allowed, start)
     status = run_solver(problem.problem, solver)
     values = problem.unknowns.value
@@ -166,7 +166,7 @@ def horizon_design(
         return _make_unsolved_design(
             system, separate, float("nan"), f"no level could be proven over the horizon ({status})"
         )
-    # the solver's answer must satisfy every step's inequality itself
+    # The solver's answer must satisfy every step's inequality itself.
     parts = [np.asarray(values[entries]) for entries in problem.places]
     solved = [layout.unpack(unknown) for layout, unknown in zip(layouts, parts[1:], strict=True)]
     square = float(parts[0][0])
@@ -175,7 +175,7 @@ def horizon_design(
     if failed is not None:
         text = f"the solver's answer fails at step {failed} ({status})"
         return _make_unsolved_design(system, separate, float("nan"), text)._replace(failed_step=failed)
-    # back to the user's units
+    # Back to the user's units.
     chosen = given_gains
     if chosen is None:
         chosen = np.array([coordinates.gain(steps[k].nominal + _gain_correction(u), k) for k, u in enumerate(solved)])
@@ -220,7 +220,7 @@ class _Recursion:
         if np.linalg.eigvalsh(top - present)[0] <= 0 or np.linalg.eigvalsh(present)[0] <= 0:
             return too_low
         design.weights[0] = relative * c.weight(present, 0)
-        # step by step: the inequality, then gain, weight and multipliers in the user's units
+        # Step by step: the inequality, then gain, weight and multipliers in the user's units.
         for k, step in enumerate(self.steps):
             fixed = step.target / relative - step.energy
             fixed[: 2 * n, : 2 * n] -= present

@@ -159,9 +159,9 @@ def check_growth(
     if not differences:
         points = _climb_at_random(lambda x: tools.ratio(with_zero(x)), starts, bottom, top, random)
         return _make_finding(name, constant, bottom, top, tools, points, with_zero(points), False)
-    # largest slope: Sobol points, then random moves from the steepest
+    # Largest slope: Sobol points, then random moves from the steepest.
     points = _climb_at_random(tools.slope, starts, bottom, top, random)
-    # largest ratio: close pairs along the steepest directions, and pairs far apart
+    # Largest ratio: close pairs along the steepest directions, and pairs far apart.
     move = tools.steepest(points) * NEARBY * tools.width / 2
     close = np.concatenate([np.clip(points - move, bottom, top), np.clip(points + move, bottom, top)], axis=1)
     far = bottom + (top - bottom) * random.random((POINTS, 2, len(bottom)))

@@ -43,7 +43,7 @@ def evaluate(jaxpr: core.ClosedJaxpr, arguments: Sequence[Interval], continuous:
     def read(atom: core.Var | core.Literal) -> Interval:
         return point_interval(atom.val) if isinstance(atom, core.Literal) else values[atom]
 
-    # intervals of the arguments and constants, then of each operation's results in order
+    # Intervals of the arguments and constants, then of each operation's results in order.
     values.update(zip(jaxpr.jaxpr.invars, arguments, strict=True))
     values.update(zip(jaxpr.jaxpr.constvars, map(point_interval, jaxpr.consts), strict=True))
     for equation in jaxpr.jaxpr.eqns:
@@ -82,11 +82,11 @@ def round_outward(low: object, high: object, ulps: int = 1) -> Interval:
 def _apply_operation(equation: Any, x: list[Interval], continuous: bool) -> Interval:
     """Return the interval of an operation's result."""
     name, params = equation.primitive.name, equation.params
-    # arithmetic, and functions of a single number
+    # Arithmetic, and functions of a single number.
     if name in ARITHMETIC:
         with np.errstate(all="ignore"):
             return ARITHMETIC[name](*x)
-    # sums, comparisons and choices, which need their parameters
+    # Sums, comparisons and choices, which need their parameters.
     match name:
         case "integer_pow":
             return _bound_power(x[0], params["y"])
@@ -101,7 +101,7 @@ def _apply_operation(equation: Any, x: list[Interval], continuous: bool) -> Inte
             return _bound_contraction(x[0], x[1], params["dimension_numbers"])
         case "iota":
             return point_interval(equation.primitive.bind(**params))
-        # what may be true in a part of the interval alone is not decided
+        # What may be true in a part of the interval alone is not decided.
         case "lt" | "le" | "gt" | "ge" | "eq" | "ne":
             return _decide(_compare(name, *x), continuous)
         case "sign":

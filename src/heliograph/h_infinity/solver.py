@@ -106,7 +106,7 @@ class StepProblem:
         for form in forms.positive:
             k = int(np.sqrt(len(form)))
             constraints.append(cp.reshape(form @ self.unknowns, (k, k), order="C") >> MARGIN * np.eye(k))
-        # objectives on L, one problem after another
+        # Objectives on L, one problem after another.
         weight = cp.reshape(forms.weight @ self.unknowns, (2 * n, 2 * n), order="C")
         self.reached = cp.Parameter()
         goals = _list_goals(cp, objective, [weight[:n, :n], weight[n:, n:]], sizes, self.reached)
@@ -119,7 +119,7 @@ class StepProblem:
         status = run_solver(first, self.solver)
         if not status.startswith("optimal") or self.unknowns.value is None:
             return status, None
-        # later objectives, held near the first one's best value
+        # Later objectives, held near the first one's best value.
         values, best = np.asarray(self.unknowns.value), float(first.value)
         for problem in others:  # next to no room is left to them, which a solver may find too narrow
             for tie in TIES:
@@ -176,18 +176,18 @@ class HorizonProblem:
     ):
         cp = solvers()
         self.layouts = layouts
-        # one vector: the level squared, then each step's unknowns
+        # One vector: the level squared, then each step's unknowns.
         sizes = [1, *(layout.size for layout in layouts)]
         self.places = [slice(b - a, b) for a, b in zip(sizes, np.cumsum(sizes), strict=True)]
         self.unknowns = cp.Variable(sum(sizes))
         self.constraints: list[Constraint] = []
-        # initial condition P_0 <= level^2 W
+        # Initial condition P_0 <= level^2 W.
         first = weight if initial is None else initial
         present = {0: (1 - MARGIN) * weight.ravel()[:, None]} if initial is None else {}
         if initial is not None:
             self._require({0: (1 - MARGIN) * weight.ravel()[:, None]}, -initial)
         forms: LinearForms | None = None
-        # every step's inequality, from the weight before it to its own
+        # Every step's inequality, from the weight before it to its own.
         for k, (step, layout) in enumerate(zip(steps, layouts, strict=True)):
             if forms is None or layout.gain is not None or not all(map(np.array_equal, step, steps[k - 1])):
                 forms = linear_forms(step, layout)
@@ -219,7 +219,7 @@ class HorizonProblem:
                 before[:width, :width] = form.reshape(width, width, -1)
                 blocks[index] = blocks.get(index, 0.0) + before.reshape(q * q, -1)[entries]
             self._require(blocks, constant[np.ix_(coupled, coupled)])
-        # positive matrices of the unknowns
+        # Positive matrices of the unknowns.
         for form in forms.positive:
             size = int(np.sqrt(len(form)))
             self._require({0: -MARGIN * np.eye(size).ravel()[:, None], k + 1: form}, np.zeros((size, size)))

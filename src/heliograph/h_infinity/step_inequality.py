@@ -81,7 +81,7 @@ def _make_step_matrices(
     state, error = np.zeros((n, q)), np.zeros((n, q))
     state[:, x], state[:, f], state[:, v] = A, eye, B
     error[:, e], error[:, df], error[:, v] = A, eye, B
-    # received: mean and spread of G (C . + h + D v) + N rho
+    # Received: mean and spread of G (C . + h + D v) + N rho.
     gain, noise = link.mean[:, :y], link.mean[:, y:]
     received = np.zeros((system.received, q))
     received[:, e], received[:, dg], received[:, v], received[:, rho] = gain @ C, gain[:, :h], gain @ D, noise
@@ -268,11 +268,11 @@ def scale_steps(
     """Transform the steps to coordinates of order one, near the best predictor's gains or the given `gains`."""
     n, nothing_grows = system.states, system.growth.absent and system.output_growth.absent
     initial = np.diag(1 / np.diagonal(system.initial_weight))
-    # covariances of x_0 and e_0 from the initial weight
+    # Covariances of x_0 and e_0 from the initial weight.
     x, e = initial[:n, :n], initial[n:, n:]
     sizes, received, forms, scaled, target = [_choose_error_scales(x, e, nothing_grows)], [], [], [], 0.0
     nominal = steps[0].nominal
-    # covariances of (x, e) propagated with the nominal gain, and sizes from these
+    # Covariances of (x, e) propagated with the nominal gain, and sizes from these.
     for k, step in enumerate(steps):
         spread = _compute_signal_covariance(system, k, step, x, e)
         target = max(target, float(np.trace(step.target @ spread)))
@@ -286,7 +286,7 @@ def scale_steps(
         scaled.append(_rescale_step(step, unit, sizes[k + 1], received[k], forms[k], nominal))
     if target == 0:
         raise fail("wanted matrix", "one that is not zero", "zero at every step")
-    # levels in units of the largest E |M e|^2
+    # Levels in units of the largest E |M e|^2.
     level = float(_nearest_power_of_four(np.sqrt(target)))
     scaled = [s._replace(target=s.target / level**2) for s in scaled]
     return scaled, Coordinates(np.array(sizes), np.array(received), np.array(forms), level, nothing_grows)

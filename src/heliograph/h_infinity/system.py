@@ -116,7 +116,7 @@ def growth_system(
             over fewer steps than `steps`.
     """
     check_count("steps", steps)
-    # sizes n, v, y from B and D; the channel must take y outputs
+    # Sizes n, v, y from B and D; the channel must take y outputs.
     B = _repeat_over(steps, "disturbance matrix", disturbance, (None, None))
     n, v = B.shape[1:]
     D = _repeat_over(steps, "feedthrough matrix", feedthrough, (None, v))
@@ -124,7 +124,7 @@ def growth_system(
     links = _compute_link_moments(steps, channel)
     if links[0].inputs != y:
         raise fail("channel", f"one that takes the sensor's {y} outputs", f"{links[0].inputs} inputs")
-    # every matrix once for each step
+    # Every matrix once for each step.
     return GrowthSystem(
         _repeat_over(steps, "transition matrix", np.zeros((n, n)) if transition is None else transition, (n, n)),
         B,

@@ -72,7 +72,7 @@ def samples_to_tell(
         raise fail("error", "a number between 0 and 0.5", level)
     name, node = _find_only_node(network)
     count = HORIZON if inputs is None else len(np.asarray(inputs))
-    # mean and long-run deviation of the ratio under each law
+    # Mean and long-run deviation of the ratio under each law.
     channels = [_replace_law(node.channel, (law_a, law_b), law) for law in (law_a, law_b)]
     of_laws = []
     for channel, alternative in (channels, channels[::-1]):

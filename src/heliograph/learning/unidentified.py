@@ -122,7 +122,7 @@ def _reduce_to_echelon(rows: np.ndarray) -> np.ndarray:
     """Return the row echelon form, leading entries 1."""
     reduced, lead, pivot = rows.copy(), 0, 0
     for row in range(len(reduced)):
-        # pivot: the largest entry of the next column that has one
+        # Pivot: the largest entry of the next column that has one.
         while lead < reduced.shape[1]:
             pivot = row + int(np.argmax(np.abs(reduced[row:, lead])))
             if abs(reduced[pivot, lead]) > SAME:
@@ -130,7 +130,7 @@ def _reduce_to_echelon(rows: np.ndarray) -> np.ndarray:
             lead += 1
         if lead == reduced.shape[1]:
             break
-        # swap, scale, eliminate
+        # Swap, scale, eliminate.
         reduced[[row, pivot]] = reduced[[pivot, row]]
         reduced[row] /= reduced[row, lead]
         for other in range(len(reduced)):

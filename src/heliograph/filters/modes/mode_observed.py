@@ -92,23 +92,16 @@ class ModeObservedFilter(AbstractSizedFilter):
         z, published = observed[:m], observed[m:]
         is_known = ~jnp.any(jnp.isnan(published)) | (~state.begun if self.late else False)
         certain = jnp.nan_to_num(published)
-        start, rule = second_moments_at_start(self.plant), Polytope()
         if self.late:
-            last = jnp.maximum(jnp.asarray(k) - 1, 0)
-            then = _condition_channel(at(self.channel, last), certain)
-            redone, _ = correct_linear(state.before, at(self.sensor, last), then, rule, state.z, start)
-            redone = predict_belief(redone, state.move)
+            # The states that came are those of the step before: use them there first.
+            redone = self._redo_last_step(state, certain, k)
             prior = jax.tree.map(lambda a, b: jnp.where(is_known & state.begun, a, b), redone, state.belief)
-            then, begins = (
-                _predict_channel(at(self.channel, last), channel, certain),
-                _predict_channel(None, channel, certain),
-            )
-            described = jax.tree.map(lambda a, b: jnp.where(state.begun, a, b), then, begins)
+            described = self._describe_next_mode(state.begun, certain, k)
         else:
             prior, described = state.belief, _condition_channel(channel, certain)
         # Update with z, which is not used where a state is missing.
         usable = jnp.where(is_known, z, jnp.nan)
-        after, innovation = correct_linear(prior, sensor, described, rule, z, start)
+        after, innovation = correct_linear(prior, sensor, described, Polytope(), z, second_moments_at_start(self.plant))
         after = jax.tree.map(lambda a, b: jnp.where(is_known, a, b), after, prior)
         value, spread = innovation.value, jnp.asarray(innovation.covariance)
         # The flags belong to the innovation; they add nothing to the likelihood.
@@ -117,6 +110,23 @@ class ModeObservedFilter(AbstractSizedFilter):
             value = jnp.append(value, flag_innovation)
         belief = ModeObservedBelief(after, prior, usable, state.move, jnp.asarray(True))
         return belief, Innovation(value, spread, innovation.log_likelihood)
+
+    def _redo_last_step(self, state: ModeObservedBelief, modes: jax.Array, k: Step) -> LinearBelief:
+        """Return the prior of step k after the last measurement is used again, under the modes that it came by."""
+        last = jnp.maximum(jnp.asarray(k) - 1, 0)
+        channel = _condition_channel(at(self.channel, last), modes)
+        start = second_moments_at_start(self.plant)
+        redone, _ = correct_linear(state.before, at(self.sensor, last), channel, Polytope(), state.z, start)
+        return predict_belief(redone, state.move)
+
+    def _describe_next_mode(self, begun: jax.Array, modes: jax.Array, k: Step) -> SecondOrder:
+        """Return the channel's moments at step k given the modes of the step before; at the first step without them."""
+        channel, last = at(self.channel, k), jnp.maximum(jnp.asarray(k) - 1, 0)
+        following = _predict_channel(at(self.channel, last), channel, modes)
+        described: SecondOrder = jax.tree.map(
+            lambda a, b: jnp.where(begun, a, b), following, _predict_channel(None, channel, modes)
+        )
+        return described
 
     @estimates
     def estimate(self, state: ModeObservedBelief) -> Estimate:

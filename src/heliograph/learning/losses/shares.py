@@ -35,7 +35,7 @@ def maximise_shares(function: Slope, starts: list[np.ndarray], precision: float 
 
 
 def estimate_shares(function: Slope, top: np.ndarray, value: float, intervals: bool) -> list[Share]:
-    """Shares at the maximum, each with the interval where the likelihood, maximised over the others, falls by FALL.
+    """Return shares at the maximum, each with the interval where the profile of the likelihood falls by FALL.
 
     A share at 0 is "0, below the high end", one at 1 "1, above the low end"; then FALL_AT_END counts.
     """
@@ -45,7 +45,7 @@ def estimate_shares(function: Slope, top: np.ndarray, value: float, intervals: b
 
 
 def _find_profile_interval(function: Slope, top: np.ndarray, value: float, i: int) -> Share:
-    """The share at logit i of the maximum, with the interval where the profile of its likelihood falls by FALL."""
+    """Return the share at logit i of the maximum, with the interval where its profile falls by FALL."""
     ends = {side: top[i] * side > END - 4 for side in (-1, 1)}
     fall = FALL_AT_END if any(ends.values()) else FALL
     low, high = (
@@ -60,6 +60,7 @@ def _find_crossing(function: Slope, top: np.ndarray, level: float, i: int, side:
     """Return the crossing of the level by the profile of logit i on one side; 0 or 1 where it does not cross."""
     others, near = np.delete(np.arange(len(top)), i), top.copy()
 
+    # How far the profile is above the level, where logit i is x and all others are the best.
     @cache  # an end of a bracket keeps its value: from another start a search may end elsewhere
     def above(x: float) -> float:
         def held(free: np.ndarray) -> tuple[float, np.ndarray]:
@@ -73,7 +74,7 @@ def _find_crossing(function: Slope, top: np.ndarray, level: float, i: int, side:
             near[others] = free
         return best - level
 
-    # a bracket by doubled steps from the top, then Brent's method
+    # A bracket by doubled steps from the top, then Brent's method.
     inside, step = float(top[i]), 0.25
     if above(inside) <= 0:
         return float(expit(inside))
