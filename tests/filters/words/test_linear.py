@@ -1,9 +1,12 @@
 """The linear filter behind words: its claims, against a recursion of scalars and against true bits."""
 
+import re
+
 import numpy as np
 import pytest
 
 import heliograph as hg
+from heliograph import report
 
 A, Q, R = 0.95, 0.1, 0.05
 X = Q / (1 - A**2)  # stationary variance of the state
@@ -165,6 +168,20 @@ def test_a_range_that_is_overloaded_is_refused_with_the_bound():
     assert filter.claim == "nominal"  # bound 1.3 %
     assert float(filter.overload.bound) == pytest.approx(0.013, abs=5e-4)
     assert float(filter.overload.probability[0]) == pytest.approx(6e-5, rel=0.1)
+
+
+def test_records_and_reports_say_what_check_says_of_overload():
+    encoder = words(8, "none", 4.0)
+    network = world(encoder, hg.decode_and_forward([0.0]))
+    record = hg.run(network, {"a": hg.simulate(network, 30, 1).measurements["a"]})
+    overload = record.overloads["a"]["linear"]
+    assert float(overload.bound) == pytest.approx(0.013, abs=5e-4)
+    health = report.examine(network, record)
+    page = re.sub("<[^>]*>", "", report.run_page(health, "words", {}).html())
+    share = float(overload.probability[0])
+    assert f"are overloaded in at most {share:.2g} of the steps" in page
+    assert "differs from its claim by at most 1.3%" in page
+    assert report.run_summary(health)["overloads"]["a"]["linear"]["bound"] == float(overload.bound)
 
 
 def test_what_a_filter_of_words_cannot_know_is_refused():

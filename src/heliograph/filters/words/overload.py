@@ -40,6 +40,21 @@ class Overload(NamedTuple):
     probability: Float[np.ndarray, " outputs"]
     bound: Float[np.ndarray, ""]
 
+    def describe(self, node: str, filter: str) -> str:
+        """Return a line that says how often words are overloaded, and what that may do to the claim of a filter.
+
+        Args:
+            node: name of the sender's node.
+            filter: name of the filter.
+        """
+        share, bound = float(np.max(self.probability)), float(self.bound)
+        often = f"words of node {node!r} are overloaded in at most {share:.2g} of the steps"
+        if not np.isfinite(bound):
+            return f"{often}, what that does to the claim of filter {filter!r} is not bounded"
+        return (
+            f"{often}, the rms error of filter {filter!r} differs from its claim by at most {100 * bound:.2g}% for it"
+        )
+
 
 def bound_overload(
     plant: AnyPlant, sensor: AnySensor, numbers: Channel, encoder: Words, places: tuple[int, ...]

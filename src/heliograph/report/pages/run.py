@@ -194,7 +194,13 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
         sections=[
             Section(
                 "At a glance",
-                [KeyFigures(keys), *_list_doubts(doubts), *_list_baseline_remarks(health), *_list_premises(health)],
+                [
+                    KeyFigures(keys),
+                    *_list_doubts(doubts),
+                    *_list_baseline_remarks(health),
+                    *_list_premises(health),
+                    *_list_overloads(health.record),
+                ],
             ),
             Section("Estimates", [*make_errors_table(record), *_list_pictures(health, drawings)]),
             *([Section("Forecasts", forecast_tables(record, health.forecasts))] if health.forecasts else []),
@@ -326,6 +332,13 @@ def _list_premises(health: Health) -> list[Text | Points]:
     """Return the filters that were made for another world than that of their node."""
     text = "These filters were made for another world than that in which they stand, and claim no more than a number:"
     return [Text([text]), Points([visible(line) for line in health.beliefs])] if health.beliefs else []
+
+
+def _list_overloads(record: Record) -> list[Text | Points]:
+    """Return how often the words that filters take are overloaded, before any data."""
+    overloads = record.overloads.items()
+    lines = [visible(overload.describe(node, name)) for node, of in overloads for name, overload in of.items()]
+    return [Text(["Of words, whose range has ends, before any data:"]), Points(lines)] if lines else []
 
 
 def _make_links_section(health: Health, drawings: Mapping[str, bytes]) -> list[Table | Picture | Text]:

@@ -39,6 +39,10 @@ def run_summary(health: Health) -> dict[str, Json]:
         "outputs": outputs,
         "errors": _error_numbers(health.record),
         "links": links,
+        "overloads": {
+            node: {name: _overload_numbers(*overload) for name, overload in of.items()}
+            for node, of in health.record.overloads.items()
+        },
         "shared": {name: list(nodes) for name, nodes in health.shared.items()},
     }
 
@@ -66,6 +70,11 @@ def _error_numbers(record: Record) -> dict[str, dict[str, Json]]:
         rmse: dict[str, Json] = {state: None if np.isnan(x) else x for state, x in of_filter.rmse.items()}
         errors.setdefault(of_filter.node, {})[of_filter.filter] = {"rmse": rmse, "nees": size}
     return errors
+
+
+def _overload_numbers(probability: np.ndarray, bound: np.ndarray) -> dict[str, Json]:
+    """How often each component's words are overloaded, and the bound on the claim, None where there is none."""
+    return {"probability": probability.tolist(), "bound": float(bound) if np.isfinite(bound) else None}
 
 
 def _link_numbers(link: Arrivals) -> dict[str, Json]:

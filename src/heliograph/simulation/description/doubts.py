@@ -11,7 +11,7 @@ from heliograph.disk.quoting import join_names
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.linear.linear import LinearFilter
-from heliograph.filters.words.linear import SEEN, LinearWordsFilter
+from heliograph.filters.words.linear import SEEN
 from heliograph.filters.wrappers.told import ToldFilter, believe_typical
 from heliograph.model.fading import memory_matters
 from heliograph.model.over_time import at_each_step, first
@@ -36,6 +36,7 @@ from heliograph.simulation.description.separable import separate_nodes
 from heliograph.simulation.description.wide_angles import warn_wide_at_start
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
+from heliograph.simulation.results.overloads import find_overloads
 
 CANCELLED = 1e-12  # of the largest mean gain: what is left where gains cancel
 HIDDEN = 1e-9  # of the largest singular value of the observability matrix: what is smaller is rounding
@@ -84,15 +85,9 @@ def doubts_before_data(network: Network) -> list[Doubt]:
 
 def _find_overloads(network: Network) -> Iterator[Doubt]:
     """Yield how often the words of a node are overloaded before any data, and what that may do to a claim."""
-    for name, node in network.nodes.items():
-        for label, filter in node.filters.items():
-            if not isinstance(filter, LinearWordsFilter):
-                continue
-            share, bound = float(np.max(filter.overload.probability)), float(filter.overload.bound)
-            often = f"words of node {name!r} are overloaded in at most {share:.2g} of the steps"
-            known = f"the rms error of filter {label!r} differs from its claim by at most {100 * bound:.2g}% for it"
-            unknown = f"what that does to the claim of filter {label!r} is not bounded"
-            yield Doubt(not bound <= SEEN, f"{often}, {known if np.isfinite(bound) else unknown}")
+    for name, filters in find_overloads(network).items():
+        for label, overload in filters.items():
+            yield Doubt(not float(overload.bound) <= SEEN, overload.describe(name, label))
 
 
 def _list_sensors(network: Network) -> list[AbstractSensor]:

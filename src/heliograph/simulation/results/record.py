@@ -36,6 +36,7 @@ from heliograph.simulation.results.labelled import (
     record_fields,
     record_frame,
 )
+from heliograph.simulation.results.overloads import Overloads, find_overloads
 from heliograph.simulation.results.plots import (
     check_run,
     choose_filters,
@@ -116,6 +117,11 @@ class Record(Saved):
         return changed
 
     @property
+    def overloads(self) -> Overloads:
+        """How often words overload, and by how much a claim may be off, by node and filter; of what `run` returns."""
+        return find_overloads(getattr(self.origin, "model", None))
+
+    @property
     def runs(self) -> int | None:
         """Number of Monte Carlo runs; None for one recording."""
         means = [np.asarray(e.mean) for filters in self.estimates.values() for e in filters.values()]
@@ -138,10 +144,7 @@ class Record(Saved):
             truth=None if self.truth is None else self.truth[run],
             measurements=measurements,
             estimates=estimates,
-            uplinks={
-                name: Uplink(uplink.nodes, uplink.saturated[run], uplink.symbols[run])
-                for name, uplink in self.uplinks.items()
-            },
+            uplinks={name: Uplink(up.nodes, up.saturated[run], up.symbols[run]) for name, up in self.uplinks.items()},
             smoothed=None if self.smoothed is None else self.smoothed.of_run(run),
             reports=reports,
         )
@@ -193,10 +196,7 @@ class Record(Saved):
         return nees(truth, np.where(sound, truth - errors, np.nan), claimed)
 
     def outputs(self, node: str, name: str) -> tuple[InnovationSummary, ...]:
-        """Summarise the innovations of a filter that weighs, one output after the other.
-
-        Values received and down-weighted, their share with its interval, mean weight, bias with its interval, and mean
-        d^2, d an innovation in units of its deviation.
+        """Summarise the innovations of a filter that weighs, output after output: what it used, weights, bias, size.
 
         Raises:
             ValueError: no such filter, one that weighs nothing, or a simulation, whose weights `filter.run` has.
@@ -218,8 +218,8 @@ class Record(Saved):
         nodes = list(dict.fromkeys([*self.measurements, *self.estimates]))
         received = [((nodes.index(node),), z) for node, z in self.measurements.items()]
         rows = {TIME: len(self.time)} if self.runs is None else {"run": self.runs, TIME: len(self.time)}
-        longest = max((z.shape[-1] for _, z in received), default=0)
-        longest_of = {"received": longest} | ({"mode": modes} if (modes := modes_of(self.estimates)) else {})
+        longest_of = {"received": max((z.shape[-1] for _, z in received), default=0)}
+        longest_of |= {"mode": modes} if (modes := modes_of(self.estimates)) else {}
         labels = FilterLabels(nodes, self.estimates, self.states, rows, longest_of, self.uplinks)
         lengths = {node: z.shape[-1] for node, z in self.measurements.items()}
         fields = {
@@ -234,8 +234,7 @@ class Record(Saved):
         }
         if modes:
             fields["modes"] = labels.of_filters("modes", read_modes)
-        if self.truth is not None:
-            fields["truth"] = self.truth
+        fields |= {} if self.truth is None else {"truth": self.truth}
         return labels.dataset(RECORD, fields, self.time, self.units)
 
     @classmethod

@@ -1,0 +1,26 @@
+"""How often the words of a network are overloaded before any data, and what that may do to a claim."""
+
+from typing_extensions import TypeAliasType
+
+from heliograph.filters.words.linear import LinearWordsFilter
+from heliograph.filters.words.overload import Overload
+from heliograph.simulation.network import Network
+
+Overloads = TypeAliasType("Overloads", dict[str, dict[str, Overload]])  # by node and filter
+
+
+def find_overloads(network: object) -> Overloads:
+    """Return the overload of the words that each linear filter takes, by node and filter, of those that take words.
+
+    Args:
+        network: a network; of any other model there are none.
+    """
+    if not isinstance(network, Network):
+        return {}
+    found = {
+        name: {
+            label: filter.overload for label, filter in node.filters.items() if isinstance(filter, LinearWordsFilter)
+        }
+        for name, node in network.nodes.items()
+    }
+    return {name: of for name, of in found.items() if of}
