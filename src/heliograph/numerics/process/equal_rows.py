@@ -15,8 +15,8 @@ from weakref import WeakSet
 
 import numpy as np
 
-LEAST = 4 << 20  # bytes of an array below which it is filled: by then that takes as long
-PIECE = 2 << 20  # bytes that are filled and mapped again, at least
+LEAST = 1 << 20  # bytes of an array below which it is filled: by then that takes as long
+PIECE = 1 << 17  # bytes that are filled and mapped again, at least
 PIECES = 32  # of an array at most: the system holds 65,530 for a process
 MOST = 512  # arrays that are held at once, of a process
 
