@@ -119,6 +119,10 @@ def against_peers() -> dict[str, list[str]]:
     return {name: cells for name, *cells in rows}
 
 
+def test_it_is_read_on_a_few_screens():
+    assert len(README.splitlines()) <= 150
+
+
 def test_every_row_of_peers_names_a_command_that_there_is():
     """Times are in test_docs.py, errors in the test above and those of quadratic bias, late data and live."""
     rows = against_peers()
