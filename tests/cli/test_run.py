@@ -208,6 +208,8 @@ def test_predictions_of_each_row_are_columns_and_a_figure(tmp_path, capsys):
     assert written["predicted.output.height"][7] == written["predicted.level"][7] == written["level"][7]
     assert len(written["time"]) == 32
     assert "What each filter expected of a row" in (report / "report.html").read_text()
-    assert (report / "predicted_0.svg").exists()
+    assert (report / "predicted_0.svg").exists() and (report / "residuals_0.svg").exists()
+    page = (report / "report.html").read_text()
+    assert "<h2>Residuals</h2>" in page and "by Ljung and Box" in page
     assert cli.main([*call, "--out", str(tmp_path / "out.mcap")]) == 2
     assert "--predicted: expected a table of estimates" in capsys.readouterr().err

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 import heliograph as hg
-from heliograph.forecasting import predict_rows, residuals
+from heliograph.forecasting import predict_rows, record_residuals, residuals
 
 
 def filter_of(noise=0.3):
@@ -16,6 +16,22 @@ def drawn(rows, seed):
     plant, sensor = hg.state_space([[0.9]], [[1.0]], 0.5, 0.3, [0.0], 2.0)
     network = hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(1), {})})
     return hg.simulate(network, rows, seed).measurements["a"]
+
+
+def test_a_record_has_the_residuals_of_each_of_its_filters():
+    """Node by node those of the filter alone; none of one that claims nothing."""
+    plant, sensor = hg.state_space([[0.9]], [[1.0]], 0.5, 0.3, [0.0], 2.0)
+    filters = {"k": hg.kalman_filter(plant, sensor), "h": hg.filters.open_loop_filter(plant)}
+    z = drawn(60, 2)
+    z[5] = np.nan
+    record = hg.run(hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(1), filters)}), {"a": z})
+    found, alone = record_residuals(record), residuals(filters["k"], z)
+    assert {node: list(of) for node, of in found.items()} == {"a": ["k"]}
+    np.testing.assert_array_equal(found["a"]["k"].values, alone.values)
+    np.testing.assert_array_equal(found["a"]["k"].ljung_box, alone.ljung_box)
+    assert found["a"]["k"].names == alone.names and found["a"]["k"].doubts() == []
+    with pytest.raises(ValueError, match="record: expected a Record"):
+        record_residuals("record")
 
 
 def test_rows_are_predicted_where_nothing_arrived_too():

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
+import heliograph
 from heliograph.cli.app import estimates_option, measured_option, path_option
 from heliograph.cli.filtered_plant import FilteredPlant, filter_plant, place_of_plant, write_plant
 from heliograph.cli.reading import ReadingOptions, read_measured
@@ -207,15 +208,14 @@ def _write_report(name: str, network: "Network", plants: "Sequence[FilteredPlant
     from heliograph.report.health import Health, examine
     from heliograph.report.results import Results, write_results
 
+    def examine_plant(plant: "FilteredPlant", advance: "Advance") -> Health:
+        record, inputs = plant.record, plant.data.recording.inputs
+        residuals = heliograph.forecasting.record_residuals(record, inputs) if plant.predicted else {}
+        health = examine(network, record, inputs, advance)
+        return replace(health, forecasts=plant.forecasts, predicted=plant.predicted, residuals=residuals)
+
     def examined(advance: "Advance") -> dict[str, Health]:
-        return {
-            plant.data.plant: replace(
-                examine(network, plant.record, plant.data.recording.inputs, advance),
-                forecasts=plant.forecasts,
-                predicted=plant.predicted,
-            )
-            for plant in plants
-        }
+        return {plant.data.plant: examine_plant(plant, advance) for plant in plants}
 
     def results_of(health: dict[str, Health]) -> Results:
         from heliograph.report.pages.run import make_results_of_plants, make_run_results

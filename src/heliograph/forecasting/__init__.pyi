@@ -23,6 +23,7 @@ from .one_step import (
 )
 from .unexplained import (
     Residuals as Residuals,
+    record_residuals as record_residuals,
     residuals as residuals,
 )
 from .prediction import (

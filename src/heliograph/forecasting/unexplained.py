@@ -8,19 +8,24 @@ from scipy.stats import chi2, f
 
 from heliograph.filters.base import AbstractFilter, FilterAngles
 from heliograph.filters.filter_data import check_data
-from heliograph.forecasting.one_step import predict_rows
+from heliograph.forecasting.backtest import measured_by
+from heliograph.forecasting.forecast import targets_of
+from heliograph.forecasting.one_step import predict_record, predict_rows
+from heliograph.forecasting.origins import origin_of
 from heliograph.forecasting.prediction import Array, Forecast
 from heliograph.forecasting.residual_figure import Quantiles, compare_quantiles, draw_residuals
-from heliograph.numerics.angle import nearest
+from heliograph.numerics.angle import Angles, nearest
 from heliograph.numerics.check import check_count, fail, instance, show_value
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
+from heliograph.simulation.results.record import Record
 
 if TYPE_CHECKING:  # it takes a second
     from matplotlib.figure import Figure
 
 FALSE = 0.01  # probability of any false doubt, of all tests together
 LEAST = 20  # residuals for tests
+LAGS = 10  # of autocorrelations
 NORMAL = 1.959963984540054  # quantile of an interval of 95 %
 
 
@@ -92,7 +97,7 @@ def residuals(
     filter: AbstractFilter,
     z: Float[ArrayLike, "steps received"],
     u: Float[ArrayLike, "steps inputs"] | None = None,
-    lags: int = 10,
+    lags: int = LAGS,
 ) -> Residuals:
     """Standardise what a filter did not predict, and test it: correlation, normality, changing variance.
 
@@ -111,16 +116,52 @@ def residuals(
     instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
     rows, inputs = check_data(filter, z, u)
     predicted, count = predict_rows(filter, rows, inputs), check_count("lags", lags)
+    angles = (filter.angles_used() or FilterAngles((), ())).received
+    found = _standardise(predicted, np.asarray(rows), angles, count)
+    if found is None:
+        raise fail("residuals", "a filter that claims a covariance of what arrives", type(filter).__name__)
+    return found
+
+
+def record_residuals(
+    record: Record, inputs: Float[ArrayLike, "steps inputs"] | None = None
+) -> dict[str, dict[str, Residuals]]:
+    """Standardise what the filters of a record did not predict, as `residuals` does of one filter.
+
+    Args:
+        record: what `hg.run` returned.
+        inputs: (steps, inputs), as they were given to `hg.run`; by default a plant without inputs is assumed.
+
+    Returns:
+        By node and filter, of those that claim a covariance of what arrives.
+
+    Raises:
+        ValueError: a record of a file or a simulation, which does not know its filters; inputs of another shape.
+
+    Source: as of `residuals`.
+    """
+    predicted = predict_record(record, inputs)
+    found: dict[str, dict[str, Residuals]] = {}
+    for target in targets_of(origin_of(record)):
+        prediction = predicted.get(target.node, {}).get(target.filter)
+        angles = (target.outlook.filter.angles_used() or FilterAngles((), ())).received
+        judged = None if prediction is None else _standardise(prediction, measured_by(target, record), angles, LAGS)
+        if judged is not None:
+            found.setdefault(target.node, {})[target.filter] = judged
+    return found
+
+
+def _standardise(predicted: Forecast, rows: np.ndarray, angles: Angles, lags: int) -> Residuals | None:
+    """Return the residuals of rows (steps, received) and their tests; None where nothing is claimed of what arrives."""
     law = predicted.received
     if law is None or law.claim == "none":
-        raise fail("residuals", "a filter that claims a covariance of what arrives", type(filter).__name__)
-    angles = (filter.angles_used() or FilterAngles((), ())).received
+        return None
     known = np.where(np.isfinite(law.deviation), law.deviation, np.nan)  # of what nothing was heard yet: none
-    values = (nearest(np.asarray(rows), law.mean, angles) - law.mean) / known
+    values = (nearest(rows, law.mean, angles) - law.mean) / known
     columns = [values[:, i] for i in range(values.shape[1])]
-    correlations = np.stack([_autocorrelation(e, count) for e in columns], axis=1)
+    correlations = np.stack([_autocorrelation(e, lags) for e in columns], axis=1)
     came = np.maximum([int(np.sum(~np.isnan(e))) for e in columns], 1)
-    white = np.array([_test_correlation(e, count) for e in columns])
+    white = np.array([_test_correlation(e, lags) for e in columns])
     normal, steady = (np.array([test(e) for e in columns]) for test in (_test_normality, _test_same_variance))
     band = NORMAL / np.sqrt(came)
     return Residuals(law.names, values, predicted, correlations, band, white, normal, steady)

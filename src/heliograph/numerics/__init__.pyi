@@ -119,6 +119,8 @@ from .shares import average_correlated as average_correlated
 from .shares import count_independent as count_independent
 from .shares import round_to as round_to
 from .shares import wilson as wilson
+from .short_programs import evaluate_at_points as evaluate_at_points
+from .short_programs import write_short_programs as write_short_programs
 from .times.dates import MISSING as MISSING
 from .times.dates import UNITS as UNITS
 from .times.dates import dates as dates

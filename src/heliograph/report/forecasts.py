@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 MOST = 12  # horizons of a table
 BOTH_SIDES = 0.95  # probability of the intervals in a table
+Residuals = Mapping[str, "Mapping[str, heliograph.forecasting.Residuals]"]
 Forecasts = Mapping[str, "Mapping[str, heliograph.forecasting.Forecast]"]  # by node and filter
 
 

@@ -15,7 +15,7 @@ from heliograph.report.compared_nodes import compare_nodes
 from heliograph.report.constant_error import ConstantError, find_constant_error
 from heliograph.report.doubts import say_apart, say_memory, say_off, say_overconfident, say_underconfident
 from heliograph.report.expected_squares import compare_squares, expect_squares
-from heliograph.report.forecasts import Forecasts
+from heliograph.report.forecasts import Forecasts, Residuals
 from heliograph.report.held import HeldValue
 from heliograph.report.outputs import OutputHealth, judge_outputs_of_filter, list_listeners, weighs
 from heliograph.report.time_unit import doubt_time_unit
@@ -77,6 +77,7 @@ class Health:
     beliefs: tuple[str, ...] = ()  # of filters that believe another world, one sentence each
     forecasts: Forecasts = field(default_factory=dict)  # by node and filter, where some were asked for
     predicted: Forecasts = field(default_factory=dict)  # of each row, by node and filter, where it was asked for
+    residuals: Residuals = field(default_factory=dict)  # of what was predicted, likewise
     off: Mapping[tuple[str, str], ConstantError] = field(default_factory=dict)  # by node and filter, where it says most
     apart: ConstantError | None = None  # of one node against the others, which filter by themselves
     time_unit: str = ""  # that times are in another unit than the plant's, which explains what is doubtful

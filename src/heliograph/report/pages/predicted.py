@@ -6,6 +6,7 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
+import heliograph
 from heliograph.disk.quoting import quote_for_figure, visible
 from heliograph.report.figures import INK, place_legend_above, stacked_panels
 from heliograph.report.health import Health
@@ -17,7 +18,10 @@ PANELS = 12  # numbers of a node that are drawn; the table of estimates has all
 
 def predicted_figures(health: Health) -> dict[str, Figure]:
     """Return a figure for each node whose filters predict what arrives, by file name; none unless asked for."""
-    return {f"predicted_{i}": _draw_predicted(health, node) for i, node in enumerate(_list_nodes(health)[:MOST])}
+    figures = {f"predicted_{i}": _draw_predicted(health, node) for i, node in enumerate(_list_nodes(health)[:MOST])}
+    for i, (_, judged) in enumerate(_list_residuals(health)[:MOST]):
+        figures[f"residuals_{i}"] = judged.figure(health.record.time)
+    return figures
 
 
 def predicted_sections(health: Health, drawings: Mapping[str, bytes]) -> list[Section]:
@@ -38,7 +42,33 @@ def predicted_sections(health: Health, drawings: Mapping[str, bytes]) -> list[Se
     )
     left = [node for node in nodes if node not in pictures]
     missing = say_not_drawn(left, "Their predictions are in the table of estimates.")
-    return [Section("Predictions", [Text([text]), *choose_picture(pictures), *missing])]
+    return [
+        Section("Predictions", [Text([text]), *choose_picture(pictures), *missing]),
+        *_make_residual_sections(health, drawings),
+    ]
+
+
+def _list_residuals(health: Health) -> "list[tuple[str, heliograph.forecasting.Residuals]]":
+    """Return what each filter did not predict, with its node and name."""
+    return [(f"{node}/{name}", one) for node, filters in health.residuals.items() for name, one in filters.items()]
+
+
+def _make_residual_sections(health: Health, drawings: Mapping[str, bytes]) -> list[Section]:
+    """Return the section on residuals: what speaks against each filter's predictions, and their pictures."""
+    every = _list_residuals(health)
+    pictures = {
+        name: Picture(drawings[f"residuals_{i}"], f"Residuals of {visible(name)} over time and by size",
+                      f"{visible(name)}: in units of the claimed deviation, over time; autocorrelations with the band "
+                      "of 95 %; in order, beside the quantiles of a normal law.")
+        for i, (name, _) in enumerate(every) if f"residuals_{i}" in drawings
+    }  # fmt: skip
+    doubts = [f"{visible(name)}: {visible(line)}." for name, one in every for line in one.doubts()]
+    said = doubts or ["Nothing speaks against them: no correlation, no other law, no variance that changes."]
+    text = (
+        "What was not predicted: of a right model independent from row to row, normal, of variance 1. Tested, with the "
+        "number of tests in mind, by Ljung and Box, by Jarque and Bera, and by the variances of first and last third."
+    )
+    return [Section("Residuals", [Text([text]), Text(said), *choose_picture(pictures)])] if every else []
 
 
 def _list_nodes(health: Health) -> list[str]:
