@@ -13,34 +13,79 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.model.over_time import OverTime
-from heliograph.model.plant import AbstractPlant
+from heliograph.model.plant import TIME_STEP, AbstractPlant
 from heliograph.model.sensor import SEVERAL_TAKEN_BY, AbstractSensor
-from heliograph.numerics.check import fail, instance, items, show_value
+from heliograph.numerics.check import array, fail, instance, items, show_value
 from heliograph.numerics.module import Module, same
+from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.chain import MarkovChain
 from heliograph.random_affine.memory import AbstractWithMemory, memories, select_alike
 from heliograph.random_affine.noise import AbstractNoise, Square, Vector
+
+Transition = MarkovChain | ArrayLike  # a chain, or its probabilities (modes, modes)
+SUM = 1e-9  # of the largest rate: what a row of rates may sum to
+APART = 1e8  # condition of the eigenvectors of rates beyond which half of the digits are lost
+
+
+class SwitchingRates(Module):
+    """Rates G (modes, modes) of switches, G[i, j] per unit of time from mode i to j, by eigenvalues and projectors.
+
+    exp(G t) = sum_k exp(l_k t) P_k, of which pairs of complex ones make real numbers.
+
+    Shapes: growth and turn, the real and imaginary parts of l (modes,); real and imaginary of P (modes, modes, modes).
+    """
+
+    growth: Vector
+    turn: Vector
+    real: np.ndarray
+    imaginary: np.ndarray
+
+    def __init__(self, rates: ArrayLike):
+        G = array("rates", rates, ("modes", "modes"))
+        if is_traced(G):
+            raise fail("rates", "numbers, which are not free", "traced ones")
+        G = np.asarray(G, float)
+        apart = G[~np.eye(len(G), dtype=bool)]
+        if len(G) != G.shape[1] or (apart < 0).any() or np.max(np.abs(G.sum(axis=1))) > SUM * np.max(np.abs(G)):
+            raise fail(
+                "rates", "a square matrix, 0 or more beside its diagonal, of which each row sums to 0", G.tolist()
+            )
+        values, vectors = np.linalg.eig(G)
+        if np.linalg.cond(vectors) > APART:
+            raise fail("rates", "as many eigenvectors as modes (change one rate a little)", G.tolist())
+        projectors = np.einsum("ik,kj->kij", vectors, np.linalg.inv(vectors))
+        self.growth, self.turn = values.real, values.imag
+        self.real, self.imaginary = projectors.real, projectors.imag
+
+    def over(self, time: jax.Array) -> jax.Array:
+        """Return exp(G t), the transition (modes, modes) over a time t."""
+        size = jnp.exp(jnp.asarray(self.growth) * time)
+        cosine, sine = size * jnp.cos(self.turn * time), size * jnp.sin(self.turn * time)
+        rows = jnp.einsum("k,kij->ij", cosine, self.real) - jnp.einsum("k,kij->ij", sine, self.imaginary)
+        return jnp.maximum(rows, 0.0)
 
 
 class ModalPlant(AbstractPlant, AbstractWithMemory):
     """A plant that has one of several laws of motion at each step, by the mode of a chain; built by `markov_plant`.
 
     Args:
-        memory: the chain.
+        memory: the chain; of rates the identity, which leaves the mode where it is.
         models: the plant of each mode.
+        rates: by which the mode moves over the time between rows, in place of the chain; none by default.
     """
 
     memory: MarkovChain
     models: tuple[AbstractPlant, ...]
+    rates: "SwitchingRates | None"
     initial_mean: Vector
     initial_covariance: Square
     deviation: AbstractNoise | None
     states: tuple[str, ...] = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
 
-    def __init__(self, memory: MarkovChain, models: Sequence[AbstractPlant]):
-        self.memory = instance("memory", memory, MarkovChain, "a MarkovChain")
+    def __init__(self, memory: MarkovChain, models: Sequence[AbstractPlant], rates: "SwitchingRates | None" = None):
+        self.memory, self.rates = instance("memory", memory, MarkovChain, "a MarkovChain"), rates
         self.models = _check_models("models of a plant", models, AbstractPlant)
         start = self.models[0]
         if start.attitude:
@@ -186,10 +231,11 @@ class _ChosenSensor(AbstractSensor):
 
 def markov_plant(
     models: Sequence[AbstractPlant],
-    transition: "MarkovChain | ArrayLike | None" = None,
+    transition: "Transition | None" = None,
     initial: "ArrayLike | None" = None,
     name: str | None = None,
     modes: "AbstractWithMemory | None" = None,
+    rates: "ArrayLike | None" = None,
 ) -> ModalPlant:
     """Return a plant whose law of motion is that of the mode of a Markov chain: straight or turning, intact or worn.
 
@@ -203,10 +249,12 @@ def markov_plant(
         initial: law (modes,) of the mode at the first step; the stationary law by default.
         name: links, sensors and plants of one name share the chain; by default it is the plant's own.
         modes: a sensor, plant or link whose chain it is, in place of `transition`; none by default.
+        rates: G (modes, modes) of switches per unit of time, in place of `transition`: T = exp(G dt) from a row to the
+            next, of plants whose input is "dt"; `imm_filter`, `gpb1_filter` and `gpb2_filter` take it. None by default.
 
     Raises:
         ValueError: fewer than two models, models of other states, inputs, angles, limits or laws of x_0 than the first,
-            probabilities that are none.
+            probabilities that are none; rates that are none, or without an input "dt" or an initial law.
     """
     plants = _check_models("models of a plant", models, AbstractPlant)
     for i, plant in enumerate(plants[1:], start=1):
@@ -219,12 +267,19 @@ def markov_plant(
             if not same(getattr(plant, what), getattr(plants[0], what)):
                 raise fail(f"law of x_0 of model {i}", "that of model 0, since the state starts before the first mode",
                            f"another {what.replace('_', ' ')}")  # fmt: skip
-    return ModalPlant(_chain_of(transition, initial, name, modes, len(plants)), plants)
+    if rates is None:
+        return ModalPlant(_chain_of(transition, initial, name, modes, len(plants)), plants)
+    if transition is not None or modes is not None or initial is None:
+        raise fail("rates of the modes", "an initial law beside them, and no transition", "another")
+    if TIME_STEP not in plants[0].inputs:
+        raise fail("rates of the modes", f"plants with the input {TIME_STEP!r}", list(plants[0].inputs))
+    moving = SwitchingRates(rates)
+    return ModalPlant(_chain_of(np.eye(len(moving.growth)), initial, name, None, len(plants)), plants, moving)
 
 
 def markov_sensor(
     models: Sequence[AbstractSensor],
-    transition: "MarkovChain | ArrayLike | None" = None,
+    transition: "Transition | None" = None,
     initial: "ArrayLike | None" = None,
     name: str | None = None,
     modes: "AbstractWithMemory | None" = None,
@@ -257,6 +312,14 @@ def markov_sensor(
     return ModalSensor(_chain_of(transition, initial, name, modes, len(sensors)), sensors)
 
 
+def transition_over(plant: AbstractPlant, u: jax.Array, chain: jax.Array) -> jax.Array:
+    """Return the transition (M, M) of joint modes, plant's first: that of a plant's rates over dt, then the chain's."""
+    if not isinstance(plant, ModalPlant) or plant.rates is None:
+        return chain
+    own = plant.rates.over(u[plant.inputs.index(TIME_STEP)])
+    return jnp.kron(own, jnp.eye(len(chain) // len(own))) @ chain
+
+
 def models_of(model: Any) -> tuple[Any, ...]:
     """Return the models of a plant's or sensor's modes, itself alone where it has none."""
     return model.models if isinstance(model, ModalPlant | ModalSensor) else (model,)
@@ -275,7 +338,7 @@ def _check_models(name: str, models: object, kind: type) -> tuple[Any, ...]:
 
 
 def _chain_of(
-    transition: "MarkovChain | ArrayLike | None",
+    transition: "Transition | None",
     initial: ArrayLike | None,
     name: str | None,
     modes: object,

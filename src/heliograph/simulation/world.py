@@ -7,8 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.model.estimate import Estimate
+from heliograph.model.modes_of_motion import ModalPlant
 from heliograph.model.over_time import at
 from heliograph.model.plant import AbstractPlant, AnyPlant
+from heliograph.numerics.check import fail
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.memory import condition_on_memories
@@ -34,6 +36,9 @@ class World(Module):
     def init(self, key: jax.Array) -> PyTree:
         """Return the state before the first step of the run with this key."""
         plant = at(self.plant, 0)
+        if isinstance(plant, ModalPlant) and plant.rates is not None:
+            expected = "transitions of a plant's modes by steps (with rates filter recordings, simulate T = exp(G dt))"
+            raise fail("simulation", expected, "rates of switches")
         x, modes = plant.sample_initial(draw_key(key, 0, WORLD, INITIAL)), start_modes(plant, key, self._places)
         edges = {name: mesh.edges.init(key) for name, mesh in self.filters.meshes.items()}
         return x, self.medium.init(key), self.filters.init(), edges, modes

@@ -27,11 +27,13 @@ class Smoothed:
         means: (steps, n).
         covariances: what is claimed of their errors (steps, n, n).
         claim: what the covariances are: "exact", "upper", "nominal" or "none".
+        modes: probabilities of the modes given all rows (steps, M); None of a filter that weighs none.
     """
 
     means: Float[np.ndarray, "steps n"]
     covariances: Float[np.ndarray, "steps n n"]
     claim: Claim
+    modes: Float[np.ndarray, "steps M"] | None = None
 
 
 def rts_smoother(
@@ -66,7 +68,8 @@ def rts_smoother(
     else:
         _, steps = step_rows(filter, rows, inputs, filter.init(), np.asarray(0))
         estimate = FixedInterval().estimates(steps)
-    return Smoothed(np.asarray(estimate.mean), np.asarray(estimate.covariance), estimate.claim)
+    modes = None if estimate.modes is None else np.asarray(estimate.modes)
+    return Smoothed(np.asarray(estimate.mean), np.asarray(estimate.covariance), estimate.claim, modes)
 
 
 @readable

@@ -115,24 +115,36 @@ def test_unscented_imm_of_turns_is_filterpys_to_rounding():
 
 def world(smoothed=False):
     plant = motion()
-    others = {"one": hg.kalman_filter(models()[0], SENSOR), "two": hg.kalman_filter(models()[1], SENSOR)}
+    others = {
+        "one": hg.kalman_filter(models()[0], SENSOR), "two": hg.kalman_filter(models()[1], SENSOR),
+        "linear": hg.linear_filter(plant, SENSOR, LINK),
+    }  # fmt: skip
     filters = {name: make(plant, SENSOR, LINK) for name, make in FILTERS.items()}
     return hg.Network(plant, {"node": hg.Node(SENSOR, LINK, filters if smoothed else filters | others)})
 
 
 def test_a_kalman_filter_of_one_law_claims_nothing_exact_in_a_world_of_two():
-    assert set(world().claims()["node"].values()) == {"nominal"}
+    claims = dict(world().claims()["node"])
+    assert claims.pop("linear") == "exact" and set(claims.values()) == {"nominal"}
+
+
+PUBLISHED = {  # squared errors of position and velocity, what is claimed, squares over what is claimed
+    "one": ((2.500, 1.046), (0.336, 0.034), 23.4), "two": ((0.786, 1.075), (0.849, 2.70), 0.644),
+    "linear": ((0.691, 0.727), (0.691, 0.725), 1.00), "gpb1": ((0.670, 0.726), (0.702, 0.781), 0.918),
+    "imm": ((0.560, 0.634), (0.587, 0.627), 0.974), "gpb2": ((0.537, 0.626), (0.550, 0.622), 0.981),
+}  # fmt: skip
 
 
 @pytest.mark.slow
 def test_errors_are_those_of_the_published_setting():
     """After 60 steps of 20,000 runs; three standard errors of 20,000 runs are 3 to 4 percent."""
     results = hg.monte_carlo(world(), 60, 20_000, 0, keep=hg.Statistics())["node"]
-    expected = {"one": (2.500, 1.046), "two": (0.786, 1.075), "gpb1": (0.670, 0.726), "imm": (0.560, 0.634),
-                "gpb2": (0.537, 0.626)}  # fmt: skip
-    for name, squares in expected.items():
-        got = (results[name].pairs.sum(0)[-1] / results[name].count.sum())[[0, 2]]
-        np.testing.assert_allclose(got, squares, rtol=0.04)
+    for name, (squares, claimed, size) in PUBLISHED.items():
+        one, runs = results[name], results[name].count.sum()
+        np.testing.assert_allclose((one.pairs.sum(0)[-1] / runs)[[0, 2]], squares, rtol=0.04)
+        # Three standard errors of what depends on the data, and two digits as they are printed.
+        np.testing.assert_allclose(np.diagonal(one.claimed()[-1]), claimed, rtol=0.02)
+        np.testing.assert_allclose(one.nees.sum(0)[-1] / runs / 2, size, rtol=0.04)
 
 
 @pytest.mark.slow

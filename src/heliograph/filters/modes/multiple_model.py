@@ -5,7 +5,7 @@ They differ in when Gaussians are merged; all reduce a mixture to two moments, s
 """
 
 from functools import partial
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -53,7 +53,7 @@ from heliograph.filters.wrappers.sensor_inputs import takes_sensor_inputs
 from heliograph.filters.wrappers.told import takes_told
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Estimate, Innovation
-from heliograph.model.modes_of_motion import ModalPlant, models_of
+from heliograph.model.modes_of_motion import ModalPlant, models_of, transition_over
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.premises.premise import believes
@@ -142,6 +142,7 @@ class MultipleModelFilter(AbstractSizedFilter):
     observed_angles: Angles = eqx.field(static=True)
     plant_modes: tuple[int, ...] = eqx.field(static=True)  # which of the plant's models each mode has
     sensor_modes: tuple[int, ...] = eqx.field(static=True)
+    takes_rates: ClassVar[bool] = True
 
     def angles_used(self) -> FilterAngles:
         """Return the angles of its plant, and those that its channel delivers."""
@@ -158,7 +159,7 @@ class MultipleModelFilter(AbstractSizedFilter):
     def predict(self, state: ModalBeliefs, u: ArrayLike = (), k: Step = 0) -> ModalBeliefs:
         """Move the chain, then the plant in each component; at the first prediction the chain has its initial law."""
         plants, u, modes = models_of(at(self.plant, k)), jnp.asarray(u), len(self.initial)
-        mixing, weight = self.merging.mixing_weights(state.weight, self.transition_matrix(state, k))
+        mixing, weight = self.merging.mixing_weights(state.weight, self.transition_matrix(state, u, k))
         parts = move_by_law(
             plants, np.array(self.plant_modes), self.transform, state.gaussian, mixing, self.merging.moves(modes), u,
             second_moments_at_start(self.plant),
@@ -166,9 +167,10 @@ class MultipleModelFilter(AbstractSizedFilter):
         parts = parts._replace(mean=align_angles(plants[0], parts.mean, jnp.sum(weight, axis=1)))
         return ModalBeliefs(parts, weight, jnp.asarray(True))
 
-    def transition_matrix(self, state: ModalBeliefs, k: Step) -> jax.Array:
+    def transition_matrix(self, state: ModalBeliefs, u: jax.Array, k: Step) -> jax.Array:
         """Return the transition matrix (M, M) of the chain; the identity before the first prediction."""
-        return jnp.where(state.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(self.initial)))
+        rows = transition_over(at(self.plant, k), u, jnp.asarray(at(self.channel, k).transition))
+        return jnp.where(state.moved, rows, jnp.eye(len(self.initial)))
 
     @corrects
     def correct(self, state: ModalBeliefs, z: ArrayLike, k: Step = 0) -> tuple[ModalBeliefs, Innovation]:
@@ -239,7 +241,7 @@ class MultipleModelFilter(AbstractSizedFilter):
             plants, np.array(self.plant_modes), self.transform, before.gaussian, jnp.asarray(step.u), start
         )
         pairs = jax.tree.map(lambda leaf: leaf.reshape(modes**2, *leaf.shape[2:]), moved.gaussian)
-        weights = before.law[:, None] * self.transition_matrix(step.before, k)
+        weights = before.law[:, None] * self.transition_matrix(step.before, jnp.asarray(step.u), k)
         known = after.gaussian if self.merging.corrects_pairs else step.prior.gaussian
         pairs = pairs._replace(mean=plants[0].near(pairs.mean, jnp.tile(known.mean, (modes, 1))))
         if not self.merging.corrects_pairs:

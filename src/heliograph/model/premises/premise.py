@@ -21,6 +21,7 @@ from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.module import readable
 
 WITHOUT_ATTITUDE = "no attitude (hg.extended_filter, unscented_filter and cubature_filter know them)"
+RATES_TAKEN_BY = "transitions of its modes by steps here (imm_filter, gpb1_filter and gpb2_filter take rates)"
 LIMITS_TAKEN_BY = "states without limits here (Gaussian, multiple model, mixture and particle filters take them)"
 MEAN_AND_COVARIANCE = 2  # order of the moments that a linear filter's claim rests on
 
@@ -109,6 +110,9 @@ def believing(made: B, premise: Premise | None) -> B:
     limits = () if premise is None else first(premise.plant).limits
     if limits and not getattr(made, "takes_limits", False):
         raise fail("plant", LIMITS_TAKEN_BY, f"limits of {[name for name, _ in limits]}")
+    rates = None if premise is None else getattr(first(premise.plant), "rates", None)
+    if rates is not None and not getattr(made, "takes_rates", False):
+        raise fail("plant", RATES_TAKEN_BY, "rates of switches")
     twin = copy(made)
     object.__setattr__(twin, "kept", Kept(premise))
     return twin
