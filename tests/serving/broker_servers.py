@@ -13,9 +13,9 @@ import nats.js.errors
 from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion
 
+from heliograph.serving import make_transport
 from heliograph.serving.brokers.transport import Part, Transport, encode_name
 from heliograph.serving.brokers.url import Address, parse_address
-from heliograph.serving.running import make_transport
 from heliograph_studies.live.server import Server
 
 KINDS = [pytest.param(kind, marks=pytest.mark.real(part)) for kind, part in (("nats", "NATS"), ("mqtt", "MQTT"))]

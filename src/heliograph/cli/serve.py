@@ -144,9 +144,9 @@ def serve(network: str | None = None, /, *, options: ServeOptions | None = None)
     import json
 
     from heliograph.numerics.check import fail
+    from heliograph.serving.assembly import run
     from heliograph.serving.message import schema as message_schema
     from heliograph.serving.output import schema as output_schema
-    from heliograph.serving.running import run
 
     requested = ServeOptions() if options is None else options
     # The schema needs no network.

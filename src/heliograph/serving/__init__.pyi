@@ -30,7 +30,7 @@ from .storage.store_protocol import (
 from .storage.store import (
     Store as Store,
 )
-from .running import (
+from .assembly import (
     make_transport as make_transport,
 )
 from .brokers.transport import (

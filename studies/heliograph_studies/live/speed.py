@@ -12,11 +12,11 @@ from paho.mqtt.enums import CallbackAPIVersion
 
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.network_program import NetworkProgram
+from heliograph.serving import make_transport
 from heliograph.serving.brokers.url import Address, parse_address
 from heliograph.serving.loop import serve_until
 from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
-from heliograph.serving.running import make_transport
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store import Store
 from heliograph.serving.storage.store_protocol import InMemoryStore, identity

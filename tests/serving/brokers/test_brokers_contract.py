@@ -14,10 +14,10 @@ import nats.js.errors
 from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion
 
+from heliograph.serving import make_transport
 from heliograph.serving.brokers.contract import check_transport
 from heliograph.serving.brokers.transport import Transport
 from heliograph.serving.output import Output
-from heliograph.serving.running import make_transport
 from heliograph_studies.live.server import Server
 from tests.serving.broker_servers import KINDS, at, published, running, sent, silent
 

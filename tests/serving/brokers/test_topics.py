@@ -21,10 +21,9 @@ from paho.mqtt.enums import CallbackAPIVersion
 
 import heliograph as hg
 from heliograph import cli
-from heliograph.serving import LineReader
+from heliograph.serving import LineReader, make_transport
 from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.message import Message
-from heliograph.serving.running import make_transport
 from heliograph_studies.live.server import Server, free_port
 from tests.serving.broker_servers import KINDS, at, running
 
