@@ -267,7 +267,10 @@ class CSource:
         return self.tables[key][0]
 
     def _write_loop(self, loop: Loop, indent: str) -> list[str]:
-        """Write a loop, with variables that carry numbers from turn to turn."""
+        """Write a loop: a variable for each number that is carried and read, the body, and the next turn's values.
+
+        Without a length the body has the break that ends it.
+        """
         deeper, lines = f"{indent}    ", []
         carried = [p for p, node in enumerate(loop.parameters) if {node, loop.results[p]} & self.needed.keys()]
         for index in carried:

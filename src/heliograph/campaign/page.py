@@ -148,7 +148,7 @@ def draw_campaign_figures(campaign: Campaign, scores: Sequence[Score]) -> dict[s
 
 
 def _is_axis(campaign: Campaign, name: str) -> bool:
-    """Return whether a parameter is a number that takes several values while all others are constant."""
+    """Return whether a parameter is a finite number and some settings differ in nothing but it."""
     values = parameter_values(campaign, name)
     if values.dtype.kind not in "if" or not np.all(np.isfinite(values)):
         return False

@@ -132,11 +132,14 @@ class LastWords:
         return {topic: self._number(topic) for topic in changed}
 
     def restore(self, words: Mapping[str, int]) -> None:
-        """Take words that were kept, as `changed` gives them."""
-        for topic, number in words.items():
+        """Take last words that were kept, as `changed` gives them: bit i is 1 if a topic's condition i says offline."""
+        for topic, bits in words.items():
             for i, condition in enumerate(self.about(topic)):
                 self._heard.add(condition)
-                (self._offline.add if number >> i & 1 else self._offline.discard)((condition, topic))
+                if (bits >> i) & 1:
+                    self._offline.add((condition, topic))
+                else:
+                    self._offline.discard((condition, topic))
 
     def _number(self, topic: str) -> int:
         """Return the word of a topic as a number, a bit for each condition that it is about: 1 if it is offline."""

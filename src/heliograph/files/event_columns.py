@@ -164,9 +164,9 @@ def judge(
 ) -> Int[np.ndarray, " events"]:
     """Return the number of the verdict on each event, among `VERDICTS`: the first that holds.
 
-    An event is in the future if its time is later than its arrival by more than `ahead`. It is late if an event that
-    came before it and belongs behind it was older than the arrival by more than the window. Of events of one node,
-    count and time the first stays. Where rows are joint, so does the first of a node's values at a time.
+    An event is in the future if its time is later than its arrival by more than `ahead`. It is late if its row was
+    final before it came: at each arrival the rows older than that by more than the window become final. Of events of
+    one node, count and time the first stays. Where rows are joint, so does the first of a node's values at a time.
 
     Args:
         events: the events, in order of arrival.
@@ -181,23 +181,23 @@ def judge(
     some = events.of(kept)
     # In a row of its own an event stands after inputs of its time, then by node and count.
     rank = _rank_rows(some.time) if joint else _rank_rows(some.time, some.node, some.sequence)
-    name = _rank_rows(some.time, some.node, some.sequence)
-    base = _find_newest_final(some, rank, window)
-    # Of what has one name, and of a node's values in a joint row, the first stays.
-    verdicts[kept[rank <= base if joint else rank < base]] = LATE
-    rivals = _rank_rows(some.time, some.node) if joint else name
+    identity = _rank_rows(some.time, some.node, some.sequence)
+    newest_final = _find_newest_final(some, rank, window)
+    # Of events of one identity, and of a node's values in a joint row, the first stays.
+    verdicts[kept[rank <= newest_final if joint else rank < newest_final]] = LATE
+    rivals = _rank_rows(some.time, some.node) if joint else identity
     several: Bool[np.ndarray, " names"] = np.bincount(rivals, minlength=1) > 1
-    held, filled = dict[int, int](), dict[int, np.ndarray]()
-    for i in np.flatnonzero(several[rivals] & (rank >= base)).tolist():
-        k, mine, row = int(kept[i]), int(name[i]), int(rivals[i])
+    first_of, filled = dict[int, int](), dict[int, np.ndarray]()  # of an identity; components of a row
+    for i in np.flatnonzero(several[rivals] & (rank >= newest_final)).tolist():
+        k, mine, row = int(kept[i]), int(identity[i]), int(rivals[i])
         there = ~np.isnan(values(k))
-        if mine in held:
-            same = np.array_equal(values(k), values(held[mine]), equal_nan=True)
+        if mine in first_of:
+            same = np.array_equal(values(k), values(first_of[mine]), equal_nan=True)
             verdicts[k] = DUPLICATE if same else CONFLICT
         elif joint and verdicts[k] == USED and row in filled and np.any(there & filled[row]):
             verdicts[k] = CONFLICT
         elif verdicts[k] == USED:
-            held[mine], filled[row] = k, there | filled.get(row, False)
+            first_of[mine], filled[row] = k, there | filled.get(row, False)
     return verdicts
 
 

@@ -85,15 +85,16 @@ def find_settled(recursion: Recursion, start: PyTree, rows: PyTree, ahead: int) 
     return None if choice.code is None else settled_of(varies, *choice.results())
 
 
-def settled_of(varies: tuple[bool, ...], halves: PyTree, outputs: PyTree) -> Settled | None:
+def settled_of(varies: tuple[bool, ...], after_windows: PyTree, outputs: PyTree) -> Settled | None:
     """Return the state after two windows of rows if it is the one after the first; None if not.
 
     Args:
         varies: which leaves of `outputs` depend on data.
-        halves: states of one run after either window (1, 2, ...).
+        after_windows: states of one run after the first and the second of two windows of rows (1, 2, ...).
         outputs: what is kept of the last row of either (1, 2, ...).
     """
-    halfway, end = (jax.tree.map(lambda leaf, at=at: leaf[:, at], halves) for at in (0, 1))
+    halfway, end = (jax.tree.map(lambda leaf, at=at: leaf[:, at], after_windows) for at in (0, 1))
+    # Means follow the data; all else must stand still.
     still = [np.zeros_like(mean) for mean in means_of(end)]
     if not agree(with_means(end, still), with_means(halfway, still), ROUNDING)[0]:
         return None

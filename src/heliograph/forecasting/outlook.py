@@ -181,10 +181,13 @@ _by_xla, _each_by_xla = quickly_compiled(_look_ahead), quickly_compiled(_look_ah
 
 
 def prediction_of(moments: Moments, names: tuple[str, ...], claim: Claim, angles: Angles) -> Prediction:
-    """Return the prediction of these moments (..., horizons, K, ...), its angles between -pi and pi."""
+    """Return the prediction of a mixture of K Gaussians at each horizon, its angles between -pi and pi.
+
+    `moments`: weights (..., horizons, K), means (..., horizons, K, m) and covariances (..., horizons, K, m, m).
+    """
     weights, means, covariances = map(np.asarray, moments)
     variances = np.maximum(np.diagonal(covariances, axis1=-2, axis2=-1), 0.0)
-    means = nearest(means, means[..., :1, :], angles)
+    means = nearest(means, means[..., :1, :], angles)  # within half a turn of the first part, to be averaged
     # First two moments of the mixture: within its parts, and between their means.
     mean = np.einsum("...k,...km->...m", weights, means)
     apart = means - mean[..., None, :]

@@ -214,7 +214,11 @@ def _prepend_present(past: PastReports, errors: ErrorMoments, links: ReportModel
 
 
 def _make_output_matrix(past: PastReports, length: int) -> Float[jax.Array, "M N"]:
-    """Return the output matrix of the reports: mean gains on x - e_i now, and on the reports of earlier steps."""
+    """Return C of E[reports] = C s for the state s = (x, e_1, ..., e_nodes, what was sent 1, 2, ... steps before).
+
+    A report that was sent a steps before is its mean gain times x - e_i for a = 0, times what was sent then for a > 0.
+    The reports (ages, nodes, m) are one below the other.
+    """
     ages, nodes, m, n = past.gain.shape
     size = nodes * n
     now = np.concatenate([np.tile(np.eye(n), (nodes, 1)), -np.eye(size)], axis=1)

@@ -151,10 +151,10 @@ def check_reports(links: Sequence[ReportLink], quantizers: Sequence[Quantizer], 
     """Raise ValueError unless the links of the nodes, and their quantizers or none, fit reports of n numbers."""
     for link in links:
         instance("report link", link, ReportLink, "a ReportLink").check(n)
-    for link, quantizer in zip(links, quantizers, strict=False):
+    for link, quantizer in zip(links, quantizers, strict=False):  # none, or one for each link
         if isinstance(quantizer, OverTime):
             raise fail("quantizer of reports", "one that does not vary over time", "an OverTime")
-        quantizer.error(n)
+        quantizer.error(n)  # refuses another count of components than its own
         if quantizer.holds and not link.delivers(n):
             raise fail(f"reports through {type(quantizer).__name__}, whose silence is understood", "a report link "
                        "that loses, changes and delays by chance nothing that is sent", "another")  # fmt: skip

@@ -139,7 +139,7 @@ class UnknownsLayout(NamedTuple):
         return n * (n + 1) + free + self.multipliers
 
     def unpack(self, vector: Float[np.ndarray, "size"]) -> Unknowns:
-        """Unpack the vector into matrices."""
+        """Unpack triangles of P1 and P2, then Y and a triangle of Z unless the gain is given, then the multipliers."""
         n, m = self.states, self.received
         triangle = n * (n + 1) // 2
         p1, p2 = (
@@ -147,11 +147,11 @@ class UnknownsLayout(NamedTuple):
             _mirror_lower_triangle(vector[triangle : 2 * triangle], n),
         )
         if self.gain is not None:
-            product = p2 @ self.gain
-            return Unknowns(p1, p2, product, self.gain.T @ product, vector[2 * triangle :])
+            Y = p2 @ self.gain
+            return Unknowns(p1, p2, Y, self.gain.T @ Y, vector[2 * triangle :])
         rest = vector[2 * triangle :]
-        product, spread = rest[: n * m].reshape(n, m), rest[n * m : n * m + m * (m + 1) // 2]
-        return Unknowns(p1, p2, product, _mirror_lower_triangle(spread, m), vector[self.size - self.multipliers :])
+        Y, triangle_of_z = rest[: n * m].reshape(n, m), rest[n * m : n * m + m * (m + 1) // 2]
+        return Unknowns(p1, p2, Y, _mirror_lower_triangle(triangle_of_z, m), vector[self.size - self.multipliers :])
 
 
 def _mirror_lower_triangle(entries: Float[np.ndarray, "triangle"], n: int) -> Float[np.ndarray, "{n} {n}"]:

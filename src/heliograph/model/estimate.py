@@ -189,9 +189,9 @@ AnyEstimate = TypeVar("AnyEstimate", bound=Estimate)
 
 
 def lower_unsound_claim(estimate: AnyEstimate) -> AnyEstimate:
-    """One estimate with the claim that it can have: "none" of what is no number, or of a covariance that is none.
+    """Return one estimate, with the claim "none" where its mean is no number or its covariance is none.
 
-    Several keep theirs: `claims` says of which it holds.
+    Several estimates side by side are returned as they are: `claims` says of which theirs holds.
     """
     if estimate.claim == "none" or np.ndim(estimate.mean) > 1 or is_sound(estimate).all():
         return estimate

@@ -204,36 +204,54 @@ def _send_on_delta_rate(system: _Scalar, delta: float) -> float:
     return fine if fine == coarse else float(fine + (fine - coarse) * half**2 / (h**2 - half**2))
 
 
-def _compute_rate_on_grid(system: _Scalar, delta: float, share: float) -> tuple[float, float]:
-    """Return the rate by a grid of cells of at most a share of the lesser noise's deviation, and the cells' length."""
+def _choose_cells(system: _Scalar, delta: float, share: float) -> tuple[int, int, float]:
+    """Return how many cells lie on either side of 0, how many delta spans, and their length.
+
+    Raises:
+        ValueError: more cells than can be computed.
+    """
     a, q, _, r = system
-    deviation = np.sqrt(q / (1 - a * a))
     # Cells that hold both noises, and reach over what is measured.
     cells = int(np.ceil(min(delta / (share * np.sqrt(min(q, r))), 1e9) - 0.5))
     h = delta / (cells + 0.5)  # delta is the edge of a cell
-    n = int(np.ceil(min(5.5 * np.sqrt(deviation**2 + r) / h, 1e9)))
+    n = int(np.ceil(min(5.5 * np.sqrt(q / (1 - a * a) + r) / h, 1e9)))
     if n > POINTS:
         raise fail(
             "plant, sensor and delta",
             f"a measurement whose deviation is at most {POINTS // 11} times that of either noise, and of delta",
             f"{n / 5.5:.3g} times",
         )
+    return n, cells, h
+
+
+def _compute_rate_on_grid(system: _Scalar, delta: float, share: float) -> tuple[float, float]:
+    """Return the share of steps with a message of send-on-delta, by a grid of cells, and the cells' length.
+
+    x+ = a x + w is measured as z = x + v and sent where |z - last sent| > delta: (x, last sent) is a Markov chain, here
+    on cells of at most `share` of the lesser noise's deviation.
+    """
+    a, q, _, r = system
+    deviation = np.sqrt(q / (1 - a * a))
+    n, cells, h = _choose_cells(system, delta, share)
     # A Markov chain of cells: probabilities of a cell given the middle of another, which sum to 1.
     x = np.arange(-n, n + 1) * h
     move, noise = _cells(x, a * x, np.sqrt(q)).T, _cells(x, x, np.sqrt(r))
+    # P(no message) of x in cell i, with the value of cell j sent last.
     quiet = ndtr((x + delta - x[:, None]) / np.sqrt(r)) - ndtr((x - delta - x[:, None]) / np.sqrt(r))
     # The stationary law is the eigenvector of a step for its largest eigenvalue, 1.
     size = 2 * n + 1
     low, high = np.clip(np.arange(size) - cells, 0, None), np.minimum(np.arange(size) + cells + 1, size)
 
-    # Law of (state, value sent last) after a message: the value is the one measured now.
-    def event(f: np.ndarray) -> np.ndarray:
+    def send(f: np.ndarray) -> np.ndarray:
+        """Return the law of (x, last sent) after a message: last sent is what is measured now."""
+        # Of each measured cell the mass of values sent last that lie more than delta from it.
         sums = np.cumsum(np.pad(f, ((0, 0), (1, 0))), axis=1)
         return np.asarray((sums[:, -1:] - sums[:, high] + sums[:, low]) * noise)
 
     def step(vector: np.ndarray) -> np.ndarray:
+        """Move x, then send or stay quiet."""
         f = move @ vector.reshape(size, size)
-        return np.asarray(f * quiet + event(f)).ravel()
+        return np.asarray(f * quiet + send(f)).ravel()
 
     # Power iterations (Arnoldi) from the law of the state and a value that was just sent.
     start = _cells(x, np.zeros(1), deviation).T * noise
@@ -243,7 +261,7 @@ def _compute_rate_on_grid(system: _Scalar, delta: float, share: float) -> tuple[
     except ArpackError as why:
         raise fail("delta", "one whose rate of messages converges within seconds", f"{delta:g}") from why
     f = np.real(vectors[:, 0] / vectors.sum()).reshape(size, size)
-    return float(event(move @ f).sum()), h
+    return float(send(move @ f).sum()), h
 
 
 def _cells(x: np.ndarray, means: np.ndarray, deviation: float) -> np.ndarray:

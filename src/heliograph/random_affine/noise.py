@@ -272,7 +272,7 @@ class Independent(AbstractNoise):
         return stack_branches([component.branches() for component in self.parts])
 
     def without_outliers(self) -> NoiseWithoutOutliers:
-        """Return the parts without theirs, one above the other."""
+        """Return mean and covariance of the parts without their outliers, one above the other and uncorrelated."""
         parts = [component.without_outliers() for component in self.parts]
         mean = library(parts).concatenate([part.mean for part in parts])
         return NoiseWithoutOutliers(mean, block_diagonal([part.covariance for part in parts]))

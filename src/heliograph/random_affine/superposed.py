@@ -145,7 +145,10 @@ class Superposed(AbstractCombination):
         return self.covers_maps(own, same_noise)
 
     def carry_known_gains(self, known: KnownGains) -> KnownGains:
-        """Return the outputs that are known in every map."""
+        """Return for each output whether its gain is known: that of a sum is where it is in every summand.
+
+        `known`: the same of each input.
+        """
         parts = zip(self.maps, self.places, strict=True)
         rows: KnownGains = np.all([affine.carry_known_gains(known[list(at)]) for affine, at in parts], axis=0)
         return rows

@@ -113,7 +113,10 @@ class Judges:
 def find_refused_rows(
     network: Network, outcome: Mapping[str, PyTree]
 ) -> tuple[dict[str, dict[int, str]], dict[int, str]]:
-    """Return rows of a recording that are implausible, each with its reason: by node, and to all central filters."""
+    """Return the rows of a recording that are implausible, with the reason: by node, and to the central filters.
+
+    Nodes without filters of their own are judged by the central ones, all alike: the first tells for all.
+    """
     judges, refused = Judges(network), dict[str, dict[int, str]]()
     shared = judges.without_own
     for name in network.names:

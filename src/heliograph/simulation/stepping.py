@@ -120,8 +120,12 @@ class AllFilters(Module):
     def _init_centre(
         self, centre: Centre | LinearisedCentre, states: Sequence[PyTree]
     ) -> CentreState | dict[str, Followed]:
-        beliefs = [(gaussian_of(states[kind]), self.alike[kind].count, f) for kind, f in centre.sources]
-        return centre.init([x.mean.reshape(count, -1, self.n)[f] for x, count, f in beliefs])
+        """Return the state in which a centre begins, from the first means of the filters whose estimates it fuses.
+
+        Those of one kind are stacked, (filter, node, n), of which a source takes filter number f.
+        """
+        sources = [(gaussian_of(states[kind]), self.alike[kind].count, f) for kind, f in centre.sources]
+        return centre.init([x.mean.reshape(count, -1, self.n)[f] for x, count, f in sources])
 
     @property
     def are_linear(self) -> bool:

@@ -114,7 +114,11 @@ def _compare_runs(
     units: dict[str, Units],
     common: bool,
 ) -> float:
-    """Run the network in other units; return the largest difference of an estimate, as a share of what is allowed."""
+    """Run the network in other units; return the largest difference of an estimate, as a share of what is allowed.
+
+    `common`: whether all nodes have one set of units. Estimates that are searched for, as by intersection, change in
+    more digits with the units of one node alone, and are compared only then.
+    """
     nodes = {name: _rescale_node(name, node, units[name]) for name, node in _list_nodes(network).items()}
     fused = {name: _rescale_fusion(name, fusion, units[Network.FUSED]) for name, fusion in network.fused.items()}
     scaled = Network(rescale_plant(network.plant, units[Network.FUSED]), nodes, fused)
@@ -125,10 +129,9 @@ def _compare_runs(
         for name, estimate in filters.items():
             searches = _has_search_in_estimate(network, node, name)
             if common or not searches:
-                difference = _find_difference(estimate, estimates[node][name], units[node].states) / DIGITS
-                worst = max(
-                    worst, _report_largest(f"{node}/{name}", difference * (DIGITS / SEARCHED if searches else 1.0))
-                )
+                allowed = SEARCHED if searches else DIGITS
+                difference = _find_difference(estimate, estimates[node][name], units[node].states) / allowed
+                worst = max(worst, _report_largest(f"{node}/{name}", difference))
     return worst
 
 

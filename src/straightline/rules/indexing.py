@@ -41,7 +41,7 @@ def _is_inside(lowering: Lowering, equation: JaxprEqn, shape: tuple[int, ...], i
 
 
 def _gather_clipped(equation: JaxprEqn, lowering: Lowering, x: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """Gather at indices that are clipped to the array."""
+    """Gather at indices that are clipped to the array; where data decide them, all places are compared."""
     at = known_integers(indices)
     if at is None:
         return _gather_by_cases(lowering, equation, x, indices)

@@ -42,7 +42,7 @@ def is_bag(path: Path) -> bool:
 
 
 def parts_of(path: Path) -> list[Path]:
-    """Return the files of a folder of bags that has no metadata of ROS 2, in the order of their names."""
+    """Return the bags in a folder in the order of their names; none where it is one bag of ROS 2, with its metadata."""
     if not path.is_dir() or (path / "metadata.yaml").is_file():
         return []
     return sorted(file for file in path.iterdir() if file.suffix.lower() in BAGS)

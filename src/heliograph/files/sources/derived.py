@@ -131,6 +131,7 @@ class Geodetic:
     metres: float = 1.0
 
     def __post_init__(self) -> None:
+        """Refuse fields that are no dotted paths, of which the height alone may be None, and units that are none."""
         instance("Geodetic, plane", self.plane, LocalPlane, "a hg.models.LocalPlane")
         for name in ("latitude", "longitude", "height"):
             path = getattr(self, name)

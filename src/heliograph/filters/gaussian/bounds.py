@@ -89,10 +89,16 @@ def observe_by_young(signal: Signal, channel: SecondOrder, z: ArrivedInnovation,
 
 
 def observe_by_zero_mean(signal: Signal, channel: SecondOrder, z: ArrivedInnovation, scalar: Array) -> Gaussian:
-    """Update by `ZeroMean`; scalar (1,), NaN to optimise it.
+    """Update by `ZeroMean`, for an error of which the mean is zero and the correlation with the gain is not known.
 
-    Omega = power(Pyy) + spread(yhat yhat') + shift(Pyy) / beta is at least M H P H' M', so that the rest is a noise;
-    beta times what the received components explain of P, C Pyy^+ C', is added.
+    For each beta > 0 the bound is P, updated by a measurement with the noise Omega - M H P H' M', plus beta C Pyy^+ C':
+    Omega = power(Pyy) + spread(yhat yhat') + shift(Pyy) / beta, and C Pyy^+ C' is what the received components explain.
+
+    Args:
+        signal: moments of the state and of y, jointly.
+        channel: what is received of y.
+        z: innovation, and which components arrived.
+        scalar: log beta (1,), NaN for the one of least trace.
     """
     prior, present = signal.prior, z.present
     slopes, of_state, _ = _select_received(signal, channel, present)

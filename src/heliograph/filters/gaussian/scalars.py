@@ -91,7 +91,21 @@ def young_fixed_point_map(
 def zero_mean_fixed_point_map(
     t: jax.Array, base: jax.Array, shift: jax.Array, power: jax.Array, whole: jax.Array
 ) -> tuple[jax.Array, Slopes]:
-    """Map log beta to its next value, beta = sqrt(tr W S / tr explained) with Omega = base + S / beta; with slopes."""
+    """Map t = log beta to its next value, in the search of the beta that minimises the bound's trace.
+
+    The trace is tr P - tr(Omega^-1 power) + beta whole, Omega = base + S / beta, S = shift. It is stationary where
+    beta^2 whole = tr(W S), W = Omega^-1 power Omega^-1: the next beta is sqrt(tr(W S) / whole).
+
+    Args:
+        t: log beta (1,).
+        base: what Omega has beside S / beta (m, m).
+        shift: S (m, m).
+        power: C' C of the cross-covariance C of state and measurement (m, m).
+        whole: trace of what the received components explain of the state.
+
+    Returns:
+        The next log beta, and its derivatives by t.
+    """
     beta = jnp.exp(t[0])
     weight, (s,) = _trace_weight(base + shift / beta, power, (shift,))
     ws = weight @ shift

@@ -217,12 +217,13 @@ def _describe_hop(hop: AbstractRandomAffine) -> HopRange:
     """Describe one hop by intervals of E g and E g^2; refuse one that is not one gain with zero-mean noise."""
     if not isinstance(hop, GainAndNoise) or not _is_multiple_of_identity(hop.matrix) or np.any(hop.noise.mean):
         raise fail("interval bound", "a chain of hops, each one gain for all components and zero-mean noise", hop)
-    radius, law = (0.0, 0.0), hop.law
+    # Probabilities p_i within r_i: E g within sum |v_i| r_i of its nominal value, E g^2 at most sum v_i^2 r_i above.
+    law, mean_radius, second_radius = hop.law, 0.0, 0.0
     if isinstance(law, Discrete):
-        radius = (float(np.abs(law.values) @ law.radius), float(law.values**2 @ law.radius))
+        mean_radius, second_radius = float(np.abs(law.values) @ law.radius), float(law.values**2 @ law.radius)
     amplitude = float(hop.matrix[0, 0])
     mean, second = float(law.moment(1)), float(law.moment(2))
-    return HopRange(amplitude, mean, radius[0], second + radius[1], np.asarray(hop.noise.covariance))
+    return HopRange(amplitude, mean, mean_radius, second + second_radius, np.asarray(hop.noise.covariance))
 
 
 def _is_multiple_of_identity(matrix: jax.Array | np.ndarray) -> bool:

@@ -175,6 +175,9 @@ def clock_filter(
 ) -> ClockFilter:
     """Return the filter of plant and clocks, as `with_clocks` makes them, that detects when a clock cannot be observed.
 
+    While the last steps of the trajectory leave an offset unobservable it is not corrected, only considered: its
+    variance counts in every update (Schmidt).
+
     Args:
         plant: the plant with its clocks' offsets and drifts among the states.
         sensor: the sensor of all nodes together (`joint_sensor`), m outputs.

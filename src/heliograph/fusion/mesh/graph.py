@@ -143,19 +143,19 @@ def graph_of(neighbours: Mapping[str, Sequence[str]], nodes: Sequence[str]) -> G
 
 
 def upstream(graph: Graph) -> list[Int[np.ndarray, " senders"]]:
-    """Places of the nodes from which a directed path leads to each node, itself included; one array where all are.
+    """Return, for each node, the places of the nodes from which a directed path leads to it, itself included.
 
-    Nodes of one strongly connected component share them.
+    Nodes that are reached from the same ones, as those of one strongly connected component, share one array.
     """
     count = len(graph.nodes)
-    rows = [row[there].tolist() for row, there in zip(graph.senders, graph.present, strict=True)]
-    # Sets of nodes as bits: each with those of its senders, forth and back until nothing is added.
-    behind, before = [1 << i for i in range(count)], list[int]()
-    while behind != before:
-        before = list(behind)
+    senders = [row[there].tolist() for row, there in zip(graph.senders, graph.present, strict=True)]
+    # Bit j of reached[i]: a path leads from j to i. Each takes its senders' bits, until nothing is added.
+    reached, before = [1 << i for i in range(count)], list[int]()
+    while reached != before:
+        before = list(reached)
         for i in (*range(count), *reversed(range(count))):
-            for sender in rows[i]:
-                behind[i] |= behind[sender]
-    bits = {known: np.frombuffer(known.to_bytes(count // 8 + 1, "little"), np.uint8) for known in set(behind)}
+            for sender in senders[i]:
+                reached[i] |= reached[sender]
+    bits = {known: np.frombuffer(known.to_bytes(count // 8 + 1, "little"), np.uint8) for known in set(reached)}
     places = {known: np.flatnonzero(np.unpackbits(row, bitorder="little")) for known, row in bits.items()}
-    return [places[known] for known in behind]
+    return [places[known] for known in reached]

@@ -11,7 +11,7 @@ MOST_STEPS = 200
 FIRST_RADIUS = 10.0  # of the trust region, in standard errors
 WIDER, NARROWER = 3.0, 0.25  # factors of the radius after a step that the model foretold well, and badly
 FLAT = 1e-10  # eigenvalue of the scaled information below which a direction is not identified
-CLOSE = 1e-15  # g' H^-1 g: twice the likelihood that a full step gains, 3e-8 standard errors away
+CLOSE = 1e-15  # g' H^-1 g: twice the log-likelihood that a full step gains, 3e-8 standard errors away
 NEAR = 1e-8  # the same where rounding lets nothing better be found: 1e-4 standard errors
 NOISE = 1e-13  # rounding of a log-likelihood, as a share of its size
 AT_LIMIT = 1e-6  # nats that remain to be gained on the way to the end of a domain
@@ -164,9 +164,10 @@ def _mark_arrived(state: _State, moving: np.ndarray, domains: Domains, close: fl
 
 
 def find_at_limits(x: np.ndarray, gradient: np.ndarray, domains: Domains) -> Bool[np.ndarray, "lanes p"]:
-    """Return the coordinates on whose way to the end of their domain the likelihood rises, but hardly.
+    """Return the coordinates at an end of their domain: on the way there the log-likelihood gains less than AT_LIMIT.
 
-    Where v = exp(x) is small l(0) - l(v) = -v l'(v) = -dl/dx to first order.
+    A number v = exp(x) has its end v = 0 at x = -inf (`low`), or v = inf at x = inf (`high`). To first order what is
+    left to gain is l(0) - l(v) = -v l'(v) = -dl/dx.
     """
     outward = np.where(domains.high & (x > 0), 1.0, np.where(domains.low, -1.0, 0.0))
     rise = outward * gradient

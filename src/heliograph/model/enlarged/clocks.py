@@ -109,17 +109,21 @@ def _step(plant: AbstractPlant, dt: ArrayLike | str) -> Any:
 
 
 def _make_clocks(clocks: Mapping[str, Clock], dt: str | Any) -> LinearPlant:
-    """Return offset and drift of each clock: o+ = o + dt d, d+ = d + its wandering, all independent at the start."""
+    """Return offset and drift of each clock: o+ = o + dt d, d+ = d + its wandering, all independent at the start.
+
+    Steps of one length: the drift gains the variance `wander` at each. Lengths that vary, by an input: it gains
+    wander dt within a step, as white noise does, and the offset what that makes of it.
+    """
     spread, wander, start_at, states = [], [], [], []
     for name, clock in clocks.items():
         instance(f"clock of {name!r}", clock, Clock, "a Clock")
         start_at += [scalar(f"delay of the clock of {name!r}", clock.delay), 0.0]
-        clock_offset, drift, gain = (
+        offset_deviation, drift_deviation, wander_of = (
             scalar(f"{field} of the clock of {name!r}", getattr(clock, field), 0.0)
             for field in ("offset", "drift", "wander")
         )
-        spread += [clock_offset**2, drift**2]
-        wander.append(gain)
+        spread += [offset_deviation**2, drift_deviation**2]
+        wander.append(wander_of)
         offset = f"{name}_offset"  # in the unit of dt, where that is an input with one
         states += [rename(dt, offset) if isinstance(dt, str) else offset, f"{name}_drift"]
     center, start, strength = (library(x).asarray(library(x).stack(x)) for x in (start_at, spread, wander))

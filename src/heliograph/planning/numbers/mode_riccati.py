@@ -95,7 +95,10 @@ def _solve_periodic(m: ModeSystem) -> tuple[Parts, np.ndarray]:
 
 
 def _step_through(m: ModeSystem, parts: Float[np.ndarray, "_ n n"]) -> tuple[Parts, np.ndarray]:
-    """X and the best gains of each step, from X before the first, of all modes together where its chain forgets."""
+    """Run the coupled Riccati recursion over all steps: X after each (steps, modes, n, n) and its best gains.
+
+    `parts` is X before the first step, by mode; one for all modes together where their chain has no memory.
+    """
     steps = []
     for k in range(len(m.law)):
         gain, parts = _update(m, k, parts)

@@ -73,7 +73,10 @@ def describe_second_moments(
 
 
 def divide_spread(spread: Tensor) -> tuple[Tensor, Columns]:
-    """Spread of the gain alone, and m columns of Cov n, from the spread of both; of none where they are correlated."""
+    """Split the covariances of (A, n), (m, m, n + 1, n + 1) by output, into those of A and m columns of Cov n.
+
+    Where A and n are correlated nothing is split: the covariances as they are, and columns of zero.
+    """
     xp, covariance = library(spread), spread[..., -1, -1]
     apart = xp.all(spread[..., :-1, -1] == 0)
     corner = np.zeros(spread.shape[-2:])

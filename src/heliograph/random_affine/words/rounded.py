@@ -133,17 +133,18 @@ class Rounded(AbstractNoise):
         return SignalNoise(self._with_error(error * self.step**2), whole)
 
     def _average_place(self, mean: Vector, variances: Vector) -> jax.Array:
-        """E f(1 - f) = 1/6 - sum_k exp(-2 pi^2 k^2 s^2 / D^2) cos(2 pi k (m - low) / D) / (pi k)^2; what is left above.
+        """Bound E f (1 - f) from above, f the place of y between two words, in steps D, for y of N(m, s^2).
 
-        The series is cut after TERMS, and the bound of the rest is added: sum_{k > K} 1 / (pi k)^2 <= 1 / (pi^2 K).
+        E f (1 - f) = 1/6 - sum_k exp(-2 pi^2 k^2 s^2 / D^2) cos(2 pi k (m - low) / D) / (pi k)^2. The series is cut
+        after K = TERMS, and the bound of its tail is added: sum_{k > K} 1 / (pi k)^2 <= 1 / (pi^2 K).
         """
         k = np.arange(1, TERMS + 1)[:, None]
         size = jnp.asarray(variances) / jnp.asarray(self.step) ** 2
         place = (jnp.asarray(mean) + jnp.asarray(self.half)) / jnp.asarray(self.step)
         place = place - jnp.floor(place)
         damped = jnp.exp(-2 * np.pi**2 * k**2 * size) / (np.pi * k) ** 2
-        left = jnp.exp(-2 * np.pi**2 * TERMS**2 * size) / (np.pi**2 * TERMS)
-        share = 1 / 6 - jnp.sum(damped * jnp.cos(2 * np.pi * k * place), axis=0) + left
+        tail = jnp.exp(-2 * np.pi**2 * TERMS**2 * size) / (np.pi**2 * TERMS)
+        share = 1 / 6 - jnp.sum(damped * jnp.cos(2 * np.pi * k * place), axis=0) + tail
         return jnp.clip(share, 0.0, 0.25)
 
     def _squares(self) -> Square:

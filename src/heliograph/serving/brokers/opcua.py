@@ -7,6 +7,7 @@ import logging
 import time
 from collections.abc import Sequence
 from datetime import UTC, datetime
+from math import isfinite
 from typing import NamedTuple
 
 from asyncua import Client, Node, ua
@@ -253,11 +254,15 @@ async def _find_variables(client: Client) -> list[Node]:
 
 
 def _translate_change(node: Node, value: object, data: DataChangeNotif) -> tuple[str, bytes]:
-    """Return the topic of a change and its message; null is a value of bad quality."""
+    """Return the topic of a change and its message; null is a value of bad quality, or that is no number."""
     sample = data.monitored_item.Value
     good = sample.StatusCode is None or sample.StatusCode.is_good()
+    if not good or (isinstance(value, float) and not isfinite(value)):  # JSON has neither NaN nor infinity
+        value = None
+    elif not isinstance(value, bool | int | float):
+        value = show_value(value)
     content = {
-        "value": value if good and isinstance(value, bool | int | float) else None if not good else show_value(value),
+        "value": value,
         "source_time": _format_date(sample.SourceTimestamp),
         "server_time": _format_date(sample.ServerTimestamp),
     }

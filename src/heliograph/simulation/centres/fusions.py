@@ -78,7 +78,7 @@ class StackedFusions(Module):
         return states, {name: Estimate(mean[i], covariance[i], claim) for i, (name, claim) in items}, uplinks
 
     def _gather(self, parts: Sequence[jax.Array | np.ndarray]) -> jax.Array:
-        """Gather the sources' values as (fusion, node, ...)."""
+        """Return the sources' values by kind (filter, node, ...) as (fusion, node, ...), in each fusion's order."""
         joined = [jnp.concatenate([parts[k][f] for k, f in source]) for source in self.sources]
         if all(np.array_equal(order, np.arange(len(order))) for order in self.order):
             return jnp.stack(joined)

@@ -247,7 +247,10 @@ class _Noises(eqx.Module):
 
 
 def _declared_variances(place: Place, z: Float[np.ndarray, "steps received"]) -> Float[np.ndarray, "steps outputs"]:
-    """Return the variances that each row declares, NaN where a number is missing."""
+    """Return the variances that the message of each row declares, NaN where one of its numbers is missing.
+
+    Typical numbers stand for missing ones meanwhile, so that the law has a variance for every row.
+    """
     numbers = z[:, place.numbers]
     complete = ~np.isnan(numbers).any(axis=1)[:, None]
     variances = np.asarray(over_runs(_Noises(place.told), np.where(complete, numbers, np.asarray(place.told.typical))))
