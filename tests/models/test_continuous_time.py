@@ -93,6 +93,16 @@ def test_substeps_are_steps():
     np.testing.assert_allclose(once, x, atol=1e-14)
 
 
+def test_limits_of_states_are_handed_on():
+    limits, drift = {"x0": (-1, None)}, lambda x, u: SPRING @ x
+    for dt in (None, 0.2):
+        plants = (
+            hg.models.continuous_plant(SPRING, SHAKEN, [0, 0], 1.0, dt=dt, limits=limits),
+            (hg.models.runge_kutta_plant(drift, SHAKEN, [0, 0], 1.0, dt, limits=limits)),
+        )
+        assert [plant.limits for plant in plants] == [(("x0", (-1.0, np.inf)),)] * 2
+
+
 def test_constant_velocity_is_filterpys():
     noise = hg.models.constant_velocity(0.1, dt=0.5).noise.covariance
     np.testing.assert_allclose(noise, Q_continuous_white_noise(2, 0.5, 0.1), rtol=1e-14)
@@ -108,6 +118,7 @@ def test_constant_velocity_is_filterpys():
         (lambda m: m.discretize(SPRING[:1], SHAKEN, 1.0), "matrix of the motion: expected shape"),
         (lambda m: m.continuous_plant(SPRING, SHAKEN, [0, 0], 1.0, [[0], [1]], inputs=["dt"]), "no 'dt'"),
         (lambda m: m.runge_kutta_plant(lambda x, u: x[:1], 1.0, [0, 0], 1.0), "drift.*expected shape"),
+        (lambda m: m.continuous_plant(SPRING, SHAKEN, [0, 0], 1.0, limits={"x1": (1, 2)}), "x1"),
         (lambda m: m.constant_velocity(-1.0), "noise intensity: expected a number of at least 0"),
         (lambda m: m.singer(1.0, 0.0), "time: expected a number of at least 1e-100"),
         (lambda m: m.known_turn(1.0, 0.1, axes=["x"]), "axes: expected two"),

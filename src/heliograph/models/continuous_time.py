@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
+from heliograph.model.intervals import StateLimitsLike
 from heliograph.model.plant import TIME_STEP, LinearPlant
 from heliograph.numerics.check import array, covariance, fail, name_list, names, scalar
 from heliograph.numerics.module import Module, readable
@@ -184,6 +185,7 @@ def continuous_plant(
     dt: Number | None = None,
     states: Names | None = None,
     inputs: Names | None = None,
+    limits: StateLimitsLike = (),
 ) -> LinearPlant:
     """Return the plant of dx = (A x + B u) dt + dW, exact for steps of any length.
 
@@ -199,10 +201,11 @@ def continuous_plant(
         dt: length of every step; by default the input "dt" says it.
         states: names of the states, or a mapping of names to units; x0, x1, ... by default.
         inputs: names of the columns of B; u0, u1, ... by default.
+        limits: lowest and highest values of states that filters believe possible, as of `hg.Plant`; none by default.
 
     Raises:
         ValueError: matrices of other shapes, an intensity that is no covariance, a step that goes backwards, an input
-            that is called "dt" already.
+            that is called "dt" already, limits that exclude the initial mean.
 
     Source: Van Loan, Computing integrals involving the matrix exponential (1978).
     """
@@ -211,7 +214,8 @@ def continuous_plant(
     named = names("input names", inputs, count, "u")
     if dt is not None:
         step = model.over(scalar("length of a step", dt, 0.0))
-        return LinearPlant(step.matrix, step.noise, initial_mean, initial_covariance, step.input_matrix, states, named)
+        parts = step.matrix, step.noise, initial_mean, initial_covariance, step.input_matrix, states, named
+        return LinearPlant(*parts, limits=limits)
     every = with_time_step(named)
     return LinearPlant(
         MatrixOver(model, count),
@@ -221,6 +225,7 @@ def continuous_plant(
         InputsOver(model, count) if count else None,
         states,
         every,
+        limits=limits,
     )
 
 

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.model.intervals import StateLimitsLike
 from heliograph.model.plant import Plant, check_shape
 from heliograph.models.continuous_time import Continuous, Drift, Number, Square, Start, with_time_step
 from heliograph.numerics.check import array, check_count, covariance, function, name_list, scalar
@@ -72,6 +73,7 @@ def runge_kutta_plant(
     circular: Names = (),
     substeps: int = 1,
     linearized_at: Start | None = None,
+    limits: StateLimitsLike = (),
 ) -> Plant:
     """Return the plant of dx = f(x, u) dt + dW by the classical Runge-Kutta step, of order 4: local error dt^5.
 
@@ -90,6 +92,7 @@ def runge_kutta_plant(
         circular: states that are angles, in radians; none by default.
         substeps: Runge-Kutta steps to a step (default 1).
         linearized_at: state at which J is taken (n,); `initial_mean` by default.
+        limits: lowest and highest values of states that filters believe possible, as of `hg.Plant`; none by default.
 
     Raises:
         ValueError: a drift that returns no state, an intensity that is no covariance, what `hg.Plant` refuses.
@@ -111,4 +114,5 @@ def runge_kutta_plant(
         states,
         own if step is not None else with_time_step(own),
         [str(name) for name in name_list("circular states", circular)],
+        limits=limits,
     )
