@@ -23,9 +23,9 @@ FUNCTIONS = {name: name for name in (
 # What is more than one operator or function; a and b are names or literals, never expressions.
 COMPOSED: dict[str, Callable[..., str]] = {
     "neg": "-{0}".format,
-    "max": "(isgreater({0}, {1}) || {0} != {0} || ({0} == {1} && !signbit({0})) ? {0} : {1})".format,
-    "min": "(isless({0}, {1}) || {0} != {0} || ({0} == {1} && signbit({0})) ? {0} : {1})".format,
-    "sign": "(isgreater({0}, 0) ? 1 : isless({0}, 0) ? -1 : {0})".format,
+    "max": "((isgreater({0}, {1}) || ({0} != {0}) || (({0} == {1}) && !signbit({0}))) ? {0} : {1})".format,
+    "min": "((isless({0}, {1}) || ({0} != {0}) || (({0} == {1}) && signbit({0}))) ? {0} : {1})".format,
+    "sign": "(isgreater({0}, 0) ? 1 : (isless({0}, 0) ? -1 : {0}))".format,
     "is_finite": "!!isfinite({0})".format,
 }
 # Operations on integers, of b bits: {t} the type, {u} that without a sign. What C leaves undefined is JAX's: numbers
@@ -69,7 +69,7 @@ def literal(value: float | int | bool, type: Type, real: Real) -> str:
     if type == "bool":
         return "1" if value else "0"
     if type not in REAL:
-        ending = f"{'u' if type[0] == 'u' else ''}{'ll' if type[1:] == '64' else ''}"
+        ending = f"{'U' if type[0] == 'u' else ''}{'LL' if type[1:] == '64' else ''}"
         if value >= 0:
             return f"{int(value)}{ending}"
         return f"({int(value) + 1}{ending} - 1)"  # of the least number C has no literal

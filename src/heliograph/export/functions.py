@@ -60,9 +60,9 @@ def write_functions(program: StepProgram, prefix: str, real: Real) -> list[str]:
     step = [
         f"    {prefix}_state after = *state;",
         f"    int refused = {prefix}_predict(&after, u);",
-        "    if (refused) return refused;",
-        f"    refused = {prefix}_correct(&after, z, 0);",
-        "    if (refused) return refused;",
+        "    if (refused != 0) { return refused; }",
+        f"    refused = {prefix}_correct(&after, z, NULL);",
+        "    if (refused != 0) { return refused; }",
         "    *state = after;",
         "    return 0;",
     ]
@@ -75,15 +75,17 @@ def _join(head: str, body: list[str]) -> str:
 
 
 def _check_measurement(program: StepProgram) -> list[str]:
-    return [f"    if (isinf(z[{i}])) return 1;" for i in range(program.filter.received)]
+    return [f"    if (isinf(z[{i}]) != 0) {{ return 1; }}" for i in range(program.filter.received)]
 
 
 def _check_inputs(program: StepProgram, both: bool = False) -> list[str]:
     """Return the statements that refuse inputs, and a step past the end; of a whole step measurements first."""
     filter = program.filter
     lines = _check_measurement(program) if both else []
-    lines += [f"    if (!isfinite(u[{i}])) return 2;" for i in range(len(filter.inputs))]
-    return [*lines, f"    if (state->step >= {filter.horizon}) return 3;"] if filter.horizon is not None else lines
+    lines += [f"    if (!isfinite(u[{i}])) {{ return 2; }}" for i in range(len(filter.inputs))]
+    return (
+        [*lines, f"    if (state->step >= {filter.horizon}) {{ return 3; }}"] if filter.horizon is not None else lines
+    )
 
 
 def _compute(program: StepProgram, number: int, prefix: str) -> list[str]:
@@ -99,12 +101,14 @@ def _compute(program: StepProgram, number: int, prefix: str) -> list[str]:
     return [
         f"    {prefix}_state after;",
         *([f"    {prefix}_innovation news;"] if told else []),
-        f"    unsigned char {', '.join(f'{name}[1]' for name in flags)};",
+        *(f"    unsigned char {name}[1];" for name in flags),
         f"    {code.name}(\n        " + ",\n        ".join(arguments) + ");",
-        *(["    if (innovation) *innovation = news;"] if told else []),
-        *(["    if (spoilt[0]) return 6;"] if "spoilt" in flags else []),
-        f"    for (int i = 0; i < {len(program.filter.states)}; ++i) if (!isfinite(after.{program.mean}[i])) return 4;",
-        "    if (implausible[0]) return 5;",
+        *(["    if (innovation != NULL) { *innovation = news; }"] if told else []),
+        *(["    if (spoilt[0] != 0U) { return 6; }"] if "spoilt" in flags else []),
+        f"    for (int i = 0; i < {len(program.filter.states)}; ++i) {{",
+        f"        if (!isfinite(after.{program.mean}[i])) {{ return 4; }}",
+        "    }",
+        "    if (implausible[0] != 0U) { return 5; }",
         *([f"    after.step = {step};"] if program.counts else []),
         "    *state = after;",
     ]
@@ -131,7 +135,7 @@ def _write_start(program: StepProgram, prefix: str) -> list[str]:
         f"    {prefix}_state after;",
         "    unsigned char none[1];",
         f"    {program.at.name}(mean, covariance, {members}, none);",
-        "    if (none[0]) return 7;",
+        "    if (none[0] != 0U) { return 7; }",
         *(["    after.step = 0;"] if program.counts else []),
         "    *state = after;",
         "    return 0;",

@@ -170,6 +170,7 @@ _SOURCE = """/* {comment} */
 #include "{prefix}.h"
 
 #include <math.h>
+#include <stddef.h>
 
 #ifdef __FAST_MATH__
 #error "a missing component is NaN, which this mode of the compiler does not know"
