@@ -74,7 +74,7 @@ def runge_kutta_plant(
     substeps: int = 1,
     linearized_at: Start | None = None,
     limits: StateLimitsLike = (),
-) -> Plant:
+) -> "Plant":
     """Return the plant of dx = f(x, u) dt + dW by the classical Runge-Kutta step, of order 4: local error dt^5.
 
     Inputs are held over a step. The noise is the integral of exp(J s) S exp(J s)' over the step, with the Jacobian J of
