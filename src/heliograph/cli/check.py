@@ -32,8 +32,9 @@ def check(
     """Show your own network as a diagram, and what is doubtful in it before any data.
 
     Judged are states that no sensor shows, errors that grow without end, memory of links that a filter ignores, what
-    links share, and what native code does not take, such as a filter of your own, with the line. The exit status is 0
-    where nothing is doubtful, 1 where something is, and 2 for bad input.
+    links share, what native code does not take, such as a filter of your own, with the line, and which filters go row
+    by row however long a recording is. The exit status is 0 where nothing is doubtful, 1 where something is, and 2 for
+    bad input.
 
     With --without or --outage also what sensors are worth: the error of one filter of all nodes at the end of a run,
     with a node left out of all of it or of its last steps, and how many times that of all nodes it is.

@@ -62,6 +62,17 @@ def test_a_network_that_native_code_takes_says_nothing():
     assert list_fallbacks(network({"own": Own(), "kalman": hg.kalman_filter(PLANT, SENSOR)})) == []
 
 
+def test_filters_that_stay_sequential_are_named():
+    curved = hg.Sensor(lambda x: x, 0.1 * np.eye(2), ["a", "b"])
+    filters = {"kalman": hg.kalman_filter(PLANT, SENSOR)}
+    bent = {"extended": hg.extended_filter(PLANT, curved), "cubature": hg.cubature_filter(PLANT, curved)}
+    said = "row by row however long a recording is, since not linear in its data: "
+    nodes = {"a": hg.Node(SENSOR, hg.perfect(2), filters), "b": hg.Node(curved, hg.perfect(2), bent)}
+    lines = [words for serious, words in doubts_before_data(hg.Network(PLANT, nodes)) if "row by row" in words]
+    assert lines == [f"{said}filter 'extended' of node 'b', filter 'cubature' of node 'b'"]
+    assert not any("row by row" in words for _, words in doubts_before_data(network(filters)))
+
+
 def test_a_filter_of_one_s_own_that_is_refused_is_named_with_its_line():
     """Once for all nodes that have it; and native code forced or not, nothing is raised."""
     item = network({"own": Own(by_svd=True), "kalman": hg.kalman_filter(PLANT, SENSOR)}, 5)

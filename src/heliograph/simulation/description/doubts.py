@@ -31,7 +31,7 @@ from heliograph.simulation.boundedness import certify_boundedness
 from heliograph.simulation.claims import Belief, list_other_beliefs
 from heliograph.simulation.declared.refit import list_declaring
 from heliograph.simulation.description.diagram import list_rounded, list_shared
-from heliograph.simulation.description.fallbacks import list_fallbacks
+from heliograph.simulation.description.fallbacks import list_fallbacks, list_sequential
 from heliograph.simulation.description.separable import separate_nodes
 from heliograph.simulation.description.wide_angles import warn_wide_at_start
 from heliograph.simulation.network import Network
@@ -73,6 +73,8 @@ def doubts_before_data(network: Network) -> list[Doubt]:
     lines += [Doubt(False, f"digits: {words}; make tables {DOUBLE}") for words in list_rounded(network)]
     lines += [Doubt(False, f"shared, so that losses come together: {words}") for words in list_shared(network)]
     lines += [Doubt(False, f"by XLA, which takes longer: {words}") for words in list_fallbacks(network)]
+    if those := list_sequential(network):
+        lines.append(Doubt(False, f"row by row however long a recording is, since not linear in its data: {those}"))
     lines += [*_find_declared_noise(network), *_find_reservations(network), *_find_overloads(network)]
     parts = separate_nodes(network)
     if len(parts) > 1:

@@ -1,4 +1,4 @@
-"""What native code refuses in a network, so that XLA computes it: which filters and fusions, and why."""
+"""Which filters and fusions of a network take longer than others, and why: those by XLA, and those row by row."""
 
 from collections.abc import Iterator
 
@@ -24,17 +24,28 @@ def list_fallbacks(network: Network) -> list[str]:
     return [f"{_join(those)}: {why}" for why, those in by_reason.items()]
 
 
-def _find_refused_filters(network: Network) -> Iterator[tuple[str, str]]:
-    """Yield each filter whose step is refused, with the reason."""
+def list_sequential(network: Network) -> str:
+    """Return which filters go row by row however long a recording is, "" if none does: those not linear in its data."""
+    those = [who for who, filter in _list_filters(network) if not filter.is_linear]
+    return _join(those) if those else ""
+
+
+def _list_filters(network: Network) -> Iterator[tuple[str, AbstractFilter]]:
+    """Yield each filter of the network, with who it is in words."""
     central = {name: fusion for name, fusion in network.fused.items() if isinstance(fusion, AbstractFilter)}
     places = [(f" of node {name!r}", network.nodes[name].filters) for name in network.names]
     for where, filters in (*places, ("", central)):
-        for label, named in filters.items():
-            filter = without_output_names(named)  # so that filters of one structure are compiled once
-            z, u = jnp.zeros(filter.received), jnp.zeros(len(filter.inputs))
-            state = jax.tree.map(jnp.asarray, filter.init())
-            if why := explain_refusal(_step, filter, state, z, u, jnp.asarray(0)):
-                yield f"filter {label!r}{where}", why
+        yield from ((f"filter {label!r}{where}", filter) for label, filter in filters.items())
+
+
+def _find_refused_filters(network: Network) -> Iterator[tuple[str, str]]:
+    """Yield each filter whose step is refused, with the reason."""
+    for who, named in _list_filters(network):
+        filter = without_output_names(named)  # so that filters of one structure are compiled once
+        z, u = jnp.zeros(filter.received), jnp.zeros(len(filter.inputs))
+        state = jax.tree.map(jnp.asarray, filter.init())
+        if why := explain_refusal(_step, filter, state, z, u, jnp.asarray(0)):
+            yield who, why
 
 
 def _step(filter: AbstractFilter, *arguments: jax.Array) -> PyTree:
