@@ -163,6 +163,17 @@ def test_smoothing_by_pairs_is_better_than_that_of_the_mixture():
 
 
 @pytest.mark.slow
+def test_of_ten_rows_the_first_is_smoothed_nearly_as_by_all_paths():
+    """Squared errors by pairs .357 and .574, where the sum over all 1,024 paths has .357 and .568."""
+    record = hg.monte_carlo(world(smoothed=True), 10, 8_000, 0, smooth=hg.smoothing.FixedInterval())
+    assert record.smoothed is not None
+    errors = record.truth[:, 0] - record.smoothed.estimates["node"]["imm"].mean[:, 0]
+    squares = np.mean(errors**2, axis=0)
+    deviation = np.std(errors**2, axis=0) / np.sqrt(len(errors))
+    assert np.all(np.abs(squares - [0.357, 0.574]) < 3 * deviation) and np.all(deviation < 0.03 * squares)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FILTERS)
 def test_modes_that_are_alike_are_smoothed_as_one_model(name):
     """Rauch's estimates, to rounding, of a plant whose two modes have one law."""
