@@ -10,7 +10,7 @@ from heliograph.filters.modes.patterns import pattern_of
 from heliograph.model.sensor import AbstractSensor
 from heliograph.numerics.angle import Angles, nearest
 from heliograph.numerics.check import fail
-from heliograph.numerics.density import log_density
+from heliograph.numerics.density import LOG_TURN
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import Array, Bool, Float
@@ -39,17 +39,24 @@ class Atoms(Module):
         expected: jax.Array = jnp.asarray(self.gain) @ y + jnp.asarray(self.offset)
         return expected
 
-    def log_density(self, y: jax.Array, z: jax.Array, angles: Angles) -> jax.Array:
-        """Return log p(z | y) of the components that arrived; -inf where y is no number."""
+    def log_densities(self, y: jax.Array, z: jax.Array, angles: Angles) -> jax.Array:
+        """Return log p(z | y) of the components that arrived, of each y (N, p); -inf where y is no number."""
+        present = ~jnp.isnan(z)
+        both = present[:, None] & present
 
-        def of_atom(expected: jax.Array, noise: jax.Array) -> jax.Array:
-            value = jnp.where(jnp.isnan(z), jnp.nan, jnp.where(jnp.isfinite(expected), z - expected, jnp.inf))
-            value = jnp.where(jnp.isfinite(value), nearest(value, jnp.zeros_like(value), angles), value)
-            density: jax.Array = log_density(value, noise, jnp.zeros_like(value))
-            return density
+        def of_atom(gain: jax.Array, offset: jax.Array, noise: jax.Array) -> jax.Array:
+            expected = y @ gain.T + offset
+            valid = jnp.all(jnp.isfinite(expected) | ~present, axis=1)
+            value = nearest(z - expected, jnp.zeros(len(z)), angles)
+            value = jnp.where(valid[:, None] & present, value, 0.0)
+            # Whitened by the factor of the noise, of what did not arrive the unit.
+            factor = jnp.linalg.cholesky(jnp.where(both, noise, jnp.eye(len(z))))
+            white = value @ jax.scipy.linalg.solve_triangular(factor, jnp.eye(len(z)), lower=True).T
+            size = 2 * jnp.sum(jnp.log(jnp.diagonal(factor))) + LOG_TURN * jnp.sum(present)
+            return jnp.where(valid, -(jnp.sum(white**2, axis=1) + size) / 2, -jnp.inf)
 
-        each = jax.vmap(of_atom)(self.expected(y), jnp.asarray(self.noise))
-        total = jax.nn.logsumexp(jnp.log(jnp.asarray(self.weight)) + each)
+        each = jax.vmap(of_atom)(jnp.asarray(self.gain), jnp.asarray(self.offset), jnp.asarray(self.noise))
+        total = jax.nn.logsumexp(jnp.log(jnp.asarray(self.weight))[:, None] + each, axis=0)
         return jnp.where(jnp.isnan(total), -jnp.inf, total)
 
     def moments(self) -> tuple[jax.Array, jax.Array, jax.Array]:

@@ -113,7 +113,7 @@ class StateParticleFilter(AbstractStateParticleFilter):
             drawn = propose(state.law, sensor, atoms, z, self.observed_angles, jax.random.fold_in(key, 2))
             position, correction = wrap_angles(drawn.position, at(self.plant, k).angles), drawn.correction
             received = jax.vmap(sensor.measure)(position)
-        likelihood = jax.vmap(lambda y: atoms.log_density(y, z, self.observed_angles))(received) + correction
+        likelihood = atoms.log_densities(received, z, self.observed_angles) + correction
         density = jax.nn.logsumexp(jax.nn.log_softmax(state.log_weight) + likelihood)
         # Nothing is left to draw.
         law = None if state.law is None else state.law._replace(center=position, root=jnp.zeros_like(state.law.root))
