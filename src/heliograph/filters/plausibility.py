@@ -177,15 +177,48 @@ def judge_step(
     state is unsound where the one before it was not: a mean or variance that is no finite number, a negative variance,
     an infinite number in it. So is a prediction; `spoilt` says that its inputs already were none.
     """
-    (before, prior, after), value = estimates, jnp.asarray(innovation.value)
-    z, covariance = jnp.asarray(z), jnp.asarray(innovation.covariance)
+    before, prior, after = estimates
+    of_value = _judge_value(innovation, z, of_atoms)
+    # States that stop being numbers, by the correction or already by the prediction.
+    sound = _is_sound_correction(after, claim, prior)
+    unsound = (_is_sound_correction(prior, claim, before) & ~sound) | _overflows(states[1], states[2])
+    predicted = (_is_finite_number(before, claim) & ~_is_sound_prediction(prior, claim)) | _overflows(
+        states[0], states[1]
+    )
+    predicted |= spoilt
+    reason = jnp.where(of_value.far, Reason.FAR, jnp.where(of_value.excluded, Reason.EXCLUDED, Reason.PLAUSIBLE))
+    reason = jnp.where(unsound & of_value.came & ~of_value.far, Reason.UNSOUND, reason)
+    reason = jnp.where(predicted, Reason.PREDICTION, reason)
+    # Inputs that move the mean to where its deviation is below its rounding.
+    distance, count = of_value.distance, of_value.arrived
+    digits = jnp.any(_mask_rounded_away(prior) & ~_mask_rounded_away(before)).astype(count.dtype)
+    input_verdict = jnp.nan if claim == "none" else digits
+    distance = jnp.where((count > 0) & (sound | (reason > 0)), distance, jnp.nan)
+    return Judgement(distance, count, reason.astype(count.dtype), jnp.asarray(input_verdict))
+
+
+class _JudgedValue(NamedTuple):
+    """Squared distance of what arrived and how much that is, whether it is far or excluded, and whether anything came.
+
+    Something came too where what was expected is no number.
+    """
+
+    distance: Array
+    arrived: Array
+    far: Array
+    excluded: Array
+    came: Array
+
+
+def _judge_value(innovation: Innovation, z: Float[Array, " m"], of_atoms: bool) -> _JudgedValue:
+    """Judge a value by its innovation; far and excluded are as `judge_step` says."""
+    value, covariance, z = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance), jnp.asarray(z)
     z = z if len(z) == len(value) else jnp.full_like(value, jnp.nan)  # a filter without measurements
     # Squared distance of each component given those before it, and which are determined.
     present, expected = ~jnp.isnan(value), z - value
     size = jnp.where(jnp.isfinite(expected), jnp.abs(z) + jnp.abs(expected), 0.0)
     every, certain = _squared_distances_in_turn(value, covariance, present, size)
     distance, count = jnp.sum(every), jnp.sum(present.astype(value.dtype))
-
     # Far: components larger than expected, beyond the bound of this precision.
     larger = present & ~(jnp.abs(z) <= jnp.abs(expected))
     squares, determined = (
@@ -198,23 +231,7 @@ def judge_step(
     excluded = jnp.any(jnp.isinf(every) & certain) & ~jnp.any(~certain & present)
     if of_atoms:
         excluded |= (jnp.asarray(innovation.log_likelihood) == -jnp.inf) & jnp.isfinite(distance)
-
-    # States that stop being numbers, by the correction or already by the prediction.
-    sound = _is_sound_correction(after, claim, prior)
-    unsound = (_is_sound_correction(prior, claim, before) & ~sound) | _overflows(states[1], states[2])
-    predicted = (_is_finite_number(before, claim) & ~_is_sound_prediction(prior, claim)) | _overflows(
-        states[0], states[1]
-    )
-    predicted |= spoilt
-    reason = jnp.where(far, Reason.FAR, jnp.where(excluded, Reason.EXCLUDED, Reason.PLAUSIBLE))
-    came = (count > 0) | jnp.any(~jnp.isnan(z))  # also where what was expected is no number
-    reason = jnp.where(unsound & came & ~far, Reason.UNSOUND, reason)
-    reason = jnp.where(predicted, Reason.PREDICTION, reason)
-    # Inputs that move the mean to where its deviation is below its rounding.
-    digits = jnp.any(_mask_rounded_away(prior) & ~_mask_rounded_away(before)).astype(value.dtype)
-    input_verdict = jnp.nan if claim == "none" else digits
-    distance = jnp.where((count > 0) & (sound | (reason > 0)), distance, jnp.nan)
-    return Judgement(distance, count, reason.astype(value.dtype), jnp.asarray(input_verdict))
+    return _JudgedValue(distance, count, far, excluded, (count > 0) | jnp.any(~jnp.isnan(z)))
 
 
 def _squared_distances_in_turn(
