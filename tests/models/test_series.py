@@ -113,6 +113,11 @@ def test_coefficients_that_wander_and_a_ragged_factor_are_statsmodels():
     model = m.structural([m.level(0.1, 0.0, 10.0), m.regression(["x"], 0.05, 10.0)], 0.5)
     found = hg.kalman_filter(model.plant, model.sensor).run(y, u[:, None])
     assert abs(found.log_likelihood + 118.58087615863967) < 1e-7
+    ahead = hg.forecast(found, 3, inputs=[[0.5], [-1.0], [2.0]]).outputs
+    right = [0.939509091936, -0.153461445959, 2.03247962983]
+    np.testing.assert_allclose(ahead.mean[:, 0], right, atol=1e-8)
+    right = [0.93296537444, 1.058026362247, 1.553861829026]
+    np.testing.assert_allclose(ahead.deviation[:, 0], right, atol=1e-8)
     np.testing.assert_allclose(found.means[-1], [0.57518558, 0.72864703], atol=1e-8)
     # One factor, three series.
     factor = np.zeros(80)
