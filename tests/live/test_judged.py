@@ -37,6 +37,22 @@ def test_push_and_estimates_say_what_was_not_expected():
     assert np.isnan(later.nis) and later.received == 0
 
 
+@pytest.mark.slow
+def test_a_filter_that_weighs_says_how_much_of_each_number_it_used():
+    """Both outputs of one, the second far off; what did not arrive has no weight, and other filters say none."""
+    sensor = hg.LinearSensor([[1.0], [1.0]], 0.01 * np.eye(2))
+    gate = hg.robust_filter(PLANT, sensor, hg.perfect(2), hg.filters.Gate(13.8))
+    plain = hg.kalman_filter(PLANT, sensor)
+    stream, node = hg.Stream(gate), hg.Node(sensor, hg.perfect(2), {"gate": gate, "plain": plain})
+    line = hg.Timeline(hg.Network(PLANT, {"a": node}), window=3)
+    for k, (value, weight) in enumerate([([0.1, 50.0], [1, 0]), ([np.nan, 0.2], [np.nan, 1])]):
+        np.testing.assert_array_equal(stream.push(value).weight, weight)
+        line.push("a", k, k, value)
+        np.testing.assert_array_equal(line.estimates()["a"]["gate"].weight, weight)
+        assert line.estimates()["a"]["plain"].weight is None
+    assert hg.Stream(plain).push([0.1, 0.2]).weight is None
+
+
 def test_a_gate_with_a_wrong_start_says_that_it_leaves_out_everything():
     still = hg.LinearPlant([[1.0]], 0.0, [0.0], 1e-4)
     gate = hg.robust_filter(still, SENSOR, hg.perfect(), hg.filters.Gate(13.8))

@@ -14,12 +14,14 @@ import numpy as np
 
 from heliograph.engine.choice import read_setting, try_native
 from heliograph.filters.base import AbstractFilter
+from heliograph.filters.plausibility import Judgement
 from heliograph.numerics.float64 import understood
 from heliograph.numerics.trees.static import Static
 from heliograph.numerics.types import Float, PyTree
 from straightline import Unsupported, compile_one
 
 Leaves = list[np.ndarray]
+PARTS = len(Judgement._fields)
 
 
 class NativeFilterStepper:
@@ -29,9 +31,19 @@ class NativeFilterStepper:
         self._code = code.again(numbers)
         places, outputs, n = self._code.inputs[len(numbers) :], self._code.outputs, len(state)
         self._state, (self._z, self._u, self._k) = places[:n], places[n:]
-        self.judgement: Float[np.ndarray, " parts"] = outputs[0]
+        self._judged: Float[np.ndarray, " parts"] = outputs[0]
         self._flagged, self._after, self._estimate = outputs[1], outputs[2 : 2 + n], outputs[2 + n : len(outputs) - n]
         self.put(state)
+
+    @property
+    def judgement(self) -> Float[np.ndarray, " 4"]:
+        """Return the judgement of the step."""
+        return self._judged[:PARTS]
+
+    @property
+    def weight(self) -> Float[np.ndarray, " m"]:
+        """Return a copy of the weights of the step's components; empty of a filter that weighs none."""
+        return self._judged[PARTS:].copy()
 
     @property
     def state(self) -> Leaves:
@@ -68,6 +80,16 @@ class XlaFilterStepper:
         self._tree: Any = tree
 
     @property
+    def judgement(self) -> Float[np.ndarray, " 4"]:
+        """Return the judgement of the step."""
+        return self._judged[:PARTS]
+
+    @property
+    def weight(self) -> Float[np.ndarray, " m"]:
+        """Return the weights of the step's components; empty of a filter that weighs none."""
+        return self._judged[PARTS:]
+
+    @property
     def state(self) -> Leaves:
         """Return the leaves of the filter's state."""
         return [np.asarray(leaf) for leaf in self._state]
@@ -82,7 +104,7 @@ class XlaFilterStepper:
         with jax.enable_x64(True):
             state = self._tree.unflatten(self._state)
             judged, flagged, self._after, self._estimate = self._run(self._numbers, state, z, u, np.asarray(k))
-        self.judgement: Float[np.ndarray, " parts"] = np.asarray(judged)
+        self._judged: Float[np.ndarray, " parts"] = np.asarray(judged)
         if flagged:
             return False
         self.accept()
@@ -101,12 +123,18 @@ class XlaFilterStepper:
 def _judge_step(
     static: Static, numbers: Sequence[jax.Array], state: PyTree, z: jax.Array, u: jax.Array, k: jax.Array
 ) -> tuple[jax.Array, jax.Array, list[jax.Array], list[jax.Array]]:
-    """Step a filter from its arrays; return judgement, whether to refuse, leaves of the state and of the estimate."""
+    """Step a filter from its arrays; return judgement, whether to refuse, leaves of the state and of the estimate.
+
+    The weights of a filter that weighs follow its judgement.
+    """
     filter: AbstractFilter = static.filled(numbers)
-    after, estimate, judgement, _ = filter.judge_step(state, z, u, k)
+    after, estimate, judgement, innovation = filter.judge_step(state, z, u, k)
     spoilt = jnp.any(jnp.isinf(z)) | ~jnp.all(jnp.isfinite(u))
     flagged = spoilt | (judgement.reason > 0) | (judgement.input > 0)
-    return jnp.stack(judgement), flagged, jax.tree.leaves(after), jax.tree.leaves(estimate)
+    judged = jnp.stack(judgement)
+    if innovation.weight is not None:
+        judged = jnp.concatenate([judged, innovation.weight])
+    return judged, flagged, jax.tree.leaves(after), jax.tree.leaves(estimate)
 
 
 @lru_cache

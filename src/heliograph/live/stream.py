@@ -93,7 +93,8 @@ class Stream:
     def push(self, measurement: ArrayLike, inputs: ArrayLike = ()) -> JudgedEstimate:
         """Advance one step: `inputs` led to this `measurement`; return the posterior estimate.
 
-        It has the squared innovation of the measurement, `nis`, and how many numbers arrived, `received`.
+        It has the squared innovation of the measurement, `nis`, how many numbers arrived, `received`, and of a filter
+        that weighs them the `weight` of each.
 
         Args:
             measurement: received values, shape (received,); NaN where a component did not arrive.
@@ -136,6 +137,8 @@ class Stream:
             for _, line in self._angles.said_of(np.diagonal(stepper.estimate[1])[None]):
                 warnings.warn(f"stream, step {k}: {line}", stacklevel=2)
         estimate: JudgedEstimate = placed.estimate.unflatten([*stepper.estimate, nis, int(arrived)])
+        if len(weight := stepper.weight):
+            estimate = replace(estimate, weight=weight)
         if self.limits is not None and self.limits.bounded:
             estimate = replace(estimate, claim=weakest([estimate.claim, "nominal"]))
         return lower_unsound_claim(estimate) if nis != nis else estimate

@@ -379,6 +379,7 @@ class Timeline:
                     nis,
                     received,
                     refused,
+                    None if place.weighed is None else outputs[list(place.weighed.weight)],
                 )
         return estimates
 

@@ -67,12 +67,14 @@ class JudgedEstimate(Estimate):
 
     nis: squared innovation e' S^-1 e, about `received` on average where the claim is right; NaN where nothing arrived
     or no covariance is claimed. received: how many numbers arrived. refused: why the filter alone left them out, "" if
-    it did not.
+    it did not. weight: of each number (m,), from 0 (left out) to 1 (in full), NaN where it did not arrive, of a filter
+    that weighs them; None of all others.
     """
 
     nis: float = float("nan")
     received: int = 0
     refused: str = eqx.field(static=True, default="")
+    weight: Array | None = None
 
 
 @readable
