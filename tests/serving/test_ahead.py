@@ -71,7 +71,7 @@ def test_horizons_of_whole_steps_are_taken_where_no_binary_number_is_one(program
     assert [horizon["ahead"] for horizon in json.loads(output.body)["forecast"]] == pytest.approx([0.3, 0.7], rel=1e-12)
 
 
-@pytest.mark.parametrize("text", ["3s", "2026-12-01", "4s,2s", "0s"])
+@pytest.mark.parametrize("text", ["3s", "2026-12-01", "4s,2s", "0s", "1.5"])
 def test_horizons_that_a_service_cannot_keep_are_refused(program, text):
     with pytest.raises(ValueError, match="--forecast: expected"):
         service(program, text)

@@ -55,10 +55,12 @@ class ForecastPublisher:
             raise fail("--forecast", "horizons ahead, each later than the one before", show_value(horizons))
 
     def _convert_horizon(self, horizon: float | np.timedelta64 | np.datetime64) -> float:
-        """Return how far ahead a horizon is, in the unit of dt or in steps."""
+        """Return how far ahead a horizon is: in steps; where time is continuous in the unit of dt, or in seconds."""
         if isinstance(horizon, np.datetime64):
             raise fail("--forecast", "spans of time or steps ahead of each message", str(horizon))
         if not isinstance(horizon, np.timedelta64):
+            if not self._continuous and not float(horizon).is_integer():
+                raise fail("--forecast", "whole steps", f"{horizon:g} of one")
             return float(horizon) if self._continuous else int(horizon)
         seconds, step = float(horizon / SECOND), self._fleet.options.step or 1.0
         if self._continuous:

@@ -39,6 +39,14 @@ def test_values_of_flux_are_rows_by_time():
     assert (path, asked, sent["type"], sent["query"]) == ("/api/v2/query", {"org": ["my plant"]}, "flux", ASKED)
 
 
+def test_measurements_of_one_time_are_rows_of_their_own():
+    """A field of one name in two measurements: neither value takes the place of the other."""
+    both = UNTAGGED + UNTAGGED.replace(",tank", ",well").replace(",1.5,", ",7.5,")
+    with Answering(both.encode()) as server:
+        columns = hg.files.read_store(f"{server.url}?flux={ASKED}")
+    assert sorted(columns["level"][columns["time"] == columns["time"].min()]) == [1.5, 7.5]
+
+
 def test_rows_that_a_query_has_pivoted_are_taken_as_they_are():
     pivoted = "#datatype,string,long,dateTime:RFC3339,double,long\n,result,table,_time,level,gate\n"
     with Answering(f"{pivoted},,0,2026-11-29T10:01:00Z,2,\n,,0,2026-11-29T10:00:00Z,1,7\n".encode()) as server:

@@ -51,6 +51,16 @@ def test_a_gate_with_a_wrong_start_comes_back_and_says_so():
     np.testing.assert_allclose(estimate.mean, run.means[9], rtol=1e-9)
 
 
+def test_an_angle_moves_by_less_than_half_a_turn():
+    """From 3.1 to -3.1: .08 across the seam, in which the words of the warning are by what it moved."""
+    plant = hg.LinearPlant([[1.0]], 1e-6, [3.1], 1e-4, states=["yaw"], circular=["yaw"])
+    sensor = hg.LinearSensor([[1.0]], 1e-6, outputs=["compass"], circular=["compass"])
+    item = hg.robust_filter(plant, sensor, hg.perfect(), hg.filters.Gate(9.0, after=3))
+    network = hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), {"gate": item})})
+    with pytest.warns(UserWarning, match=r"moved yaw by 0\.08"):
+        hg.run(network, {"a": np.full((6, 1), -3.1)})
+
+
 def test_seconds_count_the_time_between_rows():
     plant = hg.LinearPlant(
         lambda u: np.eye(1) + 0 * u[0], lambda u: 1e-3 * u[0] * np.eye(1), [0.0], [[1.0]], states=["x"], inputs=["dt"]

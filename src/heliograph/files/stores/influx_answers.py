@@ -60,8 +60,9 @@ def read_rows(address: StoreAddress, answer: bytes) -> Answer:
 def read_flux(address: StoreAddress, answer: bytes) -> Answer:
     """Read the answer to Flux: tables of CSV, each with its header, below it a value of one field at one time a row.
 
-    Values of one time and the same tags are one row, as after `pivot`, which a query may do itself. `_time` is the
-    time, `_measurement` the name; `result`, `table`, `_start` and `_stop` tell how the answer was made: left out.
+    Values of one measurement, one time and the same tags are one row, as after `pivot`, which a query may do itself.
+    `_time` is the time, `_measurement` the name; `result`, `table`, `_start` and `_stop` tell how the answer was
+    made: left out.
 
     Raises:
         ValueError: no such answer, an error in it, no rows; one line.
@@ -72,8 +73,9 @@ def read_flux(address: StoreAddress, answer: bytes) -> Answer:
         for number, row in enumerate(_yield_flux_rows(answer.decode())):
             if "error" in row:
                 raise fail(str(address), "a query that it answers", shorten(str(row["error"])))
-            measurement = measurement or str(row.pop("_measurement", ""))
-            for left in ("result", "table", "_start", "_stop", "_measurement"):
+            its_own = str(row.pop("_measurement", ""))
+            measurement = measurement or its_own
+            for left in ("result", "table", "_start", "_stop"):
                 row.pop(left, None)
             if "_time" in row:
                 row["time"] = row.pop("_time")
@@ -81,7 +83,7 @@ def read_flux(address: StoreAddress, answer: bytes) -> Answer:
                 joined[(number,)] = row
                 continue
             name, value = str(row.pop("_field")), row.pop("_value")
-            joined.setdefault(tuple(sorted(row.items())), row.copy())[name] = value
+            joined.setdefault((its_own, *sorted(row.items())), row.copy())[name] = value
     except InputError:
         raise
     except (ValueError, KeyError, csv.Error):

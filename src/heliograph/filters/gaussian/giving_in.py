@@ -124,6 +124,7 @@ class GivingInFilter(AbstractSizedFilter):
         # Given in: for long enough, and not contradicted.
         gives_in = self._is_long(refused, state.elapsed) & (evidence > -CONTRADICTED)
         kept = jnp.any(suspect) & ~gives_in
+        angles = self.angles_used().states
         chosen = _choose(gives_in, rival, after)
         belief = WatchedBelief(
             chosen,
@@ -133,7 +134,7 @@ class GivingInFilter(AbstractSizedFilter):
             jnp.where(kept, evidence, 0.0),
             state.given_in + gives_in,
             jnp.where(gives_in, jnp.asarray(k, dtype=float), state.step),
-            jnp.where(gives_in, rival.mean - after.mean, state.moved),
+            jnp.where(gives_in, nearest(rival.mean, after.mean, angles) - after.mean, state.moved),
         )
         return belief, _choose(gives_in, believing, innovation)
 
