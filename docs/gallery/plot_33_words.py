@@ -4,8 +4,7 @@ What a flipped bit costs
 
 A sensor sends words of finite length, of which bits flip. The best linear filter pays for every flipped leading bit; a
 filter that knows what a flipped bit is has a third of its variance, and is as good as a checksum that costs no bit.
-Left against the bits of a word without flips, right against the error rate at eight bits. (Some one run in ten thousand
-takes the mirrored half of the range for the truth for a while.)
+Left against the bits of a word without flips, right against the error rate at eight bits.
 """
 
 import matplotlib.pyplot as plt
