@@ -52,3 +52,10 @@ def test_a_unit_that_is_no_text_is_refused_in_one_line():
         plant({"position": 3})
     with pytest.raises(ValueError, match="1 distinct names"):
         plant({"position": "m", "speed": "m/s"})
+
+
+@pytest.mark.parametrize("names", [[""], [" "], {"": "m"}])
+def test_a_blank_name_is_refused_in_one_line(names):
+    """A column without a name could not be read back."""
+    with pytest.raises(ValueError, match="expected names that are not blank"):
+        hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0, states=names)

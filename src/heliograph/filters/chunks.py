@@ -215,7 +215,10 @@ def _with_moments_before_data(recursion: Recursion, start: PyTree, rows: PyTree,
 
 
 def _scan_all(recursion: Recursion, begun: Begun, rows: PyTree) -> Pass | None:
-    """Scan all chunks from the states with which they begin, and again those that the one before contradicts."""
+    """Filter all chunks side by side, each from the state with which it is thought to begin.
+
+    Those of which the chunk before ends in another state are filtered again, in their order. None without native code.
+    """
     length, total = begun.lengths.chunk, len(jax.tree.leaves(rows)[0])
     split = take_windows(rows, begun.first, length)
 

@@ -223,7 +223,7 @@ class LinearSensor(AbstractSensor):
         return LinearSensor(matrix(u) if isinstance(matrix, OfInputs) else matrix, noise, self.outputs, self.circular)
 
     def check_states(self, states: int) -> None:
-        """The same of the matrix, without a trace, of which each of many nodes would need its own."""
+        """Refuse a state of another length: by the shape of the matrix, since a trace for each node would take long."""
         if self.inputs:
             super().check_states(states)
         elif self.matrix.shape[-1] != states:

@@ -89,8 +89,8 @@ def told(
         raise fail("link", "a function of the numbers that are told", show_value(link))
     names = tuple(name_list("numbers told", about))
     memory = law if isinstance(law, AbstractMemory) else FreshNumbers(_check_law(law), len(names))
-    if memory.announced != len(names):
-        raise fail("numbers told", f"{memory.announced} names", list(names))
+    if memory.announced != len(names) or len(set(names)) < len(names):
+        raise fail("numbers told", f"{memory.announced} different names", list(names))
     example = array("typical numbers", _average_law(law, memory) if typical is None else typical, (len(names),))
     return deliver_told(Told(memory, link, example, names, flag("exogenous", exogenous), flag("fresh", fresh)))
 

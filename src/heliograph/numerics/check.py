@@ -376,10 +376,15 @@ def radii(name: str, value: ArrayLike, nominal: Any) -> np.ndarray:
 
 
 def name_list(name: str, value: Names) -> list[str]:
-    """Return names as a list; of a mapping, each with its unit."""
+    """Return names as a list, none of them blank; of a mapping, each with its unit."""
+    listed: list[str]
     if isinstance(value, Mapping):
-        return [NameWithUnit(str(key), text(f"{name}, unit of {key!r}", unit)) for key, unit in value.items()]
-    return [v if isinstance(v, NameWithUnit) else str(v) for v in items(name, value, "names")]
+        listed = [NameWithUnit(str(key), text(f"{name}, unit of {key!r}", unit)) for key, unit in value.items()]
+    else:
+        listed = [v if isinstance(v, NameWithUnit) else str(v) for v in items(name, value, "names")]
+    if not all(each.strip() for each in listed):
+        raise fail(name, "names that are not blank", show_value(list(map(str, listed))))
+    return listed
 
 
 def names(name: str, value: Names | None, count: int, prefix: str) -> tuple[str, ...]:

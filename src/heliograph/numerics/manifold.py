@@ -59,10 +59,13 @@ class Manifold(NamedTuple):
         return nearest(x, reference, self.angles)
 
     def chart(self, function: Callable[[jax.Array], jax.Array], center: jax.Array) -> Callable[[jax.Array], jax.Array]:
-        """Return x -> function(center plus (x - center)): of the state whose change from `center` is x - center."""
+        """Return the function of plain differences from `center`, x -> function(center plus (x - center)).
+
+        `plus` adds vectors and turns attitudes: the derivative at x = center is that by the change of the state.
+        """
         if not self.rotations:
             return function
-        return lambda x: function(self._turned(x, lambda r, d: turn(r, d), center, x - center))
+        return lambda x: function(self._turned(x, turn, center, x - center))
 
     def moved(
         self, function: Callable[[jax.Array], jax.Array], center: jax.Array, middle: jax.Array | None = None

@@ -57,10 +57,14 @@ class Arrivals:
 
     @cached_property
     def rate(self) -> Rate | None:
-        """The rate of a sender whose clock is not that of the rows, where no pattern of few rows tells as much."""
+        """The mean rate of a sender whose clock is not that of the rows; None where a pattern of rows explains as much.
+
+        None too where its period is declared, and where rows are messages.
+        """
         if self.declared_period is not None or self.of_messages:
             return None
         rate, pattern = find_rate(self.arrived), find_pattern(self.arrived)
+        # At this rate some len / period messages are due: it tells more where a pattern has more due rows than that.
         finer = pattern is None or rate is None or rate.period * pattern.rows.sum() > len(self.arrived) + rate.period
         return rate if finer else None
 

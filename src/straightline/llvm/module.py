@@ -90,13 +90,16 @@ class Code(NamedTuple):
 
 
 def output_buffers(program: Program, last: Collection[int] = ()) -> list[Buffer]:
-    """Store the results of a program, each in a buffer of its own."""
+    """Return a buffer for each result, no two the same: memory that the program filled is taken where it is.
+
+    What is not in memory is stored, number by number; so are the results `last`, which must be stored after all others.
+    """
     lowering = Lowering()
     lowering.graph = program.graph
     results: list[Buffer] = []
     for number, value in enumerate(program.outputs):
-        nodes_only = number in last or not isinstance(value, InMemory)
-        stored = _store_in_memory(lowering, value) if nodes_only else _find_or_copy(lowering, value, results)
+        is_stored = number in last or not isinstance(value, InMemory)
+        stored = _store_in_memory(lowering, value) if is_stored else _find_or_copy(lowering, value, results)
         results.append(stored.buffer)
     return results
 

@@ -217,27 +217,35 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
 
         p(j, d, z) is P(j) N(d) sum_a w_a N(z given d, atom a). q(j, d) is P(j) N(d) times N(z) of the linearised sensor
         and one Gaussian noise, in coordinates of the noise; where that is not p, a share of q is P(j) N(d) itself.
+
+        Args:
+            sensors: one of each mode of the sensor.
+            received: what arrived, with gains and noises by mode and atom.
+            x: Gaussian of the state in each mode, drawn states first.
+            log_mode: log P(j) of each mode.
+            draw: standard normal numbers for d.
+            uniform: three numbers, for prior or posterior, for the mode and for the atom of the noise.
         """
         share = self._prior_share(sensors, received)
         modes = jnp.arange(len(self.initial))
-        told, alpha = jax.vmap(lambda j, own: self._linearised_posterior(sensors, received, j, own))(modes, x)
+        posterior, alpha = jax.vmap(lambda j, own: self._linearised_posterior(sensors, received, j, own))(modes, x)
         alpha = jnp.where(jnp.isnan(alpha), -jnp.inf, alpha) + log_mode
         possible = jnp.max(alpha) > -jnp.inf
-        log_told = alpha - jnp.where(possible, jax.nn.logsumexp(alpha), 0.0)
+        log_posterior_mode = alpha - jnp.where(possible, jax.nn.logsumexp(alpha), 0.0)
         from_prior = (uniform[0] < share) | ~possible
         mode = draw_index(jnp.where(from_prior, log_mode, alpha)[None], uniform[1:2])[0]
-        prior, own_told = (jax.tree.map(lambda leaf: leaf[mode], law) for law in (x, told))
-        source: Gaussian = jax.tree.map(lambda a, b: jnp.where(from_prior, a, b), prior, own_told)
+        prior, linearised = (jax.tree.map(lambda leaf: leaf[mode], law) for law in (x, posterior))
+        source: Gaussian = jax.tree.map(lambda a, b: jnp.where(from_prior, a, b), prior, linearised)
         d = condition_on_draw(source, draw).mean[: self.drawn]
-        # log p(j, d) - log q(j, d).
+        # log p(j, d) - log q(j, d), with q = (1 - share) (linearised posterior of j and d) + share P(j) N(d).
         certain = find_certain(prior, d)
-        given, log_prior = condition_on_leading(prior, d, certain)
-        log_told = log_told[mode] + condition_on_leading(own_told, d, certain)[1]
+        rest, log_prior = condition_on_leading(prior, d, certain)
+        log_linearised = log_posterior_mode[mode] + condition_on_leading(linearised, d, certain)[1]
         log_p = log_mode[mode] + log_prior
         log_total = log_p - jax.nn.logsumexp(log_mode)  # of the prior's share, which is a law
-        log_q = jnp.logaddexp(jnp.log1p(-share) + log_told, jnp.log(share) + log_total)
+        log_q = jnp.logaddexp(jnp.log1p(-share) + log_linearised, jnp.log(share) + log_total)
         log_q = jnp.where(possible, log_q, log_total)
-        after, log_density = self._condition_on_atoms(sensors, received, mode, given, uniform[2])
+        after, log_density = self._condition_on_atoms(sensors, received, mode, rest, uniform[2])
         return after, mode, log_density + log_p - log_q
 
     def _prior_share(self, sensors: Sequence[AbstractSensor], received: Received) -> float:
@@ -248,7 +256,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
     def _linearised_posterior(
         self, sensors: Sequence[AbstractSensor], received: Received, mode: jax.Array, x: Gaussian
     ) -> tuple[Gaussian, jax.Array]:
-        """Return x given z, and log N(z), by the slopes of h at the mean and the noise as one Gaussian."""
+        """Return x given z = gain h(x) + n in this mode, and log N(z): h by its slopes, n as one Gaussian."""
         gain, offset, noise = jax.tree.map(lambda leaf: leaf[mode], received.overall)
         y, slopes = slopes_given(partial(self._measure, sensors, mode), x, 0)
         return self._condition(x, gain @ slopes, gain @ y + offset, noise, received.z)

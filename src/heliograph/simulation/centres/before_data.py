@@ -197,7 +197,8 @@ def _compute_factors(filters: AllFilters, u: np.ndarray) -> SourceFactors:
 def _compute_fused(filters: AllFilters, u: np.ndarray) -> PyTree:
     """Return the covariances of all fused estimates over the steps of u, which depend on no data."""
 
-    def body(carry: tuple[PyTree, PyTree], row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
+    def step(carry: tuple[PyTree, PyTree], row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
+        """Step all covariances: of the nodes' filters, and of the centres by these filters' matrices; means are 0."""
         (states, known), (k, u_k) = carry, row
         published: dict[str, jax.Array] = {}
         following = []
@@ -209,4 +210,4 @@ def _compute_fused(filters: AllFilters, u: np.ndarray) -> PyTree:
         return (filters.followed(states, u_k, k), tuple(following)), published
 
     states, _, _, known, *_ = filters.init()
-    return jax.lax.scan(body, (states, known), (jnp.arange(len(u)), jnp.asarray(u)))[1]
+    return jax.lax.scan(step, (states, known), (jnp.arange(len(u)), jnp.asarray(u)))[1]
