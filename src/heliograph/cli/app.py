@@ -30,7 +30,10 @@ def path_option(text: str = "") -> Parameter:
     return Parameter(help=text, converter=_path)
 
 
-MEASURED = "CSV or Parquet: rows or events; messages in lines of JSON; a bag; influx:// or postgresql://...?query=."
+MEASURED = (
+    "CSV or Parquet: rows or events; messages in lines of JSON; a folder of these; a bag; influx:// or "
+    "postgresql://...?query=."
+)
 
 
 def measured_option(text: str = MEASURED) -> Parameter:

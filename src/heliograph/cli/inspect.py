@@ -26,7 +26,8 @@ def inspect(
     ----------
     recording:
         A bag (.mcap, .db3, .bag, or a folder), a vehicle's log (.mf4, .blf, .asc, .ulg), a file of messages (lines of
-        JSON, a log, a table), or the URL of a broker: mqtt://, nats:// or opc.tcp://.
+        JSON, a log, a table) or a folder of these, of which each is a topic, or the URL of a broker: mqtt://, nats://
+        or opc.tcp://.
     """
     from heliograph.disk.quoting import visible
     from heliograph.files.inspection import suggest_sources
@@ -50,8 +51,9 @@ def inspect(
 
 def _collect_topics(recording: str, seconds: float, dbc: Path | None) -> "tuple[dict[str, Topic], str]":
     """Look at the bag, or listen for a while; return the topics, and what is broken in the bag."""
-    from heliograph.files.inspection import inspect_bag, inspect_file, inspect_log
+    from heliograph.files.inspection import inspect_bag, inspect_file, inspect_folder, inspect_log
     from heliograph.files.logs.log import is_log
+    from heliograph.files.messages.folder import is_folder
     from heliograph.files.messages.in_files import LINES
     from heliograph.files.text.text_file import kind_of
     from heliograph.report.progress import progress
@@ -67,6 +69,9 @@ def _collect_topics(recording: str, seconds: float, dbc: Path | None) -> "tuple[
         if path.is_file() and kind_of(path) in (*LINES, ".csv", ".parquet"):
             advance(f"reading {recording}")
             return inspect_file(path)
+        if is_folder(path):
+            advance(f"reading {recording}")
+            return inspect_folder(path)
         if is_log(path):
             advance(f"reading {recording}")
             return inspect_log(path, dbc)

@@ -138,6 +138,7 @@ def read_events(
     """Read the messages of a bag, a file or a store; None for rows of time."""
     from heliograph.files.bags.bag import is_bag
     from heliograph.files.logs.log import is_log
+    from heliograph.files.messages.folder import is_folder
     from heliograph.files.messages.to_events import is_mapped
     from heliograph.files.messages.to_events import read_events as read_mapped
     from heliograph.numerics.check import fail
@@ -145,7 +146,7 @@ def read_events(
     sources = module.get("sources")
     if not is_mapped(path, sources):
         return None
-    if sources is None and isinstance(path, Path) and (is_bag(path) or is_log(path)):
+    if sources is None and isinstance(path, Path) and (is_bag(path) or is_log(path) or is_folder(path)):
         hint = f"heliograph inspect {path} --network {reference} suggests them"
         raise fail(f"network {reference}", f"sources, for the topics of {path} ({hint})", "none")
 

@@ -45,11 +45,11 @@ def run(
 
     A file of events has the columns node, sequence, time, arrival, and the measured values: in any order, late, twice.
     A bag (.mcap, .db3, .bag, or a folder), a vehicle's log (.mf4, .blf, .asc, .ulg), a log or a table of somebody
-    else's making is events too, by the `sources` of the network's file. The estimates are those of the events that a
-    timeline uses, in the order of measuring; with --lag, those of a lag later go to a second file, OUT.lagged. Of
-    several plants each has a file, OUT.PLANT, and a page of its own behind the report's overview, which has the most
-    doubted first; in a store each has its name in the column `plant`, and those of a lag go to the
-    table TABLE_lagged.
+    else's making, or a folder of such files, each with a clock of its own, is events too, by the `sources` of the
+    network's file. The estimates are those of the events that a timeline uses, in the order of measuring; with --lag,
+    those of a lag later go to a second file, OUT.lagged. Of several plants each has a file, OUT.PLANT, and a page of
+    its own behind the report's overview, which has the most doubted first; in a store each has its name in the column
+    `plant`, and those of a lag go to the table TABLE_lagged.
 
     Parameters
     ----------
@@ -75,6 +75,7 @@ def run(
         loaded, module = load_module(network)
         if not any(loaded.claims().values()):
             raise fail(f"network {network}", "at least one filter to run", "none")
+        _check_kept(measurements, out, loaded, module.get("sources"))
         measured = read_measured(measurements, network, loaded, module, options, advance)
         if lag is not None and measured[0].events is None:
             raise fail("--lag", "messages or events", f"rows of time in {measurements}")
@@ -199,6 +200,20 @@ def _check_places(measurements: Path | StoreAddress, out: Path | StoreAddress | 
         from heliograph.report.results import SUMMARY
 
         check_replaceable(report, SUMMARY)
+
+
+def _check_kept(
+    measurements: Path | StoreAddress, out: Path | StoreAddress | None, network: "Network", sources: object
+) -> None:
+    """Refuse estimates in place of a file of measurements in a folder."""
+    from heliograph.files.messages.folder import is_folder, list_used_files
+    from heliograph.files.sources.sources import Sources
+    from heliograph.numerics.check import fail
+
+    if sources is None or not isinstance(out, Path) or not (isinstance(measurements, Path) and is_folder(measurements)):
+        return
+    if out.resolve() in [file.resolve() for file in list_used_files(measurements, Sources(sources, network))]:
+        raise fail(f"output file {out}", "another file than the measurements", "one of them")
 
 
 def _write_report(name: str, network: "Network", plants: "Sequence[FilteredPlant]", report: Path) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from heliograph.files.bags.bag import OFTEN, Progress, list_fields, open_bag
 from heliograph.files.bags.mcap_chunks import read_messages_in_order as bag_messages
 from heliograph.files.logs.log_sources import LogSources
 from heliograph.files.logs.reading import open_log
+from heliograph.files.messages.folder import list_files
 from heliograph.files.messages.in_files import (
     decode_payload,
     is_message_file,
@@ -43,6 +45,12 @@ YEARS = range(946_684_800, 2_366_841_600)  # seconds since 1970 of the years 200
 NO_NUMBERS = ("string", "wstring", "list", "char", "wchar")
 
 
+# Names of clocks that count from their own start, with a unit at the end: t, time_s, Time (ms), timestamp_us.
+CLOCKS = re.compile(
+    r"(?:t|time|timestamp|stamp|ts|clock|elapsed|boot|uptime|seconds|sec)(?:[ _]?[\[(]?(?P<unit>s|sec|ms|us|ns)[\])]?)?"
+)
+
+
 @dataclass
 class Topic:
     """Messages of one topic: times of logging or arrival, and lateness in seconds where messages have a time.
@@ -59,6 +67,8 @@ class Topic:
         messages: how many there were.
         bits: by dotted path the bits of a whole number, where the file says them.
         measured_in: by dotted path the unit of its values, where the file names one.
+        clocks: by dotted path the numbers that are named as a clock is, with its unit, in messages that nothing dates.
+        own_clock: whether the time counts from its own start.
     """
 
     kind: str
@@ -71,15 +81,33 @@ class Topic:
     messages: int = 0
     measured_in: dict[str, str] = field(default_factory=dict)
     bits: Mapping[str, int] = field(default_factory=dict)
+    clocks: "dict[str, array[float]]" = field(default_factory=dict)
+    own_clock: bool = False
 
     def choose_time(self) -> None:
-        """Take for the time of the messages the first date that is not the same in all of them, or else the first."""
-        if self.time is not None or not self.dates:
+        """Take for the time of the messages the first date that is not the same in all of them, or else the first.
+
+        Without dates it is the first clock by name that never goes back; its messages were logged when it says.
+        """
+        if self.time is not None:
+            return
+        if not self.dates:
+            self._choose_clock()
             return
         vary = (path for path, (moments, _) in self.dates.items() if len(set(moments)) > 1)
         self.time = next(vary, next(iter(self.dates)))
         moments, self.late = self.dates[self.time]
         self.logged = self.logged or moments
+
+    def _choose_clock(self) -> None:
+        """Take for the time the first clock that has a number in every message and never goes back, if there is one."""
+        for path, numbers in self.clocks.items() if not self.logged else ():
+            if len(numbers) == self.messages > 1 and numbers[0] < numbers[-1] and np.all(np.diff(numbers) >= 0):
+                unit = _name_clock_unit(path)
+                nanoseconds = np.rint(np.array(numbers) * UNITS[unit]).astype(np.int64)
+                self.time, self.own_clock, self.units[path] = path, True, unit
+                self.logged = array("q", nanoseconds.tobytes())
+                return
 
     @property
     def count(self) -> str | None:
@@ -157,6 +185,8 @@ def _note_message(topics: dict[str, Topic], name: str, content: object, kind: st
     for path, value in _yield_leaves(content):
         if isinstance(value, int | float) and path not in topic.fields:
             topic.fields.append(path)
+        if arrival is None and isinstance(value, int | float) and _counts_from_start(path, value):
+            topic.clocks.setdefault(path, array("d")).append(value)
         # A date in a message may be the time of its measurement.
         unit = "s" if isinstance(value, str) and looks_like_date(value) else _unit(value)
         if unit is not None:
@@ -168,6 +198,23 @@ def _note_message(topics: dict[str, Topic], name: str, content: object, kind: st
                     late.append((arrival - time) / SECOND)
                 if not isinstance(value, str):
                     topic.units[path] = unit
+
+
+def _named_clock(path: str) -> re.Match[str] | None:
+    """Return the match of a path whose last word is named as a clock is; None for any other."""
+    return CLOCKS.fullmatch(path.split(".")[-1].lower())
+
+
+def _name_clock_unit(path: str) -> Literal["s", "ms", "us", "ns"]:
+    """Return the unit that the name of a clock ends in; seconds where it has none."""
+    match = _named_clock(path)
+    unit = None if match is None else match["unit"]
+    return next((known for known in UNITS if known == unit), "s")
+
+
+def _counts_from_start(path: str, value: float) -> bool:
+    """Return whether a number is named as a clock is, and no date of these years."""
+    return not isinstance(value, bool) and _unit(value) is None and _named_clock(path) is not None
 
 
 def _unit(value: object) -> TimeUnit | None:
@@ -199,6 +246,20 @@ def inspect_file(path: Path) -> tuple[dict[str, Topic], str]:
             _note_message(topics, name, decode_payload(message), "JSON" if is_message_file(path) else "row", came)
         except InputError:
             _note_message(topics, name, None, "no JSON", came)
+    return topics, broken
+
+
+def inspect_folder(path: Path) -> tuple[dict[str, Topic], str]:
+    """Return the topics of the files of messages in a folder, and the first reason why a message cannot be read.
+
+    Raises:
+        ValueError: no file of messages in it, or one that cannot be read at all.
+    """
+    topics, broken = dict[str, Topic](), ""
+    for file in list_files(path):
+        found, reason = inspect_file(file)
+        topics |= found
+        broken = broken or reason
     return topics, broken
 
 
@@ -239,14 +300,16 @@ def suggest_sources(topics: Mapping[str, Topic], names: Mapping[str, Sequence[st
     """
     lines = [f"# {node}: {', '.join(outputs)}" for node, outputs in names.items()]
     lines.append("sources = {")
-    for name, topic in sorted(topics.items()):
+    for topic in topics.values():
         topic.choose_time()
+    dated = any(topic.dates or (topic.logged and not topic.own_clock) for topic in topics.values())
+    for name, topic in sorted(topics.items()):
         fields = topic.list_measured()
         if not fields:
             continue
         others = [f"{path}{_say_unit(topic, path, '')}" for path in fields[1:FEW]]
         more = ", ".join(others) + (", ..." if len(fields) > FEW else "")
-        when = "" if topic.time is None else f", time={topic.time!r}"
+        when = "" if topic.time is None else f", time={_describe_time(topic, dated)}"
         unit = "s" if topic.time is None else topic.units.get(topic.time, "s")
         when += "" if unit == "s" else f", time_unit={unit!r}"
         when += "" if topic.count is None else f", sequence={_describe_count(topic, topic.count)}"
@@ -254,6 +317,11 @@ def suggest_sources(topics: Mapping[str, Topic], names: Mapping[str, Sequence[st
         lines.append(f"    {name!r}: {source},{_say_unit(topic, fields[0])}")
         lines += [f"    #   or {more}"] if more else []
     return "\n".join([*lines, "}"])
+
+
+def _describe_time(topic: Topic, dated: bool) -> str:
+    """Return a time as a source has it: beside dates a clock that counts from its own start has the date of that."""
+    return f"hg.files.Stamp({topic.time!r}, start='DATE')" if topic.own_clock and dated else repr(topic.time)
 
 
 def _describe_count(topic: Topic, path: str) -> str:

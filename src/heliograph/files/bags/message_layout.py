@@ -239,7 +239,7 @@ def _convert_columns(
         time = seconds.astype(np.int64) * SECOND + rest
         if seconds.dtype.itemsize > 4 or np.any(time == 0):
             raise LayoutError
-        time += round(source.time.offset * SECOND)
+        time += source.time.shift
     sequence = none if source.sequence is None else columns[source.sequence.path]
     if sequence.dtype.kind not in "iu" or (source.sequence is not None and np.any(sequence.astype(np.int64) < 0)):
         raise LayoutError

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from heliograph.files.sources.fields import convert_time
+from heliograph.files.sources.fields import parse_start
 from heliograph.files.sources.json_field import Source
 from heliograph.numerics.check import check_count, fail, file_path, show_value
 from heliograph.numerics.module import readable
@@ -51,7 +51,7 @@ class LogSources(Mapping[str, "Source | Sequence[Source]"]):
         self._sources = dict(sources)
         self.dbc = None if dbc is None else file_path("LogSources, dbc", dbc)
         self.channel = None if channel is None else check_count("LogSources, channel", channel, 0)
-        self.start = None if start is None else _read_start(start)
+        self.start = None if start is None else parse_start("LogSources, start", start) / SECOND
 
     def __getitem__(self, name: str) -> "Source | Sequence[Source]":
         return self._sources[name]
@@ -61,11 +61,3 @@ class LogSources(Mapping[str, "Source | Sequence[Source]"]):
 
     def __len__(self) -> int:
         return len(self._sources)
-
-
-def _read_start(start: object) -> float:
-    """Return a date with a zone in seconds since 1970."""
-    name = "LogSources, start"
-    if not isinstance(start, str):
-        raise fail(name, "a date of ISO 8601 with its zone, such as 2026-09-27T10:00:00Z", show_value(start))
-    return convert_time(start, "s", name) / SECOND

@@ -7,6 +7,7 @@ from heliograph.files.bags.bag import Progress, is_bag, parts_of, read_bag
 from heliograph.files.event_table import EventTable
 from heliograph.files.logs.log import is_log
 from heliograph.files.logs.reading import read_log
+from heliograph.files.messages.folder import is_folder, list_left_files, name_topic, read_folder
 from heliograph.files.messages.in_files import (
     TOPIC,
     FileMessage,
@@ -34,7 +35,7 @@ def read_messages(
     strict: bool = False,
     ignore_unknown: bool = False,
 ) -> EventTable:
-    """Read the events of a network from a bag, a vehicle's log, a file of messages, or a store.
+    """Read the events of a network from a bag, a vehicle's log, a file of messages or a folder of them, or a store.
 
     A bag is a file of MCAP, SQLite (.db3) or ROS 1 (.bag), or a folder of ROS 2 or of such files; each event has the
     time of its source and the time when it was logged. A file of messages is CSV or Parquet, of which each row is a
@@ -45,6 +46,9 @@ def read_messages(
     its own. Messages in our own form, with node, sequence, time and values, need no sources. Rows of a store, of a URL
     as `read_store` takes it, are messages as rows of CSV are; the topic is the measurement's or the database's name.
 
+    A folder of files of messages is one recording, merged by time; the topic of each file is its name, and files that
+    are no topic of the sources are left out. A clock that counts from its own start has it in its `Stamp`.
+
     A vehicle's log is BLF (.blf) or ASC (.asc), whose frames a database describes, MDF4 (.mf4) or ULog (.ulg), read by
     `LogSources`; each message arrives when it was logged.
 
@@ -52,7 +56,7 @@ def read_messages(
     Where a bag is damaged what came before stays, and `broken` says where.
 
     Args:
-        path: the bag or the file, or the URL of a store.
+        path: the bag, the file or the folder, or the URL of a store.
         network: the network.
         sources: sources by topic, as `json_field` makes them; None for messages in our own form.
         progress: called with the numbers of messages read and to be read (default none).
@@ -91,6 +95,8 @@ def read_events(
         if known is None:
             raise fail("sources", f"hg.files.LogSources for the messages of {source}", "none")
         events = _read_log(source, sources, known, strict)
+    elif isinstance(source, Path) and is_folder(source) and known is None:
+        raise fail("sources", f"a source for the files of {source}", "none")
     elif _holds_own_rows(source):
         events = _read_own_table(source, network, strict, ignore_unknown)
     else:
@@ -106,7 +112,7 @@ def is_mapped(path: Path | StoreTable, sources: object) -> bool:
     if isinstance(path, StoreTable):
         named = isinstance(sources, Mapping) and (path.topic in sources or TOPIC in path.columns)
         return named or _holds_own_rows(path)
-    if is_bag(path) or is_log(path) or holds_events(path) or is_message_file(path):
+    if is_bag(path) or is_log(path) or is_folder(path) or holds_events(path) or is_message_file(path):
         return True
     if kind_of(path) not in (".csv", ".parquet") or not isinstance(sources, Mapping) or not path.is_file():
         return False
@@ -118,8 +124,10 @@ def _holds_own_rows(source: Path | StoreTable) -> bool:
     return holds_events(source) if isinstance(source, Path) else {NODE, SEQUENCE} <= source.columns.keys()
 
 
-def _list_messages(source: Path | StoreTable) -> Iterator[FileMessage | InputError]:
-    """Yield the messages of a file or a store's table."""
+def _list_messages(source: Path | StoreTable, sources: Sources | None = None) -> Iterator[FileMessage | InputError]:
+    """Yield the messages of a file, of those files of a folder that are topics of sources, or of a store's table."""
+    if isinstance(source, Path) and is_folder(source) and sources is not None:
+        return read_folder(source, sources)
     return read_message_file(source) if isinstance(source, Path) else source.messages()
 
 
@@ -136,7 +144,7 @@ def _map_messages(path: Path | StoreTable, network: Network, sources: Sources | 
     events = None if sources is None else EventTable(network, sources.step)
     own = OwnMessages(network, path, isinstance(path, StoreTable) or is_table(path), False)
     broken = ""
-    for message in _list_messages(path):
+    for message in _list_messages(path, sources):
         if isinstance(message, CutOffError) and not strict:
             broken = str(message)
             continue
@@ -175,7 +183,7 @@ def _append_message(
     """Append what a message says; what cannot be read is refused alone."""
     topic = message.topic
     if topic is None:
-        topic = path.topic if isinstance(path, StoreTable) else _name_topic(path, sources)
+        topic = path.topic if isinstance(path, StoreTable) else name_topic(path, sources)
     try:
         if sources.hear(topic, message.content, message.where):
             return
@@ -195,25 +203,28 @@ def _append_message(
             if message.stored and reading.time is None:
                 sources.stored += 1
                 continue
+            if came is None and reading.time is not None and events.dated:
+                sources.clocks.note(topic, content, reading.time, (single.source for single in sources.of(topic)))
             events.add(sources.original(reading, came), arrival)
             sources.senders.note(topic, reading.plant, reading.node, content, sources.list_fields(topic))
     except InputError as error:
         events.refuse(error, strict)
 
 
-def _name_topic(path: Path, sources: Sources) -> str:
-    """Return the topic of a file's messages that name none."""
-    return path.name if sources.of(path.name) else message_name(path)
-
-
 def _warn_of_left_out(path: Path | StoreTable, sources: Sources, events: EventTable) -> None:
     """Say which messages were left out.
 
     Raises:
-        ValueError: a field that no message of its topic had.
+        ValueError: a field that no message of its topic had, clocks that cannot be joined.
     """
     if said := sources.never():
         raise InputError(said)
+    own = sources.clocks.check(str(path))
+    if isinstance(path, Path) and is_folder(path):
+        events.notes += list_left_files(path, sources)
+        if len(own) > 1:
+            remedy = "start= or offset= of hg.files.Stamp says if they are not"
+            events.notes.append(f"{path}: times from 0 are taken as of one clock: {', '.join(own)} ({remedy})")
     if sources.unknown.total():
         counts = ", ".join(f"{topic} ({count})" for topic, count in sources.unknown.items() if count)
         events.notes.append(f"{path}: not among the sources: {counts}")

@@ -218,6 +218,17 @@ def parse_arrival(value: Any, name: str) -> int:
     return convert_time(value, "s", name, quoted=True)
 
 
+def parse_start(name: str, start: object) -> int:
+    """Return the date from which a clock counts in nanoseconds since 1970.
+
+    Raises:
+        ValueError: no date with a zone; one line.
+    """
+    if not isinstance(start, str):
+        raise fail(name, "a date of ISO 8601 with its zone, such as 2026-09-27T10:00:00Z", show_value(start))
+    return convert_time(start, "s", name)
+
+
 def count(value: Any, name: str, quoted: bool = False) -> int:
     """Convert a running count, which columns of numbers have as a float."""
     if quoted and isinstance(value, str):

@@ -2,6 +2,7 @@
 
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, get_args
 
 import numpy as np
@@ -9,9 +10,10 @@ from typing_extensions import TypeAliasType
 
 from heliograph.files.availability import Available
 from heliograph.files.sources.derived import Computed, Covariance, PlaneCovariance, ZeroIfAbsent
-from heliograph.files.sources.fields import TimeUnit, at, convert_name
+from heliograph.files.sources.fields import TimeUnit, at, convert_name, convert_time, parse_start
 from heliograph.numerics.check import TINY, fail, flag, scalar, show_value
 from heliograph.numerics.module import readable
+from heliograph.numerics.times.dates import looks_like_date
 from heliograph.numerics.types import ArrayLike
 
 
@@ -61,13 +63,39 @@ class Field:
 class Stamp:
     """Time of a measurement in a message.
 
+    A clock that counts from its own start, such as the boot of a device, has the date of that moment as `start`; then
+    its times can be joined with those of other clocks.
+
     Args:
         path: dotted path of the time.
         offset: seconds added to it: negative for a stamp that is set late (default 0).
+        start: date with its zone from which numbers count; None for 1970, and for times that are dates.
+
+    Raises:
+        ValueError: a start that is no date with its zone, an offset that is no number.
     """
 
     path: str
     offset: float = 0.0
+    start: str | None = None
+
+    def __post_init__(self) -> None:
+        scalar("Stamp, offset", self.offset)
+        if self.start is not None:
+            parse_start("Stamp, start", self.start)
+
+    @cached_property
+    def shift(self) -> int:
+        """Return the nanoseconds that are added to the time in a message."""
+        start = 0 if self.start is None else parse_start("Stamp, start", self.start)
+        return start + round(self.offset * 10**9)
+
+    def of(self, message: object, unit: TimeUnit, where: str, quoted: bool = False) -> int:
+        """Return the time in a message, in nanoseconds since 1970, or its step."""
+        value, name = at(message, self.path, where), f"{where}, field {self.path!r}"
+        if self.start is not None and isinstance(value, str) and looks_like_date(value):
+            raise fail(name, f"a number, which counts from start={self.start!r}", show_value(value))
+        return convert_time(value, unit, name, quoted) + self.shift
 
 
 @readable
@@ -203,7 +231,8 @@ def json_field(
     where `plant` or `node` says which sensor a message is of.
 
     A value becomes `scale` value + `offset`; true is 1, false 0; null and numbers that are not finite did not arrive. A
-    time is a date of ISO 8601 with its zone, a stamp of ROS, or a number since 1970 in `time_unit`; with the unit
+    time is a date of ISO 8601 with its zone, a stamp of ROS, or a number since 1970, or since the `start` of its
+    `Stamp`, in `time_unit`; with the unit
     "step" it is a step of a network that counts steps. Without `time` a measurement is of the moment of its arrival.
     With `step` the moments are counted in steps of so many seconds: each is of the nearest step, the first of step 0.
     A count that is absent is 0, as JSON of protobuf has it; a message that has its count and no value measured nothing.
@@ -247,7 +276,7 @@ def json_field(
         raise fail("json_field, sequence", "a text or hg.files.Count", show_value(sequence))
     whose, of = _check_name("node", node), Field(plant) if isinstance(plant, str) else plant
     seconds = None if step is None else float(scalar("json_field, step", step, TINY))
-    if time_unit == "step" and (seconds is not None or (stamp is not None and stamp.offset)):
+    if time_unit == "step" and (seconds is not None or (stamp is not None and stamp.shift)):
         raise fail("json_field, step", "none where the time is in steps already, and no offset", step)
     factors, shifts = (
         _broadcast_to_paths(name, value, paths, neutral)

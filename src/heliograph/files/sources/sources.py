@@ -8,12 +8,12 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.files.availability import LastWords
+from heliograph.files.sources.clocks import Clocks
 from heliograph.files.sources.derived import Computed, ZeroIfAbsent
 from heliograph.files.sources.fields import (
     MissingFieldError,
     at,
     convert_number,
-    convert_time,
     count,
     match_topic,
 )
@@ -87,7 +87,7 @@ class Sources:
 
     def __init__(self, table: object, network: Network, others: Collection[str] = ()):
         self.network, self.others = network, others
-        self.senders = SeveralSenders()
+        self.senders, self.clocks = SeveralSenders(), Clocks()
         self.unknown = Counter[str]()  # messages of topics that are not in the table
         self.stored = 0  # messages that only their arrival would date, which is that of a new subscriber
         self.excluded = Counter[str]()  # messages that a condition leaves out, by topic
@@ -370,11 +370,7 @@ def _read_names(mapped: Mapped, topic: str, message: object, where: str) -> tupl
 
 def _read_time(source: Source, message: object, where: str) -> int | None:
     """Return the time that names a measurement, in nanoseconds since 1970 or steps; None if the source has none."""
-    if source.time is None:
-        return None
-    stamp, name = source.time, f"{where}, field {source.time.path!r}"
-    time = convert_time(at(message, stamp.path, where), source.time_unit, name, source.quoted)
-    return time + round(stamp.offset * SECOND)
+    return None if source.time is None else source.time.of(message, source.time_unit, where, source.quoted)
 
 
 def _count_more(count: int) -> str:
