@@ -43,6 +43,50 @@ def test_probabilities_of_a_random_walk():
     assert abs(below.beyond[0] - expected) < 4 * below.beyond_error[0]
 
 
+LAWS = (0.9, 0.1), (1.1, 1.0)  # x+ = a x + w, w of variance q, in either mode
+CHAIN = np.array([[0.9, 0.1], [0.3, 0.7]])
+
+
+def switching(make, initial=(0.6, 0.4)):
+    """A plant of two laws, and a sensor of which a chain of its own has one that is stuck at noise."""
+    plant = hg.markov_plant([hg.LinearPlant([[a]], q, [0.5], 0.01) for a, q in LAWS], CHAIN, initial=initial)
+    works, stuck = hg.LinearSensor([[1.0]], 0.1), hg.LinearSensor([[0.0]], 4.0)
+    return make(plant, hg.markov_sensor([works, stuck], [[0.8, 0.2], [0.5, 0.5]], initial=[1.0, 0.0]), hg.perfect())
+
+
+@pytest.mark.parametrize("make", [hg.filters.imm_filter, hg.filters.gpb2_filter])
+def test_paths_of_a_plant_with_modes_are_those_of_all_mode_paths(make):
+    """P(x_2 > 1.5) and moments of y_2 after three rows: the belief by mode, moved along all paths of two modes."""
+    stream = hg.Stream(switching(make))
+    for z in (1.0, 0.7, -0.4):
+        stream.push([z])
+    now = hg.forecast(stream, 1)  # its parts say which modes the belief has
+    paths, found = draw_paths(stream, 2, draws=DRAWS), crossing(stream, "x0", 1.5, [2], draws=DRAWS)
+    two = hg.forecast(stream, 2)
+    deviation = two.states.deviation[1, 0]
+    # A mixture of Gaussians merged at one step beside all paths of it: equal moments, five standard errors.
+    assert abs(paths.x[:, 1, 0].mean() - two.states.mean[1, 0]) < 5 * deviation / np.sqrt(DRAWS)
+    kurtosis = np.mean((paths.x[:, 1, 0] - paths.x[:, 1, 0].mean()) ** 4) / paths.x[:, 1, 0].var() ** 2
+    assert abs(paths.x[:, 1, 0].var() / deviation**2 - 1) < 5 * np.sqrt((kurtosis - 1) / DRAWS)
+    assert abs(paths.y[:, 1, 0].std() / two.outputs.deviation[1, 0] - 1) < 5 * np.sqrt(kurtosis / DRAWS) / 2
+    assert abs(np.mean(paths.x[:, 0, 0] > 1.0) - (1 - now.states.below(1.0)[0, 0])) < 5 * np.sqrt(0.25 / DRAWS)
+    assert found.beyond[0] == np.mean(paths.x[:, 1, 0] > 1.5)
+
+
+def test_before_the_first_row_the_first_mode_is_that_of_the_start():
+    """The chain does not move before the first step: x_1 of mode 1 has mean 1.1 * .5 and variance 1.1^2 * .01 + 1."""
+    stream = hg.Stream(switching(hg.filters.imm_filter, (0.0, 1.0)))
+    paths = draw_paths(stream, 1, draws=DRAWS)
+    assert abs(paths.x.mean() - 0.55) < 5 * np.sqrt(1.0121 / DRAWS)
+    assert abs(paths.x.var() / 1.0121 - 1) < 5 * np.sqrt(2 / DRAWS)
+
+
+def test_a_filter_without_probabilities_of_modes_draws_no_paths():
+    stream = hg.Stream(switching(hg.linear_filter))
+    with pytest.raises(ValueError, match="paths of a plant or sensor with modes: expected a filter that has the modes"):
+        draw_paths(stream, 1)
+
+
 def test_a_network_says_which_filter():
     plant, sensor = walk()
     filters = {"one": hg.kalman_filter(plant, sensor), "two": hg.cubature_filter(plant, sensor)}

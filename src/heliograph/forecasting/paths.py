@@ -1,14 +1,16 @@
 """Paths into the future: drawn from the last estimate of one filter, through the plant with its noises."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.filters.modes.multiple_model import ModalBeliefs, MultipleModelFilter
 from heliograph.forecasting.forecast import Target, check_covered, target_of
 from heliograph.forecasting.horizons import Horizons, Inputs, ahead_of, check_ahead
 from heliograph.forecasting.origins import origin_of
+from heliograph.model.modes_of_motion import ModalPlant, ModalSensor, transition_over
 from heliograph.model.origin import HasOrigin
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AnyPlant
@@ -18,7 +20,8 @@ from heliograph.numerics.check import check_count, check_seed, fail
 from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.manifold import Manifold
 from heliograph.numerics.module import readable
-from heliograph.numerics.types import Array
+from heliograph.numerics.types import Array, Bool
+from heliograph.random_affine.memory import memories
 
 DRAWS = 10_000
 
@@ -55,6 +58,9 @@ def draw_paths(
 ) -> Paths:
     """Draw paths of states and outputs: the last state from its estimate, then the plant with its noises.
 
+    Where plant or sensor have modes, the present mode is drawn from its probabilities, and moves by its chain along the
+    path: what a filter merges when it predicts, as `gpb1_filter` does with all modes, is not merged here.
+
     Args:
         source: what one can forecast from, as `hg.forecast` takes it.
         horizons: a number of steps, or a list of how far ahead, as of `hg.forecast`.
@@ -66,7 +72,8 @@ def draw_paths(
 
     Raises:
         ValueError: what `hg.forecast` refuses; several filters and no name; a filter that does not say what its plant
-            is, or that claims no covariance; an unknown start (`hg.diffuse`) of which not all has been heard.
+            is, or that claims no covariance; modes of plant or sensor of which it has no probabilities; an unknown
+            start (`hg.diffuse`) of which not all has been heard.
     """
     origin = origin_of(source)
     target = target_of(origin, node, filter)
@@ -77,15 +84,52 @@ def draw_paths(
     if plant is None:
         raise fail("paths", "a filter that says what its plant is", type(target.outlook.filter).__name__)
     count, key = check_count("draws", draws), jax.random.key(check_seed("seed", seed))
-    start = _draw_starts(target, count, np.random.default_rng(seed))
-    x, y = _draw_from_starts(plant, sensor, start, ahead.u, jax.random.split(key, count), np.asarray(origin.step))
+    start, modes = _draw_starts(target, count, np.random.default_rng(seed))
+    keys, step = jax.random.split(key, count), np.asarray(origin.step)
+    x, y = _draw_from_starts(plant, sensor, (start, modes), ahead.u, keys, step, _switching_of(target))
     outputs = () if sensor is None else tuple(first(sensor).outputs)
     states = target.outlook.filter.states
     return Paths(ahead.steps, ahead.time, states, outputs, np.asarray(x)[:, ahead.rows], np.asarray(y)[:, ahead.rows])
 
 
-def _draw_starts(target: Target, draws: int, generator: np.random.Generator) -> np.ndarray:
-    """Draw states (draws, n) from the last estimate: a part of its mixture by its weight, then from its Gaussian."""
+class Switching(NamedTuple):
+    """How a path's mode moves: by the filter's chain, from the first step on if the chain has `moved` before."""
+
+    filter: MultipleModelFilter
+    moved: Bool[Array, ""]
+
+    def draw_next(self, key: jax.Array, mode: jax.Array, u: jax.Array, k: jax.Array, is_first: jax.Array) -> jax.Array:
+        """Draw the mode of step k from that of the step before; at the first of all steps it is the one drawn."""
+        plant, channel = at(self.filter.plant, k), at(self.filter.channel, k)
+        rows = transition_over(plant, u, jnp.asarray(channel.transition))
+        stays = is_first & ~jnp.asarray(self.moved)
+        return jnp.where(stays, mode, jax.random.categorical(key, jnp.log(rows[mode])))
+
+    def choose_models(self, plant: Any, sensor: Any, mode: jax.Array) -> tuple[Any, Any]:
+        """Return plant and sensor as they are in a joint mode."""
+        plant_mode, sensor_mode = (jnp.asarray(x)[mode] for x in (self.filter.plant_modes, self.filter.sensor_modes))
+        return (
+            plant.given(plant_mode) if isinstance(plant, ModalPlant) else plant,
+            sensor.given(sensor_mode) if isinstance(sensor, ModalSensor) else sensor,
+        )
+
+
+def _switching_of(target: Target) -> Switching | None:
+    """Return how the modes of plant and sensor move; None where these have none."""
+    filter, plant, sensor = target.outlook.filter, target.outlook.plant, target.outlook.sensor
+    if not memories((plant, sensor)):
+        return None
+    if not isinstance(filter, MultipleModelFilter):
+        taken = "a filter that has the modes' probabilities (imm_filter, gpb1_filter, gpb2_filter)"
+        raise fail("paths of a plant or sensor with modes", taken, type(filter).__name__)
+    return Switching(filter, target.state.moved)
+
+
+def _draw_starts(target: Target, draws: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Draw states (draws, n) and modes from the last estimate: a part of its mixture by its weight, then its Gaussian.
+
+    The modes are 0 where the filter has none.
+    """
     filter = target.outlook.filter
     if filter.claim == "none":
         raise fail("paths", "a filter that claims a covariance", f"{type(filter).__name__}, which claims none")
@@ -93,36 +137,45 @@ def _draw_starts(target: Target, draws: int, generator: np.random.Generator) -> 
     if not np.isfinite(covariances).all():
         raise fail("paths", "a state that is known", "one of which not all has been heard yet (hg.diffuse)")
     part = generator.choice(len(weights), size=draws, p=weights / weights.sum())
+    modes: np.ndarray = np.zeros(draws, dtype=int)
+    if isinstance(target.state, ModalBeliefs):  # the mode of each component, by its probability there
+        law = np.cumsum(np.asarray(target.state.weight), axis=1)[part]
+        modes = np.minimum((generator.random(draws)[:, None] * law[:, -1:] > law).sum(axis=1), law.shape[1] - 1)
     values, vectors = np.linalg.eigh(covariances)
     roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     changes = np.einsum("dij,dj->di", roots[part], generator.normal(size=(draws, means.shape[1])))
     drawn: np.ndarray = Manifold((), filter.attitude).settle(means[part], means[part] + changes)
-    return drawn
+    return drawn, modes
 
 
 @compile_in_float64
 def _draw_from_starts(
-    plant: AnyPlant, sensor: AnySensor | None, start: Array, u: Array, keys: jax.Array, step: Array
-) -> tuple[jax.Array, jax.Array]:
-    """Return the states and outputs of each path (draws, rows, ...)."""
+    plant: AnyPlant, sensor: AnySensor | None, starts: tuple[Array, Array], u: Array, keys: jax.Array, step: Array,
+    switching: Switching | None,
+) -> tuple[jax.Array, jax.Array]:  # fmt: skip
+    """Return the states and outputs of each path (draws, rows, ...), from its state and mode."""
 
-    def of_path(x: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Draw one path from x: what plant and sensor do over the steps of u, with the draws of this key."""
+    def of_path(start: tuple[jax.Array, jax.Array], key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Draw one path: what plant and sensor do over the steps of u, with the draws of this key."""
 
-        def move(x: jax.Array, row: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-            u_k, k = row
-            moving, measuring = jax.random.split(jax.random.fold_in(key, k))
-            now = at(plant, k)
-            x = now.plus(now.transition(x, u_k), now.sample_noise(moving, u_k))
-            if sensor is None:
-                return x, (x, jnp.zeros(0))
-            eye = at(sensor, k).under(now.inputs, u_k)
-            return x, (x, wrap_angles(eye.measure(x) + eye.noise.sample(measuring), eye.angles))
+        def move(now: tuple[jax.Array, jax.Array], row: tuple[jax.Array, jax.Array]) -> tuple[Any, Any]:
+            """Move mode and state over a step; return them, and state and output."""
+            (x, mode), (u_k, k) = now, row
+            of_step = jax.random.fold_in(key, k)
+            moving, measuring = jax.random.split(of_step)
+            plant_k, sensor_k = at(plant, k), None if sensor is None else at(sensor, k)
+            if switching is not None:
+                mode = switching.draw_next(jax.random.fold_in(of_step, 1), mode, u_k, k, k == jnp.asarray(step))
+                plant_k, sensor_k = switching.choose_models(plant_k, sensor_k, mode)
+            x = plant_k.plus(plant_k.transition(x, u_k), plant_k.sample_noise(moving, u_k))
+            if sensor_k is None:
+                return (x, mode), (x, jnp.zeros(0))
+            eye = sensor_k.under(plant_k.inputs, u_k)
+            return (x, mode), (x, wrap_angles(eye.measure(x) + eye.noise.sample(measuring), eye.angles))
 
-        path: tuple[jax.Array, jax.Array] = jax.lax.scan(
-            move, x, (jnp.asarray(u), jnp.asarray(step) + jnp.arange(len(u)))
-        )[1]
+        rows = jnp.asarray(u), jnp.asarray(step) + jnp.arange(len(u))
+        path: tuple[jax.Array, jax.Array] = jax.lax.scan(move, start, rows)[1]
         return path
 
-    paths: tuple[jax.Array, jax.Array] = jax.vmap(of_path)(jnp.asarray(start), keys)
+    paths: tuple[jax.Array, jax.Array] = jax.vmap(of_path)(jax.tree.map(jnp.asarray, starts), keys)
     return paths
