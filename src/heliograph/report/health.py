@@ -20,6 +20,7 @@ from heliograph.report.held import HeldValue
 from heliograph.report.outputs import OutputHealth, judge_outputs_of_filter, list_listeners, weighs
 from heliograph.report.time_unit import doubt_time_unit
 from heliograph.simulation.declared.judgement import DeclaredJudgement, judge_declared_links
+from heliograph.simulation.description.possible import doubt_what_is_possible
 from heliograph.simulation.network import Network
 from heliograph.simulation.results.record import Record
 from heliograph.simulation.results.whiteness import MemoryTest, whitened_innovations
@@ -80,11 +81,12 @@ class Health:
     residuals: Residuals = field(default_factory=dict)  # of what was predicted, likewise
     off: Mapping[tuple[str, str], ConstantError] = field(default_factory=dict)  # by node and filter, where it says most
     apart: ConstantError | None = None  # of one node against the others, which filter by themselves
+    possible: tuple[str, ...] = ()  # of estimates where no sensor shows a state any more, or at a limit
     time_unit: str = ""  # that times are in another unit than the plant's, which explains what is doubtful
 
     def warnings(self) -> list[str]:
         """Return one line for each reason to doubt the network, the weightiest first."""
-        lines = [*self.record.failures(), *self.held().values()]
+        lines = [*self.record.failures(), *self.held().values(), *self.possible]
         for link in self.links:
             name = f"{link.node}: {link.component}"
             if not link.arrived.any():
@@ -274,9 +276,8 @@ def examine(
         mean = float(np.nanmean(expected))
         filters.append(FilterHealth(node, name, claim, white, test, listener.trusted, declared, unit, mean))
     others = tuple(belief.words for belief in network.beliefs())
-    health = Health(
-        record, list_arrivals(network, record.time, record.measurements), filters, outputs, network.shared, others
-    )
+    links, possible = list_arrivals(network, record.time, record.measurements), doubt_what_is_possible(network, record)
+    health = Health(record, links, filters, outputs, network.shared, others, possible=possible)
     off = {(judged.node, judged.filter): _find_off(network, health, judged, u) for judged in health.doubted()}
     apart = None if health.held() else compare_nodes(network, record, u, FALSE)
     health = replace(health, off={place: error for place, error in off.items() if error is not None}, apart=apart)

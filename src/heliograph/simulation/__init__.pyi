@@ -32,6 +32,9 @@ from .declared.judgement import (
 from .description.wide_angles import (
     WideAngles as WideAngles,
 )
+from .description.possible import (
+    doubt_what_is_possible as doubt_what_is_possible,
+)
 from .description.doubts import (
     Doubt as Doubt,
     doubts_before_data as doubts_before_data,

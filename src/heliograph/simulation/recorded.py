@@ -24,6 +24,7 @@ from heliograph.numerics.types import Array, ArrayLike, Float, PyTree, units_in
 from heliograph.simulation.arguments import inputs_of, measurement_of
 from heliograph.simulation.centres.blame import refuse_centrally
 from heliograph.simulation.centres.uplinks import Drawn, SentReports
+from heliograph.simulation.description.possible import doubt_what_is_possible
 from heliograph.simulation.description.remarks import list_remarks
 from heliograph.simulation.description.wide_angles import warn_beyond_a_turn, warn_wide_in_rows
 from heliograph.simulation.network import FUSED, Network
@@ -64,7 +65,8 @@ def run(
     Values beyond a node's limits, those that are stuck, and those that are implausible for all filters of a node
     (`heliograph.filters.plausibility`), count as not arrived; each is warned of, with its rows from 1.
     A value that the rule of its sender forbids is warned of and used. Filters that left out most of what arrived,
-    such as one with a gate about a wrong start, are warned of.
+    such as one with a gate about a wrong start, are warned of, and an extended filter that ends where no sensor shows
+    a state any more, or a filter with limits that lies at one in most rows.
 
     Args:
         network: the network.
@@ -124,8 +126,8 @@ def run(
     if time is not None and (unit := units_in(network.inputs).get(TIME_STEP)):
         record = replace(record, units=record.units | {"time": unit})
     warn_of_no_numbers(record)
-    weighed = _describe_left_out(network, record)
-    for line in (*warn_wide_in_rows(network, record), *weighed, *list_remarks(network, state)):
+    doubts = *warn_wide_in_rows(network, record), *doubt_what_is_possible(network, record)
+    for line in (*doubts, *_describe_left_out(network, record), *list_remarks(network, state)):
         warnings.warn(line, stacklevel=2)
     origin = _make_origin(network, record, state, u, usual_spacing(clock if known is not None else clock[:2]))
     return (record if true is None else add_truth(record, network.plant, true, smooth)).with_origin(origin)

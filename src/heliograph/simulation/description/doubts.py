@@ -3,8 +3,6 @@
 from collections.abc import Iterator
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from heliograph.disk.quoting import join_names
@@ -15,14 +13,11 @@ from heliograph.filters.words.linear import SEEN
 from heliograph.filters.wrappers.told import ToldFilter, believe_typical
 from heliograph.model.fading import memory_matters
 from heliograph.model.over_time import at_each_step, first
-from heliograph.model.plant import AbstractPlant
 from heliograph.model.premises.agreement import CHANNEL, matrix_of
-from heliograph.model.sensor import AbstractSensor
 from heliograph.model.told import separate_told
 from heliograph.numerics.check import InputError, instance
 from heliograph.numerics.module import readable
 from heliograph.numerics.traced import DOUBLE
-from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.modes import redraw_modes_each_step
 from heliograph.random_affine.superposed import Superposed
@@ -32,6 +27,7 @@ from heliograph.simulation.claims import Belief, list_other_beliefs
 from heliograph.simulation.declared.refit import list_declaring
 from heliograph.simulation.description.diagram import list_rounded, list_shared
 from heliograph.simulation.description.fallbacks import list_fallbacks, list_sequential
+from heliograph.simulation.description.observability import list_sensors, make_observability_matrix
 from heliograph.simulation.description.separable import separate_nodes
 from heliograph.simulation.description.wide_angles import warn_wide_at_start
 from heliograph.simulation.network import Network
@@ -92,17 +88,13 @@ def _find_overloads(network: Network) -> Iterator[Doubt]:
             yield Doubt(not float(overload.bound) <= SEEN, overload.describe(name, label))
 
 
-def _list_sensors(network: Network) -> list[AbstractSensor]:
-    """Return every sensor of the network, at its first step."""
-    sensors = [node.sensor for node in network.nodes.values() if isinstance(node, Node)]
-    sensors += [] if network.common is None else [network.common.sensor]
-    sensors += [] if network.relays is None else [network.relays.sensor]
-    return [first(sensor) for sensor in sensors]
-
-
 def _find_unobservable(network: Network) -> Iterator[Doubt]:
     """Yield the directions that no sensor shows within n steps, by the names of their states."""
-    matrix = observability(first(network.plant), _list_sensors(network))
+    # At a state drawn around the initial mean, since a symmetric point may hide what every other one shows.
+    plant = first(network.plant)
+    spread = np.sqrt(np.diagonal(np.asarray(plant.initial_covariance)))
+    state = np.asarray(plant.initial_mean) + spread * np.random.default_rng(SEED).normal(size=len(plant.states))
+    matrix = make_observability_matrix(plant, list_sensors(network), state, len(plant.states))
     if not np.isfinite(matrix).all():
         yield Doubt(False, "observability: not judged, the derivatives of plant or sensors are no numbers")
         return
@@ -117,29 +109,6 @@ def _find_unobservable(network: Network) -> Iterator[Doubt]:
         count = len(network.states) - rank
         what = names[0] if len(names) == 1 else f"{count} of the combinations of {', '.join(names)}"
         yield Doubt(True, f"unobservable: no sensor shows {what}, of which filters know no more than before any data")
-
-
-def observability(plant: AbstractPlant, sensors: list[AbstractSensor]) -> Float[np.ndarray, "rows n"]:
-    """Return d(y_1, ..., y_n)/dx_0 over n steps, all sensors stacked, with inputs of 1.
-
-    Linear plants and sensors have it everywhere, others at a state drawn around the initial mean, since a symmetric
-    point may hide what every other one shows.
-    """
-    # A state drawn around the initial mean, and unit inputs.
-    n = len(plant.states)
-    spread = np.sqrt(np.diagonal(np.asarray(plant.initial_covariance)))
-    point = np.asarray(plant.initial_mean) + spread * np.random.default_rng(SEED).normal(size=n)
-    u = jnp.ones(len(plant.inputs))
-
-    def outputs(x: jax.Array) -> jax.Array:
-        results = []
-        for _ in range(n):
-            x = plant.transition(x, u)
-            results += [sensor.under(plant.inputs, u).measure(x) for sensor in sensors]
-        return jnp.concatenate(results)
-
-    with jax.enable_x64(True):
-        return np.asarray(jax.jacfwd(outputs)(jnp.asarray(point)))
 
 
 def _doubt_boundedness(network: Network) -> Iterator[Doubt]:

@@ -1,0 +1,118 @@
+"""Doubts about estimates at the edge of what is possible: where no sensor shows a state any more, or at its limit."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.gaussian.transform import Linearization
+from heliograph.filters.wrappers.limited import LimitedFilter
+from heliograph.model.over_time import first
+from heliograph.model.plant import AbstractPlant
+from heliograph.model.sensor import AbstractSensor, AnySensor, is_linear
+from heliograph.numerics.check import instance
+from heliograph.numerics.types import Float
+from heliograph.simulation.description.observability import list_sensors, make_observability_matrix
+from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.node import Node
+from heliograph.simulation.results.record import Record
+
+LAST = 10  # rows: in the last one and in the one so many before it no sensor shows the state
+MOST = 0.5  # share of the rows, beyond which it is worth a word that an estimate lies at a limit
+HELD = float(np.sqrt(2 / (np.pi - 2)))  # mean over deviation of a Gaussian of mean 0 that is known to be positive
+CLOSE = 1e-3  # relative, of that: a mean that is 0.007 deviations inside its limit
+APART = 10.0  # deviations between two limits, from which the other one changes nothing
+
+
+def doubt_what_is_possible(network: Network, record: Record) -> tuple[str, ...]:
+    """Return a line for each estimate that ends where no sensor shows it, or that lies at a limit in most rows.
+
+    Args:
+        network: the network.
+        record: what `run` of this network returned, over one recording.
+
+    Raises:
+        ValueError: no network, no record.
+    """
+    instance("network", network, Network, "a Network")
+    instance("record", record, Record, "a Record")
+    return *_warn_unseen_at_end(network, record), *_warn_at_limits(network, record)
+
+
+def _warn_unseen_at_end(network: Network, record: Record) -> Iterator[str]:
+    """Yield a line for each extended filter that ends where no sensor shows a state that one showed at the start.
+
+    A state is shown where an output within n steps depends on it: its column of the observability matrix is not zero.
+    Where it is exactly zero, as beyond the end of a table, the gain of the state is by its correlations alone: what
+    arrives says nothing of where it is. Not judged: states with limits, which bring an estimate back; filters that
+    average over points; models that vary over time; estimates that are no numbers.
+    """
+    plant = network.plant
+    if not isinstance(plant, AbstractPlant):
+        return
+    limited = {name for name, _ in plant.limits}
+    for node, label, filter, sensors in _find_filters(network):
+        if not isinstance(getattr(filter, "transform", None), Linearization):
+            continue
+        if all(is_linear(plant, sensor) for sensor in sensors) or any(first(one) is not one for one in sensors):
+            continue
+        means = np.asarray(record.estimates[node][label].mean)
+        if len(means) <= LAST or not np.all(np.isfinite(means[[-1 - LAST, -1]])):
+            continue
+        # Over one step first, which is cheap: hardly any recording ends so.
+        here, start, end = [first(sensor) for sensor in sensors], np.asarray(plant.initial_mean), means[-1]
+        if not np.any(_find_shown(plant, here, start, 1) & ~_find_shown(plant, here, end, 1)):
+            continue
+        unseen = _find_shown(plant, here, start) & ~_find_shown(plant, here, end)
+        unseen &= ~_find_shown(plant, here, means[-1 - LAST])
+        for i in np.flatnonzero(unseen):
+            name = network.states[i]
+            if name not in limited:
+                yield (
+                    f"{node}/{label}: {name!r} ends at {means[-1, i]:.4g}, where no sensor shows it, as beyond the end "
+                    "of a table: what arrives does not move it. If it cannot be there, limits= of the plant say so"
+                )
+
+
+def _warn_at_limits(network: Network, record: Record) -> Iterator[str]:
+    """Yield a line for each state with limits that a filter has at one of them in most rows.
+
+    A filter says mean and deviation of its Gaussian given the limits. One whose mean is held at a limit has the mean
+    sqrt(2 / pi) s inside it, and the deviation sqrt(1 - 2 / pi) s: of ratio HELD, and of a larger one where the mean
+    is inside. That holds of one limited state; of several, of which each changes those before it, nearly.
+    """
+    for node, label, limited, _ in _find_filters(network):
+        if not isinstance(limited, LimitedFilter):
+            continue
+        estimate = record.estimates[node][label]
+        for place, *limits in limited.limits:
+            mean = np.asarray(estimate.mean)[:, place]
+            deviation = np.sqrt(np.maximum(np.asarray(estimate.covariance)[:, place, place], 0.0))
+            for limit in filter(np.isfinite, limits):
+                at = (np.abs(mean - limit) <= HELD * (1 + CLOSE) * deviation) & (deviation > 0)
+                at &= np.ptp(limits) > APART * deviation
+                if np.count_nonzero(at) > MOST * len(mean):
+                    yield (
+                        f"{node}/{label}: {network.states[place]!r} is held at its limit {limit:g} in "
+                        f"{np.count_nonzero(at)} of {len(mean)} rows, as where what arrives puts it beyond: if it is "
+                        "not there, a sensor, the plant or the limit is off"
+                    )
+
+
+def _find_filters(network: Network) -> Iterator[tuple[str, str, AbstractFilter, Sequence[AnySensor]]]:
+    """Yield every filter that claims a covariance, with its places and the sensors that it hears."""
+    every = list_sensors(network)
+    for name, node in network.nodes.items():
+        sensors = [node.sensor] if isinstance(node, Node) else every
+        yield from ((name, label, one, sensors) for label, one in node.filters.items() if one.claim != "none")
+    for label, fusion in network.fused.items():
+        if isinstance(fusion, AbstractFilter) and fusion.claim != "none":
+            yield FUSED, label, fusion, every
+
+
+def _find_shown(
+    plant: AbstractPlant, sensors: Sequence[AbstractSensor], state: Float[np.ndarray, " n"], steps: int | None = None
+) -> np.ndarray:
+    """Return which states (n,) change an output within some steps, n by default."""
+    matrix = make_observability_matrix(plant, sensors, state, steps or len(plant.states))
+    return np.asarray(np.any(matrix != 0, axis=0))
