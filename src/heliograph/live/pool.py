@@ -10,8 +10,7 @@ import numpy as np
 from heliograph.live.long_gap import LONG, TAIL, factors_in, pass_long_gap
 from heliograph.live.network_program import NetworkProgram
 from heliograph.live.rows import HeldRow
-from heliograph.numerics.types import Float
-from heliograph.simulation.rows.row_smoother import RowHistory
+from heliograph.numerics.types import Float, PyTree
 
 FEWEST = 1024  # rows of the table at first; it doubles when it is full
 SHORTEST = 64  # rows of a history
@@ -127,12 +126,12 @@ class Pool:
         after = pass_long_gap(step, self.step_rows.start, row[self.state].copy(), at, to - at, places)
         self.table[slot, self.state], self.table[slot, self.at.start] = after, to
 
-    def history(self, slots: Sequence[int]) -> RowHistory:
+    def history(self, slots: Sequence[int]) -> PyTree:
         """Return the rows in these slots, in order, and behind them copies of the last up to a power of two."""
         length = max(SHORTEST, 1 << (len(slots) - 1).bit_length())
-        rows, steps = self.table[[*slots, *[slots[-1]] * (length - len(slots))]], self.step_rows
-        state, outputs = steps.state.tree(rows[:, self.state]), steps.outputs.tree(rows[:, self.outputs])
-        return RowHistory(rows[:, self.numbers], state, rows[:, self.held], rows[:, self.at.start].astype(int), outputs)
+        rows = self.table[[*slots, *[slots[-1]] * (length - len(slots))]]
+        state, outputs = rows[:, self.state], rows[:, self.outputs]
+        return self.step_rows.history(rows[:, self.numbers], state, rows[:, self.held], rows[:, self.at.start], outputs)
 
 
 def _insert_time_step(u: Float[np.ndarray, "row given"], dt: int, steps: Float[np.ndarray, " row"]) -> np.ndarray:

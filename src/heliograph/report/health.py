@@ -23,7 +23,7 @@ from heliograph.simulation.declared.judgement import DeclaredJudgement, judge_de
 from heliograph.simulation.description.possible import doubt_what_is_possible
 from heliograph.simulation.network import Network
 from heliograph.simulation.results.record import Record
-from heliograph.simulation.results.whiteness import MemoryTest, whitened_innovations
+from heliograph.simulation.results.whiteness import MemoryTest, score_innovations
 
 LAGS = 10  # of the test for memory, with ten rows for each at least
 FALSE = 0.001  # probability of a false warning by one kind of test, of all filters together
@@ -264,7 +264,7 @@ def examine(
         advance(f"testing {node}/{name}")
         white, test, expected = None, None, np.ones(1)
         if filter.claim != "none" and filter.received:
-            white = whitened_innovations(z, filter, u)
+            white = np.asarray(score_innovations(filter, z, u)[1])
             outputs += judge_outputs_of_filter(network, listener, record, u)
             test = _test_innovations(subtract_mean(white) if weighs(filter) else white)
             expected = expect_squares(filter, z, u)

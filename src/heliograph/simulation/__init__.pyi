@@ -43,7 +43,6 @@ from .rows.columns import (
     FilterColumns as FilterColumns,
 )
 from .rows.row_smoother import (
-    RowHistory as RowHistory,
     RowSmoother as RowSmoother,
 )
 from .rows.row_step import (

@@ -2,13 +2,12 @@
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from typing_extensions import TypeAliasType
 
 from heliograph.engine.choice import choose_code, map_arrays, read_setting
 from heliograph.filters.base import AbstractFilter
@@ -19,56 +18,15 @@ from heliograph.numerics.check import InputError, fail, instance, is_whole, show
 from heliograph.numerics.float64 import to_numpy, understood
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.trees.static import Static, cast
-from heliograph.numerics.types import Array, Float, Int, PyTree
+from heliograph.numerics.types import PyTree
 from heliograph.simulation.centres.fusions import StackedFusions
 from heliograph.simulation.network import Network
 from heliograph.simulation.plausible_step import reasons
+from heliograph.simulation.rows.row_history import RowHistory
 from heliograph.simulation.rows.row_step import NetworkStep
 from heliograph.simulation.stepping import AllFilters
 
-Rows = TypeAliasType("Rows", Float[Array, "row column"])
 NetworkSmootherStep: TypeAlias = "tuple[dict[int, SmootherStep], dict[str, SmootherStep]]"  # by kind, and by name
-
-
-@readable
-class RowHistory(NamedTuple):
-    """Rows in order: measurements of all nodes, inputs (NaN where none was given), and the time.
-
-    Args:
-        rows: these numbers (row, received + given + 1).
-        state: the filters' states after each row.
-        held: inputs held there (row, given).
-        step: number of the step (row,).
-        outputs: estimates and judgements after each row.
-    """
-
-    rows: Rows
-    state: PyTree
-    held: Rows
-    step: Int[Array, " row"]
-    outputs: PyTree
-
-    def parts(self, row: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Return the measurements, the inputs and the time of a row."""
-        given = self.held.shape[1]
-        numbers = self.rows[row]
-        return numbers[: -given - 1], numbers[-given - 1 : -1], numbers[-1]
-
-    def state_after(self, row: jax.Array) -> PyTree:
-        """Return the filters' states after a row."""
-        return jax.tree.map(lambda leaf: leaf[row], self.state)
-
-    def interval(self, row: jax.Array, dt: int) -> jax.Array:
-        """Return the inputs of a plant of continuous time since the row before, as held then."""
-        held, passed = self.held[row - 1], self.parts(row)[2] - self.parts(row - 1)[2]
-        return jnp.concatenate([held[:dt], passed[None], held[dt:]])
-
-    def at_step(self, row: jax.Array, k: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return measurements and inputs at step k, which is the row's or one between it and the row before."""
-        received, given, last = self.parts(row)
-        there, held = k == last.astype(self.step.dtype), self.held[row - 1]
-        u = jnp.where(there, jnp.where(jnp.isnan(given), held, given), held)
-        return jnp.where(there, received, jnp.nan), u
 
 
 class Sweep(Module):

@@ -19,6 +19,7 @@ from heliograph.numerics.types import Float, PyTree
 from heliograph.simulation.network import Network
 from heliograph.simulation.plausible_step import step_plausibly
 from heliograph.simulation.rows.columns import columns_of
+from heliograph.simulation.rows.row_history import RowHistory
 from heliograph.simulation.stepping import AllFilters, initial_states
 
 OUTPUTS = "estimates", "fused", "judged", "judged_centrally", "weighed", "weighed_centrally", "tested"
@@ -132,6 +133,25 @@ class RowStep:
     def program(self) -> str:
         """Return the step as text, which two processes compare to see that they compute the same."""
         return _text(self._layout, self._like)
+
+    def history(
+        self,
+        rows: Float[np.ndarray, "row column"],
+        state: Float[np.ndarray, "row state"],
+        held: Float[np.ndarray, "row given"],
+        step: Float[np.ndarray, " row"],
+        outputs: Float[np.ndarray, "row output"],
+    ) -> RowHistory:
+        """Return rows in order, with the states and outputs after each as they are laid out, for a `RowSmoother`.
+
+        Args:
+            rows: measurements of all nodes, inputs, and the time.
+            state: the filters' states after each row.
+            held: inputs held there.
+            step: number of the step.
+            outputs: what `RowStep` returned.
+        """
+        return RowHistory(rows, self.state.tree(state), held, step.astype(int), self.outputs.tree(outputs))
 
     def for_one(self) -> "OneRowStep":
         """Return the step of one row at a time, which has memory of its own."""

@@ -1,0 +1,53 @@
+"""The history of rows that a sweep back goes over: what came, and what the filters made of it."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from typing_extensions import TypeAliasType
+
+from heliograph.numerics.module import readable
+from heliograph.numerics.types import Array, Float, Int, PyTree
+
+Rows = TypeAliasType("Rows", Float[Array, "row column"])
+
+
+@readable
+class RowHistory(NamedTuple):
+    """Rows in order: measurements of all nodes, inputs (NaN where none was given), and the time.
+
+    Args:
+        rows: these numbers (row, received + given + 1).
+        state: the filters' states after each row.
+        held: inputs held there (row, given).
+        step: number of the step (row,).
+        outputs: estimates and judgements after each row.
+    """
+
+    rows: Rows
+    state: PyTree
+    held: Rows
+    step: Int[Array, " row"]
+    outputs: PyTree
+
+    def parts(self, row: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Return the measurements, the inputs and the time of a row."""
+        given = self.held.shape[1]
+        numbers = self.rows[row]
+        return numbers[: -given - 1], numbers[-given - 1 : -1], numbers[-1]
+
+    def state_after(self, row: jax.Array) -> PyTree:
+        """Return the filters' states after a row."""
+        return jax.tree.map(lambda leaf: leaf[row], self.state)
+
+    def interval(self, row: jax.Array, dt: int) -> jax.Array:
+        """Return the inputs of a plant of continuous time since the row before, as held then."""
+        held, passed = self.held[row - 1], self.parts(row)[2] - self.parts(row - 1)[2]
+        return jnp.concatenate([held[:dt], passed[None], held[dt:]])
+
+    def at_step(self, row: jax.Array, k: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return measurements and inputs at step k, which is the row's or one between it and the row before."""
+        received, given, last = self.parts(row)
+        there, held = k == last.astype(self.step.dtype), self.held[row - 1]
+        u = jnp.where(there, jnp.where(jnp.isnan(given), held, given), held)
+        return jnp.where(there, received, jnp.nan), u
