@@ -20,7 +20,7 @@ from heliograph.report.held import HeldValue
 from heliograph.report.outputs import OutputHealth, judge_outputs_of_filter, list_listeners, weighs
 from heliograph.report.time_unit import doubt_time_unit
 from heliograph.simulation.declared.judgement import DeclaredJudgement, judge_declared_links
-from heliograph.simulation.description.possible import doubt_what_is_possible
+from heliograph.simulation.description.possible import doubt_estimates
 from heliograph.simulation.network import Network
 from heliograph.simulation.results.record import Record
 from heliograph.simulation.results.whiteness import MemoryTest, score_innovations
@@ -276,7 +276,7 @@ def examine(
         mean = float(np.nanmean(expected))
         filters.append(FilterHealth(node, name, claim, white, test, listener.trusted, declared, unit, mean))
     others = tuple(belief.words for belief in network.beliefs())
-    links, possible = list_arrivals(network, record.time, record.measurements), doubt_what_is_possible(network, record)
+    links, possible = list_arrivals(network, record.time, record.measurements), doubt_estimates(network, record)
     health = Health(record, links, filters, outputs, network.shared, others, possible=possible)
     off = {(judged.node, judged.filter): _find_off(network, health, judged, u) for judged in health.doubted()}
     apart = None if health.held() else compare_nodes(network, record, u, FALSE)

@@ -33,7 +33,7 @@ from .description.wide_angles import (
     WideAngles as WideAngles,
 )
 from .description.possible import (
-    doubt_what_is_possible as doubt_what_is_possible,
+    doubt_estimates as doubt_estimates,
 )
 from .description.doubts import (
     Doubt as Doubt,

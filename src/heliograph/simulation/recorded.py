@@ -24,7 +24,7 @@ from heliograph.numerics.types import Array, ArrayLike, Float, PyTree, units_in
 from heliograph.simulation.arguments import inputs_of, measurement_of
 from heliograph.simulation.centres.blame import refuse_centrally
 from heliograph.simulation.centres.uplinks import Drawn, SentReports
-from heliograph.simulation.description.possible import doubt_what_is_possible
+from heliograph.simulation.description.possible import doubt_estimates
 from heliograph.simulation.description.remarks import list_remarks
 from heliograph.simulation.description.wide_angles import warn_beyond_a_turn, warn_wide_in_rows
 from heliograph.simulation.network import FUSED, Network
@@ -126,7 +126,7 @@ def run(
     if time is not None and (unit := units_in(network.inputs).get(TIME_STEP)):
         record = replace(record, units=record.units | {"time": unit})
     warn_of_no_numbers(record)
-    doubts = *warn_wide_in_rows(network, record), *doubt_what_is_possible(network, record)
+    doubts = *warn_wide_in_rows(network, record), *doubt_estimates(network, record)
     for line in (*doubts, *_describe_left_out(network, record), *list_remarks(network, state)):
         warnings.warn(line, stacklevel=2)
     origin = _make_origin(network, record, state, u, usual_spacing(clock if known is not None else clock[:2]))

@@ -24,7 +24,7 @@ CLOSE = 1e-3  # relative, of that: a mean that is 0.007 deviations inside its li
 APART = 10.0  # deviations between two limits, from which the other one changes nothing
 
 
-def doubt_what_is_possible(network: Network, record: Record) -> tuple[str, ...]:
+def doubt_estimates(network: Network, record: Record) -> tuple[str, ...]:
     """Return a line for each estimate that ends where no sensor shows it, or that lies at a limit in most rows.
 
     Args:
