@@ -62,25 +62,29 @@ class SplitIntersection(AbstractIntersection):
             raise fail("known part", f"that of {count} estimates", f"that of {len(self.known)}")
 
     def combine(self, means: Means, covariances: Covariances) -> Fused:
-        """Alternate weights for shares and shares as the roots of tr W_i P^b_i W_i': tr W P(w) W' falls with each."""
+        """Fuse by P(w) = known + diag(P^b_i / w_i), which bounds the joint covariance for all shares w that sum to 1.
+
+        Weights W and shares are found in turn, each for the other: the best W for P(w), and w_i in proportion to
+        root(tr W_i P^b_i W_i'). The trace of W P(w) W' falls with each.
+        """
         known = jnp.asarray(self.known)
         count = len(means)
         items = jnp.arange(count)
         unknown = _add_rounding(covariances - known[items, :, items, :], covariances)
 
-        # P(w), and shares in proportion to root(tr W_i P^b_i W_i').
-        def above(shares: jax.Array) -> jax.Array:
+        def bound(shares: jax.Array) -> jax.Array:
+            """Return P(w)."""
             return known.at[items, :, items, :].add(unknown / shares[:, None, None])
 
-        def better(_: int, shares: jax.Array) -> jax.Array:
-            weights = matrix_weights(above(shares))
+        def improve(_: int, shares: jax.Array) -> jax.Array:
+            weights = matrix_weights(bound(shares))
             root = jnp.sqrt(jnp.maximum(jnp.einsum("aib,ibc,aic->i", weights, unknown, weights), 0.0))
             total = root.sum()
             return jnp.maximum(jnp.where(total > 0, root / jnp.where(total > 0, total, 1.0), shares), LEAST)
 
         # Alternating minimisation from equal shares.
-        shares = jax.lax.fori_loop(0, ROUNDS, better, jnp.full(count, 1 / count))
-        joint = above(shares / shares.sum())
+        shares = jax.lax.fori_loop(0, ROUNDS, improve, jnp.full(count, 1 / count))
+        joint = bound(shares / shares.sum())
         weights = matrix_weights(joint)
         # W x and W P(w) W'; NaN if some P^b_i is no covariance.
         sound = jnp.all(jnp.isfinite(jax.vmap(cholesky)(unknown)))

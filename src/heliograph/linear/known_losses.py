@@ -89,7 +89,7 @@ def find_gains(system: KnownLossSystem) -> KindGains:
 
     Source: Sinopoli et al. (2004), Theorem 3 (the modified algebraic Riccati equation); by mode for chains.
     """
-    system = system._replace(law=np.where(system.law > 1e-9, system.law, SEEN))
+    system = system._replace(law=np.where(system.law > 1e-9, system.law, SEEN))  # a mode of no weight has a gain too
     size = float(np.trace(system.process)) or 1.0  # what starts at rest is searched as if it did not
     parts: Parts = system.law[:, None, None] * (system.process + size * np.eye(len(system.transition)))
     # Value iteration, renormalised where covariances grow.
@@ -102,6 +102,7 @@ def find_gains(system: KnownLossSystem) -> KindGains:
         before, gains = gains, _improve_gains(system, parts, noise)
         if _relative_change(before, gains) < CONVERGED:
             break
+        # After 1, 2, 4, ... steps: gains that are certified already are improved by policies instead.
         if step.bit_count() == 1 and system.closed(gains).radius() < BELOW_ONE:
             break
     # Policy iteration, and the certificate rho(operator) < 1.

@@ -91,10 +91,14 @@ def pass_long_gap(step: Step, start: Float[np.ndarray, " state"], state: Float[n
 def _pass_silent_steps(
     step: Step, state: Float[np.ndarray, " state"], at: int, count: int, places: Sequence[Factors]
 ) -> Float[np.ndarray, " state"]:
-    """Take a few probes of real steps; where they end at rest or follow an affine map, jump, else extrapolate them."""
+    """Take `count` steps of silence: a few probes, PROBED real steps each, and the rest at once by what these show.
+
+    Where a probe moves nothing the state rests; where covariances follow an affine map it is applied as often as is
+    left; else the probes are extrapolated. A state holds factors of covariances at `places`; affine are covariances.
+    """
     passed = [state]
 
-    def seen(states: Sequence[Float[np.ndarray, " state"]]) -> Sequence[Float[np.ndarray, " state"]]:
+    def as_covariances(states: Sequence[Float[np.ndarray, " state"]]) -> Sequence[Float[np.ndarray, " state"]]:
         return list(convert_to_covariances(np.stack(states), places))
 
     def by_covariances(states: Float[np.ndarray, "row state"], k: int) -> Float[np.ndarray, "row state"]:
@@ -102,16 +106,18 @@ def _pass_silent_steps(
 
     for i in range(min(PROBES, count // PROBED)):
         passed.append(_step_through(step, passed[-1], at + i * PROBED, PROBED))
-        if not (moving := _find_moving(*seen(passed[-2:]))).any():
+        if not (moving := _find_moving(*as_covariances(passed[-2:]))).any():
             return passed[-1]
         if i & (i + 1) == 0:  # after 1, 2, 4, ... probes
-            jumped = _jump_by_affine_map(by_covariances, seen(passed[-2:]), moving, at + i * PROBED, count - i * PROBED)
+            jumped = _jump_by_affine_map(
+                by_covariances, as_covariances(passed[-2:]), moving, at + i * PROBED, count - i * PROBED
+            )
             if jumped is not None:
                 return _restore_factors(jumped, places)
     done = PROBED * (len(passed) - 1)
     if count - done < PROBED:
         return _step_through(step, passed[-1], at + done, count - done)
-    return _restore_factors(_extrapolate(seen(passed), count - done), places)
+    return _restore_factors(_extrapolate(as_covariances(passed), count - done), places)
 
 
 def _restore_factors(state: Float[np.ndarray, " state"], places: Sequence[Factors]) -> Float[np.ndarray, " state"]:

@@ -97,7 +97,10 @@ def _check_powers(powers: object, nodes: Mapping[str, Node], steps: int) -> dict
 
 
 def add_best_filter(plant: AnyPlant, node: Node, channel: Channel) -> Node:
-    """Return the node with this channel, and the best linear filter behind it."""
+    """Return the node with this channel, and the best linear filter behind it.
+
+    Limits of what is received were made for the node's own channel: behind another one only what is invalid still is.
+    """
     filters = {BEST: linear_filter(plant, node.sensor, channel)}
     if node.limits is None or same(channel, node.channel):
         return Node(node.sensor, channel, filters, node.limits)

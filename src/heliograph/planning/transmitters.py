@@ -75,7 +75,10 @@ def compute_sent_powers(channel: AbstractRandomAffine, second: Second, step: int
 
 
 def steady_powers(channel: AbstractRandomAffine, second: Second) -> dict[str, Any]:
-    """Return the power of each transmitter in the long run, whatever modes the channel began with."""
+    """Return the power of each transmitter in the long run, in the stationary law of the channel's modes.
+
+    A start that is stationary is kept: where a chain has several closed classes, it says how probable each is.
+    """
     joint = joint_modes(channel, order=2)
     unchanged = np.allclose(joint.initial @ joint.transition, joint.initial, rtol=0.0, atol=UNCHANGED)
     return powers_of_law(channel, second, joint.initial if unchanged else stationary(joint.transition))

@@ -83,7 +83,10 @@ class AbstractUniform(AbstractRandomAffine):
         return results.pop()
 
     def visit_hops(self, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
-        """Visit the hops of each map, which are the same transmitters in each."""
+        """Visit the hops of each map, and return them with the position behind the map of most hops.
+
+        All begin at `position`, since hops of equal places are the same transmitters in each map.
+        """
         pairs = [affine.visit_hops(visit, position) for affine in self.maps]
         visited: AbstractRandomAffine = replace_inner_maps(self, [affine for affine, _ in pairs])
         return visited, max((after for _, after in pairs), key=lambda after: after.hops)

@@ -119,14 +119,14 @@ class ForecastPublisher:
         for node, filters in found.items():
             for name, forecast in filters.items():
                 of_row = bodies[node][name][place]
-                passed = {} if of_row[0]["claim"] == "none" else self._pass_levels(start, (node, name), forecast)
+                passed = {} if of_row[0]["claim"] == "none" else self._find_all_crossings(start, (node, name), forecast)
                 for i, body in enumerate(of_row if passed else []):
                     body["thresholds"] = {level: said[i] for level, said in passed.items()}
 
-    def _pass_levels(
+    def _find_all_crossings(
         self, start: ForecastStart, place: tuple[str, str], forecast: "heliograph.forecasting.Forecast"
     ) -> dict[str, list[dict[str, float]]]:
-        """Return by level the probabilities that it is passed, at each horizon; of levels that the filter knows."""
+        """Return, for each level of a state or output of this filter, how probably it is passed by each horizon."""
         outputs = () if forecast.outputs is None else forecast.outputs.names
         known = () if forecast.states.claim == "none" else (*forecast.states.names, *outputs)
         return {

@@ -106,12 +106,17 @@ def _slice_window(lowering: Lowering, x: np.ndarray, axis: int, start: Node, siz
 
 
 def make_indexable(lowering: Lowering, x: Value, places: list[Value]) -> Value:
-    """Place a table, or a long array, in memory, since data or a loop's counter select its entries."""
+    """Place x in memory where `places`, by which its entries are selected, are known when the program runs alone.
+
+    That is done for a table of constants and for what is longer than FEW; keys of random numbers are never in memory.
+    """
     nodes = [n for p in places for n in lowering.nodes(p).ravel().tolist()]
-    if isinstance(x, InMemory) or all(n.op == "constant" for n in nodes):
+    places_are_known = all(n.op == "constant" for n in nodes)
+    if isinstance(x, InMemory) or places_are_known:
         return x
     flat = x.ravel().tolist()
-    if any(isinstance(n, Key) for n in flat) or not (len(flat) > FEW or all(n.op == "constant" for n in flat)):
+    has_keys, is_table = any(isinstance(n, Key) for n in flat), all(n.op == "constant" for n in flat)
+    if has_keys or not (is_table or len(flat) > FEW):
         return x
     return in_memory(lowering, x)
 

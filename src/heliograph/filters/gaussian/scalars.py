@@ -123,9 +123,10 @@ def _trace_weight(omega: jax.Array, power: jax.Array, others: Sequence[jax.Array
 def _root_ratio(
     top: jax.Array, by_top: list[jax.Array], bottom: jax.Array, by_bottom: Sequence[jax.Array | None]
 ) -> tuple[jax.Array, list[jax.Array]]:
-    """Return half of log(top / bottom), at least log SMALLEST_SCALAR, also where both are zero.
+    """Return log root(top / bottom), at least log SMALLEST_SCALAR, also where both are zero; and its slopes.
 
-    Returned with its slopes, from those of both. No quotient or root of zero is taken, so that derivatives exist.
+    The slopes are (top' / top - bottom' / bottom) / 2 by each variable, `by_bottom` None where bottom does not depend
+    on it, and 0 at the limit. No quotient or root of zero is taken, so that derivatives exist.
     """
     some = (top > 0) & (bottom > 0)
     top, bottom = jnp.where(some, top, 1.0), jnp.where(some, bottom, 1.0)

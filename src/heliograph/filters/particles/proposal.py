@@ -42,10 +42,15 @@ class Proposed(NamedTuple):
 def propose(
     moved: Moved, sensor: AbstractSensor, atoms: Atoms, z: jax.Array, angles: Angles, key: jax.Array
 ) -> Proposed:
-    """Draw e from q, which is N(C' S^-1 r, I - C' S^-1 C) with C = M H G, S = C C' + R and r what z exceeds E z by.
+    """Draw x = center + G e of each particle, e near what z says of it, and weigh it for not being drawn from N(0, I).
 
-    In coordinates of the noise, so that its covariance may be singular; (I + C' R^-1 C)^-1 is the same covariance.
-    Where the sensor is linear and the noise Gaussian q is the law of e given z; else a tenth of it is N(0, I).
+    e is of q = N(C' S^-1 r, I - C' S^-1 C), its law given z, with C = M H G, S = C C' + R and r = z - E z: M the mean
+    gain of the link, H the slopes of the sensor, R the noise of z. In coordinates e of the plant's noise, so that its
+    covariance G G' may be singular; (I + C' R^-1 C)^-1 is the covariance of q in other words. Where the sensor is not
+    linear or the noise has several atoms, a share SAFE of q is N(0, I).
+
+    Returns:
+        States, and log N(e; 0, I) - log q(e) of each.
     """
     safe = 0.0 if isinstance(sensor, LinearSensor) and len(atoms.weight) == 1 else SAFE
     gain, offset, noise = atoms.moments()

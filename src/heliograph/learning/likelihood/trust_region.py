@@ -228,18 +228,35 @@ def _update_hessian(
     sound: np.ndarray,
     taken: np.ndarray,
 ) -> np.ndarray:
-    """Model of the Hessian at the end of a step: the information, or the last model corrected by the step (SR1)."""
-    # y = B+ p with the change of the gradient y: B+ = B + r r' / r' p, r = y - B p
+    """Return the model B of minus the Hessian after a step p, in each lane.
+
+    Of the information and the last model, corrected by the step (SR1), it is the one that would have foretold the gain
+    g' p - p' B p / 2 better.
+
+    Args:
+        state: before the step.
+        domains: of the numbers.
+        step: p (lanes, numbers).
+        gradient: at the end of the step.
+        information: at the end of the step.
+        gain: of the log-likelihood by the step.
+        sound: whether what was found there is finite.
+        taken: whether the step is.
+    """
+    # B+ = B + r r' / r' p with r = y - B p, so that B+ p = y, y the gradient before less that after the step
     base = np.nan_to_num(state.model)
-    wrong = np.where(sound[:, None], np.nan_to_num(state.gradient - gradient), 0.0) - _multiply_lanes(base, step)
+    residual = np.where(sound[:, None], np.nan_to_num(state.gradient - gradient), 0.0) - _multiply_lanes(base, step)
     diagonal = np.diagonal(state.information, axis1=1, axis2=2)
-    wrong = np.where(domains.free | (diagonal > INVISIBLE), wrong, 0.0)  # elsewhere y is but rounding
-    along = np.sum(wrong * step, axis=1)
+    residual = np.where(domains.free | (diagonal > INVISIBLE), residual, 0.0)  # elsewhere y is but rounding
+    along = np.sum(residual * step, axis=1)
     unit, _ = _find_flat_directions(state.information, step != 0)
-    size = np.sqrt(np.sum((wrong * unit) ** 2, axis=1) * np.sum((step / np.where(unit > 0, unit, 1.0)) ** 2, axis=1))
+    size = np.sqrt(np.sum((residual * unit) ** 2, axis=1) * np.sum((step / np.where(unit > 0, unit, 1.0)) ** 2, axis=1))
+    # r' p must be more than rounding of |r| |p|, both in standard errors
     clear = sound & (np.abs(along) > 1e-8 * size)
     secant = base + np.where(
-        clear[:, None, None], wrong[:, :, None] * wrong[:, None, :] / np.where(clear, along, 1.0)[:, None, None], 0.0
+        clear[:, None, None],
+        residual[:, :, None] * residual[:, None, :] / np.where(clear, along, 1.0)[:, None, None],
+        0.0,
     )
     # of the two the one that would have foretold this gain
     slope = np.sum(state.gradient * step, axis=1)

@@ -86,7 +86,10 @@ def disturb_hop(gain: np.ndarray, moments: tuple[float, float], root: np.ndarray
 
 
 def mix_gains(parts: Sequence[DisturbedGain], weights: Float[np.ndarray, " parts"], inputs: int) -> DisturbedGain:
-    """Return one of several maps, drawn: each has noises of its own."""
+    """Return the moments of one map, drawn from `parts` by `weights`: the weighted means of theirs.
+
+    The noises of each part stand in columns of their own.
+    """
     widened = [_place_columns(gain, inputs, parts, i) for i, gain in enumerate(parts)]
     mean = np.tensordot(weights, [gain.mean for gain in widened], axes=1)
     second = np.tensordot(weights, [gain.second for gain in widened], axes=1)
