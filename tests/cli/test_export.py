@@ -43,7 +43,7 @@ def test_without_a_compiler_it_says_so(folder, capsys, monkeypatch):
     assert cli.main(arguments("--precision", "float")) == 0
     said = capsys.readouterr().out
     assert "remote/aware (nominal), float precision" in said
-    assert said.endswith("state 36 bytes, code unmeasured, time unmeasured: no C compiler 'cc' here\n")
+    assert said.endswith("state 44 bytes, code unmeasured, time unmeasured: no C compiler 'cc' here\n")
 
 
 @pytest.mark.parametrize(
