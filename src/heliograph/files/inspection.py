@@ -13,6 +13,7 @@ import numpy as np
 
 from heliograph.files.bags.bag import OFTEN, Progress, list_fields, open_bag
 from heliograph.files.bags.mcap_chunks import read_messages_in_order as bag_messages
+from heliograph.files.bags.mcap_json import holds_json, read_json_messages
 from heliograph.files.logs.log_sources import LogSources
 from heliograph.files.logs.reading import open_log
 from heliograph.files.messages.folder import list_files
@@ -22,7 +23,7 @@ from heliograph.files.messages.in_files import (
     message_name,
     read_message_file,
 )
-from heliograph.files.sources.fields import TimeUnit, convert_time, decode_json, parse_arrival
+from heliograph.files.sources.fields import TimeUnit, convert_time, decode_json, is_stamp, parse_arrival
 from heliograph.numerics.check import InputError, fail, show_error
 from heliograph.numerics.times.dates import UNITS, looks_like_date
 
@@ -146,6 +147,8 @@ def inspect_bag(path: Path, progress: Progress | None = None) -> tuple[dict[str,
         ValueError: no bag, or one that cannot be opened.
     """
     topics: dict[str, Topic] = {}
+    if holds_json(path):
+        return _inspect_json(path)
     # Types first, then each message's times, of which a header is read without decoding the rest.
     with open_bag(path) as (reader, cut):
         for connection in reader.connections:
@@ -168,6 +171,16 @@ def inspect_bag(path: Path, progress: Progress | None = None) -> tuple[dict[str,
         return topics, cut
 
 
+def _inspect_json(path: Path) -> tuple[dict[str, Topic], str]:
+    """Return the topics of an MCAP file with messages in JSON, and where and why reading it ended early."""
+    topics = dict[str, Topic]()
+    for message in read_json_messages(path):
+        if isinstance(message, InputError):
+            return topics, str(message)
+        note(topics, str(message.topic), message.content or "", parse_arrival(message.arrival, message.where))
+    return topics, ""
+
+
 def note(topics: dict[str, Topic], name: str, payload: str | bytes, arrival: int) -> None:
     """Add a message of a broker to its topic; `arrival` is in nanoseconds since 1970."""
     try:
@@ -188,7 +201,7 @@ def _note_message(topics: dict[str, Topic], name: str, content: object, kind: st
         if arrival is None and isinstance(value, int | float) and _counts_from_start(path, value):
             topic.clocks.setdefault(path, array("d")).append(value)
         # A date in a message may be the time of its measurement.
-        unit = "s" if isinstance(value, str) and looks_like_date(value) else _unit(value)
+        unit = "s" if is_stamp(value) or (isinstance(value, str) and looks_like_date(value)) else _unit(value)
         if unit is not None:
             with suppress(InputError):
                 time = convert_time(value, unit, path)
@@ -349,9 +362,9 @@ def _stamp(data: bytes) -> int:
 
 
 def _yield_leaves(content: object, prefix: str = "", depth: int = 6) -> Iterator[tuple[str, object]]:
-    """Yield dotted path and value of what is no dictionary or list in decoded JSON."""
-    if isinstance(content, dict) and depth:
+    """Yield dotted path and value of what is no dictionary or list in decoded JSON, and of stamps."""
+    if isinstance(content, dict) and depth and not is_stamp(content):
         for key, value in content.items():
             yield from _yield_leaves(value, f"{prefix}{key}.", depth - 1)
-    elif not isinstance(content, dict | list):
+    elif is_stamp(content) or not isinstance(content, dict | list):
         yield prefix.rstrip("."), content

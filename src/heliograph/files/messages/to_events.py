@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from heliograph.files.bags.bag import Progress, is_bag, parts_of, read_bag
+from heliograph.files.bags.mcap_json import holds_json, read_json_messages
 from heliograph.files.event_table import EventTable
 from heliograph.files.logs.log import is_log
 from heliograph.files.logs.reading import read_log
@@ -38,13 +39,14 @@ def read_messages(
     """Read the events of a network from a bag, a vehicle's log, a file of messages or a folder of them, or a store.
 
     A bag is a file of MCAP, SQLite (.db3) or ROS 1 (.bag), or a folder of ROS 2 or of such files; each event has the
-    time of its source and the time when it was logged. A file of messages is CSV or Parquet, of which each row is a
-    message and its columns are the fields; Influx's annotated CSV; or lines of JSON (.jsonl, .ndjson, .json, .log,
-    .txt), also those that MQTT clients print; CSV and lines may be packed (.gz). A message has the topic in its field
-    `topic`, with JSON in `payload` if there is such a field, else that named as the file. It arrives at the time in
-    `arrival` or `tst`, beside a payload also in `timestamp`, `time` or `ts` (a date with a zone, or seconds), else at
-    its own. Messages in our own form, with node, sequence, time and values, need no sources. Rows of a store, of a URL
-    as `read_store` takes it, are messages as rows of CSV are; the topic is the measurement's or the database's name.
+    time of its source and the time when it was logged; MCAP may have messages of ROS or in JSON. A file of messages is
+    CSV or Parquet, of which each row is a message and its columns are the fields; Influx's annotated CSV; or lines of
+    JSON (.jsonl, .ndjson, .json, .log, .txt), also those that MQTT clients print; CSV and lines may be packed (.gz). A
+    message has the topic in its field `topic`, with JSON in `payload` if there is such a field, else that named as the
+    file. It arrives at the time in `arrival` or `tst`, beside a payload also in `timestamp`, `time` or `ts` (a date
+    with a zone, or seconds), else at its own. Messages in our own form, with node, sequence, time and values, need no
+    sources. Rows of a store, of a URL as `read_store` takes it, are messages as rows of CSV are; the topic is the
+    measurement's or the database's name.
 
     A folder of files of messages is one recording, merged by time; the topic of each file is its name, and files that
     are no topic of the sources are left out. A clock that counts from its own start has it in its `Stamp`.
@@ -90,7 +92,12 @@ def read_events(
             raise fail("sources", f"a source for the topics of {source}", "none")
         events = EventTable(network, known.step)
         for part in parts_of(source) or [source]:
-            read_bag(part, known, events, progress, strict)
+            if holds_json(part):
+                found = _append_all(part, read_json_messages(part, known), known, events, strict)
+                missing = [topic for topic in known.topics if not set("+#") & set(topic) and topic not in found]
+                events.notes += [f"{part}: not in the bag: {', '.join(missing)}"] if missing else []
+            else:
+                read_bag(part, known, events, progress, strict)
     elif isinstance(source, Path) and is_log(source):
         if known is None:
             raise fail("sources", f"hg.files.LogSources for the messages of {source}", "none")
@@ -167,14 +174,24 @@ def _map_messages(path: Path | StoreTable, network: Network, sources: Sources | 
 def _read_log(path: Path, table: object, sources: Sources, strict: bool) -> EventTable:
     """Read the messages of a vehicle's log."""
     events = EventTable(sources.network, sources.step)
-    for message in read_log(path, table, sources, events.notes):
+    _append_all(path, read_log(path, table, sources, events.notes), sources, events, strict)
+    return events
+
+
+def _append_all(
+    path: Path, messages: Iterator[FileMessage | InputError], sources: Sources, events: EventTable, strict: bool
+) -> set[str | None]:
+    """Append what messages of named topics say, and return these topics."""
+    topics = set[str | None]()
+    for message in messages:
         if isinstance(message, CutOffError) and not strict:
             events.broken = str(message)
         elif isinstance(message, InputError):
             events.refuse(message, strict)
         else:
+            topics.add(message.topic)
             _append_message(path, message, sources, events, strict)
-    return events
+    return topics
 
 
 def _append_message(

@@ -18,7 +18,12 @@ from heliograph.numerics.check import InputError, fail, show_value
 from heliograph.numerics.times.dates import UNITS, dates, instant
 
 TimeUnit = Literal["s", "ms", "us", "ns", "step"]
-STAMPS = (("sec", "nanosec"), ("secs", "nsecs"), ("seconds", "nanos"))  # ROS 2, ROS 1, protobuf
+STAMPS = (
+    ("sec", "nanosec"),
+    ("secs", "nsecs"),
+    ("seconds", "nanos"),
+    ("sec", "nsec"),
+)  # ROS 2 and 1, protobuf, Foxglove
 PLAIN = (Mapping, list, tuple, str, int, float, np.ndarray, type(None))
 NUMBER = "a number, true or false, or null for what did not arrive"
 # Bare words that C, C++ and JavaScript print for what is no number, outside of texts.
@@ -173,6 +178,11 @@ def parse_number(text: str) -> int | float | str:
         return text if "_" in words else kind(words)  # Python's own way to write a number, and nobody else's
     except ValueError:
         return text
+
+
+def is_stamp(value: object) -> bool:
+    """Return whether decoded JSON is a stamp of two whole numbers, seconds and nanoseconds, and nothing else."""
+    return isinstance(value, Mapping) and any(set(pair) == value.keys() for pair in STAMPS)
 
 
 def convert_time(value: Any, unit: TimeUnit, name: str, quoted: bool = False) -> int:

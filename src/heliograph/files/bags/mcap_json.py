@@ -1,0 +1,149 @@
+"""Messages of JSON in MCAP files, as viewers and loggers without ROS write them."""
+
+import os
+import struct
+from collections.abc import Iterator
+from io import BytesIO
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+from heliograph.files.bags.bag import DATA_END, FOOTER, MAGIC, DamageError, moment
+from heliograph.files.messages.in_files import FileMessage
+from heliograph.files.sources.sources import Sources
+from heliograph.files.text.text_file import CutOffError
+from heliograph.numerics.check import InputError, fail, show_error
+
+CHANNEL, MESSAGE, CHUNK = 0x04, 0x05, 0x06  # kinds of records
+RECORD = struct.Struct("<BQ")  # kind and length of a record
+HEADER = struct.Struct("<HIQQ")  # of a message: channel, count, times of logging and publishing
+PART = struct.Struct("<QQQI")  # of a chunk: first and last time, size and checksum of its content
+LENGTH, SIZE, NUMBER = struct.Struct("<I"), struct.Struct("<Q"), struct.Struct("<H")
+END = struct.Struct("<BQQQI")  # a footer: kind, length, where the summary begins, where its offsets do, checksum
+JSON = "json"
+OTHERS = {"protobuf", "flatbuffer", "cbor", "msgpack"}  # encodings of MCAP's registry that nothing here reads
+
+
+class Channel(NamedTuple):
+    """Topic of a channel, and how its messages are encoded."""
+
+    topic: str
+    encoding: str
+
+
+def holds_json(path: Path) -> bool:
+    """Return whether a file is MCAP with messages of JSON.
+
+    Raises:
+        ValueError: MCAP whose messages are all of an encoding that is not read.
+    """
+    if path.suffix.lower() != ".mcap" or not path.is_file():
+        return False
+    try:
+        with path.open("rb") as file:
+            channels = _find_channels(file)
+    except Exception:  # damage, which the reader of the file says
+        return False
+    encodings = {channel.encoding for channel in channels}
+    if encodings and encodings <= OTHERS:
+        raise fail(str(path), "messages of ROS or in JSON", ", ".join(sorted(encodings)))
+    return JSON in encodings
+
+
+def read_json_messages(path: Path, sources: Sources | None = None) -> Iterator[FileMessage | InputError]:
+    """Yield the messages of an MCAP file in its order, each with the moment when it was logged; of others no content.
+
+    Where the file is damaged or cut off the last is a `CutOffError`.
+
+    Args:
+        path: the file.
+        sources: sources, whose topics are in JSON; None for no such check.
+
+    Raises:
+        ValueError: a topic of the sources that is in another encoding; one line.
+    """
+    channels, count = dict[int, Channel](), 0
+    with path.open("rb") as file:
+        file.seek(len(MAGIC))
+        try:
+            for kind, content in _read_records(file):
+                if kind == CHANNEL:
+                    number, channel = _read_channel(content)
+                    channels[number] = channel
+                    if channel.encoding != JSON and sources is not None and sources.of(channel.topic):
+                        expected = "messages in JSON, as others of this file are"
+                        raise fail(f"{path}, {channel.topic}", expected, channel.encoding or "no encoding")
+                elif kind == MESSAGE:
+                    count += 1
+                    number, _, logged, _ = HEADER.unpack_from(content)
+                    topic, encoding = channels[number]
+                    text = content[HEADER.size :].decode(errors="replace") if encoding == JSON else None
+                    yield FileMessage(f"{path}, message {count}", topic, text, moment(logged))
+        except InputError as error:
+            if not isinstance(error, DamageError):
+                raise
+            yield CutOffError(f"{error}; what was read before it stays")
+        except Exception as error:  # whatever damage makes a reader do
+            where = f"{path}, after message {count}"
+            yield CutOffError(
+                f"{fail(where, 'a file without damage', show_error(error))}; what was read before it stays"
+            )
+
+
+def _find_channels(file: BinaryIO) -> list[Channel]:
+    """Return the channels of the summary of an MCAP file; without one, those that stand before the first message."""
+    # The footer says where the summary begins.
+    file.seek(-END.size - len(MAGIC), os.SEEK_END)
+    kind, _, summary, _, _ = END.unpack(file.read(END.size))
+    if kind == FOOTER and summary and file.read() == MAGIC:
+        file.seek(summary)
+        found = [_read_channel(content)[1] for kind, content in _read_records(file) if kind == CHANNEL]
+        if found:
+            return found
+    # Without it channels stand where they are first used.
+    channels = list[Channel]()
+    file.seek(len(MAGIC))
+    for kind, content in _read_records(file):
+        if kind == MESSAGE:
+            break
+        channels += [_read_channel(content)[1]] if kind == CHANNEL else []
+    return channels
+
+
+def _read_records(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
+    """Yield kind and content of each record up to the end of the data or of the summary, those in chunks too.
+
+    Raises:
+        DamageError: a record that is longer than what is left.
+        Exception: whatever else damage leads to.
+    """
+    from rosbags.rosbag2.storage_mcap import decompress
+
+    while head := file.read(RECORD.size):
+        kind, size = RECORD.unpack(head) if len(head) == RECORD.size else (0, 0)
+        if kind in (DATA_END, FOOTER):
+            return
+        content = file.read(size)
+        if len(head) < RECORD.size or len(content) < size:
+            raise DamageError(str(fail(str(getattr(file, "name", "a chunk")), "whole records", "one that was cut off")))
+        if kind != CHUNK:
+            yield kind, content
+            continue
+        _, _, whole, checksum = PART.unpack_from(content)
+        compression, at = _read_text(content, PART.size)
+        (packed,) = SIZE.unpack_from(content, at)
+        data = content[at + SIZE.size : at + SIZE.size + packed]
+        yield from _read_records(BytesIO(decompress(data, compression, whole, checksum)))
+
+
+def _read_channel(content: bytes) -> tuple[int, Channel]:
+    """Return the number of a channel, and its topic and encoding."""
+    topic, at = _read_text(content, 2 * NUMBER.size)
+    encoding, _ = _read_text(content, at)
+    return NUMBER.unpack_from(content)[0], Channel(topic, encoding)
+
+
+def _read_text(content: bytes, at: int) -> tuple[str, int]:
+    """Return a text that begins with its length, and where it ends."""
+    (size,) = LENGTH.unpack_from(content, at)
+    begin = at + LENGTH.size
+    return content[begin : begin + size].decode(), begin + size
