@@ -30,6 +30,7 @@ ORDER = [
         "filters.vector",
         "filters.calls",
         "filters.base",
+        "filters.remark",
         "filters.sizes",
         "filters.plausibility",
         "filters.states",

@@ -42,6 +42,9 @@ class Scripted:
     def dead_senders(self) -> dict[str, int]:
         return {}
 
+    def remarks(self) -> dict[tuple[str, str], int]:
+        return {}
+
     def unpublished(self) -> list[Output]:
         return []
 

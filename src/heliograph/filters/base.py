@@ -13,6 +13,7 @@ from heliograph.engine.choice import compile_on_call
 from heliograph.filters.calls import call_with_inputs, call_with_state
 from heliograph.filters.filter_data import Filtered, run_over_data, scan_inside_jit
 from heliograph.filters.plausibility import Judgement, judge_step
+from heliograph.filters.remark import Remark
 from heliograph.filters.sizes import make_sizes
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, add_nis
 from heliograph.filters.vector import check_vector
@@ -101,9 +102,14 @@ class AbstractFilter(Module):
         """
         raise unwritten(self, "estimate")
 
-    def remark(self, state: PyTree) -> str:
-        """Say what happened to a state that its user should know, such as that a gate gave in; "" by default."""
-        return ""
+    @property
+    def remarks(self) -> bool:
+        """Whether `remark` may say anything; of a filter that has one of its own, it may."""
+        return type(self).remark is not AbstractFilter.remark
+
+    def remark(self, state: PyTree) -> Remark:
+        """Say what happened to a state that its user should know, and how often; nothing by default."""
+        return Remark()
 
     def step(self, state: PyTree, z: ArrayLike, u: ArrayLike = (), k: Step = 0) -> tuple[PyTree, Estimate]:
         """Predict over step k with the input u, then correct with the measurement z.

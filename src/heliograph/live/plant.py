@@ -188,6 +188,7 @@ class PlantState:
         silence: row of the newest step at which nothing came, which is no row of the history; None if there is none.
         kept: row before a leap, after which all rows held are; None where that is among them, or there is no leap.
         aside: what was taken back since the last finalisation, for `undo`.
+        remarked: how often each filter's remark was said, by node and filter.
     """
 
     name: str
@@ -203,6 +204,7 @@ class PlantState:
     silence: HeldRow | None = None
     kept: BeforeLeap | None = None
     aside: list[RowsOfLeap] = field(default_factory=list)
+    remarked: dict[tuple[str, str], int] = field(default_factory=dict)
 
     @property
     def confirmed(self) -> float:

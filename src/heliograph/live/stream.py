@@ -74,7 +74,7 @@ class Stream:
         self.limits = limits_of(filter.received, limits, invalid, stuck, *believed)
         self.dropped = np.zeros(filter.received, dtype=np.int64)
         self.stuck, self._repeats = np.zeros(filter.received, dtype=np.int64), Repeats()
-        self.steps, self._last, self._beyond, self._remark = 0, -1, 0, ""
+        self.steps, self._last, self._beyond, self._remarked = 0, -1, 0, 0
         self._inputs = np.full(len(filter.inputs), np.nan)
         self._placed, self._angles = _place(filter), WideAngles(filter)
         self._stepper = self._placed.stepper()
@@ -128,7 +128,7 @@ class Stream:
             self.dropped += screened.outside[0]
             self.stuck += screened.stuck[0]
             self._repeats = screened.repeats
-        if placed.remarks:
+        if self.filter.remarks:
             self._warn_of_remark()
         nis, arrived = stepper.judgement[:2].tolist()
         if arrived and nis == nis:
@@ -153,9 +153,9 @@ class Stream:
     def _warn_of_remark(self) -> None:
         """Warn of what the filter says of its state, such as that a gate gave in, where it is new."""
         said = self.filter.remark(self._placed.state.unflatten(self._stepper.state))
-        if said and said != self._remark:
-            warnings.warn(f"stream, {said}", stacklevel=3)
-        self._remark = said
+        if said.times > self._remarked:
+            warnings.warn(f"stream, {said.words}", stacklevel=3)
+        self._remarked = said.times
 
     def _count_unexpected(self, beyond: bool) -> None:
         """Count measurements in a row that were not expected, and warn once of many."""
@@ -261,7 +261,7 @@ class Stream:
             expected = f"a state with the parts of {other['filter']} as it is here: {', '.join(layout)}"
             raise fail("snapshot", expected, ", ".join(f"{path} {list(leaf.shape)}" for path, leaf in old.items()))
         new._stepper.put(list(relocate_parts(old, layout).values()))
-        new._remark = filter.remark(new._placed.state.unflatten(new._stepper.state))
+        new._remarked = filter.remark(new._placed.state.unflatten(new._stepper.state)).times
         return new
 
     def __getstate__(self) -> dict[str, object]:
@@ -311,7 +311,6 @@ class _Placed:
     def __init__(self, filter: AbstractFilter):
         self.filter, self.horizon = filter, filter.horizon
         self.received, self.given = filter.received, len(filter.inputs)
-        self.remarks = type(filter).remark is not AbstractFilter.remark  # whether it ever says anything
         # Numbers of what a sender sent, if it decides when to send; losses that are known follow them.
         self.values = 0
         if sender := _sender_of(filter):

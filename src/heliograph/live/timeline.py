@@ -11,6 +11,7 @@ import numpy as np
 from heliograph.filters.plausibility import Judgement
 from heliograph.live.event import INPUTS, VERDICTS, Known, Verdict, check_63_bits, check_moment, check_numbers
 from heliograph.live.fleet import Fleet, Options
+from heliograph.live.fleet_remarks import FleetRemarks
 from heliograph.live.implausible_events import FleetAngles, Judges
 from heliograph.live.network_program import shared_program
 from heliograph.live.plant import LinkCounts
@@ -108,7 +109,7 @@ class Timeline:
         self._plant, self._spare = self._fleet.begin("", start, None), self._fleet.pool.take()
         self._judges = Judges(self._fleet)
         self.reasons: dict[str, str] = {}
-        self._angles = FleetAngles(self._fleet)
+        self._angles, self._remarks = FleetAngles(self._fleet), FleetRemarks(self._fleet)
         self._finals = Finals(2 * self.capacity, self._lanes.step_rows.outputs.size)
 
     def __getstate__(self) -> dict[str, object]:
@@ -174,7 +175,7 @@ class Timeline:
                 self._fleet.undo(plant, before)
                 self._fleet.step([plant])
             else:
-                for _, line in self._angles.said_of([plant]):
+                for _, line in (*self._angles.said_of([plant]), *self._remarks.said_of([plant])):
                     warnings.warn(f"timeline, {line}", stacklevel=2)
                 self._finalise()
         link = plant.link(node)
@@ -337,6 +338,7 @@ class Timeline:
             new = cls(network, window, ahead=ahead, capacity=capacity)
         new._fleet.end(new._plant)
         new._plant = unpack_plant("", arrays["plant"].tobytes(), new._fleet)
+        new._remarks.note_said(new._plant)
         new._finals.add(arrays["final.time"], arrays["final"])
         return new
 

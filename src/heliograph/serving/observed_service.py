@@ -53,6 +53,9 @@ class Serves(Takes, Protocol):
     def dead_senders(self) -> Mapping[str, int]:
         """Return how many plants have a dead sender, by node with a trigger."""
 
+    def remarks(self) -> Mapping[tuple[str, str], int]:
+        """Return how often each filter that may say so had a state changed as users should know, by node and name."""
+
 
 class Watches(Protocol):
     """The observer of a service."""

@@ -2,7 +2,7 @@
 
 import gc
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from itertools import repeat
 from time import perf_counter
@@ -12,6 +12,7 @@ from heliograph.live.event import INPUTS, Verdict
 from heliograph.live.fleet import Finalised
 from heliograph.live.fleet import Fleet as Fleet
 from heliograph.live.fleet import Options as Options
+from heliograph.live.fleet_remarks import FleetRemarks
 from heliograph.live.implausible_events import FleetAngles
 from heliograph.live.network_program import NetworkProgram as NetworkProgram
 from heliograph.live.plant import PlantState, Withdrawn
@@ -65,8 +66,8 @@ class Service:
     Args:
         fleet: the plants of the network.
         store: where the state is committed.
-        say: called with a line of text when the first message is refused as implausible, and when an angle is first
-            known less well than its filter can use.
+        say: called with a line of text when the first message is refused as implausible, when an angle is first
+            known less well than its filter can use, and each time that a gate gives in.
         every: seconds after which the estimate of a plant whose senders are silent is published again although it has
             hardly changed; None for never.
         forecast: how far ahead provisional estimates are accompanied by forecasts; None for not at all.
@@ -88,7 +89,7 @@ class Service:
         self.malformed, self.known, self.last = 0, 0, BatchStatistics(0, 0, 0.0, 0.0, 0.0)
         self._writer, self._using = EstimateWriter(fleet.program), Using(fleet, self.plants)
         self._exchange, self._silence = Exchange(fleet, self._time_in_messages), Silence(fleet, every)
-        self._angles, self._doubt = FleetAngles(fleet), say
+        self._angles, self._remarks, self._doubt = FleetAngles(fleet), FleetRemarks(fleet), say
         self._ahead = None if forecast is None else ForecastPublisher(fleet, forecast, thresholds)
         self._unsearched = 0  # messages since the last search for garbage
         self._published: int | None = None  # up to where, since the last commit
@@ -186,6 +187,10 @@ class Service:
                 dead[node] += 1
         return dead
 
+    def remarks(self) -> Mapping[tuple[str, str], int]:
+        """Count, by node and filter that may say so, how often a state was changed as its user should know."""
+        return self._remarks.counts
+
     def dead_by_plant(self) -> dict[str, list[str]]:
         """Return the dead senders of each plant in memory that has one."""
         return find_dead_senders(self.fleet, self.plants)
@@ -217,6 +222,9 @@ class Service:
         if self._doubt is not None:
             for name, line in self._angles.said_of(list(touched.values())):
                 self._doubt(f"warning: plant {name!r}, {line}; not said again, nor of other plants")
+        for name, line in self._remarks.said_of(touched.values()):
+            if self._doubt is not None:
+                self._doubt(f"warning: plant {name!r}, {line}")
         entries, malformed, known = self._refuse_unused(messages, payloads, outcomes)
         # Step what is due; estimates of final rows are committed, provisional ones and messages only published.
         sent = self._exchange.messages(touched.values())
@@ -304,6 +312,7 @@ class Service:
                 continue
             plant = self.plants[name] = unpack_plant(name, stored.body, self.fleet)
             plant.version = stored.version
+            self._remarks.note_said(plant)
 
     def _write_finals(self, finalised: Iterable[Finalised]) -> list[Entry]:
         """Return final estimates, each published once: of rows that are final now and received a measurement."""

@@ -25,7 +25,7 @@ from heliograph.simulation.arguments import inputs_of, measurement_of
 from heliograph.simulation.centres.blame import refuse_centrally
 from heliograph.simulation.centres.uplinks import Drawn, SentReports
 from heliograph.simulation.description.possible import doubt_estimates
-from heliograph.simulation.description.remarks import list_remarks
+from heliograph.simulation.description.remarks import say_remarks
 from heliograph.simulation.description.wide_angles import warn_beyond_a_turn, warn_wide_in_rows
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node, ReceivingNode
@@ -127,7 +127,7 @@ def run(
         record = replace(record, units=record.units | {"time": unit})
     warn_of_no_numbers(record)
     doubts = *warn_wide_in_rows(network, record), *doubt_estimates(network, record)
-    for line in (*doubts, *_describe_left_out(network, record), *list_remarks(network, state)):
+    for line in (*doubts, *_describe_left_out(network, record), *say_remarks(network, state)):
         warnings.warn(line, stacklevel=2)
     origin = _make_origin(network, record, state, u, usual_spacing(clock if known is not None else clock[:2]))
     return (record if true is None else add_truth(record, network.plant, true, smooth)).with_origin(origin)

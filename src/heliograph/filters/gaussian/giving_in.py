@@ -20,6 +20,7 @@ from heliograph.filters.base import (
 )
 from heliograph.filters.gaussian.robust import Gate, RobustFilter
 from heliograph.filters.gaussian.scores import PredictedMeasurement
+from heliograph.filters.remark import Remark
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import at
 from heliograph.model.plant import TIME_STEP
@@ -178,14 +179,14 @@ class GivingInFilter(AbstractSizedFilter):
         """Return the mean and covariance of the gate's state."""
         return self.base.estimate(state.believed)
 
-    def remark(self, state: WatchedBelief) -> str:
-        """Say how often the gate has given in, when it last did, and which states moved how far then; "" if never."""
+    def remark(self, state: WatchedBelief) -> Remark:
+        """Say how often the gate has given in, when it last did, and which states moved how far then."""
         times = int(state.given_in)
         if not times:
-            return ""
+            return Remark()
         moved = ", ".join(f"{name} by {far:.3g}" for name, far in zip(self.states, state.moved.tolist(), strict=True))
         often = "once" if times == 1 else f"{times} times"
-        return f"the gate gave in {often}, last in row {int(state.step) + 1}, and moved {moved}"
+        return Remark(times, f"the gate gave in {often}, last in row {int(state.step) + 1}, and moved {moved}")
 
 
 def _most_probable_change(predicted: PredictedMeasurement, e: jax.Array, of_state: jax.Array) -> jax.Array:

@@ -30,6 +30,7 @@ from heliograph.filters.base import (
     predicts,
 )
 from heliograph.filters.particles.state_particles import StateParticles
+from heliograph.filters.remark import Remark
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, gaussian_of, with_gaussian
 from heliograph.filters.truncation import PlacedLimits, hold_mean, truncate_to_limits
 from heliograph.filters.wrappers.sensor_inputs import StateUnderInputs
@@ -100,6 +101,15 @@ class LimitedFilter(AbstractSizedFilter):
     def angles_used(self) -> FilterAngles | None:
         """Return the angles of the filter within."""
         return self.base.angles_used()
+
+    @property
+    def remarks(self) -> bool:
+        """As the filter within."""
+        return self.base.remarks
+
+    def remark(self, state: PyTree) -> Remark:
+        """Say what the filter within says."""
+        return self.base.remark(state)
 
     @property
     def of_atoms(self) -> bool:

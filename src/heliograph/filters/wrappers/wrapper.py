@@ -13,6 +13,7 @@ from heliograph.filters.base import (
     estimates,
     predicts,
 )
+from heliograph.filters.remark import Remark
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import ArrayLike, PyTree
@@ -60,6 +61,15 @@ class AbstractWrapper(AbstractSizedFilter):
         """Return the angles of the filter within, of its states those that are estimated."""
         angles = self.base.angles_used()
         return angles and angles._replace(states=tuple(i for i in angles.states if i < len(self.states)))
+
+    @property
+    def remarks(self) -> bool:
+        """As the filter within."""
+        return self.base.remarks
+
+    def remark(self, state: PyTree) -> Remark:
+        """Say what the filter within says."""
+        return self.base.remark(self.within(state))
 
     @property
     def of_atoms(self) -> bool:

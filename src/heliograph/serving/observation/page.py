@@ -51,6 +51,7 @@ class Tallies(Collector):
         yield _collect_passing(self.watch)
         yield _count_doubted_fused(self.watch)
         yield _collect_dead_senders(self.watch)
+        yield _collect_remarks(self.watch)
         yield GaugeMetricFamily("heliograph_plants", "Plants known.", sum(1 for _ in self.watch.plants()))
         malformed = sum(service.malformed for service in self.watch.services)
         yield CounterMetricFamily("heliograph_malformed", "Messages that could not be read.", malformed)
@@ -116,6 +117,15 @@ def _collect_dead_senders(watch: Watch) -> Metric:
     for node, count in watch.dead_senders().items():
         dead.add_metric([node], count)
     return dead
+
+
+def _collect_remarks(watch: Watch) -> Metric:
+    """Return the metric of what filters say happened to their states."""
+    what = "Times that a gate gave in: it took up what it had refused for long."
+    gave_in = CounterMetricFamily("heliograph_gave_in", what, labels=["node", "filter"])
+    for key, count in watch.remarks().items():
+        gave_in.add_metric(list(key), count)
+    return gave_in
 
 
 def _count_doubted_fused(watch: Watch) -> Metric:

@@ -248,6 +248,13 @@ class Watch:
             total.update(service.dead_senders())  # adds, and holds zeros
         return total
 
+    def remarks(self) -> Mapping[tuple[str, str], int]:
+        """Count how often filters changed a state as users should know, by node and filter, over all services."""
+        total = Counter[tuple[str, str]]()
+        for service in self.services:
+            total.update(service.remarks())
+        return total
+
     def view(self, plant: str | None, since: int = 0) -> dict[str, Any]:
         """Return the data of the page for a plant (None: the one with the newest message), after the point `since`.
 

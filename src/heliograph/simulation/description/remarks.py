@@ -1,34 +1,44 @@
-"""What filters say of their states at the end of a run, such as that a gate gave in."""
+"""What filters say happened to their states, such as that a gate gave in."""
 
 from collections.abc import Iterator
 
 import jax
 
 from heliograph.filters.base import AbstractFilter
+from heliograph.filters.remark import Remark
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.network import FUSED, Network
 
+Place = tuple[str, str]  # node and filter
 
-def list_remarks(network: Network, state: PyTree) -> Iterator[str]:
-    """Yield what each filter says of its state, a line each.
+
+def find_remarking(network: Network) -> tuple[Place, ...]:
+    """Return the places of the filters that may say something."""
+    places = [place for place in network.places if network.nodes[place[0]].filters[place[1]].remarks]
+    fused = [(FUSED, name) for name, one in network.fused.items() if isinstance(one, AbstractFilter) and one.remarks]
+    return *places, *fused
+
+
+def list_remarks(network: Network, state: PyTree) -> Iterator[tuple[Place, Remark]]:
+    """Yield what each filter that may say something says of its state, with its place.
 
     Args:
         network: the network.
         state: states of all its filters, as the step of the network has them.
     """
     alike, central = state[0], state[1]
-    for (node, name), place in network.places.items():
-        filter = network.nodes[node].filters[name]
+    for node, name in find_remarking(network):
+        if node == FUSED:
+            fusion = network.fused[name]
+            assert isinstance(fusion, AbstractFilter)
+            yield (node, name), fusion.remark(central[name])
+            continue
+        place = network.places[node, name]
         row = place.filter * len(network.groups[network.kinds[place.kind].group]) + place.node
-        if _can_remark(filter) and (
-            said := filter.remark(jax.tree.map(lambda leaf, r=row: leaf[r], alike[place.kind]))
-        ):
-            yield f"{node}/{name}: {said}"
-    for name, fusion in network.fused.items():
-        if isinstance(fusion, AbstractFilter) and _can_remark(fusion) and (said := fusion.remark(central[name])):
-            yield f"{FUSED}/{name}: {said}"
+        of_filter = jax.tree.map(lambda leaf, r=row: leaf[r], alike[place.kind])
+        yield (node, name), network.nodes[node].filters[name].remark(of_filter)
 
 
-def _can_remark(filter: AbstractFilter) -> bool:
-    """Ask whether a filter ever says anything."""
-    return type(filter).remark is not AbstractFilter.remark
+def say_remarks(network: Network, state: PyTree) -> list[str]:
+    """Return a line for each filter to whose state something happened."""
+    return [f"{node}/{name}: {said.words}" for (node, name), said in list_remarks(network, state) if said.times]

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import choose_code
+from heliograph.filters.remark import Remark
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.float64 import in_float64, in_haste, understood
 from heliograph.numerics.module import Module, readable
@@ -16,6 +17,7 @@ from heliograph.numerics.trees.flat import Flat, flat_like, row_of
 from heliograph.numerics.trees.program_text import text_of
 from heliograph.numerics.trees.static import Static, cast
 from heliograph.numerics.types import Float, PyTree
+from heliograph.simulation.description.remarks import find_remarking, list_remarks
 from heliograph.simulation.network import Network
 from heliograph.simulation.plausible_step import step_plausibly
 from heliograph.simulation.rows.columns import columns_of
@@ -92,6 +94,7 @@ class RowStep:
     @in_float64
     def __init__(self, network: Network):
         instance("network", network, Network, "a Network")
+        self._network = network
         received, inputs = sum(node.received for node in network.nodes.values()), len(network.inputs)
         # All filters, their states before the first step, and the layouts of both.
         filters = AllFilters(network, judges=True, tests=True)
@@ -128,6 +131,19 @@ class RowStep:
         together = min(max(NUMBERS_TOGETHER // longest, 1), TOGETHER)
         turns = min(max(NUMBERS // (together * longest), 1), WIDTH // together)
         return turns * together, together
+
+    @cached_property
+    def remarking(self) -> tuple[tuple[str, str], ...]:
+        """Return node and name of each filter that may say what happened to its state."""
+        return find_remarking(self._network)
+
+    def read_remarks(self, state: Float[np.ndarray, " state"]) -> dict[tuple[str, str], Remark]:
+        """Return what each of these filters says of its state, by node and name.
+
+        Args:
+            state: the states after a row, as they are laid out.
+        """
+        return dict(list_remarks(self._network, self.state.tree(state)))
 
     @cached_property
     def program(self) -> str:

@@ -1,0 +1,42 @@
+"""What happened to the filters' states of a fleet that users should know, such as that a gate gave in; said once."""
+
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+from heliograph.live.fleet import Fleet
+from heliograph.live.plant import PlantState
+from heliograph.live.rows import HeldRow
+
+
+class FleetRemarks:
+    """Watch for what filters say of their states, by the newest row of each plant.
+
+    A late event may make a row anew, so that what was said never happened; it is counted all the same, and what happens
+    in its place is not said again. `counts` has how often each filter's state has been spoken of, over all plants, by
+    node and filter.
+    """
+
+    def __init__(self, fleet: Fleet):
+        self._pool, self._steps = fleet.pool, fleet.program.step_rows
+        self.counts = Counter[tuple[str, str]](dict.fromkeys(self._steps.remarking, 0))
+
+    def said_of(self, plants: Iterable[PlantState]) -> Iterator[tuple[str, str]]:
+        """Yield the name of a plant and a line for each filter that has something new to say."""
+        for plant in plants if self.counts else ():
+            for place, said in self._read(plant.rows.held[-1]).items():
+                new = said.times - plant.remarked.get(place, 0)
+                if new > 0:
+                    self.counts[place] += new
+                    plant.remarked[place] = said.times
+                    yield plant.name, f"{place[0]}/{place[1]}: {said.words}"
+
+    def note_said(self, plant: PlantState) -> None:
+        """Note that all was said of a plant, which was stored."""
+        plant.remarked = {place: said.times for place, said in self._read(plant.rows.held[-1]).items()}
+
+    def _read(self, row: HeldRow) -> dict[tuple[str, str], Any]:
+        """Return what the filters say of their states after a row."""
+        if not self.counts:
+            return {}
+        return self._steps.read_remarks(self._pool.table[row.slot, self._pool.state])
