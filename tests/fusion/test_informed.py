@@ -137,6 +137,7 @@ def relayed(world):
     return leaves, level, by_hand
 
 
+@pytest.mark.slow
 def test_a_tree_of_relays_is_its_weights_on_the_leaves(world):
     """Two relays and a root against W P W' by hand."""
     leaves, level, by_hand = relayed(world)

@@ -73,6 +73,7 @@ def stacked(arrives):
     return x @ start @ x.T - cross @ np.linalg.solve(reports @ start @ reports.T + white, cross.T)
 
 
+@pytest.mark.slow
 def test_late_lost_and_fading_reports_give_the_best_linear_estimate(net):
     """Every pattern of one recording of zeros: 1e-9 of the stacked problem; what is still on its way counts not."""
     draw = np.random.default_rng(0)

@@ -206,6 +206,7 @@ def test_what_is_no_component_is_refused_in_one_line(call, words):
         call()
 
 
+@pytest.mark.slow
 def test_components_may_start_where_nobody_knows_beside_others_that_are_known():
     """As the same matrices by hand, and the limit of ever wider starts: 1e8 leaves 1e-8 of itself."""
     y = np.cumsum(np.random.default_rng(0).normal(size=12)) + np.tile([1.0, -2.0, 0.5, 0.5], 3)

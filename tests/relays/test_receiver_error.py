@@ -65,6 +65,7 @@ def test_a_limit_that_does_not_bind_costs_nothing(greedy, free):
     np.testing.assert_allclose(*costs, rtol=1e-4)  # what the last barrier may leave
 
 
+@pytest.mark.slow
 def test_a_limit_just_above_the_power_of_the_mean_is_met(greedy):
     """Nearly all that three relays, one silent in each slot, may send is the mean, which says nothing."""
     net = unusual()

@@ -39,7 +39,8 @@ def test_forty_rows_without_a_loss_are_enough():
     assert arrivals(np.resize([True, True, True, False], 40)).due_in == "3 of 4 rows"
 
 
-@pytest.mark.parametrize("count", [150, pytest.param(3000, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [150, 3000])
 def test_losses_at_random_are_neither_pattern_nor_rate(count):
     """Independent ones and bursts of any length, in 20 to 1,000 rows, each with a chance of 1e-4: none of 300; of 6,000
     at most 4, where Poisson's law of mean .6 has more with a chance of 4e-4."""

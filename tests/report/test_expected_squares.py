@@ -30,6 +30,7 @@ def warnings_of(world, believed, runs):
     return [examine(believed, hg.run(believed, {"n": z}), np.zeros((ROWS, 0))).warnings() for z in recordings]
 
 
+@pytest.mark.slow
 def test_a_right_filter_of_a_wandering_plant_is_not_doubted():
     """By its mean over all runs, 32 of 40 such recordings were called too sure or too cautious."""
     right = network_of(walk(0.01), losing(0.05))

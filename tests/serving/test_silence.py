@@ -84,6 +84,7 @@ def test_four_silent_thermometers_write_and_tell_next_to_nothing(program, clock,
         assert set(plant.links) == {"a"} and (link.used, link.lost) == (2, 0)
 
 
+@pytest.mark.slow
 def test_four_thermometers_that_only_say_that_they_live_write_less_than_ten_megabytes_a_day(program, clock, tmp_path):
     """A heartbeat of each in ten minutes, in commits of their own: pages of 16 kB and the states' zeros made it 67."""
     service = begun(program, tmp_path / "a.db")

@@ -317,6 +317,7 @@ def test_numbers_are_rounded_by_their_standard_error():
         assert round_to(value, error) == text
 
 
+@pytest.mark.slow
 def test_probabilities_of_modes_have_a_figure_of_their_own_filtered_and_smoothed():
     laws = [hg.LinearPlant([[1.0, 1.0], [0.0, a]], 0.1, [0.0, 0.0], 1.0, states=["x", "v"]) for a in (0.9, 0.5)]
     plant, sensor = hg.markov_plant(laws, [[0.9, 0.1], [0.2, 0.8]]), hg.LinearSensor([[1.0, 0.0]], 1.0)
