@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from heliograph.files.bags.bag import OFTEN, Progress, list_fields, open_bag
+from heliograph.files.bags.bag import OFTEN, Progress, list_fields, open_bag, parts_of
 from heliograph.files.bags.mcap_chunks import read_messages_in_order as bag_messages
 from heliograph.files.bags.mcap_json import holds_json, read_json_messages
 from heliograph.files.logs.log_sources import LogSources
@@ -141,14 +141,20 @@ class Topic:
 
 
 def inspect_bag(path: Path, progress: Progress | None = None) -> tuple[dict[str, Topic], str]:
-    """Return the topics of a bag, and where and why reading it ended early, "" if it did not.
+    """Return the topics of a bag or of the bags in a folder, and where and why reading one ended early, "" if none did.
 
     Raises:
         ValueError: no bag, or one that cannot be opened.
     """
-    topics: dict[str, Topic] = {}
-    if holds_json(path):
-        return _inspect_json(path)
+    topics, broken = dict[str, Topic](), ""
+    for part in parts_of(path) or [path]:
+        ended = _inspect_json(part, topics) if holds_json(part) else _inspect_part(part, topics, progress)
+        broken = broken or ended
+    return topics, broken
+
+
+def _inspect_part(path: Path, topics: dict[str, Topic], progress: Progress | None) -> str:
+    """Add the topics of one bag of ROS, and return where and why reading it ended early, "" if it did not."""
     # Types first, then each message's times, of which a header is read without decoding the rest.
     with open_bag(path) as (reader, cut):
         for connection in reader.connections:
@@ -167,18 +173,17 @@ def inspect_bag(path: Path, progress: Progress | None = None) -> tuple[dict[str,
                 if progress is not None and done % OFTEN == 0:
                     progress(done, total)
         except Exception as error:  # whatever damage makes a reader do
-            return topics, str(fail(f"{path}, after message {done}", "a bag without damage", show_error(error)))
-        return topics, cut
+            return str(fail(f"{path}, after message {done}", "a bag without damage", show_error(error)))
+        return cut
 
 
-def _inspect_json(path: Path) -> tuple[dict[str, Topic], str]:
-    """Return the topics of an MCAP file with messages in JSON, and where and why reading it ended early."""
-    topics = dict[str, Topic]()
+def _inspect_json(path: Path, topics: dict[str, Topic]) -> str:
+    """Add the topics of an MCAP file with messages in JSON, and return where and why reading it ended early."""
     for message in read_json_messages(path):
         if isinstance(message, InputError):
-            return topics, str(message)
+            return str(message)
         note(topics, str(message.topic), message.content or "", parse_arrival(message.arrival, message.where))
-    return topics, ""
+    return ""
 
 
 def note(topics: dict[str, Topic], name: str, payload: str | bytes, arrival: int) -> None:

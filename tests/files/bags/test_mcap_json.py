@@ -81,6 +81,18 @@ def test_inspect_lists_topics_and_proposes_sources(folder, capsys):
     )
 
 
+def test_bags_in_a_folder_are_one(folder, capsys):
+    """Their messages are one recording, and `inspect` counts them together."""
+    (folder / "log.mcap").mkdir()
+    for name in ("first.mcap", "second.mcap"):
+        write(folder / "log.mcap" / name)
+    out, _, table = run(folder, capsys)
+    assert "a: 10 used" in out and len(table["x"]) == 10  # without a count two of one time are two
+    assert cli.main(["inspect", "log.mcap"]) == 0
+    row = next(line for line in capsys.readouterr().out.splitlines() if "/attic" in line)
+    assert row.split()[:3] == ["/attic", "JSON", "10"]
+
+
 def test_what_was_cut_off_or_damaged_is_used_up_to_there(folder, capsys):
     write(folder / "log.mcap", compression=CompressionType.NONE, use_chunking=False, use_statistics=False)
     whole = (folder / "log.mcap").read_bytes()
