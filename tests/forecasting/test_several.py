@@ -53,10 +53,9 @@ def test_inputs_are_those_of_all_or_of_each():
         same(one.of_source(i), hg.forecast(source, 4, inputs=rows[1]))
 
 
-SLOW = pytest.mark.slow
-
-
-@pytest.mark.parametrize("make", [hg.filters.imm_filter, pytest.param(hg.filters.particle_filter, marks=SLOW)])
+@pytest.mark.parametrize(
+    "make", [hg.filters.imm_filter, pytest.param(hg.filters.particle_filter, marks=pytest.mark.slow)]
+)
 def test_modes_and_particles_are_mixtures_side_by_side(make):
     """Also where XLA computes (particles), whose sums have another order side by side."""
     plant, sensor = hg.LinearPlant([[1.0]], 1.0, [0.0], 4.0), hg.LinearSensor([[1.0]], 0.1)

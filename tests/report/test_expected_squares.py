@@ -1,6 +1,7 @@
 """Behind random gains a recording is judged by its own moments: a right filter is not doubted, a wrong one is."""
 
 import numpy as np
+import pytest
 
 import heliograph as hg
 from heliograph.report.health import examine
