@@ -7,7 +7,9 @@ from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-from heliograph.files.bags.bag import DATA_END, FOOTER, MAGIC, DamageError, moment
+import numpy as np
+
+from heliograph.files.bags.bag import DATA_END, FOOTER, MAGIC, DamageError
 from heliograph.files.messages.in_files import FileMessage
 from heliograph.files.sources.sources import Sources
 from heliograph.files.text.text_file import CutOffError
@@ -77,7 +79,7 @@ def read_json_messages(path: Path, sources: Sources | None = None) -> Iterator[F
                     number, _, logged, _ = HEADER.unpack_from(content)
                     topic, encoding = channels[number]
                     text = content[HEADER.size :].decode(errors="replace") if encoding == JSON else None
-                    yield FileMessage(f"{path}, message {count}", topic, text, moment(logged))
+                    yield FileMessage(f"{path}, message {count}", topic, text, np.datetime64(logged, "ns"))
         except InputError as error:
             if not isinstance(error, DamageError):
                 raise

@@ -225,6 +225,8 @@ def convert_time(value: Any, unit: TimeUnit, name: str, quoted: bool = False) ->
 
 def parse_arrival(value: Any, name: str) -> int:
     """Convert what a log says of an arrival, a date or seconds, also as a text, to nanoseconds since 1970."""
+    if isinstance(value, np.datetime64):
+        return int(value.astype("datetime64[ns]").astype(np.int64))
     return convert_time(value, "s", name, quoted=True)
 
 
