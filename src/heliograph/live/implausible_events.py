@@ -183,28 +183,57 @@ def _judgement_columns(outputs: Sequence[FilterColumns]) -> np.ndarray:
 
 
 class FleetAngles:
-    """Watch for estimates of a fleet that know an angle less well than their filter can use; each is said once."""
+    """Watch a fleet for angles that a filter knows less well than it can use, and for degrees; each is said once."""
 
     def __init__(self, fleet: Fleet):
         self._pool, self._watched = fleet.pool, list[tuple[str, np.ndarray, WideAngles]]()
+        self._received = list[tuple[str, np.ndarray, WideAngles]]()
         for place in fleet.program.places:
             filter = filter_of(fleet, place)
             if filter is not None and (angles := WideAngles(filter)).states:
                 n = len(filter.states)
                 variances = fleet.pool.outputs.start + place.covariance + np.arange(n) * (n + 1)
                 self._watched.append((f"{place.node}/{place.filter}", variances, angles))
+        # What each node receives, by a filter that takes it: its own, or one of all nodes.
+        watched = set[int]()
+        for place in fleet.program.places:
+            if (filter := filter_of(fleet, place)) is not None and filter.received:
+                here = _list_received(fleet.network, place.node)
+                angles = WideAngles(filter, list(here.values()))
+                for i, column in enumerate(here):
+                    if column in watched:
+                        angles.received.pop(i, None)
+                watched |= set(here)
+                self._received.append((place.node, fleet.pool.numbers.start + np.array(list(here)), angles))
 
     def said_of(self, plants: Sequence[PlantState]) -> list[tuple[str, str]]:
         """Return the name of a plant and a line for each angle that is wide in a newest row for the first time."""
         self._watched = [watched for watched in self._watched if watched[-1].states]
-        if not self._watched:
+        self._received = [watched for watched in self._received if watched[-1].received]
+        if not self._watched and not self._received:
             return []
         slots = np.array([plant.rows.held[-1].slot for plant in plants], dtype=int)
-        return [
+        wide = [
             (plants[row].name, f"{of}: {line}")
             for of, columns, angles in self._watched
             for row, line in angles.said_of(self._pool.table[slots[:, None], columns])
         ]
+        return wide + [
+            (plants[row].name, f"{of}: {line}")
+            for of, columns, angles in self._received
+            for row, line in angles.doubt_unit(self._pool.table[slots[:, None], columns])
+        ]
+
+
+def _list_received(network: Network, node: str) -> dict[int, str]:
+    """Return the names of what a node receives, by their places in a row; of what all do where they are fused."""
+    if node != Network.FUSED:
+        return dict(zip(network.rows[node], network.nodes[node].received_names, strict=True))
+    return {
+        at: f"{name}: {what}"
+        for name in network.names
+        for at, what in zip(network.rows[name], network.nodes[name].received_names, strict=True)
+    }
 
 
 def filter_of(fleet: Fleet, output: FilterColumns) -> AbstractFilter | None:

@@ -133,9 +133,8 @@ class Stream:
         nis, arrived = stepper.judgement[:2].tolist()
         if arrived and nis == nis:
             self._count_unexpected(nis > placed.rare[int(arrived)])
-        if self._angles.states:
-            for _, line in self._angles.said_of(np.diagonal(stepper.estimate[1])[None]):
-                warnings.warn(f"stream, step {k}: {line}", stacklevel=2)
+        if self._angles.states or self._angles.received:
+            self._warn_of_angles(z, k)
         estimate: JudgedEstimate = placed.estimate.unflatten([*stepper.estimate, nis, int(arrived)])
         if len(weight := stepper.weight):
             estimate = replace(estimate, weight=weight)
@@ -156,6 +155,12 @@ class Stream:
         if said.times > self._remarked:
             warnings.warn(f"stream, {said.words}", stacklevel=3)
         self._remarked = said.times
+
+    def _warn_of_angles(self, z: np.ndarray, k: int) -> None:
+        """Warn of angles that are known less well than the filter can use, and of received ones in degrees, once."""
+        wide = self._angles.said_of(np.diagonal(self._stepper.estimate[1])[None])
+        for _, line in (*wide, *self._angles.doubt_unit(z[None])):
+            warnings.warn(f"stream, step {k}: {line}", stacklevel=3)
 
     def _count_unexpected(self, beyond: bool) -> None:
         """Count measurements in a row that were not expected, and warn once of many."""

@@ -29,7 +29,7 @@ from heliograph.simulation.description.diagram import list_rounded, list_shared
 from heliograph.simulation.description.fallbacks import list_fallbacks, list_sequential
 from heliograph.simulation.description.observability import list_sensors, make_observability_matrix
 from heliograph.simulation.description.separable import separate_nodes
-from heliograph.simulation.description.wide_angles import warn_wide_at_start
+from heliograph.simulation.description.wide_angles import warn_degrees_at_start, warn_wide_at_start
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.results.overloads import find_overloads
@@ -65,7 +65,7 @@ def doubts_before_data(network: Network) -> list[Doubt]:
     instance("network", network, Network, "a Network")
     lines = [*_find_unobservable(network), *_doubt_boundedness(network), *_find_unheard(network)]
     lines += [*_find_forgetful_filters(network), *_find_other_beliefs(network)]
-    lines += [Doubt(True, words) for words in warn_wide_at_start(network)]
+    lines += [Doubt(True, words) for words in (*warn_wide_at_start(network), *warn_degrees_at_start(network))]
     lines += [Doubt(False, f"digits: {words}; make tables {DOUBLE}") for words in list_rounded(network)]
     lines += [Doubt(False, f"shared, so that losses come together: {words}") for words in list_shared(network)]
     lines += [Doubt(False, f"by XLA, which takes longer: {words}") for words in list_fallbacks(network)]

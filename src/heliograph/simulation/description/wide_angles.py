@@ -1,7 +1,9 @@
 """Doubts about angles: one that is known no better than a good part of the circle, and degrees among radians."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter
@@ -11,9 +13,10 @@ from heliograph.filters.gaussian.unscented import Unscented
 from heliograph.model.over_time import first
 from heliograph.model.sensor import is_linear
 from heliograph.numerics.angle import TURN
-from heliograph.numerics.check import instance
+from heliograph.numerics.check import fail, instance, show_value
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Float
+from heliograph.simulation.description.observability import list_sensors
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.results.record import Record
 
@@ -67,20 +70,35 @@ def warn_wide_in_rows(network: Network, record: Record) -> Iterator[str]:
 class WideAngles:
     """Watch the variances of a filter's states, in rows of an array, for an angle known less well than it can use.
 
-    Each angle is said once. `states` are the names of those that are watched, by their places.
+    Each angle is said once, and each received one that is beyond a full turn, as degrees are. `states` and `received`
+    are the names of those that are watched, by their places.
 
     Args:
         filter: the filter.
+        names: of the numbers that it receives; by default measurement[0], measurement[1], ...
 
     Raises:
-        ValueError: no filter.
+        ValueError: no filter, names of another number.
     """
 
-    def __init__(self, filter: AbstractFilter):
+    def __init__(self, filter: AbstractFilter, names: Sequence[str] = ()):
         instance("filter", filter, AbstractFilter, "a filter")
         used = None if filter.claim == "none" else filter.angles_used()
         self.states = {} if used is None else {i: filter.states[i] for i in used.states}
+        if not isinstance(names, Sequence) or len(names) not in (0, filter.received):
+            raise fail("names", f"those of {filter.received} received numbers", show_value(names))
+        names = list(names) or [f"measurement[{i}]" for i in range(filter.received)]
+        self.received = {} if used is None else {i: names[i] for i in used.received}
         self._most = largest_deviation(filter) if self.states else np.inf
+
+    def doubt_unit(self, values: Float[np.ndarray, "rows m"]) -> list[tuple[int, str]]:
+        """Return a row and a line for each received angle that is beyond a full turn for the first time."""
+        said = []
+        for i in list(self.received):
+            far = np.flatnonzero(np.abs(values[:, i]) > TURN)
+            if far.size:
+                said.append((int(far[0]), say_degrees(self.received.pop(i), values[far[0], i])))
+        return said
 
     def said_of(self, variances: Float[np.ndarray, "rows n"]) -> list[tuple[int, str]]:
         """Return a row and a line for each angle that is known so badly for the first time."""
@@ -111,6 +129,37 @@ def _yield_deviations(
     used = filter.angles_used()
     for i in () if used is None or filter.claim == "none" else used.states:
         yield network.states[i], np.sqrt(np.maximum(np.nan_to_num(covariance[..., i, i]), 0.0))
+
+
+def warn_degrees_at_start(network: Network) -> Iterator[str]:
+    """Yield a line for each angle that a model has beyond a full turn before any data, as degrees are.
+
+    Looked at are initial means of states, what sensors measure there with inputs of 1, and limits of nodes.
+    """
+    plant = first(network.plant)
+    start, u = np.asarray(plant.initial_mean, dtype=float), np.ones(len(plant.inputs))
+    for i in plant.angles:
+        if line := say_degrees(plant.states[i], start[i]):
+            yield f"degrees: the initial mean of {line}"
+    for name, angles in network.angles.items():
+        node, limits = network.nodes[name], network.nodes[name].limits
+        for i in angles if limits is not None else ():
+            assert limits is not None
+            ends = [float(end[i]) for end in (limits.low, limits.high) if np.isfinite(end[i])]
+            if line := say_degrees(node.received_names[i], max(ends, key=abs, default=0.0)):
+                yield f"degrees: a limit at node {name!r} of {line}"
+    for sensor in list_sensors(network):
+        if sensor.angles:
+            with jax.enable_x64(True):
+                measured = np.asarray(sensor.under(plant.inputs, u).measure(jnp.asarray(start)))
+            for i in sensor.angles:
+                if line := say_degrees(sensor.outputs[i], measured[i]):
+                    yield f"degrees: what a sensor measures at the initial mean of {line}"
+
+
+def say_degrees(name: str, value: float) -> str:
+    """Say that a value of an angle is beyond a full turn; "" where it is not."""
+    return f"{name!r}, an angle in radians, is {value:.4g}, beyond 2 pi: degrees?" if abs(value) > TURN else ""
 
 
 def warn_beyond_a_turn(network: Network, z: dict[str, Float[np.ndarray, "steps m"]]) -> Iterator[str]:
