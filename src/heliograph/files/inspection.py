@@ -29,6 +29,7 @@ from heliograph.numerics.times.dates import UNITS, looks_like_date
 
 SECOND = 1e9  # nanoseconds
 STAMP = "header.stamp"
+DEGREES = ("deg", "degs", "degree", "degrees", "°")  # of an angle
 FEW = 6  # fields that a suggestion lists
 # What messages of devices say of themselves, and not of what they measure; words of a dotted path.
 HOUSEKEEPING = re.compile(
@@ -348,8 +349,11 @@ def _describe_count(topic: Topic, path: str) -> str:
 
 
 def _say_unit(topic: Topic, path: str, mark: str = "  #") -> str:
-    """Return the unit of a field as a comment, "" if the file names none."""
-    return f"{mark} {topic.measured_in[path]}" if path in topic.measured_in else ""
+    """Return the unit of a field as a comment, "" if the file names none; of degrees, what makes them radians."""
+    if path not in topic.measured_in:
+        return ""
+    unit = topic.measured_in[path]
+    return f"{mark} {unit}{' (of an angle: scale=np.pi / 180)' * (unit.lower().strip() in DEGREES)}"
 
 
 def _rank_field(path: str) -> int:

@@ -178,6 +178,13 @@ def test_inspect_lists_signals_with_rate_gap_and_unit(drive, kind, capsys):
     assert ("Count('Counter', bits=4)" in said) == (sources.dbc is not None)
 
 
+def test_inspect_says_how_degrees_become_radians(tmp_path, capsys):
+    path = logs.write_frames(tmp_path / "drive.blf")
+    dbc = logs.database(tmp_path, logs.DBC.replace('"km/h"', '"deg"'))
+    assert cli.main(["inspect", str(path), "--dbc", str(dbc)]) == 0
+    assert "# deg (of an angle: scale=np.pi / 180)" in capsys.readouterr().out
+
+
 def test_inspect_without_a_database_lists_identifiers_and_asks_for_it(tmp_path, capsys):
     assert cli.main(["inspect", str(logs.write_frames(tmp_path / "drive.blf"))]) == 0
     said = capsys.readouterr()
