@@ -8,9 +8,11 @@ from .fields import convert_time as convert_time
 from .fields import decode_items as decode_items
 from .fields import decode_json as decode_json
 from .fields import fail_of_doubled as fail_of_doubled
+from .fields import is_stamp as is_stamp
 from .fields import match_topic as match_topic
 from .fields import parse_arrival as parse_arrival
 from .fields import parse_number as parse_number
+from .fields import parse_start as parse_start
 from .json_field import Source as Source
 from .sources import Reading as Reading
 from .sources import SECOND as SECOND
