@@ -164,16 +164,24 @@ class LimitedFilter(AbstractSizedFilter):
         return log_mass, held._replace(gaussian=inside, weight=weight)
 
     def _condition_particles(self, state: StateParticles) -> tuple[jax.Array, StateParticles]:
-        """Leave out the particles that are not within; all stay where none is."""
-        inside = jnp.ones(len(state.log_weight), bool)
+        """Leave out the particles that are not within; mirror all at the limits that they are beyond if hardly any is.
+
+        Up to n particles of n states have no covariance: those beyond a limit stand then for states as far within it.
+        """
+        position = jnp.asarray(state.position)
+        inside, mirrored = jnp.ones(len(state.log_weight), bool), position
         for place, low, high in self.limits:
-            value = jnp.asarray(state.position)[:, place]
+            value = position[:, place]
             inside = inside & (low <= value) & (value <= high)
+            back = jnp.where(value < low, 2 * low - value, jnp.where(value > high, 2 * high - value, value))
+            mirrored = mirrored.at[:, place].set(jnp.clip(back, low, high))
         left = jnp.where(inside, state.log_weight, -jnp.inf)
         log_mass = jax.nn.logsumexp(left) - jax.nn.logsumexp(state.log_weight)
-        some = jnp.any(jnp.isfinite(left))
-        top = jnp.where(some, jnp.max(left), 0.0)
-        return log_mass, state._replace(log_weight=jnp.where(some, left - top, state.log_weight))
+        enough = jnp.sum(jnp.isfinite(left)) > position.shape[1]
+        top = jnp.where(enough, jnp.max(left), 0.0)
+        return log_mass, state._replace(
+            log_weight=jnp.where(enough, left - top, state.log_weight), position=jnp.where(enough, position, mirrored)
+        )
 
 
 def _is_particles(state: PyTree) -> bool:
