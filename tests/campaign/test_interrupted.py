@@ -28,6 +28,7 @@ def start_and_kill(folder, workers: int, chunks: int) -> int:
         cwd=folder,
         env=os.environ | {"PAUSE": "0.3"},  # at each of the 6 settings, so that the campaign cannot be done yet
         start_new_session=True,
+        stdout=subprocess.PIPE,  # held by the workers too: at its end they are all dead, and write no more
     )
     deadline = time.monotonic() + 60
     while not (folder / "out").is_dir() or len(chunk_files(folder / "out")) < chunks:
@@ -35,7 +36,7 @@ def start_and_kill(folder, workers: int, chunks: int) -> int:
         assert time.monotonic() < deadline
         time.sleep(0.01)
     os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
+    process.communicate()
     return len(chunk_files(folder / "out"))
 
 
