@@ -1,6 +1,5 @@
 """Functions of one run, compiled for many: LLVM IR as code of this machine, called on arrays of runs, on all cores."""
 
-import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -20,6 +19,7 @@ from straightline.llvm.module import Code, write_module
 from straightline.machine import Machine, Tiers, features, generate, narrow
 from straightline.nodes import Unsupported
 from straightline.program import Program, lower
+from straightline.result_memory import from_line, in_lines
 
 SHARES = 4  # parts of the work for each core, so that one that is held up holds up little
 
@@ -326,20 +326,7 @@ def addresses(arrays: Sequence[np.ndarray]) -> list[int]:
 
 def aligned(size: int) -> np.ndarray:
     """Allocate bytes of zero at an address that is a multiple of a cache line."""
-    return _from_line(np.zeros(size + LINE, np.uint8))
-
-
-def in_lines(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
-    """Allocate an array, whose numbers are to be filled, at an address that is a multiple of a cache line."""
-    size = math.prod(shape) * np.dtype(dtype).itemsize
-    numbers: np.ndarray = _from_line(np.empty(size + LINE, np.uint8)).view(dtype)
-    return numbers.reshape(shape)
-
-
-def _from_line(whole: np.ndarray) -> np.ndarray:
-    """Return all but a line of some bytes, from the first one on that begins a line."""
-    start = -whole.ctypes.data % LINE
-    return whole[start : start + len(whole) - LINE]
+    return from_line(np.zeros(size + LINE, np.uint8))
 
 
 def cpu_count() -> int:

@@ -1,0 +1,72 @@
+"""Memory of results: what nobody holds any more is kept for the next ones, since fresh memory costs more than numbers.
+
+The system gives memory in pages, of zeros, when they are first written. Of 10,000 runs of 100 Kalman steps, 32 MB of
+means, that takes 12 to 33 ns a step, and the numbers themselves 21 ns of a processor.
+"""
+
+import math
+import sys
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+
+from straightline.llvm.layout import LINE
+
+LEAST = 1 << 20  # bytes of an array below which the library of C has memory at hand
+MOST = 1 << 28  # bytes that a process keeps: what was kept first goes back to the system
+
+_kept: dict[int, np.ndarray] = {}  # by identity, oldest first; a single operation of a dict needs no lock
+
+
+class _Loan:
+    """Bytes below an array: NumPy holds this object for the array and its views, and drops it with the last of them."""
+
+    def __init__(self, memory: np.ndarray):
+        self._memory = memory
+        # NumPy's protocol, by which an array of this object's bytes holds the object.
+        self.__array_interface__ = memory.__array_interface__
+
+    def __del__(self, ends: Callable[[], bool] = sys.is_finalizing) -> None:
+        if not ends():  # at the end of the process the names of this module are gone
+            _keep(self._memory)
+
+
+def in_lines(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+    """Return an array whose numbers are to be filled, at an address that is a multiple of a cache line."""
+    size = math.prod(shape) * np.dtype(dtype).itemsize
+    memory = np.empty(size + LINE, np.uint8) if size < LEAST else np.asarray(_Loan(_take(size + LINE)))
+    numbers: np.ndarray = from_line(memory)[:size].view(dtype)
+    return numbers.reshape(shape)
+
+
+def from_line(memory: np.ndarray) -> np.ndarray:
+    """Return all but a line of some bytes, from the first one on that begins a line."""
+    start = -memory.ctypes.data % LINE
+    return memory[start : start + len(memory) - LINE]
+
+
+def _take(size: int) -> np.ndarray:
+    """Return at least so many bytes: kept ones, of which at most half would be idle, else fresh ones."""
+    for key, memory in tuple(_kept.items()):
+        if size <= len(memory) <= 2 * size and _kept.pop(key, None) is not None:
+            return memory
+    return np.empty(size, np.uint8)
+
+
+def _keep(memory: np.ndarray) -> None:
+    """Keep bytes for later results, and give back what was kept first beyond MOST."""
+    if len(memory) <= MOST:
+        _kept[id(memory)] = memory
+    for key in _surplus():
+        _kept.pop(key, None)
+
+
+def _surplus() -> Iterator[int]:
+    """Return the keys of what is to be given back, so that at most MOST bytes are kept."""
+    size = sum(len(memory) for memory in tuple(_kept.values()))
+    for key, memory in tuple(_kept.items()):
+        if size <= MOST:
+            return
+        size -= len(memory)
+        yield key
