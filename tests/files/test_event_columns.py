@@ -106,7 +106,7 @@ def test_the_count_of_numbered_transmissions_says_what_was_lost(tmp_path):
 
 def test_a_link_counts_what_was_lost_around_the_wrap_of_a_count():
     """Of 4 bits, also where one had only been overtaken; of 16 a small one long before the end is a new start."""
-    from heliograph.live.plant import LinkCounts
+    from heliograph.live import LinkCounts
 
     link = LinkCounts()
     for time, number in enumerate([13, 14, 0, 1]):

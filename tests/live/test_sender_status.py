@@ -96,8 +96,8 @@ def test_losses_in_a_row_by_modes():
     """Down with probability .2 and for 5 steps on average: h steps later still (or again) down with p + (1-p) r^h."""
     bursts = hg.gilbert_elliott(LOSSY.base, LOSSY.base, 0.05, 0.2)
     link = hg.gilbert_elliott(hg.erasure(hg.perfect(), 1.0), hg.erasure(hg.perfect(), 0.0), 0.05, 0.2)
-    assert chain(bursts).in_a_row(3, 2) == 0.0
-    assert chain(link).in_a_row(4, 2) == pytest.approx(0.2 * (0.2 + 0.8 * 0.75**4))
+    assert chain(bursts).probability_all_lost(3, 2) == 0.0
+    assert chain(link).probability_all_lost(4, 2) == pytest.approx(0.2 * (0.2 + 0.8 * 0.75**4))
 
 
 def test_a_trigger_in_continuous_time_and_no_trigger_are_refused_in_one_line():

@@ -162,7 +162,7 @@ def test_streams_of_one_filter_share_what_they_do_not_change():
     item = hg.kalman_filter(PLANT, SENSOR)
     single, other = hg.Stream(item), hg.Stream(item)
     single.push([1.0, 2.0], [0.0])
-    assert single._placed is other._placed
+    assert single._compiled is other._compiled
     np.testing.assert_array_equal(other.push([1.0, 2.0], [0.0]).mean, hg.Stream(item).push([1.0, 2.0], [0.0]).mean)
 
 

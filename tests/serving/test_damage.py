@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.live.stored import Carrier
+from heliograph.live.stored import PlantMigration
 from heliograph.serving.service import Service
 from heliograph.serving.storage import Store, identity, report_damage
 from heliograph.serving.storage.store_protocol import Damage
@@ -197,7 +197,7 @@ def test_a_store_of_an_older_release_is_refused_by_its_layout_and_release(tmp_pa
     changed(place, "insert into plants values ('p', 1, x'00')")
     said = []
     with pytest.raises(hg.InputError) as refused:
-        Store(str(place), mine, carrier=Carrier(here, mine, said.append) if accepts else None)
+        Store(str(place), mine, carrier=PlantMigration(here, mine, said.append) if accepts else None)
     assert str(refused.value) == (
         f"store {place}: expected layout 5, of heliograph {mine['heliograph']}, got layout 1, of heliograph "
         "0.1.0, whose plants cannot be carried over; to begin anew, name another"

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
 import heliograph as hg
+from heliograph.live import LinkCounts
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.network_program import NetworkProgram
-from heliograph.live.plant import LinkCounts
 from heliograph.serving.observation import watch_of
 from heliograph.serving.observation.page import Tallies
 from heliograph.serving.output import Estimates, Refused

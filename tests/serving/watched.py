@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from pydantic_core import to_json
 
-from heliograph.live.plant import LinkCounts
+from heliograph.live import LinkCounts
 from heliograph.serving.output import Output
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from heliograph.files.sources.sources import Reading
 from heliograph.live.event import VERDICTS, Verdict
-from heliograph.live.plant import GAP
+from heliograph.live.link_counts import GAP
 from heliograph.numerics.check import fail
 from heliograph.numerics.times.row_order import SECOND, YEAR, find_astray
 from heliograph.numerics.types import Bool, Float, Int

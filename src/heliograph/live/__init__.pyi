@@ -3,6 +3,6 @@
 from .event import (
     Event as Event,
 )
-from .plant import (
+from .link_counts import (
     LinkCounts as LinkCounts,
 )

@@ -37,7 +37,7 @@ class Event(NamedTuple):
 
 
 class Known(NamedTuple):
-    """An event as numbers, with the index of its node in the network, -1 for inputs."""
+    """An event whose parts are checked numbers, with the index of its node in the network, -1 for inputs."""
 
     node_index: int
     sequence: int
@@ -68,7 +68,11 @@ def check_moment(name: str, value: object) -> float:
 
 
 def check_numbers(name: str, value: ArrayLike, size: int, alone: int | None = None) -> Float[np.ndarray, " numbers"]:
-    """Copy `size` real numbers, or so many as come `alone`, NaN where one did not arrive; one need not be a list."""
+    """Return a copy of `value` as doubles, NaN where one did not arrive; raise unless there are `size` of them.
+
+    `alone`: another count that is accepted, of values that come without their numbers of lost messages. A single number
+    need not stand in a list.
+    """
     expected = "1 number" if size == 1 else f"{size} numbers"
     try:
         values = np.array(fill_masked(value))

@@ -25,15 +25,17 @@ PARTS = len(Judgement._fields)
 
 
 class NativeFilterStepper:
-    """One filter's step by native code, which writes over the state."""
+    """One filter's step by native code, which reads and writes arrays that stay where they are."""
 
     def __init__(self, code: Any, numbers: Leaves, state: Leaves):
+        """Name the arrays of the code's arguments and results, which are those of `_compile_step`."""
         self._code = code.again(numbers)
-        places, outputs, n = self._code.inputs[len(numbers) :], self._code.outputs, len(state)
-        self._state, (self._z, self._u, self._k) = places[:n], places[n:]
-        self._judged: Float[np.ndarray, " parts"] = outputs[0]
-        self._flagged, self._after, self._estimate = outputs[1], outputs[2 : 2 + n], outputs[2 + n : len(outputs) - n]
-        self.put(state)
+        arguments, results, n = self._code.inputs[len(numbers) :], self._code.outputs, len(state)
+        self._state, (self._z, self._u, self._k) = arguments[:n], arguments[n:]
+        self._judged: Float[np.ndarray, " parts"] = results[0]
+        # The last n results are written over the arguments of the state.
+        self._flagged, self._after, self._estimate = results[1], results[2 : 2 + n], results[2 + n : len(results) - n]
+        self.set_state(state)
 
     @property
     def judgement(self) -> Float[np.ndarray, " 4"]:
@@ -50,7 +52,7 @@ class NativeFilterStepper:
         """Return copies of the leaves of the filter's state."""
         return [leaf.copy() for leaf in self._state]
 
-    def put(self, leaves: Sequence[np.ndarray]) -> None:
+    def set_state(self, leaves: Sequence[np.ndarray]) -> None:
         """Set the leaves of the filter's state."""
         for leaf_of_state, leaf in zip(self._state, leaves, strict=True):
             leaf_of_state[...] = leaf
@@ -63,7 +65,7 @@ class NativeFilterStepper:
 
     def accept(self) -> None:
         """Accept the state after a step that was flagged."""
-        self.put(self._after)
+        self.set_state(self._after)
 
     @property
     def estimate(self) -> Leaves:
@@ -75,6 +77,7 @@ class XlaFilterStepper:
     """One filter's step by a program of XLA, with its state."""
 
     def __init__(self, run: Any, numbers: list[jax.Array], state: PyTree):
+        """Start from `state`; `run` is what `compile_xla_step` returns, `numbers` are the filter's arrays."""
         self._run, self._numbers = run, numbers
         self._state, tree = jax.tree.flatten(state)
         self._tree: Any = tree
@@ -94,7 +97,7 @@ class XlaFilterStepper:
         """Return the leaves of the filter's state."""
         return [np.asarray(leaf) for leaf in self._state]
 
-    def put(self, leaves: Sequence[np.ndarray]) -> None:
+    def set_state(self, leaves: Sequence[np.ndarray]) -> None:
         """Set the leaves of the filter's state."""
         with jax.enable_x64(True):
             self._state = [jnp.array(leaf) for leaf in leaves]
@@ -129,8 +132,9 @@ def _judge_step(
     """
     filter: AbstractFilter = static.filled(numbers)
     after, estimate, judgement, innovation = filter.judge_step(state, z, u, k)
-    spoilt = jnp.any(jnp.isinf(z)) | ~jnp.all(jnp.isfinite(u))
-    flagged = spoilt | (judgement.reason > 0) | (judgement.input > 0)
+    # NaN in z did not arrive; infinite measurements and inputs that are no numbers are refused.
+    unusable = jnp.any(jnp.isinf(z)) | ~jnp.all(jnp.isfinite(u))
+    flagged = unusable | (judgement.reason > 0) | (judgement.input > 0)
     judged = jnp.stack(judgement)
     if innovation.weight is not None:
         judged = jnp.concatenate([judged, innovation.weight])
@@ -158,21 +162,30 @@ def compile_native_step(static: Static, numbers: Sequence[jax.Array], state: PyT
 def _compile_step(
     static: Static, shapes: tuple[tuple[tuple[int, ...], str], ...], counts: tuple[int, int], tree: Any, engine: str
 ) -> Any:
-    """Compile the native code, once for each structure, set of shapes and engine."""
+    """Compile the native code, once for each structure, set of shapes and engine; None if XLA has to do it.
+
+    Args:
+        static: the filter without its arrays.
+        shapes: shape and type of each argument: the filter's numbers, leaves of its state, z, u, k.
+        counts: how many of the arguments are numbers, and how many leaves of the state.
+        tree: structure of the state.
+        engine: the setting of the engine, by which results are kept apart.
+    """
     numbers, state = counts
 
     def step(*leaves: jax.Array) -> PyTree:
+        """Return judgement, whether to refuse, state after, estimate, and what takes the state's place."""
         before, (z, u, k) = leaves[numbers : numbers + state], leaves[numbers + state :]
         # The step, and the state that replaces the old one: unchanged if the step was flagged.
         judged, flagged, after, estimate = _judge_step(static, leaves[:numbers], tree.unflatten(before), z, u, k)
         if any(a.shape != b.shape or a.dtype != b.dtype for a, b in zip(after, before, strict=True)):
             raise Unsupported("a state whose shape or type changes")
         placed = [jnp.where(flagged, b, a) for a, b in zip(after, before, strict=True)]
-        return judged, flagged, after, estimate, placed  # what takes the state's place comes last
+        return judged, flagged, after, estimate, placed
 
-    def made() -> Any:
-        # The last results are written over the arguments of the state.
+    def compile_code() -> Any:
+        # The last results are written over the arguments of the state: {number of the result: of the argument}.
         in_place = {-state + i: numbers + i for i in range(state)}
         return compile_one(step, *(np.zeros(shape, kind) for shape, kind in shapes), in_place=in_place)
 
-    return try_native(made)
+    return try_native(compile_code)

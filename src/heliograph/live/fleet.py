@@ -9,8 +9,9 @@ import numpy as np
 
 from heliograph.live.event import INPUTS, OF_STEPS, Known, Verdict
 from heliograph.live.leap import ARRIVAL, Leap, find_leap
+from heliograph.live.link_counts import ScreenedEvent
 from heliograph.live.network_program import NetworkProgram
-from heliograph.live.plant import PlantState, ScreenedEvent, Withdrawn
+from heliograph.live.plant import PlantState, Withdrawn
 from heliograph.live.pool import Pool, cut_into_legs, group_by_turn
 from heliograph.live.rows import BEFORE, HeldRow, Rows
 from heliograph.live.sender_status import LossChain, SenderStatus, make_sender_status
@@ -42,9 +43,14 @@ class Options(NamedTuple):
 
 
 class Finalised(NamedTuple):
-    """Rows of a plant that are final now, and its newest row; `left`: slots to free once these have been read.
+    """What `Fleet.finalise` made final of one plant.
 
-    `withdrawn`: events that had been used, of a clock that has turned out wrong.
+    Attributes:
+        plant: the plant.
+        final: rows that are final now, in order of time.
+        newest: its newest row.
+        left: slots to free once the rows have been read.
+        withdrawn: events that had been used, of a clock that has turned out wrong.
     """
 
     plant: PlantState
@@ -91,15 +97,15 @@ class Fleet:
         self.deciding = {
             name: (trigger, LossChain.of_channel(node.channel)) for name, (trigger, node) in deciding.items()
         }
-        self._numbered = {
-            i: nodes[name].received - trigger.side_information(len(nodes[name].outputs))
-            for i, name in enumerate(network.names)
-            for trigger, _ in ([self.deciding[name]] if name in self.deciding else [])
+        # By index of a node whose messages are numbered, so that losses are known: how many values come first.
+        self._values_before_losses = {
+            network.names.index(name): nodes[name].received - trigger.side_information(len(nodes[name].outputs))
+            for name, (trigger, _) in self.deciding.items()
             if trigger.losses == "numbered"
-        }  # fmt: skip
+        }
         # A slot with the prior, for plants that have not begun.
         self._blank = self.pool.take()
-        self.pool.start(self._blank, -1.0)
+        self.pool.write_prior(self._blank, -1.0)
 
     @property
     def rows_are_joint(self) -> bool:
@@ -107,13 +113,14 @@ class Fleet:
         return self._joint
 
     def begin(self, name: str, time: float, origin: datetime | None) -> PlantState:
-        """Add a plant, whose continuous time starts at `time`."""
-        begun = -1.0 if self.program.dt is None else time
+        """Return a new plant, whose continuous time starts at `time`; steps start at 0, and the prior is of step -1."""
+        by_steps = self.program.dt is None
+        prior_time = -1.0 if by_steps else time
         slot = self.pool.take()
-        self.pool.start(slot, begun)
-        base = HeldRow((begun, BEFORE, 0), slot, self.width)
-        base.numbers[-1] = begun
-        return PlantState(name, self.rows(base), time if self.program.dt is not None else 0.0, origin)
+        self.pool.write_prior(slot, prior_time)
+        base = HeldRow((prior_time, BEFORE, 0), slot, self.width)
+        base.numbers[-1] = prior_time
+        return PlantState(name, self.make_rows(base), 0.0 if by_steps else time, origin)
 
     def end(self, plant: PlantState) -> None:
         """Remove a plant and free its slots."""
@@ -121,9 +128,10 @@ class Fleet:
         self.pool.give(plant.slots)
 
     def pass_silence(self, plants: Iterable[tuple[PlantState, float]]) -> None:
-        """Predict each plant to a step at which nothing came; `silence` of the plant is the row there.
+        """Predict each plant to the step beside it, at which nothing came; `silence` of the plant becomes that row.
 
-        It goes on from the silence before, is no row of the history, and ends with the next event that is used.
+        The row is none of the history: `take` drops it at the next event that is used. A later silence is predicted
+        from an earlier one, so that no step is computed twice.
         """
         chains = []
         for plant, step in plants:
@@ -147,14 +155,16 @@ class Fleet:
         columns = self._places[node]
         return columns.stop - columns.start
 
-    def rows(self, base: HeldRow) -> Rows:
-        """Return a chain of rows that begins with this one."""
+    def make_rows(self, base: HeldRow) -> Rows:
+        """Return the rows of a plant, of which so far there is only the one before all events, `base`."""
         return Rows(base, self._joint, self._places, self.options.capacity)
 
-    def known(self, node: str, sequence: int, time: float, values: list[float | None], arrival: float) -> Known:
-        """Convert an event to numbers."""
+    def convert_message(
+        self, node: str, sequence: int, time: float, values: list[float | None], arrival: float
+    ) -> Known:
+        """Return a message as an event; raise ValueError unless its node, number of values and time are possible."""
         index, size = self.sizes.get(node, (0, -1))
-        if size < 0:
+        if size < 0:  # no such node
             raise fail("message, node", f"one of {', '.join(self.sizes)}", repr(node)[:60])
         numbers = self.with_losses(node, [nan if value is None else value for value in values])
         if len(numbers) != size:
@@ -163,7 +173,9 @@ class Fleet:
         return Known(index, sequence, time, numbers, arrival)
 
     def with_losses(self, node: str, values: list[float]) -> list[float]:
-        """Return values with a place behind them for the number of lost ones, which the running count says.
+        """Return a message's values, followed by NaN for each number of lost messages where these do not come with it.
+
+        `PlantState.take` writes the number that the running count of messages says in its place.
 
         Raises:
             ValueError: values of a sender of single components, whose losses a count of messages does not say.
@@ -171,9 +183,10 @@ class Fleet:
         (_, size), outputs = self.sizes[node], self.values_of(node)
         if outputs is None:
             return values
-        values = values + [nan] * (size - outputs if len(values) == outputs else 0)
-        alone = self.deciding[node][0].region == "each" and len(values) == size
-        if alone and any(a == a and b != b for a, b in zip(values[:outputs], values[outputs:], strict=True)):
+        if len(values) == outputs:
+            values = values + [nan] * (size - outputs)
+        by_component = self.deciding[node][0].region == "each" and len(values) == size
+        if by_component and any(a == a and b != b for a, b in zip(values[:outputs], values[outputs:], strict=True)):
             expected = "behind each value how many of its component were lost since the last"
             raise fail(
                 f"message of {node!r}, values", expected, "none, and its count is of messages, not of components"
@@ -182,11 +195,11 @@ class Fleet:
 
     def values_of(self, node: str) -> int | None:
         """Return how many values an event has without the numbers of lost ones; None if it has no such numbers."""
-        return self._numbered.get(self.sizes[node][0])
+        return self._values_before_losses.get(self.sizes[node][0])
 
     def _find_lost_column(self, node: int) -> tuple[str, int] | None:
-        """Return the name of a node whose running count says what was lost, and the column of the number."""
-        outputs = self._numbered.get(node)
+        """Return name and column of the number of lost messages that the node's running count says; None if none."""
+        outputs = self._values_before_losses.get(node)
         if outputs is None or self.size(node) != outputs + 1:
             return None
         return self._names[node], self._places[node].start + outputs
@@ -231,6 +244,7 @@ class Fleet:
         """
         if self.program.dt is None and event.time > LAST_STEP:
             return "future"
+        # `said`: what the clock of arrivals, or else the sender's, says; `sure`: another clock agrees.
         leap, said = self.options.leap, event.arrival if given else event.time
         clock = ARRIVAL if given else clock or self._names[event.node_index]
         sure = (wall is not None and abs(said - wall) <= leap) or (given and abs(said - event.time) <= leap)
@@ -249,12 +263,14 @@ class Fleet:
         return verdict
 
     def advance(self, plant: PlantState, now: float) -> None:
-        """Advance the time of a plant by a clock; a leap that contradicts it is withdrawn."""
+        """Advance the time of a plant to `now` by a clock that is right; a leap that contradicts it is withdrawn."""
         leap, most = plant.leap, self.options.leap
-        if leap is not None and (found := find_leap(leap, plant.now, now, most)) is not None and found[0].now > -inf:
-            plant.undo_leap(found[0], most, self._names)
-        elif leap is not None and now >= leap.time - most:
-            plant.leap = None
+        if leap is not None:
+            found = find_leap(leap, plant.now, now, most)
+            if found is not None and found[0].now > -inf:
+                plant.undo_leap(found[0], most, self._names)
+            elif now >= leap.time - most:
+                plant.leap = None
         plant.now = max(plant.now, now)
 
     def undo(self, plant: PlantState, clock: tuple[float, Leap | None]) -> None:
@@ -263,17 +279,19 @@ class Fleet:
         plant.clock = clock
 
     def finalise(self, touched: Iterable[PlantState], all_: bool = False) -> list[Finalised]:
-        """Step what is due, and let what is older than the window, or all, become final."""
-        plants = list(touched)
+        """Step what is due, and let rows older than the window, or all, become final; return them by plant."""
+        plants, results = list(touched), []
         self.step(plants)
-        withdrawn, window, leap = [plant.take_withdrawn() for plant in plants], self.options.window, self.options.leap
-        ends = [plant.finalise(plant.now + np.inf if all_ else plant.confirmed - window, leap) for plant in plants]
-        return [Finalised(plant, final, plant.rows.held[-1], left + slots, events)
-                for plant, (final, left), (events, slots) in zip(plants, ends, withdrawn, strict=True)]  # fmt: skip
+        for plant in plants:
+            withdrawn, their_slots = plant.take_withdrawn()
+            watermark = np.inf if all_ else plant.confirmed - self.options.window
+            final, left = plant.finalise(watermark, self.options.leap)
+            results.append(Finalised(plant, final, plant.rows.held[-1], left + their_slots, withdrawn))
+        return results
 
     def step(self, plants: Iterable[PlantState]) -> None:
         """Step what is due, for all plants at once."""
-        chains = [chain for plant in plants if (chain := plant.chain())]
+        chains = [chain for plant in plants if (chain := plant.take_dirty_rows())]
         if rows := [row for chain in chains for row in chain]:
             numbers = np.array([number for row in rows for number in row.numbers]).reshape(len(rows), -1)
             self.pool.table[[row.slot for row in rows], self.pool.numbers] = numbers
@@ -288,7 +306,7 @@ class Fleet:
                 self.pool.step(*map(np.array, zip(*steps, strict=True)))
             for legs in walks:
                 if len(legs) > 1:
-                    self.pool.jump(legs[0].steps[-1][1], legs[0].jump)
+                    self.pool.pass_long_gap(legs[0].steps[-1][1], legs[0].jump)
             walks = [legs[1:] for legs in walks if len(legs) > 1]
 
     def step_row(self, before: HeldRow, row: HeldRow) -> None:
@@ -296,20 +314,20 @@ class Fleet:
         self.pool.table[row.slot, self.pool.numbers] = row.numbers
         self._run([[before, row]])
 
-    def look(self, row: HeldRow, time: float, slot: int) -> None:
+    def predict_into(self, row: HeldRow, time: float, slot: int) -> None:
         """Predict from a row to a later time, into a slot that no row has."""
         self.step_row(row, HeldRow((float(time), 0, 0), slot, self.width))
 
-    def trial(
+    def predict_outputs(
         self, plants: Sequence[PlantState | None], given: Float[np.ndarray, "plant given"]
     ) -> Float[np.ndarray, "plant outputs"]:
-        """Return the estimates of each plant (None: one that has not begun) with these inputs, NaN: as they were.
+        """Return the outputs of each plant's filters, predicted with these inputs and without measurements.
 
         The prediction covers one step from the newest row, or one unit of continuous time. A plant that is None has not
         begun yet. An input that is NaN keeps its value.
         """
         slots = [self._blank if plant is None else plant.rows.held[-1].slot for plant in plants]
-        return self.pool.trial(np.array(slots), given, self.end_step)
+        return self.pool.predict_outputs(np.array(slots), given, self.end_step)
 
     def outputs(self, slots: list[int]) -> Float[np.ndarray, "row outputs"]:
         """Return the outputs of the filters after the rows in these slots."""
@@ -317,20 +335,20 @@ class Fleet:
 
     def senders(self, plant: PlantState) -> dict[str, SenderStatus]:
         """Return the status of each sender of a plant that decides when to send: what its silence means by now."""
-        final, now = max(plant.confirmed - self.options.window, -1.0), int(np.floor(min(plant.now, self.end_step)))
-        links = {name: plant.links.get(name) for name in self.deciding}
-        last = {
-            name: int(link.latest) if link is not None and link.latest >= 0 else None for name, link in links.items()
-        }
-        return {
-            name: make_sender_status(*items, last[name], int(np.ceil(final)) - 1, now)
-            for name, items in self.deciding.items()
-        }
+        # Steps before the watermark are final: no value may come for them any more.
+        watermark = max(plant.confirmed - self.options.window, -1.0)
+        final, now = int(np.ceil(watermark)) - 1, int(np.floor(min(plant.now, self.end_step)))
+        results = {}
+        for name, (trigger, losses) in self.deciding.items():
+            link = plant.links.get(name)
+            last = int(link.latest) if link is not None and link.latest >= 0 else None
+            results[name] = make_sender_status(trigger, losses, last, final, now)
+        return results
 
-    def forget(self, finalised: Iterable[Finalised]) -> None:
-        """Free the slots of these rows, once their outputs have been read."""
-        for row in finalised:
-            self.pool.give(row.left)
+    def free_slots(self, finalised: Iterable[Finalised]) -> None:
+        """Free the slots that are not needed any more, once the outputs of the final rows have been read."""
+        for of_plant in finalised:
+            self.pool.give(of_plant.left)
 
 
 def _check_options(options: Options) -> Options:

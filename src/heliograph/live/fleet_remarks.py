@@ -1,4 +1,4 @@
-"""What happened to the filters' states of a fleet that users should know, such as that a gate gave in; said once."""
+"""Remarks of a fleet's filters on their states that users should read once, such as that a gate gave in."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -21,7 +21,7 @@ class FleetRemarks:
         self._pool, self._steps = fleet.pool, fleet.program.step_rows
         self.counts = Counter[tuple[str, str]](dict.fromkeys(self._steps.remarking, 0))
 
-    def said_of(self, plants: Iterable[PlantState]) -> Iterator[tuple[str, str]]:
+    def find_new(self, plants: Iterable[PlantState]) -> Iterator[tuple[str, str]]:
         """Yield the name of a plant and a line for each filter that has something new to say."""
         for plant in plants if self.counts else ():
             for place, said in self._read(plant.rows.held[-1]).items():
@@ -32,11 +32,11 @@ class FleetRemarks:
                     yield plant.name, f"{place[0]}/{place[1]}: {said.words}"
 
     def note_said(self, plant: PlantState) -> None:
-        """Note that all was said of a plant, which was stored."""
+        """Note that all remarks on a plant were made before it was stored, so that none is made again."""
         plant.remarked = {place: said.times for place, said in self._read(plant.rows.held[-1]).items()}
 
     def _read(self, row: HeldRow) -> dict[tuple[str, str], Any]:
-        """Return what the filters say of their states after a row."""
+        """Return the remark of each filter on its state after a row, by node and filter."""
         if not self.counts:
             return {}
         return self._steps.read_remarks(self._pool.table[row.slot, self._pool.state])

@@ -23,41 +23,48 @@ TRIES = 10  # to find the function of a filter that returned no number
 FLAGS = [Judgement._fields.index(name) for name in ("reason", "input")]
 
 
-Candidate: TypeAlias = tuple[
-    int, PlantState, Known, HeldRow
-]  # an event that was used, its message's number, and its row
+# Number of a message, its plant, its event, which was used, and the row that this stands in.
+Candidate: TypeAlias = tuple[int, PlantState, Known, HeldRow]
 
 
 class Judges:
-    """Reader of the filters' judgements of the rows that were just stepped."""
+    """Reader of the filters' judgements of the rows that were just stepped.
+
+    A node's events are judged by its own filters; where it has none, by the central ones, which take all nodes'.
+    """
 
     def __init__(self, fleet: Fleet):
         self.fleet, places = fleet, fleet.program.places
         central = _judgement_columns([output for output in places if output.node == Network.FUSED])
-        self._judgement_columns, self._central = {}, set[int]()  # nodes without a filter of their own
+        # By index of a node the columns of the judgements on it; the nodes without a filter of their own.
+        self._judgement_columns, self._judged_centrally = {}, set[int]()
         for index, name in enumerate(fleet.network.names):
             of_node = _judgement_columns(
-                [output for output in places if output.node == name and _has_sender(fleet, output)]
+                [output for output in places if output.node == name and _takes_measurements(fleet, output)]
             )
             self._judgement_columns[index] = of_node if len(of_node) else central
             if not len(of_node):
-                self._central.add(index)
-        self._every = _judgement_columns(places)
-        self._faults: dict[tuple[str, str], tuple[int, str]] = {}  # by node and filter: how often tried, what was found
+                self._judged_centrally.add(index)
+        self._all_columns = _judgement_columns(places)
+        # By node and filter: how often a faulty function was looked for, and the sentence that was found.
+        self._faults: dict[tuple[str, str], tuple[int, str]] = {}
 
-    def implausible_inputs(
+    def explain_implausible_inputs(
         self, plants: Sequence[PlantState | None], given: Float[np.ndarray, "plant given"]
     ) -> list[str | None]:
-        """Explain which inputs are implausible, by the prediction over one step or unit of time that they lead to."""
+        """Return for each plant why its inputs are implausible, None where they are not.
+
+        They are judged by the prediction over one step, or one unit of time, that they lead to.
+        """
         if not plants:
             return []
-        return [self.why_inputs(row) for row in self.fleet.trial(plants, given)]
+        return [self.why_inputs(row) for row in self.fleet.predict_outputs(plants, given)]
 
     def why_inputs(self, outputs: Float[np.ndarray, " outputs"]) -> str | None:
         """Explain why the inputs that led to these outputs are implausible; None if they are not."""
-        return Judgement.why_inputs(outputs[self._every])
+        return Judgement.why_inputs(outputs[self._all_columns])
 
-    def implausible(self, taken: Sequence[Candidate]) -> dict[int, str]:
+    def find_implausible(self, taken: Sequence[Candidate]) -> dict[int, str]:
         """Return the indices of the implausible candidates, each with the reason.
 
         Of a plant with implausible inputs only the first of these is returned: what comes after it was judged with it.
@@ -69,44 +76,46 @@ class Judges:
         # Most rows raise no flag: look at the parts of a judgement only where one is raised.
         pool = self.fleet.pool
         slots = np.array([row.slot for *_, row in taken])
-        flagged = (pool.table[slots[:, None], pool.outputs.start + self._every[:, FLAGS].ravel()] > 0).any(axis=1)
+        flagged = (pool.table[slots[:, None], pool.outputs.start + self._all_columns[:, FLAGS].ravel()] > 0).any(axis=1)
         # Reasons by candidate; by plant the first of its implausible inputs.
-        reasons, spoilt = dict[int, str](), dict[str, int]()
+        reasons, first_inputs = dict[int, str](), dict[str, int]()
         for i in np.flatnonzero(flagged).tolist():
             (_, plant, event, _), outputs = taken[i], pool.table[slots[i], pool.outputs]
-            if event.node_index >= 0:
-                why = (
-                    Judgement.why_values(outputs[self._judgement_columns[event.node_index]])
-                    if _largest_number(event) >= 0
-                    else None
-                )
-            elif why := self.why_inputs(outputs):
-                first = spoilt.setdefault(plant.name, i)
-                spoilt[plant.name] = min(first, i, key=lambda j: taken[j][-1].key)
+            why = None
+            if event.node_index < 0:
+                why = self.why_inputs(outputs)
+                if why:
+                    first = first_inputs.setdefault(plant.name, i)
+                    first_inputs[plant.name] = min(first, i, key=lambda j: taken[j][-1].key)
+            elif _largest_number(event) >= 0:
+                why = Judgement.why_values(outputs[self._judgement_columns[event.node_index]])
             if why:
                 reasons[i] = why
-        self._pick_blamed(taken, reasons)
+        self._drop_blameless(taken, reasons)
         # Of one node in one row the event with the largest number.
         largest: dict[tuple[int, int], int] = {}
         for i in reasons:
             _, _, event, row = taken[i]
             node_of_row = row.slot, event.node_index
             largest[node_of_row] = max(largest.get(node_of_row, i), i, key=lambda j: _largest_number(taken[j][2]))
-        first_of_plant = {i: why for i, why in reasons.items() if spoilt.get(taken[i][1].name, i) == i}
+        # What came after implausible inputs of its plant was judged with these: it may be all right without them.
         return {
-            i: why + self._name_faulty_function(taken[i]) for i, why in first_of_plant.items() if i in largest.values()
+            i: why + self._name_faulty_function(taken[i])
+            for i, why in reasons.items()
+            if i in largest.values() and first_inputs.get(taken[i][1].name, i) == i
         }
 
     def _name_faulty_function(self, candidate: Candidate) -> str:
         """Name the function of a filter that returned no number in a row, after a semicolon; "" where none did.
 
-        What was found of a filter is said again, and none is tried more than TRIES times: a plant may send for ever.
+        A filter's fault, once found, is repeated without another search. A filter is searched at most TRIES times, for
+        a plant may send implausible events for ever.
         """
-        # The row, the one before it, and what the filters estimated there.
+        # The event's row, the one before it, and what the filters estimated after each.
         _, plant, event, row = candidate
         pool, index = self.fleet.pool, plant.rows.index(row.key)
         before, after = plant.rows.held[index - 1], pool.table[row.slot, pool.outputs]
-        known = pool.table[before.slot, pool.outputs]
+        estimated = pool.table[before.slot, pool.outputs]
         for place in self.fleet.program.places:
             # Filters that judged this row to be no number, of the event's node or of all nodes.
             filter = filter_of(self.fleet, place)
@@ -120,55 +129,53 @@ class Judges:
             # Call the filter's functions from the estimate before the row: which of them returns no number?
             tried, said = self._faults.get((place.node, place.filter), (0, ""))
             if not said and tried < TRIES:
-                n = len(filter.states)
-                mean = known[place.mean : place.mean + n]
-                covariance = known[place.covariance : place.covariance + n * n].reshape(n, n)
-                estimate = Estimate(mean, covariance, place.claim)
-                begun = before.key[1] != BEFORE
-                said = find_function_fault(filter, estimate if begun else filter.estimate(filter.init()),
-                                      *pool.led(before.slot, row.slot))  # fmt: skip
+                if before.key[1] == BEFORE:  # the prior, before all events: no estimate was computed there
+                    estimate = filter.estimate(filter.init())
+                else:
+                    n = len(filter.states)
+                    mean = estimated[place.mean : place.mean + n]
+                    covariance = estimated[place.covariance : place.covariance + n * n].reshape(n, n)
+                    estimate = Estimate(mean, covariance, place.claim)
+                inputs, step = pool.inputs_between(before.slot, row.slot)
+                said = find_function_fault(filter, estimate, inputs, step)
                 self._faults[place.node, place.filter] = tried + 1, said
             if said:
                 return f"; {said}"
         return ""
 
-    def _pick_blamed(self, taken: Sequence[Candidate], reasons: dict[int, str]) -> None:
-        """Leave of the events of several nodes in one row, which a central filter judged together, the one to blame.
+    def _drop_blameless(self, taken: Sequence[Candidate], reasons: dict[int, str]) -> None:
+        """Leave in `reasons`, of several nodes' events that a central filter judged together, only the one to blame.
 
         That is the first, from the largest on, without which the row is plausible; the largest if there is none.
         """
         # Events of nodes without a filter of their own, by row.
-        rows: dict[int, list[int]] = {}
+        by_row: dict[int, list[int]] = {}
         for i in reasons:
-            if taken[i][2].node_index in self._central:
-                rows.setdefault(taken[i][-1].slot, []).append(i)
-        # Of several nodes' events in a row keep the one without which the row is plausible.
-        for those in rows.values():
-            if len({taken[i][2].node_index for i in those}) > 1:
-                one = Judgement.find_culprit(
-                    those, lambda i: _largest_number(taken[i][2]), lambda i: self._plausible_without(taken[i])
+            if taken[i][2].node_index in self._judged_centrally:
+                by_row.setdefault(taken[i][-1].slot, []).append(i)
+        for together in by_row.values():
+            if len({taken[i][2].node_index for i in together}) > 1:
+                culprit = Judgement.find_culprit(
+                    together, lambda i: _largest_number(taken[i][2]), lambda i: self._is_plausible_without(taken[i])
                 )
-                for i in those:
-                    if i != one:
+                for i in together:
+                    if i != culprit:
                         del reasons[i]
 
-    def _plausible_without(self, candidate: Candidate) -> bool:
-        """Step a row without what it has of a node; is it plausible then?"""
+    def _is_plausible_without(self, candidate: Candidate) -> bool:
+        """Return whether the candidate's row is plausible without all that it has of the candidate's node."""
         # A copy of the row in a slot of its own, with NaN for the node's numbers.
         _, plant, event, row = candidate
         pool, rows = self.fleet.pool, plant.rows
-        there = HeldRow(row.key, pool.take(), self.fleet.width)
-        there.numbers = row.numbers.copy()
-        at = rows.places[event.node_index]
-        there.numbers[at] = [nan] * (at.stop - at.start)
+        trial = HeldRow(row.key, pool.take(), self.fleet.width)
+        trial.numbers = row.numbers.copy()
+        columns = rows.places[event.node_index]
+        trial.numbers[columns] = [nan] * (columns.stop - columns.start)
         # Stepped from the row before, judged, and let go.
-        self.fleet.step_row(rows.held[rows.index(row.key) - 1], there)
-        plausible = (
-            Judgement.why_values(pool.table[there.slot, pool.outputs][self._judgement_columns[event.node_index]])
-            is None
-        )
-        pool.give([there.slot])
-        return plausible
+        self.fleet.step_row(rows.held[rows.index(row.key) - 1], trial)
+        judged = pool.table[trial.slot, pool.outputs][self._judgement_columns[event.node_index]]
+        pool.give([trial.slot])
+        return Judgement.why_values(judged) is None
 
 
 def _largest_number(event: Known) -> float:
@@ -186,7 +193,9 @@ class FleetAngles:
     """Watch a fleet for angles that a filter knows less well than it can use, and for degrees; each is said once."""
 
     def __init__(self, fleet: Fleet):
+        # Name, columns of the variances of its states in the table, and the angles among these, by filter.
         self._pool, self._watched = fleet.pool, list[tuple[str, np.ndarray, WideAngles]]()
+        # The same by node of what it receives.
         self._received = list[tuple[str, np.ndarray, WideAngles]]()
         for place in fleet.program.places:
             filter = filter_of(fleet, place)
@@ -194,7 +203,7 @@ class FleetAngles:
                 n = len(filter.states)
                 variances = fleet.pool.outputs.start + place.covariance + np.arange(n) * (n + 1)
                 self._watched.append((f"{place.node}/{place.filter}", variances, angles))
-        # What each node receives, by a filter that takes it: its own, or one of all nodes.
+        # What each node receives, by a filter that takes it: its own, or one of all nodes; each column only once.
         watched = set[int]()
         for place in fleet.program.places:
             if (filter := filter_of(fleet, place)) is not None and filter.received:
@@ -206,27 +215,27 @@ class FleetAngles:
                 watched |= set(here)
                 self._received.append((place.node, fleet.pool.numbers.start + np.array(list(here)), angles))
 
-    def said_of(self, plants: Sequence[PlantState]) -> list[tuple[str, str]]:
-        """Return the name of a plant and a line for each angle that is wide in a newest row for the first time."""
+    def find_new(self, plants: Sequence[PlantState]) -> list[tuple[str, str]]:
+        """Return (name of the plant, line) for each angle whose doubt shows in a newest row for the first time."""
         self._watched = [watched for watched in self._watched if watched[-1].states]
         self._received = [watched for watched in self._received if watched[-1].received]
         if not self._watched and not self._received:
             return []
         slots = np.array([plant.rows.held[-1].slot for plant in plants], dtype=int)
         wide = [
-            (plants[row].name, f"{of}: {line}")
-            for of, columns, angles in self._watched
+            (plants[row].name, f"{name}: {line}")
+            for name, columns, angles in self._watched
             for row, line in angles.said_of(self._pool.table[slots[:, None], columns])
         ]
         return wide + [
-            (plants[row].name, f"{of}: {line}")
-            for of, columns, angles in self._received
+            (plants[row].name, f"{name}: {line}")
+            for name, columns, angles in self._received
             for row, line in angles.doubt_unit(self._pool.table[slots[:, None], columns])
         ]
 
 
 def _list_received(network: Network, node: str) -> dict[int, str]:
-    """Return the names of what a node receives, by their places in a row; of what all do where they are fused."""
+    """Return {column of a row's measurements: name of what is received there} of a node, or of all for `FUSED`."""
     if node != Network.FUSED:
         return dict(zip(network.rows[node], network.nodes[node].received_names, strict=True))
     return {
@@ -244,7 +253,7 @@ def filter_of(fleet: Fleet, output: FilterColumns) -> AbstractFilter | None:
     return fleet.network.nodes[output.node].filters.get(output.filter)
 
 
-def _has_sender(fleet: Fleet, output: FilterColumns) -> bool:
-    """Test whether the filter of these columns knows a sender that decides when to send."""
+def _takes_measurements(fleet: Fleet, output: FilterColumns) -> bool:
+    """Return whether these columns are of a filter of the node that takes measurements itself."""
     filter = fleet.network.nodes[output.node].filters.get(output.filter)  # a fusion between neighbours is none
     return filter is not None and bool(filter.received)

@@ -1,4 +1,4 @@
-"""Leaps in time: of which clock they are, and what confirms them or takes them back."""
+"""Leaps in time: which clock made them, and what confirms them or takes them back."""
 
 from collections.abc import Iterator
 from math import inf
@@ -9,7 +9,7 @@ ARRIVAL = ""  # the clock by which arrivals are dated, which is no node's
 
 
 class Leap(NamedTuple):
-    """A leap in time of which one clock speaks.
+    """A leap in time that one clock has made so far.
 
     Another clock confirms it: that of another node, the one on the wall, or that of an arrival where it agrees with the
     node's. A second message by the same clock makes it believed where no other node was heard shortly before: there is
@@ -51,19 +51,22 @@ class Leap(NamedTuple):
         return now - self.since >= self.since - self.now
 
     def as_believed(self) -> "Leap":
-        """Return this leap where it is believed; with an earlier one that is not the plant's beginning it is one."""
+        """Return this leap, believed; one that follows an earlier believed one is joined with that into one leap.
+
+        Not with the leap with which the plant begins (`now` is -inf), which has no time before it.
+        """
         if self.earlier is None or self.earlier.now == -inf:
             return self._replace(believed=True, back=None)
         return self.earlier._replace(since=self.since, back=None)
 
     def with_back(self, of: "Leap", back: float | None) -> "Leap":
-        """Return this leap with `back` noted in the leap `of` of its chain."""
+        """Return this leap with its `back` set in that leap of its chain which is `of`."""
         if self is of:
             return self._replace(back=back)
         return self._replace(earlier=self.earlier and self.earlier.with_back(of, back))
 
     def taken_back_by(self, clock: str, time: float, now: float) -> bool:
-        """Return whether what `clock` says of `time`, between the two sides of the leap, takes it back.
+        """Return whether `clock` takes the leap back by saying `time`, which lies between the leap's two sides.
 
         `now`: the newest arrival after it.
         """
@@ -71,25 +74,28 @@ class Leap(NamedTuple):
             return True
         if now - self.since >= self.since - time:
             return False  # it is late for no longer than the plant has gone on
+        # By its own clock only the second message in a row, if it goes on from the first more closely than to the leap.
         return clock != self.clock or (self.back is not None and self.back < time < self.back + self.time - time)
 
 
 def find_leap(leap: Leap | None, now: float, time: float, most: float) -> tuple[Leap, float] | None:
-    """Return the leap of a chain before which a time goes on, and the newest arrival after it; None if there is none.
+    """Return the leap that `time` contradicts by lying before it, and the newest arrival after it; None if none.
+
+    A time contradicts a leap if it is later than all before the leap, but more than `most` before its far side.
 
     Args:
         leap: the newest of the chain, None if there is none.
         now: the newest arrival.
-        time: the time.
+        time: what a clock says.
         most: the longest gap that is no leap.
     """
-    for one in leap.chain() if leap else ():
-        if one.now < time < one.time - most:
-            return one, now
-        now = one.now
+    for candidate in leap.chain() if leap else ():
+        if candidate.now < time < candidate.time - most:
+            return candidate, now
+        now = candidate.now
     return None
 
 
-def beginning(time: float, clock: str) -> Leap:
-    """Return the leap with which a plant begins."""
+def make_first_leap(time: float, clock: str) -> Leap:
+    """Return the leap with which a plant begins: from no time at all to its first, by this clock."""
     return Leap(time, time, -inf, {}, clock)

@@ -1,4 +1,4 @@
-"""Many silent steps in bounded work: by real steps while they last, then by powers of the affine map that a step is."""
+"""Many silent steps in bounded work: some real steps, then powers of the affine map that a step is."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -10,7 +10,7 @@ from heliograph.live.stored.old_layout import LOWER, VARIANCES, factorise, split
 from heliograph.numerics.types import Float, PyTree
 
 Step = Callable[[Float[np.ndarray, "row state"], int], Float[np.ndarray, "row state"]]
-"""Silent step with a number from several states, each by itself."""
+"""Takes several states, each by itself, through the silent step with this number."""
 
 LONG = 10_000  # steps: a longer gap is not stepped through one by one
 PROBED = 256  # steps by which a jump is proved
@@ -52,7 +52,7 @@ def convert_to_covariances(
 def convert_to_factors(
     rows: Float[np.ndarray, "row state"], places: Sequence[Factors]
 ) -> Float[np.ndarray, "row state"]:
-    """Return what `convert_to_covariances` was given."""
+    """Return rows with the factors L and D in the places of covariances: undo `convert_to_covariances`."""
     rows = rows.copy()
     for lower, variances in places:
         n = variances.shape[-1]
@@ -93,10 +93,11 @@ def _pass_silent_steps(
 ) -> Float[np.ndarray, " state"]:
     """Take `count` steps of silence: a few probes, PROBED real steps each, and the rest at once by what these show.
 
-    Where a probe moves nothing the state rests; where covariances follow an affine map it is applied as often as is
-    left; else the probes are extrapolated. A state holds factors of covariances at `places`; affine are covariances.
+    Where a probe moves nothing the state rests; where an affine map predicts the probe it is applied for all steps that
+    are left; else the probes are extrapolated. A state holds factors L, D of covariances at `places`; they are compared
+    and extrapolated as L D L', since P' = F P F' + Q is affine in P and not in its factors.
     """
-    passed = [state]
+    passed = [state]  # the states after 0, 1, 2, ... probes
 
     def as_covariances(states: Sequence[Float[np.ndarray, " state"]]) -> Sequence[Float[np.ndarray, " state"]]:
         return list(convert_to_covariances(np.stack(states), places))
@@ -108,7 +109,7 @@ def _pass_silent_steps(
         passed.append(_step_through(step, passed[-1], at + i * PROBED, PROBED))
         if not (moving := _find_moving(*as_covariances(passed[-2:]))).any():
             return passed[-1]
-        if i & (i + 1) == 0:  # after 1, 2, 4, ... probes
+        if i & (i + 1) == 0:  # after 1, 2, 4, ... probes; the jump starts before the last of them
             jumped = _jump_by_affine_map(
                 by_covariances, as_covariances(passed[-2:]), moving, at + i * PROBED, count - i * PROBED
             )
@@ -127,19 +128,24 @@ def _restore_factors(state: Float[np.ndarray, " state"], places: Sequence[Factor
 
 
 def _extrapolate(passed: Sequence[Float[np.ndarray, " state"]], count: int) -> Float[np.ndarray, " state"]:
-    """Let go on what moved over the last quarter of some probes as it did over the quarter before."""
+    """Return the state `count` steps after the last of those passed, which are a probe of steps apart.
+
+    Numbers that moved over the last quarter of the probes as they did over the quarter before go on at this rate; all
+    others stay.
+    """
     quarter = len(passed) // 4
     end, middle, begin = (passed[-1 - i * quarter] for i in range(3))
     with np.errstate(invalid="ignore"):
-        now, before = end - middle, middle - begin
-        steady = np.isfinite(end) & (np.abs(now - before) <= STEADY * np.abs(before)) & _find_moving(middle, end)
+        last_change, change_before = end - middle, middle - begin
+        even = np.abs(last_change - change_before) <= STEADY * np.abs(change_before)
+        steady = np.isfinite(end) & even & _find_moving(middle, end)
     moved = end.copy()
-    moved[steady] += now[steady] * (count / (quarter * PROBED))
+    moved[steady] += last_change[steady] * (count / (quarter * PROBED))
     return moved
 
 
 def _step_through(step: Step, state: Float[np.ndarray, " state"], at: int, count: int) -> Float[np.ndarray, " state"]:
-    """Take `count` steps one by one."""
+    """Return the state after `count` steps, taken one by one after step number `at`."""
     states = state[None]
     for k in range(at + 1, at + count + 1):
         states = step(states, k)
@@ -157,11 +163,20 @@ def _find_moving(before: Float[np.ndarray, " state"], after: Float[np.ndarray, "
 
 def _jump_by_affine_map(step: Step, probe: Sequence[Float[np.ndarray, " state"]], moving: np.ndarray,
             at: int, count: int) -> Float[np.ndarray, " state"] | None:  # fmt: skip
-    """Return the state `count` steps after the begin of a probe by the affine map there; None if the step is none."""
+    """Return the state `count` steps after the begin of a probe by the affine map there; None if it fails the probe.
+
+    Args:
+        step: the silent step, of states with covariances.
+        probe: the states before and after PROBED real steps.
+        moving: which numbers changed over the probe; the map is of these alone.
+        at: number of the step before the probe.
+        count: how many steps to go on from there.
+    """
     state, probed = probe
     if not (np.isfinite(state[moving]) & np.isfinite(probed[moving])).all():
         return None
-    # Differences along each number that moves, of the size of its own movement, which is a change that it makes.
+    # A by differences along each number that moves: over a power of two of about the size of its movement, so that
+    # the division is exact, and not less than 2^-20 of the number itself, so that rounding does not count.
     columns = np.flatnonzero(moving)
     size = np.exp2(np.ceil(np.log2(np.maximum(np.abs(probed - state), np.abs(state) * 2.0**-20)[columns])))
     tried = np.repeat(state[None], len(columns) + 1, axis=0)
@@ -170,16 +185,15 @@ def _jump_by_affine_map(step: Step, probe: Sequence[Float[np.ndarray, " state"]]
     matrix, moved = ((after[1:] - after[0]) / size[:, None]).T, after[0] - state[columns]
     if not np.isfinite(matrix).all():
         return None
-    # In units of the movements, rounding is taken off: a zero that is 1e-15 would couple what grows with what does not.
+    # Entries in units of the movements are rounded to LEAST: a zero computed as 1e-15 would let what grows for ever
+    # drive what rests.
     units = size[:, None] / size
     matrix = np.round(matrix / units / LEAST) * LEAST * units
-    # It has to predict the probe.
+    # The map has to predict the probe.
     with np.errstate(over="ignore", invalid="ignore"):
-        expected = _iterate_affine_map(matrix, moved, PROBED)
-        scale = np.abs(probed - state)[columns] + AGREES * np.abs(state)[columns]
-        if not (
-            np.abs(expected - (probed - state)[columns]) <= AGREES * scale + SETTLED * np.abs(probed)[columns]
-        ).all():
+        expected, seen = _iterate_affine_map(matrix, moved, PROBED), (probed - state)[columns]
+        scale = np.abs(seen) + AGREES * np.abs(state)[columns]
+        if not (np.abs(expected - seen) <= AGREES * scale + SETTLED * np.abs(probed)[columns]).all():
             return None
         jumped = state.copy()
         jumped[columns] += _iterate_affine_map(matrix, moved, count)
@@ -189,8 +203,9 @@ def _jump_by_affine_map(step: Step, probe: Sequence[Float[np.ndarray, " state"]]
 def _iterate_affine_map(
     matrix: Float[np.ndarray, "m m"], moved: Float[np.ndarray, " m"], count: int
 ) -> Float[np.ndarray, " m"]:
-    """Return d after `count` steps d' = A d + c from d = 0, by squaring the map."""
+    """Return d after `count` steps d' = A d + c from d = 0, by squaring the map: A is `matrix`, c is `moved`."""
     total = np.zeros_like(moved)
+    # Before each turn, (matrix, moved) is the map of 1, 2, 4, ... steps: d' = A (A d + c) + c = A^2 d + (A c + c).
     while count:
         if count & 1:
             total = matrix @ total + moved

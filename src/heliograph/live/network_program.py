@@ -1,4 +1,4 @@
-"""A network on live data: its step as a function of rows, and its time."""
+"""The program of a network on live data: its step as a function of rows, and the input that is its time step."""
 
 from functools import cached_property
 
@@ -24,7 +24,7 @@ TOLERANCE = 1e-9  # relative: a few products lose 1e-15
 
 
 def time_input(network: Network) -> int | None:
-    """Return the index of the plant's input that is the time since the previous row; None if time counts steps.
+    """Return the index of the plant's input dt, the time since the previous row; None if time counts steps.
 
     Raises:
         ValueError: a plant with the input dt in a network with parts that need step numbers: they vary over time or
@@ -54,15 +54,17 @@ def explain_unevenness(plant: AbstractPlant, dt: int) -> str:
 
     f(f(x, s), t) = f(x, s + t), A(s + t) = A(t) A(s), Q(s + t) = A(t) Q(s) A(t)' + Q(t), with A the Jacobian of f. We
     test these around the initial mean, with all other inputs 1; s = 0 and t = 0 are among the divisions.
+
+    Args:
+        plant: the plant, whose time step is an input.
+        dt: index of this input.
     """
     mean, spread = np.asarray(plant.initial_mean), np.sqrt(np.diag(np.asarray(plant.initial_covariance)))
     cuts = np.array(CUTS)
     # At the initial mean, and one standard deviation from it.
     for x in (mean, mean + spread):
-        whole, parts = (
-            _integrate_parts(plant, dt, x, cuts.sum(axis=1, keepdims=True)),
-            _integrate_parts(plant, dt, x, cuts),
-        )
+        whole = _integrate_parts(plant, dt, x, cuts.sum(axis=1, keepdims=True))
+        parts = _integrate_parts(plant, dt, x, cuts)
         for i, (s, t) in enumerate(CUTS):
             for what, at_once, in_two in zip(("transition", "Jacobian", "noise"), whole, parts, strict=True):
                 gap = float(np.abs(at_once[i] - in_two[i]).max())
@@ -78,10 +80,13 @@ def explain_unevenness(plant: AbstractPlant, dt: int) -> str:
 def _integrate_parts(
     plant: AbstractPlant, dt: int, x: Float[Array, " n"], intervals: Float[Array, "cut part"]
 ) -> tuple[Float[Array, "cut n"], Float[Array, "cut n n"], Float[Array, "cut n n"]]:
-    """Return state, Jacobian and noise covariance after the parts of each cut."""
+    """Return for each cut the mean, transition matrix and noise covariance after its intervals, passed one by one.
 
-    def after(parts: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Return mean, transition matrix and noise covariance after intervals of these lengths, one by one."""
+    intervals (cut, part): lengths, in the plant's unit of time; the mean starts at x.
+    """
+
+    def integrate(parts: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Return mean, transition matrix and noise covariance after intervals of these lengths."""
         n = len(x)
         state, matrix, spread = jnp.asarray(x), jnp.eye(n), jnp.zeros((n, n))
         for interval in parts:
@@ -94,7 +99,7 @@ def _integrate_parts(
             )
         return state, matrix, spread
 
-    moved: tuple[jax.Array, jax.Array, jax.Array] = jax.vmap(after)(jnp.asarray(intervals))
+    moved: tuple[jax.Array, jax.Array, jax.Array] = jax.vmap(integrate)(jnp.asarray(intervals))
     return moved
 
 
@@ -140,4 +145,4 @@ class NetworkProgram:
         return network_identity(self.network, self.step_rows.program, {})
 
 
-shared_program = share_by_object(NetworkProgram)  # of a network, made at the first call
+shared_program = share_by_object(NetworkProgram)  # returns a network's program, which it makes at the first call

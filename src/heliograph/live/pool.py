@@ -19,8 +19,9 @@ SHORTEST = 64  # rows of a history
 class Pool:
     """Table with one row per slot; slots are taken and given back.
 
-    The columns are (state, outputs, inputs held, step number, received, inputs, time). `numbers` is the slice of the
-    last three, as in the rows of a timeline. `alone`: single rows are stepped, not many at once.
+    The columns are (state, outputs, inputs held, step number, received, inputs, time); `state`, `outputs`, `held` and
+    `at` are the slices of the first four, `numbers` that of the last three, which a `HeldRow` has as well.
+    `alone`: single rows are stepped, not many at once.
     """
 
     def __init__(self, program: NetworkProgram, alone: bool = False):
@@ -55,18 +56,18 @@ class Pool:
         """Give slots back."""
         self._free += slots
 
-    def start(self, slot: int, time: float) -> None:
+    def write_prior(self, slot: int, time: float) -> None:
         """Fill a slot with the prior, at `time`, before any measurement."""
         row = self.table[slot]
         row[:] = 0.0
         row[self.state], row[self.at], row[self.numbers] = self.step_rows.start, -1.0, np.nan
         row[-1] = time
 
-    def trial(self, before: np.ndarray, given: np.ndarray, last: float) -> np.ndarray:
-        """Predict from the rows in these slots, with these inputs and no measurement; return the outputs.
+    def predict_outputs(self, before: np.ndarray, given: np.ndarray, last: float) -> np.ndarray:
+        """Predict from the rows in the slots `before`, with inputs and no measurement; return outputs (row, outputs).
 
         The prediction covers one step, or one unit of continuous time. An input that is NaN keeps its value. The step
-        number is at most `last`.
+        number is at most `last`, the last step for which the network is defined.
         """
         dt, table = self.program.dt, self.table
         u = np.where(np.isnan(given), table[before, self.held], given)
@@ -87,10 +88,12 @@ class Pool:
         received, given = numbers[:, : self.program.received], numbers[:, self.program.received : -1]
         now_held = np.where(np.isnan(given), held, given)
         if dt is None:
-            there = (at == numbers[:, -1])[:, None]
-            received, u = np.where(there, received, np.nan), np.where(there, now_held, held)
+            # On the way to a row nothing is received, and the inputs are those of before.
+            arrives = (at == numbers[:, -1])[:, None]
+            received, u = np.where(arrives, received, np.nan), np.where(arrives, now_held, held)
             now_held, k = u, at
         else:
+            # Inputs given with a row hold from there on: those of before led to it.
             u = _insert_time_step(held, dt, numbers[:, -1] - table[before, -1])
             k = table[before, self.at.start] + 1
         done = self._step_parts(table[before, self.state], received, u, k[:, None])
@@ -98,12 +101,15 @@ class Pool:
         table[after, self.held], table[after, self.at.start] = now_held, k
 
     def _step_parts(self, *parts: np.ndarray) -> np.ndarray:
-        """Step rows, given in parts that stand side by side; of a single row the next call overwrites the result."""
+        """Return (row, state and outputs) after a step of rows (state, received, inputs, step number), given in parts.
+
+        The result for a single row is overwritten by the next call.
+        """
         if len(parts[0]) == 1 and (self._alone or self.step_rows.is_native):
             return self._one(*parts)
         return self.step_rows(np.concatenate(parts, axis=1))
 
-    def led(self, before: int, after: int) -> tuple[Float[np.ndarray, " inputs"], int]:
+    def inputs_between(self, before: int, after: int) -> tuple[Float[np.ndarray, " inputs"], int]:
         """Return the inputs that led from the row in one slot to that in another, and the number of the step there."""
         dt, table = self.program.dt, self.table
         u = table[after if dt is None else before, self.held]
@@ -111,8 +117,8 @@ class Pool:
             u = _insert_time_step(u[None], dt, table[[after], self.numbers.stop - 1] - table[[before], -1])[0]
         return u, int(table[after, self.at.start])
 
-    def jump(self, slot: int, to: int) -> None:
-        """Take the row in a slot, in place, to step number `to` without measurements, in bounded work."""
+    def pass_long_gap(self, slot: int, to: int) -> None:
+        """Predict the row in a slot, in place, to step number `to` without measurements, in bounded work."""
         row = self.table[slot]
         at, held = int(row[self.at.start]), row[self.held]
         nothing = np.full(self.program.received, np.nan)
@@ -127,7 +133,10 @@ class Pool:
         self.table[slot, self.state], self.table[slot, self.at.start] = after, to
 
     def history(self, slots: Sequence[int]) -> PyTree:
-        """Return the rows in these slots, in order, and behind them copies of the last up to a power of two."""
+        """Return the rows in these slots, in order, as a smoother takes them.
+
+        Copies of the last row behind them make their number a power of two, so that few lengths are compiled.
+        """
         length = max(SHORTEST, 1 << (len(slots) - 1).bit_length())
         rows = self.table[[*slots, *[slots[-1]] * (length - len(slots))]]
         state, outputs = rows[:, self.state], rows[:, self.outputs]
@@ -143,14 +152,14 @@ Single: TypeAlias = tuple[int, int, float]  # a step: slot to step from, slot to
 
 
 class Leg(NamedTuple):
-    """Steps of a chain, and the step number to which the last row jumps behind them."""
+    """Steps of a chain one by one, and the step number to which the last row is then taken at once; 0 if to none."""
 
     steps: list[Single]
     jump: int = 0
 
 
 def cut_into_legs(chain: list[HeldRow], by_steps: bool, endless: bool) -> list[Leg]:
-    """Cut the steps of a chain where a gap is too long to step through one by one.
+    """Return the steps along a chain of rows, cut into legs where a gap is too long to step through one by one.
 
     Args:
         chain: rows, of which each is stepped into from the one before it.
@@ -162,6 +171,7 @@ def cut_into_legs(chain: list[HeldRow], by_steps: bool, endless: bool) -> list[L
         begin, last, before = int(row.key[0]) + 1, next_row.key[0], row.slot
         numbers: Sequence[float] = range(begin, int(last) + 1) if by_steps else (last,)
         if len(numbers) > LONG and endless:
+            # One step into the new row, which is then taken in place to TAIL steps before its own; these one by one.
             legs[-1] = Leg([*legs[-1].steps, (before, next_row.slot, begin)], int(last) - TAIL)
             legs.append(Leg([]))
             before, numbers = next_row.slot, range(int(last) - TAIL + 1, int(last) + 1)
@@ -172,11 +182,11 @@ def cut_into_legs(chain: list[HeldRow], by_steps: bool, endless: bool) -> list[L
 
 
 def group_by_turn(walks: Iterable[list[Single]]) -> list[list[Single]]:
-    """Group the steps of all chains by turn, so that each group has at most one step of each chain."""
-    rounds: list[list[Single]] = []
+    """Return the first steps of all walks, then all second ones, and so on: each group has one of each at most."""
+    turns: list[list[Single]] = []
     for steps in walks:
         for turn, step in enumerate(steps):
-            if turn == len(rounds):
-                rounds.append([])
-            rounds[turn].append(step)
-    return rounds
+            if turn == len(turns):
+                turns.append([])
+            turns[turn].append(step)
+    return turns

@@ -66,8 +66,8 @@ def play(
     lagged: list[tuple[float, Mapping[str, Mapping[str, Estimate]]]] = []
     waiting: list[float] = []  # moments of which the lag has not passed
 
-    # Fixed-lag smoothing: estimates of each moment, once a lag has passed and before anything later arrives.
-    def look(until: float) -> None:
+    def smooth_moments(until: float) -> None:
+        """Smooth each waiting moment whose lag ends before `until`, which nothing that arrives earlier can change."""
         while lag is not None and waiting and waiting[0] + lag < until:
             moment = heappop(waiting)
             if (lagged and lagged[-1][0] == moment) or moment > timeline.now:  # there already; of a wrong clock
@@ -78,14 +78,14 @@ def play(
     # Final estimates are collected before the timeline would drop any.
     count = 0
     for count, event in enumerate(coming, 1):
-        look(_arrival_of(event))
+        smooth_moments(_arrival_of(event))
         if timeline.push(*event) == "used" and event.node != INPUTS and timeline.now <= event.time + (lag or 0.0):
             heappush(waiting, event.time)
         if count % timeline.capacity == 0:
             finals.append(timeline.final())
     if not count:
         raise fail("events", "at least one", "none")
-    look(np.inf)
+    smooth_moments(np.inf)
     # The rest becomes final.
     timeline.advance(timeline.now + window + 1.0)
     finals.append(timeline.final())
@@ -123,8 +123,8 @@ def _make_record(network: Network, parts: Sequence[tuple[float, Mapping[str, Map
     return Record(np.array([time for time, _ in parts]), network.states, None, {}, estimates)
 
 
-def _stack_estimates(parts: Sequence[Estimate], how: Callable[[list[np.ndarray]], np.ndarray]) -> Estimate:
-    """Join estimates of several times by `how`, `np.stack` or `np.concatenate`, with the weakest of their claims."""
-    mean, covariance = (how([np.asarray(getattr(e, name)) for e in parts]) for name in ("mean", "covariance"))
-    modes = None if parts[0].modes is None else how([np.asarray(e.modes) for e in parts])
+def _stack_estimates(parts: Sequence[Estimate], join: Callable[[list[np.ndarray]], np.ndarray]) -> Estimate:
+    """Return the estimates of several times as one, joined by `np.stack` or `np.concatenate`; all claim the same."""
+    mean, covariance = (join([np.asarray(getattr(e, name)) for e in parts]) for name in ("mean", "covariance"))
+    modes = None if parts[0].modes is None else join([np.asarray(e.modes) for e in parts])
     return Estimate(mean, covariance, parts[0].claim, modes, parts[0].attitude)

@@ -1,4 +1,4 @@
-"""Forecasts of live plants start from a row: its filters' states, the inputs held there, and its estimates."""
+"""The origin of forecasts of live plants, a row: its filters' states, the inputs held there, and its estimates."""
 
 import numpy as np
 
@@ -30,7 +30,7 @@ def make_row_origin(fleet: Fleet, slot: int | list[int], time: float | np.ndarra
 
 
 def estimates_by_name(program: NetworkProgram, outputs: np.ndarray) -> dict[str, dict[str, Estimate]]:
-    """Arrange the outputs of a row, or of rows, by node and filter."""
+    """Return the estimates of a row, or of rows, by node and filter, from its outputs (..., outputs)."""
     n, attitude = len(program.network.states), first(program.network.plant).manifold.rotations
     estimates: dict[str, dict[str, Estimate]] = {node: {} for node in program.claims}
     for place in program.places:

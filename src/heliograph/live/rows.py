@@ -60,7 +60,10 @@ class Rows:
         return bisect_left(self.keys, (time,))
 
     def verdict(self, event: Known, key: Key, watermark: float, ahead: float) -> Verdict:
-        """Judge an event of the row with this key, for this watermark."""
+        """Return the verdict on an event whose row has this key, where rows before the watermark are final.
+
+        `ahead`: how much later than its arrival an event may be dated.
+        """
         if event.time > event.arrival + ahead:
             return "future"
         if key > self.keys[-1]:  # as most are: nothing can be said against what is newest
@@ -74,6 +77,7 @@ class Rows:
             return "used"
         if held is not None:
             return "duplicate" if np.array_equal(held, event.values, equal_nan=True) else "conflict"
+        # Two events of a node in one row are fine where they fill different components (no NaN is no equal to itself).
         there = row.numbers[self.places[event.node_index]]
         return "conflict" if any(a == a and b == b for a, b in zip(there, event.values, strict=True)) else "used"
 
@@ -104,9 +108,10 @@ class Rows:
     def count_lost(
         self, index: int, event: Known, column: int, newest: int
     ) -> tuple[float, list[tuple[HeldRow, float]]]:
-        """Return how many of a sender's transmissions were lost before an event, by the running count; NaN if unknown.
+        """Return how many of a sender's messages were lost just before an event, by the running count; NaN if unknown.
 
-        Also the row of the sender's next event with what is the number there now, if the event stands before one.
+        An event that arrives late changes this number for the sender's next event: the row of this and its new number
+        are returned as well, in a list that is empty where there is no later event.
 
         Args:
             index: index of the event's row.
@@ -114,21 +119,24 @@ class Rows:
             column: column of the number in a row.
             newest: greatest running count before the event, -1 if there was none.
         """
-        before = self._event_of(event.node_index, range(index - 1, -1, -1))
-        after = self._event_of(event.node_index, range(index + 1, len(self.held)))
+        before = self._find_event_of(event.node_index, range(index - 1, -1, -1))
+        after = self._find_event_of(event.node_index, range(index + 1, len(self.held)))
         count = event.sequence
+        # The count before the event: of the row before; else what the next event's number says of it.
         if before is not None:
-            newest = before[1]
+            _, newest = before
         elif after is not None:
-            lost = after[0].numbers[column]
-            newest = after[1] - int(lost) - 1 if lost == lost else -1
+            row_after, count_after = after
+            lost = row_after.numbers[column]
+            newest = count_after - int(lost) - 1 if lost == lost else -1
         number = float(count - newest - 1) if 0 <= newest < count else nan
         if after is None:
             return number, []
-        return number, [(after[0], float(after[1] - count - 1) if count < after[1] else nan)]
+        row_after, count_after = after
+        return number, [(row_after, float(count_after - count - 1) if count < count_after else nan)]
 
-    def _event_of(self, node: int, indices: range) -> tuple[HeldRow, int] | None:
-        """Return the first of these rows with an event of a node, and the running count of this."""
+    def _find_event_of(self, node: int, indices: range) -> tuple[HeldRow, int] | None:
+        """Return the first of these rows with an event of a node, and the event's running count; None if none has."""
         for i in indices:
             for name in self.held[i].events:
                 if name[0] == node:

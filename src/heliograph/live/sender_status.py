@@ -1,4 +1,4 @@
-"""Silence of senders that decide: steps that are silent, steps that are not final, and senders that are dead."""
+"""Status of senders that decide when to send: which steps are silent, which not final, and which senders are dead."""
 
 from typing import NamedTuple
 
@@ -43,13 +43,16 @@ class LossChain(NamedTuple):
 
     @staticmethod
     def of_channel(channel: Channel) -> "LossChain":
-        """Return the losses of a link."""
+        """Return the losses of a link: in each mode the probability of the outcomes of which nothing arrives."""
         modes = joint_modes(first(channel))
         loss = [sum(float(o.probability) for o in m.list_outcomes() if not o.arrived.any()) for m in modes.maps]
         return LossChain(np.array(loss), np.asarray(modes.transition), np.asarray(modes.initial))
 
-    def in_a_row(self, apart: int, count: int) -> float:
-        """Return the probability that `count` transmissions, so many steps apart, are all lost."""
+    def probability_all_lost(self, apart: int, count: int) -> float:
+        """Return the probability that `count` transmissions, `apart` steps from one to the next, are all lost.
+
+        p diag(l) (T^apart diag(l))^(count - 1) 1, with initial law p, loss probabilities l and transition T.
+        """
         if not count:
             return 1.0
         moved = np.linalg.matrix_power(self.transition, apart)
@@ -59,24 +62,28 @@ class LossChain(NamedTuple):
 def make_sender_status(
     trigger: AbstractTrigger, losses: LossChain, last: int | None, final: int, now: int
 ) -> SenderStatus:
-    """The status where the newest value is of step `last`, the newest final step `final` and the present one `now`."""
-    begun = -1 if last is None else last
-    silent, provisional = max(final - begun, 0), max(now - max(final, begun), 0)
+    """Return a sender's status at the step `now`.
+
+    Args:
+        trigger: its rule.
+        losses: losses of its link.
+        last: step of its newest value, None before the first.
+        final: the newest final step.
+        now: the present step.
+    """
+    heard = -1 if last is None else last
+    silent, provisional = max(final - heard, 0), max(now - max(final, heard), 0)
     missed = count_missed_heartbeats(trigger, last, silent, final)
-    return SenderStatus(
-        last,
-        silent,
-        provisional,
-        missed,
-        losses.in_a_row(1 if trigger.heartbeat is None else int(trigger.heartbeat), missed),
-    )
+    interval = 1 if trigger.heartbeat is None else int(trigger.heartbeat)
+    chance = losses.probability_all_lost(interval, missed)
+    return SenderStatus(last=last, silent=silent, provisional=provisional, missed=missed, chance=chance)
 
 
 def count_missed_heartbeats(trigger: AbstractTrigger, last: int | None, silent: int, final: int) -> int:
-    """Return the transmissions that were due in the silent steps; the first value is due at once.
+    """Return how many transmissions, at least, were due in the `silent` final steps up to step `final`.
 
-    Between two heartbeats the sender may have transmitted on an event that was lost too: then the next one is due
-    later. So of the silent steps at least every `heartbeat` steps one transmission was.
+    The first value (`last` is None) is due at once. A heartbeat is due `heartbeat` steps after the last transmission;
+    one on an event that was lost too only delays the next, so that at least one falls into each `heartbeat` steps.
     """
     if isinstance(trigger, Periodic):
         period, phase = int(trigger.period), int(trigger.phase)

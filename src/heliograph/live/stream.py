@@ -74,14 +74,15 @@ class Stream:
         self.limits = limits_of(filter.received, limits, invalid, stuck, *believed)
         self.dropped = np.zeros(filter.received, dtype=np.int64)
         self.stuck, self._repeats = np.zeros(filter.received, dtype=np.int64), Repeats()
+        # Steps done; step of a sender's newest value; unexpected measurements in a row; remarks made.
         self.steps, self._last, self._beyond, self._remarked = 0, -1, 0, 0
         self._inputs = np.full(len(filter.inputs), np.nan)
-        self._placed, self._angles = _place(filter), WideAngles(filter)
-        self._stepper = self._placed.stepper()
+        self._compiled, self._angles = _compile_once(filter), WideAngles(filter)
+        self._stepper = self._compiled.stepper()
 
     @property
     def doubt(self) -> str:
-        """Return in words that the last measurements were all not expected; "" where they were."""
+        """Return a sentence where the last BEYOND measurements, or more, were all unexpected; else ""."""
         if self._beyond < BEYOND:
             return ""
         return (
@@ -93,8 +94,8 @@ class Stream:
     def push(self, measurement: ArrayLike, inputs: ArrayLike = ()) -> JudgedEstimate:
         """Advance one step: `inputs` led to this `measurement`; return the posterior estimate.
 
-        It has the squared innovation of the measurement, `nis`, how many numbers arrived, `received`, and of a filter
-        that weighs them the `weight` of each.
+        It has the normalised innovation squared of the measurement, `nis`, how many numbers arrived, `received`, and of
+        a filter that weighs them the `weight` of each.
 
         Args:
             measurement: received values, shape (received,); NaN where a component did not arrive.
@@ -104,25 +105,25 @@ class Stream:
             ValueError: a measurement or inputs of another size, infinite values, an input that is NaN, a step past the
                 end of what varies over time, implausible values; the state stays unchanged.
         """
-        placed, k, stepper = self._placed, self.steps, self._stepper
+        compiled, k, stepper = self._compiled, self.steps, self._stepper
         # Arrays of doubles of the right size pass at once; everything else is checked and converted.
-        z, screened = _as_doubles(measurement, placed.received), None
+        z, screened = _as_doubles(measurement, compiled.received), None
         if z is None or self.limits is not None:
             z = np.asarray(self.filter.check_measurement(measurement))
-        u = _as_doubles(inputs, placed.given)
+        u = _as_doubles(inputs, compiled.given)
         if u is None:
             u = np.asarray(self.filter.check_input(inputs))
         if self.limits is not None:
             # Values beyond the limits, or repeated for too long, count as not arrived.
             screened = self.limits.screen(z[None], self._repeats)
             z = screened.values[0]
-        if placed.horizon is not None and k >= placed.horizon:
-            raise fail("step", f"one of the {placed.horizon} that the filter covers, counted from 0", k)
-        # The step itself; a flagged one is examined.
+        if compiled.horizon is not None and k >= compiled.horizon:
+            raise fail("step", f"one of the {compiled.horizon} that the filter covers, counted from 0", k)
+        # The step itself; one that was flagged is either refused by an error or accepted.
         if not stepper.step(z, u, k):
-            self._refuse(z, u)
+            self._refuse_or_accept(z, u)
         self.steps, self._inputs = k + 1, u
-        if placed.values and not np.isnan(z[: placed.values]).all():
+        if compiled.values and not np.isnan(z[: compiled.values]).all():
             self._last = k
         if screened is not None:
             self.dropped += screened.outside[0]
@@ -130,28 +131,30 @@ class Stream:
             self._repeats = screened.repeats
         if self.filter.remarks:
             self._warn_of_remark()
+        # Count in how many steps in a row nis was over its quantile.
         nis, arrived = stepper.judgement[:2].tolist()
-        if arrived and nis == nis:
-            self._count_unexpected(nis > placed.rare[int(arrived)])
+        has_nis = nis == nis  # NaN if not
+        if arrived and has_nis:
+            self._count_unexpected(nis > compiled.rare[int(arrived)])
         if self._angles.states or self._angles.received:
             self._warn_of_angles(z, k)
-        estimate: JudgedEstimate = placed.estimate.unflatten([*stepper.estimate, nis, int(arrived)])
+        estimate: JudgedEstimate = compiled.estimate.unflatten([*stepper.estimate, nis, int(arrived)])
         if len(weight := stepper.weight):
             estimate = replace(estimate, weight=weight)
         if self.limits is not None and self.limits.bounded:
             estimate = replace(estimate, claim=weakest([estimate.claim, "nominal"]))
-        return lower_unsound_claim(estimate) if nis != nis else estimate
+        return estimate if has_nis else lower_unsound_claim(estimate)
 
     @property
     def origin(self) -> Origin:
         """Return the state after the last step, from which `hg.forecast` predicts."""
-        state = self._placed.state.unflatten([np.array(leaf) for leaf in self._stepper.state])
+        state = self._compiled.state.unflatten([np.array(leaf) for leaf in self._stepper.state])
         time, spacing = float(self.steps - 1), float("nan") if "dt" in self.filter.inputs else 1.0
         return Origin(self.filter, state, self.steps, np.array(self._inputs), time, spacing)
 
     def _warn_of_remark(self) -> None:
         """Warn of what the filter says of its state, such as that a gate gave in, where it is new."""
-        said = self.filter.remark(self._placed.state.unflatten(self._stepper.state))
+        said = self.filter.remark(self._compiled.state.unflatten(self._stepper.state))
         if said.times > self._remarked:
             warnings.warn(f"stream, {said.words}", stacklevel=3)
         self._remarked = said.times
@@ -163,23 +166,24 @@ class Stream:
             warnings.warn(f"stream, step {k}: {line}", stacklevel=3)
 
     def _count_unexpected(self, beyond: bool) -> None:
-        """Count measurements in a row that were not expected, and warn once of many."""
+        """Count unexpected measurements in a row (`beyond`: this was one), and warn at the BEYOND-th."""
         self._beyond = self._beyond + 1 if beyond else 0
         if self._beyond == BEYOND:
             warnings.warn(f"stream, step {self.steps - 1}: {self.doubt}", stacklevel=3)
 
-    def _refuse(self, z: np.ndarray, u: np.ndarray) -> None:
-        """Refuse implausible values, or accept the step that was flagged."""
+    def _refuse_or_accept(self, z: np.ndarray, u: np.ndarray) -> None:
+        """Raise ValueError at implausible values; accept the flagged step where only the filter is to blame."""
         self.filter.check_measurement(z)
         self.filter.check_input(u)
         stepper, (distance, _, reason, _) = self._stepper, self._stepper.judgement.tolist()
         if len(u) and (why := Judgement.why_inputs(stepper.judgement[None])):
             check_inputs(self.filter.inputs, u[None], self.filter, self.steps)
+            # Are inputs of zero implausible too? Then it is not the inputs that are wrong.
             state = stepper.state
             stepper.step(np.full(len(z), np.nan), np.zeros(len(u)), self.steps)
-            without = Judgement.why_inputs(stepper.judgement[None])
-            stepper.put(state)
-            if not without:
+            why_zeros = Judgement.why_inputs(stepper.judgement[None])
+            stepper.set_state(state)
+            if not why_zeros:
                 raise fail(
                     f"inputs of step {self.steps}",
                     "plausible ones",
@@ -188,12 +192,12 @@ class Stream:
         if reason > 0:
             why = Judgement.describe(reason, distance) + self._name_faulty_function(u)
             raise fail(f"measurement of step {self.steps}", "a plausible one", f"{z.tolist()}: {why}")
-        stepper.step(z, u, self.steps)  # anew, if inputs were tried without
+        stepper.step(z, u, self.steps)  # anew, since zeros may have been tried in between
         stepper.accept()
 
     def _name_faulty_function(self, u: np.ndarray) -> str:
         """Name the function of the filter's model that returned no number, after a semicolon; "" where none did."""
-        before = self.filter.estimate(self._placed.state.unflatten(self._stepper.state))
+        before = self.filter.estimate(self._compiled.state.unflatten(self._stepper.state))
         fault = find_function_fault(self.filter, before, u, self.steps)
         return f"; {fault}" if fault else ""
 
@@ -212,7 +216,7 @@ class Stream:
         """Return state and step number for `restore`: after it, the same pushes give the same bits."""
         leaves = {f"state.{i}": leaf for i, leaf in enumerate(self._stepper.state)}
         head = {
-            "paths": list(self._placed.layout),
+            "paths": list(self._compiled.layout),
             "steps": self.steps,
             "dropped": self.dropped.tolist(),
             "stuck": self.stuck.tolist(),
@@ -220,7 +224,7 @@ class Stream:
             "last": self._last,
             "beyond": self._beyond,
             "inputs": [None if value != value else value for value in self._inputs.tolist()],
-            "of": self._placed.identity,
+            "of": self._compiled.identity,
         }
         return pack(head, leaves)
 
@@ -249,7 +253,7 @@ class Stream:
             ValueError: no snapshot, or one of another filter or version.
         """
         new, (head, arrays) = cls(filter, limits, invalid, stuck), unpack(data)
-        mine, other = new._placed.identity, head.get("of", {})
+        mine, other = new._compiled.identity, head.get("of", {})
         check_same("snapshot", mine, other, SAME, accept_changes)
         new.steps, new.dropped = int(head["steps"]), np.array(head["dropped"], dtype=np.int64)
         new.stuck = np.array(head.get("stuck", np.zeros(filter.received)), dtype=np.int64)
@@ -258,28 +262,28 @@ class Stream:
         held = head.get("inputs", [None] * len(filter.inputs))
         new._inputs = np.array([np.nan if value is None else value for value in held], dtype=float)
         # Parts by their paths, which a version before 0.3.0 did not write.
-        layout = new._placed.layout
+        layout = new._compiled.layout
         paths = head.get("paths", list(describe_old_layout(layout)))
         leaves = [arrays[f"state.{i}"] for i in range(sum(name.startswith("state.") for name in arrays))]
         old = dict(zip(paths, leaves, strict=False))
         if len(paths) != len(leaves) or not can_read({path: leaf.shape for path, leaf in old.items()}, layout):
             expected = f"a state with the parts of {other['filter']} as it is here: {', '.join(layout)}"
             raise fail("snapshot", expected, ", ".join(f"{path} {list(leaf.shape)}" for path, leaf in old.items()))
-        new._stepper.put(list(relocate_parts(old, layout).values()))
-        new._remarked = filter.remark(new._placed.state.unflatten(new._stepper.state)).times
+        new._stepper.set_state(list(relocate_parts(old, layout).values()))
+        new._remarked = filter.remark(new._compiled.state.unflatten(new._stepper.state)).times
         return new
 
     def __getstate__(self) -> dict[str, object]:
         """Return filter, step number and state, in double precision; compiled programs are left out."""
-        data = {name: value for name, value in vars(self).items() if name not in ("_placed", "_stepper")}
+        data = {name: value for name, value in vars(self).items() if name not in ("_compiled", "_stepper")}
         return data | {"state": self._stepper.state}
 
     def __setstate__(self, data: dict[str, Any]) -> None:
         state = data["state"]
         vars(self).update({name: value for name, value in data.items() if name != "state"})
-        self._placed = _place(self.filter)
-        self._stepper = self._placed.stepper()
-        self._stepper.put(state)
+        self._compiled = _compile_once(self.filter)
+        self._stepper = self._compiled.stepper()
+        self._stepper.set_state(state)
 
 
 class _Sender(NamedTuple):
@@ -310,13 +314,13 @@ def _as_doubles(value: object, length: int) -> np.ndarray | None:
     return row if row.shape == (length,) and row.dtype.char == "d" else None
 
 
-class _Placed:
+class _CompiledFilter:
     """A compiled filter with its arrays, shared by all streams of the filter."""
 
     def __init__(self, filter: AbstractFilter):
         self.filter, self.horizon = filter, filter.horizon
         self.received, self.given = filter.received, len(filter.inputs)
-        # Numbers of what a sender sent, if it decides when to send; losses that are known follow them.
+        # How many of the received numbers are values of a sender that decides when to send; its losses follow them.
         self.values = 0
         if sender := _sender_of(filter):
             self.values = filter.received - sender.trigger.side_information(sender.outputs)
@@ -331,10 +335,11 @@ class _Placed:
         self.estimate: PyTree = jax.tree.structure(
             JudgedEstimate(np.zeros(()), np.zeros(()), filter.claim, modes, filter.attitude, 0.0, 0)
         )
+        # By count of numbers that arrived: what their nis exceeds with probability RARE, as chi-square with so many.
         self.rare = [np.inf, *(float(chi2.isf(RARE, count)) for count in range(1, self.received + 1))]
 
     def stepper(self) -> NativeFilterStepper | XlaFilterStepper:
-        """Return a stepper at the prior."""
+        """Return a new stepper whose state is the prior."""
         code = compile_native_step(self._static, self.numbers, self._start, self._data)
         if code is None:
             return XlaFilterStepper(compile_xla_step(self._static), self.numbers, self._start)
@@ -359,4 +364,4 @@ class _Placed:
         }
 
 
-_place = share_by_object(_Placed)
+_compile_once = share_by_object(_CompiledFilter)  # returns a filter's compiled program, made at the first call

@@ -13,12 +13,12 @@ from heliograph.live.event import INPUTS, VERDICTS, Known, Verdict, check_63_bit
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.fleet_remarks import FleetRemarks
 from heliograph.live.implausible_events import FleetAngles, Judges
+from heliograph.live.link_counts import LinkCounts
 from heliograph.live.network_program import shared_program
-from heliograph.live.plant import LinkCounts
 from heliograph.live.row_origin import estimates_by_name, make_row_origin
 from heliograph.live.rows import BEFORE, HeldRow
 from heliograph.live.sender_status import SenderStatus
-from heliograph.live.stored.migration import DESCRIPTION, SAME, Carrier, describe_network
+from heliograph.live.stored.migration import DESCRIPTION, SAME, PlantMigration, describe_network
 from heliograph.live.stored.plant_codec import pack_plant, unpack_plant
 from heliograph.live.stored.snapshot import check_same, pack, unpack
 from heliograph.model.estimate import Estimate, JudgedEstimate
@@ -30,8 +30,8 @@ from heliograph.simulation.network import Network
 from heliograph.simulation.results.record import Record
 
 
-class Finals:
-    """Rows of final outputs, of `size` numbers, in order of time; beyond `most` rows the oldest parts are dropped."""
+class FinalRows:
+    """Outputs of final rows, `size` numbers each, in order of time; beyond `most` rows the oldest parts are dropped."""
 
     def __init__(self, most: int, size: int):
         self.most, self.size, self._parts = most, size, deque[tuple[np.ndarray, np.ndarray]]()
@@ -99,18 +99,18 @@ class Timeline:
         if INPUTS in network.nodes:
             names = list(network.nodes)
             raise fail("node names", f"none called {INPUTS!r}, which stands for the plant's inputs", names)
-        self._lanes = shared_program(network)
-        if self._lanes.dt is None and start != 0:
+        self._program = shared_program(network)
+        if self._program.dt is None and start != 0:
             raise fail("start", "0 where time counts steps", start)
-        if what := self._lanes.uneven:
+        if what := self._program.uneven:
             warnings.warn(f"timeline: predictions depend on when others are asked for: {what}", stacklevel=2)
         # A fleet of one plant, and a slot to look ahead in.
-        self._fleet = Fleet(self._lanes, Options(self.window, self.ahead, capacity=self.capacity), alone=True)
+        self._fleet = Fleet(self._program, Options(self.window, self.ahead, capacity=self.capacity), alone=True)
         self._plant, self._spare = self._fleet.begin("", start, None), self._fleet.pool.take()
         self._judges = Judges(self._fleet)
         self.reasons: dict[str, str] = {}
         self._angles, self._remarks = FleetAngles(self._fleet), FleetRemarks(self._fleet)
-        self._finals = Finals(2 * self.capacity, self._lanes.step_rows.outputs.size)
+        self._finals = FinalRows(2 * self.capacity, self._program.step_rows.outputs.size)
 
     def __getstate__(self) -> dict[str, object]:
         """Return the whole state, in double precision; compiled programs are left out."""
@@ -123,7 +123,7 @@ class Timeline:
     @property
     def engine(self) -> str:
         """Return which engine steps the filters, "native: ..." or "xla: ...", and why."""
-        return self._lanes.step_rows.engine
+        return self._program.step_rows.engine
 
     @property
     def now(self) -> float:
@@ -175,7 +175,7 @@ class Timeline:
                 self._fleet.undo(plant, before)
                 self._fleet.step([plant])
             else:
-                for _, line in (*self._angles.said_of([plant]), *self._remarks.said_of([plant])):
+                for _, line in (*self._angles.find_new([plant]), *self._remarks.find_new([plant])):
                     warnings.warn(f"timeline, {line}", stacklevel=2)
                 self._finalise()
         link = plant.link(node)
@@ -190,9 +190,9 @@ class Timeline:
         """
         fleet, plant = self._fleet, self._plant
         fleet.step([plant])
-        why = self._judges.implausible([(0, plant, event, row)]).get(0)
-        if why is None and event.node_index < 0 and self._lanes.dt is not None:
-            after = fleet.pool.trial(np.array([row.slot]), np.full((1, self._lanes.given), np.nan), np.inf)
+        why = self._judges.find_implausible([(0, plant, event, row)]).get(0)
+        if why is None and event.node_index < 0 and self._program.dt is not None:
+            after = fleet.pool.predict_outputs(np.array([row.slot]), np.full((1, self._program.given), np.nan), np.inf)
             why = self._judges.why_inputs(after[0])
         return why
 
@@ -214,13 +214,13 @@ class Timeline:
         return make_row_origin(self._fleet, *self._slot_now())
 
     def _slot_now(self) -> tuple[int, float]:
-        """Return the slot of the row at `now`, which is looked ahead to where there is none, and its time."""
+        """Return the slot of the row at `now`, which is predicted where there is none, and its time."""
         newest, now = self._plant.rows.held[-1], self.now
-        if self._lanes.dt is None:
+        if self._program.dt is None:
             now = np.floor(min(now, self._fleet.end_step))
         if newest.key[1] != BEFORE and now <= newest.key[0]:
             return newest.slot, float(newest.key[0])
-        self._fleet.look(newest, now, self._spare)
+        self._fleet.predict_into(newest, now, self._spare)
         return self._spare, float(now)
 
     def senders(self) -> dict[str, SenderStatus]:
@@ -242,18 +242,19 @@ class Timeline:
         """Return smoothed estimates at `now` - `lag` given all events held, by node and filter."""
         if not 0 <= check_moment("lag", lag) <= self.window:
             raise fail("lag", f"a number from 0 to the window, {self.window:g}", lag)
-        by_steps, rows = self._lanes.dt is None, self._plant.rows
+        by_steps, rows = self._program.dt is None, self._plant.rows
         time = np.ceil(min(self.now, self._fleet.end_step) - lag) if by_steps else self.now - lag
         if time <= rows.keys[0][0] if by_steps else time < rows.keys[0][0]:
             raise fail("lag", "one to a moment after what is final", f"{lag:g}, to {time:g}")
-        # The row of that moment, or a prediction to it, behind the row before it, and all later ones.
+        # Slots of the row before that moment, of the moment itself, and of all later rows. Where no step has a row at
+        # the moment, the spare slot takes a prediction to it.
         after = rows.after(time)
-        there = by_steps and rows.keys[after - 1][0] >= time
-        slots = [row.slot for row in rows.held[after - 1 - there :]]
-        if not there:
-            self._fleet.look(rows.held[after - 1], time, self._spare)
+        has_row = by_steps and rows.keys[after - 1][0] >= time
+        slots = [row.slot for row in rows.held[after - 1 - has_row :]]
+        if not has_row:
+            self._fleet.predict_into(rows.held[after - 1], time, self._spare)
             slots.insert(1, self._spare)
-        return self._lanes.smoother.estimates(self._fleet.pool.history(slots), 1, len(slots))
+        return self._program.smoother.estimates(self._fleet.pool.history(slots), 1, len(slots))
 
     def final(self) -> Record:
         """Return the estimates that became final since the last call, one for each row with a measurement.
@@ -267,11 +268,11 @@ class Timeline:
     def save(self) -> bytes:
         """Serialise the whole state for `restore`: after it, the same pushes give the same bits."""
         head, arrays = self._pack_state()
-        return pack(head | {"of": self._lanes.identity, DESCRIPTION: self._describe_network}, arrays)
+        return pack(head | {"of": self._program.identity, DESCRIPTION: self._describe_network}, arrays)
 
     @cached_property
     def _describe_network(self) -> str:
-        """Describe the network's numbers and columns, for a later version or network that carries the state on."""
+        """Return the network's numbers and columns as JSON, by which a later version or network reads the state."""
         return describe_network(self._fleet)
 
     def _pack_state(self) -> tuple[dict[str, object], dict[str, np.ndarray]]:
@@ -308,7 +309,7 @@ class Timeline:
     def _carry_over(
         cls, network: Network, head: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
     ) -> dict[str, np.ndarray]:
-        """Return the plant and the final rows that another network or version saved, as this one would."""
+        """Return the arrays of a snapshot of another network or version as this network would have saved them."""
         window, ahead, capacity = head["options"]
         fleet = Fleet(shared_program(network), Options(window, ahead, capacity=capacity), alone=True)
         mine, other = fleet.program.identity | {DESCRIPTION: describe_network(fleet)}, head["of"]
@@ -316,13 +317,13 @@ class Timeline:
         if DESCRIPTION not in head:
             check_same("snapshot", mine, other, (*SAME, "nodes", "filters"), accept=True)
         there = other | {DESCRIPTION: head.get(DESCRIPTION) or describe_network(fleet, covariances=True)}
-        carrier = Carrier(fleet, mine, lambda line: warnings.warn(f"timeline, {line}", stacklevel=5))
+        carrier = PlantMigration(fleet, mine, lambda line: warnings.warn(f"timeline, {line}", stacklevel=5))
         carrier.begin("snapshot", there)
         try:
-            plant = np.frombuffer(carrier.carried({"": arrays["plant"].tobytes()})[""], np.uint8)
+            plant = np.frombuffer(carrier.migrate({"": arrays["plant"].tobytes()})[""], np.uint8)
         except ValueError as error:
             raise fail("snapshot", "rows of the filters that are here", f"other ones: {error}") from None
-        time, final = arrays["final.time"], carrier.carry_outputs(arrays["final"])
+        time, final = arrays["final.time"], carrier.migrate_outputs(arrays["final"])
         if final is None:
             said = f"timeline, snapshot: {len(time)} final rows are estimates of other filters, and not carried on"
             warnings.warn(said, stacklevel=4)
@@ -343,7 +344,7 @@ class Timeline:
         return new
 
     def _convert_event(self, node: str, sequence: int, time: float, values: ArrayLike, arrival: float | None) -> Known:
-        """Convert an event to numbers."""
+        """Return a pushed event as checked numbers; without an arrival it arrives when measured, or now if later."""
         sizes, name = self._fleet.sizes, f"event of {node!r}"
         if not isinstance(node, str) or node not in sizes:
             raise fail("node of an event", f"one of {', '.join(sizes)}", show_value(node))
@@ -361,12 +362,12 @@ class Timeline:
         read = [row for row in results[0].final if row.has_data()]
         if read:
             self._finals.add(np.array([row.key[0] for row in read]), self._outputs_after([row.slot for row in read]))
-        self._fleet.forget(results)
+        self._fleet.free_slots(results)
 
     def _arrange_judgements(self, outputs: np.ndarray) -> dict[str, dict[str, Estimate]]:
-        """Arrange the outputs of a row by node and filter, with what each filter made of what arrived there."""
+        """Return the estimates of a row by node and filter, each with what its filter made of what arrived there."""
         estimates = self._arrange_outputs(outputs)
-        for place in self._lanes.places:
+        for place in self._program.places:
             estimate, judged = estimates[place.node][place.filter], place.judgement or place.tested
             if judged is not None:
                 nis, received = float(outputs[judged.distance]), int(outputs[judged.arrived])
@@ -378,13 +379,13 @@ class Timeline:
                     estimate.claim,
                     estimate.modes,
                     estimate.attitude,
-                    nis,
-                    received,
-                    refused,
-                    None if place.weighed is None else outputs[list(place.weighed.weight)],
+                    nis=nis,
+                    received=received,
+                    refused=refused,
+                    weight=None if place.weighed is None else outputs[list(place.weighed.weight)],
                 )
         return estimates
 
     def _arrange_outputs(self, outputs: np.ndarray) -> dict[str, dict[str, Estimate]]:
-        """Arrange outputs by node and filter."""
-        return estimates_by_name(self._lanes, outputs)
+        """Return the estimates in the outputs of a row, or of rows, by node and filter."""
+        return estimates_by_name(self._program, outputs)

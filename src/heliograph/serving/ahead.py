@@ -14,8 +14,9 @@ from heliograph.model.origin import Origin
 from heliograph.numerics.check import fail, show_value
 from heliograph.serving.thresholds import Thresholds, check_names, find_crossings
 
-Ahead = tuple[float, float, dict[str, dict[str, object]]]  # time of a horizon, how far it is, what each filter says
-Bodies = list[list[dict[str, object]]]  # of one filter, by row and horizon
+# Forecasts at one horizon: its time, how far ahead it is, and what each filter says, by node and filter.
+Ahead = tuple[float, float, dict[str, dict[str, object]]]
+Bodies = list[list[dict[str, object]]]  # what one filter says, by row and horizon
 Spans = int | list[float | np.timedelta64 | np.datetime64]  # how far ahead, as `horizons_in` reads it
 SECOND = np.timedelta64(1, "s")
 OFF = 1e-6  # of a step: a horizon of 300 ms is three steps of 0.1 s, which no binary number is
@@ -23,7 +24,7 @@ OFF = 1e-6  # of a step: a horizon of 300 ms is three steps of 0.1 s, which no b
 
 @dataclass(frozen=True)
 class ForecastStart:
-    """A row, or several side by side, as `heliograph.forecast` takes them."""
+    """What `heliograph.forecast` takes in place of a live object: an origin made of one row, or of several."""
 
     origin: Origin
 
@@ -55,7 +56,10 @@ class ForecastPublisher:
             raise fail("--forecast", "horizons ahead, each later than the one before", show_value(horizons))
 
     def _convert_horizon(self, horizon: float | np.timedelta64 | np.datetime64) -> float:
-        """Return how far ahead a horizon is: in steps; where time is continuous in the unit of dt, or in seconds."""
+        """Return how far ahead a horizon is: in steps, or in the unit of dt where time is continuous.
+
+        Spans of time are seconds there; in steps they have to be a whole number of them.
+        """
         if isinstance(horizon, np.datetime64):
             raise fail("--forecast", "spans of time or steps ahead of each message", str(horizon))
         if not isinstance(horizon, np.timedelta64):
@@ -71,16 +75,16 @@ class ForecastPublisher:
         return count
 
     def forecasts(self, rows: Sequence[HeldRow]) -> list[list[Ahead]]:
-        """Return of each row and horizon its time, how far ahead it is, and what each filter says.
+        """Return the forecasts from each row, by horizon: its time, how far ahead it is, and what each filter says.
 
-        The rows of all plants are predicted side by side. Nothing is said of a row whose horizons reach behind the last
-        step. How far: in seconds where the messages have dates, else in the unit of their time.
+        The rows of all plants are predicted side by side. A row whose horizons reach behind the last step has none. How
+        far ahead is in seconds where the messages have dates, else in the unit of their time.
         """
-        said: list[list[Ahead]] = [[] for _ in rows]
+        results: list[list[Ahead]] = [[] for _ in rows]
         limit = np.inf if self._continuous else self._fleet.end_step - max(self.horizons)
         covered = [i for i, row in enumerate(rows) if row.key[0] <= limit]
         if not covered:
-            return said
+            return results
         slots, times = [rows[i].slot for i in covered], np.array([float(rows[i].key[0]) for i in covered])
         start = ForecastStart(make_row_origin(self._fleet, slots, times))
         found = heliograph.forecast(start, self.horizons, inputs="held")
@@ -89,44 +93,53 @@ class ForecastPublisher:
             node: {name: _write_forecasts(forecast) for name, forecast in filters.items()}
             for node, filters in found.items()
         }
-        for place, i in enumerate(covered):
+        for number, i in enumerate(covered):
             if self._thresholds:
-                self._add_crossings(rows[i], found, bodies, place)
-            said[i] = self._arrange_by_horizon(float(rows[i].key[0]), bodies, place)
-        return said
+                self._add_crossings(rows[i], found, bodies, number)
+            results[i] = self._arrange_by_horizon(float(rows[i].key[0]), bodies, number)
+        return results
 
-    def _arrange_by_horizon(self, now: float, bodies: dict[str, dict[str, Bodies]], place: int) -> list[Ahead]:
-        """Return of each horizon its time, how far it is, and what each filter says of one of the rows."""
+    def _arrange_by_horizon(self, now: float, bodies: dict[str, dict[str, Bodies]], number: int) -> list[Ahead]:
+        """Return the forecasts from the row with this number among those in `bodies`, by horizon; `now`: its time."""
         unit = 1.0 if self._continuous else self._fleet.options.step or 1.0
-        return [
-            (
-                now + distance,
-                distance * unit,
-                {node: {name: of[place][i] for name, of in filters.items()} for node, filters in bodies.items()},
-            )
-            for i, distance in enumerate(self.horizons)
-        ]
+        results: list[Ahead] = []
+        for i, distance in enumerate(self.horizons):
+            by_filter: dict[str, dict[str, object]] = {
+                node: {name: of_filter[number][i] for name, of_filter in filters.items()}
+                for node, filters in bodies.items()
+            }
+            results.append((now + distance, distance * unit, by_filter))
+        return results
 
     def _add_crossings(
         self,
         row: HeldRow,
         found: "Mapping[str, Mapping[str, heliograph.forecasting.Forecast]]",
         bodies: dict[str, dict[str, Bodies]],
-        place: int,
+        number: int,
     ) -> None:
-        """Add to what filters say of one of the rows the probabilities to pass levels."""
+        """Add the probabilities of passing each threshold to the forecasts from one row, in `bodies`.
+
+        Args:
+            row: the row.
+            found: the forecasts from all rows, by node and filter.
+            bodies: what is published of them, which is changed.
+            number: number of the row among them.
+        """
         start = ForecastStart(make_row_origin(self._fleet, row.slot, float(row.key[0])))
         for node, filters in found.items():
             for name, forecast in filters.items():
-                of_row = bodies[node][name][place]
-                passed = {} if of_row[0]["claim"] == "none" else self._find_all_crossings(start, (node, name), forecast)
-                for i, body in enumerate(of_row if passed else []):
-                    body["thresholds"] = {level: said[i] for level, said in passed.items()}
+                of_row = bodies[node][name][number]
+                if of_row[0]["claim"] == "none":
+                    continue
+                crossings = self._find_all_crossings(start, (node, name), forecast)
+                for i, body in enumerate(of_row if crossings else []):
+                    body["thresholds"] = {level: by_horizon[i] for level, by_horizon in crossings.items()}
 
     def _find_all_crossings(
         self, start: ForecastStart, place: tuple[str, str], forecast: "heliograph.forecasting.Forecast"
     ) -> dict[str, list[dict[str, float]]]:
-        """Return, for each level of a state or output of this filter, how probably it is passed by each horizon."""
+        """Return {threshold: probabilities that it is crossed, by horizon}, for the states and outputs of a filter."""
         outputs = () if forecast.outputs is None else forecast.outputs.names
         known = () if forecast.states.claim == "none" else (*forecast.states.names, *outputs)
         return {
@@ -137,9 +150,9 @@ class ForecastPublisher:
 
 
 def _write_forecasts(forecast: "heliograph.forecasting.Forecast") -> Bodies:
-    """Return what one filter says of each row and horizon, as it is published: (rows, horizons).
+    """Return what is published of one filter's forecast, by row and horizon.
 
-    A covariance that is no number is none, and claims nothing.
+    A covariance that is not finite is published as null, with the claim "none".
     """
     states, outputs = forecast.states, forecast.outputs
     known = np.isfinite(states.covariance).all(axis=(-2, -1)) & (states.claim != "none")
@@ -153,9 +166,10 @@ def _write_forecasts(forecast: "heliograph.forecasting.Forecast") -> Bodies:
     ]
     if outputs is not None:
         rows = zip(bodies, outputs.mean.tolist(), outputs.deviation.tolist(), strict=True)
-        for body, means, deviations in (one for row in rows for one in zip(*row, strict=True)):
-            body["outputs"] = {
-                name: {"mean": mean, "deviation": None if isnan(deviation) else deviation}
-                for name, mean, deviation in zip(outputs.names, means, deviations, strict=True)
-            }
+        for of_row in rows:
+            for body, means, deviations in zip(*of_row, strict=True):
+                body["outputs"] = {
+                    name: {"mean": mean, "deviation": None if isnan(deviation) else deviation}
+                    for name, mean, deviation in zip(outputs.names, means, deviations, strict=True)
+                }
     return bodies

@@ -67,8 +67,8 @@ def make_transport(address: Address, part: Part = WHOLE, translator: Translator 
     return Nats(address, part, translator)
 
 
-class Leased(Protocol):
-    """Source of the parts that this process may serve."""
+class PartLeases(Protocol):
+    """Leases on the parts of the plants that this process may serve."""
 
     term: float
 
@@ -96,7 +96,7 @@ class _Part:
             await self.work
 
 
-async def keep_sharing(leases: Leased, serve: Serve) -> None:
+async def serve_leased_parts(leases: PartLeases, serve: Serve) -> None:
     """Serve the leased parts until SIGTERM or SIGINT; `serve(part, stop)` serves one until `stop` is set.
 
     When a process joins, the others finish some of their parts and leave them to it. When one dies, its parts become
@@ -107,7 +107,7 @@ async def keep_sharing(leases: Leased, serve: Serve) -> None:
     with signals(stop):
         try:
             while not stop.is_set():
-                await _adjust(parts, leases, serve)
+                await _serve_exactly(parts, leases, serve)
                 with contextlib.suppress(TimeoutError):
                     await asyncio.wait_for(stop.wait(), leases.term / 5)
         finally:
@@ -116,8 +116,8 @@ async def keep_sharing(leases: Leased, serve: Serve) -> None:
                 await asyncio.to_thread(leases.leave)
 
 
-async def _adjust(parts: dict[int, _Part], leases: Leased, serve: Serve) -> None:
-    """Start and stop services so that exactly the leased parts are served."""
+async def _serve_exactly(parts: dict[int, _Part], leases: PartLeases, serve: Serve) -> None:
+    """Start and stop services so that `parts`, by number those that are served, are exactly the leased ones."""
     # Parts whose service ended by itself: another process took them over, or it failed.
     for number, part in list(parts.items()):
         if part.work.done():
@@ -145,7 +145,7 @@ async def _adjust(parts: dict[int, _Part], leases: Leased, serve: Serve) -> None
 async def run(settings: ServiceSettings) -> None:
     """Serve until the messages end, or until SIGTERM or SIGINT."""
     _log_to_stderr()
-    async with _watch_services(settings) as look:
+    async with _watching(settings) as wrap:
         program = await _compile_steps(settings.network)
         if program is None:
             return
@@ -153,9 +153,9 @@ async def run(settings: ServiceSettings) -> None:
             what = f"predictions depend on when others are asked for: {program.uneven}"
             print(f"heliograph: warning: {what}", file=sys.stderr)
         if settings.parts is None:
-            await _serve_alone(settings, program, look)
+            await _serve_alone(settings, program, wrap)
         else:
-            await _serve_shared(settings, program, look, settings.parts)
+            await _serve_shared(settings, program, wrap, settings.parts)
 
 
 async def _compile_steps(network: Network) -> NetworkProgram | None:
@@ -178,12 +178,12 @@ def _log_to_stderr() -> None:
         LOG.setLevel(logging.INFO)
 
 
-Look = Callable[[Service], Takes]
+WrapService = Callable[[Service], Takes]
 
 
 @asynccontextmanager
-async def _watch_services(settings: ServiceSettings) -> AsyncIterator[Look]:
-    """Wrap services for the page, if there is one."""
+async def _watching(settings: ServiceSettings) -> AsyncIterator[WrapService]:
+    """Serve the page for a block, if there is one, and yield what wraps a service so that the page shows it."""
     if settings.page is None:
         yield lambda service: service
         return
@@ -198,8 +198,8 @@ async def _watch_services(settings: ServiceSettings) -> AsyncIterator[Look]:
         yield watch.wrap
 
 
-async def _serve_alone(settings: ServiceSettings, program: NetworkProgram, look: Look) -> None:
-    """Serve all messages in one process."""
+async def _serve_alone(settings: ServiceSettings, program: NetworkProgram, wrap: WrapService) -> None:
+    """Serve all plants in this process; `wrap` shows the service on the page."""
     stop = asyncio.Event()
     reads = None if settings.sources is None else Translator(settings.sources, settings.network, settings.others)
     step = settings.options.step if reads is None else reads.sources.step
@@ -216,8 +216,8 @@ async def _serve_alone(settings: ServiceSettings, program: NetworkProgram, look:
             transport = _open_pipe(settings, reads) if broker is None else make_transport(broker, translator=reads)
             transport = _add_states(settings, transport)
             patience = None if step is None else max(step, SHORTEST)
-            looked = look(service) if reads is None else LastWordsService(look(service), reads.sources.words, store)
-            await serve_until(stop, WaitingService(looked, stop), transport, patience)
+            shown = wrap(service) if reads is None else LastWordsService(wrap(service), reads.sources.words, store)
+            await serve_until(stop, WaitingService(shown, stop), transport, patience)
         finally:
             store.close()
     # What was not used, in words.
@@ -254,11 +254,11 @@ def _open_store(settings: ServiceSettings, fleet: Fleet, owning: contextlib.Exit
         from heliograph.serving.storage.owner import own_store
 
         owning.enter_context(own_store(settings.store, settings.process))
-    from heliograph.live.stored.migration import Carrier
+    from heliograph.live.stored.migration import PlantMigration
     from heliograph.serving.storage.store import Store
 
     mine = identity(fleet)
-    carrier = Carrier(fleet, mine, _say) if settings.accept_changes else None
+    carrier = PlantMigration(fleet, mine, _say) if settings.accept_changes else None
     store = Store(settings.store, mine, settings.process, carrier=carrier)
     if settings.snapshot is not None:
         store.begin_from(settings.snapshot, mine, carrier)
@@ -270,11 +270,12 @@ def _open_store(settings: ServiceSettings, fleet: Fleet, owning: contextlib.Exit
 
 
 def _say(what: str) -> None:
+    """Print a line to the standard error."""
     print(f"heliograph: {what}", file=sys.stderr)
 
 
-async def _serve_shared(settings: ServiceSettings, program: NetworkProgram, look: Look, parts: int) -> None:
-    """Serve the parts that this process leases, as one of several."""
+async def _serve_shared(settings: ServiceSettings, program: NetworkProgram, wrap: WrapService, parts: int) -> None:
+    """Serve the parts that this process leases, as one of several processes; `wrap` shows services on the page."""
     from heliograph.serving.storage.database import open_database
     from heliograph.serving.storage.leases import Leases
     from heliograph.serving.storage.owner import name_of_process
@@ -290,11 +291,12 @@ async def _serve_shared(settings: ServiceSettings, program: NetworkProgram, look
     mine = identity(fleet)
 
     async def serve(number: int, stop: asyncio.Event) -> None:
+        """Serve one part until `stop` is set."""
         # The journal of a part continues with whichever process serves it.
         store = Store(store_name, mine, f"part {number} of {parts}", opened=first)
         try:
             ahead = settings.forecast, settings.thresholds
-            service = look(Service(Fleet(program, settings.options), store, _say, None, *ahead))
+            service = wrap(Service(Fleet(program, settings.options), store, _say, None, *ahead))
             await serve_until(stop, WaitingService(service, stop), make_transport(broker, Part(number, parts)))
         finally:
             store.close()
@@ -303,6 +305,6 @@ async def _serve_shared(settings: ServiceSettings, program: NetworkProgram, look
     name = settings.process or name_of_process()
     engine = open_database(store_name)
     try:
-        await keep_sharing(Leases(engine, name, parts), serve)
+        await serve_leased_parts(Leases(engine, name, parts), serve)
     finally:
         engine.dispose()

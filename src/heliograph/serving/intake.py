@@ -11,8 +11,9 @@ import numpy as np
 from heliograph.live.event import INPUTS, Known, Verdict
 from heliograph.live.fleet import Fleet
 from heliograph.live.implausible_events import Candidate, Judges
-from heliograph.live.leap import ARRIVAL, Leap, beginning, find_leap
-from heliograph.live.plant import LinkCounts, PlantState, Withdrawn
+from heliograph.live.leap import ARRIVAL, Leap, find_leap, make_first_leap
+from heliograph.live.link_counts import LinkCounts
+from heliograph.live.plant import PlantState, Withdrawn
 from heliograph.numerics.check import InputError
 from heliograph.serving.message import AnyMessage, Read, UnreadMessage, seconds
 
@@ -85,7 +86,7 @@ class Using:
                     assert not isinstance(message, str | UnreadMessage)
                     outcomes[i] = self._count_unread(message), None, str(error), ()
             self.fleet.step({plant.name: plant for _, plant, _, _ in self._taken}.values())
-            implausible = self._judges.implausible(self._taken)
+            implausible = self._judges.find_implausible(self._taken)
             # Plants that an implausible message has spoilt go back.
             spoilt = set()
             for i, why in implausible.items():
@@ -105,7 +106,7 @@ class Using:
                  and len(values) == self.fleet.program.given]  # fmt: skip
         plants = [self.plants.get(message.plant) for _, message, _ in given]
         numbers = np.array([values for *_, values in given], dtype=np.float64)
-        why = self._judges.implausible_inputs(plants, numbers)
+        why = self._judges.explain_implausible_inputs(plants, numbers)
         return {(i, True): said for (i, _, _), said in zip(given, why, strict=True) if said}
 
     def _use_message(self, number: int, message: AnyMessage, wall: datetime) -> Outcome:
@@ -126,7 +127,7 @@ class Using:
             return None, "implausible", why, ()
         given = message.arrival is not None
         if plant is None:
-            begins = beginning(*((arrival, ARRIVAL) if given else (at, message.node)))
+            begins = make_first_leap(*((arrival, ARRIVAL) if given else (at, message.node)))
             plant = self._begin_plant(message.plant, at, brought.origin, begins)
         plant = self._remember(plant, at)
         # Inputs and measurement are used or refused independently.
@@ -157,9 +158,9 @@ class Using:
         came = message.arrival
         arrival = max(now, at) if came is None else self._time_as_number(came, origin, message.plant)
         clock = None if origin is None else self._time_as_number(wall, origin, message.plant)
-        event, inputs = self.fleet.known(message.node, message.sequence, at, message.values, arrival), None
+        event, inputs = self.fleet.convert_message(message.node, message.sequence, at, message.values, arrival), None
         if message.inputs is not None:
-            inputs = self.fleet.known(INPUTS, message.sequence, at, message.inputs, arrival)
+            inputs = self.fleet.convert_message(INPUTS, message.sequence, at, message.inputs, arrival)
         return Brought(at, arrival, clock, origin, event, inputs)
 
     def _count_unread(self, message: AnyMessage) -> PlantState | None:

@@ -137,7 +137,7 @@ class Service:
         self.fleet.pass_silence(due)
         rows = [(plant, plant.silence) for plant, _ in due if plant.silence is not None]
         provisional = self._write_provisional(self._silence.select_for_publication(rows)) if rows else []
-        self.fleet.forget(finalised)
+        self.fleet.free_slots(finalised)
         try:
             return (self._commit(changed, entries, 0) if changed else []) + provisional
         except ConflictError:  # another process has them now
@@ -211,7 +211,7 @@ class Service:
         last = list(self.plants.values()) if ended and not self.store.keeps else []
         finalised = self.fleet.finalise(last, all_=True)
         entries = self._write_finals(finalised)
-        self.fleet.forget(finalised)
+        self.fleet.free_slots(finalised)
         return self._commit({}, entries, 0)
 
     def _take_messages(self, messages: Sequence[Read], payloads: Sequence[Payload]) -> tuple[list[Output], float]:
@@ -220,9 +220,9 @@ class Service:
         touched = {plant.name: plant for plant, _, _, _ in outcomes if plant is not None}
         used = {plant.name for plant, verdict, _, _ in outcomes if plant is not None and verdict == "used"}
         if self._doubt is not None:
-            for name, line in self._angles.said_of(list(touched.values())):
+            for name, line in self._angles.find_new(list(touched.values())):
                 self._doubt(f"warning: plant {name!r}, {line}; not said again, nor of other plants")
-        for name, line in self._remarks.said_of(touched.values()):
+        for name, line in self._remarks.find_new(touched.values()):
             if self._doubt is not None:
                 self._doubt(f"warning: plant {name!r}, {line}")
         entries, malformed, known = self._refuse_unused(messages, payloads, outcomes)
@@ -234,7 +234,7 @@ class Service:
         entries += self._write_finals(finalised)
         newest = [(row_set.plant, row_set.newest) for row_set in finalised if row_set.plant.name in used]
         provisional = self._write_provisional(newest)
-        self.fleet.forget(finalised)
+        self.fleet.free_slots(finalised)
         begun = perf_counter()
         outputs = self._commit(touched, entries, malformed)
         committed = perf_counter() - begun

@@ -11,9 +11,9 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from matplotlib.figure import Figure
 
+from heliograph.live import LinkCounts
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.network_program import NetworkProgram
-from heliograph.live.plant import LinkCounts
 from heliograph.live.stored.plant_codec import unpack_plant
 from heliograph.report.figures import BLUE, GREEN, VERMILION
 from heliograph.serving.storage.store import Store

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pydantic_core import to_json
 
-from heliograph.live.plant import LinkCounts
+from heliograph.live import LinkCounts
 from heliograph.serving.observation import parse_page_address, serve_page
 from heliograph.serving.observation.page import PageAddress
 from heliograph.serving.observation.running_nis import read_nis

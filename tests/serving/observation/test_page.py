@@ -16,7 +16,7 @@ import heliograph as hg
 
 pytest.importorskip("uvicorn")
 from heliograph.files.sources import Sources
-from heliograph.live.plant import LinkCounts
+from heliograph.live import LinkCounts
 from heliograph.serving.observation import parse_page_address, serve_page, watch_of
 from heliograph.serving.observation.page import PageAddress, Tallies
 from heliograph.serving.observation.running_nis import RunningNis

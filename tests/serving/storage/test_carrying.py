@@ -9,7 +9,7 @@ import pytest
 import heliograph as hg
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.network_program import NetworkProgram
-from heliograph.live.stored import Carrier, unpack_plant
+from heliograph.live.stored import PlantMigration, unpack_plant
 from heliograph.serving.service import Service
 from heliograph.serving.storage import Store, identity
 from tests.serving.worlds import fleet as world
@@ -56,7 +56,7 @@ def finals(service: Service, messages: list[bytes]) -> dict[float, dict]:
 def carried(place: str, item: hg.Network, window: float = WINDOW) -> tuple[Service, list[str]]:
     lines: list[str] = []
     new = fleet(item, window)
-    store = Store(place, identity(new), carrier=Carrier(new, identity(new), lines.append))
+    store = Store(place, identity(new), carrier=PlantMigration(new, identity(new), lines.append))
     return Service(new, store), lines
 
 
@@ -134,7 +134,7 @@ def test_a_snapshot_is_carried_over_and_stays_as_it_is(tmp_path):
     place, new = stored(tmp_path / "a.db", network()), fleet(network(0.09))
     lines: list[str] = []
     store = Store(str(tmp_path / "b.db"), identity(new))
-    store.begin_from(place, identity(new), Carrier(new, identity(new), lines.append))
+    store.begin_from(place, identity(new), PlantMigration(new, identity(new), lines.append))
     known = finals(Service(new, store), sent(20, 24))
     service, other = carried(place, network(0.09))
     assert known == finals(service, sent(20, 24)) and lines == other
@@ -165,7 +165,7 @@ def test_rows_of_single_events_and_inputs_in_continuous_time_are_carried_over(tm
             store.close()
             here = world(item, window=4.0)
             said: list[str] = []
-            store = Store(place, identity(here), carrier=Carrier(here, identity(here), said.append))
+            store = Store(place, identity(here), carrier=PlantMigration(here, identity(here), said.append))
             service = Service(here, store)
             assert [line.split(": ", 1)[1] for line in said] == ["option window: 5.0 -> 4.0"]
         known = [json.loads(output.body) for output in service.take(messages[40:])]

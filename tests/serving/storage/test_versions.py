@@ -19,7 +19,7 @@ import pytest
 import heliograph as hg
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.network_program import NetworkProgram
-from heliograph.live.stored import Carrier
+from heliograph.live.stored import PlantMigration
 from heliograph.serving.service import Service
 from heliograph.serving.storage import Store, identity
 
@@ -95,10 +95,10 @@ def test_a_store_of_the_version_before_goes_on_where_the_user_says_so(place, pro
     mine = identity(fleet)
     if copied:
         store = Store(str(tmp_path / "new.db"), mine)
-        store.begin_from(str(place), mine, Carrier(fleet, mine, said.append))
+        store.begin_from(str(place), mine, PlantMigration(fleet, mine, said.append))
         assert content(place) == before
     else:
-        store = Store(str(place), mine, carrier=Carrier(fleet, mine, said.append))
+        store = Store(str(place), mine, carrier=PlantMigration(fleet, mine, said.append))
     known = finals(Service(fleet, store))
     check_goes_on(known)
     assert [output["id"] for output in known] == list(range(1, 7) if copied else range(7, 13))  # of the journal
@@ -114,7 +114,7 @@ def test_filters_go_on_where_the_nodes_have_changed_places_too(place, program):
     item = program.network
     network = hg.Network(item.plant, {name: item.nodes[name] for name in ("b", "a")}, item.fused)
     fleet = Fleet(NetworkProgram(network), OPTIONS)
-    store = Store(str(place), identity(fleet), carrier=Carrier(fleet, identity(fleet), print))
+    store = Store(str(place), identity(fleet), carrier=PlantMigration(fleet, identity(fleet), print))
     check_goes_on(finals(Service(fleet, store)))
     store.close()
 

@@ -1,6 +1,6 @@
 """Names that other folders take; the package loads them when first used."""
 
-from .migration import Carrier as Carrier
+from .migration import PlantMigration as PlantMigration
 from .migration import DESCRIPTION as DESCRIPTION
 from .migration import LISTED as LISTED
 from .migration import SAME as SAME

@@ -1,10 +1,10 @@
 """Carrying stored plants over to a network that has changed."""
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import count
 from math import prod
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -67,16 +67,16 @@ def _numbers_by_path(tree: PyTree) -> dict[str, object]:
 
 
 def _filter_columns(fleet: Fleet, covariances: bool) -> tuple[dict[str, dict[str, list[Any]]], int]:
-    """Return the columns of each filter's state by its name, and how many there are.
+    """Return {name of filter: {path of leaf: [shape, first column, end]}}, and how many columns the states have.
 
-    Of each leaf its shape, and its columns' begin and end.
+    `covariances`: as before version 0.3.0, when states held covariances.
     """
     network, flat, free = fleet.network, fleet.pool.step_rows.state, count()
     by_kind, central, *rest = flat.tree(np.zeros(flat.size))
     results: dict[str, dict[str, list[Any]]] = {}
 
-    def columns(state: PyTree) -> dict[str, np.ndarray]:
-        """Number the next columns, by the path of each leaf."""
+    def number_columns(state: PyTree) -> dict[str, np.ndarray]:
+        """Return the numbers of the next free columns, in the shape of each leaf, by its path."""
         shapes: Mapping[str, Sequence[int]] = {path: part.shape for path, part in split_by_path(state).items()}
         shapes = describe_old_layout(shapes) if covariances else shapes
         return {
@@ -84,26 +84,27 @@ def _filter_columns(fleet: Fleet, covariances: bool) -> tuple[dict[str, dict[str
         }
 
     def note(name: str, path: str, columns: np.ndarray) -> None:
+        """Add a leaf to the results; its columns stand side by side."""
         begin = int(columns.flat[0]) if columns.size else 0
         results.setdefault(name, {})[path] = [list(columns.shape), begin, begin + columns.size]
 
     # Filters of nodes stand by kind, (filter x node, ...); central ones by name.
     for (group, filters), state in zip(network.kinds, by_kind, strict=True):
         names = [f"{node}/{name}" for name in filters for node in network.groups[group]]
-        for path, leaf in columns(state).items():
-            for name, own in zip(names, leaf, strict=True):
-                note(name, path, np.asarray(own))
+        for path, leaf in number_columns(state).items():
+            for name, of_filter in zip(names, leaf, strict=True):
+                note(name, path, np.asarray(of_filter))
     for name, state in sorted(central.items()):
-        for path, leaf in columns(state).items():
+        for path, leaf in number_columns(state).items():
             note(f"{Network.FUSED}/{name}", path, leaf)
-    # What centres and neighbours remember goes on only if the nodes are the same.
-    for path, leaf in columns(rest).items():
+    # What centres and neighbours remember goes on only if the nodes are the same, which are part of its name.
+    for path, leaf in number_columns(rest).items():
         note(f"memory of the fusions of {', '.join(network.names)}", path, leaf)
     return results, next(free)
 
 
-class Carrier:
-    """State of one network's stored plants, as that of another network.
+class PlantMigration:
+    """Migration of stored plants to another network: takes their bytes, returns those that this network stores.
 
     A filter goes on with its state where all parts of this have the shape that they had, or are factors of a covariance
     that was there; others begin with the network's initial law. Rows that may still change are stepped again, with the
@@ -141,14 +142,13 @@ class Carrier:
             self._say(f"{what}: {line}")
 
     def _has_counterpart(self, name: str, new: Mapping[str, Mapping[str, Sequence[Any]]]) -> bool:
-        """Test whether the filter of this name had a state of the same layout before."""
-        old, here = (
-            {path: leaf[0] for path, leaf in side.get(name, {}).items()} for side in (self._old["filters"], new)
-        )
-        return can_read(old, here)
+        """Return whether the filter of this name had a state before that can be read as its state now."""
+        shapes_before = {path: shape for path, (shape, _, _) in self._old["filters"].get(name, {}).items()}
+        shapes_now = {path: shape for path, (shape, _, _) in new.get(name, {}).items()}
+        return can_read(shapes_before, shapes_now)
 
-    def carried(self, bodies: Mapping[str, bytes]) -> dict[str, bytes]:
-        """Return plants, by name, as this network stores them."""
+    def migrate(self, bodies: Mapping[str, bytes]) -> dict[str, bytes]:
+        """Return the bytes of plants, by name, as this network stores them."""
         plants = {name: unpack_plant(name, self._translate(body), self.fleet) for name, body in bodies.items()}
         # All rows after the base are stepped with what the network is now.
         for plant in plants.values():
@@ -159,68 +159,79 @@ class Carrier:
             self.fleet.end(plant)
         return results
 
-    def carry_outputs(self, rows: Float[np.ndarray, "row output"]) -> Float[np.ndarray, "row output"] | None:
-        """Return outputs with this network's columns, NaN for modes that were not told; None of other filters."""
-        new, told = json.loads(self.mine[DESCRIPTION])["layout"], ~_mode_columns(self.fleet)
+    def migrate_outputs(self, rows: Float[np.ndarray, "row output"]) -> Float[np.ndarray, "row output"] | None:
+        """Return stored outputs with this network's columns; None where they are of other nodes or filters.
+
+        Before 0.3.0 outputs had no probabilities of modes: these become NaN.
+        """
+        new, without_modes = json.loads(self.mine[DESCRIPTION])["layout"], ~_mode_columns(self.fleet)
         if any(list(self._old[part]) != list(new[part]) for part in ("nodes", "filters")):
             return None
-        if rows.shape[1] == len(told):
+        if rows.shape[1] == len(without_modes):
             return rows
-        if rows.shape[1] != np.count_nonzero(told):
+        if rows.shape[1] != np.count_nonzero(without_modes):
             return None
-        results = np.full((len(rows), len(told)), np.nan)
-        results[:, told] = rows
+        results = np.full((len(rows), len(without_modes)), np.nan)
+        results[:, without_modes] = rows
         return results
 
     def _translate(self, body: bytes) -> bytes:
         """Return a plant's bytes with the columns, places of nodes and counts of this network; rows not stepped."""
         old = self._old
-        names, names_here = list(old["nodes"]), list(self.fleet.network.names)
-        same = [name for name in names if old["nodes"][name] == dict(self._node_sizes()).get(name)]
-        new_index = {i: names_here.index(name) for i, name in enumerate(names) if name in same} | {-1: -1}
-        received = sum(old["nodes"].values())
-        parts = PlantParts.of(body, old["state"] + old["outputs"] + 2 * old["given"] + received + 2)
-        # Rows in the order of their keys; one of a node that is gone goes with it. First stands the base, or a row kept
-        # from before a leap and then the base.
-        joint, ahead = self.fleet.rows_are_joint, 1 + (parts.head.get(BEFORE_LEAP) is not None)
-        rows = [
-            (float(parts.table[i, -1]), int(a) if joint or a == BEFORE else new_index.get(int(a), BEFORE), int(b), i)
-            for i, (a, b) in enumerate(parts.keys)
-            if i < ahead or joint or int(a) in new_index
+        nodes_before, network = old["nodes"], self.fleet.network
+        same = [
+            name
+            for name, received in nodes_before.items()
+            if name in network.nodes and network.nodes[name].received == received
         ]
-        rows = [*rows[:ahead], *sorted(rows[ahead:])]
-        number = {row[-1]: i for i, row in enumerate(rows)}
-        table = self._translate_rows(parts.table[[row[-1] for row in rows]], new_index, names)
+        new_index = {i: network.names.index(name) for i, name in enumerate(nodes_before) if name in same} | {-1: -1}
+        width = old["state"] + old["outputs"] + 2 * old["given"] + sum(nodes_before.values()) + 2
+        parts = PlantParts.of(body, width)
+        rows = self._translate_keys(parts, new_index)
+        number = {row.number_before: i for i, row in enumerate(rows)}
+        table = self._translate_rows(parts.table[[row.number_before for row in rows]], new_index)
         assert table.shape[1] == self.fleet.pool.table.shape[1]
-        # Events, in the order of their rows.
-        ends = np.cumsum([self._node_size(names, int(node)) for _, node, _ in parts.events])
-        values = np.split(parts.values, ends[:-1]) if len(parts.events) else []
-        stay = [i for i, (row, p, _) in enumerate(parts.events) if int(p) in new_index and int(row) in number]
-        events = [(number[int(row)], new_index[int(p)], int(count)) for row, p, count in parts.events[stay]]
+        # Events (row, node, count), in the order of their rows; their values stand one after another.
+        sizes = [old["given"] if node < 0 else list(nodes_before.values())[node] for _, node, _ in parts.events]
+        values = np.split(parts.values, np.cumsum(sizes)[:-1]) if len(parts.events) else []
+        stay = [i for i, (row, node, _) in enumerate(parts.events) if int(node) in new_index and int(row) in number]
+        events = [(number[int(row)], new_index[int(node)], int(count)) for row, node, count in parts.events[stay]]
         links = {name: link for name, link in parts.head["links"].items() if name in (*same, "inputs")}
         return PlantParts(
             head=parts.head | {"links": links},
-            keys=np.array([row[1:3] for row in rows]),
+            keys=np.array([(row.node, row.sequence) for row in rows]),
             events=np.array(events, dtype=np.int64),
             table=table,
             times=parts.times[stay],
             values=np.concatenate([np.zeros(0), *(values[i] for i in stay)]),
         ).to_bytes()
 
-    def _node_sizes(self) -> Iterator[tuple[str, int]]:
-        """Return how many numbers each node's events have here."""
-        return ((name, node.received) for name, node in self.fleet.network.nodes.items())
+    def _translate_keys(self, parts: PlantParts, new_index: Mapping[int, int]) -> list["_MovedRow"]:
+        """Return the rows that stay, in the order of their keys here; the row of a node that is gone goes with it.
 
-    def _node_size(self, names: Sequence[str], node: int) -> int:
-        """Return how many numbers an event of this node has, -1 standing for inputs."""
-        return int(self._old["given"] if node < 0 else self._old["nodes"][names[node]])
+        First stands the base, or a row kept from before a leap and then the base: these stay in any case.
+        """
+        joint, first = self.fleet.rows_are_joint, 1 + (parts.head.get(BEFORE_LEAP) is not None)
+        rows = []
+        for i, (node, sequence) in enumerate(parts.keys.tolist()):
+            if i < first or joint or node in new_index:
+                node_here = node if joint or node == BEFORE else new_index.get(node, BEFORE)
+                rows.append(_MovedRow(float(parts.table[i, -1]), node_here, sequence, i))
+        return [*rows[:first], *sorted(rows[first:])]
 
-    def _translate_rows(self, table: np.ndarray, new_index: Mapping[int, int], names: Sequence[str]) -> np.ndarray:
-        """Return rows of the table with this network's columns."""
+    def _translate_rows(self, table: np.ndarray, new_index: Mapping[int, int]) -> np.ndarray:
+        """Return rows of another network's table with this network's columns.
+
+        A row has (state, outputs, inputs held, step number, measurements by node, inputs, time). States of filters with
+        a counterpart are copied, of others the start; outputs stay 0 until the next step.
+
+        Args:
+            table: rows of the other network.
+            new_index: index here of each node that is here too, by its index there.
+        """
         old, pool, program = self._old, self.fleet.pool, self.fleet.program
         given, state = old["given"], old["state"]
         translated = np.zeros((len(table), pool.table.shape[1]))
-        # The state: of filters that go on their own, of others the start.
         translated[:, pool.state] = pool.step_rows.start
         filters = json.loads(self.mine[DESCRIPTION])["layout"]["filters"]
         for name, new in filters.items():
@@ -230,22 +241,36 @@ class Carrier:
                 for path, part in relocate_parts(parts, new).items():
                     _, begin, end = new[path]
                     translated[:, begin:end] = part.reshape(len(table), -1) if end > begin else 0.0
-        # Inputs held and step number, then measurements by node, inputs and time.
-        after = state + old["outputs"]
-        translated[:, pool.held], translated[:, pool.at] = table[:, after : after + given], table[:, [after + given]]
-        numbers, received = translated[:, pool.numbers], table[:, after + given + 1 :]
+        # Inputs held and step number.
+        held = state + old["outputs"]
+        step = held + given
+        translated[:, pool.held], translated[:, pool.at] = table[:, held:step], table[:, [step]]
+        # Measurements by node, NaN of nodes that were not there; inputs and time. `numbers` is a view of a slice.
+        numbers, numbers_before = translated[:, pool.numbers], table[:, step + 1 :]
         numbers[:] = np.nan
-        numbers[:, program.received :] = received[:, received.shape[1] - given - 1 :]
-        starts = np.cumsum([0, *old["nodes"].values()])
-        here = np.cumsum([0, *(self.fleet.network.nodes[name].received for name in self.fleet.network.names)])
+        numbers[:, program.received :] = numbers_before[:, numbers_before.shape[1] - given - 1 :]
+        starts_before = np.cumsum([0, *old["nodes"].values()])
+        starts = np.cumsum([0, *(self.fleet.network.nodes[name].received for name in self.fleet.network.names)])
         for i, j in new_index.items():
-            if i >= 0:
-                numbers[:, here[j] : here[j + 1]] = received[:, starts[i] : starts[i + 1]]
+            if i >= 0:  # a node; -1 stands for the inputs
+                numbers[:, starts[j] : starts[j + 1]] = numbers_before[:, starts_before[i] : starts_before[i + 1]]
         return translated
 
 
+class _MovedRow(NamedTuple):
+    """A row by its key, with the index of its node here, and its number among the rows of the other network."""
+
+    time: float
+    node: int
+    sequence: int
+    number_before: int
+
+
 def list_changes(mine: Identity, other: Identity) -> list[str]:
-    """List what has changed from the identity `other` to `mine`: options and versions, nodes and filters, numbers."""
+    """Return a line for each thing that has changed from the identity `other` to `mine`.
+
+    These are options and versions, nodes and filters, numbers of the parts, and functions where nothing else has.
+    """
     lines = [
         f"{name}: {other.get(name, 'none')} -> {mine.get(name, 'none')}"
         for name in {**mine, **other}
@@ -274,7 +299,7 @@ def list_changes(mine: Identity, other: Identity) -> list[str]:
 
 
 def _describe_changes(before: object, after: object) -> list[str]:
-    """Describe the change of a number or an array, entry by entry where the shape is the same."""
+    """Return lines on the change of a number or an array, entry by entry where the shape is the same; [] if none."""
     if before == after:
         return []
     try:
@@ -283,6 +308,6 @@ def _describe_changes(before: object, after: object) -> list[str]:
         return [f"{before} -> {after}"]
     if a.shape != b.shape or before is None or after is None:
         return [" -> ".join("none" if side is None else f"{side}" for side in (before, after))]
-    places = [tuple(map(int, index)) for index in np.argwhere(a != b)]
-    lines = [f"{list(index) if a.size > 1 else ''} {a[index]:.6g} -> {b[index]:.6g}".strip() for index in places]
+    changed = [tuple(map(int, index)) for index in np.argwhere(a != b)]
+    lines = [f"{list(index) if a.size > 1 else ''} {a[index]:.6g} -> {b[index]:.6g}".strip() for index in changed]
     return lines[:LISTED] + ([f"and {len(lines) - LISTED} more of its numbers"] if len(lines) > LISTED else [])

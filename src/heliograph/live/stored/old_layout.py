@@ -28,7 +28,10 @@ def split_by_path(state: PyTree) -> dict[str, np.ndarray]:
 
 
 def can_read(old: Shapes, new: Shapes) -> bool:
-    """Return whether a state of the layout `old` can be read as one of `new`: all shapes are there, or covariances."""
+    """Return whether a state of the layout `old` can be read as one of `new`.
+
+    That is so if each part of `new` was there with its shape, or is a factor of a covariance that was there.
+    """
     shapes, places = {path: list(shape) for path, shape in old.items()}, _trace_paths(old, new)
     for stem in _find_factored(old, places.values()):
         *lead, n, _ = shapes.pop(stem + COVARIANCE)
@@ -58,20 +61,27 @@ def describe_old_layout(new: Shapes) -> dict[str, list[int]]:
 
 
 def place_flags(filters: Columns) -> dict[str, dict[str, list[Any]]]:
-    """Return the columns of a row's states with each flag in its place, for which versions before 0.3.0 noted 0 or 1.
+    """Return the columns of a row's states with the true columns of each boolean part (flag).
 
-    The parts of a filter stand in their order, and the same part of filters that share a program side by side: so flags
-    stand where nothing else does, in the order of the parts before them.
+    Versions before 0.3.0 wrote the flag's value, 0 or 1, in place of its first column. The parts of a filter stand in
+    their order, and the same part of filters that share a program side by side: so flags stand in the columns that no
+    other part has, in the order of the parts before them.
     """
     results = {name: {path: list(part) for path, part in parts.items()} for name, parts in filters.items()}
-    lost: list[tuple[int, list[Any], list[list[Any]]]] = []  # end of the part before, the flag, and what comes after it
+    # A flag whose place is not known: end of the part before it, the flag, and the parts after it; a part is [shape,
+    # first column, end].
+    lost: list[tuple[int, list[Any], list[list[Any]]]] = []
     taken: set[int] = set()
 
-    def follow(parts: list[list[Any]], end: int) -> None:
-        """Take the columns of parts in their order, up to one that stands where an earlier one does, or before it."""
+    def take_columns(parts: list[list[Any]], end: int) -> None:
+        """Take the columns of a filter's parts in order, up to the first flag: its columns go back or are taken.
+
+        `end`: end of the part before them, 0 if they are the filter's first.
+        """
         for i, part in enumerate(parts):
             if part[2] > part[1] and (part[1] < end or (not end and part[1] in taken)):
-                end = end or sys.maxsize  # the memory of fusions, which stands behind all filters
+                # A flag that comes first is of the memory of fusions, which stands behind all filters.
+                end = end or sys.maxsize
                 lost.append((end, part, parts[i + 1 :]))
                 taken.update(*(range(*after[1:]) for after in parts[i + 1 :] if after[1] >= end))
                 return
@@ -79,21 +89,23 @@ def place_flags(filters: Columns) -> dict[str, dict[str, list[Any]]]:
             end = max(end, part[2])
 
     for columns in results.values():
-        follow(list(columns.values()), 0)
+        take_columns(list(columns.values()), 0)
+    # The flag behind the earliest part stands in the first free column.
     while lost:
         first = min(lost, key=lambda item: item[0])
         lost.remove(first)
         _, part, after = first
         begin = next(i for i in range(len(taken) + 1) if i not in taken)
         part[1:] = begin, begin + part[2] - part[1]
-        follow([part, *after], begin)
+        take_columns([part, *after], begin)
     return results
 
 
 def factorise(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return lower (..., n (n - 1) / 2) and variances (..., n) of covariances (..., n, n) that a filter computed.
+    """Return the entries of L below its diagonal (..., n (n - 1) / 2), row by row, and of D (..., n), P = L D L'.
 
-    By elimination, of many at once; no pivot is known to less than n eps of its variance.
+    By elimination of many covariances P (..., n, n) at once. A pivot of less than n eps of its variance is rounding,
+    and is set to that.
     """
     n = covariance.shape[-1]
     rest, whole = covariance.copy(), np.diagonal(covariance, axis1=-2, axis2=-1)
@@ -108,19 +120,19 @@ def factorise(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _trace_paths(old: Iterable[str], new: Iterable[str]) -> dict[str, str]:
-    """Return where each part of now stood in an older state: under its path, or beside the Gaussian that has it now."""
+    """Return {path of a part now: its path in an older state}: the same path, or that outside its nested Gaussian."""
     there = set(old)
     return {path: path if path in there else _flatten_path(path) for path in new}
 
 
 def _flatten_path(path: str) -> str:
-    """Return the path that a part of a nested Gaussian had before."""
+    """Return the path that a part had before its Gaussian was nested: '.gaussian.mean' stood as '.mean'."""
     stem, dot, name = path.rpartition(".")
     return stem.removesuffix(NESTED) + dot + name if dot + name in (MEAN, LOWER, VARIANCES) else path
 
 
 def _find_factored(old: Iterable[str], new: Iterable[str]) -> list[str]:
-    """Return the paths, without their last names, of covariances in `old` that are factors in `new` alone."""
+    """Return the paths, without '.covariance', of covariances in `old` of which `new` has the factors instead."""
     before, now = set(old), set(new)
     stems = [path.removesuffix(COVARIANCE) for path in old if path.endswith(COVARIANCE) and path not in now]
     return [stem for stem in stems if {stem + LOWER, stem + VARIANCES} <= now - before]

@@ -11,11 +11,13 @@ import numpy as np
 
 from heliograph.live.fleet import Fleet
 from heliograph.live.leap import Leap
-from heliograph.live.plant import BeforeLeap, LinkCounts, PlantState
+from heliograph.live.link_counts import LinkCounts
+from heliograph.live.plant import BeforeLeap, PlantState
 from heliograph.live.rows import HeldRow
 
 HEAD = struct.Struct("<4q")  # lengths: of the head in bytes, of rows, of events, of their values
 TYPES = ("<i8", "<i8", "<f8", "<f8", "<f8")  # of the parts after the head
+TABLE = 2  # number of the table among them
 BEFORE_LEAP = "before a leap"  # in the head: the arrival before a leap if the first row is the one kept from before it
 KEPT = "kept"  # in the head: how many numbers of the table are there, behind a bit for each; all, where it is absent
 
@@ -43,12 +45,12 @@ class PlantParts(NamedTuple):
 
     @staticmethod
     def of(data: bytes, width: int) -> "PlantParts":
-        """Read bytes, of rows with so many numbers."""
+        """Read the parts from bytes, of rows with `width` numbers; raise ValueError if these have another width."""
         length, rows, events, numbers = HEAD.unpack_from(data)
         head, at, arrays = json.loads(data[HEAD.size : HEAD.size + length]), HEAD.size + length, list[np.ndarray]()
         shapes = ((rows, 2), (events, 3), (rows, width), (events,), (numbers,))
-        for kind, shape in zip(TYPES, shapes, strict=True):
-            if len(arrays) == 2 and KEPT in head:
+        for number, (kind, shape) in enumerate(zip(TYPES, shapes, strict=True)):
+            if number == TABLE and KEPT in head:
                 array, at = _unpack_table(data, at, math.prod(shape), head.pop(KEPT))
             else:
                 array = np.frombuffer(data, kind, math.prod(shape), at)
@@ -88,18 +90,18 @@ def _pack_parts(head: dict[str, Any], *flat: Sequence[float] | np.ndarray) -> by
     counts = len(flat[0]) // 2, len(flat[1]) // 3, len(flat[4])
     arrays = [np.array(a, dtype=kind) for a, kind in zip(flat, TYPES, strict=True)]
     # Of a table that is mostly zeros a bit for each number, and those that are not zero.
-    table = arrays[2]
+    table = arrays[TABLE]
     nonzero = table.view("<i8") != 0  # the sign of a zero counts
     kept = int(np.count_nonzero(nonzero))
     packed = [array.tobytes() for array in arrays]
     if 2 * kept < len(table):
-        head, packed[2] = head | {KEPT: kept}, np.packbits(nonzero).tobytes() + table[nonzero].tobytes()
+        head, packed[TABLE] = head | {KEPT: kept}, np.packbits(nonzero).tobytes() + table[nonzero].tobytes()
     text = json.dumps(head).encode()
     return b"".join([HEAD.pack(len(text), *counts), text, *packed])
 
 
 def _unpack_table(data: bytes, at: int, size: int, kept: int) -> tuple[np.ndarray, int]:
-    """Read so many numbers, of which some are kept; return them and the place behind them."""
+    """Read `size` numbers from place `at`, of which `kept` stand behind a bit for each; return them and the end."""
     bits = np.frombuffer(data, np.uint8, -(-size // 8), at)
     values = np.frombuffer(data, "<f8", kept, at + len(bits))
     array = np.zeros(size)
@@ -111,7 +113,10 @@ def unpack_plant(name: str, data: bytes, fleet: Fleet) -> PlantState:
     """Restore a plant from bytes, with its rows in slots of the fleet's table."""
     head, keys, events, table, times, values = PlantParts.of(data, fleet.pool.table.shape[1])
     # Rows, each in a new slot; then their events.
-    rows = [_make_held_row(fleet, numbers, *key) for numbers, key in zip(table, keys.tolist(), strict=True)]
+    rows = [
+        _make_held_row(fleet, numbers, node, sequence)
+        for numbers, (node, sequence) in zip(table, keys.tolist(), strict=True)
+    ]
     begin = 0
     for time, (i, node, sequence) in zip(times.tolist(), events.tolist(), strict=True):
         end = begin + fleet.size(node)
@@ -119,7 +124,7 @@ def unpack_plant(name: str, data: bytes, fleet: Fleet) -> PlantState:
         begin = end
     before = head.get(BEFORE_LEAP)
     kept = None if before is None else BeforeLeap(rows.pop(0), before)
-    held = fleet.rows(rows[0])
+    held = fleet.make_rows(rows[0])
     held.hold(rows)
     links = {node: LinkCounts(*numbers) for node, numbers in head["links"].items()}
     origin = head["origin"] and datetime.fromisoformat(head["origin"])
@@ -142,7 +147,7 @@ def _unpack_leap(parts: Any) -> Leap:
 
 
 def _make_held_row(fleet: Fleet, numbers: np.ndarray, node: int, sequence: int) -> HeldRow:
-    """Make a row with an event of a node, or of the inputs."""
+    """Return a row with the key (time, node, sequence), whose numbers stand in a new slot of the fleet's table."""
     slot = fleet.pool.take()
     fleet.pool.table[slot] = numbers
     row = HeldRow((float(numbers[-1]), node, sequence), slot, fleet.width)

@@ -24,7 +24,10 @@ def versions() -> Identity:
 
 
 def network_identity(network: Network, program: str, options: Mapping[str, object]) -> Identity:
-    """Return versions, precision, options, names, sizes, hashes of each part's numbers, and a hash of the program."""
+    """Return all by which a stored state is recognised as one of this network.
+
+    These are versions, precision, options, names, sizes, a hash of the numbers of each part, and one of the program.
+    """
     parts: dict[str, PyTree] = {f"node {name!r}": node for name, node in network.nodes.items()}
     parts |= {f"fusion {name!r}": fusion for name, fusion in (network.fused | network.meshes).items()}
     filters = [f"{node}/{name}" for node, claims in network.claims().items() for name in claims]
@@ -45,10 +48,14 @@ def network_identity(network: Network, program: str, options: Mapping[str, objec
 def check_same(
     what: str, mine: Mapping[str, str], other: Mapping[str, str], kept: Sequence[str] = (), accept: bool = False
 ) -> None:
-    """Refuse a saved state of something else, and name the difference.
+    """Raise ValueError, which names the differences, if the state of `other` is not one of `mine`.
 
-    `kept` are the names of what must be the same where changes are accepted; where they are not, that is advised if it
-    would do.
+    Args:
+        what: name of the state.
+        mine: identity of what is here.
+        other: identity of what was saved.
+        kept: names of entries that have to be the same even if changes are accepted.
+        accept: whether changes of other entries are accepted; where they are not and would do, the error advises it.
     """
     names = [name for name in {**mine, **other} if mine.get(name) != other.get(name)]
     fits = not any(name in kept for name in names)

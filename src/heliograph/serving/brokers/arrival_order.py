@@ -15,11 +15,11 @@ HELD = 250_000  # messages that wait for earlier ones
 
 
 class ArrivalOrder:
-    """Messages put in the order of their arrivals, or of their times where those are not known; of equal ones as given.
+    """Puts messages in the order of their arrivals, or of their times where those are not known.
 
-    What is no message stays behind the one before it. Of messages that say nothing of their arrival, those whose times
-    are more than a year outside of all others of their node were not set: each is refused alone, as by a run. A file of
-    more than `HELD` messages is put in order as far as these reach.
+    Messages of equal moments keep their order, and what is no message stays behind the one before it. Of messages that
+    say nothing of their arrival, those whose times are more than a year outside of all others of their node were not
+    set: each is refused alone, as by a run. A file of more than `HELD` messages is put in order as far as these reach.
 
     Args:
         source: name of the file, for errors.
@@ -32,7 +32,7 @@ class ArrivalOrder:
         self._count, self._last = 0, float("-inf")
 
     def add(self, payloads: Sequence[Payload]) -> list[Payload]:
-        """Return the messages that no longer wait."""
+        """Take messages; return those that no longer wait, since more than HELD would."""
         results = list[Payload]()
         for payload in payloads:
             self._last = self._moment(payload)
@@ -45,8 +45,8 @@ class ArrivalOrder:
         return results
 
     def end(self) -> list[Payload]:
-        """Return the others."""
-        if self._count == len(self._held):
+        """Return all messages that still wait, in order."""
+        if self._count == len(self._held):  # all are here, so that times can be compared with all others
             self._refuse_astray()
         return [heappop(self._held)[2] for _ in range(len(self._held))]
 
@@ -63,13 +63,13 @@ class ArrivalOrder:
             times = np.array([moment for moment, *_ in entries])
             for i in np.flatnonzero(find_astray(times, YEAR / SECOND)):
                 moment, number, message = entries[i]
-                came = getattr(message, "time", moment)
+                time = getattr(message, "time", moment)
                 where, expected = f"{self._source}, {node}", "a time that was set, near the others in order"
-                error = str(fail(where, expected, came.isoformat() if isinstance(came, datetime) else came))
+                error = str(fail(where, expected, time.isoformat() if isinstance(time, datetime) else time))
                 self._held[self._held.index(entries[i])] = (moment, number, error)
 
     def _moment(self, payload: Payload) -> float:
-        """Return when a payload arrived; what says nothing of that, when the one before it did."""
+        """Return when a payload arrived, or else was measured; for what is no message, the moment of the one before."""
         message = payload.read if isinstance(payload, UnreadMessage) else payload
         if not isinstance(message, Message | NumberedMessage):
             return self._last

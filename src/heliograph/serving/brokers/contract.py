@@ -15,7 +15,7 @@ PAUSE = 0.1  # seconds between looks at the published outputs
 
 
 class Broker(Protocol):
-    """Both sides of a broker: the service's, and that of a sensor and of a reader, who know nothing of the service."""
+    """A broker under test, from both sides: the service's transport, and sensors and readers, who do not know of it."""
 
     def transport(self) -> Transport:
         """Make the service's side anew, as after a restart."""
@@ -47,42 +47,42 @@ def check_transport(broker: Broker, messages: int = 100, patience: float = 20.0)
     Raises:
         AssertionError: naming the promise that does not hold.
     """
-    return asyncio.run(_Examination(broker, messages, patience).all())
+    return asyncio.run(_Examination(broker, messages, patience).check_all())
 
 
 class _Examination:
-    """State of one examination of a broker."""
+    """One examination of a broker, which sends numbered messages and asserts each promise of its transport."""
 
     def __init__(self, broker: Broker, messages: int, patience: float):
         self.broker, self.messages, self.patience = broker, messages, patience
         self.silence = patience / 20  # seconds without a message after which we assume that there is none
         self._numbers = count()
 
-    async def all(self) -> bool:
+    async def check_all(self) -> bool:
         """Check each promise in turn, with one service after another."""
         # First service: new messages arrive in order, and all are acknowledged.
-        async with self._service() as transport:
+        async with self._open_transport() as transport:
             await self._start_listening(transport)
-            sent = await self._sent()
+            sent = await self._send_new()
             assert await self._receive_until(transport, sent) == sent, "receive: expected new messages in order"
-            await self._silent(transport)
-        async with self._service() as transport:
+            await self._drain_copies(transport)
+        async with self._open_transport() as transport:
             # Second service: none of them arrives again; half of the next messages are left unacknowledged.
             again = await self._receive_for_a_while(transport)
             assert not again, f"acknowledge: expected nothing to come again, got {len(again)} messages"
-            sent = await self._sent()
+            sent = await self._send_new()
             await self._receive_until(transport, sent[: len(sent) // 2], acknowledge=False)
             await self._receive_for_a_while(transport)
         # Third service: these arrive again, with those that were sent while nobody was reading.
-        sent += await self._sent()
-        async with self._service() as transport:
+        sent += await self._send_new()
+        async with self._open_transport() as transport:
             received = await self._receive_until(transport, sent)
             assert set(received) == set(sent), "acknowledge: expected no more than what was not acknowledged"
         await self._check_published()
         return received == sent
 
     @asynccontextmanager
-    async def _service(self) -> AsyncIterator[Transport]:
+    async def _open_transport(self) -> AsyncIterator[Transport]:
         """Open a transport for a block, and close it at the end."""
         transport = self.broker.transport()
         try:
@@ -92,19 +92,19 @@ class _Examination:
 
     async def _start_listening(self, transport: Transport) -> None:
         """Send greetings until the service receives one: before its first start a broker may store nothing."""
-        greeting = self._bodies(1)
+        greeting = self._make_bodies(1)
         observation = asyncio.ensure_future(self._receive_until(transport, greeting))
         while not observation.done():
             await self._await_soon("send", self.broker.send(greeting))
             await asyncio.wait({observation}, timeout=self.silence / 2)
         assert await observation == greeting, "receive: expected the bytes that were sent"
-        await self._silent(transport)
+        await self._drain_copies(transport)
 
     async def _check_published(self) -> None:
         """Check that closing right after `publish` loses no output that has a number."""
-        outputs = [Output(i, "a.b", "final", body) for i, body in enumerate(self._bodies(self.messages), 1)]
+        outputs = [Output(i, "a.b", "final", body) for i, body in enumerate(self._make_bodies(self.messages), 1)]
         now = Output(None, "a.b", "provisional", b"now")
-        async with self._service() as transport:
+        async with self._open_transport() as transport:
             await self._await_soon("publish", transport.publish([]))
             await self._await_soon("publish", transport.publish([now, *outputs]))
         expected, arrived = [output.body for output in outputs], list[bytes]()
@@ -118,8 +118,9 @@ class _Examination:
         assert not missing, f"publish: expected {len(expected)} outputs at the broker, {missing} are not"
         assert arrived == expected, "publish: expected the outputs in order, and nothing else"
 
-    async def _sent(self) -> list[bytes]:
-        bodies = self._bodies(self.messages)
+    async def _send_new(self) -> list[bytes]:
+        """Send `messages` bodies that were not sent before, and return them."""
+        bodies = self._make_bodies(self.messages)
         await self._await_soon("send", self.broker.send(bodies))
         return bodies
 
@@ -153,7 +154,7 @@ class _Examination:
             return []
         return await self._unpack(batch, acknowledge)
 
-    async def _silent(self, transport: Transport) -> None:
+    async def _drain_copies(self, transport: Transport) -> None:
         """Receive and acknowledge late copies until none arrive."""
         while await self._receive_for_a_while(transport, acknowledge=True):
             pass
@@ -176,7 +177,7 @@ class _Examination:
         except TimeoutError:
             raise AssertionError(f"{what}: expected an end within {self.patience:g} s") from None
 
-    def _bodies(self, total: int) -> list[bytes]:
+    def _make_bodies(self, total: int) -> list[bytes]:
         """Make bodies that were not sent before; the first is long."""
         return [
             b'{"number":%d,"\xce\xa9":"%s"}' % (next(self._numbers), b"" if i else b"x" * LONG) for i in range(total)

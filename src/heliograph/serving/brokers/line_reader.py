@@ -13,7 +13,7 @@ from heliograph.files.messages.own import OwnReader, is_own
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, file_path, flag, instance
 from heliograph.serving.brokers.arrival_order import ArrivalOrder
-from heliograph.serving.brokers.table_lines import TableMessages, read_own
+from heliograph.serving.brokers.table_lines import TableLineReader, read_own
 from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.message import LONGEST, Message, Payload, Read, UnreadMessage, read_messages
 from heliograph.simulation.network import Network
@@ -23,7 +23,7 @@ CLOSES = re.compile(rb"[\]}]")  # the last one, which is not indented
 
 
 class LineReader:
-    """Lines of a pipe, to messages of a network; of a file in the order of their arrivals.
+    """Reads lines of a pipe as messages of a network; those of a file in the order of their arrivals.
 
     Args:
         network: the network.
@@ -54,7 +54,7 @@ class LineReader:
         self._translator = translator
         self._topic = None if translator is None else translator.topic_of(path)
         self._own = OwnReader(network, self.source, ignore_unknown, table=False)
-        self._table = TableMessages(network, translator, path, ignore_unknown)
+        self._table = TableLineReader(network, translator, path, ignore_unknown)
         self._is_table: bool | None = None  # known once a message or the names of columns came
         self._document: list[bytes] | None = None  # lines of a document that has not ended
         self._number = 0
@@ -69,28 +69,28 @@ class LineReader:
         payloads, rows = list[Payload](), list[str]()
         for line in lines:
             if self._is_table is None:
-                self._is_table = self._table.names_columns(_text(line)) or None
+                self._is_table = self._table.names_columns(_decode_line(line)) or None
             if self._is_table:
-                rows.append(_text(line))
+                rows.append(_decode_line(line))
             else:
                 self._number += 1
-                payloads += self._line(line)
+                payloads += self._read_line(line)
         payloads += self._table.read(rows) if rows else []
         return payloads if self._order is None else self._order.add(payloads)
 
     def end(self) -> list[Payload]:
-        """Return the messages of what is left at the end."""
+        """Return the messages that are left when no more lines come."""
         if self._is_table:
             rest = self._table.end()
         else:
-            rest = [] if self._document is None else self._read_document(self._document)
+            rest = [] if self._document is None else self._read_document_or_lines(self._document)
         return rest if self._order is None else [*self._order.add(rest), *self._order.end()]
 
-    def _line(self, line: bytes) -> list[Payload]:
-        """Return the messages of a line that is none of a table."""
+    def _read_line(self, line: bytes) -> list[Payload]:
+        """Return the messages of a line that is none of a table; [] while a document over several lines goes on."""
         if self._document is not None:
             self._document.append(line)
-            return self._read_document(self._document) if CLOSES.match(line) else []
+            return self._read_document_or_lines(self._document) if CLOSES.match(line) else []
         if self._is_table is None and OPENS.match(line):
             self._document = [line]
             return []
@@ -100,26 +100,33 @@ class LineReader:
         if not isinstance(read, str | UnreadMessage):
             self._is_table = False
             return [read]
-        messages = convert_line(f"{self.source}, line {self._number}", _text(line))
-        return [payload for message in messages for payload in self._message(message, read)]
+        messages = convert_line(f"{self.source}, line {self._number}", _decode_line(line))
+        return [payload for message in messages for payload in self._interpret_message(message, read)]
 
-    def _read_document(self, lines: list[bytes]) -> list[Payload]:
-        """Return the messages of a document of several lines; of its lines, where these are none together."""
+    def _read_document_or_lines(self, lines: list[bytes]) -> list[Payload]:
+        """Return the messages of a JSON document of several lines, or else of each line by itself."""
         self._document = None
         with suppress(InputError):
             found = decode_document(b"\n".join(lines), self.source)
-            return [payload for message in found for payload in self._message(message, None)]
+            return [payload for message in found for payload in self._interpret_message(message, None)]
         self._is_table, self._number = False, self._number - len(lines)
         payloads = list[Payload]()
         for line in lines:
             self._number += 1
-            payloads += self._line(line)
+            payloads += self._read_line(line)
         return payloads
 
-    def _message(self, message: FileMessage | InputError, read: Read | None) -> list[Payload]:
-        """Return the messages of a line or of a part of it; `read` is why the line is none in our own form as it is."""
+    def _interpret_message(self, message: FileMessage | InputError, read: Read | None) -> list[Payload]:
+        """Return the payloads of one message of a line or document.
+
+        Args:
+            message: the message, or why it could not be read.
+            read: how `read_messages` read the line; None of a part of a document, which has not been tried.
+        """
         if isinstance(message, InputError):
             return [str(message)]
+        # Messages of others, by topic, are for the sources; those in our own form are tried as a service gets them, and
+        # then as a file has them.
         own = message.topic is None and is_own(message.content)
         if self._translator is not None and not own:
             self._is_table = False
@@ -144,5 +151,6 @@ def redirected_file(descriptor: int) -> Path | None:
     return None
 
 
-def _text(line: bytes) -> str:
+def _decode_line(line: bytes) -> str:
+    """Return a line as text, in which bytes that are no UTF-8 are kept as surrogates."""
     return line.decode("utf-8", "surrogateescape")

@@ -1,4 +1,4 @@
-"""Messages that a broker passes on in a while, to see what there is."""
+"""Messages that a broker passes on in some seconds, by topic, to inspect what is there."""
 
 import asyncio
 import threading
@@ -37,7 +37,7 @@ def listen(address: Address, seconds: float) -> dict[str, Topic]:
 
 
 def _listen_mqtt(address: Address, seconds: float, topics: dict[str, Topic]) -> None:
-    """Note all messages of an MQTT broker by topic for so many seconds, but for those that it had stored before."""
+    """Note all messages of an MQTT broker by topic for some seconds, except those that it had stored before."""
     from paho.mqtt.client import Client, ConnectFlags, MQTTMessage
     from paho.mqtt.enums import CallbackAPIVersion
     from paho.mqtt.properties import Properties
@@ -45,18 +45,18 @@ def _listen_mqtt(address: Address, seconds: float, topics: dict[str, Topic]) -> 
 
     ready = threading.Event()
 
-    def connected(client: Client, data: object, flags: ConnectFlags, code: ReasonCode, more: Properties | None) -> None:
+    def subscribe(client: Client, data: object, flags: ConnectFlags, code: ReasonCode, more: Properties | None) -> None:
         if not code.is_failure:
             client.subscribe("#", 0)
             ready.set()
 
-    def message(client: Client, data: object, message: MQTTMessage) -> None:
-        if not message.retain:  # it says nothing of rate and lateness
+    def note_message(client: Client, data: object, message: MQTTMessage) -> None:
+        if not message.retain:  # a stored message says nothing of rate and lateness
             note(topics, message.topic, bytes(message.payload), time.time_ns())
 
     # Callbacks run in the client's thread while this one sleeps.
     client = Client(CallbackAPIVersion.VERSION2)
-    client.on_connect, client.on_message = connected, message
+    client.on_connect, client.on_message = subscribe, note_message
     if address.user is not None:
         client.username_pw_set(address.user, address.password)
     if context := address.tls():
@@ -78,12 +78,12 @@ async def _listen_nats(address: Address, seconds: float, topics: dict[str, Topic
     from nats.aio.msg import Msg
     from nats.errors import Error
 
-    async def message(received: Msg) -> None:
+    async def note_message(received: Msg) -> None:
         if not received.subject.startswith(INTERNAL):
             note(topics, received.subject.replace(".", "/"), received.data, time.time_ns())
 
-    async def ignored(error: Exception) -> None:
-        """Leave out what the client would log with a traceback; what it raises is one line."""
+    async def ignore(error: Exception) -> None:
+        """Do nothing at an error, which the client would log with a traceback; what it raises is one line."""
 
     # Connect, listen for a while, and leave.
     try:
@@ -97,12 +97,12 @@ async def _listen_nats(address: Address, seconds: float, topics: dict[str, Topic
             max_reconnect_attempts=1,  # also before the first connection, where the client would try for two minutes
             reconnect_time_wait=0,
             connect_timeout=int(WAIT),
-            error_cb=ignored,
+            error_cb=ignore,
         )
     except (Error, OSError, TimeoutError) as error:
         raise fail(f"broker {address}", "a connection", type(error).__name__) from None
     try:
-        await client.subscribe(">", cb=message)
+        await client.subscribe(">", cb=note_message)
         await asyncio.sleep(seconds)
     finally:
         await client.close()

@@ -53,7 +53,7 @@ class Connection:
 
     def __init__(self, address: Address, identity: str):
         self.address, self.open = address, True
-        self.room = threading.Condition()
+        self.changed = threading.Condition()
         session = bool(identity)
         client = Client(
             CallbackAPIVersion.VERSION2, identity, clean_session=not session, protocol=MQTTv311, manual_ack=session
@@ -74,7 +74,7 @@ class Connection:
         self.client.loop_start()
 
     def connected(self, client: Client, data: object, flags: ConnectFlags, code: ReasonCode, more: object) -> None:
-        """Log where the broker refuses."""
+        """Log it where the broker refuses the connection."""
         if code.is_failure:
             LOG.warning("%s: refused, %s; trying again", self.address, code)
 
@@ -88,15 +88,14 @@ class Connection:
     def failed(self, client: Client, data: object) -> None:
         """Report that nobody answers there, or nobody who is trusted."""
         if self.open:
-            LOG.warning(
-                "%s: %s; trying again", self.address, explain_failure(sys.exc_info()[1])
-            )  # called where it was caught
+            # The client calls this where it caught the exception.
+            LOG.warning("%s: %s; trying again", self.address, explain_failure(sys.exc_info()[1]))
 
     def close(self) -> None:
         """End the connection, and its thread."""
-        with self.room:
+        with self.changed:
             self.open = False
-            self.room.notify_all()
+            self.changed.notify_all()
         self.client.disconnect()
         self.client.loop_stop()
 
@@ -106,8 +105,8 @@ class _Reader(Connection):
 
     def __init__(self, address: Address, part: Part, translator: Translator | None):
         super().__init__(address, f"{address.topic.replace('/', '-')}-part-{part.number}-of-{part.of}")
-        self._below = f"{part.number}/#" if part.of > 1 else "#"
-        self._loop, self._came = asyncio.get_running_loop(), asyncio.Event()
+        self._topics_below = f"{part.number}/#" if part.of > 1 else "#"
+        self._loop, self._some_held = asyncio.get_running_loop(), asyncio.Event()
         self._prefix, self._translator = f"{address.topic}/in/", translator
         self._held: deque[tuple[int, MQTTMessage, datetime]] = deque()
         self._connection = 0
@@ -115,18 +114,19 @@ class _Reader(Connection):
         self.start()
 
     async def receive(self) -> Batch:
-        """Wait for messages, and return those that a service reads; the batch acknowledges them all."""
+        """Wait for messages, and return those that the service reads; acknowledging the batch acknowledges them all."""
         batch, payloads = list[tuple[int, MQTTMessage, datetime]](), list[Payload]()
-        # Wait until messages came of which there is something to give.
-        while not payloads:  # the word that one came may come after the batch that took it
-            for connection, message, _ in batch:  # of topics that nobody reads
+        # Wait until there are messages that the service reads: `_some_held` may be set although the batch before took
+        # all, and messages of topics that no source reads are acknowledged at once.
+        while not payloads:
+            for connection, message, _ in batch:
                 self._acknowledge(connection, message)
-            await self._came.wait()
-            with self.room:
+            await self._some_held.wait()
+            with self.changed:
                 batch = [self._held.popleft() for _ in range(min(MOST, len(self._held)))]
                 if not self._held:
-                    self._came.clear()
-                self.room.notify_all()
+                    self._some_held.clear()
+                self.changed.notify_all()
             payloads = [payload for _, message, arrival in batch for payload in self._read_payloads(message, arrival)]
 
         async def acknowledge() -> None:
@@ -142,16 +142,20 @@ class _Reader(Connection):
         return self._translator.read(message.topic, bytes(message.payload), arrival, message.retain)
 
     def _acknowledge(self, connection: int, message: MQTTMessage) -> None:
-        if connection == self._connection:  # else the number may by now be another message's; it comes again
+        """Acknowledge a message of the present connection; one of an earlier connection comes again.
+
+        Its number may by now be that of another message.
+        """
+        if connection == self._connection:
             self.client.ack(message.mid, message.qos)
 
     def _hold_message(self, client: Client, data: object, message: MQTTMessage) -> None:
         """Hold a message; while too many are held, block the client's thread so that no more are read."""
-        with self.room:
-            self.room.wait_for(lambda: len(self._held) < HELD or not self.open)
+        with self.changed:
+            self.changed.wait_for(lambda: len(self._held) < HELD or not self.open)
             self._held.append((self._connection, message, datetime.now(UTC)))
             if self.open:
-                self._loop.call_soon_threadsafe(self._came.set)
+                self._loop.call_soon_threadsafe(self._some_held.set)
 
     def connected(self, client: Client, data: object, flags: ConnectFlags, code: ReasonCode, more: object) -> None:
         """Subscribe to our topics and to those of the sources, after each connection anew."""
@@ -160,7 +164,7 @@ class _Reader(Connection):
         if not code.is_failure:
             topics = [] if self._translator is None else self._translator.sources.subscribed
             LOG.info("%s: connected", self.address)
-            client.subscribe([(topic, AT_LEAST_ONCE) for topic in (f"{self._prefix}{self._below}", *topics)])
+            client.subscribe([(topic, AT_LEAST_ONCE) for topic in (f"{self._prefix}{self._topics_below}", *topics)])
 
     def disconnected(
         self, client: Client, data: object, flags: DisconnectFlags, code: ReasonCode, more: object
@@ -174,7 +178,7 @@ class _Writer(Connection):
 
     def __init__(self, address: Address):
         super().__init__(address, "")
-        self._arrived: set[int] = set()  # numbers of what the broker has
+        self._delivered: set[int] = set()  # numbers of what the broker has
         self.client.on_publish = self._note_received
         self.start()
 
@@ -186,12 +190,12 @@ class _Writer(Connection):
             handle = self.client.publish(topic_of(self.address.topic, output), output.body, quality)
             if output.number is not None:
                 sent.add(handle.mid)
-        with self.room:
-            self.room.wait_for(lambda: sent <= self._arrived or not self.open)
-            self._arrived.clear()
+        with self.changed:
+            self.changed.wait_for(lambda: sent <= self._delivered or not self.open)
+            self._delivered.clear()
 
     def _note_received(self, client: Client, data: object, number: int, code: ReasonCode, more: object) -> None:
         """Note that the broker has the message with this number."""
-        with self.room:
-            self._arrived.add(number)
-            self.room.notify_all()
+        with self.changed:
+            self._delivered.add(number)
+            self.changed.notify_all()

@@ -73,7 +73,7 @@ class Nats:
         while True:
             raise_if_cancelled()
             # A request that times out is repeated; a broken connection gets a new consumer.
-            reader = await self._persist(self._open_reader)
+            reader = await self._repeat_while_away(self._open_reader)
             try:
                 messages = await reader.fetch(MOST, WAIT)
             except TimeoutError:
@@ -103,7 +103,7 @@ class Nats:
         return self._translator.read(message.subject.replace(".", "/"), message.data, message.metadata.timestamp)
 
     @property
-    def _list_subjects(self) -> list[str]:
+    def _source_subjects(self) -> list[str]:
         """Return the subjects of the sources, with the wildcards of NATS."""
         topics = [] if self._translator is None else self._translator.sources.subscribed
         return [topic.replace("/", ".").replace("+", "*").replace("#", ">") for topic in topics]
@@ -116,14 +116,14 @@ class Nats:
 
     async def publish(self, outputs: Sequence[Output]) -> None:
         for begin in range(0, len(outputs), MOST):
-            await self._persist(partial(self._tell, outputs[begin : begin + MOST]))
+            await self._repeat_while_away(partial(self._publish_some, outputs[begin : begin + MOST]))
 
     async def close(self) -> None:
         if self._client.is_connected:
             with contextlib.suppress(*AWAY):
                 await asyncio.wait_for(self._client.close(), WAIT)
 
-    async def _tell(self, outputs: Sequence[Output]) -> None:
+    async def _publish_some(self, outputs: Sequence[Output]) -> None:
         """Publish what has no number as it comes; store outputs that have one, without duplicates."""
         server, stored = await self._open(), []
         for output in outputs:
@@ -135,7 +135,7 @@ class Nats:
                 stored.append(await server.publish_async(subject, output.body, headers=name))
         await asyncio.wait_for(asyncio.gather(*stored), ANSWER)
 
-    async def _persist(self, act: Callable[[], Awaitable[T]]) -> T:
+    async def _repeat_while_away(self, act: Callable[[], Awaitable[T]]) -> T:
         """Await an action, and repeat it for as long as the server is away."""
         while True:
             try:
@@ -146,7 +146,7 @@ class Nats:
                 self._retry.worked()
                 return done
 
-    def _require_connection(self) -> bool:
+    def _is_connected(self) -> bool:
         """Return the connection, which `start` opened."""
         return self._client.is_connected
 
@@ -188,7 +188,7 @@ class Nats:
 
     async def _open_reader(self) -> JetStreamContext.PullSubscription:
         """Return a consumer of this part that begins after the last acknowledged message; remove all others."""
-        if self._reader is not None and self._require_connection():
+        if self._reader is not None and self._is_connected():
             return self._reader
         server = await self._open()
         newest = await self._make_stream(server)
@@ -219,7 +219,7 @@ class Nats:
             ack_wait=UNTOUCHED,
             max_ack_pending=4 * MOST,
             filter_subject=f"{self.topic}.in.{self.part.number}.*" if self.part.of > 1 else None,
-            filter_subjects=None if self.part.of > 1 else [f"{self.topic}.in.*", *self._list_subjects],
+            filter_subjects=None if self.part.of > 1 else [f"{self.topic}.in.*", *self._source_subjects],
         )
 
     async def _make_stream(self, server: JetStreamContext) -> int:
@@ -233,7 +233,7 @@ class Nats:
         source, parts = f"{self.topic}.in.*", self.part.of
         target = f"{self.topic}.in.{{{{partition({parts},1)}}}}.{{{{wildcard(1)}}}}"
         transform = SubjectTransform(source, target) if parts > 1 else None
-        subjects = [source, *self._list_subjects]
+        subjects = [source, *self._source_subjects]
         expected = StreamConfig(self.stream, subjects=subjects, storage=StorageType.FILE, subject_transform=transform)
         info = await _find_or_make_stream(server, expected)
         known = info.config.subject_transform

@@ -77,7 +77,7 @@ def read_reporting(url: str, variables: Sequence[str]) -> dict[str, Reporting]:
 
     async def work() -> dict[str, Reporting]:
         async with Client(url, timeout=WAIT) as client:
-            return {name: await reporting_of(_find_node(client, name)) for name in names}
+            return {name: await _read_rule(_find_node(client, name)) for name in names}
 
     try:
         return asyncio.run(work())
@@ -85,7 +85,7 @@ def read_reporting(url: str, variables: Sequence[str]) -> dict[str, Reporting]:
         raise fail(f"OPC UA server {where}", "an answer", f"{type(error).__name__} {error}") from None
 
 
-async def reporting_of(node: Node) -> Reporting:
+async def _read_rule(node: Node) -> Reporting:
     """Return the rule by which a variable is reported, 0 for what the server does not state."""
     interval = await _read_attribute(node, ua.AttributeIds.MinimumSamplingInterval)
     # The deviation is a property of the variable, or of its historical configuration.
@@ -93,12 +93,12 @@ async def reporting_of(node: Node) -> Reporting:
     with contextlib.suppress(UaError):
         places += await node.get_referenced_nodes(ua.ObjectIds.HasHistoricalConfiguration)
     for stated_by in places:
-        deviation = await _property(stated_by, "ExceptionDeviation")
+        deviation = await _read_property(stated_by, "ExceptionDeviation")
         if deviation is None:
             continue
         # Absolute, or a share of the variable's range.
-        kind = await _property(stated_by, "ExceptionDeviationFormat")
-        bounds = await _property(node, "EURange")
+        kind = await _read_property(stated_by, "ExceptionDeviationFormat")
+        bounds = await _read_property(node, "EURange")
         if kind in (None, ABSOLUTE):
             return Reporting(float(str(deviation)), max(interval, 0.0) / 1e3)
         if int(str(kind)) == OF_RANGE and isinstance(bounds, ua.Range):
@@ -118,7 +118,7 @@ class OpcUa:
     def __init__(self, parse_address: Address, translator: Translator, target: int = 1):
         self.address, self._translator = parse_address, translator
         self._output, self._retry = Pipe(target=target), Retry(str(parse_address))
-        self._came: asyncio.Queue[Sequence[Payload]] = asyncio.Queue()
+        self._changes: asyncio.Queue[Sequence[Payload]] = asyncio.Queue()
         self._client: Client | None = None
         self._first: set[str] = set()  # variables of which the first value is still to come
         self.reporting: dict[str, Reporting] = {}
@@ -128,11 +128,11 @@ class OpcUa:
         while True:
             await self._connect()
             try:
-                payloads = list(await asyncio.wait_for(self._came.get(), WAIT))
+                payloads = list(await asyncio.wait_for(self._changes.get(), WAIT))
             except TimeoutError:
                 continue
-            while len(payloads) < MOST and not self._came.empty():
-                payloads += self._came.get_nowait()
+            while len(payloads) < MOST and not self._changes.empty():
+                payloads += self._changes.get_nowait()
             if payloads:
                 return Batch(payloads, nothing)
 
@@ -149,7 +149,7 @@ class OpcUa:
         name, body = _translate_change(node, val, data)
         stored = name in self._first
         self._first.discard(name)
-        self._came.put_nowait(self._translator.read(name, body, datetime.now(UTC), stored))
+        self._changes.put_nowait(self._translator.read(name, body, datetime.now(UTC), stored))
 
     async def _connect(self) -> None:
         """Connect and subscribe, again and again while the server is away."""
@@ -228,7 +228,7 @@ def _make_client(where: Address) -> Client:
 
 async def _monitor(client: Client, node: Node, handler: OpcUa | Listener) -> Reporting:
     """Subscribe to a variable with the deadband and the interval that the server states."""
-    rule = await reporting_of(node)
+    rule = await _read_rule(node)
     interval = 1e3 * (rule.interval or FASTEST)
     subscription = await client.create_subscription(interval, handler)
     if rule.deadband > 0:
@@ -285,7 +285,7 @@ async def _read_attribute(node: Node, attribute: ua.AttributeIds) -> float:
     return 0.0 if value is None or value.Value is None else float(value.Value)
 
 
-async def _property(node: Node, name: str) -> object:
+async def _read_property(node: Node, name: str) -> object:
     for member in await node.get_properties():
         if (await member.read_browse_name()).Name == name:
             return await member.read_value()

@@ -26,7 +26,7 @@ from heliograph.simulation.network import Network
 SECOND = np.timedelta64(1_000_000_000, "ns")
 
 
-class TableMessages:
+class TableLineReader:
     """Lines of a table, to messages. What the table has is said by its header, as of a file.
 
     Args:
@@ -40,7 +40,7 @@ class TableMessages:
         self._network, self._translator, self._path, self._ignore = network, translator, path, ignore_unknown
         self._source = "standard input" if path is None else str(path)
         self._text = CsvText(self._source, path, marked=translator is not None)
-        self._reader: MessageRows | TimeRows | None = None
+        self._reader: MessageRowReader | TimeRowReader | None = None
 
     def names_columns(self, line: str) -> bool:
         """Return whether a line is the first of a table: it names a column that the network or its sources know."""
@@ -59,32 +59,32 @@ class TableMessages:
         Raises:
             ValueError: a header that names no columns, or others than expected; one line.
         """
-        return self._convert([row for line in lines for row in self._text.add(f"{line}\n")])
+        return self._read_rows([row for line in lines for row in self._text.add(f"{line}\n")])
 
     def end(self) -> list[Payload]:
         """Return the messages of what is left at the end."""
-        rest = self._convert(self._text.end())
-        return rest + (self._reader.end() if isinstance(self._reader, TimeRows) else [])
+        rest = self._read_rows(self._text.end())
+        return rest + (self._reader.end() if isinstance(self._reader, TimeRowReader) else [])
 
-    def _convert(self, rows: list[CsvRow | InputError]) -> list[Payload]:
+    def _read_rows(self, rows: list[CsvRow | InputError]) -> list[Payload]:
         if self._reader is None and self._text.header:
-            self._reader = self._choose(self._text.header)
+            self._reader = self._choose_reader(self._text.header)
         return [] if self._reader is None or not rows else self._reader.read(rows)
 
-    def _choose(self, header: list[str]) -> "MessageRows | TimeRows":
+    def _choose_reader(self, header: list[str]) -> "MessageRowReader | TimeRowReader":
         """Return the reader of rows with these columns."""
         if {NODE, SEQUENCE} <= set(header):
             own = OwnReader(self._network, self._source, self._ignore, table=True)
-            return MessageRows(lambda row: read_own(own, row.where, typed_cells(row)))
+            return MessageRowReader(lambda row: read_own(own, row.where, typed_cells(row)))
         translator = self._translator
         if translator is not None:
             topic = translator.topic_of_rows(self._path, header)
             if topic is not None or TOPIC in header:
-                return MessageRows(lambda row: translator.decode(convert_row(row.where, typed_cells(row)), topic))
-        return TimeRows(self._network, header, self._text, self._ignore)
+                return MessageRowReader(lambda row: translator.decode(convert_row(row.where, typed_cells(row)), topic))
+        return TimeRowReader(self._network, header, self._text, self._ignore)
 
 
-class MessageRows:
+class MessageRowReader:
     """Rows each of which is a message, or several: an event in our own form, or what sources map."""
 
     def __init__(self, decode: Callable[[CsvRow], Sequence[Payload]]):
@@ -97,7 +97,7 @@ class MessageRows:
         ]
 
 
-class TimeRows:
+class TimeRowReader:
     """Rows of time, as `heliograph run` reads them: of a file all of them at its end: the same rows."""
 
     def __init__(self, network: Network, header: list[str], text: CsvText, ignore_unknown: bool):
@@ -119,7 +119,7 @@ class TimeRows:
         if not count or self._whole:
             self._cells += [cells] if count else []
             return [*refused]
-        time = self._seconds(cells.time, cells.numbers)
+        time = self._time_of_messages(cells.time, cells.numbers)
         if TIME_STEP in cells.inputs:
             dt, first = cells.inputs[TIME_STEP], [] if self._before is None else [self._before]
             numbers = np.concatenate([cells.numbers[: len(first)], cells.numbers])
@@ -144,7 +144,7 @@ class TimeRows:
         lines = [json.dumps(encode_event(event, "", origin)).encode() for event in events]
         return [*lines, *(str(error) for error in self._rows.refused)]
 
-    def _seconds(self, time: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+    def _time_of_messages(self, time: np.ndarray, numbers: np.ndarray) -> np.ndarray:
         """Return the times in the unit of messages: steps, numbers, or seconds since the first date."""
         if self._steps:
             return np.asarray(numbers - 1.0)

@@ -61,7 +61,7 @@ class Translator:
             arrival: when it arrived.
             stored: whether the broker had stored it for new subscribers.
         """
-        return self._read(topic, payload, arrival, stored, again=True, where=topic)
+        return self._read_payload(topic, payload, arrival, stored, repeatable=True, where=topic)
 
     def topic_of(self, path: Path | None) -> str | None:
         """Return the topic of messages that name none: that of their file, or the only one; None if there is neither.
@@ -104,7 +104,7 @@ class Translator:
                 arrival = date_of(parse_arrival(message.arrival, f"{message.where}, arrival"))
         except InputError as error:
             return [str(error)]
-        return self._read(name, message.content, arrival, message.stored, again=False, where=message.where)
+        return self._read_payload(name, message.content, arrival, message.stored, repeatable=False, where=message.where)
 
     def left_out(self) -> list[str]:
         """Return lines on messages that were not used: of unknown topics, and stored ones."""
@@ -120,8 +120,8 @@ class Translator:
             lines.append(f"{self._stored} stored messages were left out: without time= they have no date")
         return lines
 
-    def _read(
-        self, topic: str, payload: object, arrival: datetime | None, stored: bool, again: bool, where: str
+    def _read_payload(
+        self, topic: str, payload: object, arrival: datetime | None, stored: bool, repeatable: bool, where: str
     ) -> list[Message | UnreadMessage | str]:
         """Read a payload: the readings that it has, or why one, or all of it, cannot be used.
 
@@ -130,7 +130,7 @@ class Translator:
             payload: as the broker gave it.
             arrival: when it came, None for now.
             stored: the broker had kept it, so that it is left out where it has no time of its own.
-            again: whether a copy of it may come again, so that its number is made from what it says.
+            repeatable: whether a copy of it may come again, so that its number is made from what it says.
             where: place that an error names.
         """
         results: list[Message | UnreadMessage | str] = []
@@ -143,12 +143,12 @@ class Translator:
             content = _decode(payload, where)
             for reading in self.sources.read(topic, content, where):
                 if isinstance(reading, Unread):
-                    results.append(self._explain_unread(where, reading, arrival, again))
+                    results.append(self._explain_unread(where, reading, arrival, repeatable))
                     continue
                 if stored and reading.time is None:
                     self._stored += 1
                     continue
-                results.append(self._make_message(where, reading, arrival, again))
+                results.append(self._make_message(where, reading, arrival, repeatable))
                 self.sources.senders.note(topic, reading.plant, reading.node, content, self.sources.list_fields(topic))
                 for said in self.sources.senders.news():
                     LOG.warning("%s", said)
@@ -156,17 +156,19 @@ class Translator:
             results.append(str(error))
         return results
 
-    def _explain_unread(self, topic: str, unread: Unread, known: datetime | None, again: bool) -> UnreadMessage | str:
+    def _explain_unread(
+        self, topic: str, unread: Unread, known: datetime | None, repeatable: bool
+    ) -> UnreadMessage | str:
         """Return why a message could not be read, with its node, count and time where these were."""
         why = str(unread.error)
         if unread.counted is None:
             return why
         try:
-            return UnreadMessage(self._make_message(topic, unread.counted, known, again), why)
+            return UnreadMessage(self._make_message(topic, unread.counted, known, repeatable), why)
         except InputError:
             return why
 
-    def _make_message(self, topic: str, reading: Reading, known: datetime | None, again: bool) -> Message:
+    def _make_message(self, topic: str, reading: Reading, known: datetime | None, repeatable: bool) -> Message:
         """Make the message of a reading, with the arrival that is known, else now, and a number if it has no count."""
         if len(reading.plant) > NAME or "\0" in reading.plant:
             raise fail(
@@ -184,10 +186,12 @@ class Translator:
                 what = f"{topic}, time"
                 raise fail(what, f"a time that was set, near that of arrival, {arrival.isoformat()}", time.isoformat())
             # What a log says; of what comes now only that it cannot have been measured later.
-            came = arrival if time > arrival or (known is not None and not again) else None
+            came = arrival if time > arrival or (known is not None and not repeatable) else None
         sequence, name = reading.sequence, (reading.plant, reading.node)
         if sequence is None:
-            sequence = self._counts[name] if reading.time is None else self._number_among_simultaneous(reading, again)
+            sequence = (
+                self._counts[name] if reading.time is None else self._number_among_simultaneous(reading, repeatable)
+            )
             self._counts[name] += 1
         # Checked already, and dates are no texts here.
         return Message.model_construct(
@@ -200,15 +204,15 @@ class Translator:
             arrival=came,
         )
 
-    def _number_among_simultaneous(self, reading: Reading, again: bool) -> int:
+    def _number_among_simultaneous(self, reading: Reading, repeatable: bool) -> int:
         """Return the sequence number of a message without a count: how many of its node and time came before.
 
-        A message that comes `again`, with the same values, has the number that it had.
+        A copy of a message, which has the same values and may come where `repeatable`, gets the number of the message.
         """
         assert reading.time is not None
         values = self._uncounted.setdefault((reading.plant, reading.node, reading.time), [])
         mine = reading.values.tobytes()
-        if again and mine in values:
+        if repeatable and mine in values:
             return values.index(mine)
         values.append(mine)
         if len(self._uncounted) > REMEMBERED:

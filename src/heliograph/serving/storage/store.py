@@ -10,7 +10,7 @@ from sqlalchemy import Column, Connection, Table, delete, func, inspect, select,
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import SQLAlchemyError
 
-from heliograph.live.stored.migration import DESCRIPTION, LISTED, Carrier, list_changes
+from heliograph.live.stored.migration import DESCRIPTION, LISTED, PlantMigration, list_changes
 from heliograph.live.stored.snapshot import Identity, check_same, versions
 from heliograph.numerics.check import InputError, fail, table
 from heliograph.serving.output import Output
@@ -67,7 +67,7 @@ class Store:
         process: str = "",
         journal: int = 100_000,
         opened: "Store | None" = None,
-        carrier: Carrier | None = None,
+        carrier: PlantMigration | None = None,
     ):
         self.process, self.journal, self.identity = process, journal, {}
         self._engine = open_database(location)
@@ -298,7 +298,7 @@ class Store:
             raise fail(f"store {self.name}, count {name!r}", "what was written", f"damage; {MEND} {self.name}")
         return value
 
-    def carry(self, carrier: Carrier, what: str, stored: Identity) -> None:
+    def carry(self, carrier: PlantMigration, what: str, stored: Identity) -> None:
         """Carry all plants, which are of the network with the identity `stored`, over to the carrier's network."""
         carrier.begin(what, stored)
         mine = carrier.mine | {LAYOUT_KEY: LAYOUT}
@@ -306,14 +306,14 @@ class Store:
             names = [name for (name,) in connection.execute(select(PLANTS.c.name)) if name not in self.damaged]
             for i in range(0, len(names), AT_ONCE):
                 rows = {row[0]: row[1:3] for row in _select_plants(connection, list(PLANTS.c), names[i : i + AT_ONCE])}
-                bodies = carrier.carried({name: body for name, (_, body) in rows.items()})
+                bodies = carrier.migrate({name: body for name, (_, body) in rows.items()})
                 after = [with_checksum(PLANTS, name, rows[name][0] + 1, body) for name, body in bodies.items()]
                 self._put(connection, PLANTS, after)
             this = IDENTITY_TABLE.c.name == IDENTITY
             connection.execute(update(IDENTITY_TABLE).where(this).values(value=json.dumps(mine)))
         self.identity = mine
 
-    def begin_from(self, location: str, mine: Identity, carrier: Carrier | None = None) -> None:
+    def begin_from(self, location: str, mine: Identity, carrier: PlantMigration | None = None) -> None:
         """Copy the plants of another store, which is not changed; those of another network by a carrier."""
         other = Store(location, mine if carrier is None else None)
         saying = self._name_store_in_errors(f"a database that takes the plants of {other.name}")

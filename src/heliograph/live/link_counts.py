@@ -1,0 +1,141 @@
+"""Counts of a node's messages by verdict, and of those that its running count says were lost."""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from heliograph.live.event import Known, Verdict
+from heliograph.live.leap import Moments
+from heliograph.model.stuck import Repeats
+
+NO_REPEATS = Repeats()
+GAP = 1 << 14  # more messages in a row are not lost: the count began anew (LoRaWAN's MAX_FCNT_GAP)
+
+
+class ScreenedEvent(NamedTuple):
+    """An event without the values that count as not arrived.
+
+    Args:
+        event: the event, NaN for these values.
+        dropped: how many are beyond the limits of the node, or codes.
+        stuck: how many repeat for longer than their noise allows.
+        why: which of either, in words.
+        repeats: runs of equal readings of the node that end with this event.
+    """
+
+    event: Known
+    dropped: int = 0
+    stuck: int = 0
+    why: str = ""
+    repeats: Repeats = NO_REPEATS
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether values were removed and none is left."""
+        return bool(self.why) and all(value != value for value in self.event.values)
+
+
+@dataclass
+class LinkCounts:
+    """Counts of the messages of a node by verdict, and its running count, in which gaps are lost messages.
+
+    The running count of the node goes from `first` to `newest`, which was measured at time `at`. A smaller number with
+    a later time means that the node was restarted; a larger one with an earlier time is from before the restart.
+
+    Attributes:
+        first: smallest running count since the node's last start; -1 before the first message.
+        newest: greatest running count since then.
+        at: time of the measurement with the greatest count.
+        lost: gaps in the running count that no message has filled.
+        used, duplicate, conflict, late, future, implausible: numbers of messages by verdict.
+        dropped: single values beyond the limits of the node.
+        latest: time of the newest measurement that was used; -1 before the first.
+        stuck: single values that repeated for longer than their noise allows.
+        repeats: newest readings, and how many in a row are equal to them, of a node that watches for it.
+    """
+
+    first: int = -1
+    newest: int = -1
+    at: float = 0.0
+    lost: int = 0
+    used: int = 0
+    duplicate: int = 0
+    conflict: int = 0
+    late: int = 0
+    future: int = 0
+    implausible: int = 0
+    dropped: int = 0
+    latest: float = -1.0
+    stuck: int = 0
+    repeats: Repeats = field(default_factory=Repeats)
+
+    def __post_init__(self) -> None:
+        """Take runs of equal readings as they were stored."""
+        self.repeats = Repeats.read(self.repeats)
+
+    def count_screened(self, screened: ScreenedEvent, verdict: Verdict) -> None:
+        """Add the values of an event that count as not arrived; a copy, or one of a wrong time, adds none."""
+        if verdict in ("used", "implausible"):
+            self.dropped += screened.dropped
+            self.stuck += screened.stuck
+            self.repeats = screened.repeats
+
+    def count(self, verdict: Verdict, sequence: int, time: float, period: int = 0) -> None:
+        """Count one message. A late, implausible or future message was received too, so it fills a gap.
+
+        `period`: after how many messages the count begins at 0 again; 0 if it does not.
+        """
+        setattr(self, verdict, getattr(self, verdict) + 1)
+        self._follow_sequence(verdict, sequence, time, period)
+
+    def count_unread(self, sequence: int, time: float, period: int = 0) -> None:
+        """Count a message of which only count and time could be read: it has no verdict, and fills a gap."""
+        self._follow_sequence(None, sequence, time, period)
+
+    def _follow_sequence(self, verdict: Verdict | None, sequence: int, time: float, period: int) -> None:
+        """Update `first`, `newest`, `at` and `lost` by a message's running count; None: it has no verdict."""
+        sequence = self._unwrap_count(sequence, time, period)
+        if verdict == "used":
+            self.latest = max(self.latest, time)
+            if sequence - 1 == self.newest >= 0 and time >= self.at:  # the next, as most are
+                self.newest, self.at = sequence, time
+                return
+        if verdict in ("duplicate", "conflict"):
+            return
+        if verdict in ("future", "implausible", None):  # its time may be wrong: it says nothing of the order
+            time = self.at
+        # First message, or the node was restarted: count from here.
+        if self.newest < 0 or (sequence < self.newest and time > self.at):
+            self.first, self.newest, self.at = sequence, sequence, time
+        # A gap above the newest count: its messages are lost, until they arrive.
+        elif sequence > self.newest:
+            if time >= self.at or sequence - 1 == self.newest:  # the next in any case, if its clock was set back
+                self.lost += sequence - self.newest - 1
+                self.newest, self.at = sequence, max(time, self.at)
+        elif verdict != "used":
+            return  # it may have been counted when it first came
+        elif sequence < self.first:
+            self.lost += self.first - sequence - 1
+            self.first = sequence
+        elif sequence < self.newest:
+            self.lost -= self.lost > 0  # it had only been overtaken
+
+    def _unwrap_count(self, sequence: int, time: float, period: int) -> int:
+        """Return a count that goes on where the node's own begins at 0 again after `period` messages.
+
+        It is the nearest one to `newest`, above it for a message measured later and below it for one before; where that
+        is more than GAP away the node was restarted, and its own count is returned.
+        """
+        if not period or self.newest < 0:
+            return sequence
+        ahead, behind = (sequence - self.newest) % period, (self.newest - sequence) % period
+        if time >= self.at:
+            return self.newest + ahead if ahead <= GAP else sequence
+        return self.newest - behind if behind <= min(GAP, self.newest) else sequence
+
+    def count_withdrawn(self, count: int, before: Moments | None) -> None:
+        """Count `count` used messages, whose clock was wrong, as ones from the future instead.
+
+        `before`: `at` and `latest` before the first of these; None where it was the node's first.
+        """
+        self.at, self.latest = before or (0.0, -1.0)
+        self.used, self.future = max(self.used - count, 0), self.future + count
