@@ -65,6 +65,7 @@ class Nats:
         self._client = Client()
         self._server: JetStreamContext | None = None
         self._reader: JetStreamContext.PullSubscription | None = None
+        # Name of the consumer, how many messages it has sent, and the number in the stream of the last acknowledged.
         self._name, self._read, self._acknowledged = "", 0, 0
         self._retry, self._opening = Retry(str(address)), asyncio.Lock()
 
@@ -124,7 +125,7 @@ class Nats:
                 await asyncio.wait_for(self._client.close(), WAIT)
 
     async def _publish_some(self, outputs: Sequence[Output]) -> None:
-        """Publish what has no number as it comes; store outputs that have one, without duplicates."""
+        """Publish outputs; those that have a number are stored by the server, each once, before this returns."""
         server, stored = await self._open(), []
         for output in outputs:
             subject = topic_of(self.address.topic, output).replace("/", ".")
@@ -147,7 +148,7 @@ class Nats:
                 return done
 
     def _is_connected(self) -> bool:
-        """Return the connection, which `start` opened."""
+        """Return whether the connection is open; a call, since it may change while other tasks run."""
         return self._client.is_connected
 
     async def _open(self) -> JetStreamContext:
@@ -158,14 +159,14 @@ class Nats:
             # Connect without the client's reconnection, after which messages would arrive out of order.
             await self.close()
             self._client, self._server, self._reader = Client(), None, None
-            failures = list[Exception]()  # of which the client raises none
+            failures = list[Exception]()  # the client reports these by a callback and raises another error
 
-            async def failed(error: Exception) -> None:
+            async def note_failure(error: Exception) -> None:
                 failures.append(error)
 
             connecting = self._client.connect(
                 f"nats://{self.address.host}:{self.address.port}",
-                error_cb=failed,
+                error_cb=note_failure,
                 user=self.address.user if self.address.password else None,
                 password=self.address.password,
                 token=None if self.address.password else self.address.user,
@@ -193,20 +194,20 @@ class Nats:
         server = await self._open()
         newest = await self._make_stream(server)
         # Another process has taken over this part if our consumer is gone and there is another.
-        mine = f"part-{self.part.number}-of-{self.part.of}-"
-        others = [c for c in await server.consumers_info(self.stream) if c.name.startswith(mine)]
-        if self._name and others and self._name not in [c.name for c in others]:
+        prefix = f"part-{self.part.number}-of-{self.part.of}-"
+        of_part = [c for c in await server.consumers_info(self.stream) if c.name.startswith(prefix)]
+        if self._name and of_part and self._name not in [c.name for c in of_part]:
             raise TakenOverError(f"{self.address}, part {self.part.number}: expected one reader, another took over")
         # Begin after the last message that any reader acknowledged.
-        floors = [c.ack_floor.stream_seq for c in others if c.ack_floor is not None]
-        begun = self._acknowledged if others else 0  # a stream without its consumers is a new one
-        self._acknowledged = min(max([begun, *floors]), newest)
-        # Make the new consumer before the others are removed.
-        self._name, self._read = mine + uuid.uuid4().hex[:12], 0
+        floors = [c.ack_floor.stream_seq for c in of_part if c.ack_floor is not None]
+        own_floor = self._acknowledged if of_part else 0  # a stream without its consumers is a new one
+        self._acknowledged = min(max([own_floor, *floors]), newest)
+        # Make the new consumer before the old ones are removed.
+        self._name, self._read = prefix + uuid.uuid4().hex[:12], 0
         await server.add_consumer(self.stream, self._configure_consumer())
         self._reader = await server.pull_subscribe_bind(self._name, self.stream)
-        for other in others:
-            await server.delete_consumer(self.stream, other.name)
+        for old in of_part:
+            await server.delete_consumer(self.stream, old.name)
         return self._reader
 
     def _configure_consumer(self) -> ConsumerConfig:
@@ -236,8 +237,8 @@ class Nats:
         subjects = [source, *self._source_subjects]
         expected = StreamConfig(self.stream, subjects=subjects, storage=StorageType.FILE, subject_transform=transform)
         info = await _find_or_make_stream(server, expected)
-        known = info.config.subject_transform
-        if (known.dest if known else None) != (target if transform else None):
+        found = info.config.subject_transform
+        if (found.dest if found else None) != (target if transform else None):
             raise fail(f"stream {self.stream} of {self.address}", f"one of {parts} parts", "one of another number")
         return info.state.last_seq
 

@@ -75,19 +75,20 @@ def read_reporting(url: str, variables: Sequence[str]) -> dict[str, Reporting]:
         raise fail("url", "opc.tcp://host:port/path", where.kind)
     names = [text("variable", name) for name in items("variables", variables, "identifiers")]
 
-    async def work() -> dict[str, Reporting]:
+    async def read_rules() -> dict[str, Reporting]:
         async with Client(url, timeout=WAIT) as client:
             return {name: await _read_rule(_find_node(client, name)) for name in names}
 
     try:
-        return asyncio.run(work())
+        return asyncio.run(read_rules())
     except AWAY as error:
         raise fail(f"OPC UA server {where}", "an answer", f"{type(error).__name__} {error}") from None
 
 
 async def _read_rule(node: Node) -> Reporting:
     """Return the rule by which a variable is reported, 0 for what the server does not state."""
-    interval = await _read_attribute(node, ua.AttributeIds.MinimumSamplingInterval)
+    interval = await _read_attribute(node, ua.AttributeIds.MinimumSamplingInterval)  # milliseconds; negative: unknown
+    seconds = max(interval, 0.0) / 1e3
     # The deviation is a property of the variable, or of its historical configuration.
     places = [node]
     with contextlib.suppress(UaError):
@@ -100,11 +101,11 @@ async def _read_rule(node: Node) -> Reporting:
         kind = await _read_property(stated_by, "ExceptionDeviationFormat")
         bounds = await _read_property(node, "EURange")
         if kind in (None, ABSOLUTE):
-            return Reporting(float(str(deviation)), max(interval, 0.0) / 1e3)
+            return Reporting(float(str(deviation)), seconds)
         if int(str(kind)) == OF_RANGE and isinstance(bounds, ua.Range):
             share = float(str(deviation)) / 100
-            return Reporting(share * (bounds.High - bounds.Low), max(interval, 0.0) / 1e3)
-    return Reporting(0.0, max(interval, 0.0) / 1e3)
+            return Reporting(share * (bounds.High - bounds.Low), seconds)
+    return Reporting(0.0, seconds)
 
 
 class OpcUa:
@@ -180,7 +181,7 @@ class OpcUa:
 
 
 class Listener:
-    """Handler of changes that notes them as messages of topics; `kinds` names the type and the rule of each variable.
+    """Listens to a server's variables and notes their changes in `topics`; `kinds` has each variable's type and rule.
 
     The first value of a variable was there before: it says nothing of rate and lateness.
     """
@@ -208,7 +209,7 @@ class Listener:
             topic.kind = self.kinds[name]
 
     def datachange_notification(self, node: Node, val: object, data: DataChangeNotif) -> None:
-        """Note a change."""
+        """Note a change; of a variable's first value only that it is there."""
         name, body = _translate_change(node, val, data)
         stored = name not in self.topics
         note(self.topics, name, body, time.time_ns())
@@ -217,8 +218,9 @@ class Listener:
 
 
 def _make_client(where: Address) -> Client:
-    """Make a client of the server at an address, with its user and password if it has any."""
-    logging.getLogger("asyncua").setLevel(logging.ERROR)  # it warns of what a server grants less of than it asks for
+    """Return a client of the server at an address, with its user and password if it has any."""
+    # It warns of everything of which a server grants less than it asks for.
+    logging.getLogger("asyncua").setLevel(logging.ERROR)
     client = Client(str(where), timeout=WAIT)
     if where.user is not None:
         client.set_user(where.user)
@@ -227,7 +229,7 @@ def _make_client(where: Address) -> Client:
 
 
 async def _monitor(client: Client, node: Node, handler: OpcUa | Listener) -> Reporting:
-    """Subscribe to a variable with the deadband and the interval that the server states."""
+    """Subscribe to a variable with the deadband and the interval that the server states; return these."""
     rule = await _read_rule(node)
     interval = 1e3 * (rule.interval or FASTEST)
     subscription = await client.create_subscription(interval, handler)
@@ -243,8 +245,8 @@ async def _find_variables(client: Client) -> list[Node]:
     variables, seen, waiting = list[Node](), set[ua.NodeId](), [client.nodes.objects]
     while waiting and len(variables) < MOST:
         for child in await waiting.pop(0).get_children_descriptions():
-            known = child.NodeId.NamespaceIndex == 0 or child.NodeId in seen
-            if known or child.ReferenceTypeId.Identifier == ua.ObjectIds.HasProperty:
+            skipped = child.NodeId.NamespaceIndex == 0 or child.NodeId in seen  # 0: the namespace of OPC UA itself
+            if skipped or child.ReferenceTypeId.Identifier == ua.ObjectIds.HasProperty:
                 continue
             seen.add(child.NodeId)
             waiting.append(client.get_node(child.NodeId))
@@ -254,7 +256,7 @@ async def _find_variables(client: Client) -> list[Node]:
 
 
 def _translate_change(node: Node, value: object, data: DataChangeNotif) -> tuple[str, bytes]:
-    """Return the topic of a change and its message; null is a value of bad quality, or that is no number."""
+    """Return the topic of a change and its message; a value of bad quality, or NaN or infinite, becomes null."""
     sample = data.monitored_item.Value
     good = sample.StatusCode is None or sample.StatusCode.is_good()
     if not good or (isinstance(value, float) and not isfinite(value)):  # JSON has neither NaN nor infinity
@@ -278,6 +280,7 @@ def _find_node(client: Client, name: str) -> Node:
 
 
 async def _read_attribute(node: Node, attribute: ua.AttributeIds) -> float:
+    """Return the number in an attribute of a node; 0 where it has none."""
     try:
         value = (await node.read_attribute(attribute)).Value
     except UaError:
@@ -286,6 +289,7 @@ async def _read_attribute(node: Node, attribute: ua.AttributeIds) -> float:
 
 
 async def _read_property(node: Node, name: str) -> object:
+    """Return the value of a node's property with this name; None where it has none."""
     for member in await node.get_properties():
         if (await member.read_browse_name()).Name == name:
             return await member.read_value()

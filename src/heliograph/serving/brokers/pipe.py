@@ -16,10 +16,8 @@ from heliograph.serving.message import LONGEST, Payload
 from heliograph.serving.output import Output
 
 READ = 1 << 20  # bytes of a batch
-FULL, MORE = (
-    1 << 15,
-    2,
-)  # bytes of a pipe with a sender that is ahead, so that we wait for more; for so many milliseconds
+FULL = 1 << 15  # bytes that show that the sender is ahead, so that we wait for more
+MORE = 2  # milliseconds that we wait for more
 AT_ONCE = 4096  # bytes that a pipe takes without waiting, once it takes any
 
 
@@ -86,7 +84,13 @@ class Pipe:
         return data
 
     def _split_lines(self, data: bytes, ended: bool) -> list[bytes]:
-        """Return the lines that are complete with these bytes; at the end of the file, also the incomplete last one."""
+        """Return the lines that are complete with these bytes; at the end of the file, also the incomplete last one.
+
+        Of a line longer than LONGEST one byte more is returned than is allowed, so that it is refused; its rest is
+        skipped.
+        """
+        # Lines end with a newline (a carriage return before it is blank), or with a carriage return where there is no
+        # newline; which, is known once something follows.
         if self._newline is None and re.search(rb"[\r\n].", data, re.DOTALL):
             self._newline = b"\n" if b"\n" in data else b"\r"
         *lines, rest = (self._rest + data).split(self._newline or b"\n")

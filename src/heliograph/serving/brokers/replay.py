@@ -142,9 +142,14 @@ def simulate_link(events: Sequence[Event], link: Link, seed: int) -> list[Event]
     loss, twice = scalar("loss", link.loss, 0, 1), scalar("duplicates", link.duplicates, 0, 1)
     scalar("delay", link.delay, 0, FAR)
     # Markov chain of losses with stationary probability pi = loss: P(loss | no loss) = pi P(no loss | loss) / (1 - pi).
-    stays = 1 - 1 / scalar("run", link.run, 1)  # lost again after a loss
-    falls = 1.0 if loss == 1 else loss * (1 - stays) / (1 - loss) if link.run > 1 else loss
-    if falls > 1:
+    # With run 1 losses are independent: both probabilities are pi.
+    after_loss = 1 - 1 / scalar("run", link.run, 1)
+    after_success = loss
+    if loss == 1:
+        after_success = 1.0
+    elif link.run > 1:
+        after_success = loss * (1 - after_loss) / (1 - loss)
+    if after_success > 1:
         raise fail("run", f"at least {loss / (1 - loss):g}, for so many losses", link.run)
     arriving, lost = list[Event](), dict[str, bool]()
     for event in events:
@@ -152,10 +157,10 @@ def simulate_link(events: Sequence[Event], link: Link, seed: int) -> list[Event]
             arriving.append(_delay_event(event, 0.0))
             continue
         # The first state of the chain is drawn from the stationary law.
-        before = lost.get(event.node, chance.random() < loss)
-        now = chance.random() < (stays if before and link.run > 1 else falls)
-        lost[event.node] = now
-        copies = 0 if now else 1 + (chance.random() < twice)
+        lost_before = lost.get(event.node, chance.random() < loss)
+        is_lost = chance.random() < (after_loss if lost_before and link.run > 1 else after_success)
+        lost[event.node] = is_lost
+        copies = 0 if is_lost else 1 + (chance.random() < twice)
         arriving += [_delay_event(event, chance.exponential(link.delay)) for _ in range(copies)]
     return _sort_events(arriving)
 
@@ -212,12 +217,13 @@ def encode_event(event: Event, plant: str, origin: np.datetime64 | None) -> dict
 
 
 def _delay_event(event: Event, delay: float) -> Event:
-    """Return an event that arrives so much later."""
-    began = event.time if event.arrival is None else event.arrival
-    return event._replace(arrival=began + float(delay))
+    """Return an event that arrives so much later; without an arrival it arrived when it was measured."""
+    arrival = event.time if event.arrival is None else event.arrival
+    return event._replace(arrival=arrival + float(delay))
 
 
 def _sort_events(events: list[Event]) -> list[Event]:
+    """Return events in order of arrival."""
     return sorted(events, key=lambda event: event.time if event.arrival is None else event.arrival)
 
 

@@ -1,4 +1,4 @@
-"""Messages of single states: one flat JSON object a state, as Home Assistant and telegraf read them."""
+"""Messages of single states: one flat JSON object for each state, as Home Assistant and telegraf read them."""
 
 import json
 import math
@@ -70,7 +70,7 @@ def make_state_messages(topic: str, states: Sequence[str], body: bytes) -> Itera
 
 
 def make_discovery_messages(topic: str, states: Sequence[str], body: bytes, prefix: str) -> Iterator[StateMessage]:
-    """Yield what tells Home Assistant of the states of a plant: a sensor each of value and deviation, and of dead ones.
+    """Yield messages that make Home Assistant show a plant's states: sensors of value, deviation, and a dead sender.
 
     Args:
         topic: the service's.

@@ -76,7 +76,7 @@ class StatePublishing:
 class _StateWriter(Connection):
     """Connection that publishes states; its last will is that the service is offline.
 
-    What the client is given while it has no broker it drops, so the newest states are published again with each
+    The client drops what it is given while it has no broker, so the newest states are published again with each
     connection, by the client's thread.
     """
 

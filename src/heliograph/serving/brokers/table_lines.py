@@ -27,7 +27,7 @@ SECOND = np.timedelta64(1_000_000_000, "ns")
 
 
 class TableLineReader:
-    """Lines of a table, to messages. What the table has is said by its header, as of a file.
+    """Reads lines of a table of CSV as messages; its header says what the rows are, as in a file.
 
     Args:
         network: the network.
@@ -67,12 +67,13 @@ class TableLineReader:
         return rest + (self._reader.end() if isinstance(self._reader, TimeRowReader) else [])
 
     def _read_rows(self, rows: list[CsvRow | InputError]) -> list[Payload]:
+        """Return the messages of rows of text; the header chooses their reader."""
         if self._reader is None and self._text.header:
             self._reader = self._choose_reader(self._text.header)
         return [] if self._reader is None or not rows else self._reader.read(rows)
 
     def _choose_reader(self, header: list[str]) -> "MessageRowReader | TimeRowReader":
-        """Return the reader of rows with these columns."""
+        """Return the reader of rows with these columns: events in our own form, rows that sources map, rows of time."""
         if {NODE, SEQUENCE} <= set(header):
             own = OwnReader(self._network, self._source, self._ignore, table=True)
             return MessageRowReader(lambda row: read_own(own, row.where, typed_cells(row)))
@@ -85,7 +86,7 @@ class TableLineReader:
 
 
 class MessageRowReader:
-    """Rows each of which is a message, or several: an event in our own form, or what sources map."""
+    """Reads rows by themselves: each is a message, or several, in our own form or by the sources' map."""
 
     def __init__(self, decode: Callable[[CsvRow], Sequence[Payload]]):
         self._decode = decode
@@ -98,7 +99,10 @@ class MessageRowReader:
 
 
 class TimeRowReader:
-    """Rows of time, as `heliograph run` reads them: of a file all of them at its end: the same rows."""
+    """Reads rows of time, each with the measurements of all nodes, as `heliograph run` reads them.
+
+    Those of a pipe are messages at once; those of a file at its end, when all rows can be put in order.
+    """
 
     def __init__(self, network: Network, header: list[str], text: CsvText, ignore_unknown: bool):
         self._network, self._steps = network, TIME_STEP not in network.inputs
@@ -121,10 +125,12 @@ class TimeRowReader:
             return [*refused]
         time = self._time_of_messages(cells.time, cells.numbers)
         if TIME_STEP in cells.inputs:
-            dt, first = cells.inputs[TIME_STEP], [] if self._before is None else [self._before]
-            numbers = np.concatenate([cells.numbers[: len(first)], cells.numbers])
-            steps = np.concatenate([dt[: len(first)], dt])
-            check_time_steps(steps, np.concatenate([first, time]), numbers, self._rows.source)
+            # With the time of the row before, so that the first step can be checked too; the check takes no step and
+            # number of that row, in whose place those of the first row stand.
+            dt, before = cells.inputs[TIME_STEP], [] if self._before is None else [self._before]
+            numbers = np.concatenate([cells.numbers[: len(before)], cells.numbers])
+            steps = np.concatenate([dt[: len(before)], dt])
+            check_time_steps(steps, np.concatenate([before, time]), numbers, self._rows.source)
         inputs = np.stack([cells.inputs[name] for name in self._given], axis=1) if self._given else np.zeros((count, 0))
         events = row_events(cells.numbers - 1, time, inputs, cells.measurements, self._before, self._steps)
         lines = [json.dumps(encode_event(event, "", self._origin)).encode() for event in events]
@@ -170,16 +176,18 @@ def read_own(reader: OwnReader, where: str, content: dict[str, object]) -> list[
 
 
 def _make_message(reader: OwnReader, reading: Reading, arrival: float) -> Message:
-    """Return the message of an event; where it arrived when it was measured, as far as is known, it says no arrival."""
+    """Return the message of an event; it has no arrival where that is the time of the measurement."""
     assert reading.time is not None
-    moments = [reading.time, *([] if arrival == reading.time else [arrival])]
-    said = [moment if reader.numbers else date_of(int(moment)) for moment in moments]
+    time = reading.time if reader.numbers else date_of(int(reading.time))
+    came = None
+    if arrival != reading.time:
+        came = arrival if reader.numbers else date_of(int(arrival))
     return Message.model_construct(
         plant=reading.plant,
         node=reading.node,
         sequence=reading.sequence,
-        time=said[0],
+        time=time,
         values=[None if value != value else value for value in reading.values.tolist()],
         inputs=None,
-        arrival=said[1] if len(said) > 1 else None,
+        arrival=came,
     )

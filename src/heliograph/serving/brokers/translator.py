@@ -53,7 +53,7 @@ class Translator:
     def read(
         self, topic: str, payload: bytes, arrival: datetime, stored: bool = False
     ) -> list[Message | UnreadMessage | str]:
-        """Return the messages in a payload of a topic, or the reason why it cannot be read; nothing of unknown topics.
+        """Return the messages in a payload of a topic, or the reason why it cannot be read; [] of unknown topics.
 
         Args:
             topic: the topic.
@@ -86,10 +86,9 @@ class Translator:
         return topic if all(field in header or field.split(".")[0] in header for field in fields) else None
 
     def decode(self, message: FileMessage, topic: str | None) -> list[Message | UnreadMessage | str]:
-        """Return the messages in a line or a row, or why it cannot be read; nothing of unknown topics.
+        """Return the messages in a line or a row, or why it cannot be read; [] of unknown topics.
 
-        What it says of its arrival is used; one that says nothing arrives when it was measured, and at the present at
-        the latest.
+        It arrived when it says so; else when it was measured, or now if that is later than now.
 
         Args:
             message: the line or the row.
@@ -123,7 +122,9 @@ class Translator:
     def _read_payload(
         self, topic: str, payload: object, arrival: datetime | None, stored: bool, repeatable: bool, where: str
     ) -> list[Message | UnreadMessage | str]:
-        """Read a payload: the readings that it has, or why one, or all of it, cannot be used.
+        """Return the messages in a payload, and for each reading that cannot be used the reason.
+
+        The reason is an UnreadMessage where node and count of the reading are known, else a text.
 
         Args:
             topic: where it came from.
@@ -135,9 +136,11 @@ class Translator:
         """
         results: list[Message | UnreadMessage | str] = []
         try:
+            # Who is online or offline is noted by the sources; such a message has no readings.
             if self.sources.hear(topic, payload, where):
                 return []
-            if not self.sources.of(topic):  # whatever it is
+            # Messages of unknown topics are counted, whatever they carry.
+            if not self.sources.of(topic):
                 self.sources.unknown[topic] += 1
                 return []
             content = _decode(payload, where)
@@ -169,7 +172,14 @@ class Translator:
             return why
 
     def _make_message(self, topic: str, reading: Reading, known: datetime | None, repeatable: bool) -> Message:
-        """Make the message of a reading, with the arrival that is known, else now, and a number if it has no count."""
+        """Return the message of a reading, with a number if it has no count.
+
+        Args:
+            topic: where it came from, for errors.
+            reading: what the sources read.
+            known: when it arrived; None if it is not known, and is taken to be now.
+            repeatable: whether a copy of it may come again.
+        """
         if len(reading.plant) > NAME or "\0" in reading.plant:
             raise fail(
                 f"{topic}, plant", f"a name of at most {NAME} characters, without NUL", show_value(reading.plant)
@@ -185,7 +195,7 @@ class Translator:
             if known is not None and (arrival - time) // MICROSECOND * 1000 > YEAR:
                 what = f"{topic}, time"
                 raise fail(what, f"a time that was set, near that of arrival, {arrival.isoformat()}", time.isoformat())
-            # What a log says; of what comes now only that it cannot have been measured later.
+            # A log's arrival is told; of what comes now, only that it cannot have been measured later than it came.
             came = arrival if time > arrival or (known is not None and not repeatable) else None
         sequence, name = reading.sequence, (reading.plant, reading.node)
         if sequence is None:
@@ -205,7 +215,7 @@ class Translator:
         )
 
     def _number_among_simultaneous(self, reading: Reading, repeatable: bool) -> int:
-        """Return the sequence number of a message without a count: how many of its node and time came before.
+        """Return the sequence number of a message without a count: how many of its node and time came before it.
 
         A copy of a message, which has the same values and may come where `repeatable`, gets the number of the message.
         """
@@ -233,7 +243,7 @@ def date_of(nanoseconds: int) -> datetime:
 
 
 def _decode(payload: object, where: str) -> object:
-    """Return the content of a payload; of a row what its columns say."""
+    """Return the content of a payload of JSON; what is read already, as a row's columns, as it is."""
     if not isinstance(payload, bytes | str):
         return payload
     if len(payload) > LONGEST:

@@ -79,7 +79,7 @@ def raise_if_cancelled() -> None:
 
 
 def explain_failure(error: BaseException | None) -> str:
-    """Return in words why there is no connection; no part of it is a password."""
+    """Return in words why there is no connection, in words that hold no password."""
     if isinstance(error, ssl.SSLCertVerificationError):
         return f"its certificate is not trusted: {error.verify_message}"
     if isinstance(error, ssl.SSLError):
@@ -128,7 +128,7 @@ def encode_name(plant: str) -> str:
 
 
 def topic_of(topic: str, output: Output) -> str:
-    """Return the topic of an output of the service at `topic`; of a message to a node the input of its service."""
+    """Return the topic of an output of the service at `topic`; of a message to a node, that node's input topic."""
     if output.kind == "message":
         return "/".join([*topic.split("/")[:-1], encode_name(output.to), "in", encode_name(output.plant)])
     return f"{topic}/out/{output.kind}/{encode_name(output.plant)}"
