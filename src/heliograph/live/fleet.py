@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from datetime import datetime
-from math import inf, nan
+from math import ceil, floor, inf, nan
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +14,7 @@ from heliograph.live.network_program import NetworkProgram
 from heliograph.live.plant import PlantState, Withdrawn
 from heliograph.live.pool import Pool, cut_into_legs, group_by_turn
 from heliograph.live.rows import BEFORE, HeldRow, Rows
-from heliograph.live.sender_status import LossChain, SenderStatus, make_sender_status
+from heliograph.live.sender_status import Sender, SenderStatus
 from heliograph.model.over_time import steps_covered
 from heliograph.model.stuck import Repeats
 from heliograph.numerics.check import TINY, check_count, fail, instance, scalar
@@ -90,22 +90,26 @@ class Fleet:
         self._names = [*network.names, INPUTS]
         self._joint = self.program.dt is None or network.common is not None
         self._limits = {name: node.limits for name, node in network.nodes.items() if node.limits is not None}
-        # Nodes whose sender decides when to send.
-        nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
-        deciding = {name: (node.trigger, node) for name, node in nodes.items() if node.trigger is not None}
         self.periods = dict[str, int]()  # after how many messages a node's count begins at 0 again, where it does
-        self.deciding = {
-            name: (trigger, LossChain.of_channel(node.channel)) for name, (trigger, node) in deciding.items()
-        }
+        # Nodes of which silence says something, and of these the ones whose sender decides when to send.
+        nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
+        senders = {name: Sender.of_node(node) for name, node in nodes.items()}
+        self.watched = {name: sender for name, sender in senders.items() if sender is not None}
+        self.deciding = {name: sender.trigger for name, sender in self.watched.items() if sender.trigger is not None}
         # By index of a node whose messages are numbered, so that losses are known: how many values come first.
         self._values_before_losses = {
             network.names.index(name): nodes[name].received - trigger.side_information(len(nodes[name].outputs))
-            for name, (trigger, _) in self.deciding.items()
+            for name, trigger in self.deciding.items()
             if trigger.losses == "numbered"
         }
         # A slot with the prior, for plants that have not begun.
         self._blank = self.pool.take()
         self.pool.write_prior(self._blank, -1.0)
+
+    @property
+    def shortest_timeout(self) -> float:
+        """Return the shortest timeout of a node, in steps or in the unit of continuous time; infinite where none is."""
+        return min((s.timeout for s in self.watched.values() if s.timeout is not None), default=inf)
 
     @property
     def rows_are_joint(self) -> bool:
@@ -120,7 +124,7 @@ class Fleet:
         self.pool.write_prior(slot, prior_time)
         base = HeldRow((prior_time, BEFORE, 0), slot, self.width)
         base.numbers[-1] = prior_time
-        return PlantState(name, self.make_rows(base), 0.0 if by_steps else time, origin)
+        return PlantState(name, self.make_rows(base), 0.0 if by_steps else time, origin, begun=time)
 
     def end(self, plant: PlantState) -> None:
         """Remove a plant and free its slots."""
@@ -185,7 +189,7 @@ class Fleet:
             return values
         if len(values) == outputs:
             values = values + [nan] * (size - outputs)
-        by_component = self.deciding[node][0].region == "each" and len(values) == size
+        by_component = self.deciding[node].region == "each" and len(values) == size
         if by_component and any(a == a and b != b for a, b in zip(values[:outputs], values[outputs:], strict=True)):
             expected = "behind each value how many of its component were lost since the last"
             raise fail(
@@ -333,17 +337,32 @@ class Fleet:
         """Return the outputs of the filters after the rows in these slots."""
         return self.pool.table[np.array(slots, dtype=int), self.pool.outputs]
 
-    def senders(self, plant: PlantState) -> dict[str, SenderStatus]:
-        """Return the status of each sender of a plant that decides when to send: what its silence means by now."""
+    def senders(self, plant: PlantState, now: float = -inf) -> dict[str, SenderStatus]:
+        """Return the status of each sender of a plant of which silence says something, by now.
+
+        `now`: a moment that a clock says; if it is before the newest arrival, or the newest silent row, that counts.
+        """
+        now = max(now, plant.now, -inf if plant.silence is None else plant.silence.key[0])
         # Steps before the watermark are final: no value may come for them any more.
-        watermark = max(plant.confirmed - self.options.window, -1.0)
-        final, now = int(np.ceil(watermark)) - 1, int(np.floor(min(plant.now, self.end_step)))
-        results = {}
-        for name, (trigger, losses) in self.deciding.items():
+        by_steps, watermark = self.program.dt is None, plant.confirmed - self.options.window
+        final = ceil(max(watermark, -1.0)) - 1 if by_steps else max(watermark, plant.begun)
+        now = floor(min(now, self.end_step)) if by_steps else now
+        statuses = {}
+        for name, sender in self.watched.items():
             link = plant.links.get(name)
-            last = int(link.latest) if link is not None and link.latest >= 0 else None
-            results[name] = make_sender_status(trigger, losses, last, final, now)
-        return results
+            last = None if link is None or not link.used else link.latest
+            if by_steps and last is not None:
+                last = int(last) if last >= 0 else None
+            statuses[name] = sender.status(last, plant.begun if sender.trigger is None else -1, final, now)
+        return statuses
+
+    def count(self, plant: PlantState, node: str, screened: ScreenedEvent, verdict: Verdict) -> None:
+        """Count an event of a node by its verdict, what was screened of it, and the silence before it."""
+        link, event, sender = plant.link(node), screened.event, self.watched.get(node)
+        if sender is not None and sender.timeout is not None and verdict == "used":
+            link.count_timeout(event.time, plant.begun, sender.timeout)
+        link.count(verdict, event.sequence, event.time, self.periods.get(node, 0))
+        link.count_screened(screened, verdict)
 
     def free_slots(self, finalised: Iterable[Finalised]) -> None:
         """Free the slots that are not needed any more, once the outputs of the final rows have been read."""

@@ -1,4 +1,4 @@
-"""Counts of a node's messages by verdict, and of those that its running count says were lost."""
+"""Counts of a node's messages by verdict, of those that its running count says were lost, and of long silences."""
 
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -51,6 +51,7 @@ class LinkCounts:
         latest: time of the newest measurement that was used; -1 before the first.
         stuck: single values that repeated for longer than their noise allows.
         repeats: newest readings, and how many in a row are equal to them, of a node that watches for it.
+        timeouts: silences longer than the timeout of the node that a message has ended, in order of arrival.
     """
 
     first: int = -1
@@ -66,7 +67,8 @@ class LinkCounts:
     dropped: int = 0
     latest: float = -1.0
     stuck: int = 0
-    repeats: Repeats = field(default_factory=Repeats)
+    repeats: "Repeats" = field(default_factory=Repeats)
+    timeouts: int = 0
 
     def __post_init__(self) -> None:
         """Take runs of equal readings as they were stored."""
@@ -78,6 +80,13 @@ class LinkCounts:
             self.dropped += screened.dropped
             self.stuck += screened.stuck
             self.repeats = screened.repeats
+
+    def count_timeout(self, time: float, begun: float, timeout: float) -> None:
+        """Count the silence that a message of `time` ends if it is longer than the timeout of its node.
+
+        `begun`: since when the node is silent that has not sent yet. It comes before `count` of the message.
+        """
+        self.timeouts += time - (self.latest if self.used else begun) > timeout
 
     def count(self, verdict: Verdict, sequence: int, time: float, period: int = 0) -> None:
         """Count one message. A late, implausible or future message was received too, so it fills a gap.
@@ -95,7 +104,7 @@ class LinkCounts:
         """Update `first`, `newest`, `at` and `lost` by a message's running count; None: it has no verdict."""
         sequence = self._unwrap_count(sequence, time, period)
         if verdict == "used":
-            self.latest = max(self.latest, time)
+            self.latest = time if self.used == 1 else max(self.latest, time)
             if sequence - 1 == self.newest >= 0 and time >= self.at:  # the next, as most are
                 self.newest, self.at = sequence, time
                 return

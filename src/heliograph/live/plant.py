@@ -68,6 +68,7 @@ class PlantState:
         kept: row before a leap, after which all rows held are; None where that is among them, or there is no leap.
         aside: what was taken back since the last finalisation, for `undo`.
         remarked: how often each filter's remark was said, by node and filter.
+        begun: time of the message with which it began, from which on a node may be silent.
     """
 
     name: str
@@ -84,6 +85,7 @@ class PlantState:
     kept: BeforeLeap | None = None
     aside: list[RowsOfLeap] = field(default_factory=list)
     remarked: dict[tuple[str, str], int] = field(default_factory=dict)
+    begun: float = 0.0
 
     @property
     def confirmed(self) -> float:

@@ -1,4 +1,4 @@
-"""Status of senders that decide when to send: which steps are silent, which not final, and which senders are dead."""
+"""Silence of senders: what of it is final, what is not, and which senders are dead, and why."""
 
 from typing import NamedTuple
 
@@ -8,6 +8,7 @@ from heliograph.model.channel import Channel
 from heliograph.model.over_time import first
 from heliograph.model.trigger import AbstractTrigger, Periodic
 from heliograph.random_affine.modes import joint_modes
+from heliograph.simulation.node import Node
 
 DEAD = 1e-3  # probability below which heartbeats are not lost one after another by chance
 
@@ -15,23 +16,36 @@ DEAD = 1e-3  # probability below which heartbeats are not lost one after another
 class SenderStatus(NamedTuple):
     """A sender by now.
 
-    last: the step of the newest value, None before the first. silent: steps since then that are final and at which
-    nothing came. provisional: later steps at which nothing came yet: a value may still be under way, and estimates
-    that take it for silence are made anew if one comes. missed: heartbeats that were due in the silent steps and did
-    not come; chance: the probability that the link lost them all. A sender is dead where that is below 1 in 1,000: its
-    value is unknown, not constant.
+    last: the step of the newest value, or its time where time is continuous; None before the first. silent: steps since
+    then that are final and at which nothing came, or the time. provisional: later ones at which nothing came yet: a
+    value may still be under way, and estimates that take it for silence are made anew if one comes. missed: heartbeats
+    that were due in the silent steps and did not come; chance: the probability that the link lost them all. timeout:
+    for how long nothing need come, None for any time. A sender is dead where that chance is below 1 in 1,000, or where
+    nothing came for longer than the timeout: its value is unknown, not constant.
     """
 
-    last: int | None
-    silent: int
-    provisional: int
+    last: float | None
+    silent: float
+    provisional: float
     missed: int
     chance: float
+    timeout: float | None = None
 
     @property
     def dead(self) -> bool:
-        """True if it misses its heartbeats, and not by chance."""
-        return self.missed > 0 and self.chance < DEAD
+        """True if it misses its heartbeats, and not by chance, or if it is silent for longer than its timeout."""
+        return bool(self.reason)
+
+    @property
+    def reason(self) -> str:
+        """Return why the sender is dead, in words; "" if it is not."""
+        if self.missed > 0 and self.chance < DEAD:
+            chance = f"by chance once in {1 / self.chance:,.0f}" if self.chance else "never by chance"
+            return f"{self.missed} heartbeats did not come, {chance}"
+        quiet = self.silent + self.provisional
+        if self.timeout is not None and quiet > self.timeout:
+            return f"nothing came for {quiet:g}, and its timeout is {self.timeout:g}"
+        return ""
 
 
 class LossChain(NamedTuple):
@@ -59,24 +73,41 @@ class LossChain(NamedTuple):
         return float((self.initial * self.loss @ np.linalg.matrix_power(moved * self.loss, count - 1)).sum())
 
 
-def make_sender_status(
-    trigger: AbstractTrigger, losses: LossChain, last: int | None, final: int, now: int
-) -> SenderStatus:
-    """Return a sender's status at the step `now`.
+class Sender(NamedTuple):
+    """What tells how long a node may be silent.
 
     Args:
-        trigger: its rule.
-        losses: losses of its link.
-        last: step of its newest value, None before the first.
-        final: the newest final step.
-        now: the present step.
+        trigger: when its sender transmits, if that decides; None of one that sends whatever it measures.
+        losses: of its link; None where there is no trigger.
+        timeout: for how long nothing need come; None for any time.
     """
-    heard = -1 if last is None else last
-    silent, provisional = max(final - heard, 0), max(now - max(final, heard), 0)
-    missed = count_missed_heartbeats(trigger, last, silent, final)
-    interval = 1 if trigger.heartbeat is None else int(trigger.heartbeat)
-    chance = losses.probability_all_lost(interval, missed)
-    return SenderStatus(last=last, silent=silent, provisional=provisional, missed=missed, chance=chance)
+
+    trigger: AbstractTrigger | None
+    losses: LossChain | None
+    timeout: float | None
+
+    @staticmethod
+    def of_node(node: Node) -> "Sender | None":
+        """Return the sender of a node; None of one that may be silent for any time."""
+        if node.trigger is None:
+            return None if node.timeout is None else Sender(None, None, node.timeout)
+        return Sender(node.trigger, LossChain.of_channel(node.channel), node.timeout)
+
+    def status(self, last: float | None, begun: float, final: float, now: float) -> SenderStatus:
+        """Return the status where the newest value is of `last`, the newest final moment `final` and the present `now`.
+
+        Before the first value the sender is silent since `begun`. All are steps where a trigger is, which begin at -1.
+        """
+        since = begun if last is None else last
+        silent, provisional = max(final - since, 0), max(now - max(final, since), 0)
+        if self.trigger is None or self.losses is None:
+            return SenderStatus(last, silent, provisional, 0, 1.0, self.timeout)
+        step = None if last is None else int(last)
+        missed = count_missed_heartbeats(self.trigger, step, int(silent), int(final))
+        apart = 1 if self.trigger.heartbeat is None else int(self.trigger.heartbeat)
+        return SenderStatus(
+            last, silent, provisional, missed, self.losses.probability_all_lost(apart, missed), self.timeout
+        )
 
 
 def count_missed_heartbeats(trigger: AbstractTrigger, last: int | None, silent: int, final: int) -> int:

@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import Judgement
 from heliograph.live.filter_stepper import NativeFilterStepper, XlaFilterStepper, compile_native_step, compile_xla_step
-from heliograph.live.sender_status import LossChain, SenderStatus, make_sender_status
+from heliograph.live.sender_status import LossChain, Sender, SenderStatus
 from heliograph.live.stored.old_layout import can_read, describe_old_layout, relocate_parts, split_by_path
 from heliograph.live.stored.snapshot import Identity, check_same, pack, unpack, versions
 from heliograph.model.channel import Channel
@@ -210,7 +210,7 @@ class Stream:
         if (sender := _sender_of(self.filter)) is None:
             raise fail("filter of a stream", "one of event_filter, whose sender decides", type(self.filter).__name__)
         last, now = None if self._last < 0 else self._last, self.steps - 1
-        return make_sender_status(sender.trigger, LossChain.of_channel(sender.channel), last, now, now)
+        return Sender(sender.trigger, LossChain.of_channel(sender.channel), None).status(last, -1, now, now)
 
     def save(self) -> bytes:
         """Return state and step number for `restore`: after it, the same pushes give the same bits."""

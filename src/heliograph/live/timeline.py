@@ -75,7 +75,8 @@ class Timeline:
     row.
 
     `counts` has the number of each verdict; `dropped` the number of single values beyond a node's limits, and `stuck`
-    of those that repeat for too long, which counted as not arrived; `reasons` says in words, by node, why the last
+    of those that repeat for too long, which counted as not arrived; `timeouts` that of silences longer than a node's
+    timeout, which `senders` names while they last; `reasons` says in words, by node, why the last
     implausible event was one; `forced` is the number of rows that became final early.
 
     Args:
@@ -154,6 +155,11 @@ class Timeline:
         """Return the number of single values of each node that repeated for longer than its noise allows."""
         return {name: self._plant.links.get(name, LinkCounts()).stuck for name in self.network.names}
 
+    @property
+    def timeouts(self) -> dict[str, int]:
+        """Return of each node how many silences were longer than its timeout, and ended; `senders` names others."""
+        return {name: self._plant.links.get(name, LinkCounts()).timeouts for name in self.network.names}
+
     def push(self, node: str, sequence: int, time: float, values: ArrayLike, arrival: float | None = None) -> Verdict:
         """Take what a node measured at `time`, which arrived at `arrival` (None: at once), and judge it.
 
@@ -178,9 +184,7 @@ class Timeline:
                 for _, line in (*self._angles.find_new([plant]), *self._remarks.find_new([plant])):
                     warnings.warn(f"timeline, {line}", stacklevel=2)
                 self._finalise()
-        link = plant.link(node)
-        link.count(verdict, event.sequence, event.time)
-        link.count_screened(screened, verdict)
+        self._fleet.count(plant, node, screened, verdict)
         return verdict
 
     def _why_implausible(self, event: Known, row: HeldRow) -> str | None:
@@ -224,13 +228,13 @@ class Timeline:
         return self._spare, float(now)
 
     def senders(self) -> dict[str, SenderStatus]:
-        """Return the status of each node's sender that decides when to send: what its silence means by now.
+        """Return what silence means by now, of each node with a sender that decides when to send, or with a timeout.
 
         Raises:
             ValueError: no such node.
         """
-        if not self._fleet.deciding:
-            raise fail("senders", "a node with a trigger", list(self.network.names))
+        if not self._fleet.watched:
+            raise fail("senders", "a node with a trigger or a timeout", list(self.network.names))
         return self._fleet.senders(self._plant)
 
     def _outputs_after(self, slots: int | list[int]) -> np.ndarray:

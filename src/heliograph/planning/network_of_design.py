@@ -103,8 +103,8 @@ def add_best_filter(plant: AnyPlant, node: Node, channel: Channel) -> Node:
     """
     filters = {BEST: linear_filter(plant, node.sensor, channel)}
     if node.limits is None or same(channel, node.channel):
-        return Node(node.sensor, channel, filters, node.limits)
-    return Node(node.sensor, channel, filters, invalid=node.limits.invalid)
+        return Node(node.sensor, channel, filters, node.limits, timeout=node.timeout)
+    return Node(node.sensor, channel, filters, invalid=node.limits.invalid, timeout=node.timeout)
 
 
 def _select_node(name: str, powers: Mapping[str, Float[np.ndarray, "steps"]], k: int) -> dict[str, float]:

@@ -7,6 +7,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from heliograph.model.plant import TIME_STEP
+from heliograph.model.timeouts import LongSilences, find_long_silences
 from heliograph.numerics.check import array, fail, instance
 from heliograph.numerics.shares import average_correlated
 from heliograph.numerics.types import ArrayLike, Float
@@ -82,11 +83,13 @@ class Health:
     off: Mapping[tuple[str, str], ConstantError] = field(default_factory=dict)  # by node and filter, where it says most
     apart: ConstantError | None = None  # of one node against the others, which filter by themselves
     possible: tuple[str, ...] = ()  # of estimates where no sensor shows a state any more, or at a limit
+    silences: Mapping[str, LongSilences] = field(default_factory=dict)  # by node that was silent past its timeout
     time_unit: str = ""  # that times are in another unit than the plant's, which explains what is doubtful
 
     def warnings(self) -> list[str]:
         """Return one line for each reason to doubt the network, the weightiest first."""
         lines = [*self.record.failures(), *self.held().values(), *self.possible]
+        lines += [f"{node}: {found.describe()}" for node, found in self.silences.items()]
         for link in self.links:
             name = f"{link.node}: {link.component}"
             if not link.arrived.any():
@@ -276,8 +279,10 @@ def examine(
         mean = float(np.nanmean(expected))
         filters.append(FilterHealth(node, name, claim, white, test, listener.trusted, declared, unit, mean))
     others = tuple(belief.words for belief in network.beliefs())
+    timeouts = {node: network.nodes[node].timeout for node in network.names}
+    silences = find_long_silences(timeouts, record.measurements, u, network.inputs)
     links, possible = list_arrivals(network, record.time, record.measurements), doubt_estimates(network, record)
-    health = Health(record, links, filters, outputs, network.shared, others, possible=possible)
+    health = Health(record, links, filters, outputs, network.shared, others, possible=possible, silences=silences)
     off = {(judged.node, judged.filter): _find_off(network, health, judged, u) for judged in health.doubted()}
     apart = None if health.held() else compare_nodes(network, record, u, FALSE)
     health = replace(health, off={place: error for place, error in off.items() if error is not None}, apart=apart)

@@ -7,6 +7,7 @@ import sys
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
+from math import inf
 from typing import Protocol
 
 from heliograph.live.fleet import Fleet
@@ -216,6 +217,8 @@ async def _serve_alone(settings: ServiceSettings, program: NetworkProgram, wrap:
             transport = _open_pipe(settings, reads) if broker is None else make_transport(broker, translator=reads)
             transport = _add_states(settings, transport)
             patience = None if step is None else max(step, SHORTEST)
+            if patience is None and fleet.shortest_timeout < inf:
+                patience = SHORTEST
             shown = wrap(service) if reads is None else LastWordsService(wrap(service), reads.sources.words, store)
             await serve_until(stop, WaitingService(shown, stop), transport, patience)
         finally:
@@ -297,7 +300,10 @@ async def _serve_shared(settings: ServiceSettings, program: NetworkProgram, wrap
         try:
             ahead = settings.forecast, settings.thresholds
             service = wrap(Service(Fleet(program, settings.options), store, _say, None, *ahead))
-            await serve_until(stop, WaitingService(service, stop), make_transport(broker, Part(number, parts)))
+            # A silent step is not used by processes that share plants; a timeout is told all the same.
+            patience = SHORTEST if fleet.shortest_timeout < inf and not fleet.deciding else None
+            transport = make_transport(broker, Part(number, parts))
+            await serve_until(stop, WaitingService(service, stop), transport, patience)
         finally:
             store.close()
 

@@ -140,9 +140,7 @@ class Using:
         verdict: Verdict = "implausible"
         if not why:
             verdict = self._give_to_plant(number, plant, event, given, brought.clock, message.node)
-        link = plant.link(message.node)
-        link.count(verdict, message.sequence, at, self.fleet.periods.get(message.node, 0))
-        link.count_screened(screened, verdict)
+        self.fleet.count(plant, message.node, screened, verdict)
         if screened.why and verdict == "used":
             notes.append(f"{screened.why}; the rest is used")
         return plant, verdict, why, notes

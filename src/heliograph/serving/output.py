@@ -69,23 +69,28 @@ class FilterOutput(BaseModel):
 
 
 class SenderOutput(BaseModel):
-    """Status of a sender that decides when to send, by the time of the newest arrival.
+    """Status of a sender that decides when to send, or of a node with a timeout, by the time of the newest arrival.
 
     Args:
-        last: step of its newest value; null before the first.
-        silent: steps since then that are final, at which it sent nothing or what it sent was lost.
-        provisional: later steps at which nothing came yet.
+        last: step of its newest value, or its time where time is continuous; null before the first.
+        silent: steps since then that are final, at which it sent nothing or what it sent was lost, or the time.
+        provisional: later ones at which nothing came yet.
         missed: heartbeats that were due in the silent steps and did not come.
         chance: probability that the link lost all of these.
-        dead: true where that is below 1 in 1,000: the value is unknown then, not constant.
+        timeout: for how long nothing need come; null for any time.
+        dead: true where that chance is below 1 in 1,000, or where nothing came for longer than the timeout: the value
+            is unknown then, not constant.
+        reason: why it is dead, in words; empty if it is not.
     """
 
-    last: int | None
-    silent: int
-    provisional: int
+    last: float | None
+    silent: float
+    provisional: float
     missed: int
     chance: float
+    timeout: float | None = None
     dead: bool
+    reason: str = ""
 
 
 class OutputAhead(BaseModel):
@@ -156,7 +161,7 @@ class Estimates(BaseModel):
         time: time of the row: steps, seconds or an ISO 8601 date.
         estimates: the filters' estimates by node and filter.
         forecast: of provisional ones, what is forecast at each horizon; left out unless asked for.
-        senders: of provisional ones, senders that decide when to send, by node; left out where there are none.
+        senders: of provisional ones, senders of which silence says something, by node; left out where there are none.
     """
 
     id: int | None = Field(
@@ -167,7 +172,7 @@ class Estimates(BaseModel):
     time: float | str
     estimates: dict[str, dict[str, FilterOutput]]
     forecast: list[Horizon] = Field([], description="Of provisional ones: what is ahead, where it is asked for.")
-    senders: dict[str, SenderOutput] = Field({}, description="Of provisional ones: senders that decide when to send.")
+    senders: dict[str, SenderOutput] = Field({}, description="Of provisional ones: what silence says, by node.")
 
 
 class Refused(BaseModel):

@@ -5,6 +5,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from itertools import repeat
+from math import inf
 from time import perf_counter
 from typing import NamedTuple
 
@@ -99,10 +100,13 @@ class Service:
         """Use messages, each a JSON object or read already, and commit; return the outputs to publish.
 
         Nothing in a message stops the service: a message that cannot be used is counted and refused, with the reason.
-        Without messages, time has passed: plants whose senders decide when to send are stepped to the present.
+        Without messages, time has passed: plants whose senders decide when to send are stepped to the present, and
+        senders that are silent for longer than their timeout are told.
         """
         with no_collector():  # a batch makes many objects and no cycles, and a search would take a third of its time
             outputs = self._take_batch(payloads) if payloads else self._take_silence(datetime.now(UTC))
+            if not payloads or self._silence.looks_between_batches(self.last.lag):
+                outputs += self._tell_timeouts(datetime.now(UTC))
             # What a large batch made counts as old, and is searched for garbage once in a million messages.
             if len(payloads) > LARGE:
                 gc.freeze()
@@ -114,13 +118,19 @@ class Service:
         return outputs
 
     def resume(self) -> None:
-        """Load the stored plants of a network with senders that decide, whose silence goes on."""
-        if self.fleet.deciding and self.fleet.options.step is not None:
+        """Load the stored plants of a network in which silence says something, which goes on."""
+        if (self.fleet.deciding and self.fleet.options.step is not None) or self.fleet.shortest_timeout < inf:
             names = self.store.names()
             for i in range(0, len(names), LARGE):
                 if self.fleet.pool.used < ROWS:
                     self._load(names[i : i + LARGE])
             self._silence.resume(self.plants)
+
+    def _tell_timeouts(self, now: datetime) -> list[Output]:
+        """Tell the estimates by now of plants of which a sender has timed out; nothing is committed."""
+        late = self._silence.overdue(self.plants.values(), now)
+        self.fleet.pass_silence(late)
+        return self._write_provisional([(plant, plant.silence) for plant, _ in late if plant.silence is not None])
 
     def _take_silence(self, now: datetime) -> list[Output]:
         """Advance the clock where no message came: commit what is final by it; silence is published, not committed."""
@@ -177,11 +187,11 @@ class Service:
         return outputs
 
     def dead_senders(self) -> dict[str, int]:
-        """Count, for each node whose sender decides when to send, the plants in memory of which that sender is dead.
+        """Count, for each node of which silence says something, the plants in memory of which its sender is dead.
 
-        Dead is one that was silent for longer than its rule allows.
+        Dead is one that was silent for longer than its rule, or its timeout, allows.
         """
-        dead = dict.fromkeys(self.fleet.deciding, 0)
+        dead = dict.fromkeys(self.fleet.watched, 0)
         for nodes in self.dead_by_plant().values():
             for node in nodes:
                 dead[node] += 1
@@ -337,8 +347,8 @@ class Service:
                 ahead = [{"time": self._time_in_messages(plant, time), "ahead": distance, "estimates": estimates}
                          for time, distance, estimates in horizons]  # fmt: skip
                 body = b'%b,"forecast":%b}' % (body[:-1], line(ahead))
-            if self.fleet.deciding:
-                senders = {name: status._asdict() | {"dead": status.dead}
+            if self.fleet.watched:
+                senders = {name: status._asdict() | {"dead": status.dead, "reason": status.reason}
                            for name, status in self.fleet.senders(plant).items()}  # fmt: skip
                 body = b'%b,"senders":%b}' % (body[:-1], line(senders))
             outputs.append(Output(None, plant.name, "provisional", body))

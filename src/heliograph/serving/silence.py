@@ -1,8 +1,8 @@
-"""Silence of senders that decide when to send: it follows from the last commit and the clock, and is not committed."""
+"""Silence of senders, told by the clock: it follows from the last commit, and is not committed."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import datetime, timedelta
-from math import inf
+from math import floor, inf
 from time import monotonic
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from heliograph.live.fleet import Fleet
 from heliograph.live.plant import PlantState
 from heliograph.live.rows import HeldRow
+from heliograph.serving.settings import SHORTEST
 
 MOVED = 0.1  # deviations by which a mean, and share by which a deviation has to move to be told
 GRACE = 10.0  # seconds after a start in which messages that waited come first
@@ -27,7 +28,7 @@ class Silence:
     """
 
     def __init__(self, fleet: Fleet, every: float | None):
-        self.fleet, self.every, self._begun = fleet, every, monotonic()
+        self.fleet, self.every, self._begun, self._looked = fleet, every, monotonic(), -inf
         self._told: dict[str, tuple[np.ndarray, tuple[str, ...], float]] = {}  # outputs, dead senders, step
         self._resumed = set[str]()
         n, places = len(fleet.network.states), fleet.program.places
@@ -43,20 +44,49 @@ class Silence:
         step, due = self.fleet.options.step, list[tuple[PlantState, float]]()
         if step is None or not self.fleet.deciding:
             return due
+        for plant, origin in self._dated(plants):
+            passed = min((now - origin) // timedelta(seconds=step), self.fleet.end_step)
+            leap = plant.leap  # which the clock confirms or contradicts
+            leaps = leap is not None and leap.now > -inf and not leap.believed
+            if passed > plant.confirmed and (leaps or passed > plant.rows.held[-1].key[0]):
+                due.append((plant, float(passed)))
+        return due
+
+    def overdue(self, plants: Iterable[PlantState], now: datetime) -> list[tuple[PlantState, float]]:
+        """Return the plants of which a sender has been silent for longer than its timeout since it was told last.
+
+        With the present moment by the clock: its step, or the time where time is continuous.
+        """
+        if self.fleet.shortest_timeout == inf:
+            return []
+        self._looked = monotonic()
+        step, found = self.fleet.options.step, list[tuple[PlantState, float]]()
+        for plant, origin in self._dated(plants):
+            at = (now - origin) / timedelta(seconds=step or 1.0)
+            at = at if step is None else min(floor(at), self.fleet.end_step)
+            if at > plant.now and set(self._dead_senders(plant, at)) - set(self._told_dead(plant)):
+                found.append((plant, float(at)))
+        return found
+
+    def looks_between_batches(self, lag: float) -> bool:
+        """Return whether to look for timeouts after a batch that came so many seconds late: once a second, if in time.
+
+        Where messages wait for longer than a timeout, a sender is silent since its messages wait.
+        """
+        in_time = lag < self.fleet.shortest_timeout * (self.fleet.options.step or 1.0) < inf
+        return in_time and monotonic() > self._looked + SHORTEST
+
+    def _dated(self, plants: Iterable[PlantState]) -> Iterator[tuple[PlantState, datetime]]:
+        """Yield the plants whose time is a date's, with their origins; not those of which messages may wait."""
         if self._resumed and monotonic() > self._begun + GRACE:
             self._resumed.clear()
         for plant in plants:
             if plant.origin is not None and plant.name not in self._resumed:
-                passed = min((now - plant.origin) // timedelta(seconds=step), self.fleet.end_step)
-                leap = plant.leap  # which the clock confirms or contradicts
-                leaps = leap is not None and leap.now > -inf and not leap.believed
-                if passed > plant.confirmed and (leaps or passed > plant.rows.held[-1].key[0]):
-                    due.append((plant, float(passed)))
-        return due
+                yield plant, plant.origin
 
     def note_published(self, rows: Sequence[tuple[PlantState, HeldRow]]) -> None:
         """Note that the estimates after these rows were published."""
-        if self.fleet.options.step is not None and self.fleet.deciding:
+        if self.fleet.watched:
             outputs = self.fleet.outputs([row.slot for _, row in rows])
             for (plant, row), output in zip(rows, outputs, strict=True):
                 self._told[plant.name] = output, self._dead_senders(plant), row.key[0]
@@ -84,15 +114,19 @@ class Silence:
         moved = np.abs(output[self._means] - told[0][self._means]) > MOVED * before
         return bool((moved | (np.abs(now - before) > MOVED * before)).any())
 
-    def _dead_senders(self, plant: PlantState) -> tuple[str, ...]:
-        """Return the dead senders of a plant."""
-        return tuple(name for name, status in self.fleet.senders(plant).items() if status.dead)
+    def _dead_senders(self, plant: PlantState, now: float = -inf) -> tuple[str, ...]:
+        """Return the dead senders of a plant, by now."""
+        return tuple(name for name, status in self.fleet.senders(plant, now).items() if status.dead)
+
+    def _told_dead(self, plant: PlantState) -> tuple[str, ...]:
+        """Return the senders of a plant that were told to be dead."""
+        return self._told[plant.name][1] if plant.name in self._told else ()
 
 
 def find_dead_senders(fleet: Fleet, plants: Mapping[str, PlantState]) -> dict[str, list[str]]:
     """Return the dead senders of each plant that has one."""
     dead = {
         name: [node for node, status in fleet.senders(plant).items() if status.dead]
-        for name, plant in (plants.items() if fleet.deciding else ())
+        for name, plant in (plants.items() if fleet.watched else ())
     }
     return {name: nodes for name, nodes in dead.items() if nodes}

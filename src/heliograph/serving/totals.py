@@ -6,7 +6,7 @@ from typing import Protocol
 
 from heliograph.live.event import VERDICTS
 
-COUNTS = (*VERDICTS, "dropped", "stuck")  # which never fall
+COUNTS = (*VERDICTS, "dropped", "stuck", "timeouts")  # which never fall
 FIELDS = (*COUNTS, "lost")
 
 
@@ -17,12 +17,14 @@ class LinkTotals(Protocol):
         lost: gaps in the node's running count.
         dropped: single values beyond limits.
         stuck: single values that repeated for too long.
+        timeouts: silences longer than the timeout that have ended.
         used, duplicate, conflict, late, future, implausible: numbers of messages by verdict.
     """
 
     lost: int
     dropped: int
     stuck: int
+    timeouts: int
     used: int
     duplicate: int
     conflict: int
@@ -34,7 +36,8 @@ class LinkTotals(Protocol):
 class Totals:
     """Sums of counts over plants, by node; a plant that leaves the memory takes nothing with it.
 
-    `by_node` has the counts of messages by verdict, of dropped and stuck values, and of lost messages, which may fall.
+    `by_node` has the counts of messages by verdict, of dropped and stuck values, of timeouts, and of
+    lost messages, which may fall.
     """
 
     def __init__(self) -> None:

@@ -39,6 +39,7 @@ from heliograph.simulation.claims import (
     nominal_nodes,
 )
 from heliograph.simulation.description.diagram import short_text_of, table_of, text_of
+from heliograph.simulation.flags import check_flags
 from heliograph.simulation.index import (
     Kind,
     Place,
@@ -55,7 +56,6 @@ from heliograph.simulation.node import (
     ReceivingNode,
     check_angles,
     check_filters,
-    check_flags,
     check_received,
     check_states,
     check_type,

@@ -1,16 +1,13 @@
 """Nodes of a network: a sensor, the channel of its signal, and the filters that receive it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Protocol
 
 import equinox as eqx
-import jax
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.event.event_filter import EventFilter
 from heliograph.filters.event.stochastic import StochasticEventFilter
-from heliograph.filters.modes.mode_observed import ModeObservedFilter
-from heliograph.filters.modes.side_information import SideInformationFilter
 from heliograph.filters.wrappers.fed_back import FedBackFilter
 from heliograph.fusion.rules import Fusion
 from heliograph.model.channel import Channel, check_sent
@@ -26,54 +23,15 @@ from heliograph.model.trigger import AbstractTrigger, Periodic
 from heliograph.model.words.encoder import Words
 from heliograph.model.words.route import FLAG, find_places
 from heliograph.numerics.angle import Angles
-from heliograph.numerics.check import fail, show_value, table
+from heliograph.numerics.check import TINY, fail, scalar, show_value, table
 from heliograph.numerics.frozen import FrozenMapping
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.base import AbstractRandomAffine, all_inner_maps
-from heliograph.random_affine.modes import ModeOutput, OneStepLate
 from heliograph.random_affine.words.flips import Flips
+from heliograph.simulation.flags import check_flags
 
 FUSED = "fused"  # the name under which results of several nodes stand
-NOW, LATE = "hg.model.with_flag(link)", "hg.model.with_flag(link, late=True)"
-
-
-def check_flags(name: str, filter: AbstractFilter, channels: Sequence[AbstractRandomAffine]) -> None:
-    """Refuse channels, one after another, whose flags are not those of the filter's model: its claim would be wrong.
-
-    Raises:
-        ValueError: a flag of another step; no flag where a filter uses the mode.
-    """
-    rows = [part for channel in channels for part in channel.in_parallel for _ in range(part.outputs)]
-    # Flags stand after the measurement; each comes from one row of the channels.
-    for reader in _find_flag_filters(filter):
-        if isinstance(reader, ModeObservedFilter):
-            sent, expected = first(reader.channel).outputs, LATE if reader.late else NOW
-            wrong = [row for row in rows[sent : reader.received] if not _reveals(row, reader.late)]
-        else:
-            expected = "hg.model.with_flag(link, flags)"
-            wrong = [row for row in rows[reader.received - 1 : reader.received] if isinstance(row, OneStepLate)]
-        if wrong:
-            late = isinstance(wrong[0], OneStepLate)
-            plain = "one of this step" if isinstance(wrong[0], ModeOutput) else f"{type(wrong[0]).__name__}, no mode"
-            raise fail(f"{name}, flags", f"those of {expected}", "one of the step before" if late else plain)
-
-
-def _find_flag_filters(filter: AbstractFilter) -> list[SideInformationFilter | ModeObservedFilter]:
-    """Return the filters that use flags, after the measurement in the received vector; also inside of others."""
-    kinds = SideInformationFilter, ModeObservedFilter
-    leaves = jax.tree.leaves(filter, is_leaf=lambda leaf: isinstance(leaf, kinds))
-    return [
-        leaf
-        for leaf in leaves
-        if isinstance(leaf, ModeObservedFilter) or (isinstance(leaf, SideInformationFilter) and leaf.flagged)
-    ]
-
-
-def _reveals(affine: AbstractRandomAffine, late: bool) -> bool:
-    if late:
-        return isinstance(affine, OneStepLate) and isinstance(affine.base, ModeOutput)
-    return isinstance(affine, ModeOutput)
 
 
 @readable
@@ -93,6 +51,8 @@ class Node(Module):
         stuck: after how many equal readings in a row one counts as not arrived, a number or one for each; True for
             what the sensor's noise and resolution make less than once in 10^9 readings; None (default) where readings
             may repeat. Counted and named, and claims are nominal, as with limits.
+        timeout: for how long nothing need come of a sensor that works, in steps, or in the unit of continuous time;
+            None (default) for any time. What is silent for longer is named and counted; no estimate depends on it.
         trigger: when the sender transmits, such as `SendOnDelta(0.5)`; at each step by default. The filter for it is
             `event_filter`; all others take what was not sent for missing.
         encoder: `Words` as which the sender sends what it measures; the channel is then one of words, and behind what
@@ -101,7 +61,8 @@ class Node(Module):
     Raises:
         ValueError: a sensor and a channel that do not fit; a filter with another number of values than arrive,
             or flags of another step than those that do; another filter of the measurement next to one that is fed back;
-            limits that are none; `stuck` of True without a resolution; a trigger that does not fit, or next to feedback
+            limits that are none; `stuck` of True without a resolution; a timeout that is not positive; a trigger that
+            does not fit, or next to feedback
             or a channel that is late; words that are amplified, or compared by a trigger with what a flipped bit or a
             dither lets the ends not share.
     """
@@ -110,6 +71,7 @@ class Node(Module):
     channel: Channel
     filters: dict[str, AbstractFilter]
     limits: Limits | None
+    timeout: float | None = eqx.field(static=True)
     trigger: AbstractTrigger | None
     encoder: Words | None
     received: int = eqx.field(static=True, init=False, repr=False)  # length of the measurement that reaches the filters
@@ -125,7 +87,9 @@ class Node(Module):
         trigger: "AbstractTrigger | None" = None,
         encoder: "Words | None" = None,
         stuck: "StuckLike" = None,
+        timeout: float | None = None,
     ):
+        self.timeout = None if timeout is None else float(scalar("timeout", timeout, TINY))
         self.trigger, self.encoder = trigger, encoder
         self.sensor, self.channel, self.filters = sensor, channel, table("filters of a node", filters, "filters")
         # Sensor, channel and filters fit.
@@ -208,6 +172,10 @@ class ReceivingNode(Module):
     @property
     def limits(self) -> None:
         """None: a network of relays has no limits."""
+
+    @property
+    def timeout(self) -> None:
+        """None: what comes from relays may be silent for any time."""
 
 
 @readable

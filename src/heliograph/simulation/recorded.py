@@ -17,6 +17,7 @@ from heliograph.model.limits import Limits
 from heliograph.model.origin import Origin, last_input, usual_months, usual_spacing
 from heliograph.model.plant import TIME_STEP
 from heliograph.model.stuck import Repeats
+from heliograph.model.timeouts import find_long_silences
 from heliograph.numerics.check import array, check_columns, fail, instance, rank, table
 from heliograph.numerics.float64 import check_process, quickly_compiled, to_numpy
 from heliograph.numerics.times.row_times import check_times
@@ -64,7 +65,8 @@ def run(
 
     Values beyond a node's limits, those that are stuck, and those that are implausible for all filters of a node
     (`heliograph.filters.plausibility`), count as not arrived; each is warned of, with its rows from 1.
-    A value that the rule of its sender forbids is warned of and used. Filters that left out most of what arrived,
+    A value that the rule of its sender forbids is warned of and used, and a node is warned of that is silent for longer
+    than its timeout. Filters that left out most of what arrived,
     such as one with a gate about a wrong start, are warned of, and an extended filter that ends where no sensor shows
     a state any more, or a filter with limits that lies at one in most rows.
 
@@ -111,7 +113,7 @@ def run(
     warn_of_unequal_steps(network.inputs, known)
     clock = np.arange(steps, dtype=np.float64) if known is None else known
     refuse_shared_dithers(network, z)
-    z, said = _screen_measurements(network, z)
+    z, said = _screen_measurements(network, z, u)
     for line in (*said, *warn_beyond_a_turn(network, z)):
         warnings.warn(line, stacklevel=2)
     # Filters, on what a recording without implausible data has.
@@ -154,10 +156,13 @@ def _find_clock(
     return common_dates({**{f"measurements of node {name!r}": z for name, z in measured.items()}, **others})
 
 
-def _screen_measurements(network: Network, z: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], list[str]]:
+def _screen_measurements(
+    network: Network, z: dict[str, np.ndarray], u: np.ndarray
+) -> tuple[dict[str, np.ndarray], list[str]]:
     """Drop values that are beyond their node's limits, or stuck; return the others.
 
-    Return also a line on those of each node, and on values that the rule of their sender forbids, which stay.
+    Return also a line on those of each node, and on values that the rule of their sender forbids, which stay,
+    and on silences that are longer than its timeout.
     """
     kept, said = dict[str, np.ndarray](), list[str]()
     for name, node in network.nodes.items():
@@ -168,6 +173,9 @@ def _screen_measurements(network: Network, z: dict[str, np.ndarray]) -> tuple[di
                 "within delta of the value before, and no heartbeat due"
             )
         said += [f"node {name!r}: {line}" for line in lines]
+    timeouts = {name: node.timeout for name, node in network.nodes.items()}
+    silences = find_long_silences(timeouts, kept, u, network.inputs)
+    said += [f"node {name!r}: {found.describe()}" for name, found in silences.items()]
     return kept, said
 
 

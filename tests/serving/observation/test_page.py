@@ -215,8 +215,16 @@ async def drawn(url: str) -> str:
 
 
 SENDERS = {
-    "node 1": {"last": 290, "silent": 5, "provisional": 4, "missed": 0, "chance": 1.0, "dead": False},
-    "node 2": {"last": 3, "silent": 292, "provisional": 4, "missed": 9, "chance": 1e-5, "dead": True},
+    "node 1": {"last": 290, "silent": 5, "provisional": 4, "missed": 0, "chance": 1.0, "dead": False, "reason": ""},
+    "node 2": {
+        "last": 3,
+        "silent": 292,
+        "provisional": 4,
+        "missed": 9,
+        "chance": 1e-5,
+        "dead": True,
+        "reason": "9 heartbeats did not come, by chance once in 100,000",
+    },
 }
 
 

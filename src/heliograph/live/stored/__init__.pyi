@@ -1,8 +1,8 @@
 """Names that other folders take; the package loads them when first used."""
 
-from .migration import PlantMigration as PlantMigration
 from .migration import DESCRIPTION as DESCRIPTION
 from .migration import LISTED as LISTED
+from .migration import PlantMigration as PlantMigration
 from .migration import SAME as SAME
 from .migration import describe_network as describe_network
 from .migration import list_changes as list_changes

@@ -19,6 +19,7 @@ HEAD = struct.Struct("<4q")  # lengths: of the head in bytes, of rows, of events
 TYPES = ("<i8", "<i8", "<f8", "<f8", "<f8")  # of the parts after the head
 TABLE = 2  # number of the table among them
 BEFORE_LEAP = "before a leap"  # in the head: the arrival before a leap if the first row is the one kept from before it
+BEGUN = "begun"  # in the head: when the plant began; absent until version 0.4.0
 KEPT = "kept"  # in the head: how many numbers of the table are there, behind a bit for each; all, where it is absent
 
 
@@ -71,6 +72,7 @@ def pack_plant(plant: PlantState, fleet: Fleet) -> bytes:
         {
             "now": plant.now,
             "forced": plant.forced,
+            BEGUN: plant.begun,
             "origin": origin,
             "links": links,
             "leap": None if plant.leap is None else _pack_leap(plant.leap),
@@ -129,7 +131,9 @@ def unpack_plant(name: str, data: bytes, fleet: Fleet) -> PlantState:
     links = {node: LinkCounts(*numbers) for node, numbers in head["links"].items()}
     origin = head["origin"] and datetime.fromisoformat(head["origin"])
     leap = None if head["leap"] is None else _unpack_leap(head["leap"])
-    return PlantState(name, held, head["now"], origin, forced=head["forced"], links=links, leap=leap, kept=kept)
+    begun = head.get(BEGUN, max(rows[0].key[0], 0.0))
+    state = {"forced": head["forced"], "links": links, "leap": leap, "kept": kept, "begun": begun}
+    return PlantState(name, held, head["now"], origin, **state)
 
 
 def _pack_leap(leap: Leap) -> dict[str, Any]:

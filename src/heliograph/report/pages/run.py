@@ -349,8 +349,11 @@ def _make_links_section(health: Health, drawings: Mapping[str, bytes]) -> list[T
         known = "may be lost" if link.may_be_lost else "never lost"
         name = visible(f"{link.node}: {link.component}")
         gap = "–" if link.due is None else str(link.longest_gap)
-        rows.append([name, link.due_in, _format_share(link, "{:.1%}", "–"), gap, known, mean, deviation])
-    headers = ["received", "due", "arrived", "longest gap", "the network says", "mean", "std. deviation"]
+        quiet = health.silences.get(link.node)
+        past = ["–" if quiet is None else f"{len(quiet.rows)}, up to {quiet.lengths.max():g}"] * bool(health.silences)
+        rows.append([name, link.due_in, _format_share(link, "{:.1%}", "–"), gap, *past, known, mean, deviation])
+    past = ["past its timeout"] * bool(health.silences)
+    headers = ["received", "due", "arrived", "longest gap", *past, "the network says", "mean", "std. deviation"]
     unit = health.record.units.get("time", "s" if health.record.time.dtype.kind == "M" else "the unit of time")
     slower = (
         f"**Due**: a sender that is slower than the rows is due at its own regular intervals (in {unit}), declared or "

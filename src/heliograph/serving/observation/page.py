@@ -93,13 +93,15 @@ def _collect_passing(watch: Watch) -> Metric:
 
 
 def _collect_links(watch: Watch) -> Iterable[Metric]:
-    """Return the metrics of the nodes' messages: by verdict, lost, and values beyond limits."""
+    """Return the metrics of the nodes' messages: by verdict, lost, values beyond limits or stuck, and timeouts."""
     messages = CounterMetricFamily("heliograph_messages", "Messages by node and verdict.", labels=["node", "verdict"])
     lost = GaugeMetricFamily("heliograph_lost", "Gaps in a node's sequence numbers, now.", labels=["node"])
     what = "Values beyond a node's limits, or codes, which count as not arrived."
     dropped = CounterMetricFamily("heliograph_dropped", what, labels=["node"])
     why = "Values that repeat for longer than their noise allows, which count as not arrived."
     stuck = CounterMetricFamily("heliograph_stuck", why, labels=["node"])
+    quiet = "Silences longer than a node's timeout that have ended; heliograph_dead_senders has those that last."
+    timeouts = CounterMetricFamily("heliograph_timeouts", quiet, labels=["node"])
     for node, tally in watch.links().items():
         for verdict in VERDICTS:
             messages.add_metric([node, verdict], tally[verdict] or 0)
@@ -107,12 +109,13 @@ def _collect_links(watch: Watch) -> Iterable[Metric]:
             lost.add_metric([node], tally["lost"])
         dropped.add_metric([node], tally["dropped"] or 0)
         stuck.add_metric([node], tally["stuck"] or 0)
-    return messages, lost, dropped, stuck
+        timeouts.add_metric([node], tally["timeouts"] or 0)
+    return messages, lost, dropped, stuck, timeouts
 
 
 def _collect_dead_senders(watch: Watch) -> Metric:
     """Return the metric of the dead senders, by node."""
-    what = "Plants in memory whose sender at a node misses its heartbeats, and not by chance."
+    what = "Plants in memory whose sender at a node misses its heartbeats, and not by chance, or is past its timeout."
     dead = GaugeMetricFamily("heliograph_dead_senders", what, labels=["node"])
     for node, count in watch.dead_senders().items():
         dead.add_metric([node], count)

@@ -13,7 +13,6 @@ from pydantic_core import from_json
 
 from heliograph.disk.quoting import join_names
 from heliograph.fusion.rules import Fusion
-from heliograph.live.event import VERDICTS
 from heliograph.model.estimate import Claim
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.types import unit_of, units_in
@@ -23,7 +22,7 @@ from heliograph.serving.observation.overview import Overview, Wrong
 from heliograph.serving.observation.running_nis import MEMORY, RunningNis, read_nis
 from heliograph.serving.observed_service import ObservedService, Serves, Taken, WatchedPlant
 from heliograph.serving.output import Output
-from heliograph.serving.totals import Totals
+from heliograph.serving.totals import FIELDS, Totals
 from heliograph.simulation.network import Network
 
 T = TypeVar("T")
@@ -43,6 +42,7 @@ COUNTED = {  # of a node's messages
     "implausible": "implausible and refused; the refused lines say why",
     "dropped": "beyond its limits, or codes, counted as not arrived",
     "stuck": "equal for longer than its noise allows, counted as not arrived: it is stuck",
+    "timeouts": "silences that were longer than its timeout, and ended",
     "conflict": "came again with other values; the first stayed",
 }
 
@@ -328,8 +328,7 @@ class Watch:
                 yield f"{node}/{filter_name}: {doubt}"
         for node, sender in senders.items():
             if sender["dead"]:
-                chance = f"by chance once in {1 / sender['chance']:,.0f}" if sender["chance"] else "never by chance"
-                yield f"{node}: its sender is dead: {sender['missed']} heartbeats did not come, {chance}"
+                yield f"{node}: its sender is dead: {sender['reason']}"
         for name, words in COUNTED.items():
             of = sorted(node for node in links if links[node][name])
             # A line for each node, or one for many.
@@ -367,7 +366,7 @@ def _add_counts(plants: Sequence[WatchedPlant]) -> dict[str, dict[str, int]]:
     results: dict[str, dict[str, int]] = {}
     for plant in plants:
         for node, link in plant.links.items():
-            tally = results.setdefault(node, dict.fromkeys((*VERDICTS, "lost", "dropped", "stuck"), 0))
+            tally = results.setdefault(node, dict.fromkeys(FIELDS, 0))
             for name in tally:
                 tally[name] += getattr(link, name)
     return results

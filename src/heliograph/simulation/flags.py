@@ -1,0 +1,53 @@
+"""Flags of channels beside a measurement, which tell their modes: those that a filter's model has, and no others."""
+
+from collections.abc import Sequence
+
+import jax
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.modes.mode_observed import ModeObservedFilter
+from heliograph.filters.modes.side_information import SideInformationFilter
+from heliograph.model.over_time import first
+from heliograph.numerics.check import fail
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.modes import ModeOutput, OneStepLate
+
+NOW, LATE = "hg.model.with_flag(link)", "hg.model.with_flag(link, late=True)"
+
+
+def check_flags(name: str, filter: AbstractFilter, channels: Sequence[AbstractRandomAffine]) -> None:
+    """Refuse channels, one after another, whose flags are not those of the filter's model: its claim would be wrong.
+
+    Raises:
+        ValueError: a flag of another step; no flag where a filter uses the mode.
+    """
+    rows = [part for channel in channels for part in channel.in_parallel for _ in range(part.outputs)]
+    # Flags stand after the measurement; each comes from one row of the channels.
+    for reader in _find_flag_filters(filter):
+        if isinstance(reader, ModeObservedFilter):
+            sent, expected = first(reader.channel).outputs, LATE if reader.late else NOW
+            wrong = [row for row in rows[sent : reader.received] if not _reveals(row, reader.late)]
+        else:
+            expected = "hg.model.with_flag(link, flags)"
+            wrong = [row for row in rows[reader.received - 1 : reader.received] if isinstance(row, OneStepLate)]
+        if wrong:
+            late = isinstance(wrong[0], OneStepLate)
+            plain = "one of this step" if isinstance(wrong[0], ModeOutput) else f"{type(wrong[0]).__name__}, no mode"
+            raise fail(f"{name}, flags", f"those of {expected}", "one of the step before" if late else plain)
+
+
+def _find_flag_filters(filter: AbstractFilter) -> list[SideInformationFilter | ModeObservedFilter]:
+    """Return the filters that use flags, after the measurement in the received vector; also inside of others."""
+    kinds = SideInformationFilter, ModeObservedFilter
+    leaves = jax.tree.leaves(filter, is_leaf=lambda leaf: isinstance(leaf, kinds))
+    return [
+        leaf
+        for leaf in leaves
+        if isinstance(leaf, ModeObservedFilter) or (isinstance(leaf, SideInformationFilter) and leaf.flagged)
+    ]
+
+
+def _reveals(affine: AbstractRandomAffine, late: bool) -> bool:
+    if late:
+        return isinstance(affine, OneStepLate) and isinstance(affine.base, ModeOutput)
+    return isinstance(affine, ModeOutput)
