@@ -22,7 +22,8 @@ import heliograph as hg
 from heliograph.engine.choice import choose_code
 from heliograph.learning.description import Build, describe
 from heliograph.learning.intervals import Method, long_run, quantile, sandwich
-from heliograph.learning.likelihood.objective import Evaluation, Form, Objective, evaluate_recording, make_objectives
+from heliograph.learning.likelihood.evaluation import Evaluation, evaluate_recording
+from heliograph.learning.likelihood.objective import Form, Objective, make_objectives
 from heliograph.learning.likelihood.surface import DIFFERENCE
 from heliograph.learning.likelihood.transforms import unlink
 from heliograph.learning.likelihood.trust_region import NEAR, Evaluated, maximise

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import choose_code
-from heliograph.filters.recursion import FilterRows, Recursion, end_of_rows, linear_start, scan_chunk
+from heliograph.filters.recursion import FilterRows, Recursion, end_of_rows, linear_start, scan_chunk, sum_chunk
 from heliograph.filters.settled import (
     CompleteRows,
     Settled,
@@ -30,6 +30,7 @@ from heliograph.filters.settled import (
     find_settled,
     repeat_state,
     scan_settled,
+    sum_settled,
 )
 from heliograph.filters.states import agree, beside_gaussians, means_of, with_gaussians
 from heliograph.numerics.types import Array, Bool, Int, PyTree
@@ -75,6 +76,11 @@ class Begun(NamedTuple):
     complete: CompleteRows
 
 
+def is_long(total: int) -> bool:
+    """Test whether rows are enough to be divided into chunks."""
+    return total >= CHUNKS * LADDER[0].chunk
+
+
 def filter_in_chunks(filter: Any, z: Array, u: Array, output: Callable[..., PyTree]) -> Pass | None:
     """Filter rows in chunks side by side; None where rows are few, or the filter is not linear or forgets too late.
 
@@ -88,11 +94,30 @@ def filter_in_chunks(filter: Any, z: Array, u: Array, output: Callable[..., PyTr
     return None if start is None else scan_in_chunks(FilterRows(filter, output), start, (np.asarray(z), np.asarray(u)))
 
 
+def sum_filtered_in_chunks(filter: Any, z: Array, u: Array, output: Callable[..., PyTree]) -> PyTree | None:
+    """Filter rows as `filter_in_chunks` does; return sums over all rows of what is kept of each, or None."""
+    start = linear_start(filter)
+    if start is None:
+        return None
+    whole = sum_in_chunks(FilterRows(filter, output), start, (np.asarray(z), np.asarray(u)))
+    return None if whole is None else jax.tree.map(lambda leaf: leaf.sum(axis=0), whole.outputs)
+
+
 def scan_in_chunks(recursion: Recursion, start: PyTree, rows: PyTree) -> Pass | None:
     """Step a recursion over rows in chunks side by side; None where rows are few, or it forgets too late."""
     with jax.enable_x64(True):
-        begun = begin_chunks(recursion, start, rows)
-        return None if begun is None else _scan_all(recursion, begun, rows)
+        whole = _scan_all(recursion, start, rows, OF_ROWS)
+    if whole is None:
+        return None
+    total = len(jax.tree.leaves(rows)[0])
+    joined = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:total], whole.outputs)
+    return Pass(whole.last, joined)
+
+
+def sum_in_chunks(recursion: Recursion, start: PyTree, rows: PyTree) -> Pass | None:
+    """Step a recursion over rows as `scan_in_chunks` does; outputs are sums over each chunk (chunks, ...)."""
+    with jax.enable_x64(True):
+        return _scan_all(recursion, start, rows, OF_SUMS)
 
 
 def begin_chunks(recursion: Recursion, start: PyTree, rows: PyTree) -> Begun | None:
@@ -195,7 +220,8 @@ def _is_forgotten(reach: Reach, starts: PyTree, first: Int[np.ndarray, " chunks"
     if once is None:
         return None
     twice = reach.states_before(probes, early, begun=True)
-    return bool(np.mean(agree(once, twice)) > 0.5)
+    among = jax.tree.map(lambda *leaves: np.concatenate(leaves), take(starts, slice(0, 1)), twice)
+    return bool(np.mean(agree(once, twice, among=among)) > 0.5)
 
 
 def _with_moments_before_data(recursion: Recursion, start: PyTree, rows: PyTree, ahead: int) -> PyTree | None:
@@ -214,34 +240,48 @@ def _with_moments_before_data(recursion: Recursion, start: PyTree, rows: PyTree,
     return with_gaussians(joined, repeat_state(start, BLOCKS * len(parts)))
 
 
-def _scan_all(recursion: Recursion, begun: Begun, rows: PyTree) -> Pass | None:
+class Programs(NamedTuple):
+    """How a chunk is scanned: in full, or settled by its means alone, and then what is kept of all chunks."""
+
+    full: Callable[..., Any]
+    settled: Callable[..., Any]
+    complete: Callable[[Settled, PyTree], PyTree]
+
+
+OF_ROWS = Programs(scan_chunk, scan_settled, Settled.rows_of)
+OF_SUMS = Programs(sum_chunk, sum_settled, lambda settled, sums: sums)
+
+
+def _scan_all(recursion: Recursion, start: PyTree, rows: PyTree, programs: Programs) -> Pass | None:
     """Filter all chunks side by side, each from the state with which it is thought to begin.
 
-    Those of which the chunk before ends in another state are filtered again, in their order. None without native code.
+    Those of which the chunk before ends in another state are filtered again, in their order. Outputs are by chunk
+    (chunks, ...). None where rows are few, where they forget too late, and without native code.
     """
-    length, total = begun.lengths.chunk, len(jax.tree.leaves(rows)[0])
-    split = take_windows(rows, begun.first, length)
+    begun = begin_chunks(recursion, start, rows)
+    if begun is None:
+        return None
+    total, split = len(jax.tree.leaves(rows)[0]), take_windows(rows, begun.first, begun.lengths.chunk)
 
     def scan(states: PyTree, which: Which) -> PyTree:
         arguments = recursion, states, take(split, which), begun.first[which], np.asarray(total)
-        choice = choose_code(scan_chunk, arguments, [False, True, True, True, False])
+        choice = choose_code(programs.full, arguments, [False, True, True, True, False])
         return None if choice.code is None else choice.results()
 
     def scan_means(settled: Settled) -> PyTree:
         arguments = recursion, settled, means_of(begun.states), split, begun.first, np.asarray(total)
-        choice = choose_code(scan_settled, arguments, [False, False, True, True, True, False])
+        choice = choose_code(programs.settled, arguments, [False, False, True, True, True, False])
         if choice.code is None:
             return None
-        means, varying = choice.results()
-        return settled.repeated(means), settled.rows_of(varying)
+        means, kept = choice.results()
+        return settled.repeated(means), programs.complete(settled, kept)
 
     results = scan_chunks(begun, scan, scan_means)
     if results is None:
         return None
-    last, outputs = results
     mend_chunks(scan, begun.states, lambda results: results[0], results)
-    joined = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:total], outputs)
-    return Pass(jax.tree.map(lambda leaf: leaf[-1, ...], last), joined)
+    last, outputs = results
+    return Pass(jax.tree.map(lambda leaf: leaf[-1, ...], last), outputs)
 
 
 def scan_chunks(
@@ -275,14 +315,14 @@ def mend_chunks(
         results: of all chunks, (chunks, ...).
     """
     ends = ends_of(results)
-    wrong = ~agree(take(ends, slice(None, -1)), take(begun, slice(1, None)))
+    wrong = ~agree(take(ends, slice(None, -1)), take(begun, slice(1, None)), among=begun)
     for c in range(1, len(wrong) + 1):
         if not wrong[c - 1]:
             continue
         here = slice(c, c + 1)
         replace_chunk(results, here, scan(take(ends, slice(c - 1, c)), here))
         if c < len(wrong):
-            wrong[c] = not agree(take(ends, here), take(begun, slice(c + 1, c + 2)))[0]
+            wrong[c] = not agree(take(ends, here), take(begun, slice(c + 1, c + 2)), among=begun)[0]
 
 
 def replace_chunk(results: PyTree, here: Which, again: PyTree) -> None:

@@ -56,6 +56,31 @@ def scan_chunk(recursion: Recursion, state: PyTree, rows: PyTree, first: Array, 
     return jax.lax.scan(body, jax.tree.map(jnp.asarray, state), (rows, number_rows(rows, first)))
 
 
+def sum_chunk(recursion: Recursion, state: PyTree, rows: PyTree, first: Array, count: Array) -> tuple[PyTree, PyTree]:
+    """Scan rows as `scan_chunk` does, and return the sums over rows of what is kept of each."""
+
+    def step(state: PyTree, data: PyTree, k: Array) -> tuple[PyTree, PyTree]:
+        return recursion.step(state, data, k)
+
+    return sum_rows(step, jax.tree.map(jnp.asarray, state), rows, first, count)
+
+
+def sum_rows(
+    step: Callable[..., tuple[PyTree, PyTree]], state: PyTree, rows: PyTree, first: Array, count: Array
+) -> tuple[PyTree, PyTree]:
+    """Step over rows from number `first` on, before row `count`: the last state, and the sums of what steps return."""
+
+    def body(now: tuple[PyTree, PyTree], row: tuple[PyTree, Array]) -> tuple[tuple[PyTree, PyTree], None]:
+        (state, sums), (data, k) = now, row
+        after, output = step(state, data, k)
+        return select_state(k < count, (after, jax.tree.map(jnp.add, sums, output)), now), None
+
+    numbers = number_rows(rows, first)
+    shapes = jax.eval_shape(lambda: step(state, jax.tree.map(lambda leaf: leaf[0], rows), numbers[0])[1])
+    none = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    return jax.lax.scan(body, (state, none), (rows, numbers))[0]
+
+
 def end_of_rows(recursion: Recursion, state: PyTree, rows: PyTree, first: Array) -> PyTree:
     """Return the state after some rows alone."""
 

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import choose_code
-from heliograph.filters.recursion import Recursion, number_rows
+from heliograph.filters.recursion import Recursion, number_rows, sum_rows
 from heliograph.filters.states import ROUNDING, agree, means_of, select_state, with_means
 from heliograph.numerics.process.equal_rows import repeat_row
 from heliograph.numerics.types import Array, Bool, Int, PyTree
@@ -155,6 +155,18 @@ def scan_settled(
         return select_state(k < count, means_of(after), means), settled.varying_of(outputs)
 
     return jax.lax.scan(body, [jnp.asarray(mean) for mean in means], (rows, number_rows(rows, first)))
+
+
+def sum_settled(
+    recursion: Recursion, settled: Settled, means: Sequence[Array], rows: PyTree, first: Array, count: Array
+) -> tuple[list[jax.Array], PyTree]:
+    """Scan complete rows as `scan_settled` does; return the last means, and sums of all that is kept of a row."""
+
+    def step(means: list[jax.Array], data: PyTree, k: Array) -> tuple[list[jax.Array], PyTree]:
+        after, outputs = step_settled(recursion, settled.state, means, data, k)
+        return means_of(after), outputs
+
+    return sum_rows(step, [jnp.asarray(mean) for mean in means], rows, first, count)
 
 
 def end_of_settled_rows(

@@ -1,7 +1,12 @@
-"""States of linear filters: Gaussians, whose means depend on data, and what no data change; when two are the same."""
+"""States of linear filters: Gaussians, whose means depend on data, and what no data change; when two are the same.
 
-from collections.abc import Sequence
-from typing import Any
+A state may hold the derivatives of a Gaussian behind it, in some numbers of a model. With the closed loop
+L = F (I - K H) an error of the mean falls as L^k, and its derivative as sum_j L^(k - j) L' L^(j - 1), by the same rate
+beside a factor of k: what forgets how it began also forgets how its derivatives did, some rows later.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,21 +20,52 @@ ROUNDINGS = 16  # of a number, by which two ways to it differ; of means a millio
 ROUNDING = ROUNDINGS * float(np.finfo(np.float64).eps)
 
 
-def agree(states: PyTree, others: PyTree, tolerance: float = TOLERANCE) -> Bool[np.ndarray, " n"]:
+class Slopes(NamedTuple):
+    """Derivatives of the Gaussian before them in a state, in one number: of its mean (n,) and covariance (n, n)."""
+
+    mean: jax.Array
+    covariance: jax.Array
+
+
+def agree(
+    states: PyTree, others: PyTree, tolerance: float = TOLERANCE, among: PyTree | None = None
+) -> Bool[np.ndarray, " n"]:
     """Test whether states (n, ...) are the same to a share of a deviation, and to some roundings of each number.
 
-    Those of a mean that is far from zero enter all others, by the innovations.
+    Those of a mean that is far from zero enter all others, by the innovations. Derivatives are measured by the
+    deviations of their Gaussian as well, and as shares of the largest such derivative in the same number: of those
+    `among` which they are, or of the others.
     """
     pairs = [(a, b, np.zeros(())) for a, b in zip(*map(_leaves_beside, (states, others)), strict=True)]
-    for x, y in zip(gaussians_of(states), gaussians_of(others), strict=True):
+    sizes = _size_slopes(others if among is None else among)
+    for x, y in zip(*map(_moving_parts, (states, others)), strict=True):
+        if isinstance(y, Gaussian):
+            deviation, outer = _deviations(y)
+            ratio = np.abs(y.mean) / np.where(deviation > 0, deviation, np.inf)
+            far = np.max(ratio, axis=-1, keepdims=True, initial=0.0)
+        size = 1.0 if isinstance(y, Gaussian) else next(sizes)
         p, q = np.asarray(x.covariance), np.asarray(y.covariance)
-        deviation = np.sqrt(np.diagonal(q, axis1=-2, axis2=-1))
-        outer = deviation[..., :, None] * deviation[..., None, :]
-        far = np.max(np.abs(y.mean) / np.where(deviation > 0, deviation, np.inf), axis=-1, keepdims=True, initial=0.0)
-        pairs += [(x.mean, y.mean, (tolerance + ROUNDING * far) * deviation), (p, q, tolerance * outer)]
+        pairs += [(x.mean, y.mean, size * (tolerance + ROUNDING * far) * deviation), (p, q, size * tolerance * outer)]
     near = [_are_near(*pair).reshape(len(pair[0]), -1).all(axis=1) for pair in pairs]
     result: np.ndarray = np.all(near, axis=0)
     return result
+
+
+def _deviations(gaussian: Gaussian) -> tuple[np.ndarray, np.ndarray]:
+    """Return the deviations of Gaussians (n, k), and the products of each two of them (n, k, k)."""
+    deviation = np.sqrt(np.diagonal(np.asarray(gaussian.covariance), axis1=-2, axis2=-1))
+    return deviation, deviation[..., :, None] * deviation[..., None, :]
+
+
+def _size_slopes(states: PyTree) -> Iterator[float]:
+    """Return of the derivatives in each number the largest among states (n, ...), in deviations of their Gaussian."""
+    for part in _moving_parts(states):
+        if isinstance(part, Gaussian):
+            units = _deviations(part)
+            continue
+        with np.errstate(invalid="ignore", divide="ignore"):
+            shares = [np.where(unit > 0, np.abs(slope) / unit, 0.0) for slope, unit in zip(part, units, strict=True)]
+        yield max(float(np.max(share, initial=0.0, where=np.isfinite(share))) for share in shares)
 
 
 def _are_near(a: np.ndarray, b: np.ndarray, within: np.ndarray) -> Bool[np.ndarray, "..."]:
@@ -47,35 +83,40 @@ def select_state(condition: Array, one: PyTree, other: PyTree) -> PyTree:
 
 def gaussians_of(state: PyTree) -> list[Gaussian]:
     """Return the Gaussians of a state."""
-    return [part for part in jax.tree.leaves(state, is_leaf=_is_gaussian) if _is_gaussian(part)]
+    return [part for part in _moving_parts(state) if isinstance(part, Gaussian)]
 
 
 def means_of(state: PyTree) -> list[Any]:
-    """Return the means of a state's Gaussians."""
-    return [x.mean for x in gaussians_of(state)]
+    """Return the means of a state's Gaussians, and of their derivatives."""
+    return [part.mean for part in _moving_parts(state)]
 
 
 def with_means(state: PyTree, means: Sequence[Any]) -> PyTree:
-    """Return a state whose Gaussians have other means."""
+    """Return a state whose Gaussians, and their derivatives, have other means."""
     rest = iter(means)
     return jax.tree.map(
-        lambda part: part._replace(mean=next(rest)) if _is_gaussian(part) else part, state, is_leaf=_is_gaussian
+        lambda part: part._replace(mean=next(rest)) if _is_moving(part) else part, state, is_leaf=_is_moving
     )
 
 
 def beside_gaussians(state: PyTree) -> PyTree:
-    """Return what a state holds beside its Gaussians, in their place nothing."""
-    return jax.tree.map(lambda part: () if _is_gaussian(part) else part, state, is_leaf=_is_gaussian)
+    """Return what a state holds beside its Gaussians and their derivatives, in their place nothing."""
+    return jax.tree.map(lambda part: () if _is_moving(part) else part, state, is_leaf=_is_moving)
 
 
 def with_gaussians(beside: PyTree, state: PyTree) -> PyTree:
-    """Return the Gaussians of a state, and beside them what another one holds there."""
+    """Return the Gaussians of a state and their derivatives, and beside them what another one holds there."""
     parts = iter(_leaves_beside(beside))
-    return jax.tree.map(lambda part: part if _is_gaussian(part) else next(parts), state, is_leaf=_is_gaussian)
+    return jax.tree.map(lambda part: part if _is_moving(part) else next(parts), state, is_leaf=_is_moving)
 
 
-def _is_gaussian(part: Any) -> bool:
-    return isinstance(part, Gaussian)
+def _moving_parts(state: PyTree) -> list[Any]:
+    """Return the parts of a state with means that depend on data."""
+    return [part for part in jax.tree.leaves(state, is_leaf=_is_moving) if _is_moving(part)]
+
+
+def _is_moving(part: Any) -> bool:
+    return isinstance(part, Gaussian | Slopes)
 
 
 def _leaves_beside(state: PyTree) -> list[np.ndarray]:

@@ -348,7 +348,7 @@ def _choose_starts(surface: Surface, count: int, seed: int) -> Float[np.ndarray,
     start, rng = parameters.start, np.random.default_rng(seed)
     first = surface.evaluations(start[None])
     if not np.isfinite(first.total[0]):
-        step = int(np.argmax(~np.isfinite(first.density[0].sum(axis=0))))
+        step = int(np.argmax(~np.isfinite(surface.evaluate_rows(start[None]).density[0].sum(axis=0))))
         raise fail("start of the fit", "numbers under which the recording is possible",
                    f"a log-likelihood of {first.total[0]} from step {step} on")  # fmt: skip
     # spread: of logarithms and logits a fixed one, of real numbers half their size or some standard errors

@@ -46,7 +46,7 @@ def make_inference_data(solution: Solution, draws: int, seed: int) -> Any:
 
 def _evaluate_rows(solution: Solution, points: np.ndarray) -> np.ndarray:
     """Return log p of each row given those before it, (points, rows) over all recordings."""
-    density = np.asarray(solution.surface.evaluations(points).density)
+    density = np.asarray(solution.surface.evaluate_rows(points).density)
     return np.concatenate([density[:, i, :steps] for i, steps in enumerate(solution.surface.data.lengths)], axis=1)
 
 

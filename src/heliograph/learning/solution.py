@@ -146,7 +146,7 @@ class Solution:
     @cached_property
     def scores(self) -> Scores:
         """Scores of each step, by recording, among active coordinates."""
-        score = self.surface.evaluations(self.top.x[None]).score[0][..., self.active]
+        score = self.surface.evaluate_rows(self.top.x[None]).score[0][..., self.active]
         return [s[:steps] for s, steps in zip(score, self.surface.data.lengths, strict=True)]
 
     @cached_property

@@ -53,6 +53,7 @@ from .compensated import Compensated as Compensated
 from .compensated import compensate as compensate
 from .compensated import split_sum as split_sum
 from .density import LOG_TURN as LOG_TURN
+from .density import differentiate_log_density as differentiate_log_density
 from .density import log_density as log_density
 from .float64 import check_process as check_process
 from .float64 import compile_in_float64 as compile_in_float64

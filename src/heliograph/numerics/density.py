@@ -1,4 +1,4 @@
-"""Density of a Gaussian vector of which components may be missing or determined by others."""
+"""Density of a Gaussian vector of which components may be missing or determined by others, and its derivatives."""
 
 from typing import Any
 
@@ -12,18 +12,22 @@ from heliograph.numerics.linalg import (
     PIVOT_TOLERANCE,
     WRITTEN,
     negative_tolerance,
+    psd_solve,
     rounding,
 )
-from heliograph.numerics.types import Float
+from heliograph.numerics.types import Bool, Float
 
 LOG_TURN = float(np.log(2 * np.pi))
 
 
 @jax.jit
 def log_density(
-    value: "Float[jax.Array, ' m']", covariance: "Float[jax.Array, 'm m']", size: "Float[jax.Array, ' m']"
+    value: "Float[jax.Array, ' m']",
+    covariance: "Float[jax.Array, 'm m']",
+    size: "Float[jax.Array, ' m']",
+    present: "Bool[jax.Array, ' m'] | None" = None,
 ) -> "Float[jax.Array, '']":
-    """Return log N(value; 0, covariance) of the components that are not NaN, 0 if all are.
+    """Return log N(value; 0, covariance) of the components that are present, not NaN unless it is said; 0 if none is.
 
     Component after component given those before it: sum_j -(d_j^2 / s_j + log(2 pi s_j)) / 2, s_j the pivots of the
     covariance. A component that those before it determine (s_j = 0) adds nothing where it agrees with them, and -inf
@@ -31,7 +35,7 @@ def log_density(
     is `value`, for its rounding. An indefinite covariance gives NaN.
     """
     # Absent components: value and covariance zero, so that they are determined and agree.
-    present = ~jnp.isnan(value)
+    present = ~jnp.isnan(value) if present is None else present
     rest = jnp.where(present, value, 0.0)
     left = jnp.where(present[:, None] & present, covariance, 0.0)
     # Deviation within which a determined component agrees with those before it.
@@ -65,3 +69,27 @@ def log_density(
     for j in range(len(value)):
         carry = condition(j, carry)
     return carry[2]
+
+
+def differentiate_log_density(
+    value: "Float[jax.Array, ' m']",
+    covariance: "Float[jax.Array, 'm m']",
+    slopes: "tuple[Float[jax.Array, 'p m'], Float[jax.Array, 'p m m']]",
+    size: "Float[jax.Array, ' m']",
+    present: "Bool[jax.Array, ' m']",
+) -> "tuple[Float[jax.Array, ''], Float[jax.Array, ' p'], Float[jax.Array, 'p p']]":
+    """Return log N(e; 0, S) of the components that are present, its derivatives in p numbers, and their information.
+
+    -de' S^-1 e - tr(S^-1 dS) / 2 + e' S^-1 dS S^-1 e / 2 and de' S^-1 de + tr(S^-1 dS S^-1 dS) / 2, with the slopes de
+    and dS; see `log_density` for the other arguments.
+    """
+    both = present[:, None] & present
+    density = log_density(value, covariance, size, present)
+    e, s = jnp.where(present, value, 0.0), jnp.where(both, covariance, 0.0)
+    de, ds = jnp.where(present, slopes[0], 0.0), jnp.where(both, slopes[1], 0.0)
+    p, m = de.shape
+    # S^-1 (e, de, dS) by one factorisation
+    solved = psd_solve(s, jnp.concatenate([e[:, None], de.T, jnp.moveaxis(ds, 0, 1).reshape(m, p * m)], axis=1))
+    w, v, q = solved[:, 0], solved[:, 1 : 1 + p], solved[:, 1 + p :].reshape(m, p, m)
+    score = -de @ w - jnp.einsum("iai->a", q) / 2 + jnp.einsum("i,aij,j->a", w, ds, w) / 2
+    return density, score, de @ v + jnp.einsum("iaj,jbi->ab", q, q) / 2

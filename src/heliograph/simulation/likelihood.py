@@ -4,11 +4,10 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from heliograph.engine.choice import compute_once
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.chunks import filter_in_chunks
+from heliograph.filters.chunks import sum_filtered_in_chunks
 from heliograph.filters.filter_data import check_data
 from heliograph.model.estimate import Innovation
 from heliograph.numerics.check import instance
@@ -45,9 +44,9 @@ def log_likelihood(
     arguments = filter, *check_data(filter, measurements, inputs)
     if is_traced(arguments):
         return _sum(*arguments)
-    whole = filter_in_chunks(*arguments, _judge_likelihood)
+    whole = sum_filtered_in_chunks(*arguments, _judge_likelihood)
     if whole is not None:
-        return float(np.sum(whole.outputs))
+        return float(whole)
     return float(compute_once(_sum, _by_xla, arguments))
 
 

@@ -1,5 +1,6 @@
 """Best linear filter behind a random channel with independent draws, and the choice among the others."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from itertools import product
@@ -17,6 +18,7 @@ from heliograph.filters.gaussian.update import Polytope
 from heliograph.filters.linear.belief import LinearBelief, motion_of_plant, predict_belief, prior_belief
 from heliograph.filters.linear.given_record import LinearFilterOfRecord
 from heliograph.filters.linear.plan import plan_filter
+from heliograph.filters.linear.scores import ScoreRows
 from heliograph.filters.modes.additive import additive_modal_filter, independent_terms
 from heliograph.filters.modes.modal import modal_filter
 from heliograph.filters.modes.side_information import side_information_filter
@@ -116,6 +118,18 @@ class LinearFilter(AbstractSizedFilter):
         """Whether the channel's gain is known and no noise depends on the signal: then it is Kalman's filter."""
         whole = stacked(self.channel)
         return not (whole.uncertain or np.any(np.asarray(whole.gain_spread)) or find_rounded(self.sensor))
+
+    def score_rows(self, make: Callable[[Array], "LinearFilter"], x: Float[Array, " p"], half: Array) -> ScoreRows:
+        """Return the log-likelihood of rows, its derivatives and information, of a filter like this with free numbers.
+
+        Args:
+            make: the filter by the free numbers, one that `has_known_gain`.
+            x: the free numbers.
+            half: number of the first row of the second half of the recording, of which information is summed apart.
+
+        Source: Gupta and Mehra, Computational aspects of maximum likelihood estimation (1974).
+        """
+        return ScoreRows(make, x, half, informed=True)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains."""

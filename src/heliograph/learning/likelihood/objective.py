@@ -3,18 +3,14 @@
 from dataclasses import dataclass
 from functools import lru_cache
 from types import FunctionType
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from heliograph.engine.choice import choose_code
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.likelihood_filter import likelihood_filter
 from heliograph.learning.description import Build, Description
-from heliograph.learning.likelihood.data import Data
-from heliograph.learning.likelihood.linear_score import differentiate_innovations
 from heliograph.model.channel import Channel
 from heliograph.model.enlarged.joint import join_links
 from heliograph.model.estimate import Innovation
@@ -23,11 +19,8 @@ from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor, is_linear
 from heliograph.numerics.angle import nearest
 from heliograph.numerics.check import fail
-from heliograph.numerics.density import log_density
-from heliograph.numerics.float64 import quickly_compiled, to_numpy
-from heliograph.numerics.linalg import psd_solve
 from heliograph.numerics.module import same
-from heliograph.numerics.types import Array, Float, PyTree
+from heliograph.numerics.types import Array, PyTree
 from heliograph.random_affine.moments.second_moments import has_random_gain, second_order
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
@@ -60,37 +53,6 @@ def _join_channels(channel: Channel) -> Channel:
 
 
 Form = Literal["linear", "conditional", "truth"]
-
-
-class Evaluation(NamedTuple):
-    """Log-likelihoods and scores of each step at points of the line, and the Gauss-Newton information of both halves.
-
-    Shapes: density (points, recordings, steps), score (points, recordings, steps, p), halves (points, 2, p, p).
-    """
-
-    density: Float[Array, "points recordings steps"]
-    score: Float[Array, "points recordings steps p"]
-    halves: Float[Array, "points 2 p p"]
-
-    @property
-    def information(self) -> Float[np.ndarray, "points p p"]:
-        """Gauss-Newton information of all data."""
-        return np.asarray(self.halves.sum(axis=1))
-
-    @property
-    def late(self) -> Float[np.ndarray, "points p p"]:
-        """Information of the second half, to which the initial state adds nothing."""
-        return np.asarray(self.halves[:, 1])
-
-    @property
-    def total(self) -> Float[np.ndarray, " points"]:
-        """Log-likelihood of all data at each point."""
-        return np.asarray(self.density.sum(axis=(1, 2)))
-
-    @property
-    def gradient(self) -> Float[np.ndarray, "points p"]:
-        """Gradient of the log-likelihood of all data at each point."""
-        return np.asarray(self.score.sum(axis=(1, 2)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,68 +179,3 @@ def find_sole_filter(network: Network) -> AbstractFilter:
     if items[0].claim == "none":
         raise fail("filter to be learned by true states", "one that claims a covariance", "one that claims none")
     return items[0]
-
-
-def evaluate_at_points(objective: Objective, x: Float[np.ndarray, "points p"], data: Data) -> Evaluation:
-    """Return likelihood, scores and information at points: all side by side in native code, or one by one by XLA."""
-    data_rows = [rows for rows in (data.measurements, data.inputs, data.truth) if rows is not None]
-    count, copies = len(data.measurements), (len(x), 1, 1)
-    runs = np.repeat(x, count, axis=0), *(np.tile(data_row, copies) for data_row in data_rows)
-    with jax.enable_x64(True):
-        choice = choose_code(evaluate_recording, (objective, *runs), [False, *(True for _ in runs)])
-        if choice.code is not None:
-            results = choice.results()
-        else:
-            parts = [to_numpy(_by_xla(objective, *run)) for run in zip(*runs, strict=True)]
-            results = jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
-    density, score, halves = (leaf.reshape(len(x), count, *leaf.shape[1:]) for leaf in results)
-    return Evaluation(density, score, halves.sum(axis=1))
-
-
-def evaluate_recording(objective: Objective, x: Array, z: Array, u: Array, truth: Array | None = None) -> Evaluation:
-    """Evaluate one recording: density (steps,), score (steps, p) and information (2, p, p); derivatives run forward.
-
-    With the true states e is the error of the estimates and S what they claim.
-    """
-
-    def along(x: Array) -> tuple[jax.Array, jax.Array]:
-        return objective.innovations(x, z, u) if truth is None else objective.errors(x, z, u, truth)
-
-    start = filter_of(objective.description.start, objective.form)
-    if truth is None and getattr(start, "has_known_gain", False):
-        (e, s), (de, ds) = differentiate_innovations(objective.filter, x, z, u)
-    else:
-        (e, s), (de, ds) = jax.vmap(lambda axis: jax.jvp(along, (x,), (axis,)), out_axes=(None, 1))(jnp.eye(len(x)))
-
-    def step(halves: jax.Array, row: tuple[jax.Array, ...]) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-        k, *innovation = row
-        density, score, information = _score_innovation(*innovation)
-        late = jnp.stack([k < len(z) // 2, k >= len(z) // 2])[:, None, None]
-        return halves + jnp.where(late, information, 0.0), (density, score)
-
-    rows = jnp.arange(len(z)), e, s, de, ds, jnp.asarray(z if truth is None else truth)
-    halves, (density, score) = jax.lax.scan(step, jnp.zeros((2, len(x), len(x))), rows)
-    return Evaluation(density, score, halves)
-
-
-_by_xla = quickly_compiled(evaluate_recording)
-
-
-def _score_innovation(
-    e: jax.Array, s: jax.Array, de: jax.Array, ds: jax.Array, z: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Log-density, score and information of an innovation e (m,) and its covariance, with derivatives (p, ...).
-
-    -de' S^-1 e - tr(S^-1 dS) / 2 + e' S^-1 dS S^-1 e / 2 and de' S^-1 de + tr(S^-1 dS S^-1 dS) / 2, of what arrived.
-    """
-    p, m = de.shape
-    present = ~jnp.isnan(e)
-    both = present[:, None] & present
-    density = log_density(e, s, jnp.abs(z[:m]) + jnp.abs(z[:m] - e))
-    e, s = jnp.where(present, e, 0.0), jnp.where(both, s, 0.0)
-    de, ds = jnp.where(present, de, 0.0), jnp.where(both, ds, 0.0)
-    # S^-1 (e, de, dS) by one factorisation
-    solved = psd_solve(s, jnp.concatenate([e[:, None], de.T, jnp.moveaxis(ds, 0, 1).reshape(m, p * m)], axis=1))
-    w, v, q = solved[:, 0], solved[:, 1 : 1 + p], solved[:, 1 + p :].reshape(m, p, m)
-    score = -de @ w - jnp.einsum("iai->a", q) / 2 + jnp.einsum("i,aij,j->a", w, ds, w) / 2
-    return density, score, de @ v + jnp.einsum("iaj,jbi->ab", q, q) / 2

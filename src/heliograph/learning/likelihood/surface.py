@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.learning.likelihood.data import Data
-from heliograph.learning.likelihood.objective import Evaluation, Objective, evaluate_at_points
+from heliograph.learning.likelihood.evaluation import Evaluation, evaluate_at_points
+from heliograph.learning.likelihood.objective import Objective
 from heliograph.learning.likelihood.trust_region import FLAT, Domains, Evaluated, maximise
 from heliograph.learning.parameters import Parameter
 from heliograph.numerics.types import Bool, Float
@@ -50,6 +51,13 @@ class Surface:
             self._last[:] = [(np.array(x), evaluate_at_points(self.objective, np.asarray(x), self.data))]
         return self._last[0][1]
 
+    def evaluate_rows(self, x: Float[np.ndarray, "points p"]) -> Evaluation:
+        """Return the evaluation at points with densities and scores by row, which are not cached of long recordings."""
+        whole = self.evaluations(x)
+        if whole.density.shape[2] == self.data.measurements.shape[1]:
+            return whole
+        return evaluate_at_points(self.objective, np.asarray(x), self.data, by_row=True)
+
     def evaluate(self, x: Float[np.ndarray, "points p"]) -> Evaluated:
         """Return the likelihood, gradient and information at points."""
         evaluation = self.evaluations(x)
@@ -78,7 +86,7 @@ class Surface:
         width = DIFFERENCE * np.where(np.isfinite(deviation), deviation, 0.0)
         shifts = np.zeros((len(places), len(x)))
         shifts[np.arange(len(places)), places] = width
-        score = self.evaluations(np.concatenate([x + shifts, x - shifts])).score
+        score = self.evaluate_rows(np.concatenate([x + shifts, x - shifts])).score
         further, back = (np.stack([s[..., k] for s, k in zip(half, places, strict=True)], axis=-1)
                          for half in (score[: len(places)], score[len(places) :]))  # fmt: skip
         told = (back - further) / np.where(width > 0, 2 * width, 1.0)

@@ -1,0 +1,89 @@
+"""Log-likelihood, scores and information of recordings under a linear filter behind a known gain."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.engine.choice import compute_once
+from heliograph.filters.chunks import is_long, scan_in_chunks, sum_in_chunks
+from heliograph.filters.linear.derivatives import Differentiated, differentiate_start, differentiate_step
+from heliograph.filters.recursion import Recursion
+from heliograph.numerics.density import differentiate_log_density
+from heliograph.numerics.float64 import quickly_compiled
+from heliograph.numerics.types import Array, PyTree
+
+Scores = tuple[Array, Array, Array]  # log-densities, scores, information by half of the recording
+
+
+class ScoreRows(Recursion):
+    """A filter with free numbers x over rows: log-density and score of each row, with the derivatives of its estimate.
+
+    Where it is `informed` also information (2, p, p), by halves of the recording.
+
+    Args:
+        make: the filter by the free numbers, a `LinearFilter` with `has_known_gain`.
+        x: the free numbers (p,).
+        half: number of the first row of the second half.
+        informed: whether there is information.
+    """
+
+    make: Callable[[Array], Any] = eqx.field(static=True)
+    x: Array
+    half: Array
+    informed: bool = eqx.field(static=True)
+
+    def step(self, state: Differentiated, row: tuple[Array, Array], k: Array) -> tuple[Differentiated, PyTree]:
+        """Return the estimate and its derivatives after row k, and what is kept of the row."""
+        after, (e, s, *slopes, present, lost) = differentiate_step(self.make, self.x, state, row, k)
+        size = jnp.abs(row[0]) + jnp.abs(row[0] - e)
+        kept = differentiate_log_density(e, s, (slopes[0], slopes[1]), size, present)
+        # Where the estimate is no number, no likelihood is taken for that of silence.
+        density, score, information = (jnp.where(lost, jnp.nan, part) for part in kept)
+        if not self.informed:
+            return after, (density, score)
+        within = jnp.stack([k < self.half, k >= self.half])
+        return after, (density, score, jnp.where(within[:, None, None], information, 0.0))
+
+    def scan(self, z: Array, u: Array) -> Scores:
+        """Return log-densities (rows,) and scores (rows, p) row by row, and the information; it may be traced."""
+        Now = tuple[Differentiated, jax.Array]  # a state, and the information of the rows before
+
+        def body(now: Now, row: tuple[Array, Array, Array]) -> tuple[Now, tuple[jax.Array, jax.Array]]:
+            k, z, u = row
+            after, (density, score, halves) = self.step(now[0], (z, u), k)
+            return (after, now[1] + halves), (density, score)
+
+        start: Now = (_start_at(self.make, self.x), jnp.zeros((2, len(self.x), len(self.x))))
+        (_, halves), (density, score) = jax.lax.scan(body, start, (jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)))
+        return density, score, halves
+
+    def sum_long(self, z: np.ndarray, u: np.ndarray) -> Scores | None:
+        """Return the sums over all rows of a long recording, by chunks; None where it cannot be divided into these."""
+        if not is_long(len(z)):
+            return None
+        whole = sum_in_chunks(self, self._start(), (z, u))
+        summed: Scores | None = None if whole is None else jax.tree.map(lambda leaf: leaf.sum(axis=0), whole.outputs)
+        return summed
+
+    def scan_long(self, z: np.ndarray, u: np.ndarray) -> Scores | None:
+        """Return what `scan` does of a long recording, by chunks; None where it cannot be divided into these."""
+        sums = self.sum_long(z, u)
+        if sums is None:
+            return None
+        rows = scan_in_chunks(ScoreRows(self.make, self.x, self.half, informed=False), self._start(), (z, u))
+        return None if rows is None else (*rows.outputs, sums[2])
+
+    def _start(self) -> Differentiated:
+        start: Differentiated = compute_once(_start_at, _start_by_xla, (self.make, self.x))
+        return start
+
+
+def _start_at(make: Callable[[Array], Any], x: Array) -> Differentiated:
+    return differentiate_start(make, x)
+
+
+_start_by_xla = quickly_compiled(_start_at)
