@@ -1,5 +1,6 @@
 """The Rauch-Tung-Striebel smoother against the textbook's pass back."""
 
+import equinox as eqx
 import numpy as np
 import pytest
 
@@ -47,3 +48,43 @@ def test_one_row_is_smoothed_to_what_the_filter_says_and_none_is_refused():
         np.testing.assert_allclose(*both, rtol=1e-14)
     with pytest.raises(ValueError, match="measurements: expected at least one row, got none"):
         hg.rts_smoother(item, [])
+
+
+class FadingMemory(hg.filters.AbstractFilter):
+    """The Kalman filter of a plant whose covariance is enlarged before each prediction, which is nobody's model."""
+
+    base: hg.filters.AbstractFilter
+    claim: str = eqx.field(static=True, default="nominal")
+    states: tuple = eqx.field(static=True, default=PLANT.states)
+    inputs: tuple = eqx.field(static=True, default=())
+    received: int = eqx.field(static=True, default=1)
+
+    @hg.filters.in_float64
+    def init(self):
+        return self.base.init()
+
+    @hg.filters.predicts
+    def predict(self, state, u=(), k=0):
+        return self.base.predict(state._replace(variances=1.1 * state.variances), u, k)
+
+    @hg.filters.corrects
+    def correct(self, state, z, k=0):
+        return self.base.correct(state, z, k)
+
+    @hg.filters.estimates
+    def estimate(self, state):
+        within = self.base.estimate(state)
+        return hg.model.Estimate(within.mean, within.covariance, self.claim)
+
+    def smoother_step(self, step):
+        return self.base.smoother_step(step)
+
+
+@pytest.mark.parametrize("rows", [25, 5000])
+def test_smoothing_claims_no_more_than_the_filter_around_another(rows):
+    """Its smoother step is that of an exact filter, row by row and in chunks."""
+    network = hg.Network(PLANT, {"node": hg.Node(SENSOR, hg.perfect(1), {})})
+    z = hg.simulate(network, horizon=rows, key=6).measurements["node"]
+    fading = FadingMemory(hg.kalman_filter(PLANT, SENSOR))
+    assert hg.rts_smoother(fading.base, z).claim == "exact"
+    assert hg.rts_smoother(fading, z).claim == "nominal"

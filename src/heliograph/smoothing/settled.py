@@ -14,10 +14,11 @@ import numpy as np
 
 from heliograph.engine.choice import choose_code
 from heliograph.factors.gaussian import Gaussian
+from heliograph.filters.base import make_smoother_step
 from heliograph.filters.chunks import Begun, take
 from heliograph.filters.recursion import Recursion
 from heliograph.filters.settled import Settled, find_settled, scan_settled, step_settled
-from heliograph.filters.smoother_step import SmootherStep, StepTrace, add_nis, gaussian_of
+from heliograph.filters.smoother_step import SmootherStep, StepTrace, gaussian_of
 from heliograph.filters.states import means_of, with_means
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.types import Array, PyTree
@@ -35,7 +36,7 @@ class SmootherRows(Recursion):
         prior = self.filter.predict(state, u, k)
         after, innovation = self.filter.correct(prior, z, k)
         trace = StepTrace(state, prior, after, innovation, z, u, jnp.asarray(k))
-        return after, add_nis(self.filter.smoother_step(trace), innovation)
+        return after, make_smoother_step(self.filter, trace)
 
 
 class SmoothedChunk(NamedTuple):
