@@ -1,7 +1,7 @@
 """Compiled computations in double precision, without flipping JAX's global switch."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache, wraps
 from typing import Literal, ParamSpec, TypeVar
 
@@ -123,6 +123,40 @@ def in_float64(function: Callable[P, R]) -> Callable[P, R]:
             return function(*args, **kwargs)
         check_process()
         with jax.enable_x64(True):
+            arrays: R = to_numpy(function(*args, **kwargs))
+        return arrays
+
+    return scoped
+
+
+def let_compute_in_float64(kind: type, names: Sequence[str]) -> None:
+    """Let these methods and properties of a user's class compute what is known in float64, wherever they are called.
+
+    A model is described outside of any computation in float64, where a formula in jax.numpy would give seven digits.
+    The library's own classes use NumPy for numbers that are known, and are left as they are.
+
+    Args:
+        kind: the class, while it is made (`__init_subclass__`).
+        names: methods that return numbers; those that it does not write itself are left out.
+    """
+    if kind.__module__.split(".")[0] == __name__.split(".")[0]:
+        return
+    for name in names:
+        written = vars(kind).get(name)
+        if isinstance(written, property) and written.fget is not None:
+            type.__setattr__(kind, name, property(_known_in_float64(written.fget), doc=written.__doc__))
+        elif callable(written):
+            type.__setattr__(kind, name, _known_in_float64(written))
+
+
+def _known_in_float64(function: Callable[P, R]) -> Callable[P, R]:
+    """Compute at once, in float64, what depends on no traced number, also inside of a trace."""
+
+    @wraps(function)
+    def scoped(*args: P.args, **kwargs: P.kwargs) -> R:
+        if jax.dtypes.canonicalize_dtype(float).itemsize == 8 or _is_traced((args, kwargs)):
+            return function(*args, **kwargs)
+        with jax.ensure_compile_time_eval(), jax.enable_x64(True):
             arrays: R = to_numpy(function(*args, **kwargs))
         return arrays
 

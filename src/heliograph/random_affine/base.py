@@ -1,15 +1,14 @@
 """Random affine maps z = G y + n: a sampler and joint moments of one matrix H = [[G, n], [0, 1]]."""
 
 from collections.abc import Callable, Sequence
-from functools import wraps
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import NamedTuple, TypeVar
 
 import jax
 import numpy as np
 
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.caching import cache_by_object
-from heliograph.numerics.check import array, fail, items, show_value
+from heliograph.numerics.check import fail, items, show_value
 from heliograph.numerics.module import Module, readable, same, unwritten
 from heliograph.numerics.traced import is_traced, stack_parts
 from heliograph.numerics.types import Bool, Float, PyTree
@@ -22,7 +21,7 @@ from heliograph.random_affine.memory import (
 from heliograph.random_affine.moments.components import Component
 from heliograph.random_affine.moments.disturbed_gain import DisturbedGain
 from heliograph.random_affine.moments.intervals import CORNERS, Interval
-from heliograph.random_affine.moments.monomials import Moments, count_monomials
+from heliograph.random_affine.moments.monomials import Moments, give_sizes
 from heliograph.random_affine.moments.route import Position, Signal, Visit, carry_by_moments, refuse_gain_on_angles
 from heliograph.random_affine.noise import AbstractNoise
 
@@ -47,11 +46,13 @@ class AbstractRandomAffine(Module):
     an answer that holds for any map, or a refusal in one line; a class says more where it knows more.
     """
 
+    formulas = "moments", "mean_gain", "list_atoms", "extremes", "list_outcomes"
+
     def __init_subclass__(cls, **options: object) -> None:
         """Let a map's `moments` return the matrix alone."""
         super().__init_subclass__(**options)
         if (written := cls.__dict__.get("moments")) is not None:
-            type.__setattr__(cls, "moments", _check_sizes(written))
+            type.__setattr__(cls, "moments", give_sizes(written))
 
     @property
     def outputs(self) -> int:
@@ -303,21 +304,6 @@ class AbstractRandomAffine(Module):
     def example_input(self, generator: np.random.Generator) -> np.ndarray:
         """Return a point at which moments can be compared with samples (a lifted map takes only lifted points)."""
         return generator.normal(size=self.inputs)
-
-
-def _check_sizes(written: Callable[[Any, int], object]) -> Callable[[Any, int], Moments]:
-    """Return a map's `moments` that gives a matrix its sizes, and refuses one of another shape."""
-
-    @wraps(written)
-    def moments(channel: AbstractRandomAffine, order: int) -> Moments:
-        result = written(channel, order)
-        if isinstance(result, Moments):
-            return result
-        shape = count_monomials(channel.outputs + 1, order), count_monomials(channel.inputs + 1, order)
-        matrix = array(f"moments({order}) of {type(channel).__name__}", cast(Any, result), shape)
-        return Moments(matrix, channel.outputs, channel.inputs, order)
-
-    return moments
 
 
 def inner_maps(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:

@@ -48,6 +48,7 @@ class AbstractNoise(Module):
 
     mean: eqx.AbstractVar[Vector]
     covariance: eqx.AbstractVar[Square]
+    formulas = "mean", "covariance", "moment", "list_atoms", "branches", "without_outliers"
 
     @property
     def dimension(self) -> int:

@@ -40,6 +40,8 @@ class AbstractLaw(Module):
     Its parameters are numbers, or traced by JAX: then so are its moments.
     """
 
+    formulas = "constant", "moment", "extremes", "corner_moments", "moment_interval", "list_atoms", "quantile", "bulk"
+
     @property
     def constant(self) -> Scalar | None:
         """The gain where it is one number; None where it is random."""

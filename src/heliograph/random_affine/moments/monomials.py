@@ -4,7 +4,8 @@ With Y = (y_1, ..., y_p, 1), the monomials of degree k in Y are all monomials of
 Sym^k(H) of a homogeneous matrix H takes the monomials of Y to those of Z = H Y, and Sym^k(H2 H1) = Sym^k(H2) Sym^k(H1).
 """
 
-from functools import cache
+from collections.abc import Callable
+from functools import cache, wraps
 from itertools import combinations_with_replacement, product
 from math import comb, prod
 from typing import Any
@@ -14,7 +15,7 @@ import jax
 import numpy as np
 
 from heliograph.numerics.caching import cache_arrays
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import array, fail
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import scatter
 from heliograph.numerics.types import Float
@@ -224,3 +225,22 @@ def times_one(variables: int, low: int, high: int) -> np.ndarray:
     """Return the positions at degree `high` of the monomials of degree `low` times powers of the last variable, 1."""
     chosen = factor_variables(variables, low)
     return place(np.pad(chosen, ((0, 0), (0, high - low)), constant_values=variables - 1), variables)
+
+
+def give_sizes(written: Callable[[Any, int], Any]) -> Callable[[Any, int], Moments]:
+    """Return a map's method `moments`, which may give a matrix alone, as one that gives `Moments`.
+
+    Raises:
+        ValueError: a matrix whose shape is not that of the map's monomials.
+    """
+
+    @wraps(written)
+    def moments(channel: Any, order: int) -> Moments:
+        result = written(channel, order)
+        if isinstance(result, Moments):
+            return result
+        shape = count_monomials(channel.outputs + 1, order), count_monomials(channel.inputs + 1, order)
+        matrix = array(f"moments({order}) of {type(channel).__name__}", result, shape)
+        return Moments(matrix, channel.outputs, channel.inputs, order)
+
+    return moments
