@@ -71,3 +71,8 @@ def test_the_files_that_a_newcomer_is_led_to_are_there():
     rows = [row for row in page.splitlines() if row.startswith("| ") and "`" in row]
     files = [name for row in rows for name in re.findall(r"`([\w/]+\.py)`", row)]
     assert len(files) > 16 and not [name for name in files if not (SOURCE / name).exists()]
+    # Where a row names a function too, it is in the row's first file.
+    for row in rows:
+        for function in re.findall(r"`(\w+)` (?:of|in) ", row):
+            text = (SOURCE / re.findall(r"`([\w/]+\.py)`", row)[0]).read_text()
+            assert re.search(rf"^ *(def {function}\(|{function}[:,])|[(,] ?{function}: ", text, re.M), row

@@ -13,9 +13,10 @@ from heliograph.numerics.manifold import Manifold
 
 
 def settle(manifold: Manifold, center: jax.Array, x: Gaussian) -> Gaussian:
-    """Return the law of center plus d, from that of center + d: the mean settled, errors turned to its own axes.
+    """Return x as it is where no state is an attitude; else the law of center plus d, from that of center + d.
 
-    About m' = center plus E d an error is J (d - E d) to first order, J the derivative of the change from m' there.
+    The mean is settled, and errors are turned to its own axes. About m' = center plus E d an error is J (d - E d) to
+    first order, J the derivative of the change from m' there.
 
     Source: Sola, Quaternion kinematics for the error-state Kalman filter (2017), section 6.3 (the reset).
     """
@@ -26,7 +27,10 @@ def settle(manifold: Manifold, center: jax.Array, x: Gaussian) -> Gaussian:
 
 
 def unsettle(manifold: Manifold, center: jax.Array, x: Gaussian) -> Gaussian:
-    """Return the law of center + d, from that of x = center plus d: the inverse of `settle`."""
+    """Return x as it is where no state is an attitude; else the law of center + d, from that of x = center plus d.
+
+    The inverse of `settle`.
+    """
     if not manifold.rotations:
         return x
     mean = manifold.unsettle(center, x.mean)

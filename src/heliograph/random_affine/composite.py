@@ -42,7 +42,7 @@ class AbstractComposite(AbstractRandomAffine):
         return self.rebuilt(*(affine.mean_gain() for affine in self.parts))
 
 
-class AbstractWrapper(AbstractComposite):
+class AbstractMapWrapper(AbstractComposite):
     """Random affine map made of one other, with its shapes and state unless it says otherwise."""
 
     @property

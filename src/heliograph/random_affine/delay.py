@@ -17,7 +17,7 @@ from heliograph.numerics.types import PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, check_maps, replace_inner_maps
 from heliograph.random_affine.chain import MarkovChain
 from heliograph.random_affine.combine import Series, Stack
-from heliograph.random_affine.composite import DIRECT, AbstractWrapper
+from heliograph.random_affine.composite import DIRECT, AbstractMapWrapper
 from heliograph.random_affine.hop import GainAndNoise, known
 from heliograph.random_affine.laws.law import Discrete
 from heliograph.random_affine.mixture import Mixture
@@ -30,7 +30,7 @@ Delay = TypeAliasType("Delay", int | Discrete | MarkovChain)
 T = TypeVar("T")
 
 
-class AbstractDelayLine(AbstractWrapper):
+class AbstractDelayLine(AbstractMapWrapper):
     """Map of the tapped delay line (y_k, y_{k-1}, ..., y_{k-past}), stacked."""
 
     @property
@@ -208,7 +208,7 @@ def place_part(channel: AbstractRandomAffine, total: int, start: int, past: int)
     return DelayLine(chosen, past) if past else chosen
 
 
-class DelayedLine(AbstractWrapper):
+class DelayedLine(AbstractMapWrapper):
     """Storage of a relay: received signals of this step and `steps` before, (r_k, ..., r_{k-steps}).
 
     A map of the line of what was sent. Draws are stored: a value that is forwarded twice has its gain and noise twice.

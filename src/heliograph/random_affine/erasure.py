@@ -9,13 +9,13 @@ from heliograph.numerics.check import fail, scalar
 from heliograph.numerics.traced import plain
 from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, Outcome, check_maps
-from heliograph.random_affine.composite import DIRECT, AbstractWrapper, percent_in_words
+from heliograph.random_affine.composite import DIRECT, AbstractMapWrapper, percent_in_words
 from heliograph.random_affine.hop import known
 from heliograph.random_affine.moments.monomials import Moments
 from heliograph.random_affine.moments.route import Position, Signal, Visit
 
 
-class Erasure(AbstractWrapper):
+class Erasure(AbstractMapWrapper):
     """A map whose outputs are all lost with probability 1 - arrival, and the receiver knows: it reads NaN."""
 
     base: AbstractRandomAffine

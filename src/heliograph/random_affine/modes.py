@@ -17,7 +17,7 @@ from heliograph.numerics.traced import library, stack_parts
 from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.random_affine.base import AbstractModal, AbstractRandomAffine, SameNoise, check_forgets, check_maps
 from heliograph.random_affine.chain import AbstractMemory, Autoregression, Law, MarkovChain, Nodes, Rows
-from heliograph.random_affine.composite import DIRECT, AbstractUniform, AbstractWrapper
+from heliograph.random_affine.composite import DIRECT, AbstractMapWrapper, AbstractUniform
 from heliograph.random_affine.hop import AbstractHop, GainAndNoise, known
 from heliograph.random_affine.laws.law import Constant
 from heliograph.random_affine.memory import condition_on_states, memories, select_alike
@@ -113,7 +113,7 @@ class ModeOutput(AbstractModal):
         return known(np.zeros((self.outputs, self.sent)), self.memory.announce(state))
 
 
-class OneStepLate(AbstractWrapper):
+class OneStepLate(AbstractMapWrapper):
     """Map of which each step receives what was drawn at the step before; NaN at the first."""
 
     base: AbstractRandomAffine

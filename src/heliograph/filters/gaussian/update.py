@@ -123,7 +123,7 @@ class Polytope(AbstractUpdate):
         self.scalars = scalars_as_array(scalars)
 
     def condition(self, signal: Signal, channel: SecondOrder, z: ArrivedInnovation, nominal: Gaussian) -> Gaussian:
-        """Minimise the trace over K, and over the scalars unless they are fixed."""
+        """Return `nominal` behind a known law; else minimise the trace over K, and over the scalars unless fixed."""
         return observe_by_young(signal, channel, z, self.scalars) if channel.uncertain else nominal
 
     def claim(self, uncertain: bool) -> Claim:
@@ -157,7 +157,7 @@ class ZeroMean(AbstractUpdate):
             raise fail("scalar of the bound", "a positive number", scalar)
 
     def condition(self, signal: Signal, channel: SecondOrder, z: ArrivedInnovation, nominal: Gaussian) -> Gaussian:
-        """Minimise the trace over K, and over beta unless it is fixed."""
+        """Return `nominal` behind a known law; else minimise the trace over K, and over beta unless it is fixed."""
         return observe_by_zero_mean(signal, channel, z, self.scalar) if channel.uncertain else nominal
 
     def claim(self, uncertain: bool) -> Claim:
@@ -195,7 +195,7 @@ class Interval(AbstractUpdate):
         return Polytope(as_scalars(self.scalars))
 
     def condition(self, signal: Signal, channel: SecondOrder, z: ArrivedInnovation, nominal: Gaussian) -> Gaussian:
-        """Minimise the trace over K, and over the scalars unless they are fixed."""
+        """Return `nominal` behind a known law; else minimise the trace over K, and over the scalars unless fixed."""
         return observe_by_young(signal, channel, z, self.scalars) if channel.uncertain else nominal
 
     def claim(self, uncertain: bool) -> Claim:

@@ -8,7 +8,7 @@ import numpy as np
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, check_maps
-from heliograph.random_affine.composite import AbstractWrapper
+from heliograph.random_affine.composite import AbstractMapWrapper
 from heliograph.random_affine.moments.monomials import (
     Moments,
     count_monomials,
@@ -20,7 +20,7 @@ from heliograph.random_affine.moments.monomials import (
 )
 
 
-class Lift(AbstractWrapper):
+class Lift(AbstractMapWrapper):
     """Lift of a map to monomials: from those of y of degree 1 to `degree` to those of z; degree 2 is the square.
 
     Its order-k moments are the order-(degree k) moments of the map. A lifted input has repeated products, so a row of
