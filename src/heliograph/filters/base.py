@@ -131,8 +131,16 @@ class AbstractFilter(Module):
         z, u = self.check_measurement(z), self.check_input(u)
         return call_with_inputs(self, state, _step, z, u, step_number(self, k))
 
-    def run(self, z: Float[ArrayLike, "steps received"], u: Float[ArrayLike, "steps inputs"] | None = None) -> Filtered:
+    def run(
+        self,
+        z: Float[ArrayLike, "steps received"],
+        u: Float[ArrayLike, "steps inputs"] | None = None,
+        after: Filtered | None = None,
+    ) -> Filtered:
         """Run the filter over rows of data from its initial state: for each row predict, then correct.
+
+        Rows too many to be held at once are run in blocks, each `after` the result of the one before it. Results are
+        those of one run, and log-likelihoods add up.
 
         Every number is used as it is; `hg.run` leaves out those that are implausible, and warns. A linear filter takes
         from 32,768 rows on in chunks side by side where it forgets its start within 512 rows (of 131,072 rows within
@@ -141,11 +149,13 @@ class AbstractFilter(Module):
         Args:
             z: measurements (steps, received), or (steps,) of one number; NaN for what did not arrive.
             u: inputs (steps, inputs), the one that led to each row; by default a filter without inputs is assumed.
+            after: result of the rows before these, of this filter; none by default.
 
         Raises:
-            ValueError: data of another size than the filter's, infinite values, more steps than the filter covers.
+            ValueError: data of another size than the filter's, infinite values, more steps than the filter covers;
+                a result of another filter, or of rows that are not before these.
         """
-        return run_over_data(self, z, u)
+        return run_over_data(self, z, u, after)
 
     def scan(
         self,

@@ -81,7 +81,9 @@ def is_long(total: int) -> bool:
     return total >= CHUNKS * LADDER[0].chunk
 
 
-def filter_in_chunks(filter: Any, z: Array, u: Array, output: Callable[..., PyTree]) -> Pass | None:
+def filter_in_chunks(
+    filter: Any, z: Array, u: Array, output: Callable[..., PyTree], state: PyTree | None = None, begin: int = 0
+) -> Pass | None:
     """Filter rows in chunks side by side; None where rows are few, or the filter is not linear or forgets too late.
 
     Args:
@@ -89,9 +91,14 @@ def filter_in_chunks(filter: Any, z: Array, u: Array, output: Callable[..., PyTr
         z: measurements (rows, received), NaN for what did not arrive.
         u: inputs (rows, inputs).
         output: what is kept of a row, a function of the filter, its state, the innovation and the row's number.
+        state: before the first row; that before any unless given.
+        begin: number of the first row.
     """
     start = linear_start(filter)
-    return None if start is None else scan_in_chunks(FilterRows(filter, output), start, (np.asarray(z), np.asarray(u)))
+    if start is None:
+        return None
+    rows = FilterRows(filter, output, np.asarray(begin))
+    return scan_in_chunks(rows, start if state is None else state, (np.asarray(z), np.asarray(u)))
 
 
 def sum_filtered_in_chunks(filter: Any, z: Array, u: Array, output: Callable[..., PyTree]) -> PyTree | None:

@@ -16,7 +16,7 @@ from heliograph.model.checks.inputs import check_inputs
 from heliograph.model.checks.row_times import common_dates, judge_dates
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.origin import KeptOrigin, Origin, last_input, usual_months, usual_spacing
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import fail, instance
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.linalg import find_lost
 from heliograph.numerics.module import readable
@@ -111,37 +111,74 @@ def scan_with_last_state(
     z: Float[Array, "steps received"],
     u: Float[Array, "steps inputs"],
     output: Callable[[PyTree, Innovation, jax.Array], PyTree],
+    state: PyTree | None = None,
+    begin: Array | int = 0,
 ) -> tuple[PyTree, PyTree]:
-    """Step a filter over rows like `scan_inside_jit`; return its last state too, before the outputs."""
+    """Step a filter over rows like `scan_inside_jit`; return its last state too, before the outputs.
+
+    It begins with `state`, that before any row unless given, at the row of number `begin`.
+    """
 
     def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:
         k, z_k, u_k = row
         after, innovation = filter.correct(filter.predict(state, u_k, k), z_k, k)
         return after, output(after, innovation, k)
 
-    start = jax.tree.map(jnp.asarray, filter.init())
-    last, outputs = jax.lax.scan(body, start, (jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)))
+    start = jax.tree.map(jnp.asarray, filter.init() if state is None else state)
+    last, outputs = jax.lax.scan(body, start, (jnp.asarray(begin) + jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)))
     return last, outputs
 
 
-def run_over_data(filter: SteppedFilter, z: ArrayLike, u: ArrayLike | None) -> Filtered:
-    """Run a filter over rows of data, by native code where the filter has it; return estimates and innovations."""
-    rows_z, rows_u = check_data(filter, z, u)
-    whole = filter_in_chunks(filter, rows_z, rows_u, _tell_estimate)
-    state, outputs = whole or compute_once(_compute_filtered, _by_xla, (filter, rows_z, rows_u))
+def run_over_data(filter: SteppedFilter, z: ArrayLike, u: ArrayLike | None, after: Filtered | None = None) -> Filtered:
+    """Run a filter over rows of data, by native code where the filter has it; return estimates and innovations.
+
+    The rows are the first ones, or those `after` an earlier result.
+    """
+    before = None if after is None else _origin_of(filter, after)
+    begin = 0 if before is None else int(before.step)
+    rows_z, rows_u = check_data(filter, z, u, begin)
+    clock = common_dates(_tables(z, u))
+    if before is not None and clock is not None and len(clock):
+        _check_later(before, clock)
+    start = () if before is None else (before.state, np.asarray(begin))
+    whole = filter_in_chunks(filter, rows_z, rows_u, _tell_estimate, *start)
+    state, outputs = whole or compute_once(_compute_filtered, _by_xla, (filter, rows_z, rows_u, *start))
     mean, covariance, innovation, modes, counts = outputs
     lost = find_lost(mean, 1)
     if lost.any():
-        said = f"{type(filter).__name__}: the estimate is no finite number from row {int(np.argmax(lost)) + 1} on"
+        row = begin + int(np.argmax(lost)) + 1
+        said = f"{type(filter).__name__}: the estimate is no finite number from row {row} on"
         warnings.warn(f"{said}; hg.run leaves out what makes it so, and says which row and why", stacklevel=3)
-    clock = common_dates(_tables(z, u))
-    last, spacing = (float(len(rows_z) - 1), np.nan) if clock is None else (clock[-1], usual_spacing(clock))
+    end = begin + len(rows_z)
+    last, spacing = (float(end - 1), np.nan) if clock is None else (clock[-1], usual_spacing(clock))
     months = 0 if clock is None else usual_months(clock)
-    origin = Origin(filter, state, len(rows_z), last_input(np.asarray(rows_u)), last, spacing, months=months)
+    origin = Origin(filter, state, end, last_input(np.asarray(rows_u)), last, spacing, months=months)
     return Filtered(
         mean, covariance, innovation.value, innovation.covariance, innovation.log_likelihood, filter.claim,
         innovation.weight, origin, modes, _warn_of_few(counts),
     )  # fmt: skip
+
+
+def _origin_of(filter: SteppedFilter, after: Filtered) -> Origin:
+    """Return the state after earlier rows; raise of what is no result of such a filter."""
+    expected = "what `run` of this filter returned for the rows before"
+    origin = instance("after", after, Filtered, expected).origin
+    if origin is None:
+        raise fail("after", expected, "a result without the state after its last row")
+    if not isinstance(origin.model, type(filter)) or _shapes_of(origin.state) != _shapes_of(filter.init()):
+        raise fail("after", expected, f"one of another filter, {type(origin.model).__name__}")
+    return origin
+
+
+def _shapes_of(state: PyTree) -> tuple[object, list[tuple[int, ...]]]:
+    leaves, form = jax.tree.flatten(state)
+    return form, [np.shape(leaf) for leaf in leaves]
+
+
+def _check_later(before: Origin, clock: np.ndarray) -> None:
+    """Check that dates of rows are behind that of the last row before them, where it has one."""
+    if isinstance(before.time, np.datetime64) and not clock[0] > before.time:
+        raise fail("measurements", f"rows behind {before.time}, the last one before them", str(clock[0]))
 
 
 def _warn_of_few(counts: Array | None) -> Array | None:
@@ -156,9 +193,11 @@ def _warn_of_few(counts: Array | None) -> Array | None:
     return counts
 
 
-def _compute_filtered(filter: SteppedFilter, z: Array, u: Array) -> PyTree:
+def _compute_filtered(
+    filter: SteppedFilter, z: Array, u: Array, state: PyTree | None = None, begin: Array | int = 0
+) -> PyTree:
     """Filter all rows and return the results stacked: compiled body of `run_over_data`."""
-    return scan_with_last_state(filter, z, u, partial(_tell_estimate, filter))
+    return scan_with_last_state(filter, z, u, partial(_tell_estimate, filter), state, begin)
 
 
 def _tell_estimate(filter: SteppedFilter, state: PyTree, innovation: Innovation, k: jax.Array) -> PyTree:
@@ -171,11 +210,12 @@ _by_xla = quickly_compiled(_compute_filtered)
 
 
 def check_data(
-    filter: SteppedFilter, measurements: ArrayLike, inputs: ArrayLike | None
+    filter: SteppedFilter, measurements: ArrayLike, inputs: ArrayLike | None, begin: int = 0
 ) -> tuple[Float[Array, "steps received"], Float[Array, "steps inputs"]]:
     """Return measurements and inputs of a filter as arrays of rows; without inputs the filter must take none.
 
     Dates by which the rows of a table are known are judged: in order, the same in both, of equal steps or with dt.
+    `begin` rows were before them.
     """
     judge_dates(filter.inputs, _tables(measurements, inputs))
     z = check_rows("measurements", measurements, None, filter.received or None, missing=True)
@@ -183,8 +223,8 @@ def check_data(
     given = np.zeros((len(z), 0)) if inputs is None and not filter.inputs else inputs
     u = check_rows("inputs", given, len(z), len(filter.inputs), missing=False, names=filter.inputs)
     check_inputs(filter.inputs, u, filter)
-    if filter.horizon is not None and len(z) > filter.horizon:
-        raise fail("measurements", f"at most {filter.horizon} steps, which the filter covers", len(z))
+    if filter.horizon is not None and begin + len(z) > filter.horizon:
+        raise fail("measurements", f"at most {filter.horizon} steps, which the filter covers", begin + len(z))
     return z, u
 
 

@@ -27,16 +27,17 @@ class Recursion(Module):
 
 
 class FilterRows(Recursion):
-    """A filter over rows, and what is kept of each: output(filter, state, innovation, k)."""
+    """A filter over rows, and what is kept of each: output(filter, state, innovation, k); `begin` is the first k."""
 
     filter: Any
     output: Callable[..., PyTree] = eqx.field(static=True)
+    begin: Array = eqx.field(default_factory=lambda: np.asarray(0))
 
     def step(self, state: PyTree, row: tuple[Array, Array], k: Array) -> tuple[PyTree, PyTree]:
         """Predict and correct."""
-        z, u = row
-        after, innovation = self.filter.correct(self.filter.predict(state, u, k), z, k)
-        return after, self.output(self.filter, after, innovation, k)
+        (z, u), number = row, self.begin + k
+        after, innovation = self.filter.correct(self.filter.predict(state, u, number), z, number)
+        return after, self.output(self.filter, after, innovation, number)
 
 
 def linear_start(filter: Any) -> PyTree | None:
