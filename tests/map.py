@@ -61,12 +61,18 @@ BEGIN, END = "<!-- made by python -m tests.map -->", "<!-- end -->"
 
 
 @cache
+def parsed(path: Path) -> ast.Module:
+    """A file, read once for all tests of a process."""
+    return ast.parse(path.read_text())
+
+
+@cache
 def imported_names() -> list[tuple[Path, str, str]]:
     """Every import of the library: the file, the module and the name."""
     return [
         (path, node.module, alias.name)
         for path in SOURCE.rglob("*.py")
-        for node in ast.walk(ast.parse(path.read_text()))
+        for node in ast.walk(parsed(path))
         if isinstance(node, ast.ImportFrom) and node.module
         for alias in node.names
     ]
@@ -131,7 +137,7 @@ def border_of(folder: str) -> str:
     here, package = SOURCE / folder, f"heliograph.{folder.replace('/', '.')}"
     names = defaultdict(set)
     for path, module, name in imported_names():
-        if here not in path.parents and module.startswith(f"{package}."):
+        if not path.is_relative_to(here) and module.startswith(f"{package}."):
             names[module.removeprefix(package)].add(name)
     lines = ['"""Names that other folders take; the package loads them when first used."""', ""]
     for module in sorted(names):
@@ -146,7 +152,7 @@ def at_borders() -> set[str]:
     return {
         f"heliograph.{folder.replace('/', '.')}.{alias.name}"
         for folder in BORDERS
-        for node in ast.parse((SOURCE / folder / "__init__.pyi").read_text()).body
+        for node in parsed(SOURCE / folder / "__init__.pyi").body
         if isinstance(node, ast.ImportFrom)
         for alias in node.names
     }

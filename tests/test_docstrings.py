@@ -3,11 +3,10 @@
 import ast
 import re
 from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
 
 import heliograph
-from tests.map import BORDERS
+from tests.map import BORDERS, parsed
 
 SOURCE = Path(heliograph.__file__).parent
 ARRAY = re.compile(r"\b(np\.ndarray|jax\.Array|ArrayLike|Array)\b")
@@ -17,12 +16,6 @@ DEFAULT = re.compile(r"default|None|unless|if not|else|without|empty|by itself|o
 SHARE = 0.95  # of public array annotations that carry a shape: others take numbers of any
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 PATHS = sorted(SOURCE.rglob("*.py"))
-
-
-@cache
-def parsed(path: Path) -> ast.Module:
-    """A file, read once for all tests."""
-    return ast.parse(path.read_text())
 
 
 def names_of(room: Path) -> set[str]:

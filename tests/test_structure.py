@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 import heliograph
-from tests.map import BORDERS
+from tests.map import BORDERS, parsed
 
 SOURCE = Path(heliograph.__file__).parent
 PACKAGES = SOURCE, SOURCE.parent / "straightline", SOURCE.parents[1] / "studies"
@@ -76,13 +76,8 @@ def rank(module: str) -> int | None:
 
 
 @cache
-def tree(path: Path) -> ast.Module:
-    return ast.parse(path.read_text())
-
-
-@cache
 def statements(path: Path) -> list[ast.ImportFrom]:
-    return [node for node in ast.walk(tree(path)) if isinstance(node, ast.ImportFrom)]
+    return [node for node in ast.walk(parsed(path)) if isinstance(node, ast.ImportFrom)]
 
 
 def imports(path: Path) -> set[str]:
@@ -168,7 +163,7 @@ def test_every_room_says_what_it_is():
 
 def test_no_public_function_is_without_a_docstring():
     for path in FILES:
-        for node in tree(path).body:
+        for node in parsed(path).body:
             if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
                 if any(isinstance(d, ast.Name) and d.id == "overload" for d in node.decorator_list):
                     continue  # the function itself says it
@@ -206,7 +201,7 @@ def test_no_function_has_forty_lines():
     """Counted without signature and docstring: a longer one has steps that have names."""
     lengths = {}
     for path in (path for package in PACKAGES for path in package.rglob("*.py")):
-        for node in ast.walk(tree(path)):
+        for node in ast.walk(parsed(path)):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 start = node.body[0].end_lineno if ast.get_docstring(node) else node.body[0].lineno - 1
                 lengths[f"{path}: {node.name}"] = node.end_lineno - start

@@ -1,5 +1,6 @@
 """The law of a gain given a noisy reading of it, against closed forms and quadrature on fine panels."""
 
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
@@ -12,12 +13,19 @@ from heliograph.random_affine.laws.reading import gain_given_reading
 SCALE = 0.8
 
 
+@eqx.filter_jit
+def compiled_moments(law, reading, variance):
+    """The same, compiled once for each kind of law: within filters it is traced too."""
+    given = gain_given_reading(law, reading, variance)
+    mean = given.moment(1)
+    return mean, given.variance if hasattr(given, "variance") else given.moment(2) - mean**2
+
+
 def moments(law, reading, variance):
     """Mean and variance of the gain given its reading."""
     with jax.enable_x64(True):
-        given = gain_given_reading(law, np.float64(reading), np.float64(variance))
-        mean, second = float(given.moment(1)), float(given.moment(2))
-        return mean, float(given.variance) if hasattr(given, "variance") else second - mean**2
+        mean, variance = compiled_moments(law, np.float64(reading), np.float64(variance))
+        return float(mean), float(variance)
 
 
 def mean_of_rayleigh(a, s):

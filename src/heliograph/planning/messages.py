@@ -240,13 +240,16 @@ def _compute_rate_on_grid(system: _Scalar, delta: float, share: float) -> tuple[
     quiet = ndtr((x + delta - x[:, None]) / np.sqrt(r)) - ndtr((x - delta - x[:, None]) / np.sqrt(r))
     # The stationary law is the eigenvector of a step for its largest eigenvalue, 1.
     size = 2 * n + 1
-    low, high = np.clip(np.arange(size) - cells, 0, None), np.minimum(np.arange(size) + cells + 1, size)
+    beyond = max(size - cells - 1, 0)  # values sent last on one side of a measured cell, more than delta away at most
 
     def send(f: np.ndarray) -> np.ndarray:
         """Return the law of (x, last sent) after a message: last sent is what is measured now."""
-        # Of each measured cell the mass of values sent last that lie more than delta from it.
-        sums = np.cumsum(np.pad(f, ((0, 0), (1, 0))), axis=1)
-        return np.asarray((sums[:, -1:] - sums[:, high] + sums[:, low]) * noise)
+        # Of each measured cell the mass of values sent last that lie more than delta from it: above, then below.
+        sums = np.cumsum(f, axis=1)
+        far = np.zeros_like(f)
+        far[:, :beyond] = sums[:, -1:] - sums[:, size - beyond - 1 : -1]
+        far[:, size - beyond :] += sums[:, :beyond]
+        return np.asarray(far * noise)
 
     def step(vector: np.ndarray) -> np.ndarray:
         """Move x, then send or stay quiet."""
