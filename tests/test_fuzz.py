@@ -72,6 +72,7 @@ CALLS = [  # what is called, and arguments with which it works
     (random_affine.GainAndNoise, {"law": hg.Rayleigh(1.0), "matrix": EYE, "noise": 0.1}),
     (random_affine.known, {"matrix": EYE}),
     (random_affine.Lift, {"base": HOP, "degree": 2}),
+    (random_affine.DelayLine, {"link": random_affine.known([[0.5, 0.5]]), "past": 1}),
     (random_affine.Mixture, {"maps": [HOP, HOP], "weights": [0.5, 0.5], "radius": 0.0}),
     (random_affine.Series, {"maps": [HOP]}),
     (random_affine.Stack, {"maps": [HOP]}),

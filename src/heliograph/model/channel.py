@@ -331,7 +331,9 @@ def check_link(
         _ = sensor.noise.covariance
     check_maps("channel", [channel])
     if channel.past and not late:
-        expected = "one without delays (linear_filter knows them; hg.filters.late_filter a constant one for any filter)"
+        constant = isinstance(channel, Delayed) and channel.constant
+        late_filter = ", and hg.filters.late_filter this one for any filter" if constant else ""
+        expected = f"one without delays (linear_filter knows them{late_filter})"
         raise fail("channel", expected, f"one that is late by up to {channel.past} steps")
     check_sent(sensor, channel)
 

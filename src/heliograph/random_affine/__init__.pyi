@@ -30,6 +30,9 @@ from .laws.law import (
     GivenMoments as GivenMoments,
     bernoulli as bernoulli,
 )
+from .delay import (
+    DelayLine as DelayLine,
+)
 from .modes import (
     Faded as Faded,
     Modes as Modes,

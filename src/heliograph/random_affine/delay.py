@@ -57,15 +57,32 @@ class AbstractDelayLine(AbstractMapWrapper):
 
 
 class DelayLine(AbstractDelayLine):
-    """A map that is given as one of the line."""
+    """Link that is given what was sent at this step and at the `past` steps before: z_k = G (y_k, ..., y_{k-past}) + n.
 
-    plain: AbstractRandomAffine
+    A link that delivers the mean of the last two signals is `DelayLine(Series([known([[0.5, 0.5]]), link]), 1)`. Before
+    the first step zeros were sent. The best linear filter estimates the past states too, and so knows all of it.
+
+    Args:
+        link: map of 1 + past signals one above the other, the newest first.
+        past: steps back that it reaches, at least 1.
+
+    Raises:
+        ValueError: no map; fewer steps; inputs that are not those of so many signals.
+    """
+
+    link: AbstractRandomAffine
     steps: int = eqx.field(static=True)
+
+    def __init__(self, link: AbstractRandomAffine, past: int):
+        check_maps("link", [link])
+        self.link, self.steps = link, check_count("past", past)
+        if link.inputs % (1 + past):
+            raise fail("link", f"inputs of {1 + past} signals of one length", link.inputs)
 
     @property
     def line(self) -> AbstractRandomAffine:
         """The map that was given, whose input is the whole line."""
-        return self.plain
+        return self.link
 
     @property
     def past(self) -> int:
@@ -78,12 +95,12 @@ class DelayLine(AbstractDelayLine):
         return self.line.carry_angles(tuple(t * size + i for t in range(1 + self.past) for i in sent))
 
     def in_words(self) -> str:
-        """Return the map in words."""
-        return self.plain.in_words()
+        """Return the map in words, and how many signals it is given."""
+        return f"{self.link.in_words() or DIRECT}, of the last {self.steps + 1} signals"
 
     def visit_hops(self, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
         """Visit the hops of the map, to which the line of past signals goes."""
-        plain, position = self.plain.visit_hops(visit, position.on_delay_line(self.inputs // signal_size(self)))
+        plain, position = self.link.visit_hops(visit, position.on_delay_line(self.inputs // signal_size(self)))
         return replace_inner_maps(self, [plain]), position
 
 

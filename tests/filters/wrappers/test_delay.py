@@ -278,3 +278,15 @@ REFUSED = {
 def test_refusals(expected):
     with pytest.raises(ValueError, match=expected.replace("depends", "depend")):
         REFUSED[expected]()
+
+
+def test_a_link_of_the_last_two_signals():
+    """Their mean, through a hop: the linear filter knows it exactly, and the diagram says what it is."""
+    channel = hg.random_affine.DelayLine(hg.random_affine.Series([hg.random_affine.known([[0.5, 0.5]]), LINK]), 1)
+    item = hg.linear_filter(PLANT, SENSOR, channel)
+    network = hg.Network(PLANT, {"node": hg.Node(SENSOR, channel, {"linear": item})})
+    found = hg.monte_carlo(network, horizon=20, runs=1024, key=3, keep=hg.Statistics())["node"]["linear"]
+    _, low, high = found.nees_per_dimension()
+    assert found.claim == "exact" and low < 1 < high and channel.in_words().endswith("of the last 2 signals")
+    with pytest.raises(ValueError, match="link: expected inputs of 3 signals of one length, got 2"):
+        hg.random_affine.DelayLine(hg.random_affine.known([[0.5, 0.5]]), 2)
