@@ -1,7 +1,6 @@
 """Interface of every filter: deterministic predictions and corrections of an explicit state, with sizes and a claim."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import wraps
 from typing import TYPE_CHECKING, NamedTuple, NoReturn, ParamSpec, TypeVar, cast
 
@@ -16,10 +15,10 @@ from heliograph.filters.filter_data import Filtered, run_over_data, scan_inside_
 from heliograph.filters.plausibility import Judgement, judge_step
 from heliograph.filters.remark import Remark
 from heliograph.filters.sizes import make_sizes
-from heliograph.filters.smoother_step import SmootherStep, StepTrace, add_nis
+from heliograph.filters.smoother_step import SmootherStep, StepTrace, make_smoother_step
 from heliograph.filters.vector import check_vector
 from heliograph.model.checks.inputs import check_time_step, do_inputs_spoil
-from heliograph.model.estimate import Claim, Estimate, Innovation, weakest
+from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import steps_covered
 from heliograph.model.premises.premise import NOTHING, Kept, Premise, believes
 from heliograph.numerics.angle import Angles
@@ -337,15 +336,6 @@ def _step_with_smoother(
     prior = filter.predict(state, u, k)
     after, innovation = filter.correct(prior, z, k)
     return after, make_smoother_step(filter, StepTrace(state, prior, after, innovation, z, u, k))
-
-
-def make_smoother_step(filter: AbstractFilter, trace: StepTrace) -> SmootherStep:
-    """Return a filter's smoother step with the NIS of its innovation, under no stronger claim than the filter's own.
-
-    A filter around another may hand on the smoother step of the filter within, and that filter's claim with it.
-    """
-    step = add_nis(filter.smoother_step(trace), trace.innovation)
-    return replace(step, claim=weakest([step.claim, filter.claim]))
 
 
 def predicts(predict: Callable[P, R]) -> Callable[P, R]:

@@ -14,7 +14,7 @@ from heliograph.factors.columns import Columns, decorrelate, join_columns, trian
 from heliograph.factors.gaussian import BackwardGain, Gaussian, condition_on_next_state, from_columns, rts_step
 from heliograph.filters.plausibility import innovation_distance
 from heliograph.filters.truncation import PlacedLimits, hold_mean, truncate_to_limits
-from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.estimate import Claim, Estimate, Innovation, weakest
 from heliograph.numerics.angle import Angles, wrap_angles
 from heliograph.numerics.manifold import Manifold
 from heliograph.numerics.module import Module
@@ -206,7 +206,11 @@ def smoother_step_of(
     )
 
 
-def add_nis(step: SmootherStep, innovation: Innovation) -> SmootherStep:
-    """Return the step with the normalised innovation squared, e' S^-1 e."""
-    nis, count = innovation_distance(innovation)
-    return replace(step, nis=nis, received=count)
+def make_smoother_step(filter: Any, trace: StepTrace) -> SmootherStep:
+    """Return a filter's smoother step with the NIS of its innovation, under no stronger claim than the filter's own.
+
+    A filter around another may hand on the smoother step of the filter within, and that filter's claim with it.
+    """
+    step: SmootherStep = filter.smoother_step(trace)
+    nis, count = innovation_distance(trace.innovation)
+    return replace(step, nis=nis, received=count, claim=weakest([step.claim, filter.claim]))
