@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.live.event import INPUTS, OF_STEPS, Known, Verdict
+from heliograph.live.held_watch import HeldWatch
 from heliograph.live.leap import ARRIVAL, Leap, find_leap
 from heliograph.live.link_counts import ScreenedEvent
 from heliograph.live.network_program import NetworkProgram
@@ -15,6 +16,7 @@ from heliograph.live.plant import PlantState, Withdrawn
 from heliograph.live.pool import Pool, cut_into_legs, group_by_turn
 from heliograph.live.rows import BEFORE, HeldRow, Rows
 from heliograph.live.sender_status import Sender, SenderStatus
+from heliograph.model.limits import Limits
 from heliograph.model.over_time import steps_covered
 from heliograph.model.stuck import Repeats
 from heliograph.numerics.check import TINY, check_count, fail, instance, scalar
@@ -90,6 +92,7 @@ class Fleet:
         self._names = [*network.names, INPUTS]
         self._joint = self.program.dt is None or network.common is not None
         self._limits = {name: node.limits for name, node in network.nodes.items() if node.limits is not None}
+        self.held_watches = {name: watch for name, node in network.nodes.items() if (watch := HeldWatch.of_node(node))}
         self.periods = dict[str, int]()  # after how many messages a node's count begins at 0 again, where it does
         # Nodes of which silence says something, and of these the ones whose sender decides when to send.
         nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
@@ -219,11 +222,21 @@ class Fleet:
 
         Readings repeat in the order in which they arrive; `plant` is None where it has not begun.
         """
-        if node not in self._limits:
+        limits, watch = self._limits.get(node), self.held_watches.get(node)
+        if limits is None and watch is None:
             return ScreenedEvent(event)
-        limits, values = self._limits[node], np.array(event.values)
         link = None if plant is None else plant.links.get(node)
-        screened = limits.screen(values[None], Repeats() if link is None else link.repeats)
+        screened = ScreenedEvent(event, repeats=Repeats() if link is None else link.repeats)
+        if limits is not None:
+            screened = self._screen_by_limits(limits, node, screened)
+        if watch is not None:
+            screened = screened._replace(repeats=watch.follow(screened.event.values, screened.repeats))
+        return screened
+
+    def _screen_by_limits(self, limits: Limits, node: str, taken: ScreenedEvent) -> ScreenedEvent:
+        """Remove an event's values that its node refuses, given the runs of equal readings before it."""
+        event, values = taken.event, np.array(taken.event.values)
+        screened = limits.screen(values[None], taken.repeats)
         outside, stuck = screened.outside[0], screened.stuck[0]
         if not (outside | stuck).any():
             return ScreenedEvent(event, repeats=screened.repeats)

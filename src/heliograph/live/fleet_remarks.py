@@ -1,4 +1,4 @@
-"""Remarks of a fleet's filters on their states that users should read once, such as that a gate gave in."""
+"""What users of a fleet should read once: remarks of filters on their states, and sensors that seem stuck."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -40,3 +40,21 @@ class FleetRemarks:
         if not self.counts:
             return {}
         return self._steps.read_remarks(self._pool.table[row.slot, self._pool.state])
+
+
+class FleetHeld:
+    """Watch for outputs that repeat for longer than their noise allows; each is said once, of one plant."""
+
+    def __init__(self, fleet: Fleet):
+        self._watches, self._nodes = fleet.held_watches, fleet.network.nodes
+        self._said = set[tuple[str, int]]()  # node and output
+
+    def find_new(self, plants: Iterable[PlantState]) -> Iterator[tuple[str, str]]:
+        """Yield the name of a plant and a line for each output that repeats for too long for the first time."""
+        for plant in plants if self._watches else ():
+            for node, link in plant.links.items():
+                for output in [i for i, count in enumerate(link.repeats.found) if count]:
+                    if (node, output) not in self._said:
+                        self._said.add((node, output))
+                        name = self._nodes[node].received_names[output]
+                        yield plant.name, f"{node}: {self._watches[node].describe(output, name, link.repeats)}"

@@ -81,6 +81,11 @@ class LinkCounts:
             self.stuck += screened.stuck
             self.repeats = screened.repeats
 
+    @property
+    def held(self) -> int:
+        """Return how many runs of equal readings were longer than noise allows, of a node that refuses none."""
+        return sum(self.repeats.found)
+
     def count_timeout(self, time: float, begun: float, timeout: float) -> None:
         """Count the silence that a message of `time` ends if it is longer than the timeout of its node.
 

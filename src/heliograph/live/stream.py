@@ -12,6 +12,7 @@ from scipy.stats import chi2
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import Judgement
 from heliograph.live.filter_stepper import NativeFilterStepper, XlaFilterStepper, compile_native_step, compile_xla_step
+from heliograph.live.held_watch import HeldWatch
 from heliograph.live.sender_status import LossChain, Sender, SenderStatus
 from heliograph.live.stored.old_layout import can_read, describe_old_layout, relocate_parts, split_by_path
 from heliograph.live.stored.snapshot import Identity, check_same, pack, unpack, versions
@@ -19,7 +20,7 @@ from heliograph.model.channel import Channel
 from heliograph.model.checks.faults import find_function_fault
 from heliograph.model.checks.inputs import check_inputs
 from heliograph.model.estimate import JudgedEstimate, lower_unsound_claim, weakest
-from heliograph.model.limits import LimitsLike, limits_of
+from heliograph.model.limits import LimitsLike, Screened, limits_of
 from heliograph.model.origin import Origin
 from heliograph.model.over_time import first
 from heliograph.model.stuck import Repeats, StuckLike
@@ -74,6 +75,8 @@ class Stream:
         self.limits = limits_of(filter.received, limits, invalid, stuck, *believed)
         self.dropped = np.zeros(filter.received, dtype=np.int64)
         self.stuck, self._repeats = np.zeros(filter.received, dtype=np.int64), Repeats()
+        refuses = self.limits is not None and self.limits.stuck is not None
+        self._watch = None if refuses or _sender_of(filter) else HeldWatch.of(*believed, filter.received)
         # Steps done; step of a sender's newest value; unexpected measurements in a row; remarks made.
         self.steps, self._last, self._beyond, self._remarked = 0, -1, 0, 0
         self._inputs = np.full(len(filter.inputs), np.nan)
@@ -125,10 +128,7 @@ class Stream:
         self.steps, self._inputs = k + 1, u
         if compiled.values and not np.isnan(z[: compiled.values]).all():
             self._last = k
-        if screened is not None:
-            self.dropped += screened.outside[0]
-            self.stuck += screened.stuck[0]
-            self._repeats = screened.repeats
+        self._count_readings(screened, z)
         if self.filter.remarks:
             self._warn_of_remark()
         # Count in how many steps in a row nis was over its quantile.
@@ -151,6 +151,27 @@ class Stream:
         state = self._compiled.state.unflatten([np.array(leaf) for leaf in self._stepper.state])
         time, spacing = float(self.steps - 1), float("nan") if "dt" in self.filter.inputs else 1.0
         return Origin(self.filter, state, self.steps, np.array(self._inputs), time, spacing)
+
+    @property
+    def held(self) -> np.ndarray:
+        """Return by component how many runs of equal readings were longer than its noise allows; none was refused."""
+        found = self._repeats.found or [0] * self.filter.received
+        return np.array(found, dtype=np.int64)
+
+    def _count_readings(self, screened: Screened | None, z: np.ndarray) -> None:
+        """Count what was screened; where none is stuck by rule, warn of the first run of each component that is."""
+        if screened is not None:
+            self.dropped += screened.outside[0]
+            self.stuck += screened.stuck[0]
+            self._repeats = screened.repeats
+        before, watch = self._repeats.found, self._watch
+        if watch is None:
+            return
+        self._repeats = watch.follow(z.tolist(), self._repeats)
+        for i, count in enumerate(self._repeats.found if self._repeats.found != before else ()):
+            if count == 1 and not (before and before[i]):
+                said = watch.describe(i, f"received number {i}", self._repeats)
+                warnings.warn(f"stream, step {self.steps - 1}: {said}", stacklevel=3)
 
     def _warn_of_remark(self) -> None:
         """Warn of what the filter says of its state, such as that a gate gave in, where it is new."""

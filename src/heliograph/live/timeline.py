@@ -1,7 +1,6 @@
 """Filters on events in any order: each event gets a verdict and its place in time."""
 
 import warnings
-from collections import deque
 from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
@@ -10,8 +9,9 @@ import numpy as np
 
 from heliograph.filters.plausibility import Judgement
 from heliograph.live.event import INPUTS, VERDICTS, Known, Verdict, check_63_bits, check_moment, check_numbers
+from heliograph.live.final_rows import FinalRows
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.fleet_remarks import FleetRemarks
+from heliograph.live.fleet_remarks import FleetHeld, FleetRemarks
 from heliograph.live.implausible_events import FleetAngles, Judges
 from heliograph.live.link_counts import LinkCounts
 from heliograph.live.network_program import shared_program
@@ -25,31 +25,9 @@ from heliograph.model.estimate import Estimate, JudgedEstimate
 from heliograph.model.origin import Origin
 from heliograph.numerics.check import check_count, fail, instance, scalar, show_value
 from heliograph.numerics.module import readable
-from heliograph.numerics.types import ArrayLike, Float
+from heliograph.numerics.types import ArrayLike
 from heliograph.simulation.network import Network
 from heliograph.simulation.results.record import Record
-
-
-class FinalRows:
-    """Outputs of final rows, `size` numbers each, in order of time; beyond `most` rows the oldest parts are dropped."""
-
-    def __init__(self, most: int, size: int):
-        self.most, self.size, self._parts = most, size, deque[tuple[np.ndarray, np.ndarray]]()
-        self._count = 0  # rows of all parts
-
-    def add(self, time: np.ndarray, rows: Float[np.ndarray, "row output"]) -> None:
-        """Append the outputs of some rows."""
-        self._parts.append((time, rows))
-        self._count += len(time)
-        while self._count - len(self._parts[0][0]) >= self.most:
-            self._count -= len(self._parts.popleft()[0])
-
-    def take(self) -> tuple[np.ndarray, Float[np.ndarray, "row output"]]:
-        """Remove and return all times and rows."""
-        times, rows = zip((np.zeros(0), np.zeros((0, self.size))), *self._parts, strict=True)
-        self._parts.clear()
-        self._count = 0
-        return np.concatenate(times), np.concatenate(rows)
 
 
 @readable
@@ -76,7 +54,8 @@ class Timeline:
 
     `counts` has the number of each verdict; `dropped` the number of single values beyond a node's limits, and `stuck`
     of those that repeat for too long, which counted as not arrived; `timeouts` that of silences longer than a node's
-    timeout, which `senders` names while they last; `reasons` says in words, by node, why the last
+    timeout, which `senders` names while they last; `held` that of runs of equal readings that a node without `stuck=`
+    does not refuse; `reasons` says in words, by node, why the last
     implausible event was one; `forced` is the number of rows that became final early.
 
     Args:
@@ -111,6 +90,7 @@ class Timeline:
         self._judges = Judges(self._fleet)
         self.reasons: dict[str, str] = {}
         self._angles, self._remarks = FleetAngles(self._fleet), FleetRemarks(self._fleet)
+        self._held = FleetHeld(self._fleet)
         self._finals = FinalRows(2 * self.capacity, self._program.step_rows.outputs.size)
 
     def __getstate__(self) -> dict[str, object]:
@@ -148,17 +128,26 @@ class Timeline:
     @property
     def dropped(self) -> dict[str, int]:
         """Return the number of single values beyond each node's limits."""
-        return {name: self._plant.links.get(name, LinkCounts()).dropped for name in self.network.names}
+        return self._counts_of("dropped")
 
     @property
     def stuck(self) -> dict[str, int]:
         """Return the number of single values of each node that repeated for longer than its noise allows."""
-        return {name: self._plant.links.get(name, LinkCounts()).stuck for name in self.network.names}
+        return self._counts_of("stuck")
 
     @property
     def timeouts(self) -> dict[str, int]:
         """Return of each node how many silences were longer than its timeout, and ended; `senders` names others."""
-        return {name: self._plant.links.get(name, LinkCounts()).timeouts for name in self.network.names}
+        return self._counts_of("timeouts")
+
+    @property
+    def held(self) -> dict[str, int]:
+        """Return of each node without `stuck` how many runs of equal readings were longer than its noise allows."""
+        return self._counts_of("held")
+
+    def _counts_of(self, what: str) -> dict[str, int]:
+        """Return one of the counts of the links, by node."""
+        return {name: getattr(self._plant.links.get(name, LinkCounts()), what) for name in self.network.names}
 
     def push(self, node: str, sequence: int, time: float, values: ArrayLike, arrival: float | None = None) -> Verdict:
         """Take what a node measured at `time`, which arrived at `arrival` (None: at once), and judge it.
@@ -185,6 +174,8 @@ class Timeline:
                     warnings.warn(f"timeline, {line}", stacklevel=2)
                 self._finalise()
         self._fleet.count(plant, node, screened, verdict)
+        for _, line in self._held.find_new([plant]):
+            warnings.warn(f"timeline, {line}", stacklevel=2)
         return verdict
 
     def _why_implausible(self, event: Known, row: HeldRow) -> str | None:

@@ -32,22 +32,31 @@ class Repeats(NamedTuple):
     Args:
         newest: newest readings (m,), NaN before the first.
         lengths: of the runs of equal readings that end with them (m,).
+        steps: least differences of two successive readings that differ (m,), infinite where all were equal. This and
+            the next three are of sensors of which nobody said when they are stuck; () of others.
+        readings: how many there were (m,).
+        equal: how many of them were equal to the one before (m,).
+        found: runs that were found to be longer than noise allows (m,).
     """
 
     newest: tuple[float, ...] = ()
     lengths: tuple[int, ...] = ()
+    steps: tuple[float, ...] = ()
+    readings: tuple[int, ...] = ()
+    equal: tuple[int, ...] = ()
+    found: tuple[int, ...] = ()
 
     @staticmethod
     def read(stored: object) -> "Repeats":
-        """Return runs that were stored: a pair of lists, or the runs themselves.
+        """Return runs that were stored: a list of their parts, until version 0.4.0 of two; or the runs themselves.
 
         Raises:
-            ValueError: no such pair.
+            ValueError: no such list.
         """
-        pair = stored if isinstance(stored, tuple | list) else ()
-        if len(pair) != 2 or not all(isinstance(part, tuple | list) for part in pair):
+        parts = stored if isinstance(stored, tuple | list) else ()
+        if len(parts) not in (2, len(Repeats._fields)) or not all(isinstance(part, tuple | list) for part in parts):
             raise fail("repeats", "newest readings, and how many in a row are equal to them", show_value(stored))
-        return Repeats(tuple(pair[0]), tuple(pair[1]))
+        return Repeats(*map(tuple, parts))
 
 
 def count_repeats(z: Float[np.ndarray, "time m"], before: Repeats) -> tuple[Int[np.ndarray, "time m"], Repeats]:
@@ -73,7 +82,9 @@ def count_repeats(z: Float[np.ndarray, "time m"], before: Repeats) -> tuple[Int[
     return counts, Repeats(tuple(newest), tuple(lengths))
 
 
-def bound_equal_readings(noise: AbstractNoise) -> Float[np.ndarray, " outputs"]:
+def bound_equal_readings(
+    noise: AbstractNoise, steps: Float[np.ndarray, " outputs"] | None = None
+) -> Float[np.ndarray, " outputs"]:
     """Bound the probability that a reading equals the one before it, whatever the sensor measures, of each output.
 
     A reading y = h(x) + v is reported as the nearest multiple of its resolution q, and equals the one before where v
@@ -81,19 +92,22 @@ def bound_equal_readings(noise: AbstractNoise) -> Float[np.ndarray, " outputs"]:
     larger probability than the one about the centre: erf(q / sqrt(8 r)) for Gaussian noise of variance r. That of a
     mixture is at most the mean over its branches.
 
+    Args:
+        noise: the law of v.
+        steps: the resolution of each output that declares none; by default each has to.
+
     Raises:
         ValueError: readings without a resolution, or noise that is not Gaussian, Student's or contaminated.
     """
+    if isinstance(noise, Rounded):
+        return bound_equal_readings(noise.source, np.asarray(noise.step))
     if isinstance(noise, Independent):
-        return np.concatenate([bound_equal_readings(part) for part in noise.parts])
-    if not isinstance(noise, Rounded):
+        ends = np.cumsum([part.dimension for part in noise.parts])[:-1]
+        of_parts = [None] * len(noise.parts) if steps is None else np.split(steps, ends)
+        return np.concatenate([bound_equal_readings(*part) for part in zip(noise.parts, of_parts, strict=True)])
+    if steps is None:
         raise fail("stuck", "a sensor with resolution=, or after how many equal readings", "no resolution")
-    source, step = noise.source, np.asarray(noise.step)
-    if isinstance(source, Independent):
-        ends = np.cumsum([part.dimension for part in source.parts])[:-1]
-        steps = np.split(step, ends)
-        return np.concatenate([_bound(part, q) for part, q in zip(source.parts, steps, strict=True)])
-    return _bound(source, step)
+    return _bound(noise, steps)
 
 
 def _bound(noise: AbstractNoise, step: Float[np.ndarray, " outputs"]) -> Float[np.ndarray, " outputs"]:

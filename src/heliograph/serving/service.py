@@ -13,7 +13,7 @@ from heliograph.live.event import INPUTS, Verdict
 from heliograph.live.fleet import Finalised
 from heliograph.live.fleet import Fleet as Fleet
 from heliograph.live.fleet import Options as Options
-from heliograph.live.fleet_remarks import FleetRemarks
+from heliograph.live.fleet_remarks import FleetHeld, FleetRemarks
 from heliograph.live.implausible_events import FleetAngles
 from heliograph.live.network_program import NetworkProgram as NetworkProgram
 from heliograph.live.plant import PlantState, Withdrawn
@@ -91,6 +91,7 @@ class Service:
         self._writer, self._using = EstimateWriter(fleet.program), Using(fleet, self.plants)
         self._exchange, self._silence = Exchange(fleet, self._time_in_messages), Silence(fleet, every)
         self._angles, self._remarks, self._doubt = FleetAngles(fleet), FleetRemarks(fleet), say
+        self._held = FleetHeld(fleet)
         self._ahead = None if forecast is None else ForecastPublisher(fleet, forecast, thresholds)
         self._unsearched = 0  # messages since the last search for garbage
         self._published: int | None = None  # up to where, since the last commit
@@ -230,7 +231,8 @@ class Service:
         touched = {plant.name: plant for plant, _, _, _ in outcomes if plant is not None}
         used = {plant.name for plant, verdict, _, _ in outcomes if plant is not None and verdict == "used"}
         if self._doubt is not None:
-            for name, line in self._angles.find_new(list(touched.values())):
+            plants = list(touched.values())
+            for name, line in (*self._angles.find_new(plants), *self._held.find_new(plants)):
                 self._doubt(f"warning: plant {name!r}, {line}; not said again, nor of other plants")
         for name, line in self._remarks.find_new(touched.values()):
             if self._doubt is not None:

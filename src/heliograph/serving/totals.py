@@ -6,7 +6,7 @@ from typing import Protocol
 
 from heliograph.live.event import VERDICTS
 
-COUNTS = (*VERDICTS, "dropped", "stuck", "timeouts")  # which never fall
+COUNTS = (*VERDICTS, "dropped", "stuck", "timeouts", "held")  # which never fall
 FIELDS = (*COUNTS, "lost")
 
 
@@ -18,6 +18,7 @@ class LinkTotals(Protocol):
         dropped: single values beyond limits.
         stuck: single values that repeated for too long.
         timeouts: silences longer than the timeout that have ended.
+        held: runs of equal readings that were longer than noise allows, and not refused.
         used, duplicate, conflict, late, future, implausible: numbers of messages by verdict.
     """
 
@@ -25,6 +26,11 @@ class LinkTotals(Protocol):
     dropped: int
     stuck: int
     timeouts: int
+
+    @property
+    def held(self) -> int:
+        """Return the number of those runs."""
+
     used: int
     duplicate: int
     conflict: int

@@ -102,6 +102,8 @@ def _collect_links(watch: Watch) -> Iterable[Metric]:
     stuck = CounterMetricFamily("heliograph_stuck", why, labels=["node"])
     quiet = "Silences longer than a node's timeout that have ended; heliograph_dead_senders has those that last."
     timeouts = CounterMetricFamily("heliograph_timeouts", quiet, labels=["node"])
+    said = "Runs of equal readings longer than noise allows, of a node that does not refuse them (stuck=)."
+    held = CounterMetricFamily("heliograph_held", said, labels=["node"])
     for node, tally in watch.links().items():
         for verdict in VERDICTS:
             messages.add_metric([node, verdict], tally[verdict] or 0)
@@ -110,7 +112,8 @@ def _collect_links(watch: Watch) -> Iterable[Metric]:
         dropped.add_metric([node], tally["dropped"] or 0)
         stuck.add_metric([node], tally["stuck"] or 0)
         timeouts.add_metric([node], tally["timeouts"] or 0)
-    return messages, lost, dropped, stuck, timeouts
+        held.add_metric([node], tally["held"] or 0)
+    return messages, lost, dropped, stuck, timeouts, held
 
 
 def _collect_dead_senders(watch: Watch) -> Metric:

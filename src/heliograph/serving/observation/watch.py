@@ -42,6 +42,7 @@ COUNTED = {  # of a node's messages
     "implausible": "implausible and refused; the refused lines say why",
     "dropped": "beyond its limits, or codes, counted as not arrived",
     "stuck": "equal for longer than its noise allows, counted as not arrived: it is stuck",
+    "held": "runs of equal readings longer than its noise allows: it is stuck, or has no noise",
     "timeouts": "silences that were longer than its timeout, and ended",
     "conflict": "came again with other values; the first stayed",
 }

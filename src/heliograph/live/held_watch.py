@@ -1,0 +1,111 @@
+"""Readings that repeat for longer than their noise allows, of sensors of which nobody said when they are stuck."""
+
+from collections.abc import Sequence
+from math import ceil, inf, log
+
+import numpy as np
+
+from heliograph.model.channel import Channel
+from heliograph.model.over_time import unstack
+from heliograph.model.sensor import AbstractSensor, AnySensor
+from heliograph.model.stuck import LEAST, SELDOM, Repeats, bound_equal_readings, delivers_as_sent
+from heliograph.random_affine.noise import AbstractNoise
+from heliograph.simulation.node import Node
+
+FIRST = Repeats()  # before the first reading
+SURE = 1e-12  # of a probability below one: a run is as long as one likes
+
+
+class HeldWatch:
+    """Watch for runs of equal readings that noise makes less than once in 10^9 readings, one sensor's, one by one.
+
+    A reading of resolution q equals the one before with probability at most p(q), whatever the sensor measures
+    (`bound_equal_readings`), and p grows with q. Where no resolution is declared, the least difference of two
+    successive readings so far is a multiple of q, so that its p is a bound too; where all were equal that is 1, and
+    nothing is found. A law may be stated too large, or repeat values by itself: p is at least (e + 1) / (o + 2), where
+    e of the o pairs of successive readings outside of the run were equal. A run of n readings begins at a reading with
+    probability at most p^(n - 1), and is found where that is at most SELDOM: one by chance is at most so rare.
+
+    Args:
+        noises: laws of the sensor's noise, one for each that it has over time.
+    """
+
+    def __init__(self, noises: Sequence[AbstractNoise]):
+        self.noises = noises
+        self._bounds = dict[tuple[int, float], float]()  # by output and resolution
+
+    @staticmethod
+    def of(sensor: AnySensor | None, channel: Channel | None, received: int) -> "HeldWatch | None":
+        """Return the watch for what arrives of a sensor; None if its law is not known, or readings arrive changed."""
+        steps = [] if sensor is None else unstack(sensor)
+        if channel is None or not steps or not all(isinstance(step, AbstractSensor) for step in steps):
+            return None
+        outputs = tuple(range(received))
+        if len(steps[0].outputs) != received or not all(delivers_as_sent(link, outputs) for link in unstack(channel)):
+            return None
+        noises = list({id(step.noise): step.noise for step in steps}.values())
+        try:
+            for noise in noises:
+                bound_equal_readings(noise, np.full(received, inf))
+        except ValueError:
+            return None
+        return HeldWatch(noises)
+
+    @staticmethod
+    def of_node(node: object) -> "HeldWatch | None":
+        """Return the watch for what a node receives; None if it refuses what is stuck, or its sender decides."""
+        if not isinstance(node, Node) or node.trigger is not None or node.encoder is not None:
+            return None
+        refuses = node.limits is not None and node.limits.stuck is not None
+        return None if refuses else HeldWatch.of(node.sensor, node.channel, node.received)
+
+    def follow(self, values: Sequence[float], before: Repeats | None = None) -> Repeats:
+        """Return the runs that end with these readings, NaN where none arrived, after those `before`, if any.
+
+        Its `found` has one more where a run has become too long with this reading.
+        """
+        m, before = len(values), before or FIRST
+        newest, lengths = list(before.newest or [np.nan] * m), list(before.lengths or [0] * m)
+        steps, readings = list(before.steps or [inf] * m), list(before.readings or [0] * m)
+        equal, found = list(before.equal or [0] * m), list(before.found or [0] * m)
+        for i, value in enumerate(values):
+            if value != value:
+                continue
+            if value == newest[i]:
+                lengths[i] += 1
+                equal[i] += 1
+            else:
+                if readings[i]:
+                    steps[i] = min(steps[i], abs(value - newest[i]))
+                newest[i], lengths[i] = value, 1
+            readings[i] += 1
+            if lengths[i] >= LEAST:
+                found[i] += lengths[i] == self._count_too_many(i, lengths[i], steps[i], readings[i], equal[i])
+        followed = tuple(newest), tuple(lengths), tuple(steps), tuple(readings), tuple(equal), tuple(found)
+        return Repeats(*followed)
+
+    def describe(self, output: int, name: str, repeats: Repeats) -> str:
+        """Say that an output repeats its newest reading for longer than its noise allows, and what refuses that."""
+        length, value = repeats.lengths[output], repeats.newest[output]
+        before = repeats.steps[output], repeats.readings[output], repeats.equal[output]
+        count = self._count_too_many(output, length, *before)
+        return (
+            f"{name} is stuck, or has no noise: {length} equal readings in a row ({value:g}), of which its noise makes "
+            f"{count:g} less than once in {1 / SELDOM:,.0f} readings; stuck={count:g} refuses such"
+        )
+
+    def _bound(self, output: int, step: float) -> float:
+        """Return the largest probability that a reading of this resolution equals the one before it."""
+        key = output, step
+        if key not in self._bounds:
+            if len(self._bounds) > 10_000:
+                self._bounds.clear()
+            bounds = [bound_equal_readings(noise, np.full(noise.dimension, step))[output] for noise in self.noises]
+            self._bounds[key] = float(max(bounds))
+        return self._bounds[key]
+
+    def _count_too_many(self, output: int, length: int, step: float, readings: int, equal: int) -> float:
+        """Return the least count of equal readings that is too long, given the present run and what came before it."""
+        by_count = (equal - (length - 1) + 1) / (readings - length + 2)
+        p = max(self._bound(output, step), by_count)
+        return inf if p >= 1 - SURE else max(LEAST, 1 + ceil(log(SELDOM) / log(p)))
