@@ -29,6 +29,7 @@ ORDER = [
     [
         "filters.vector",
         "filters.calls",
+        "filters.filter_angles",
         "filters.base",
         "filters.remark",
         "filters.sizes",

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import wraps
-from typing import TYPE_CHECKING, NamedTuple, NoReturn, ParamSpec, TypeVar, cast
+from typing import TYPE_CHECKING, NoReturn, ParamSpec, TypeVar, cast
 
 import equinox as eqx
 import jax
@@ -11,6 +11,7 @@ from typing_extensions import TypeAliasType
 
 from heliograph.engine.choice import compile_on_call
 from heliograph.filters.calls import call_with_inputs, call_with_state
+from heliograph.filters.filter_angles import FilterAngles
 from heliograph.filters.filter_data import Filtered, run_over_data, scan_inside_jit
 from heliograph.filters.plausibility import Judgement, judge_step
 from heliograph.filters.remark import Remark
@@ -28,8 +29,8 @@ from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.names import refuse_attribute
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 
-__all__ = ["AbstractFilter", "AbstractSizedFilter", "Step", "believes", "corrects", "estimates", "in_float64",
-           "make_sizes", "predicts", "step_number"]  # fmt: skip
+__all__ = ["AbstractFilter", "AbstractSizedFilter", "FilterAngles", "Step", "believes", "corrects", "estimates",
+           "in_float64", "make_sizes", "predicts", "step_number"]  # fmt: skip
 
 Step = TypeAliasType("Step", int | np.integer | Int[Array, ""])
 
@@ -42,13 +43,6 @@ INSTEAD = {  # what other packages call what a filter does here
     "smooth": "hg.rts_smoother(filter, z, u)",
     "gain": "hg.steady_state(plant, sensor).gain",
 }
-
-
-class FilterAngles(NamedTuple):
-    """Places of the angles among a filter's states, and among the numbers that it receives."""
-
-    states: Angles
-    received: Angles
 
 
 @readable
@@ -138,9 +132,7 @@ class AbstractFilter(Module):
     ) -> Filtered:
         """Run the filter over rows of data from its initial state: for each row predict, then correct.
 
-        Rows too many to be held at once are run in blocks, each `after` the result of the one before it. Results are
-        those of one run, and log-likelihoods add up.
-
+        Rows too many to be held are run in blocks, each `after` the result of that before, as if they were one run.
         Every number is used as it is; `hg.run` leaves out those that are implausible, and warns. A linear filter takes
         from 32,768 rows on in chunks side by side where it forgets its start within 512 rows (of 131,072 rows within
         2,048), equal to the pass row by row to 1e-10 of a deviation; every other filter goes row by row.
