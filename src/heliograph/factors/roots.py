@@ -54,16 +54,18 @@ def observe_root(
     Source: Morf and Kailath, Square-root algorithms for least-squares estimation (1975).
     """
     (m, n), through = output.shape[-2:], output @ root
-    noise, root = (np.broadcast_to(part, (*through.shape[:-2], *part.shape[-2:])) for part in (noise, root))
-    measured = np.concatenate([noise, through], axis=-1)
-    says = _find_rows_that_add(measured)
-    order = np.argsort(~says, axis=-1, kind="stable")
-    says, measured = np.take_along_axis(says, order, axis=-1), np.take_along_axis(measured, order[..., None], axis=-2)
-    nothing = np.zeros((*through.shape[:-2], n, noise.shape[-1]))
-    rows = np.concatenate([measured, np.concatenate([nothing, root], axis=-1)], axis=-2)
+    columns = noise.shape[-1] + root.shape[-1]
     # At least as many columns as rows, so that the triangle is whole.
-    short = max(m + n - rows.shape[-1], 0)
-    rows = np.pad(rows, [*[(0, 0)] * (rows.ndim - 1), (0, short)])
+    rows = np.zeros((*through.shape[:-2], m + n, max(columns, m + n)))
+    rows[..., :m, : noise.shape[-1]] = noise
+    rows[..., :m, noise.shape[-1] : columns] = through
+    rows[..., m:, noise.shape[-1] : columns] = root
+    # Those that add something first, of most models all of them as they are.
+    says = _find_rows_that_add(rows[..., :m, :columns])
+    order = None if says.all() else np.argsort(~says, axis=-1, kind="stable")
+    if order is not None:
+        says = np.take_along_axis(says, order, axis=-1)
+        rows[..., :m, :] = np.take_along_axis(rows[..., :m, :], order[..., None], axis=-2)
     lower = np.asarray(np.linalg.qr(rows.swapaxes(-1, -2), mode="r")).swapaxes(-1, -2)
     # K from K V, the last column first.
     total, moved = lower[..., :m, :m], lower[..., m:, :m]
@@ -73,8 +75,9 @@ def observe_root(
         rest = moved[..., j] - (gain[..., j + 1 :] @ total[..., j + 1 :, j, None])[..., 0]
         gain[..., j] = rest * inverse[..., j, None]
     unused = np.where(says[..., None, :], 0.0, moved)
-    gain = np.take_along_axis(gain, np.argsort(order, axis=-1)[..., None, :], axis=-1)
-    return Observed(gain, np.concatenate([lower[..., m:, m:], unused], axis=-1))
+    if order is not None:
+        gain = np.take_along_axis(gain, np.argsort(order, axis=-1)[..., None, :], axis=-1)
+    return Observed(np.ascontiguousarray(gain), np.concatenate([lower[..., m:, m:], unused], axis=-1))
 
 
 def observe_information(
