@@ -64,9 +64,21 @@ LONG = ("tests/studies/", "tests/test_docs.py", "tests/test_readme.py", "tests/s
 
 
 @pytest.hookimpl(trylast=True)
-def pytest_collection_modifyitems(items):
+def pytest_collection_modifyitems(config, items):
     """Files that take long come first, so that no worker has one left when the other has none."""
+    if hasattr(config, "workerinput"):  # each in the same order, whichever it collected in
+        items.sort(key=lambda item: item.path)
     items.sort(key=lambda item: not item.nodeid.startswith(LONG))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(collector):
+    """Every second worker imports the files from the end on: each file that is not compiled yet is compiled by one."""
+    report = yield
+    worker = getattr(collector.config, "workerinput", {}).get("workerid", "gw0")
+    if isinstance(collector, pytest.Directory) and int(worker.removeprefix("gw")) % 2:
+        report.result.reverse()
+    return report
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
