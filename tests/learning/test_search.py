@@ -154,6 +154,39 @@ def test_steps_go_up_where_single_coordinates_would_turn_them():
     assert end.converged.all() and np.all(np.diff(seen) >= 0) and end.total[0] > -1e-12
 
 
+def two_tops(counts):
+    """l = -50 ((x^2 - 1)^2 + (y - x)^2): tops of 0 at x = y = 1 and -1, a saddle between them; counts what is asked."""
+
+    def evaluate(x):
+        counts.append(len(x))
+        a, b = x.T
+        slope = np.stack([-200 * a * (a**2 - 1) + 100 * (b - a), -100 * (b - a)], axis=1)
+        return (
+            -50 * ((a**2 - 1) ** 2 + (b - a) ** 2),
+            slope,
+            np.repeat(np.array([[[500.0, -100], [-100, 100]]]), len(x), 0),
+        )
+
+    return evaluate
+
+
+@pytest.mark.parametrize("joining", [False, True])
+def test_lanes_before_one_top_are_climbed_by_one(joining):
+    """Three lanes end at one top and one at the other; those that are left to another one are asked no more."""
+    counts, starts = [], np.array([[2.0, 2.0], [0.6, 0.7], [1.1, 0.9], [-2.0, -1.0]])
+    found = maximise(two_tops(counts), starts, joining=joining)
+    assert found.converged.all() and found.total == pytest.approx(0.0, abs=1e-12)
+    np.testing.assert_allclose(found.x[:, 0], [1, 1, 1, -1], atol=1e-6)
+    assert (len({tuple(x) for x in found.x}) == 2) == joining
+    assert (sum(counts) < 30) == joining  # 27, and 33 of all on their own
+
+
+def test_lanes_on_both_sides_of_a_saddle_stay_apart():
+    """They are a hundredth of a standard error from each other, as high and flat, and end at different tops."""
+    found = maximise(two_tops([]), np.array([[1e-4, 1e-4], [-1e-4, -1e-4]]), joining=True)
+    np.testing.assert_allclose(found.x[:, 0], [1, -1], atol=1e-6)
+
+
 def test_a_gradient_that_the_information_overstates_is_climbed_to_the_end():
     """Information a thousand times too large: the model learns from its steps, which Fisher's scoring does not."""
 

@@ -9,7 +9,7 @@ S = H P- H' + R, K = C S^-1, w = S^-1 e and a dot for the derivative in one of t
     m'  = m-' + K e' + (C' - K S') w,   P' = P-' - C' K' - K C'' + K S' K',
 
 the last of P = P- - C S^-1 C'. A fit of four variances of thirteen states takes 84,000 operations a row by the former,
-and 15,000 by the latter.
+and 14,500 by the latter.
 
 Source: Gupta and Mehra, Computational aspects of maximum likelihood estimation (1974).
 """
@@ -150,5 +150,6 @@ class Step(NamedTuple):
         solved = psd_solve(safe, jnp.concatenate([jnp.where(present, self.e, 0.0)[:, None], seen @ P], axis=1))
         w, gain = solved[:, 0], solved[:, 1:].T
         mean = mean + gain @ e + (cross - gain @ S) @ w
-        turned = cross @ gain.T
-        return Slopes(mean, symmetric(covariance - (turned + turned.T) + gain @ S @ gain.T)), e, S
+        # C' K' + K C'' - K S' K' = (C' - K S' / 2) K' and its transpose.
+        turned = (cross - gain @ S / 2) @ gain.T
+        return Slopes(mean, symmetric(covariance - (turned + turned.T))), e, S

@@ -83,8 +83,9 @@ class Search:
         top = self._prove_maximum(climbed)
         self.best, ends = top._replace(converged=False, reason=""), climbed.total
         if len(starts) > 1:
-            climbed = self._climb(self._draw_around(top, len(starts) - 1, seed), none)
-            ends = np.concatenate([ends, climbed.total])
+            around = self._draw_around(top, len(starts) - 1, seed)
+            climbed = self._climb(np.concatenate([around, top.x[None]]), none)  # what climbs to the top joins it there
+            ends = np.concatenate([ends, climbed.total[:-1]])
             if climbed.total.max() > top.total + SAME:
                 top = self._prove_maximum(climbed)
         self.best, self.ends = top, -np.sort(-np.nan_to_num(ends, nan=-np.inf))
@@ -134,7 +135,7 @@ class Search:
             self.watch(now)
 
         moving = np.repeat((ends == 0)[None], len(starts), axis=0)
-        return maximise(self.surface.evaluate, starts, moving, seen, self.surface.domains)
+        return maximise(self.surface.evaluate, starts, moving, seen, self.surface.domains, joining=True)
 
     def _move_to_limits(self, top: Top) -> Top:
         """Put numbers that the data hardly see at the end of their domains, where the likelihood is the same."""

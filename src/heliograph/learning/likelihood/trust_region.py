@@ -21,6 +21,10 @@ LONGEST = 5.0  # step of a logarithm or a logit: a factor of 150
 ROUNDING = 1e-14
 LEAST = 1e-150  # information, of which the square is a number
 LARGEST = 1e12  # curvature in units of standard errors: beyond this a model is taken for rounding
+JOINED = 0.1  # standard errors between two lanes that climb to one top, and of either from it
+BENT = 0.5  # of the information between two such lanes, that the likelihood bends by at least
+ALIKE = 0.1  # of the gain between two such lanes, that their slopes may leave unexplained
+NEIGHBOURS = 1.0  # between logarithms or logits of two such lanes, whatever the information says
 INVISIBLE = 1e-6  # information of a logarithm or a logit of which the likelihood sees next to nothing
 
 Evaluated = tuple[Float[np.ndarray, " lanes"], Float[np.ndarray, "lanes p"], Float[np.ndarray, "lanes p p"]]
@@ -73,7 +77,8 @@ class Maximum(NamedTuple):
 class _State(NamedTuple):
     """Lanes of a search: B is the model of the Hessian of -l, radius that of the trust region.
 
-    remaining: g' I^-1 g / 2. done: lanes that go no further.
+    remaining: g' I^-1 g / 2. done: lanes that go no further. joined: the lane that one of them has joined, itself if
+    none.
     """
 
     x: np.ndarray
@@ -85,6 +90,15 @@ class _State(NamedTuple):
     remaining: np.ndarray
     done: np.ndarray
     converged: np.ndarray
+    joined: np.ndarray
+
+    def ends(self, steps: int) -> Maximum:
+        """Return where lanes are, those that have joined another where that one is."""
+        lane = self.joined
+        for _ in range(len(lane)):  # a lane may join one that joins a third
+            lane = lane[lane]
+        x, total, gradient = self.x[lane], self.total[lane], self.gradient[lane]
+        return Maximum(x, total, gradient, self.converged[lane], self.remaining[lane], steps)
 
 
 def maximise(
@@ -94,6 +108,7 @@ def maximise(
     watch: Callable[[Maximum], None] | None = None,
     domains: Domains | None = None,
     close: float = CLOSE,
+    joining: bool = False,
 ) -> Maximum:
     """Search from each start: the step maximises g' p - p' B p / 2 over |D p| <= radius, in units of standard errors.
 
@@ -111,6 +126,7 @@ def maximise(
         watch: called with the best so far before each step.
         domains: what the coordinates are; plain real numbers unless given.
         close: g' I^-1 g at which a lane has arrived.
+        joining: whether a lane that has come so near another that both have one top before them is left to it.
     Source: Moré and Sorensen (1983) for the step; Dennis, Gay and Welsch (1981) for the choice of the model; Conn,
     Gould and Toint, Trust-Region Methods (2000).
     """
@@ -119,13 +135,14 @@ def maximise(
     with np.errstate(all="ignore"):
         state = _init_lanes(evaluate, start, moving, domains, close)
         for count in range(MOST_STEPS):
-            best = Maximum(state.x, state.total, state.gradient, state.converged, state.remaining, count)
+            best = state.ends(count)
             if watch is not None:
                 watch(best)
             if state.done.all():
                 return best
             state = _step_lanes(evaluate, state, moving, domains, close)
-    return Maximum(state.x, state.total, state.gradient, state.converged, state.remaining, MOST_STEPS)
+            state = _join_lanes(state, moving, domains) if joining else state
+    return state.ends(MOST_STEPS)
 
 
 def _init_lanes(evaluate: Evaluate, start: np.ndarray, moving: np.ndarray, domains: Domains, close: float) -> _State:
@@ -143,6 +160,7 @@ def _init_lanes(evaluate: Evaluate, start: np.ndarray, moving: np.ndarray, domai
         np.full(lanes, np.inf),
         impossible,
         np.zeros(lanes, dtype=bool),
+        np.arange(lanes),
     )
     return _mark_arrived(state, moving, domains, close)
 
@@ -206,8 +224,36 @@ def _step_lanes(evaluate: Evaluate, state: _State, moving: np.ndarray, domains: 
         state.remaining,
         state.done,
         state.converged,
+        state.joined,
     )
     return _mark_arrived(after, moving, domains, close)
+
+
+def _join_lanes(state: _State, moving: np.ndarray, domains: Domains) -> _State:
+    """End each lane a that climbs to the same top as a lane b that is higher: it would learn nothing that b does not.
+
+    By the information I of either, both are within JOINED standard errors of a top and of each other, and neighbours in
+    every logarithm and logit. On the way d from a to b the likelihood rises as the slopes at both ends say,
+    (g_a + g_b)' d / 2, exact of a quadratic, and bends down, (g_a - g_b)' d, by BENT of d' I d at least: between them
+    is no saddle.
+    """
+    lanes, g = np.arange(len(state.x)), np.nan_to_num(state.gradient)
+    d = state.x[None, :] - state.x[:, None]  # (a, b, p)
+    both = np.einsum("abi,cij,abj->cab", d, np.nan_to_num(state.information), d)
+    apart = np.maximum(both[lanes, lanes, :], both[lanes, :, lanes].T)  # d' I d by the information of a, and of b
+    gain = state.total[None] - state.total[:, None]
+    foretold = np.einsum("abi,abi->ab", d, g[:, None] + g[None]) / 2
+    bend = np.einsum("abi,abi->ab", d, g[:, None] - g[None])
+    # Both are before a top, and before the same one.
+    before = (2 * state.remaining < JOINED**2) & (state.joined == lanes)
+    beside = np.all(domains.free | (np.abs(d) < NEIGHBOURS), axis=2) & np.all(moving[:, None] == moving[None], axis=2)
+    smooth = (np.abs(gain - foretold) <= ALIKE * gain + NOISE * np.abs(state.total)) & (bend >= BENT * apart)
+    same = before[:, None] & before[None] & beside & (apart < JOINED**2) & smooth
+    # The higher one goes on; of two that are as high the first.
+    higher = same & ((gain > 0) | ((gain == 0) & (lanes[None] < lanes[:, None])))
+    joins = ~state.done & np.any(higher, axis=1)
+    best = np.argmax(np.where(higher, state.total[None], -np.inf), axis=1)
+    return state._replace(joined=np.where(joins, best, state.joined), done=state.done | joins)
 
 
 def _evaluate_lanes(evaluate: Evaluate, x: np.ndarray, going: np.ndarray, state: _State) -> Evaluated:
