@@ -27,7 +27,7 @@ def key_of(key: object) -> jax.Array:
 
 
 def inputs_of(network: Network, inputs: ArrayLike | None, horizon: int) -> np.ndarray:
-    """Return the plant's inputs (horizon, inputs), which a plant without any does not need."""
+    """Return the plant's inputs, checked, as an array (horizon, inputs); None is accepted of a plant without any."""
     count = len(network.inputs)
     if inputs is None and count:
         raise fail("inputs", f"an array ({horizon}, {count}) of {list(network.inputs)}", "none")
@@ -38,7 +38,7 @@ def inputs_of(network: Network, inputs: ArrayLike | None, horizon: int) -> np.nd
 
 
 def check_precision(precision: object) -> None:
-    """Refuse what is no precision of a run."""
+    """Raise ValueError unless `precision` is the name of a precision of a run."""
     known = get_args(Precision.__value__)
     if not isinstance(precision, str) or precision not in known:
         raise fail("precision", f"one of {', '.join(known)}", show_value(precision))
@@ -47,7 +47,7 @@ def check_precision(precision: object) -> None:
 def measurement_of(name: str, value: ArrayLike, steps: int, node: Node | ReceivingNode) -> np.ndarray:
     """Return a node's measurements (steps, received), NaN where nothing arrived.
 
-    (steps,) is accepted for one component; columns of a table that have the names of its components have their order.
+    (steps,) is accepted for one component. A table whose columns have the components' names must have their order too.
     """
     what, received = f"measurements of node {name!r}", node.received
     check_columns(what, value, node.received_names)

@@ -58,7 +58,10 @@ class Boundedness(NamedTuple):
 
 
 class JointLinks(NamedTuple):
-    """Joint model of all links: a chain of modes, the outcomes of each, and the stacked sensors."""
+    """Joint model of all links: a chain of modes, the outcomes of each, and the sensors, one above the other.
+
+    m: measured components of all nodes; n: states; outcomes: one list per mode.
+    """
 
     initial: Float[np.ndarray, "modes"]
     chain: Float[np.ndarray, "modes modes"]
@@ -99,15 +102,27 @@ def certify_boundedness(network: Network) -> Boundedness:
         radius = certify_radius(known.system, gains)
         if radius < BELOW_ONE:
             bound = known.system.bound(gains).sum(axis=0) if known.exact else None
-            return Boundedness("certified", _describe_certificate(a, radius), radius, 0.0, known.gains(gains), bound)
+            return Boundedness(
+                verdict="certified",
+                reason=_describe_certificate(a, radius),
+                radius=radius,
+                growth=0.0,
+                gains=known.gains(gains),
+                bound=bound,
+            )
     # Not certified: is there an unstable mode that losses hide?
     unseen = find_fastest_unobserved_mode(a, known.system.chain, [known.system.outputs[s] for s in known.system.known])
     verdict, reason = _judge_unseen(network, links, growing, known, unseen, radius)
-    return Boundedness(verdict, reason, radius, unseen.growth, known.gains(gains), None)
+    return Boundedness(
+        verdict=verdict, reason=reason, radius=radius, growth=unseen.growth, gains=known.gains(gains), bound=None
+    )
 
 
 def _join_links(network: Network, states: int) -> JointLinks:
-    """Join all nodes: sensors stacked, channels in parallel."""
+    """Return the joint model of all nodes' links: sensors stacked, channels in parallel, modes that occur.
+
+    Raises ValueError for relays that filter, and for channels that vary, deliver late or have uncertain probabilities.
+    """
     if network.relays is not None:
         raise fail("nodes", "ones that receive the sensors over channels", "relays that filter")
     # Sensors one above the other.
@@ -122,12 +137,16 @@ def _join_links(network: Network, states: int) -> JointLinks:
             raise fail("chain of a channel", "one of known transition", "one whose probabilities are uncertain")
     modes = joint_modes(joint, 2)  # of a gain that drifts two values say that it is random
     initial, chain = np.asarray(modes.initial), np.asarray(modes.transition)
-    # Modes that can occur.
+    # Modes that can occur: entries of p (I + T)^modes, which counts the ways from the initial law p, are positive.
     happens = initial @ np.linalg.matrix_power(np.eye(len(chain)) + chain, len(chain)) > 0
-    outputs = [m.list_outcomes() for m, ever in zip(modes.maps, happens, strict=True) if ever]
-    noise = scipy.linalg.block_diag(*noises)
-    links = initial[happens], chain[np.ix_(happens, happens)], outputs
-    return JointLinks(*links, np.concatenate(matrices), np.concatenate(means), noise)
+    return JointLinks(
+        initial=initial[happens],
+        chain=chain[np.ix_(happens, happens)],
+        outcomes=[mode.list_outcomes() for mode, ever in zip(modes.maps, happens, strict=True) if ever],
+        sensing=np.concatenate(matrices),
+        sensor_mean=np.concatenate(means),
+        sensor_noise=scipy.linalg.block_diag(*noises),
+    )
 
 
 def _require_constant(channel: Channel) -> AbstractRandomAffine:
@@ -140,31 +159,31 @@ def _require_constant(channel: Channel) -> AbstractRandomAffine:
 
 
 def _find_unstable_modes(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n d"]:
-    """Return the orthonormal basis of the plant's modes that do not decay."""
-    _, basis, count = scipy.linalg.schur(matrix / BELOW_ONE, sort="ouc")
+    """Return an orthonormal basis, one column each, of the plant's modes that do not decay."""
+    _, basis, count = scipy.linalg.schur(matrix / BELOW_ONE, sort="ouc")  # first those outside the unit circle
     return np.asarray(basis[:, :count])
 
 
 class KnownLosses(NamedTuple):
-    """Usable measurements of a receiver, for each of the `kinds` of losses."""
+    """Usable measurements of a receiver, for each of the `kinds` of losses: flags of the components that arrive."""
 
     system: KnownLossSystem
     kinds: list[tuple[bool, ...]]
-    parts: list["Certain"]
+    parts: list["KnownGainSums"]
 
     @property
     def exact(self) -> bool:
         """True where nothing that arrives is left out."""
-        return all(outcome.exact for outcome in self.parts)
+        return all(part.exact for part in self.parts)
 
     @property
     def random(self) -> bool:
         """True where random gains make something unusable."""
-        return any(outcome.random for outcome in self.parts)
+        return any(part.random for part in self.parts)
 
     def gains(self, gains: KindGains) -> dict[tuple[bool, ...], np.ndarray]:
-        """Return the gains on what arrives, from those on its sums of known gain."""
-        return {kind: k @ outcome.combine for kind, k, outcome in zip(self.kinds, gains, self.parts, strict=True)}
+        """Return K D (n, received) by kind: gains on what arrives, from gains K on its sums D z of known gain."""
+        return {kind: k @ part.combine for kind, k, part in zip(self.kinds, gains, self.parts, strict=True)}
 
 
 def _group_losses(a: np.ndarray, q: np.ndarray, links: JointLinks, space: Float[np.ndarray, "n d"]) -> KnownLosses:
@@ -172,26 +191,32 @@ def _group_losses(a: np.ndarray, q: np.ndarray, links: JointLinks, space: Float[
 
     Modes that look the same to the receiver are one kind: a gain that differs between them is unknown.
     """
+    # Cases, one for each outcome of each mode: its mode i, and its flags of what arrives.
+    outcomes = [outcome for of_mode in links.outcomes for outcome in of_mode]
+    mode = np.array([i for i, of_mode in enumerate(links.outcomes) for _ in of_mode])
+    flags = [tuple(outcome.arrived.tolist()) for outcome in outcomes]
     # Sets of losses, and the sums of rows with known gain in each.
-    kinds = list(dict.fromkeys(tuple(o.arrived.tolist()) for outcome in links.outcomes for o in outcome))
-    # Cases: mode i, outcome o, and the number s of the outcome's set of losses.
-    cases = [
-        (i, o, kinds.index(tuple(o.arrived.tolist()))) for i, outcome in enumerate(links.outcomes) for o in outcome
+    kinds = list(dict.fromkeys(flags))
+    kind_of_case = np.array([kinds.index(arrived) for arrived in flags])
+    parts = [
+        _find_known_sums([o for o, arrived in zip(outcomes, flags, strict=True) if arrived == kind], links, space)
+        for kind in kinds
     ]
-    parts = [_find_certain([o for _, o, s in cases if s == kind], links, space) for kind in range(len(kinds))]
     # Chain of (mode, outcome), with its long-run law.
-    kind_of_case = np.array([s for _, _, s in cases])
-    mode = np.array([i for i, _, _ in cases])
-    probability = np.array([o.probability for _, o, _ in cases])
+    probability = np.array([outcome.probability for outcome in outcomes])
     chain = links.chain[np.ix_(mode, mode)] * probability
     law = long_run_law(links.initial[mode] * probability, chain)
-    noises = tuple(parts[s].noise(o, links) for _, o, s in cases)
-    system = KnownLossSystem(a, q, chain, law, kind_of_case, tuple(outcome.rows for outcome in parts), noises)
+    noises = tuple(parts[s].noise(outcome, links) for outcome, s in zip(outcomes, kind_of_case, strict=True))
+    system = KnownLossSystem(a, q, chain, law, kind_of_case, tuple(part.rows for part in parts), noises)
     return KnownLosses(system, kinds, parts)
 
 
-class Certain(NamedTuple):
-    """Sums of received rows with known gain: `combine` (r, m) of them, which equal `rows` x + noise."""
+class KnownGainSums(NamedTuple):
+    """Sums D z of received rows whose gain on x is known: D z = rows x + noise.
+
+    `combine`: D (r, m). `mean`: of the channel's gain and offset (m, p + 1), over the outcomes that look the same.
+    `exact`: nothing that arrives is left out, and offsets are known. `random`: something is left out.
+    """
 
     combine: Float[np.ndarray, "r m"]
     rows: Float[np.ndarray, "r n"]
@@ -200,7 +225,10 @@ class Certain(NamedTuple):
     random: bool
 
     def noise(self, outcome: Outcome, links: JointLinks) -> Float[np.ndarray, "r r"]:
-        """Return Cov(D z) of the sums D z of known gain, at x = 0 and about the mean over outcomes of a kind."""
+        """Return Cov(D z) in one outcome, at x = 0 and about the mean over the outcomes that look the same.
+
+        With z = G y, E y = v and the common mean M v: E[(G y - M v)(G y - M v)'].
+        """
         mean, second = second_moments(outcome.map)
         v = np.append(links.sensor_mean, 1.0)
         signal = np.outer(v, v)
@@ -211,10 +239,10 @@ class Certain(NamedTuple):
         return np.asarray(self.combine @ (total + np.outer(about, about)) @ self.combine.T)
 
 
-def _find_certain(alike: Sequence[Outcome], links: JointLinks, space: Float[np.ndarray, "n d"]) -> Certain:
-    """Find the sums of known gain: the null space of E[(G - M) C Y Y' C' (G - M)'] over outcomes that look the same.
+def _find_known_sums(alike: Sequence[Outcome], links: JointLinks, space: Float[np.ndarray, "n d"]) -> KnownGainSums:
+    """Return the sums of known gain: the null space of E[(G - M) C Y Y' C' (G - M)'] over outcomes that look the same.
 
-    Y is a basis of the subspace `space`.
+    G is the random gain of mean M, C the sensors' matrix, Y (n, d) the basis `space` of the states that matter.
     """
     moments = [second_moments(o.map) for o in alike]
     mean = np.mean([m for m, _ in moments], axis=0)
@@ -232,13 +260,19 @@ def _find_certain(alike: Sequence[Outcome], links: JointLinks, space: Float[np.n
     values, vectors = np.linalg.eigh(spread)
     combine = np.zeros((int(np.sum(values <= CERTAIN)), len(mean)))
     combine[:, arrived] = vectors[:, values <= CERTAIN].T / scale
-    same = all(np.array_equal(m[:, -1], mean[:, -1]) for m, _ in moments)
-    random = len(combine) < len(arrived)
-    whole = space.shape[1] == len(space)
-    return Certain(combine, combine @ rows, mean, whole and same, random)
+    offset_is_known = all(np.array_equal(m[:, -1], mean[:, -1]) for m, _ in moments)
+    all_states = space.shape[1] == len(space)
+    return KnownGainSums(
+        combine=combine,
+        rows=combine @ rows,
+        mean=mean,
+        exact=all_states and offset_is_known,
+        random=len(combine) < len(arrived),
+    )
 
 
 def _describe_certificate(a: Float[np.ndarray, "n n"], radius: float) -> str:
+    """Return the reason of a certificate: whether the plant itself is stable, and the radius that gains leave."""
     if spectral_radius(a) < BELOW_ONE:
         return f"the plant is stable, and fixed gains leave the error a spectral radius of {radius:.6g}"
     return f"fixed gains leave the mean square of the error a spectral radius of {radius:.6g}"
@@ -248,7 +282,7 @@ def _judge_unseen(
     network: Network,
     links: JointLinks,
     growing: np.ndarray,
-    channel: KnownLosses,
+    known: KnownLosses,
     unseen: UnobservedGrowth,
     radius: float,
 ) -> tuple[Verdict, str]:
@@ -256,8 +290,8 @@ def _judge_unseen(
     if unseen.growth < 1:
         best = f"no gains are certified: the best that were found leave {radius:.6g}"
         return "undecided", f"{best}, and nothing that losses hide grows: {unseen.growth:.6g} < 1"
-    reason = _explain_growth(links, channel.system, unseen)
-    if not _is_excited(network, growing, channel, unseen):
+    reason = _explain_growth(links, known.system, unseen)
+    if not _is_excited(network, growing, known, unseen):
         return "undecided", f"{reason}; but noise does not reach all that grows, so that it may stay zero"
     return "impossible", reason
 
@@ -275,16 +309,19 @@ def _explain_growth(links: JointLinks, system: KnownLossSystem, unseen: Unobserv
     return f"{mode} is not seen at all"
 
 
-def _is_excited(network: Network, growing: np.ndarray, channel: KnownLosses, unseen: UnobservedGrowth) -> bool:
+def _is_excited(network: Network, growing: np.ndarray, known: KnownLosses, unseen: UnobservedGrowth) -> bool:
     """Test whether P stays above eps v v': noise enters along v at once, or reaches it and every measurement has noise.
 
-    The noise of random gains grows only where noise reaches all that is unstable.
+    v is the unseen eigenvector. The noise of random gains grows only where noise reaches all that is unstable, so with
+    such gains all of `growing` must be reached too.
     """
-    a, q = channel.system.transition, channel.system.process
-    expected = np.concatenate([unseen.vectors, growing], axis=1) if channel.random else unseen.vectors
-    if is_excited_by_noise(expected, np.zeros_like(a), q):
+    a, q = known.system.transition, known.system.process
+    directions = np.concatenate([unseen.vectors, growing], axis=1) if known.random else unseen.vectors
+    # In one step, whatever is measured.
+    if is_excited_by_noise(directions, np.zeros_like(a), q):
         return True
-    if any(np.linalg.eigvalsh(r).min(initial=np.inf) <= 0 for r in channel.system.noises):
+    # Over several steps: measurements without noise could remove it on the way.
+    if any(np.linalg.eigvalsh(r).min(initial=np.inf) <= 0 for r in known.system.noises):
         return False
     start = q + np.asarray(first(network.plant).initial_covariance)
-    return is_excited_by_noise(expected, a, q) or (unseen.growth > 1 and is_excited_by_noise(expected, a, start))
+    return is_excited_by_noise(directions, a, q) or (unseen.growth > 1 and is_excited_by_noise(directions, a, start))

@@ -18,9 +18,10 @@ UNSAID = "something that it does not say"
 
 
 class Belief(NamedTuple):
-    """A filter of a network, its node (`FUSED` for one of all measurements), and where it believes another world.
+    """What a filter of a network believes that is not so at its node (`FUSED` for a filter of all measurements).
 
-    lowered: whether it would claim more than "nominal" in the world that it believes.
+    `parts`: the parts of the model in which it believes another world. `lowered`: whether it would claim more than
+    "nominal" in the world that it believes.
     """
 
     node: str
@@ -36,21 +37,22 @@ class Belief(NamedTuple):
     @property
     def words(self) -> str:
         """The same as a sentence: "filter 'f' believes another channel than node 'a'"."""
-        where = "all nodes together" if self.node == FUSED else f"node {self.node!r}"
-        why = ", where limits refuse some" * (RANGE in self.parts)
-        at = " at" if self.parts == (UNSAID,) else " than"
-        return f"filter {self.filter!r} believes {self.another}{at} {where}{why}"
+        place = "all nodes together" if self.node == FUSED else f"node {self.node!r}"
+        reason = ", where limits refuse some" if RANGE in self.parts else ""
+        preposition = "at" if self.parts == (UNSAID,) else "than"
+        return f"filter {self.filter!r} believes {self.another} {preposition} {place}{reason}"
 
 
 def lower_claim(claim: Claim) -> Claim:
-    """Return the nominal, whatever is claimed more."""
+    """Return "nominal" for any claim of a covariance, "none" for none."""
     return "none" if claim == "none" else "nominal"
 
 
 def nominal(filter: AbstractFilter) -> AbstractFilter:
-    """Return the filter, and those inside, with a claim of "nominal" at most: all that is made of it says so."""
+    """Return a copy of the filter, and of those inside it, that claims "nominal" at most, and keeps what it claimed."""
 
     def is_inner(leaf: object) -> bool:
+        """Return whether this is a filter inside the filter."""
         return leaf is not filter and isinstance(leaf, AbstractFilter)
 
     leaves, tree = jax.tree.flatten(filter, is_leaf=is_inner)
@@ -62,7 +64,7 @@ def nominal(filter: AbstractFilter) -> AbstractFilter:
 
 
 def judge_filter(own: Premise, filter: AbstractFilter) -> AbstractFilter:
-    """Return the filter as it stands in a world: with its claim where it believes it, else `nominal`.
+    """Return the filter with its claim if it believes the world where it stands, else `nominal`.
 
     Args:
         own: plant, sensor, channel and trigger of the place where it stands.
@@ -73,7 +75,7 @@ def judge_filter(own: Premise, filter: AbstractFilter) -> AbstractFilter:
 
 
 def judge_nodes(network: HasNodes) -> dict[str, Node | ReceivingNode]:
-    """Return the nodes with their filters as they stand in them."""
+    """Return the nodes, with each filter `nominal` that believes another world than its node's."""
     results = dict(network.nodes)
     for name, node in network.nodes.items():
         if node.filters:
@@ -83,7 +85,7 @@ def judge_nodes(network: HasNodes) -> dict[str, Node | ReceivingNode]:
 
 
 def nodes_alike(nodes: Mapping[str, Node | ReceivingNode]) -> dict[str, Node | ReceivingNode]:
-    """Return the nodes with filters whose arrays are as large as those of the others."""
+    """Return the nodes with filters whose arrays are padded to the largest of all filters, so that they stack."""
     every = [filter for node in nodes.values() for filter in node.filters.values()]
     return {
         name: _replace_filters(node, {f: filter.as_large_as(every) for f, filter in node.filters.items()})
@@ -92,7 +94,7 @@ def nodes_alike(nodes: Mapping[str, Node | ReceivingNode]) -> dict[str, Node | R
 
 
 def judge_fused_standing(network: HasNodes) -> dict[str, Fusion | AbstractFilter]:
-    """Return the fusions, with filters of all measurements as they stand in the network."""
+    """Return the fusions, with each filter of all measurements `nominal` that believes another world."""
     if not any(isinstance(fusion, AbstractFilter) for fusion in network.fused.values()):
         return network.fused
     own = premise_of_all(network)
@@ -127,11 +129,11 @@ def parts_apart(own: Premise, filter: AbstractFilter) -> tuple[str, ...]:
 
 
 def premise_at(network: HasNodes, name: str) -> Premise:
-    """Return plant, sensor, channel and trigger of a node, and its limits where they refuse values."""
+    """Return the world at a node: plant, sensor, channel and trigger, and its limits where they refuse values."""
     node, plant = network.nodes[name], network.plant
     if isinstance(node, Node):
-        range = node.limits if node.limits is not None and node.limits.bounded else None
-        return Premise(plant, node.sensor, node.channel, node.trigger, range=range, encoder=node.encoder)
+        limits = node.limits if node.limits is not None and node.limits.bounded else None
+        return Premise(plant, node.sensor, node.channel, node.trigger, range=limits, encoder=node.encoder)
     if network.common is not None:
         return part_of(Premise(plant, network.common.sensor, network.common.channel), network.rows[name])
     if network.relays is None:  # a node without a sensor

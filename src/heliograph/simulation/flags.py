@@ -16,7 +16,9 @@ NOW, LATE = "hg.model.with_flag(link)", "hg.model.with_flag(link, late=True)"
 
 
 def check_flags(name: str, filter: AbstractFilter, channels: Sequence[AbstractRandomAffine]) -> None:
-    """Refuse channels, one after another, whose flags are not those of the filter's model: its claim would be wrong.
+    """Raise ValueError unless the flags that these channels deliver are those of the filter's model.
+
+    With others the filter's claim would be wrong.
 
     Raises:
         ValueError: a flag of another step; no flag where a filter uses the mode.
@@ -31,9 +33,13 @@ def check_flags(name: str, filter: AbstractFilter, channels: Sequence[AbstractRa
             expected = "hg.model.with_flag(link, flags)"
             wrong = [row for row in rows[reader.received - 1 : reader.received] if isinstance(row, OneStepLate)]
         if wrong:
-            late = isinstance(wrong[0], OneStepLate)
-            plain = "one of this step" if isinstance(wrong[0], ModeOutput) else f"{type(wrong[0]).__name__}, no mode"
-            raise fail(f"{name}, flags", f"those of {expected}", "one of the step before" if late else plain)
+            if isinstance(wrong[0], OneStepLate):
+                got = "one of the step before"
+            elif isinstance(wrong[0], ModeOutput):
+                got = "one of this step"
+            else:
+                got = f"{type(wrong[0]).__name__}, no mode"
+            raise fail(f"{name}, flags", f"those of {expected}", got)
 
 
 def _find_flag_filters(filter: AbstractFilter) -> list[SideInformationFilter | ModeObservedFilter]:
@@ -48,6 +54,7 @@ def _find_flag_filters(filter: AbstractFilter) -> list[SideInformationFilter | M
 
 
 def _reveals(affine: AbstractRandomAffine, late: bool) -> bool:
+    """Return whether a map delivers a mode: that of the step before if `late`, else that of this step."""
     if late:
         return isinstance(affine, OneStepLate) and isinstance(affine.base, ModeOutput)
     return isinstance(affine, ModeOutput)

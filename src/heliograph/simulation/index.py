@@ -15,7 +15,7 @@ class Kind(NamedTuple):
 
 
 class Place(NamedTuple):
-    """Where an estimate stands: which kind of filters, and which filter and node along its axes."""
+    """Where an estimate stands: number of its kind, of its filter within the kind, and of its node within the group."""
 
     kind: int
     filter: int
@@ -25,7 +25,7 @@ class Place(NamedTuple):
 def places_of(groups: Sequence[Sequence[str]], kinds: Sequence[Kind]) -> dict[tuple[str, str], Place]:
     """Return the place of each estimate, by node and filter."""
     return {
-        (node, name): Place(k, f, i)
+        (node, name): Place(kind=k, filter=f, node=i)
         for k, kind in enumerate(kinds)
         for f, name in enumerate(kind.filters)
         for i, node in enumerate(groups[kind.group])

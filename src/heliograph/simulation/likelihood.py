@@ -43,21 +43,24 @@ def log_likelihood(
     instance("filter", filter, AbstractFilter, "a filter")
     arguments = filter, *check_data(filter, measurements, inputs)
     if is_traced(arguments):
-        return _sum(*arguments)
+        return _sum_log_likelihoods(*arguments)
     whole = sum_filtered_in_chunks(*arguments, _judge_likelihood)
     if whole is not None:
         return float(whole)
-    return float(compute_once(_sum, _by_xla, arguments))
+    return float(compute_once(_sum_log_likelihoods, _sum_by_xla, arguments))
 
 
-def _sum(filter: AbstractFilter, z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]) -> jax.Array:
+def _sum_log_likelihoods(
+    filter: AbstractFilter, z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]
+) -> jax.Array:
+    """Return the sum of the innovations' log-likelihoods over all rows, filtered one after another."""
     return jnp.sum(filter.scan(z, u, partial(_judge_likelihood, filter)))
 
 
 def _judge_likelihood(filter: AbstractFilter, state: PyTree, innovation: Innovation, k: jax.Array) -> jax.Array:
-    """Log-likelihood of a row; NaN where the estimate is no number, whose innovations would look like silence."""
+    """Return the log-likelihood of a row; NaN where the estimate is no number, since the row would look lost."""
     lost = jnp.any(jnp.isnan(jnp.asarray(filter.estimate(state).mean)))
     return jnp.where(lost, jnp.nan, innovation.log_likelihood)
 
 
-_by_xla = compile_in_float64(_sum)
+_sum_by_xla = compile_in_float64(_sum_log_likelihoods)

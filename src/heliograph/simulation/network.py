@@ -58,8 +58,8 @@ from heliograph.simulation.node import (
     check_filters,
     check_received,
     check_states,
-    check_type,
 )
+from heliograph.simulation.sender_checks import check_type
 
 Claims = dict[str, dict[str, Claim]]  # by node and filter
 
@@ -216,7 +216,7 @@ class Network(Module):
         filters[RECEIVER] = table("receiver's filters", receivers, "filters")
         check_filters(filters[RECEIVER], relays.received[-1])
         outputs = tuple(first(relays.sensor).outputs)
-        # All places receive sums of hops.
+        # All places, the receiver last, receive sums of hops.
         nodes = {
             name: ReceivingNode(filters[name], size, outputs, relays.always_receives(name))
             for name, size in zip(relays.filters, relays.received, strict=True)
@@ -313,8 +313,8 @@ class Network(Module):
                 name: find_received_angles(self.plant, node.sensor, node.channel) if isinstance(node, Node) else ()
                 for name, node in self.nodes.items()
             }
-        every = find_received_angles(self.plant, self.common.sensor, self.common.channel)
-        return {name: tuple(i - row.start for i in every if i in row) for name, row in self.rows.items()}
+        common = find_received_angles(self.plant, self.common.sensor, self.common.channel)
+        return {name: tuple(i - rows.start for i in common if i in rows) for name, rows in self.rows.items()}
 
     def diagram(self) -> str:
         """Return all of the network as lines of text, of which `repr` shows the first."""
@@ -362,22 +362,23 @@ class Network(Module):
         if fusion.quantizer is not None and not fusion.by_report:
             raise fail(f"fusion by {rule}", "uplinks that deliver what is sent", "a quantizer")
         # An informed rule: it needs the joint moments of the errors.
-        known = self.parts_of(fusion.filter)
-        if len(known) < len(nodes):
+        parts = self.parts_of(fusion.filter)
+        if len(parts) < len(nodes):
             raise fail(f"fusion by {rule}", "nodes that receive sensors through channels", "relays")
-        if (fusion.by_report or fusion.rule.needs_plant_moments) and along_estimates(known):
+        if (fusion.by_report or fusion.rule.needs_plant_moments) and along_estimates(parts):
+            (_, _, filter), *_ = parts.values()
             raise fail(f"fusion by {rule}", "filters whose gains depend on no data, for the plant's own moments",
-                       type(next(iter(known.values()))[2]).__name__)  # fmt: skip
-        claim = claim_of_informed(rule, self.plant, known, self.common is not None)
+                       type(filter).__name__)  # fmt: skip
+        claim = claim_of_informed(rule, self.plant, parts, shared=self.common is not None)
         if not fusion.by_report:
             return claim
         return claim_of_reports(rule, claim, fusion, {n: node.complete for n, node in nodes.items()})
 
     def parts_of(self, name: str) -> dict[str, tuple[AnySensor, Channel, AbstractFilter]]:
-        """Sensor, channel and the filter `name` of each node that has it and receives a sensor through a channel."""
-        nodes = {node: self.nodes[node] for node in self.nodes_with(name)}
-        worlds = {n: v if isinstance(v, Node) else self.common for n, v in nodes.items()}
-        return {n: (w.sensor, w.channel, nodes[n].filters[name]) for n, w in worlds.items() if w is not None}
+        """Return sensor, channel and the filter `name` of each node that has it and receives over a channel."""
+        nodes = {label: self.nodes[label] for label in self.nodes_with(name)}
+        sources = {label: n if isinstance(n, Node) else self.common for label, n in nodes.items()}  # None behind relays
+        return {label: (s.sensor, s.channel, nodes[label].filters[name]) for label, s in sources.items() if s}
 
     def check_horizon(self, horizon: int) -> None:
         """Raise ValueError if something that varies over time ends before `horizon` steps."""

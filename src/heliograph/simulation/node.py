@@ -6,8 +6,6 @@ from typing import Protocol
 import equinox as eqx
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.event.event_filter import EventFilter
-from heliograph.filters.event.stochastic import StochasticEventFilter
 from heliograph.filters.wrappers.fed_back import FedBackFilter
 from heliograph.fusion.rules import Fusion
 from heliograph.model.channel import Channel, check_sent
@@ -19,17 +17,23 @@ from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.model.stuck import StuckLike
 from heliograph.model.told import name_received
-from heliograph.model.trigger import AbstractTrigger, Periodic
+from heliograph.model.trigger import AbstractTrigger
 from heliograph.model.words.encoder import Words
 from heliograph.model.words.route import FLAG, find_places
 from heliograph.numerics.angle import Angles
-from heliograph.numerics.check import TINY, fail, scalar, show_value, table
+from heliograph.numerics.check import TINY, fail, scalar, table
 from heliograph.numerics.frozen import FrozenMapping
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import ArrayLike
-from heliograph.random_affine.base import AbstractRandomAffine, all_inner_maps
-from heliograph.random_affine.words.flips import Flips
+from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.simulation.flags import check_flags
+from heliograph.simulation.sender_checks import (
+    check_encoder,
+    check_trigger,
+    check_type,
+    compares_with_prediction,
+    count_subtracted_dithers,
+)
 
 FUSED = "fused"  # the name under which results of several nodes stand
 
@@ -98,10 +102,11 @@ class Node(Module):
         check_sent(first(sensor), first(channel))
         if trigger is not None:
             check_trigger(trigger, first(sensor), first(channel), self.filters)
-        known = 0 if trigger is None else trigger.side_information(len(self.outputs))
+        side_information = 0 if trigger is None else trigger.side_information(len(self.outputs))
         if encoder is not None:
-            known += check_encoder(encoder, first(sensor), channel, trigger, self.filters)
-        self.received = int(first(channel).outputs) + known
+            check_encoder(encoder, first(sensor), channel, trigger, self.filters)
+            side_information += count_subtracted_dithers(encoder, channel)
+        self.received = int(first(channel).outputs) + side_information
         self.complete = not first(channel).erases and trigger is None
         check_filters(self.filters, self.received)
         self.limits = limits_of(self.received, limits, invalid, stuck, self.sensor, self.channel)
@@ -126,7 +131,7 @@ class Node(Module):
         """Name of the filter whose prediction the sender compares with; None where it compares with none."""
         if self.trigger is None or self.trigger.reference != "prediction":
             return None
-        return next(name for name, filter in self.filters.items() if _predicts(filter, self.trigger))
+        return next(name for name, filter in self.filters.items() if compares_with_prediction(filter, self.trigger))
 
     @property
     def informed_by(self) -> str | None:
@@ -239,74 +244,6 @@ class HasNodes(Protocol):
         """Return the nodes of a fusion between neighbours."""
 
 
-def _predicts(filter: AbstractFilter, trigger: AbstractTrigger) -> bool:
-    return isinstance(filter, EventFilter | StochasticEventFilter) and filter.trigger.reference == "prediction"
-
-
-def check_trigger(
-    trigger: AbstractTrigger, sensor: AbstractSensor, channel: AbstractRandomAffine, filters: Mapping[str, object]
-) -> None:
-    """A trigger that fits the sensor, the channel and the filters of a node.
-
-    Raises:
-        ValueError: numbers for another count of components; a channel that is late, or that does not carry each
-            component for itself where each is sent alone; no filter whose prediction the sender could know.
-    """
-    check_type("trigger", trigger, AbstractTrigger)
-    # The trigger, the sensor and the channel fit.
-    trigger.check_outputs(len(sensor.outputs))
-    if sensor.circular:
-        raise fail("trigger", "a sensor without angles", list(sensor.circular))
-    if channel.past:
-        raise fail(
-            "channel of a node with a trigger", "one that is not late", f"one late by up to {channel.past} steps"
-        )
-    if trigger.region == "each" and channel.outputs != len(sensor.outputs):
-        raise fail("channel of components that are each sent alone", f"{len(sensor.outputs)} outputs", channel.outputs)
-    # A sender that compares with a prediction knows one filter.
-    if any(isinstance(filter, FedBackFilter) for filter in filters.values()):
-        raise fail("trigger", "no filter that is fed back", "one")
-    if trigger.reference == "prediction" and not any(
-        isinstance(filter, AbstractFilter) and _predicts(filter, trigger) for filter in filters.values()
-    ):
-        raise fail("node whose sender compares with a prediction", "an event_filter with this trigger", list(filters))
-
-
-def check_encoder(
-    encoder: Words,
-    sensor: AbstractSensor,
-    channel: Channel,
-    trigger: AbstractTrigger | None,
-    filters: Mapping[str, object],
-) -> int:
-    """Check that an encoder fits the sensor, channel, trigger and filters of a node; count the dithers to take off.
-
-    Raises:
-        ValueError: a range for another count of components, angles, words that are amplified, a trigger whose ends do
-            not share what it compares with, a filter that is fed back.
-    """
-    check_type("encoder", encoder, Words)
-    encoder.check_outputs(len(sensor.outputs))
-    if sensor.circular:
-        raise fail("encoder", "a sensor without angles", list(sensor.circular))
-    if any(isinstance(filter, FedBackFilter) for filter in filters.values()):
-        raise fail("encoder", "no filter that is fed back", "one")
-    places = find_places(channel)
-    if trigger is not None and not isinstance(trigger, Periodic):
-        if encoder.subtracts:
-            raise fail("trigger of a node with an encoder", "a dither that is not taken off, or Periodic", "subtracted")
-        if flips_words(first(channel)):
-            expected = "a link without flipped bits (erasure for a checksum), as both ends share the word; or Periodic"
-            raise fail("trigger of a node with an encoder", expected, type(trigger).__name__)
-    return sum(place != FLAG for place in places) if encoder.subtracts else 0
-
-
-def flips_words(channel: AbstractRandomAffine) -> bool:
-    """Test whether a channel of words may flip bits."""
-    links = [link for link in [channel, *all_inner_maps(channel)] if isinstance(link, Flips)]
-    return any(float(link.error.moment(1)) > 0 for link in links)
-
-
 def name_values(outputs: tuple[str, ...], received: int) -> tuple[str, ...]:
     """Return the names of the received components: the sensor's outputs where these are as many, else z0, z1, ..."""
     return outputs if len(outputs) == received else tuple(f"z{i}" for i in range(received))
@@ -321,12 +258,12 @@ def check_received(name: str, filter: AbstractFilter, received: int) -> None:
 
 
 def check_states(name: str, filter: object, network: HasNodes) -> None:
-    """Refuse a filter of other numbers of states and inputs than the plant, or a fusion too that turns no attitudes."""
+    """Raise ValueError unless a filter has as many states and inputs as the plant, and it or a fusion its attitudes."""
     plant = first(network.plant)
     if isinstance(filter, AbstractFilter):
-        for what, single, theirs in (("states", plant.states, filter.states), ("inputs", plant.inputs, filter.inputs)):
-            if len(single) != len(theirs):
-                raise fail(name, f"the plant's {len(single)} {what} {list(single)}", f"{len(theirs)} {list(theirs)}")
+        for what, ours, theirs in (("states", plant.states, filter.states), ("inputs", plant.inputs, filter.inputs)):
+            if len(ours) != len(theirs):
+                raise fail(name, f"the plant's {len(ours)} {what} {list(ours)}", f"{len(theirs)} {list(theirs)}")
     # Attitudes are turned where others are added.
     attitudes = plant.manifold.rotations, getattr(filter, "attitude", ())
     if attitudes[0] != attitudes[1]:
@@ -335,9 +272,9 @@ def check_states(name: str, filter: object, network: HasNodes) -> None:
 
 
 def check_angles(name: str, filter: AbstractFilter, network: HasNodes) -> None:
-    """Refuse a filter of all nodes' measurements that takes for numbers on a line what are angles, or the reverse."""
+    """Raise ValueError unless a filter of all measurements takes as angles what are angles, and nothing else."""
     used, angles = filter.angles_used(), first(network.plant).angles
-    if used is None:  # a filter of somebody else's
+    if used is None:  # a filter of a user's own class, which does not say
         return
     if used.states != angles:
         expected, got = ([network.states[i] for i in places] for places in (angles, used.states))
@@ -358,9 +295,3 @@ def check_filters(filters: Mapping[str, object], received: int) -> None:
         check_type(f"filter {name!r}", filter, AbstractFilter)
         if isinstance(filter, AbstractFilter):
             check_received(f"filter {name!r}", filter, received)
-
-
-def check_type(name: str, value: object, expected: type) -> None:
-    """Refuse an object of another class, in one line."""
-    if not isinstance(value, expected):
-        raise fail(name, f"{'an' if expected.__name__[0] in 'AEIOU' else 'a'} {expected.__name__}", show_value(value))

@@ -24,18 +24,18 @@ RIM = 1e-9  # share of delta by which a value may lie inside for rounding
 
 
 def implausible(outputs: Mapping[str, PyTree]) -> jax.Array:
-    """Test whether some filter judges its measurement implausible."""
+    """Return, within a program, whether some filter judges its measurement implausible."""
     flags = [jnp.any(j.implausible) for j in (*outputs["judged"], *outputs["judged_centrally"].values())]
     return jnp.any(jnp.stack(flags)) if flags else jnp.asarray(False)
 
 
 def any_implausible(outputs: Mapping[str, PyTree]) -> bool:
-    """Test the same of stored results."""
+    """Return whether some filter judged a measurement implausible in stored results, NumPy arrays."""
     return any((j.reason > 0).any() for j in (*outputs["judged"], *outputs["judged_centrally"].values()))
 
 
 def reasons(outputs: Mapping[str, PyTree]) -> tuple[list[jax.Array], dict[str, jax.Array]]:
-    """Return the reason of each filter not to use its measurement, by kind and by name."""
+    """Return each filter's reason not to use its measurement, 0 for none: of nodes by kind, of central ones by name."""
     return [judgement.reason for judgement in outputs["judged"]], {
         n: judgement.reason for n, judgement in outputs["judged_centrally"].items()
     }
@@ -55,16 +55,20 @@ def step_plausibly(
 ) -> Stepped:
     """Step all filters with all data, which they judge; where some is implausible, step again without it.
 
-    In the second turn each filter skips what it judged implausible in the first; the judgements of the first stay.
+    In the second turn each filter skips what it judged implausible in the first; the judgements of the first stay. A
+    loop of at most two turns, so that the second is left out where it is not needed.
     """
-    nothing = [jnp.zeros((a.count, a.nodes)) for a in filters.alike], {name: jnp.zeros(()) for name in filters.central}
-    _, outputs = eqx.filter_eval_shape(_step, filters, states, z, u, k, drawn, nothing)
+    by_kind = [jnp.zeros((a.count, a.nodes)) for a in filters.alike]
+    none_skipped = by_kind, {name: jnp.zeros(()) for name in filters.central}
+    _, outputs = eqx.filter_eval_shape(_step, filters, states, z, u, k, drawn, none_skipped)
 
-    def goes_on(carry: tuple[jax.Array, Stepped]) -> jax.Array:
+    def needs_turn(carry: tuple[jax.Array, Stepped]) -> jax.Array:
+        """Return whether to step: in turn 0 always, in turn 1 where something was implausible."""
         turn, (_, outputs) = carry
         return (turn == 0) | (turn == 1) & implausible(outputs)
 
     def step(carry: tuple[jax.Array, Stepped]) -> tuple[jax.Array, Stepped]:
+        """Step from the states before, without what the turn before judged implausible; in turn 0 that is nothing."""
         turn, (_, before) = carry
         after, outputs = _step(filters, states, z, u, k, drawn, reasons(before))
         for name in ("judged", "judged_centrally"):
@@ -72,12 +76,12 @@ def step_plausibly(
         return turn + 1, (after, outputs)
 
     start = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), outputs)
-    stepped: Stepped = jax.lax.while_loop(goes_on, step, (jnp.asarray(0), (states, start)))[1]
+    stepped: Stepped = jax.lax.while_loop(needs_turn, step, (jnp.asarray(0), (states, start)))[1]
     return stepped
 
 
 class Judges:
-    """Judgements of the filters by node: of a step, or of a recording, whose axis comes first."""
+    """The filters that judge what each node received; reads their judgements of a step, or of a recording's rows."""
 
     def __init__(self, network: Network):
         self._places: dict[str, list[tuple[int, int, int]]] = {name: [] for name in network.names}
@@ -91,13 +95,18 @@ class Judges:
 
     def of_all(self, outputs: Mapping[str, PyTree]) -> Float[np.ndarray, "... filters 4"]:
         """Return the judgements of all filters."""
-        places = [(k, f, i) for k, j in enumerate(outputs["judged"]) for f, i in np.ndindex(*j[0].shape[-2:])]
-        return self._stack_judgements(outputs, places, True)
+        places = []
+        for kind, judgement in enumerate(outputs["judged"]):
+            places += [(kind, f, i) for f, i in np.ndindex(*judgement[0].shape[-2:])]
+        return self._stack_judgements(outputs, places, central=True)
 
     def _stack_judgements(
         self, outputs: Mapping[str, PyTree], places: Sequence[tuple[int, int, int]], central: bool
     ) -> Float[np.ndarray, "... filters 4"]:
-        """Return the judgements of these filters, those of the centre behind them, as rows of numbers."""
+        """Return the judgements of these filters, and those of the centre behind them if `central`.
+
+        Axes: the recording's, filter, field of a Judgement.
+        """
         judgements = [[field[..., f, i] for field in outputs["judged"][k]] for k, f, i in places]
         judgements += [list(judgement) for judgement in outputs["judged_centrally"].values()] if central else []
         if not judgements:
@@ -113,20 +122,23 @@ class Judges:
 def find_refused_rows(
     network: Network, outcome: Mapping[str, PyTree]
 ) -> tuple[dict[str, dict[int, str]], dict[int, str]]:
-    """Return the rows of a recording that are implausible, with the reason: by node, and to the central filters.
+    """Return the rows that a filter calls implausible, with the reason: by node with filters, and of the central ones.
 
     Nodes without filters of their own are judged by the central ones, all alike: the first tells for all.
     """
     judges, refused = Judges(network), dict[str, dict[int, str]]()
-    shared = judges.without_own
+    without_own = judges.without_own
     for name in network.names:
-        if name not in shared and (why := _list_reasons(judges.of_node(outcome, name))):
-            refused[name] = why
-    return refused, _list_reasons(judges.of_node(outcome, shared[0])) if shared else {}
+        if name not in without_own and (reasons_by_row := _list_reasons(judges.of_node(outcome, name))):
+            refused[name] = reasons_by_row
+    central = _list_reasons(judges.of_node(outcome, without_own[0])) if without_own else {}
+    return refused, central
 
 
 def _list_reasons(votes: Float[np.ndarray, "steps filters 4"]) -> dict[int, str]:
-    return {k: said for k in _find_flagged(votes, "reason") if (said := Judgement.why_values(votes[k]))}
+    """Return the rows whose values all these filters refuse, with the reason."""
+    reasons_by_row = {row: Judgement.why_values(votes[row]) for row in _find_flagged(votes, "reason")}
+    return {row: reason for row, reason in reasons_by_row.items() if reason}
 
 
 def describe_doubts(
@@ -137,11 +149,12 @@ def describe_doubts(
 ) -> list[str]:
     """Return messages about a recording: rows that are implausible to all filters or to one alone, and inputs."""
     # Rows that are implausible for all filters of a node.
-    faults = _Faults(network, outputs, u)
+    faults = _FaultFinder(network, outputs, u)
     lines = []
     for node, by_row in refused.items():
         row, why = next(iter(by_row.items()))
-        fault = next((said for name in network.nodes[node].filters if (said := faults.of(node, name, row))), "")
+        named = [faults.of(node, name, row) for name in network.nodes[node].filters]
+        fault = next((words for words in named if words), "")
         lines.append(f"node {node!r}: {_format_rows(list(by_row))} implausible, as if not arrived: {why}{fault}")
     # Rows that a single filter skips.
     at_nodes = {(node, name): [field[:, f, i] for field in outputs["judged"][kind]]
@@ -162,12 +175,12 @@ def describe_doubts(
     return lines
 
 
-class _Faults:
-    """Functions of the filters' models that returned no number in a recording."""
+class _FaultFinder:
+    """Names functions of the filters' models that returned no number in a recording."""
 
     def __init__(self, network: Network, outputs: Mapping[str, PyTree], u: Float[np.ndarray, "steps inputs"]):
         self.network, self.u = network, u
-        self.outputs = outputs.get("filtered", outputs)  # beside smoothed ones
+        self.outputs = outputs.get("filtered", outputs)  # those of filters, where smoothed ones stand beside them
 
     def of(self, node: str, name: str, row: int) -> str:
         """Name the function of a filter that returned no number in a row, after a semicolon; "" where none did."""
@@ -187,7 +200,7 @@ class _Faults:
 
 
 def _find_flagged(votes: Float[np.ndarray, "steps filters 4"], field: str) -> list[int]:
-    """Return the rows that some filter flags."""
+    """Return the rows in which this field of some filter's judgement is over 0."""
     if not votes.size:
         return []
     flagged: list[int] = np.flatnonzero((votes[..., Judgement._fields.index(field)] > 0).any(axis=-1)).tolist()
@@ -195,7 +208,7 @@ def _find_flagged(votes: Float[np.ndarray, "steps filters 4"], field: str) -> li
 
 
 def _format_rows(rows: Sequence[int]) -> str:
-    """Write rows as text, counted from 1: the first few."""
+    """Return "row 3 is", or "7 rows (1, 2, ...) are" with the first five, counted from 1."""
     listed = ", ".join(str(k + 1) for k in rows[:5]) + (", ..." if len(rows) > 5 else "")
     return f"{len(rows)} rows ({listed}) are" if len(rows) > 1 else f"row {listed} is"
 

@@ -13,7 +13,7 @@ Number = int | jax.Array | np.ndarray
 
 
 def draw_key(run_key: jax.Array, k: Number, source: Number, purpose: int) -> jax.Array:
-    """Key of one draw: folded in by step, source and purpose, so no draw depends on how many others there are."""
+    """Return the key of one draw: step, source and purpose are folded in, so that draws do not depend on each other."""
     for number in (k, source, purpose):
         run_key = jax.random.fold_in(run_key, number)
     return run_key

@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -44,7 +45,14 @@ from heliograph.simulation.stepping import AllFilters, initial_states
 from heliograph.simulation.transmission.shared_dithers import refuse_shared_dithers
 from heliograph.smoothing.fixed_interval_lag_point import AbstractSmoothing
 
-Rest = tuple[AllFilters, Smoother | None, np.ndarray, dict[str, PyTree]]  # what a recording is filtered with
+
+class Rest(NamedTuple):
+    """What a recording's measurements are filtered with: filters, a smoother, inputs, and what arrived by fusion."""
+
+    filters: AllFilters
+    later: Smoother | None
+    u: np.ndarray
+    arrivals: dict[str, PyTree]
 
 
 ROWS = 128  # of a recording with fusions between neighbours, whose weights are in memory at a time
@@ -99,30 +107,28 @@ def run(
     name = next(iter(network.nodes))
     measured = table("measurements", measurements, f"arrays of nodes, such as {{{name!r}: z}},")
     network = network.restricted_to(measured)
-    some = next(iter(measured.values()))
-    steps = len(some) if rank("measurements", some) else 1
-    if steps == 0:
-        raise fail("measurements", "at least one row", "none")
+    steps = _count_rows(next(iter(measured.values())))
     # Measurements, inputs and times of one length.
     z = {name: measurement_of(name, measurements[name], steps, node) for name, node in network.nodes.items()}
     network.check_horizon(steps)
     u = inputs_of(network, inputs, steps)
     check_columns("truth", truth, network.states)
     true = None if truth is None else array("truth", truth, (steps, len(network.states)), missing=True)
-    known = _find_clock(measured, {"inputs": inputs, "truth": truth}, time, steps)
-    warn_of_unequal_steps(network.inputs, known)
-    clock = np.arange(steps, dtype=np.float64) if known is None else known
+    times = _find_times(measured, {"inputs": inputs, "truth": truth}, time, steps)
+    warn_of_unequal_steps(network.inputs, times)
+    clock = np.arange(steps, dtype=np.float64) if times is None else times
     refuse_shared_dithers(network, z)
     z, said = _screen_measurements(network, z, u)
     for line in (*said, *warn_beyond_a_turn(network, z)):
         warnings.warn(line, stacklevel=2)
     # Filters, on what a recording without implausible data has.
     smoothing = None if smooth is None else select_smoothed_part(network, smooth, steps)
-    filters = AllFilters(network, smoothing and smoothing.kinds, judges=True)
+    filters = AllFilters(network, None if smoothing is None else smoothing.kinds, judges=True)
     with jax.enable_x64(True):
         sent = {} if reports is None else table("reports", reports, "reports by fusion")
         arrivals = _collect_arrivals(filters, sent, steps)
-        outputs = _filter_plausible(network, z, (filters, smoothing and smoothing.smoother(filters), u, arrivals))
+        smoother = None if smoothing is None else smoothing.smoother(filters)
+        outputs = _filter_plausible(network, z, Rest(filters, smoother, u, arrivals))
     state = outputs.pop("state")
     record = make_record(network, smoothing, outputs, clock)
     if time is not None and (unit := units_in(network.inputs).get(TIME_STEP)):
@@ -131,23 +137,32 @@ def run(
     doubts = *warn_wide_in_rows(network, record), *doubt_estimates(network, record)
     for line in (*doubts, *_describe_left_out(network, record), *say_remarks(network, state)):
         warnings.warn(line, stacklevel=2)
-    origin = _make_origin(network, record, state, u, usual_spacing(clock if known is not None else clock[:2]))
+    # Row numbers are one apart: two of them say so.
+    origin = _make_origin(network, record, state, u, usual_spacing(clock if times is not None else clock[:2]))
     return (record if true is None else add_truth(record, network.plant, true, smooth)).with_origin(origin)
+
+
+def _count_rows(measurements: ArrayLike) -> int:
+    """Return the number of rows of a node's measurements, one of a scalar; raise where there is none."""
+    steps = len(measurements) if rank("measurements", measurements) else 1  # type: ignore[arg-type]
+    if steps == 0:
+        raise fail("measurements", "at least one row", "none")
+    return steps
 
 
 def _make_origin(network: Network, record: Record, state: PyTree, u: np.ndarray, spacing: float) -> Origin:
     """Return where forecasts start: behind the last row, whose time between rows is dt where the plant has it."""
-    last = {
-        node: {name: jax.tree.map(lambda leaf: np.asarray(leaf)[-1], e) for name, e in of.items()}
-        for node, of in record.estimates.items()
+    last_estimates = {
+        node: {name: jax.tree.map(lambda leaf: np.asarray(leaf)[-1], e) for name, e in by_filter.items()}
+        for node, by_filter in record.estimates.items()
     }
     if TIME_STEP in network.inputs and len(u) > 1:
         spacing = float(np.median(u[1:, network.inputs.index(TIME_STEP)]))
     months = usual_months(record.time)
-    return Origin(network, state, len(u), last_input(u), record.time[-1], spacing, last, months)
+    return Origin(network, state, len(u), last_input(u), record.time[-1], spacing, last_estimates, months)
 
 
-def _find_clock(
+def _find_times(
     measured: Mapping[str, ArrayLike], others: Mapping[str, object], time: ArrayLike | None, steps: int
 ) -> np.ndarray | None:
     """Return the times of the rows: those given, else the dates by which the tables know them; None where neither."""
@@ -159,10 +174,10 @@ def _find_clock(
 def _screen_measurements(
     network: Network, z: dict[str, np.ndarray], u: np.ndarray
 ) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Drop values that are beyond their node's limits, or stuck; return the others.
+    """Return the measurements without values that are beyond their node's limits, or stuck; and lines that say so.
 
-    Return also a line on those of each node, and on values that the rule of their sender forbids, which stay,
-    and on silences that are longer than its timeout.
+    A line is said too of values that the rule of their sender forbids, which stay, and of silences that are longer
+    than the node's timeout.
     """
     kept, said = dict[str, np.ndarray](), list[str]()
     for name, node in network.nodes.items():
@@ -182,10 +197,10 @@ def _screen_measurements(
 def _drop_beyond(
     limits: Limits, z: Float[np.ndarray, "steps m"], node: Node | ReceivingNode
 ) -> tuple[Float[np.ndarray, "steps m"], list[str]]:
-    """Drop values beyond limits and those that are stuck; return the others, and a line on each of these."""
+    """Return the values that are neither beyond limits nor stuck, NaN for others; and a line on each of the two."""
     screened, came = limits.screen(z, Repeats()), int(np.count_nonzero(~np.isnan(z)))
-    nothing, lines = np.zeros_like(screened.stuck[0]), list[str]()
-    for dropped, stuck in ((screened.outside, nothing), (screened.stuck, screened.stuck)):
+    none_stuck, lines = np.zeros_like(screened.stuck[0]), list[str]()
+    for dropped, stuck in ((screened.outside, none_stuck), (screened.stuck, screened.stuck)):
         if dropped.any():
             row = int(np.argmax(dropped.any(axis=1)))
             at_row = np.where(dropped[row], z[row], np.nan)
@@ -195,10 +210,10 @@ def _drop_beyond(
 
 
 def _describe_left_out(network: Network, record: Record) -> Iterator[str]:
-    """Say of which outputs filters that weigh left out most, a line each."""
+    """Yield a line for each output of which a filter that weighs what arrives left out most."""
     for node, filters in record.weighed.items():
         if node == FUSED:
-            names = [f"{one}: {name}" for one in record.measurements for name in network.nodes[one].received_names]
+            names = [f"{each}: {name}" for each in record.measurements for name in network.nodes[each].received_names]
         else:
             names = list(network.nodes[node].received_names)
         for filter in filters:
@@ -219,33 +234,34 @@ def _collect_arrivals(filters: AllFilters, reports: Reports, steps: int) -> dict
 
 
 def _filter_plausible(network: Network, z: dict[str, np.ndarray], rest: Rest) -> PyTree:
-    """Filter a recording without implausible data, and warn of them.
+    """Return the results of filtering a recording without implausible data, and warn of these.
 
     If there are any, the recording is first filtered step by step without them to find all rows; then, without those
     that all filters of a node refuse, once again as a recording that never had them. Of what central filters refuse
     one node is to blame in each row, and the others' values are judged again without it.
     """
 
-    def grouped() -> tuple[np.ndarray, ...]:
+    def group_measurements() -> tuple[np.ndarray, ...]:
+        """Return the measurements as they are now, (steps, node, received) by group."""
         return tuple(np.stack([z[name] for name in names], axis=1) for names in network.groups)
 
     # Usually nothing is implausible.
-    outputs = _filter_rows(*rest, grouped(), False)
+    outputs = _filter_rows(*rest, group_measurements(), False)
     if not any_implausible(outputs):
-        said = describe_doubts(network, outputs, {}, rest[2])
+        doubts = describe_doubts(network, outputs, {}, rest.u)
     else:
         # Find all rows that are, then filter again without them.
-        outputs = first_time = _filter_rows(*rest, grouped(), True)
+        outputs = first_time = _filter_rows(*rest, group_measurements(), True)
         refused = dict[str, dict[int, str]]()
-        while new := _find_refused(network, outputs, z, grouped(), rest, refused):
+        while new := _find_refused(network, outputs, z, group_measurements(), rest, refused):
             for name, rows in new.items():
                 refused[name] = dict(sorted((refused.get(name, {}) | rows).items()))
                 z[name] = z[name].copy()
                 z[name][list(rows)] = np.nan
-            again = _filter_rows(*rest, grouped(), False)
-            outputs = _filter_rows(*rest, grouped(), True) if any_implausible(again) else again
-        said = describe_doubts(network, first_time, refused, rest[2])
-    for line in said:
+            again = _filter_rows(*rest, group_measurements(), False)
+            outputs = _filter_rows(*rest, group_measurements(), True) if any_implausible(again) else again
+        doubts = describe_doubts(network, first_time, refused, rest.u)
+    for line in doubts:
         warnings.warn(line, stacklevel=3)
     return {name: values for name, values in outputs.items() if not name.startswith("judged")}
 
@@ -254,13 +270,17 @@ def _find_refused(
     network: Network, outputs: PyTree, z: dict[str, np.ndarray], grouped: tuple[np.ndarray, ...], rest: Rest,
     before: dict[str, dict[int, str]],
 ) -> dict[str, dict[int, str]]:  # fmt: skip
-    """Find the rows that all filters of a node refuse, and central ones' by the node to blame; new ones alone."""
-    (filters, _, u, arrivals), (refused, shared) = rest, find_refused_rows(network, outputs)
-    if shared:
-        states = compute_once(_collect_central_states, _central_states_by_xla, (filters, u, arrivals, grouped))
+    """Return, by node, the rows that its filters refuse and that were not refused `before`, with the reason.
+
+    Rows that the central filters refuse are those of the node to blame.
+    """
+    refused, centrally = find_refused_rows(network, outputs)
+    filters, u = rest.filters, rest.u
+    if centrally:
+        states = compute_once(_collect_central_states, _central_states_by_xla, (filters, u, rest.arrivals, grouped))
         in_order = {name: z[name] for name in network.names}
         nodes = Judges(network).without_own
-        refused |= refuse_centrally(filters.central, states, in_order, u, shared, nodes)
+        refused |= refuse_centrally(filters.central, states, in_order, u, centrally, nodes)
     new = {name: {k: why for k, why in rows.items() if k not in before.get(name, ())} for name, rows in refused.items()}
     return {name: rows for name, rows in new.items() if rows}
 
@@ -270,26 +290,28 @@ def _collect_central_states(
 ) -> PyTree:
     """Return the states of the central filters before each row."""
 
-    def body(states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
+    def step(states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
+        """Step all filters; the central ones' states before the step are the output."""
         k, u_k, z_k, drawn = row
         return step_plausibly(filters, states, z_k, u_k, k, drawn)[0], states[1]
 
-    before: PyTree = jax.lax.scan(body, filters.init(), (jnp.arange(len(u)), u, z, arrivals))[1]
+    before: PyTree = jax.lax.scan(step, filters.init(), (jnp.arange(len(u)), u, z, arrivals))[1]
     return before
 
 
 def _filter_rows(*arguments: PyTree) -> PyTree:
-    """Run `_run_filters`, with results as NumPy arrays, by native code where it supports the filters."""
-    in_chunks = _filter_in_chunks(*arguments)
-    if in_chunks is not None:
-        return in_chunks
-    # Joint covariances are stored at places that the graph, an argument here, decides: XLA's.
-    by_xla = any(mesh.is_long or mesh.needs_joint for mesh in arguments[0].meshes.values())
+    """Return what `_run_filters` does, as NumPy arrays: in chunks side by side, by native code, or by XLA."""
+    results = _filter_in_chunks(*arguments)
+    if results is not None:
+        return results
+    # XLA for a joint covariance: the graph, an argument here, decides where its blocks are stored.
+    filters, *_ = arguments
+    by_xla = any(mesh.is_long or mesh.needs_joint for mesh in filters.meshes.values())
     return _scan_in_parts(*arguments) if by_xla else compute_once(_run_filters, _by_xla, arguments)
 
 
 class NetworkRows(Recursion):
-    """All filters of a network over rows, with all that is said of them kept."""
+    """Recursion of all filters of a network over rows; each row's output is all that they estimate and judge."""
 
     filters: AllFilters
 
@@ -303,7 +325,7 @@ def _filter_in_chunks(
     filters: AllFilters, later: Smoother | None, u: np.ndarray, arrivals: dict[str, Drawn], z: tuple[np.ndarray, ...],
     judged: bool,
 ) -> PyTree | None:  # fmt: skip
-    """Filter rows in chunks side by side, given the arguments of `_run_filters`; None where that cannot be.
+    """Filter rows in chunks side by side; None where that cannot be. Arguments as of `_run_filters`.
 
     All filters must be linear, and take each measurement as it is; results are not smoothed, and rows are many.
     """
@@ -317,36 +339,49 @@ def _scan_in_parts(
     filters: AllFilters, later: Smoother | None, u: np.ndarray, arrivals: dict[str, Drawn], z: tuple[np.ndarray, ...],
     judged: bool,
 ) -> PyTree:  # fmt: skip
-    """Scan over some rows at a time, with the weights between neighbours of these computed ahead."""
+    """Filter by XLA, some rows at a time, whose weights between neighbours are computed ahead.
+
+    Arguments as of `_run_filters`.
+    """
+    # As few parts of at most ROWS rows as there can be, of one size, so that they share a program.
     count = -(-len(u) // ROWS)
     size = -(-len(u) // count)
     rows, states, parts = (np.arange(len(u)), u, z, arrivals), initial_states(filters), []
     for start in range(0, len(u), size):
-        # The last row again until the part is full.
-        now = np.minimum(np.arange(start, start + size), len(u) - 1)
-        k, u_k, z_k, drawn = jax.tree.map(lambda leaf, now=now: np.asarray(leaf)[now], rows)
+        # The last part is filled with its last row, which does not count again.
+        indices = np.minimum(np.arange(start, start + size), len(u) - 1)
+        k, u_k, z_k, drawn = jax.tree.map(lambda leaf, rows=indices: np.asarray(leaf)[rows], rows)
         drawn |= {name: (drawn[name], mesh.ahead(drawn[name])) for name, mesh in filters.meshes.items()}
         counts = np.arange(start, start + size) < len(u)
         states, results = _scanned_by_xla(filters, states, (k, u_k, z_k, drawn), judged, counts)
         parts.append(to_numpy(results))
-    whole = jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(u)], *parts)
-    return to_numpy(_collect_results(later, z, states, whole))
+    all_rows = jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(u)], *parts)
+    return to_numpy(_collect_results(later, z, states, all_rows))
 
 
 def _run_filters(
     filters: AllFilters, later: Smoother | None, u: np.ndarray, arrivals: dict[str, Drawn], z: tuple[np.ndarray, ...],
     judged: bool,
 ) -> PyTree:  # fmt: skip
-    """Filter all rows in one scan; `judged`: what is implausible is found before it is used, and left out."""
+    """Filter all rows in one scan.
+
+    Args:
+        filters: all filters of a network.
+        later: smoother of their results; None without.
+        u: inputs (steps, inputs).
+        arrivals: what arrived of reports and between neighbours, by fusion.
+        z: measurements (steps, node, received) by group.
+        judged: whether what a filter judges implausible is left out before it is used.
+    """
     return _collect_results(later, z, *_scan(filters, filters.init(), (jnp.arange(len(u)), u, z, arrivals), judged))
 
 
 def _scan(
     filters: AllFilters, states: PyTree, rows: tuple[PyTree, ...], judged: bool, counts: np.ndarray | None = None
 ) -> tuple[PyTree, dict[str, PyTree]]:
-    """Step over rows; the states stay as they are at those that do not count."""
+    """Step over rows: return the last states, and the results by row; rows that do not count change no state."""
 
-    def body(states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
+    def step_row(states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
         (k, u_k, z_k, drawn), row_counts = row
         step = step_plausibly if judged else AllFilters.step
         after, results = step(filters, states, z_k, u_k, k, drawn)
@@ -354,7 +389,7 @@ def _scan(
             after = jax.tree.map(lambda new, old: jnp.where(row_counts, new, old), after, states)
         return after, results
 
-    states, results = jax.lax.scan(body, states, (rows, counts))
+    states, results = jax.lax.scan(step_row, states, (rows, counts))
     return states, results
 
 

@@ -20,7 +20,7 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.random_affine.memory import drop_identities
 from heliograph.simulation.arguments import Precision, check_precision, inputs_of, key_of
-from heliograph.simulation.centres.mesh import build_meshes
+from heliograph.simulation.centres.mesh_building import build_meshes
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.results.record import Record, warn_of_no_numbers
@@ -115,12 +115,17 @@ def monte_carlo(
         if by_native_code is not None:
             return _warn_of_nan(by_native_code, network)
     # Otherwise XLA: the world, and what is collected of it.
-    filters = AllFilters(network, smoothing and smoothing.kinds)
-    world = World(
-        drop_identities(network.plant), make_reception(network), plan(filters, u) if has_plan(filters) else filters
+    filters = AllFilters(network, None if smoothing is None else smoothing.kinds)
+    planned = plan(filters, u) if has_plan(filters) else filters
+    job = _Job(
+        world=World(drop_identities(network.plant), make_reception(network), planned),
+        later=None if smoothing is None else smoothing.smoother(filters),
+        inputs=u,
+        key=base,
+        stop=np.asarray(first_run + runs),
+        reducer=reducer,
+        precision=precision,
     )
-    later, stop = smoothing and smoothing.smoother(filters), np.asarray(first_run + runs)
-    job = _Job(world, later, u, base, stop, reducer, precision)
     if one_processor():
         check_memory(_estimate_memory(job, runs, chunk), runs, horizon)
     with explain_out_of_memory(runs, horizon):
@@ -150,7 +155,7 @@ def _warn_beyond_limits(record: Record, network: Network) -> None:
 
 
 def _check_counts(horizon: int, runs: int, chunk: int, first_run: int) -> None:
-    """Raise at counts that are none, and at a first run amid a block."""
+    """Raise ValueError for counts that are no positive integers, and for a first run within a block."""
     for name, count in (("horizon", horizon), ("runs", runs), ("chunk", chunk)):
         check_count(name, count)
     if check_count("first_run", first_run, 0) % BLOCK:
@@ -167,7 +172,7 @@ def _warn_if_lost(network: Network) -> None:
 
 
 class _Job(Module):
-    """World, smoother, inputs and key of a simulation, its last run, its reducer and its precision."""
+    """What a simulation by XLA needs: world, smoother, inputs and key, the run after its last, reducer, precision."""
 
     world: World
     later: Smoother | None
@@ -183,8 +188,8 @@ def _run_chunks(job: _Job, first_run: int, runs: int, chunk: int, progress: Prog
     with jax.enable_x64(True):
         lanes = RunLanes(
             lambda blocks, carry: _simulate_lane((job, blocks), carry),
-            partial(_all_lanes, job),
-            partial(_initial, job),
+            partial(_simulate_all_lanes, job),
+            partial(_make_zero_sums, job),
             first_run,
             one_by_one=bool(job.world.filters.meshes),  # weights are solved for many estimates at once
         )
@@ -199,7 +204,7 @@ def _run_chunks(job: _Job, first_run: int, runs: int, chunk: int, progress: Prog
 
 
 @quickly_compiled
-def _initial(job: _Job) -> PyTree:
+def _make_zero_sums(job: _Job) -> PyTree:
     """Return the sums of zero before the first block; compiled, so that shapes are worked out once a network."""
     shapes = eqx.filter_eval_shape(_simulate_block, job, np.arange(BLOCK))[0]
     return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), shapes)
@@ -207,22 +212,27 @@ def _initial(job: _Job) -> PyTree:
 
 @partial(quickly_compiled, donate="all-except-first")
 def _simulate_lane(todo: tuple[_Job, PyTree], carry: PyTree) -> tuple[PyTree, PyTree]:
+    """Simulate (job, blocks) as `_simulate_blocks` does, compiled, in the memory of the carry."""
     return _simulate_blocks(*todo, carry)
 
 
 def _simulate_blocks(job: _Job, blocks: PyTree, carry: PyTree) -> tuple[PyTree, PyTree]:
-    """Sum over blocks one after another, of fixed width and order of sums: so chunks do not change a bit."""
+    """Simulate blocks (block, BLOCK) one after another; return the carry with their sums, and what is collected.
 
-    def body(carry: PyTree, runs: jax.Array) -> tuple[PyTree, PyTree]:
+    Width and order of the sums are fixed, so that chunks do not change a bit.
+    """
+
+    def add_block(carry: PyTree, runs: jax.Array) -> tuple[PyTree, PyTree]:
+        """Add the sums of one block."""
         sums, collected = _simulate_block(job, runs)
         return added(carry, sums), collected
 
-    return jax.lax.scan(body, carry, jnp.asarray(blocks))
+    return jax.lax.scan(add_block, carry, jnp.asarray(blocks))
 
 
 @quickly_compiled
-def _all_lanes(job: _Job, blocks: PyTree, carries: PyTree) -> tuple[PyTree, PyTree]:
-    """Sum over every lane's blocks, with a leading axis for the lanes."""
+def _simulate_all_lanes(job: _Job, blocks: PyTree, carries: PyTree) -> tuple[PyTree, PyTree]:
+    """Simulate the blocks of all lanes, which are the leading axis of everything."""
     sums: tuple[PyTree, PyTree] = jax.vmap(partial(_simulate_blocks, job))(blocks, carries)
     return sums
 
@@ -232,19 +242,19 @@ def _simulate_block(job: _Job, runs: jax.Array) -> tuple[tuple[PyTree, PyTree], 
     recorded = _reduced(job.reducer, job.later, _simulate_outputs(job, runs))
     valid, start = jnp.asarray(runs) < job.stop, runs[0] % BATCHES
 
-    # What all runs share stands as of one; of the others the axis of runs becomes one of batches, without padding.
-    def summed(leaf: jax.Array) -> PyTree:
+    def sum_by_batch(leaf: jax.Array) -> PyTree:
+        """Return (run, ...) as (..., batch), without runs beyond the last; what all runs share as of one."""
         if len(leaf) < len(runs):
             return Shared(leaf[0].astype(float))
         return group_by_batch(jnp.where(valid, jnp.moveaxis(leaf, 0, -1).astype(float), 0.0), start)
 
-    sums, ever = jax.tree.map(summed, (recorded.sums, recorded.ever))
+    sums, ever = jax.tree.map(sum_by_batch, (recorded.sums, recorded.ever))
     collected = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(runs), *leaf.shape[1:])), recorded.collected)
     return (sums, ever), collected
 
 
 def _simulate_outputs(job: _Job, runs: jax.Array) -> PyTree:
-    """Trajectories of one block of runs, (run, time, ...), in double precision whatever they were simulated in."""
+    """Return trajectories of one block of runs, (run, time, ...), in double precision whatever simulated them."""
     if job.precision == "float64":
         return _trajectories(job.world, job.inputs, job.key, runs)
     with jax.enable_x64(False):
@@ -266,17 +276,20 @@ def _estimate_memory(job: _Job, runs: int, chunk: int) -> Needed:
         read = read_by(partial(_reduced, job.reducer, job.later), outputs)
     blocks, at_once = -(-runs // BLOCK), -(-min(runs, chunk) // BLOCK)
     in_flight = 1 if job.world.filters.meshes else min(LANES, at_once, os.cpu_count() or 1)
-    rows = size_of(sums) * (BATCHES + BLOCK - 1) / BATCHES
+    rows = size_of(sums) * (BATCHES + BLOCK - 1) / BATCHES  # as `group_by_batch` makes them
     kept = blocks * size_of(collected)
     return Needed(
-        2 * kept,  # by chunk, then joined, when no trajectories are left
-        min(LANES, blocks) * size_of(sums) + in_flight * (size_of(sums) + rows),
-        max(0.0, in_flight * size_of(read) - kept),
+        collected=2 * kept,  # by chunk, then joined, when no trajectories are left
+        sums=min(LANES, blocks) * size_of(sums) + in_flight * (size_of(sums) + rows),
+        trajectories=max(0.0, in_flight * size_of(read) - kept),
     )
 
 
 def group_by_batch(values: jax.Array, start: jax.Array | int) -> jax.Array:
-    """Return values (..., run) of consecutive runs from batch `start` on as (..., batch), zero where there is none."""
+    """Return values (..., run) of consecutive runs from batch `start` on as (..., batch), zero where there is none.
+
+    Runs beyond the last batch go on from the first: one row of batches, with what is beyond its end added to its begin.
+    """
     runs, zero = values.shape[-1], (0,) * (values.ndim - 1)
     row = jnp.zeros((*values.shape[:-1], BATCHES + runs - 1), values.dtype)
     row = jax.lax.dynamic_update_slice(row, values, (*zero, start))
@@ -291,18 +304,20 @@ def _convert_to_single(leaf: PyTree) -> PyTree:
 
 
 def _simulate_world(world: World, u: PyTree, key: jax.Array, runs: jax.Array) -> PyTree:
+    """Return the trajectories of these runs, by number, (run, time, ...)."""
     keys = jax.vmap(lambda run: jax.random.fold_in(key, run))(runs)
     return simulate_trajectories(world.init, world.step, keys, (jnp.arange(len(u)), jnp.asarray(u)))
 
 
-def _each_reduced(reducer: AbstractReducer[Any], later: Smoother | None, outputs: PyTree) -> OfStep:
+def _reduce_runs(reducer: AbstractReducer[Any], later: Smoother | None, outputs: PyTree) -> OfStep:
+    """Return what is summed and collected of each run's trajectories, smoothed where there is a smoother."""
     recorded: OfStep = each_run(partial(reduce_run, reducer, later), outputs)
     return recorded
 
 
 # Traced once, for their shapes and for the program alike: tracing is half of what a first call takes.
 _trajectories: Callable[..., PyTree] = eqx.filter_jit(_simulate_world, inline=True)  # type: ignore[call-overload]
-_reduced: Callable[..., OfStep] = eqx.filter_jit(_each_reduced, inline=True)  # type: ignore[call-overload]
+_reduced: Callable[..., OfStep] = eqx.filter_jit(_reduce_runs, inline=True)  # type: ignore[call-overload]
 
 
 def simulate(

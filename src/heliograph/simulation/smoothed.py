@@ -36,7 +36,7 @@ from heliograph.smoothing.fixed_interval_lag_point import AbstractSmoothing, nis
 
 
 class Smoother(Module):
-    """Smoothing of a network's filters: `kinds` of them and `groups` of measurements, by their places.
+    """Smooths a network's filters: `kinds` are the numbers of those smoothed, `groups` of the nodes that have them.
 
     `fusions`: of smoothed estimates at the same time.
     """
@@ -70,7 +70,7 @@ class Smoother(Module):
             truth = self.smoothing.select_reference(outputs["truth"])
             smoothed |= {
                 "truth": truth,
-                **self._turn_to_truth(truth, smoothed, [steps.angles for steps in steps_by_kind]),
+                **_turn_to_truth(truth, smoothed, [steps.angles for steps in steps_by_kind]),
             }
         # Sums of the NIS, for the test of consistency.
         sum_nis = jax.vmap(jax.vmap(nis_sums, in_axes=1), in_axes=1)
@@ -78,19 +78,22 @@ class Smoother(Module):
         centrally = {name: nis_sums(steps) for name, steps in outputs["central_steps"].items()}
         return {"filtered": filtered, "smoothed": smoothed, "nis": {"estimates": nis, "fused": centrally}}
 
-    def _turn_to_truth(
-        self, truth: jax.Array, known: Mapping[str, PyTree], angles: Sequence[Angles]
-    ) -> dict[str, PyTree]:
-        """Return the estimates with their angles within half a turn of the truth, so that x - xhat is the error."""
 
-        def near(estimate: Estimate, which: Angles) -> Estimate:
-            mean = jnp.asarray(estimate.mean)
-            others = truth.reshape(len(truth), *[1] * (mean.ndim - 2), -1)
-            return replace(estimate, mean=nearest(mean, others, which))
+def _turn_to_truth(
+    truth: jax.Array, smoothed: Mapping[str, PyTree], angles_of_kinds: Sequence[Angles]
+) -> dict[str, PyTree]:
+    """Return the estimates with their angles within half a turn of the truth, so that x - xhat is the error."""
 
-        every = next((which for which in angles if which), ())
-        estimates = tuple(near(e, which) for e, which in zip(known["estimates"], angles, strict=True))
-        return {"estimates": estimates, "fused": {name: near(e, every) for name, e in known["fused"].items()}}
+    def turn(estimate: Estimate, angles: Angles) -> Estimate:
+        """Turn the angles of an estimate (time, ..., n); truth (time, n)."""
+        mean = jnp.asarray(estimate.mean)
+        truth_at_each = truth.reshape(len(truth), *[1] * (mean.ndim - 2), -1)
+        return replace(estimate, mean=nearest(mean, truth_at_each, angles))
+
+    # All kinds that have angles have the plant's.
+    of_plant = next((angles for angles in angles_of_kinds if angles), ())
+    estimates = tuple(turn(e, angles) for e, angles in zip(smoothed["estimates"], angles_of_kinds, strict=True))
+    return {"estimates": estimates, "fused": {name: turn(e, of_plant) for name, e in smoothed["fused"].items()}}
 
 
 def _fuse_at_each_time(fusion: StackedFusions, estimates: Sequence[Estimate]) -> dict[str, Estimate]:
@@ -103,12 +106,12 @@ def reduce_run(reducer: AbstractReducer[Result], later: Smoother | None, outputs
     """Reduce the results of a run (time, ...); with a smoother pairs of filtered and smoothed ones, and its NIS."""
     if later is None:
         return reduce_rows(reducer, outputs)
-    both = later.smooth_run(outputs)
-    filtered, smoothed = reduce_rows(reducer, both["filtered"]), reduce_rows(reducer, both["smoothed"])
+    results = later.smooth_run(outputs)
+    filtered, smoothed = reduce_rows(reducer, results["filtered"]), reduce_rows(reducer, results["smoothed"])
     return OfStep(
-        (filtered.sums, smoothed.sums, both["nis"]),
-        (filtered.ever, smoothed.ever),
-        (filtered.collected, smoothed.collected),
+        sums=(filtered.sums, smoothed.sums, results["nis"]),
+        ever=(filtered.ever, smoothed.ever),
+        collected=(filtered.collected, smoothed.collected),
     )
 
 
@@ -203,19 +206,19 @@ def make_record(network: Network, smoothing: SmoothedPart | None, outputs: PyTre
 def add_truth(record: Record, plant: AnyPlant, truth: np.ndarray, smoothing: AbstractSmoothing | None) -> Record:
     """Return the record of a recording with the true states, angles of estimates within half a turn of them."""
 
-    def near(estimate: Estimate, x: np.ndarray) -> Estimate:
+    def turn(estimate: Estimate, x: np.ndarray) -> Estimate:
+        """Turn an estimate's angles towards x where x is known."""
         mean = np.asarray(estimate.mean)
         known = np.where(np.isnan(x), mean, x)
         return replace(estimate, mean=first(plant).near(mean, known))
 
     later = record.smoothed
     if later is not None and smoothing is not None:
-        later = add_truth(
-            later, plant, np.broadcast_to(smoothing.select_reference(truth), (len(later.time), truth.shape[1])), None
-        )
+        reference = np.broadcast_to(smoothing.select_reference(truth), (len(later.time), truth.shape[1]))
+        later = add_truth(later, plant, reference, smoothing=None)
     estimates = {
-        node: {name: near(filter, truth) for name, filter in filters.items()}
-        for node, filters in record.estimates.items()
+        node: {name: turn(estimate, truth) for name, estimate in by_filter.items()}
+        for node, by_filter in record.estimates.items()
     }
     return replace(record, truth=truth, estimates=estimates, smoothed=later)
 
@@ -237,17 +240,16 @@ def finish(
     # Without smoothing the result of the network alone.
     if smoothing is None:
         return reducer.finish(reducer.summed(sums, common, count), collected, network)
-    # Pairs of filtered and smoothed estimates, and sums of the NIS over all runs.
+    # As `reduce_run` has them: sums are of filtered estimates, of smoothed ones, and of the NIS.
+    *_, nis_sums_by_batch = sums.sums
+    *_, is_common = common.sums
     nis = jax.tree.map(
-        lambda leaf, same: leaf * count.sum() if same else leaf.sum(axis=-1), sums.sums[2], common.sums[2]
+        lambda leaf, same: leaf * count.sum() if same else leaf.sum(axis=-1), nis_sums_by_batch, is_common
     )
     _warn_of_inconsistency(smoothing.network, nis)
-    filtered, smoothed = (
-        reducer.finish(
-            reducer.summed(OfStep(sums.sums[i], sums.ever[i]), OfStep(common.sums[i], common.ever[i]), count),
-            collected[i],
-            of,
-        )
-        for i, of in enumerate((network, smoothing.network))
-    )
+    results = []
+    for i, part in enumerate((network, smoothing.network)):
+        sums_of_part, common_of_part = (OfStep(sums=x.sums[i], ever=x.ever[i]) for x in (sums, common))
+        results.append(reducer.finish(reducer.summed(sums_of_part, common_of_part, count), collected[i], part))
+    filtered, smoothed = results
     return reducer.others(filtered, smoothed, smoothing.claims)

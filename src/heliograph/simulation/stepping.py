@@ -31,7 +31,8 @@ from heliograph.simulation.centres.centre import (
 from heliograph.simulation.centres.fused_innovation import FusedInnovation, following_prior, make_fused_innovations
 from heliograph.simulation.centres.fusions import Reporting, StackedFusions, centres_of, fusions_of, sources_of
 from heliograph.simulation.centres.linearised import Followed, LinearisedCentre
-from heliograph.simulation.centres.mesh import Mesh, build_meshes
+from heliograph.simulation.centres.mesh import Mesh
+from heliograph.simulation.centres.mesh_building import build_meshes
 from heliograph.simulation.centres.uplinks import uplinks_of
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node, ReceivingNode
@@ -73,20 +74,21 @@ class AllFilters(Module):
         what arrives at the next step.
         """
         self.smooths, self.judges = smoothed_groups is not None, judges
-        # Filters of the nodes, by kind.
-        self.alike = tuple(
-            StackedFilters(
-                stack(
-                    [without_output_names(network.nodes[name].filters[f]) for f in names for name in network.groups[g]]
-                ),
-                g,
-                len(names),
-                len(network.groups[g]),
-                smoothed_groups is not None and kind in smoothed_groups,
-                judges,
+        alike = []
+        for number, kind in enumerate(network.kinds):
+            nodes = network.groups[kind.group]
+            filters = [without_output_names(network.nodes[node].filters[f]) for f in kind.filters for node in nodes]
+            alike.append(
+                StackedFilters(
+                    filters=stack(filters),
+                    group=kind.group,
+                    count=len(kind.filters),
+                    nodes=len(nodes),
+                    smooths=smoothed_groups is not None and number in smoothed_groups,
+                    judges=judges,
+                )
             )
-            for kind, (g, names) in enumerate(network.kinds)
-        )
+        self.alike = tuple(alike)
         # Central filters, fusions, informed centres, centres with reports.
         self.central = {name: fusion for name, fusion in network.fused.items() if isinstance(fusion, AbstractFilter)}
         self.fusions, self.centres = fusions_of(network), centres_of(network)
@@ -129,10 +131,10 @@ class AllFilters(Module):
 
     @property
     def are_linear(self) -> bool:
-        """Test whether all are filters, and of each no gain depends on data."""
+        """Whether no filter's gain depends on data, and nothing is fused."""
         filters = [*(stacked.filters for stacked in self.alike), *self.central.values()]
-        alone = not (self.fusions or self.centres or self.reporting or self.meshes)
-        return alone and all(filter.is_linear for filter in filters)
+        fuses = self.fusions or self.centres or self.reporting or self.meshes
+        return not fuses and all(filter.is_linear for filter in filters)
 
     @property
     def informed(self) -> tuple[Centre, ...]:
@@ -141,14 +143,16 @@ class AllFilters(Module):
 
     def matrices(self, centre: Centre, states: PyTree, u: jax.Array, k: jax.Array) -> list[LinearStep]:
         """Return the matrices of a centre's sources at step k; they depend on covariances alone, so z may be zero."""
-        return [self.alike[i].matrices(centre.read, states[i], f, self._quiet(i), u, k) for i, f in centre.sources]
+        sources = [(self.alike[kind], states[kind], f, self._make_zeros(kind)) for kind, f in centre.sources]
+        return [alike.matrices(centre.read, state, f, zeros, u, k) for alike, state, f, zeros in sources]
 
     def followed(self, states: PyTree, u: jax.Array, k: jax.Array) -> PyTree:
         """Return the states of the nodes' filters after step k, for measurements of zero."""
-        pairs = zip(self.alike, states, strict=True)
-        return tuple(stacked.step(state, self._quiet(i), u, k)[0] for i, (stacked, state) in enumerate(pairs))
+        kinds = enumerate(zip(self.alike, states, strict=True))
+        return tuple(alike.step(state, self._make_zeros(kind), u, k)[0] for kind, (alike, state) in kinds)
 
-    def _quiet(self, kind: int) -> jax.Array:
+    def _make_zeros(self, kind: int) -> jax.Array:
+        """Return measurements (node, received) of zero for the nodes of a kind."""
         return jnp.zeros((self.alike[kind].nodes, self.alike[kind].filters.received))
 
     def step(
@@ -172,22 +176,24 @@ class AllFilters(Module):
         filter_states, central, quantizer_states, centre_states, reporting, tested = states
         # The nodes' filters, and central ones on all measurements in the order of the nodes.
         reasons = [None] * len(filter_states) if skip is None else skip[0]
+        central_reasons = {} if skip is None else skip[1]
         stepped = [
-            stacked.step(state, z[stacked.group], u, k, why)
-            for stacked, state, why in zip(self.alike, filter_states, reasons, strict=True)
+            stacked.step(state, z[stacked.group], u, k, reason)
+            for stacked, state, reason in zip(self.alike, filter_states, reasons, strict=True)
         ]
         joined = jnp.concatenate([jnp.ravel(values) for values in z])
         joined = joined if self.order is None else joined[self.order]
-        received = {
-            name: filter_step(filter, central[name], joined, u, k, self.smooths, self.judges, skip and skip[1][name])
+        stepped_centrally = {
+            name: filter_step(filter, central[name], joined, u, k, self.smooths, self.judges, central_reasons.get(name))
             for name, filter in self.central.items()
         }
         # Fusions of the nodes' estimates.
-        estimates = tuple(single.estimate for _, single in stepped)
+        estimates = tuple(output.estimate for _, output in stepped)
         following, outputs = self._step_fusions(
             (filter_states, quantizer_states, centre_states, reporting), z, estimates, u, k, drawn or {}
         )
-        fused = outputs["fused"] = {name: single.estimate for name, (_, single) in received.items()} | outputs["fused"]
+        fused = {name: output.estimate for name, (_, output) in stepped_centrally.items()} | outputs["fused"]
+        outputs["fused"] = fused
         # Tests of fused estimates, by what arrived after the last of them.
         distances = {
             name: test.step(tested[name], self.alike, filter_states, z, u, k, reasons)
@@ -196,18 +202,17 @@ class AllFilters(Module):
         tested = {name: following_prior(fused[name]) for name in self.tests}
         if self.judges:
             outputs["tested"] = distances
-        for field, of_nodes, centrally in self._details():
-            outputs[of_nodes] = tuple(getattr(single, field) for _, single in stepped)
-            outputs[centrally] = {name: getattr(single, field) for name, (_, single) in received.items()}
-        # Next states.
-        central = {name: state for name, (state, _) in received.items()}
+        for field, of_nodes, centrally in self._list_details():
+            outputs[of_nodes] = tuple(getattr(output, field) for _, output in stepped)
+            outputs[centrally] = {name: getattr(output, field) for name, (_, output) in stepped_centrally.items()}
+        central = {name: state for name, (state, _) in stepped_centrally.items()}
         return (tuple(state for state, _ in stepped), central, *following, tested), outputs
 
-    def _details(self) -> list[tuple[str, str, str]]:
-        """Further fields of each filter's step, with their names among the outputs: of nodes, of central filters."""
+    def _list_details(self) -> list[tuple[str, str, str]]:
+        """Return further fields of each filter's step, with their names among the outputs of nodes and central ones."""
         judged = [("judgement", "judged", "judged_centrally"), ("weighed", "weighed", "weighed_centrally")]
         steps = [("steps", "smoother_steps", "central_steps")]
-        return steps * self.smooths + judged * self.judges
+        return (steps if self.smooths else []) + (judged if self.judges else [])
 
     def _step_fusions(
         self,
@@ -223,32 +228,34 @@ class AllFilters(Module):
         Returns the next states of quantizers, centres and reports, and the outputs that every step has.
         """
         filter_states, quantizer_states, centre_states, reporting = states
-        fused, uplinks, reports, published = (dict[str, PyTree]() for _ in range(4))
+        fused, uplinks, reports, links_after = (dict[str, PyTree]() for _ in range(4))
         # Rules, through their quantizers.
-        after, learned = list[PyTree](), list[PyTree]()
+        quantizers_after, centres_after = list[PyTree](), list[PyTree]()
         for fusion, state in zip(self.fusions, quantizer_states, strict=True):
             following, outcome, traffic = fusion.step(state, estimates, k)
-            after.append(following)
+            quantizers_after.append(following)
             fused |= outcome
             uplinks |= traffic
         # Informed centres, which propagate the joint moments of the errors.
         for centre, state in zip(self.centres, centre_states, strict=True):
             following, outcome = self._step_centre(centre, state, filter_states, z, estimates, u, k)
-            learned.append(following)
+            centres_after.append(following)
             fused |= outcome
         # Centres with reports over uplinks.
         for name, link in self.reporting.items():
-            happens = drawn[name] if name in drawn else link.uplinks.undrawn()
-            published[name], fused[name], traffic, reports[name] = link.step(reporting[name], estimates, happens, u, k)
+            arrivals = drawn[name] if name in drawn else link.uplinks.undrawn()
+            links_after[name], fused[name], traffic, reports[name] = link.step(
+                reporting[name], estimates, arrivals, u, k
+            )
             uplinks |= {name: traffic} if traffic else {}
         # Fusions between neighbours: estimates of each node, after those of the filters, in the order of their names.
         for name, mesh in sorted(self.meshes.items()):
-            happens = drawn[name] if name in drawn else mesh.edges.lossless()  # within a process nothing is lost
-            flags, ahead = happens if isinstance(happens, tuple) else (happens, ())
-            published[name], shown = mesh.step(reporting[name], z, jnp.asarray(flags), u, k, ahead)
-            estimates, reports[name] = (*estimates, *shown), (flags, jnp.zeros(()))
+            arrivals = drawn[name] if name in drawn else mesh.edges.lossless()  # within a process nothing is lost
+            flags, ahead = arrivals if isinstance(arrivals, tuple) else (arrivals, ())
+            links_after[name], of_mesh = mesh.step(reporting[name], z, jnp.asarray(flags), u, k, ahead)
+            estimates, reports[name] = (*estimates, *of_mesh), (flags, jnp.zeros(()))
         outputs = {"estimates": estimates, "fused": fused, "uplinks": uplinks, "reports": reports}
-        return (tuple(after), tuple(learned), published), outputs
+        return (tuple(quantizers_after), tuple(centres_after), links_after), outputs
 
     def _step_centre(
         self,
@@ -260,22 +267,26 @@ class AllFilters(Module):
         u: jax.Array,
         k: jax.Array,
     ) -> tuple[PyTree, dict[str, Estimate]]:
-        """Step a centre, which reads the matrices of its sources' steps before they are taken."""
-        parts = [
-            self.alike[i].matrices(centre.read, states[i], f, z[self.alike[i].group], u, k) for i, f in centre.sources
-        ]
-        means = [jnp.asarray(estimates[i].mean)[f] for i, f in centre.sources]
-        return centre.step(state, parts, means, u, k)
+        """Step a centre with the estimates of its sources' filters, and with the matrices of their steps.
+
+        `states`: of the filters before the step, from which the matrices follow.
+        """
+        matrices = []
+        for kind, f in centre.sources:
+            alike = self.alike[kind]
+            matrices.append(alike.matrices(centre.read, states[kind], f, z[alike.group], u, k))
+        means = [jnp.asarray(estimates[kind].mean)[f] for kind, f in centre.sources]
+        return centre.step(state, matrices, means, u, k)
 
 
 @compile_on_call
 def initial_states(filters: AllFilters) -> PyTree:
-    """Return states before the first step, by one program: otherwise each operation is a program of its own."""
+    """Return the states before the first step, computed by one program instead of one for each operation."""
     return jax.tree.map(jnp.asarray, filters.init())
 
 
 def plan(filters: AllFilters, u: Float[Array, "horizon inputs"]) -> AllFilters:
-    """Precompute what does not depend on data, where all data arrive."""
+    """Return the filters with all that depends on no data precomputed for inputs u, where all data arrive."""
     central = filters.central if all(filters.complete) else {}
     planned = [_plan_alike(a, u) if filters.complete[a.group] else a for a in filters.alike]
     central = {
@@ -287,7 +298,7 @@ def plan(filters: AllFilters, u: Float[Array, "horizon inputs"]) -> AllFilters:
 
 
 def _plan_alike(alike: StackedFilters, u: Array) -> StackedFilters:
-    """Plan filters that differ in numbers alone by one program, by native code where it supports the filter."""
+    """Return filters that differ in numbers alone, planned by one program: native code, or XLA's where it must be."""
     count, arguments = alike.count * alike.nodes, (alike.filters, u, alike.smooths)
     with jax.enable_x64(True):
         choice = choose_code(_plan_filter, arguments, (True, False, False))
@@ -298,6 +309,7 @@ def _plan_alike(alike: StackedFilters, u: Array) -> StackedFilters:
 
 
 def _plan_filter(filter: AbstractFilter, u: Array, smooths: bool) -> AbstractFilter:
+    """Return a filter planned for inputs u, also for smoothing where it `smooths`."""
     return plan_with_past(filter, u) if smooths else filter.planned(u)
 
 
@@ -306,15 +318,14 @@ _planned_by_xla = quickly_compiled(_plan_filter)
 
 @quickly_compiled
 def _all_planned_by_xla(filters: AbstractFilter, u: Array, smooths: bool, count: int) -> PyTree:
+    """Return `count` stacked filters, each planned for inputs u."""
     return map_all(lambda filter: _plan_filter(filter, u, smooths), count)(filters)
 
 
 def has_plan(filters: AllFilters) -> bool:
-    """Test whether some filter has anything to precompute."""
-    return any(
-        type(filter).planned is not AbstractFilter.planned
-        for filter in (*(stacked.filters for stacked in filters.alike), *filters.central.values())
-    )
+    """Return whether some filter has anything to precompute: a `planned` of its own."""
+    every = [*(stacked.filters for stacked in filters.alike), *filters.central.values()]
+    return any(type(filter).planned is not AbstractFilter.planned for filter in every)
 
 
 def _make_reporting(network: Network) -> dict[str, Reporting]:
@@ -323,15 +334,15 @@ def _make_reporting(network: Network) -> dict[str, Reporting]:
     for name, fusion in network.fused.items():
         if isinstance(fusion, Fusion) and fusion.by_report:
             centre = centre_filter(network, name)
-            places, mine = network.places, network.nodes_with(fusion.filter)
-            sources, order = sources_of(network, places, mine, fusion.filter)
-            uplinks = uplinks_of(fusion, mine, len(network.states))
-            results[name] = Reporting(uplinks, centre, order, sources, tuple(mine))
+            nodes = network.nodes_with(fusion.filter)
+            sources, order = sources_of(network, network.places, nodes, fusion.filter)
+            uplinks = uplinks_of(fusion, nodes, len(network.states))
+            results[name] = Reporting(uplinks, centre, order, sources, tuple(nodes))
     return results
 
 
 def centre_filter(network: Network, name: str) -> CentreFilter:
-    """Filter of the fusion centre for the fusion `name` of `network`, by `AllReports`, on the nodes' reports.
+    """Return the filter of the fusion centre for the fusion `name` of `network`, by `AllReports`, on nodes' reports.
 
     The measurement is, joined: of each node in the network's order what arrives of the report of this step, then of
     that of the step before if links may be a step late, and so on; NaN for what did not arrive. A quantizer enters by
@@ -349,23 +360,21 @@ def centre_filter(network: Network, name: str) -> CentreFilter:
     """
     instance("network", network, Network, "a Network")
     text("fusion", name)
-    # A fusion by reports.
     fusion = network.fused.get(name)
     if not isinstance(fusion, Fusion) or not fusion.rule.uses_reports:
-        observation = [n for n, f in network.fused.items() if isinstance(f, Fusion) and f.rule.uses_reports]
-        raise fail("fusion", f"one of {observation}, which receive reports", repr(name))
+        by_reports = [n for n, f in network.fused.items() if isinstance(f, Fusion) and f.rule.uses_reports]
+        raise fail("fusion", f"one of {by_reports}, which receive reports", repr(name))
     # The nodes with that filter alone, for the moments of its errors.
     names = network.nodes_with(fusion.filter)
-    complete = {single: network.nodes[single].complete for single in names}
+    complete = {node: network.nodes[node].complete for node in names}
     claim = claim_of_reports(type(fusion.rule).__name__, network.claims()[FUSED][name], fusion, complete)
     alone = Network(
         network.plant,
-        {single: _keep_one_filter(network.nodes[single], fusion.filter) for single in network.names},
+        {node: _keep_one_filter(network.nodes[node], fusion.filter) for node in network.names},
         {"all": Fusion(fusion.filter, AllReports())},
         network.relays,
         network.common,
     )
-    # The uplinks as the centre models them.
     uplinks = uplinks_of(fusion, names, len(network.states))
     return CentreFilter(
         filters=AllFilters(alone),
@@ -379,12 +388,13 @@ def centre_filter(network: Network, name: str) -> CentreFilter:
 
 
 def _keep_one_filter(node: Node | ReceivingNode, name: str) -> Node | ReceivingNode:
-    """Return a node with one of its filters."""
-    filters = {single: filter for single, filter in node.filters.items() if single == name}
+    """Return a node with one of its filters, or with none if it has none of this name."""
+    filters = {label: filter for label, filter in node.filters.items() if label == name}
     if isinstance(node, Node):
         return Node(node.sensor, node.channel, filters)
     return replace(node, filters=filters)
 
 
 def _unless_sorted(order: np.ndarray) -> np.ndarray | None:
+    """Return an order, None for 0, 1, 2, ...: no gather is compiled then."""
     return None if np.array_equal(order, np.arange(len(order))) else order

@@ -54,21 +54,22 @@ class World(Module):
         plant = condition_on_memories(at(self.plant, k), modes)
         x = plant.plus(plant.transition(x, u), plant.sample_noise(draw_key(key, k, WORLD, PROCESS), u))
         medium, z = self.medium.receive(medium, x, u, key, k)
-        z = tuple(present(values) if whole else values for values, whole in zip(z, self.filters.complete, strict=True))
+        # Where nothing is ever missing, native code is told so.
+        z = tuple(present(values) if full else values for values, full in zip(z, self.filters.complete, strict=True))
         drawn: dict[str, PyTree] = {name: link.uplinks.draw(key, k) for name, link in self.filters.reporting.items()}
-        across = {name: mesh.edges.draw(edges[name], key, k) for name, mesh in self.filters.meshes.items()}
-        edges = {name: state for name, (state, _) in across.items()}
-        drawn |= {name: arrived for name, (_, arrived) in across.items()}
+        drawn_edges = {name: mesh.edges.draw(edges[name], key, k) for name, mesh in self.filters.meshes.items()}
+        edges = {name: state for name, (state, _) in drawn_edges.items()}
+        drawn |= {name: arrived for name, (_, arrived) in drawn_edges.items()}
         states, outputs = self.filters.step(states, z, u, k, drawn)
         modes = move_modes(self.plant, modes, key, k, self._places)
         after = x, self.medium.feed_back(medium, outputs["estimates"]), states, edges, modes
-        seen = {
+        results = {
             "truth": x,
             "measurements": z,
             "transmissions": self.medium.reasons(medium),
             **_turn_to_truth(plant, x, outputs),
         }
-        return after, seen
+        return after, results
 
 
 def _turn_to_truth(plant: AbstractPlant, x: jax.Array, outputs: dict[str, PyTree]) -> dict[str, PyTree]:
@@ -76,8 +77,9 @@ def _turn_to_truth(plant: AbstractPlant, x: jax.Array, outputs: dict[str, PyTree
     if not plant.circular:
         return outputs
 
-    def near(estimate: Estimate) -> Estimate:
+    def turn(estimate: Estimate) -> Estimate:
+        """Turn the angles of one estimate."""
         return replace(estimate, mean=plant.near(jnp.asarray(estimate.mean), x))
 
-    items = {key: outputs[key] for key in ("estimates", "fused")}
-    return {**outputs, **jax.tree.map(near, items, is_leaf=lambda leaf: isinstance(leaf, Estimate))}
+    estimates = {key: outputs[key] for key in ("estimates", "fused")}
+    return {**outputs, **jax.tree.map(turn, estimates, is_leaf=lambda leaf: isinstance(leaf, Estimate))}

@@ -17,10 +17,10 @@ from .fusions import fusions_of as fusions_of
 from .fusions import sources_of as sources_of
 from .linearised import Followed as Followed
 from .linearised import LinearisedCentre as LinearisedCentre
-from .mesh import DENSE as DENSE
 from .mesh import Mesh as Mesh
-from .mesh import build_mesh as build_mesh
-from .mesh import build_meshes as build_meshes
+from .mesh_building import DENSE as DENSE
+from .mesh_building import build_mesh as build_mesh
+from .mesh_building import build_meshes as build_meshes
 from .mesh_check import check_mesh as check_mesh
 from .mesh_check import mesh_claim as mesh_claim
 from .named_filter import find_filter_by_name as find_filter_by_name

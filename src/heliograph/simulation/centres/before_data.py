@@ -96,18 +96,26 @@ class CrossCovariances:
             )
         # Weights of each relay's nodes, and the moments of its error.
         index = {name: i for i, name in enumerate(self.nodes)}
-        parts = []
+        relayed = []
         for names in relays.values():
-            mine = [index[name] for name in names]
-            received = ErrorSources(self.shared[mine], self.independent[mine])
-            parts.append(received.weigh(_choose_weights(received)))
-        shared, independent = (np.stack(leaves) for leaves in zip(*parts, strict=True))
-        bias = np.zeros((len(relays), len(self.mean)))
-        return CrossCovariances(tuple(relays), self.states, self.mean, self.state, bias, shared, independent)
+            rows = [index[name] for name in names]
+            received = ErrorSources(self.shared[rows], self.independent[rows])
+            relayed.append(received.weigh(_choose_weights(received)))
+        shared, independent = (np.stack(leaves) for leaves in zip(*relayed, strict=True))
+        return CrossCovariances(
+            nodes=tuple(relays),
+            states=self.states,
+            mean=self.mean,
+            state=self.state,
+            bias=np.zeros((len(relays), len(self.mean))),
+            shared=shared,
+            independent=independent,
+        )
 
 
 def _choose_weights(errors: ErrorSources) -> Float[np.ndarray, "n node n"]:
-    """Return the best weights, by factors where the errors' independent parts are regular enough."""
+    """Return the weights of least error variance, by factors where the errors' independent parts are regular enough."""
+    # Least eigenvalue of the independent parts, in units of each component's whole deviation.
     scale = np.sqrt(np.einsum("iaa->ia", errors.covariances()))
     scale = np.where(scale > 0, scale, 1.0)
     least = np.linalg.eigvalsh(errors.independent / (scale[:, :, None] * scale[:, None]))[:, 0].min()
@@ -139,8 +147,15 @@ def cross_covariances(
     filters, u = _plan_filters(alone, horizon, inputs)
     with jax.enable_x64(True):
         factors: SourceFactors = to_numpy(_compute_factors(filters, u))
-    parts = factors.mean[0], factors.state, factors.mean[1:], *factors.errors
-    return CrossCovariances(tuple(network.nodes_with(filter)), network.states, *map(np.asarray, parts))
+    return CrossCovariances(
+        nodes=tuple(network.nodes_with(filter)),
+        states=network.states,
+        mean=np.asarray(factors.mean[0]),  # row 0 is the plant's, the others the nodes' errors'
+        state=np.asarray(factors.state),
+        bias=np.asarray(factors.mean[1:]),
+        shared=np.asarray(factors.errors.shared),
+        independent=np.asarray(factors.errors.independent),
+    )
 
 
 def fused_covariances(
@@ -166,7 +181,7 @@ def fused_covariances(
 
 
 def _plan_filters(network: Network, horizon: int, inputs: ArrayLike | None) -> tuple[AllFilters, np.ndarray]:
-    """Plan the filters for the inputs."""
+    """Return the filters, planned for the inputs, and the inputs (horizon, inputs); raise unless all need no data."""
     network.check_horizon(check_horizon(horizon))
     u = inputs_of(network, inputs, horizon)
     filters = AllFilters(network)
@@ -184,10 +199,12 @@ def _compute_factors(filters: AllFilters, u: np.ndarray) -> SourceFactors:
 
     separate, _, _, known, *_ = filters.init()
     nodes, n = known[0].errors.bias.shape
-    sources = n + (nodes * centre.size if isinstance(centre.observation_model, Together) else 0)  # sources of a step
+    # New sources of each step: the plant's noise, and noises of measurements where nodes share them.
+    sources = n + (nodes * centre.size if isinstance(centre.observation_model, Together) else 0)
     start = separate, initial_factors(known[0].errors, sources * len(u))
 
     def matrices(states: PyTree, u_k: jax.Array, k: jax.Array) -> LinearStep:
+        """Return the matrices of all nodes' filters in step k."""
         return centre.gathered(filters.matrices(centre, states, u_k, k))
 
     return centre.factors(start, matrices, filters.followed, u)
@@ -203,7 +220,7 @@ def _compute_fused(filters: AllFilters, u: np.ndarray) -> PyTree:
         published: dict[str, jax.Array] = {}
         following = []
         for centre, state in zip(filters.informed, known, strict=True):
-            means = [jnp.zeros((filters.alike[i].nodes, filters.n)) for i, _ in centre.sources]
+            means = [jnp.zeros((filters.alike[kind].nodes, filters.n)) for kind, _ in centre.sources]
             after, estimates = centre.step(state, filters.matrices(centre, states, u_k, k), means, u_k, k)
             following.append(after)
             published |= {name: jnp.asarray(estimate.covariance) for name, estimate in estimates.items()}

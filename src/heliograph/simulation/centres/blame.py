@@ -34,7 +34,7 @@ def refuse_centrally(
     Returns:
         the rows of each node that is to blame, with the reason.
     """
-    # Each row once for each of these nodes that has a value in it, without that value.
+    # Each row once for each of these nodes that has a value in it, without the node's values.
     removals = [(k, name) for k in why for name in nodes if not np.isnan(z[name][k]).all()]
     rows = np.array([k for k, _ in removals], dtype=int)
     without = [z[name][rows] for name in z]
@@ -43,12 +43,16 @@ def refuse_centrally(
     # Whether the filters find the row plausible then.
     votes = _judge_rows(filters, before, np.concatenate(without, axis=1), u, rows)
     plausible = {removal: Judgement.why_values(vote) is None for removal, vote in zip(removals, votes, strict=True)}
+
+    def find_largest(removal: tuple[int, str]) -> float:
+        """Return the largest size of the values removed."""
+        k, name = removal
+        return float(np.nanmax(np.abs(z[name][k])))
+
     refused = dict[str, dict[int, str]]()
     for k, reason in why.items():
         if candidates := [removal for removal in removals if removal[0] == k]:
-            _, name = Judgement.find_culprit(
-                candidates, lambda removal: float(np.nanmax(np.abs(z[removal[1]][removal[0]]))), plausible.__getitem__
-            )
+            _, name = Judgement.find_culprit(candidates, find_largest, plausible.__getitem__)
             refused.setdefault(name, {})[k] = reason
     return refused
 
@@ -56,7 +60,10 @@ def refuse_centrally(
 def _judge_rows(
     filters: Mapping[str, AbstractFilter], before: Mapping[str, PyTree], z: np.ndarray, u: np.ndarray, rows: np.ndarray
 ) -> Float[np.ndarray, "row filter 4"]:
-    """Let each filter judge measurements of these rows, from its states before them."""
+    """Return each filter's judgement of measurements of these rows, from its states before them.
+
+    The last axis: the fields of a Judgement. By native code where there is any, else by XLA.
+    """
     votes = []
     for name, filter in filters.items():
         states = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], before[name])
@@ -69,6 +76,7 @@ def _judge_rows(
 
 
 def _judge_filter_step(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: jax.Array) -> Judgement:
+    """Return a filter's judgement of measurement z in step k, from its state before."""
     judgement = filter_step(filter, state, z, u, k, False, True)[1].judgement
     assert judgement is not None  # as it judges
     return judgement
@@ -76,4 +84,5 @@ def _judge_filter_step(filter: AbstractFilter, state: PyTree, z: jax.Array, u: j
 
 @quickly_compiled
 def _all_by_xla(filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree, count: int) -> PyTree:
+    """Return the judgements of `count` rows, compiled by XLA."""
     return map_all(lambda *row: _judge_filter_step(filter, *row), count)(state, z, u, k)

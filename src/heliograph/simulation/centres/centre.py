@@ -54,26 +54,30 @@ class ObservationModel(Module):
     channel: SecondOrder | OverTime
 
     def observe(self, mean: jax.Array, covariance: jax.Array, k: jax.Array, size: int) -> Observation:
-        """Moments of the nodes' measurements at step k for a plant with these moments, zero rows up to `size`."""
+        """Return the nodes' measurement models at step k for a plant with these moments, zero rows up to `size`."""
 
-        def single(sensor: AnySensor, channel: SecondOrder | OverTime) -> Observation:
+        def observe_one(sensor: AnySensor, channel: SecondOrder | OverTime) -> Observation:
+            """Return the measurement model of one node."""
             return _linearise_observation(at(sensor, k), at(channel, k), mean, covariance)
 
-        gain, offset, noise = eqx.filter_vmap(single, in_axes=(eqx.if_array(0), eqx.if_array(0)))(
+        gain, offset, noise = eqx.filter_vmap(observe_one, in_axes=(eqx.if_array(0), eqx.if_array(0)))(
             self.sensor, self.channel
         )
-        more = (0, size - offset.shape[-1])
+        padding = (0, size - offset.shape[-1])
         return Observation(
-            jnp.pad(gain, ((0, 0), more, (0, 0))),
-            jnp.pad(offset, ((0, 0), more)),
-            jnp.pad(noise, ((0, 0), more, more)),
+            jnp.pad(gain, ((0, 0), padding, (0, 0))),
+            jnp.pad(offset, ((0, 0), padding)),
+            jnp.pad(noise, ((0, 0), padding, padding)),
         )
 
 
 def _linearise_observation(
     sensor: LinearSensor, channel: SecondOrder, mean: jax.Array, covariance: jax.Array
 ) -> Observation:
-    """M = E[G] C, o = E[G] E v + E n, and Cov(z - M x): the noise through the mean gain, and the spread of the gain."""
+    """Return M, o and Cov(z - M x) of z = G (C x + v) + n, G a random gain, for a plant with these moments.
+
+    M = E[G] C and o = E[G] E v + E n; the covariance is that of noise through the mean gain, and of the gain's spread.
+    """
     c, noise = jnp.asarray(sensor.matrix), jnp.asarray(sensor.noise.covariance)
     signal = c @ mean + sensor.noise.mean
     second = augmented_second_moment(c @ covariance @ c.T + noise + jnp.outer(signal, signal), signal, 1.0)
@@ -94,23 +98,32 @@ class Apart(Module):
     counts: tuple[int, ...] = eqx.field(static=True, default=())
 
     def observe(self, mean: jax.Array, covariance: jax.Array, k: jax.Array) -> Observation:
-        """Return the moments of the measurements, group after group."""
+        """Return the nodes' measurement models at step k, in the order of the nodes, for a plant with these moments."""
         m, n = self.size, len(mean)
-        parts = [Observation(*(jnp.zeros((self.counts[i], *s)) for s in ((m, n), (m,), (m, m)))) if group is None
-                 else group.observe(mean, covariance, k, m) for i, group in enumerate(self.groups)]  # fmt: skip
+        parts = []
+        for i, group in enumerate(self.groups):
+            if group is None:
+                shapes = (m, n), (m,), (m, m)
+                parts.append(Observation(*(jnp.zeros((self.counts[i], *shape)) for shape in shapes)))
+            else:
+                parts.append(group.observe(mean, covariance, k, m))
         return Observation(*(jnp.concatenate(leaves)[self.order] for leaves in zip(*parts, strict=True)))
 
 
 class Together(Module):
-    """Common sensor and channel, of whose outputs each node receives some `rows`; -1 stands for none."""
+    """Measurement models of nodes that share a sensor and a channel.
+
+    `rows` (node, size): which outputs of the channel each node receives, -1 beyond its own.
+    """
 
     sensor: AnySensor
     channel: SecondOrder | OverTime
     rows: np.ndarray
 
     def observe(self, mean: jax.Array, covariance: jax.Array, k: jax.Array) -> Observation:
-        """Return the moments of the rows of each node, and the cross-covariance of their noises."""
+        """Return gain (node, size, n) and offset of each node, and the noise's covariance (node, size, node, size)."""
         gain, offset, noise = _linearise_observation(at(self.sensor, k), at(self.channel, k), mean, covariance)
+        # A last row of zeros, which index -1 takes.
         gain, offset = jnp.pad(gain, ((0, 1), (0, 0))), jnp.pad(offset, (0, 1))
         noise = jnp.pad(noise, (0, 1))
         return Observation(gain[self.rows], offset[self.rows], noise[self.rows[:, :, None, None], self.rows])
@@ -126,8 +139,8 @@ class CentreState(NamedTuple):
 class Centre(Module):
     """All informed fusions of one filter's estimates, at the nodes that have it.
 
-    `sources`: kind and place of that filter, one group after another; `order` brings what is gathered from them into
-    the order of the nodes. `size`: the longest measurement.
+    `sources`: (kind, number within the kind) of the stacked filters, one group of nodes after another; `order` brings
+    what is gathered from them into the order of the nodes. `size`: length of the longest measurement.
     """
 
     plant: AnyPlant
@@ -154,7 +167,7 @@ class Centre(Module):
     def error_step(
         self, mean: jax.Array, covariance: jax.Array, filters: LinearStep, u: jax.Array, k: jax.Array
     ) -> ErrorStep:
-        """Step k of the errors, for a plant with these moments before it."""
+        """Return the linear maps of the errors in step k, for a plant with these moments before it."""
         plant: LinearPlant = at(self.plant, k)
         motion = Motion(plant.transition_matrix(u), plant.shift(u), plant.noise_covariance(u))
         observation = self.observation_model.observe(*propagate_state(mean, covariance, motion), k)
@@ -172,20 +185,20 @@ class Centre(Module):
         `matrices(states, u, k)` and `follow(states, u, k)` are those of the filters' step k, and their next states.
         """
 
-        def body(
+        def propagate(
             carry: tuple[PyTree, SourceFactors], row: tuple[jax.Array, jax.Array]
         ) -> tuple[tuple[PyTree, SourceFactors], None]:
+            """Step the filters' states, and the factors by the filters' matrices."""
             (states, factors), (k, u_k) = carry, row
             spread = jnp.asarray(factors.state @ factors.state.T)
             step = self.error_step(factors.mean[0], spread, matrices(states, u_k, k), u_k, k)
             return (follow(states, u_k, k), propagate_factors(factors, step, k)), None
 
-        factors: SourceFactors = jax.lax.scan(body, start, (jnp.arange(len(u)), jnp.asarray(u)))[0][1]
+        factors: SourceFactors = jax.lax.scan(propagate, start, (jnp.arange(len(u)), jnp.asarray(u)))[0][1]
         return factors
 
     def gathered(self, parts: Sequence[LinearStep]) -> LinearStep:
-        """Matrices of the sources' filters in the order of the nodes, padded with zeros to the longest measurement."""
-
+        """Return the filters' matrices in the order of the nodes, padded with zeros to the longest measurement."""
         return gather_steps(parts, self.order, self.size)
 
     def step(
@@ -201,24 +214,27 @@ class Centre(Module):
         return CentreState(happened.errors, after), results
 
 
+# Axes of a filter's matrices that are as long as its measurement, counted from the last.
 MEASURED = {"gain": (-1,), "output": (-2,), "offset": (-1,), "innovation": (-2, -1), "noise": (-2, -1)}
 Matrices = TypeVar("Matrices", LinearStep, Linearised)
 
 
 def gather_steps(parts: Sequence[Matrices], order: np.ndarray, size: int) -> Matrices:
-    """Matrices of several groups of filters in this order, with zeros up to a measurement of `size` components."""
+    """Return the matrices of several groups of filters in this order, padded with zeros to `size` measurements."""
 
-    def padded(name: str, leaf: jax.Array) -> jax.Array:
-        more = [(0, size - length) if axis - leaf.ndim in MEASURED.get(name, ()) else (0, 0)
-                for axis, length in enumerate(leaf.shape)]  # fmt: skip
-        return jnp.pad(leaf, more)
+    def pad(name: str, leaf: jax.Array) -> jax.Array:
+        """Pad the measurement axes of the matrix `name`."""
+        padding = [(0, size - length) if axis - leaf.ndim in MEASURED.get(name, ()) else (0, 0)
+                   for axis, length in enumerate(leaf.shape)]  # fmt: skip
+        return jnp.pad(leaf, padding)
 
-    kind = type(parts[0])
-    return kind(*(jnp.concatenate([padded(f, getattr(p, f)) for p in parts])[order] for f in kind._fields))
+    matrices = type(parts[0])
+    joined = {f: jnp.concatenate([pad(f, getattr(part, f)) for part in parts]) for f in matrices._fields}
+    return matrices(**{f: leaf[order] for f, leaf in joined.items()})
 
 
 def stack_nodes(sensors: Sequence[AnySensor], channels: Sequence[Channel]) -> ObservationModel:
-    """Stack nodes of one structure."""
+    """Return the measurement models of nodes of one structure, stacked along a first axis of nodes."""
     return ObservationModel(
         stack([without_output_names(sensor) for sensor in sensors]),
         stack([describe_channel(channel) for channel in channels]),
@@ -231,7 +247,7 @@ def describe_channel(channel: Channel) -> SecondOrder | OverTime:
     return moments
 
 
-Parts = Mapping[str, tuple[AnySensor, Channel, AbstractFilter]]  # of each node
+Parts = Mapping[str, tuple[AnySensor, Channel, AbstractFilter]]  # sensor, channel and filter of each node
 
 
 def claim_of_informed(rule: str, plant: AnyPlant, nodes: Parts, shared: bool) -> Claim:
@@ -283,7 +299,9 @@ def _check_linear(rule: str, plant: AnyPlant, nodes: Parts) -> None:
 
 
 def claim_of_reports(rule: str, claim: Claim, fusion: Fusion, complete: Mapping[str, bool]) -> Claim:
-    """Lower a claim where the nodes' reports travel over uplinks; `complete`: nodes that lose nothing.
+    """Return the claim of fusion by reports: that of the fusion, lowered by quantizers and uplinks of uncertain laws.
+
+    `complete`: for each node whether it loses no measurement.
 
     Raises:
         ValueError: nodes that lose measurements, which the centre cannot know from a missing report.
@@ -335,9 +353,10 @@ class CentreBelief(NamedTuple):
 class CentreFilter(AbstractSizedFilter):
     """Filter form of `AllReports`, whose measurement is the reports: for streams, recordings and simulated runs.
 
-    The measurement is, for each age in steps and each node in turn, the part of the report that arrived: NaN for a
-    report that did not. `rows`: their places among (age, node, m). Local filters are propagated without data: their
-    gains depend on none.
+    The measurement is, for each age in steps and each node in turn, the report that arrived, NaN where none did.
+
+    `rows`: which of all (age, node, component), flattened, can arrive. `ages`: possible ages, 0 included. `widest`:
+    components of the longest report. Local filters are propagated without data: their gains depend on none.
     """
 
     filters: NodesFilters
@@ -367,8 +386,8 @@ class CentreFilter(AbstractSizedFilter):
     def correct(self, state: CentreBelief, z: ArrayLike, k: Step = 0) -> tuple[CentreBelief, Innovation]:
         """Correct with the reports that arrived."""
         nodes, rows = state.known.past.gain.shape[1], np.array(self.rows)
-        everything = jnp.full(self.ages * nodes * self.widest, jnp.nan).at[rows].set(jnp.asarray(z))
-        known, expected = correct_with_reports(state.known, everything.reshape(self.ages, nodes, self.widest))
+        reports = jnp.full(self.ages * nodes * self.widest, jnp.nan).at[rows].set(jnp.asarray(z))
+        known, expected = correct_with_reports(state.known, reports.reshape(self.ages, nodes, self.widest))
         mean, covariance = expected.mean[rows], expected.covariance[rows][:, rows]
         return state._replace(known=known), gaussian_innovation(jnp.asarray(z), mean, covariance)
 

@@ -33,10 +33,11 @@ Recorded = Mapping[str, SentReports | ArrayLike]
 
 
 class Edges(Module):
-    """All edges of a fusion between neighbours; none of them loses anything where there are no groups.
+    """All edges of a fusion between neighbours, by what arrives over them; without groups nothing is ever lost.
 
-    `slots` (edge,) are the places of their flags among those of all (node, degree). Where messages may be `past` steps
-    late, a flag is the age of the message that arrives, -1 where none does.
+    `present` (node, degree): whether the node has a neighbour there, itself at 0. `slots` (edge,): where an edge lies
+    in the flattened (node, degree). `rounds`: exchanges within a step. Where messages may be up to `past` steps late,
+    a flag is the age of the message that arrives, -1 where none does.
     """
 
     groups: tuple[ChannelGroup, ...]
@@ -48,10 +49,11 @@ class Edges(Module):
     def init(self, key: jax.Array) -> tuple[PyTree, ...]:
         """Return the states of the channels before the first step."""
 
-        def single(group: ChannelGroup) -> PyTree:
+        def start_group(group: ChannelGroup) -> PyTree:
+            """Return the initial state of one channel of a stack."""
             return start(group.channel, key, group.checksums, group.memories)
 
-        return tuple(eqx.filter_vmap(single, in_axes=(eqx.if_array(0),))(group) for group in self.groups)
+        return tuple(eqx.filter_vmap(start_group, in_axes=(eqx.if_array(0),))(group) for group in self.groups)
 
     def draw(self, states: tuple[PyTree, ...], key: jax.Array, k: jax.Array) -> tuple[tuple[PyTree, ...], jax.Array]:
         """Draw what arrives at step k in each round: next states, and flags or ages (node, rounds, degree)."""
@@ -61,20 +63,23 @@ class Edges(Module):
             flags, following = jnp.asarray(self.lossless()[:, 0]), []
             for group, state in zip(self.groups, states, strict=True):
 
-                def single(edge: ChannelGroup, state: PyTree, count: jax.Array) -> tuple[PyTree, jax.Array]:
+                def deliver_once(edge: ChannelGroup, state: PyTree, count: jax.Array) -> tuple[PyTree, jax.Array]:
+                    """Send a message over one edge: the channel's next state, and the flag or age of what arrives."""
                     channel = at(edge.channel, k)
                     state, z = deliver(channel, state, jnp.zeros(signal_size(channel)), key, count, edge.checksums,
                                        edge.memories)  # fmt: skip
                     arrives, late = ~jnp.any(jnp.isnan(z)), late_part(channel)
                     if not self.past:
                         return state, arrives
+                    age: jax.Array | int = 0
+                    if late is not None:
+                        age = z[-1].astype(int) if late.timestamped else late.times[0]
                     # Nothing was sent before the first step.
-                    age = 0 if late is None else z[-1].astype(int) if late.timestamped else late.times[0]
                     return state, jnp.where(arrives & (age <= count), age, -1)
 
                 # All channels of one kind at once; their flags go to the places of the edges.
-                both = eqx.filter_vmap(single, in_axes=(eqx.if_array(0), 0, None))
-                state, arrives = both(group, state, k * self.rounds + number)
+                deliver_all = eqx.filter_vmap(deliver_once, in_axes=(eqx.if_array(0), 0, None))
+                state, arrives = deliver_all(group, state, k * self.rounds + number)
                 following.append(state)
                 flags = flags.ravel().at[self.slots[group.places]].set(arrives).reshape(flags.shape)
             states = tuple(following)
@@ -94,9 +99,9 @@ class Edges(Module):
     def recorded(
         self, name: str, nodes: Sequence[str], reports: Recorded | None, steps: int
     ) -> Bool[np.ndarray, "time node rounds degree"]:
-        """Flags of each step from a recording, (steps, rounds times neighbours) for each node that has neighbours.
+        """Return the flags of each step, or ages where messages may be late, from a recording.
 
-        Of late messages their ages in steps.
+        `reports`: for each node that has neighbours (steps, rounds times neighbours), NaN where nothing arrived.
 
         Raises:
             ValueError: nodes without flags or the reverse, shapes that do not fit.
@@ -170,7 +175,7 @@ def late_part(channel: AbstractRandomAffine) -> Delayed | None:
 
 
 def _open_link(channel: AbstractRandomAffine, kinds: type | UnionType = Erasure) -> tuple[Scalar, AbstractRandomAffine]:
-    """Return the link for messages that are not lost, inside all maps of these kinds, and how probable they are."""
+    """Return the probability that a message passes all outer maps of these kinds, and the map inside them."""
     arrival: Scalar = 1.0
     while isinstance(channel, kinds):
         arrival = arrival * plain(channel.arrival) if isinstance(channel, Erasure) else arrival
@@ -179,7 +184,7 @@ def _open_link(channel: AbstractRandomAffine, kinds: type | UnionType = Erasure)
 
 
 def arrival_chance(channel: Channel | None) -> float | None:
-    """Return probability that a message arrives; None where it is not the same at every step whatever was before."""
+    """Return the probability that a message arrives; None where it differs between steps or depends on earlier ones."""
     if channel is None or isinstance(channel, OverTime):
         return 1.0 if channel is None else None
     chance, inside = _open_link(channel)
@@ -187,9 +192,10 @@ def arrival_chance(channel: Channel | None) -> float | None:
 
 
 def loss_rate(channel: Channel | None) -> float | None:
-    """Factor by which one more loss in a row is less probable, in the long run; None where steps or edges are linked.
+    """Return the factor by which each further loss in a row is less probable, in the long run.
 
-    Of modes with losses l and transitions P the spectral radius of diag(l) P; without modes the probability of a loss.
+    Of modes with loss probabilities l and transitions P it is the spectral radius of diag(l) P; without modes the
+    probability of a loss. None where the channel varies, or shares its modes with other edges.
     """
     if channel is None or isinstance(channel, OverTime):
         return 0.0 if channel is None else None

@@ -63,13 +63,15 @@ class FusedInnovation(Module):
         # x = N(xf-, Pf-), d = 0; then for each node i: x, e_i, S_i by its correction, d += e_i' S_i^-1 e_i.
         carry: tuple[Gaussian, jax.Array, jax.Array] | None = None
         for kind, f in self.sources:
-            # Numbers of each node's filter, its state and what it receives.
-            stacked, why = alike[kind], skip[kind]
-            mine = slice(f * stacked.nodes, (f + 1) * stacked.nodes)
+            # Arrays of each node's filter, its state and what it receives; a stack has the nodes of filter 0 first.
+            stacked, reasons = alike[kind], skip[kind]
+            rows = slice(f * stacked.nodes, (f + 1) * stacked.nodes)
             filters, beliefs = jax.tree.map(
-                lambda a, mine=mine: a[mine] if eqx.is_array(a) else a, (stacked.filters, states[kind])
+                lambda a, rows=rows: a[rows] if eqx.is_array(a) else a, (stacked.filters, states[kind])
             )
-            received = z[stacked.group] if why is None else jnp.where(why[f][:, None] > 0, jnp.nan, z[stacked.group])
+            received = z[stacked.group]
+            if reasons is not None:
+                received = jnp.where(reasons[f][:, None] > 0, jnp.nan, received)
             numbers, static = eqx.partition(filters, eqx.is_array)
             # Prediction from the fused estimate, by the first node's model of the plant.
             if carry is None:
@@ -87,24 +89,24 @@ class FusedInnovation(Module):
 
             # What else a filter's state holds, predicted; then correction by node after node.
             predict = eqx.filter_vmap(lambda node, state: node.predict(state, u, k), in_axes=(eqx.if_array(0), 0))
-            rows = numbers, predict(filters, beliefs), received
-            carry, _ = jax.lax.scan(correct, carry, rows, unroll=min(stacked.nodes, UNROLLED))
+            by_node = numbers, predict(filters, beliefs), received
+            carry, _ = jax.lax.scan(correct, carry, by_node, unroll=min(stacked.nodes, UNROLLED))
         assert carry is not None  # there is at least one node
         _, distance, arrived = carry
         return FusedDistance(jnp.where(arrived > 0, distance, jnp.nan), arrived)
 
 
 def following_prior(estimate: Estimate) -> Gaussian:
-    """Return the fused estimate as what the next step is predicted from."""
+    """Return the Gaussian of a fused estimate, from which the next step is predicted."""
     return from_covariance(jnp.asarray(estimate.mean), jnp.asarray(estimate.covariance))
 
 
 def make_fused_innovations(network: Network, alike: Sequence[StackedFilters]) -> dict[str, FusedInnovation]:
     """Return the tests of the network's fusions of estimates, by name, where there is one.
 
-    There is none where a filter's state is more than a mean and a covariance of the plant's states, such as a mixture,
-    or past signals behind a link that is late by chance, or a fusion claims no covariance, or where nodes share a
-    channel, fading or relays: their measurements' noises then depend on each other.
+    There is none where a filter's state is more than a mean and a covariance of the plant's states (a mixture, or past
+    signals behind a link of random delay), or where a fusion claims no covariance. Nor where nodes share a channel,
+    fading or relays: their measurements' noises then depend on each other.
     """
     tests: dict[str, FusedInnovation] = {}
     if network.common is not None or network.relays is not None or network.shared:
@@ -119,6 +121,6 @@ def make_fused_innovations(network: Network, alike: Sequence[StackedFilters]) ->
                 start = in_float64(from_covariance)(
                     np.asarray(plant.initial_mean), np.asarray(plant.initial_covariance)
                 )
-                # On no device: no program.
+                # NumPy arrays, so that the test is a constant and takes no device.
                 tests[name] = FusedInnovation(jax.tree.map(np.asarray, start), sources)
     return tests

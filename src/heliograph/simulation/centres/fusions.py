@@ -34,8 +34,8 @@ from heliograph.simulation.runs.side_by_side import initial_state, map_all
 class StackedFusions(Module):
     """Fusions that differ in numbers alone, stacked: rules, and the quantizers on the estimates' way (fusion, node).
 
-    `sources` of each fusion: kind and filter of the estimates that it fuses, one group after another; `order` of each
-    (fusion, node) brings them into the order of the nodes.
+    `sources` of each fusion: (kind, number within the kind) of the filters whose estimates it fuses, one group of nodes
+    after another; `order` (fusion, node) brings what is gathered from them into the order of the fusion's nodes.
     """
 
     rules: AbstractFusion
@@ -56,7 +56,10 @@ class StackedFusions(Module):
     def step(
         self, states: PyTree, estimates: Sequence[Estimate], k: jax.Array
     ) -> tuple[PyTree, dict[str, Estimate], dict[str, PyTree]]:
-        """Fuse the filters' estimates, (filter, node, ...) of each kind: estimates and uplinks by fusion."""
+        """Fuse the filters' estimates at step k, arrays (filter, node, ...) by kind.
+
+        Returns: the quantizers' next states, the fused estimates by fusion, and what the quantizers did by fusion.
+        """
         # Means and covariances in the order of each fusion's nodes.
         means = self._gather([e.mean for e in estimates])
         covariances = self._gather([e.covariance for e in estimates])
@@ -78,11 +81,12 @@ class StackedFusions(Module):
         return states, {name: Estimate(mean[i], covariance[i], claim) for i, (name, claim) in items}, uplinks
 
     def _gather(self, parts: Sequence[jax.Array | np.ndarray]) -> jax.Array:
-        """Return the sources' values by kind (filter, node, ...) as (fusion, node, ...), in each fusion's order."""
-        joined = [jnp.concatenate([parts[k][f] for k, f in source]) for source in self.sources]
+        """Return values of the filters, (filter, node, ...) by kind, as (fusion, node, ...) in each fusion's order."""
+        joined = [jnp.concatenate([parts[kind][f] for kind, f in source]) for source in self.sources]
+        # In order already: no gather is compiled.
         if all(np.array_equal(order, np.arange(len(order))) for order in self.order):
             return jnp.stack(joined)
-        return jnp.stack([estimates[order] for estimates, order in zip(joined, self.order, strict=True)])
+        return jnp.stack([values[order] for values, order in zip(joined, self.order, strict=True)])
 
 
 class Reporting(Module):
@@ -104,9 +108,12 @@ class Reporting(Module):
     def step(
         self, state: tuple[InFlight, PyTree], estimates: Sequence[Estimate], drawn: Drawn, u: jax.Array, k: jax.Array
     ) -> tuple[tuple[InFlight, PyTree], Estimate, dict[str, jax.Array], tuple[jax.Array, Array]]:
-        """Send the nodes' means, and use what arrives: state, estimate, traffic, and each report with its delay."""
+        """Send the nodes' means as reports, and correct the centre's filter with those that arrive at step k.
+
+        Returns: the next state, the centre's estimate, what the quantizers did, and the reports sent with their delays.
+        """
         flying, known = state
-        means = jnp.concatenate([estimates[i].mean[f] for i, f in self.sources])[self.order]
+        means = jnp.concatenate([estimates[kind].mean[f] for kind, f in self.sources])[self.order]
         flying, sent, traffic = self.uplinks.send(flying, means, drawn, k)
         flying, reports = self.uplinks.arrive(flying, sent, drawn.delay)
         known, estimate = self.centre.step(known, jnp.ravel(reports)[np.array(self.centre.rows)], u, k)
@@ -129,18 +136,22 @@ def _stack_fusions(
 ) -> StackedFusions:
     """Stack fusions of one structure, with the places of the estimates that they fuse."""
     fusions = [fusion for fusion in (network.fused[name] for name in names) if isinstance(fusion, Fusion)]
-    nodes = [network.nodes_with(fusion.filter) for fusion in fusions]
-    sources, order = [], []
-    # Kinds and filters of the sources, and the order of the nodes in them.
-    for fusion, mine in zip(fusions, nodes, strict=True):
-        source, which = sources_of(network, places, mine, fusion.filter)
+    sources, orders, quantizers = [], [], []
+    for fusion in fusions:
+        nodes = network.nodes_with(fusion.filter)
+        source, order = sources_of(network, places, nodes, fusion.filter)
         sources.append(source)
-        order.append(which)
-    # Numbers of all fusions along a leading axis.
-    quantizers = stack([fusion.uplinks(mine) for fusion, mine in zip(fusions, nodes, strict=True)])
-    rules = stack([fusion.rule for fusion in fusions])
-    angles = first(network.plant).angles
-    return StackedFusions(rules, quantizers, np.array(order), tuple(names), tuple(sources), tuple(claims), angles)
+        orders.append(order)
+        quantizers.append(fusion.uplinks(nodes))
+    return StackedFusions(
+        rules=stack([fusion.rule for fusion in fusions]),
+        quantizers=stack(quantizers),
+        order=np.array(orders),
+        names=tuple(names),
+        sources=tuple(sources),
+        claims=tuple(claims),
+        angles=first(network.plant).angles,
+    )
 
 
 def centres_of(network: Network) -> tuple[Centre | LinearisedCentre, ...]:
@@ -149,24 +160,24 @@ def centres_of(network: Network) -> tuple[Centre | LinearisedCentre, ...]:
     for name, fusion in network.fused.items():
         if isinstance(fusion, Fusion) and isinstance(fusion.rule, AbstractInformedFusion) and not fusion.by_report:
             rules.setdefault(fusion.filter, {})[name] = fusion.rule
-    return tuple(_build_centre(network, name, mine) for name, mine in rules.items())
+    return tuple(_build_centre(network, name, rules_of_filter) for name, rules_of_filter in rules.items())
 
 
 def _build_centre(network: Network, name: str, rules: dict[str, AbstractInformedFusion]) -> Centre | LinearisedCentre:
     """Build the centre for the nodes that have the filter `name`."""
     places, claims = network.places, network.claims()[FUSED]
-    mine = network.nodes_with(name)
+    nodes = network.nodes_with(name)
     # Places of the nodes' filters, and the longest measurement.
-    sources, order = sources_of(network, places, mine, name)
+    sources, order = sources_of(network, places, nodes, name)
     groups = [network.groups[network.kinds[kind].group] for kind, _ in sources]
-    size = max(network.nodes[node].received for node in mine)
+    size = max(network.nodes[node].received for node in nodes)
     claim = claims[next(iter(rules))]
     # Gains that depend on data: moments along the estimates.
     if along_estimates(network.parts_of(name)):
         return LinearisedCentre(network.plant, rules, order, sources, size, claim)
     return Centre(
         plant=network.plant,
-        observation_model=_observe(network, mine, groups, order, size),
+        observation_model=_model_measurements(network, nodes, groups, order, size),
         rules=rules,
         order=order,
         sources=sources,
@@ -178,21 +189,26 @@ def _build_centre(network: Network, name: str, rules: dict[str, AbstractInformed
 def sources_of(
     network: Network, places: Mapping[tuple[str, str], tuple[int, int, int]], nodes: Sequence[str], name: str
 ) -> tuple[tuple[tuple[int, int], ...], np.ndarray]:
-    """Kinds and filters that hold the nodes' estimates, and the permutation of these into the order of the nodes."""
+    """Return (kind, number within the kind) of the filters of this name at the nodes, and the nodes' order in them.
+
+    The estimates of the sources one after another, indexed by the order, are those of `nodes`.
+    """
     sources = tuple({places[node, name][:2]: None for node in nodes})
     groups = [network.groups[network.kinds[kind].group] for kind, _ in sources]
-    results = {node: i for i, node in enumerate(node for names in groups for node in names)}
-    return sources, np.array([results[node] for node in nodes])
+    positions = {node: i for i, node in enumerate(node for names in groups for node in names)}
+    return sources, np.array([positions[node] for node in nodes])
 
 
-def _observe(
-    network: Network, mine: Sequence[str], groups: Sequence[Sequence[str]], order: np.ndarray, size: int
+def _model_measurements(
+    network: Network, nodes: Sequence[str], groups: Sequence[Sequence[str]], order: np.ndarray, size: int
 ) -> Apart | Together:
-    """Return the measurement model of these nodes for a centre."""
+    """Return the measurement models of these nodes for a centre."""
     if network.common is not None:
         rows = network.rows
-        padded = [np.pad(rows[name], (0, size - len(rows[name])), constant_values=-1) for name in mine]
+        padded = [np.pad(rows[name], (0, size - len(rows[name])), constant_values=-1) for name in nodes]
         return Together(network.common.sensor, describe_channel(network.common.channel), np.array(padded))
-    parts = [[node for node in map(network.nodes.__getitem__, names) if isinstance(node, Node)] for names in groups]
-    items = tuple(stack_nodes([n.sensor for n in nodes], [n.channel for n in nodes]) for nodes in parts)
-    return Apart(items, order, size)
+    stacked = []
+    for names in groups:
+        members = [node for node in map(network.nodes.__getitem__, names) if isinstance(node, Node)]
+        stacked.append(stack_nodes([node.sensor for node in members], [node.channel for node in members]))
+    return Apart(tuple(stacked), order, size)

@@ -42,6 +42,8 @@ class LinearisedCentre(Module):
     step, S_ij = 0, and S_ii is the innovation covariance less C_i P_i C_i'. A is common, the plant's derivative at the
     fusion's last estimate: with each filter's A, nodes that share an error would seem to differ by their linearisations
     alone, and weights of such differences claim information that is not there.
+
+    Fields as of `Centre`: `sources` are the stacked filters, `order` the nodes' order in what is gathered from them.
     """
 
     plant: AnyPlant
@@ -84,7 +86,7 @@ class LinearisedCentre(Module):
             step = _make_shared_step(motion, keep, linear)
             errors = _keep_plant_moments(before.errors, propagate_errors_jointly(before.errors, step))
             if isinstance(rule, AllReports):
-                drift = _drift(before.rule, matrix, moved, keep, linear)
+                drift = _compute_drift(before.rule, matrix, moved, keep, linear)
                 step = step._replace(shift=jnp.concatenate([motion.shift, drift.reshape(-1)]))
             known, (mean, covariance) = rule.fuse_step(before.rule, CentreStep(step, errors), reports)
             following[name], results[name] = Followed(errors, mean, known), Estimate(mean, covariance, self.claim)
@@ -92,7 +94,10 @@ class LinearisedCentre(Module):
 
 
 def _make_shared_step(motion: Motion, keep: jax.Array, linear: Linearised) -> ErrorStep:
-    """Return e+ = F_i (A e + w) - K_i nu: errors of mean zero keep it."""
+    """Return the step e_i+ = F_i (A e_i + w) - K_i nu_i of all nodes' errors; `keep`: F_i = I - K_i C_i (node, n, n).
+
+    The state x itself stands first. Errors do not depend on x, and those of mean zero keep it.
+    """
     nodes, n, _ = keep.shape
     return ErrorStep(
         transition=ErrorMap(motion.matrix, jnp.zeros_like(keep), keep @ motion.matrix),
@@ -105,15 +110,23 @@ def _make_shared_step(motion: Motion, keep: jax.Array, linear: Linearised) -> Er
 
 
 def _keep_plant_moments(before: ErrorMoments, after: ErrorMoments) -> ErrorMoments:
-    """Moments of the errors `after` a step and those of the plant `before` it, which nobody knows along estimates."""
+    """Return the moments of the errors `after` a step with those of the plant `before` it.
+
+    Along estimates nobody knows the plant's own moments: its mean stays, and its covariance with all else.
+    """
     n = before.mean.shape[1]
     of_errors = np.arange(len(before.covariance)) >= n
     covariance = jnp.where(np.outer(of_errors, of_errors), after.covariance, before.covariance)
     return ErrorMoments(jnp.concatenate([before.mean[:1], after.bias]), covariance)
 
 
-def _drift(state: ReportsBelief, matrix: jax.Array, moved: jax.Array, keep: jax.Array, linear: Linearised) -> jax.Array:
-    """Return F_i (E e_i- - A E e_i): each filter's prediction is known, so that E e_i- = E x- - m_i-."""
+def _compute_drift(
+    state: ReportsBelief, matrix: jax.Array, moved: jax.Array, keep: jax.Array, linear: Linearised
+) -> jax.Array:
+    """Return F_i (E e_i- - A E e_i) (node, n): how far each mean error moves other than by the linear map A.
+
+    Each filter's prediction m_i- is known, so that E e_i- = E x- - m_i-; E x- is `moved`, A is `matrix`.
+    """
     nodes, n, _ = keep.shape
     before = state.gaussian.mean[n:].reshape(nodes, n)
     return jnp.einsum("iab,ib->ia", keep, moved - linear.predicted - before @ matrix.T)

@@ -19,26 +19,27 @@ from heliograph.fusion.mesh.gains import (
     gains_of,
     information_of,
 )
-from heliograph.fusion.mesh.graph import graph_of
 from heliograph.fusion.mesh.joint import blocks_of, error_transitions, joint_after, measurement_weights, scatter_blocks
 from heliograph.fusion.mesh.neighbour_rules import FrozenWeights
 from heliograph.fusion.quantizer import AbstractQuantizer
 from heliograph.fusion.rules import AbstractFusion
 from heliograph.model.estimate import Claim, Estimate
-from heliograph.model.over_time import at, first, stack
+from heliograph.model.over_time import at, first
 from heliograph.model.plant import AnyPlant, LinearPlant
-from heliograph.numerics.check import fail
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, Bool, Float, PyTree
-from heliograph.simulation.centres.centre import Apart, ObservationModel, stack_nodes
-from heliograph.simulation.centres.edges import Edges, edges_of
-from heliograph.simulation.centres.messages import Messages, OnTheWay, gather_messages, step_way, test_moved_beyond
-from heliograph.simulation.network import Network
-from heliograph.simulation.node import Node
+from heliograph.simulation.centres.centre import Apart
+from heliograph.simulation.centres.edges import Edges
+from heliograph.simulation.centres.messages import (
+    Messages,
+    OnTheWay,
+    gather_messages,
+    step_messages_on_the_way,
+    test_moved_beyond,
+)
 
-DENSE = 200  # nodes whose joint covariance is propagated at every step
 Arrived = Bool[Array, "node rounds degree"]  # which messages arrived, each node's from itself first
-Ahead = Sequence[Sequence[Array]]  # parts and covariance of weights, by part of the nodes; none where there are none
+Ahead = Sequence[Sequence[Array]]  # weights computed before a step: parts and covariance by bucket; empty: none are
 
 
 class MeshState(NamedTuple):
@@ -58,9 +59,10 @@ class MeshState(NamedTuple):
 
 
 class Data(NamedTuple):
-    """Measurement models of one step: H_j' R_j^-1 (node, n, m) and S_j = H_j' R_j^-1 H_j (node, n, n) of what is there.
+    """Information in the measurements of one step, by the node j that took them, of components that are not missing.
 
-    `complete`: S_j if no component were missing.
+    `observation`: z_j = H_j x + offset + noise of covariance R_j. `weighted`: H_j' R_j^-1 (node, n, m). `information`:
+    S_j = H_j' R_j^-1 H_j (node, n, n). `complete`: S_j if no component were missing.
     """
 
     observation: Observation
@@ -85,7 +87,10 @@ class MeshStep(NamedTuple):
 
 
 class Rows(Module):
-    """Some nodes of a mesh, of about as many neighbours, and the rule placed on them."""
+    """Some nodes of a mesh, of about as many neighbours, and the rule placed on them.
+
+    `rows`: their numbers. `width`: the most messages that one of them receives, its own included.
+    """
 
     rule: AbstractFusion
     rows: np.ndarray
@@ -95,7 +100,9 @@ class Rows(Module):
 class Mesh(Module):
     """A fusion between neighbours: the graph, its edges, the rule on parts of its nodes, models of the measurements.
 
-    `places` bring the nodes into the order of the network's groups again, `ranks` the nodes of all buckets.
+    `buckets`: the nodes, those of about as many neighbours together; `ranks` bring what buckets give, one after
+    another, into the order of the nodes. `senders` (node, degree): of whom each node receives, itself first. `places`:
+    numbers of the nodes of each group of the network.
     """
 
     plant: AnyPlant
@@ -126,12 +133,18 @@ class Mesh(Module):
         nodes, n = len(self.senders), len(mean)
         joint = jnp.broadcast_to(covariance[None, :, None], (nodes, n, nodes, n)) if self.needs_joint else None
         sent = None if self.alpha is None else jnp.tile(mean, (*self.senders.shape, 1))
-        both = jnp.tile(mean, (nodes, 1)), jnp.tile(covariance, (nodes, 1, 1))
         way = None
         if self.edges.past or self.quantizer is not None:
             ages = self.edges.past
             way = OnTheWay(jnp.tile(mean, (ages, nodes, 1)), jnp.tile(covariance, (ages, nodes, 1, 1)))
-        return MeshState(*both, joint, (mean, covariance), sent, way)
+        return MeshState(
+            mean=jnp.tile(mean, (nodes, 1)),
+            covariance=jnp.tile(covariance, (nodes, 1, 1)),
+            joint=joint,
+            plant=(mean, covariance),
+            sent=sent,
+            way=way,
+        )
 
     def step(
         self, state: MeshState, z: Sequence[jax.Array], arrived: Arrived,
@@ -139,10 +152,11 @@ class Mesh(Module):
     ) -> tuple[MeshState, tuple[Estimate, ...]]:  # fmt: skip
         """Exchange, fuse, predict and correct at step k: next state, and estimates (1, node, ...) by group of nodes.
 
-        xhat+ = A xhat + b + sum_j M_j (xhat_j - xhat) + W (s - S (A xhat + b)), M_j `gains.front` `gains.parts`,
-        W `gains.gain`, S `parts.information`. `arrived`: (node, round, neighbour); `ahead`: weights computed before.
+        xhat+ = A xhat + b + sum_j M_j (xhat_j - xhat) + W (s - S (A xhat + b)): M_j = `gains.front` `gains.parts`,
+        W = `gains.gain`, S = `parts.information` and s, `sums` of H' R^-1 z over the measurements that arrived.
+        `z`: measurements by group. `arrived` (node, round, neighbour): flags or ages. `ahead`: weights computed before.
         """
-        measured = jnp.concatenate([self._rows(rows) for rows in z])[self.observation_model.order]
+        measured = jnp.concatenate([self._pad_to_longest(rows) for rows in z])[self.observation_model.order]
         blocks = None if state.joint is None else blocks_of(state.joint, self.senders)
         present = ~jnp.isnan(measured)
         messages = self._keep_messages(state, jnp.asarray(arrived))
@@ -171,12 +185,12 @@ class Mesh(Module):
         moved_on = None if state.sent is None else sent @ motion.matrix.T + motion.shift
         after = MeshState(mean, gains.covariance, joint, parts.plant, moved_on, None)
         if messages is not None and state.way is not None:
-            under_way = step_way(messages, state.way, motion, common, weighted, parts.data.information)
+            under_way = step_messages_on_the_way(messages, state.way, motion, common, weighted, parts.data.information)
             after = after._replace(way=under_way)
         return after, self._split_by_group(mean, claimed)
 
     def _keep_messages(self, state: MeshState, arrived: jax.Array) -> Messages | None:
-        """Return the messages that are no estimates of now as they are; None where all are."""
+        """Return the messages that arrive, where they may be late or quantized; None where all are estimates of now."""
         if state.way is None:
             return None
         ages = arrived if self.edges.past else jnp.where(arrived, 0, -1)
@@ -185,12 +199,13 @@ class Mesh(Module):
     def _send_estimates(
         self, mean: jax.Array, state: MeshState, arrives: jax.Array, messages: Messages | None
     ) -> Float[jax.Array, "node degree n"]:
-        """Estimates that the nodes have of their neighbours: those of now, or what they received last or late."""
+        """Return the estimates that each node has of its neighbours: those of now, or what it received last or late."""
         if messages is not None:
             return messages.mean[messages.senders]
         now = mean[self.senders]
         if state.sent is None or self.alpha is None:
             return now
+        # With events: a node sends only where its estimate has moved beyond what somebody received last.
         information = jax.vmap(invert)(state.covariance)[self.senders]
         moved = test_moved_beyond(self.alpha, now - state.sent, information, self.senders, self.edges.present)
         return jnp.where((arrives & moved[self.senders])[..., None], now, state.sent)
@@ -200,16 +215,20 @@ class Mesh(Module):
         moments: tuple[Array, Array], there: Bool[Array, "node m"], arrived: Arrived, u: Array, k: Array,
         ahead: Ahead = (), messages: Messages | None = None,
     ) -> MeshStep:  # fmt: skip
-        """Everything at step k but the estimates, from the covariances before it and what is there and arrives."""
+        """Return all of step k but the estimates: models, moments of the plant, weights and gains.
+
+        `covariance`, `blocks` and `moments` are of before the step; blocks: the joint covariance of each neighbourhood.
+        `there`: components measured. `arrived`: messages that arrive.
+        """
         covariance, there, arrived, u = (jnp.asarray(x) for x in (covariance, there, arrived, u))
-        held = None if blocks is None else jnp.asarray(blocks)
+        blocks = None if blocks is None else jnp.asarray(blocks)
         plant: LinearPlant = at(self.plant, jnp.asarray(k))
         shift = jnp.asarray(plant.input_matrix) @ u + plant.noise_mean()
         motion = Motion(jnp.asarray(plant.matrix), shift, plant.noise_covariance(u))
         after = propagate_state(jnp.asarray(moments[0]), jnp.asarray(moments[1]), motion)
         exchanges = []
         for number in range(self.edges.rounds - 1):
-            exchanges.append(self._map_nodes(_weights, covariance, None, arrived[:, number]))
+            exchanges.append(self._map_nodes(_weigh_neighbours, covariance, None, arrived[:, number]))
             covariance = jnp.asarray(exchanges[-1].covariance)
         # What each node learns of the measurements, and its gains.
         data = self._exchange_measurements(self.observation_model.observe(*after, jnp.asarray(k)), there)
@@ -218,24 +237,33 @@ class Mesh(Module):
         arrives, senders = arrived[:, -1], None
         if messages is not None:
             covariance, senders, arrives = messages.covariance, messages.senders, messages.arrives[:, -1]
-        gains = self.gains(covariance, held, arrives, motion, information, complete, ahead, senders)
-        return MeshStep(motion, after, tuple(exchanges), data, information, gains)
+        gains = self.gains(covariance, blocks, arrives, motion, information, complete, ahead, senders)
+        return MeshStep(
+            motion=motion,
+            plant=after,
+            exchanges=tuple(exchanges),
+            data=data,
+            information=information,
+            gains=gains,
+        )
 
-    def _rows(self, z: jax.Array) -> Float[jax.Array, "node m"]:
-        """Return the measurements of a group, filled with NaN up to the longest."""
+    def _pad_to_longest(self, z: jax.Array) -> Float[jax.Array, "node m"]:
+        """Return the measurements of a group, filled with NaN up to the longest of all nodes."""
         return jnp.pad(z, ((0, 0), (0, self.observation_model.size - z.shape[1])), constant_values=jnp.nan)
 
     def _pull_to_neighbours(
         self, front: Float[jax.Array, "node n n"], parts: Float[jax.Array, "node degree n *n"],
         mean: jax.Array, sent: Float[jax.Array, "node degree n"],
     ) -> Float[jax.Array, "node n"]:  # fmt: skip
-        """Return front_i sum_j parts_ij (xs_ij - xhat_i) over the neighbours j of i and what it has of them."""
-        away = (sent - mean[:, None]).at[:, 0].set(0.0)
-        off = jnp.einsum("idab,idb->ia", parts, away) if parts.ndim == 4 else jnp.sum(parts * away, axis=1)
-        return jnp.einsum("iab,ib->ia", front, off)
+        """Return front_i sum_j parts_ij (sent_ij - mean_i) over the neighbours j of i; parts: matrices or scalars."""
+        difference = (sent - mean[:, None]).at[:, 0].set(0.0)
+        is_matrix = parts.ndim == 4
+        pull = jnp.einsum("idab,idb->ia", parts, difference) if is_matrix else jnp.sum(parts * difference, axis=1)
+        return jnp.einsum("iab,ib->ia", front, pull)
 
     def _exchange_measurements(self, observation: Observation, there: Bool[jax.Array, "node m"]) -> Data:
-        """Return the messages about what was measured, and about what would be if no component were missing."""
+        """Return each node's information from what it measured, and from all of it if no component were missing."""
+        # Rows of zeros without noise only pad a measurement.
         real = jnp.any(observation.gain != 0, axis=-1) | (jnp.einsum("imm->im", observation.noise) > 0)
         gain, noise = jnp.asarray(observation.gain), jnp.asarray(observation.noise)
         weighted, information = jax.vmap(information_of)(gain, noise, real & there)
@@ -252,18 +280,29 @@ class Mesh(Module):
         ahead: Ahead = (),
         senders: Array | None = None,
     ) -> PyTree:
-        """Apply a function of rule, what a node believes, and more by node, to all nodes side by side."""
+        """Apply function(rule, estimates of the neighbours, *rest, *ahead) to all nodes side by side.
+
+        Args:
+            function: of one node.
+            covariance: (node, n, n) of all estimates.
+            blocks: (node, degree, n, degree, n) joint covariances of each neighbourhood; None where no rule needs them.
+            present: (node, degree) which messages arrive.
+            *rest: further arguments by node.
+            ahead: weights computed before, by bucket.
+            senders: rows of `covariance` that each node's messages are of; None for the graph's.
+        """
         information, traces = jax.vmap(invert)(covariance), jnp.trace(covariance, axis1=1, axis2=2)
         over_rows = eqx.filter_vmap(function, in_axes=(eqx.if_array(-1), *[0] * (2 + len(rest))))
         by_bucket = []
         for bucket, bucket_ahead in zip(self.buckets, ahead or [()] * len(self.buckets), strict=True):
             rows, width = bucket.rows, bucket.width
-            theirs = (self.senders if senders is None else senders)[rows, :width]
+            sent_by = (self.senders if senders is None else senders)[rows, :width]
             block = None if blocks is None else blocks[rows, :width, :, :width]
             seen = NeighbourEstimates(
-                covariance[theirs[:, 0]], traces[theirs], information[theirs], block, present[rows, :width]
+                covariance[sent_by[:, 0]], traces[sent_by], information[sent_by], block, present[rows, :width]
             )
-            if self.alpha is not None:  # what was sent last errs by more than the estimate
+            # With events what a neighbour sent last errs by more than its estimate: by (1 + sqrt(alpha n))^2 P.
+            if self.alpha is not None:
                 wider = jnp.where(np.arange(width) > 0, (1 + jnp.sqrt(self.alpha * covariance.shape[-1])) ** 2, 1.0)
                 seen = seen._replace(traces=seen.traces * wider, information=seen.information / wider[:, None, None])
             by_bucket.append(over_rows(bucket.rule, seen, *(leaf[rows] for leaf in rest), bucket_ahead))
@@ -280,14 +319,14 @@ class Mesh(Module):
         return jnp.tensordot(self.known(arrived).astype(values.dtype), values, 1)
 
     def known(self, arrived: Arrived) -> Bool[jax.Array, "node node"]:
-        """Return the test whose measurements each node has after all rounds."""
+        """Return for each node (row) whether it has each node's (column) measurement after all rounds."""
         known, arrived = jnp.eye(len(self.senders), dtype=bool), jnp.asarray(arrived)
         for number in range(self.edges.rounds):
             known = jnp.any(known[self.senders] & arrived[:, number, :, None], axis=1)
         return known
 
     def sum_of(self, values: jax.Array, present: jax.Array) -> jax.Array:
-        """Sum over what arrived of values by node."""
+        """Return for each node the sum of the values (node, ...) of those whose messages are present (node, degree)."""
         sums: jax.Array = jnp.einsum("id,id...->i...", present.astype(values.dtype), values[self.senders])
         return sums
 
@@ -295,26 +334,31 @@ class Mesh(Module):
         self, covariance: jax.Array, blocks: jax.Array | None, present: jax.Array, motion: Motion,
         information: jax.Array, complete: jax.Array, ahead: Ahead = (), senders: Array | None = None,
     ) -> NodeGains:  # fmt: skip
-        """Return the gains of all nodes."""
+        """Return the gains of all nodes in a step of this motion.
 
-        def single(
+        `information`: what each node learns of the measurements; `complete`: if none were missing; others as of
+        `_map_nodes`.
+        """
+
+        def compute_gains(
             rule: AbstractFusion,
             belief: NeighbourEstimates,
             arrived: jax.Array,
             every: jax.Array,
             known: Sequence[jax.Array],
         ) -> NodeGains:
+            """Return the gains of one node, with weights that are known or those of the rule."""
             step = NodeStep(motion.matrix, motion.noise, arrived, every)
             if known:
                 return gains_of(NeighbourWeights(jnp.eye(len(motion.shift)), *known), step)
             return rule.neighbour_gains(belief, step)
 
-        gains: NodeGains = self._map_nodes(single, covariance, blocks, present, information, complete,
+        gains: NodeGains = self._map_nodes(compute_gains, covariance, blocks, present, information, complete,
                                          ahead=ahead, senders=senders)  # fmt: skip
         return gains
 
     def ahead(self, arrived: Bool[np.ndarray, "step node rounds degree"]) -> Ahead:
-        """Return the weights of many steps, by part of the nodes; none where they depend on more than what arrives."""
+        """Return the weights of many steps by bucket; none where they depend on more than what arrives."""
         weights = [bucket.rule.weights_ahead(arrived[:, bucket.rows, -1, : bucket.width])
                  for bucket in self.buckets if isinstance(bucket.rule, FrozenWeights)]  # fmt: skip
         return () if None in weights else tuple(filter(None, weights))
@@ -322,8 +366,9 @@ class Mesh(Module):
     def _propagate_joint(
         self, joint: jax.Array, parts: MeshStep, present: jax.Array
     ) -> Float[jax.Array, "node n node n"]:
-        """Return the joint covariance after a step."""
+        """Return the joint covariance M J M' + F Q F' + sum_l K_l R_l K_l' after a step, F `gains.innovation`."""
         gains, motion, size = parts.gains, parts.motion, joint.shape[0] * joint.shape[1]
+        # W_il of node i for node l's H_l' R_l^-1 z_l: K_l = W_l H_l' R_l^-1, K_l R_l K_l' = W_l S_l W_l'.
         measured = measurement_weights(gains.gain, present)
         blocks = error_transitions(gains, motion.matrix), measured @ parts.data.information[self.senders], measured
         m, ws, w = (scatter_blocks(jnp.asarray(each), self.senders, self.edges.present) for each in blocks)
@@ -337,64 +382,11 @@ class Mesh(Module):
         )
 
 
-def _weights(rule: AbstractFusion, belief: NeighbourEstimates, *_: PyTree) -> NeighbourWeights:
+def _weigh_neighbours(rule: AbstractFusion, belief: NeighbourEstimates, *_: PyTree) -> NeighbourWeights:
     """Return the weights of an exchange that only intersects, with the covariance after it."""
     return rule.neighbour_weights(belief)
 
 
 def _pad_to_degree(parts: jax.Array, degree: int) -> Float[jax.Array, "node degree n *n"]:
-    """Pad rows with zeros up to the longest."""
+    """Return the weights of each node's messages, padded with zeros to `degree` messages."""
     return jnp.pad(parts, ((0, 0), (0, degree - parts.shape[1]), *[(0, 0)] * (parts.ndim - 2)))
-
-
-def build_mesh(network: Network, name: str) -> Mesh:
-    """Build the fusion `name` between neighbours of a network."""
-    fusion = network.meshes[name]
-    assert fusion.neighbours is not None
-    nodes = network.mesh_nodes(name)
-    graph = graph_of(fusion.neighbours, nodes)
-    # Models of the measurements, group after group.
-    index = {node: i for i, node in enumerate(nodes)}
-    groups: list[ObservationModel | None] = []
-    group_places: dict[str, int] = {}
-    for names in network.groups:
-        sensors = [node for node in map(network.nodes.__getitem__, names) if isinstance(node, Node)]
-        groups.append(stack_nodes([n.sensor for n in sensors], [n.channel for n in sensors]) if sensors else None)
-        group_places |= {node: len(group_places) + i for i, node in enumerate(names)}
-    # Kinds of its filters, and the places of their nodes in the mesh.
-    kinds = [kind for kind in network.mesh_kinds if kind.filters == (name,)]
-    kind_places = [tuple(index[node] for node in network.groups[kind.group]) for kind in kinds]
-    return Mesh(
-        plant=network.plant,
-        buckets=tuple(Rows(fusion.rule.placed(b), b.senders[:, 0], b.senders.shape[1]) for b in graph.buckets()),
-        ranks=np.argsort(np.concatenate([bucket.senders[:, 0] for bucket in graph.buckets()])),
-        edges=edges_of(fusion, graph),
-        observation_model=Apart(
-            tuple(groups),
-            np.array([group_places[node] for node in nodes]),
-            max(1, *(node.received for node in network.nodes.values())),
-            tuple(map(len, network.groups)),
-        ),
-        senders=graph.senders,
-        places=tuple(kind_places),
-        nodes=graph.nodes,
-        alpha=None if fusion.alpha is None else np.asarray(fusion.alpha),  # a number of its program
-        quantizer=stack(fusion.quantizers(graph.nodes)) if fusion.quantizer is not None else None,
-        needs_joint=fusion.rule.needs_joint,
-        claim=network.claims()[nodes[0]][name],
-    )
-
-
-def build_meshes(network: Network) -> dict[str, Mesh]:
-    """Return the fusions between neighbours, by name, to be stepped.
-
-    Raises:
-        ValueError: too many nodes for a rule that follows the joint covariance of their errors.
-    """
-    for name, fusion in network.meshes.items():
-        nodes = len(network.mesh_nodes(name))
-        if fusion.rule.needs_joint and nodes > DENSE:
-            kind = type(fusion.rule).__name__
-            expected = f"at most {DENSE} nodes, whose joint covariance it follows (freeze it, or intersect)"
-            raise fail(f"fusion {name!r} between neighbours by {kind}", expected, nodes)
-    return {name: build_mesh(network, name) for name in network.meshes}

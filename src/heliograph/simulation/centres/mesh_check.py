@@ -24,10 +24,11 @@ from heliograph.simulation.centres.edges import arrival_chance, edge_links, edge
 from heliograph.simulation.node import HasNodes, Node
 
 MODE = 1e-6  # below 1: a mode is computed to half of the digits where it is a double one
-CUTS, UNIT = 200, 1e5  # nodes whose losses are judged, and the digits of a loss's logarithm
+CUTS = 200  # most nodes of which losses are judged: one minimal cut for each
+UNIT = 1e5  # whole units of one e-fold of a loss's probability, for integer capacities
 RANK = 1e-9  # relative: singular values of a mode's observability below are zero
-STEPS, LAST = 100, 40  # of the recursion of errors, and those by which their growth is judged
-SLOW = 1e-3  # growth of a variance within so many steps' precision
+STEPS, LAST = 100, 40  # of the recursion of errors, and those at its end by which their growth is judged
+SLOW = 1e-3  # growth a step that so few steps cannot tell from none
 
 
 def check_mesh(name: str, fusion: Fusion, network: HasNodes) -> None:
@@ -65,15 +66,20 @@ def check_mesh(name: str, fusion: Fusion, network: HasNodes) -> None:
 
 
 def error_claim(name: str, fusion: Fusion, network: HasNodes) -> Claim:
-    """Claim of the joint covariance of all nodes' errors: "exact", weaker where laws or noises are known by bounds."""
-    parts = {node: (n.sensor, n.channel, n.filters[fusion.filter])
-             for node in network.mesh_nodes(name)
-             if isinstance(n := network.nodes[node], Node)}  # fmt: skip
-    return claim_of_informed(f"{type(fusion.rule).__name__} between neighbours", network.plant, parts, False)
+    """Return the claim of the joint covariance of all nodes' errors.
+
+    "exact", weaker where laws or noises are known by bounds.
+    """
+    parts = {}
+    for name_of_node in network.mesh_nodes(name):
+        node = network.nodes[name_of_node]
+        if isinstance(node, Node):
+            parts[name_of_node] = node.sensor, node.channel, node.filters[fusion.filter]
+    return claim_of_informed(f"{type(fusion.rule).__name__} between neighbours", network.plant, parts, shared=False)
 
 
 def mesh_claim(name: str, fusion: Fusion, network: HasNodes) -> Claim:
-    """Claim of every node's estimate: "upper" by intersection, "exact" by the joint covariance given what arrived.
+    """Return the claim of every node's estimate: "upper" by intersection, "exact" by the joint covariance.
 
     Weaker where laws are known up to a radius, weights are frozen means over losses, or data decide what arrives: a
     sender by what it measured, limits by what they refuse, a quantizer by what it cannot send.
@@ -109,7 +115,7 @@ def _check_rule(what: str, fusion: Fusion, network: HasNodes) -> None:
 
 
 def _check_messages(what: str, fusion: Fusion, network: HasNodes, graph: Graph) -> None:
-    """Refuse links that do not serve, and delays and quantizers where no bound is known then."""
+    """Raise ValueError for links that do not serve, and for delays and quantizers with which no bound is known."""
     past, kind = edges_of(fusion, graph).past, type(fusion.rule).__name__
     if not past and fusion.quantizer is None:
         return
@@ -127,9 +133,10 @@ def _check_messages(what: str, fusion: Fusion, network: HasNodes, graph: Graph) 
 
 
 def _check_seen(what: str, name: str, fusion: Fusion, network: HasNodes) -> None:
-    """Refuse every node for which an unstable mode is seen by nobody upstream; warn of stable ones.
+    """Raise ValueError if neither a node nor one upstream of it observes an unstable mode; warn of decaying modes.
 
-    Mode lambda is seen where rank [lambda I - A; H of all upstream] = n, itself included.
+    Mode lambda is observed where rank [lambda I - A; H of all upstream and itself] = n. Not checked where plant,
+    sensors or channels vary over time.
     """
     nodes = network.mesh_nodes(name)
     sensors = [network.nodes[node] for node in nodes]
@@ -148,31 +155,24 @@ def _check_seen(what: str, name: str, fusion: Fusion, network: HasNodes) -> None
             h, noise = _model_node(sensor)
             squares[i] = _scale_rows(h).T @ _scale_rows(h)
             _check_regular(f"{what}: node {nodes[i]!r}", noise)
-    # Modes of the plant, unstable and decaying, that nobody upstream of a node observes.
-    unseen: dict[bool, list[str]] = {True: [], False: []}
-    values = np.linalg.eigvals(a)
-    checked: dict[int, set[bool]] = {}
-    for i, places in enumerate(upstream(graph_of(fusion.neighbours or {}, nodes))):
-        if id(places) not in checked:
-            checked[id(places)] = _find_unseen(a, values, squares[places].sum(axis=0))
-        for unstable in checked[id(places)]:
-            unseen[unstable].append(nodes[i])
-    # Unstable ones are refused, decaying ones warned of.
-    if unseen[True]:
-        some = ", ".join(map(repr, unseen[True][:5])) + (" and more" if len(unseen[True]) > 5 else "")
+    # Unstable modes that nobody upstream observes are refused, decaying ones warned of.
+    without_unstable, without_decaying = _list_unseeing_nodes(graph_of(fusion.neighbours or {}, nodes), a, squares)
+    if without_unstable:
+        some = ", ".join(map(repr, without_unstable[:5])) + (" and more" if len(without_unstable) > 5 else "")
         raise fail(
             what, "that a node or one upstream of it observes every mode that does not decay", f"none for {some}"
         )
-    if unseen[False]:
-        warnings.warn(f"{what}: a decaying mode is observed by nobody upstream of {unseen[False][:5]}; their errors "
+    if without_decaying:
+        warnings.warn(f"{what}: a decaying mode is observed by nobody upstream of {without_decaying[:5]}; their errors "
                       "are those of its prior", stacklevel=4)  # fmt: skip
 
 
 def _check_losses(what: str, fusion: Fusion, network: HasNodes, graph: Graph) -> None:
-    """Refuse a node whose error grows whatever the rule, since messages from those that see a mode are lost too often.
+    """Raise ValueError if a node's error grows whatever the rule, since messages about a mode are lost too often.
 
-    Of nodes that do not see the mode lambda, |lambda|^2 p < 1: p is the product of the loss rates of all edges into
-    them (of losses in bursts the chance of a bad state to stay), over sets of nodes the largest, by a minimal cut.
+    For each set of nodes that do not see the mode lambda, all edges into the set must not be lost too often together:
+    |lambda|^2 p < 1, p the product of their loss rates (of losses in bursts the chance of a bad state to stay). The set
+    of largest p about a node is the minimal cut between it and those that see the mode, of capacities -log p.
     """
     link, names = fusion.link, graph.nodes
     if link is None or len(names) > CUTS or isinstance(first(network.plant), OverTime):
@@ -208,25 +208,48 @@ def _sees(node: object, vector: np.ndarray) -> bool:
     return bool(np.any(np.abs(_scale_rows(_model_node(node)[0]) @ vector) > RANK))
 
 
-def _find_unseen(a: np.ndarray, values: np.ndarray, square: np.ndarray) -> set[bool]:
-    """Test which modes these squares of outputs do not show: True where some does not decay, False where some does."""
+def _list_unseeing_nodes(graph: Graph, a: np.ndarray, squares: np.ndarray) -> tuple[list[str], list[str]]:
+    """Return the nodes for which nobody upstream observes some unstable mode of A, and those for some decaying mode.
+
+    Nodes of one strongly connected part share the array `places`, so that each part is checked once.
+    """
+    without_unstable, without_decaying = [], []
+    values = np.linalg.eigvals(a)
+    checked: dict[int, tuple[bool, bool]] = {}
+    for node, places in zip(graph.nodes, upstream(graph), strict=True):
+        if id(places) not in checked:
+            checked[id(places)] = _find_unseen(a, values, squares[places].sum(axis=0))
+        unstable, decaying = checked[id(places)]
+        if unstable:
+            without_unstable.append(node)
+        if decaying:
+            without_decaying.append(node)
+    return without_unstable, without_decaying
+
+
+def _find_unseen(a: np.ndarray, values: np.ndarray, square: np.ndarray) -> tuple[bool, bool]:
+    """Return whether outputs H, `square` H'H, hide a mode that does not decay, and whether they hide one that does.
+
+    `values`: eigenvalues of a.
+    """
     size = np.linalg.norm(a, 2) or 1.0
-    hidden = set()
+    hides_unstable = hides_decaying = False
     for value in values:
-        both = np.concatenate([(value * np.eye(len(a)) - a) / size, square])
-        if np.linalg.svd(both, compute_uv=False)[-1] < RANK:
-            hidden.add(bool(abs(value) >= 1 - MODE))
-    return hidden
+        pencil = np.concatenate([(value * np.eye(len(a)) - a) / size, square])
+        if np.linalg.svd(pencil, compute_uv=False)[-1] < RANK:
+            unstable = abs(value) >= 1 - MODE
+            hides_unstable, hides_decaying = hides_unstable or unstable, hides_decaying or not unstable
+    return hides_unstable, hides_decaying
 
 
 def _scale_rows(h: np.ndarray) -> np.ndarray:
-    """Return the rows of unit length, whatever the unit of a measurement."""
+    """Return the rows scaled to unit length, so that the unit of a measurement does not matter."""
     lengths = np.linalg.norm(h, axis=1, keepdims=True)
     return np.asarray(h / np.where(lengths > 0, lengths, 1.0))
 
 
 def _model_node(node: Node) -> tuple[np.ndarray, np.ndarray]:
-    """Return matrix of what a node receives of the state, and the covariance of the noise that no signal adds to."""
+    """Return the mean matrix from the state to what a node receives, and the covariance of its noise at zero signal."""
     sensor, channel = first(node.sensor), second_order(first(node.channel).condition_on_arrival())
     assert isinstance(sensor, LinearSensor)  # as its filter's claim requires
     gain = np.asarray(channel.mean_gain)
@@ -242,18 +265,19 @@ def _check_regular(where: str, noise: np.ndarray) -> None:
 
 
 def _check_fixed(what: str, fusion: Fusion, network: HasNodes, graph: Graph) -> None:
-    """Refuse fixed shares with which errors grow, where the plant does not decay and gains become steady."""
+    """Raise ValueError for fixed shares with which errors grow, where the plant does not decay and gains settle."""
     plant, link, names = network.plant, fusion.link, graph.nodes
     if not isinstance(fusion.rule, DiffusionWeights) or not isinstance(plant, LinearPlant) or len(names) > CUTS:
         return
     a, q = np.asarray(plant.matrix), np.asarray(plant.noise_covariance(jnp.zeros(len(plant.inputs))))
-    items = [network.nodes[name] for name in names]
+    nodes = [network.nodes[name] for name in names]
     rates = [1.0] * len(graph.edges) if link is None else [arrival_chance(c) for c in edge_links(link, graph).values()]
     arrival = np.array([p for p in rates if p is not None])
-    steady = all(_is_steady(n) for n in items if isinstance(n, Node))
+    steady = all(_is_steady(node) for node in nodes if isinstance(node, Node))
     if np.abs(np.linalg.eigvals(a)).max() < 1 - MODE or len(arrival) < len(rates) or not steady:
         return
-    models = [_model_node(n) if isinstance(n, Node) else (np.zeros((1, len(a))), np.eye(1)) for n in items]
+    # Of a node without a sensor a row of zeros.
+    models = [_model_node(node) if isinstance(node, Node) else (np.zeros((1, len(a))), np.eye(1)) for node in nodes]
     squares = np.array([h.T @ np.linalg.solve(noise, h) for h, noise in models])
     check_decay(what, graph, np.asarray(fusion.rule.placed(graph).shares).T, arrival, (a, q), squares)
 
@@ -293,7 +317,12 @@ def check_decay(
 def _make_error_steps(
     graph: Graph, shares: np.ndarray, plant: tuple[np.ndarray, np.ndarray], squares: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Step of a node's error: alone (node, n, n), and what a message adds of the sender's and of its (node, degree)."""
+    """Return the matrices of one step of the errors e_i, with the gains of the long run.
+
+    e_i+ = alone_i e_i + sum_j (pulled_ij e_j + pushed_ij e_i), over the senders j whose messages arrive.
+
+    Returns: alone (node, n, n), pulled and pushed (node, degree, n, n).
+    """
     a, q = plant
     n = len(a)
     # Gains of a filter that receives all its neighbours' measurements, in the long run.
@@ -311,7 +340,10 @@ def _make_error_steps(
 def _compute_growth(
     graph: Graph, arrives: np.ndarray, alone: np.ndarray, pulled: np.ndarray, pushed: np.ndarray
 ) -> tuple[float, np.ndarray]:
-    """Return the growth of the errors' second moments in a step, and in the end their sizes by node."""
+    """Return the growth of the errors' second moments in a step, and their sizes by node in the end.
+
+    Args: `arrives` (node, degree): probability of each message; the others as `_make_error_steps` returns them.
+    """
     nodes, n = alone.shape[:2]
     # Mean over what gets lost, and its variance.
     mean = arrives[:, :, None, None] * pulled
@@ -319,14 +351,16 @@ def _compute_growth(
     m = scatter_blocks(mean, graph.senders, graph.present)
     variance = (arrives * (1 - arrives))[:, :, None, None]
     # Second moments without noise, in units of their size before a step.
+    # J+ = E[M] J E[M]', and on the diagonal sum_j p_j (1 - p_j) D_j E[(e_i, e_j)(e_i, e_j)'] D_j',
+    # D_j = (pushed, pulled).
     joint, logarithms, places, senders = np.eye(nodes * n), [], np.arange(nodes), graph.senders
-    both = np.concatenate([pushed, pulled], axis=3)
+    added_by_message = np.concatenate([pushed, pulled], axis=3)
     for _ in range(STEPS):
         blocks = joint.reshape(nodes, n, nodes, n)
         cross = blocks[places[:, None], :, senders, :]
         top = np.concatenate([np.broadcast_to(blocks[places, :, places, :][:, None], cross.shape), cross], axis=3)
         below = np.concatenate([cross.swapaxes(2, 3), blocks[senders, :, senders, :]], axis=3)
-        more = propagate_by_mode(both, np.concatenate([top, below], axis=2), 0.0)
+        more = propagate_by_mode(added_by_message, np.concatenate([top, below], axis=2), 0.0)
         joint = np.asarray(propagate_by_mode(m, joint, 0.0))
         joint.reshape(nodes, n, nodes, n)[places, :, places, :] += (variance * more).sum(axis=1)
         # Their size, of which the next step is a multiple.

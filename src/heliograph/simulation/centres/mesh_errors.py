@@ -21,7 +21,8 @@ from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Bool, Float, PyTree
 from heliograph.simulation.arguments import inputs_of, key_of
 from heliograph.simulation.centres.edges import Edges
-from heliograph.simulation.centres.mesh import Mesh, MeshStep, build_mesh
+from heliograph.simulation.centres.mesh import Mesh, MeshStep
+from heliograph.simulation.centres.mesh_building import build_mesh
 from heliograph.simulation.centres.mesh_check import error_claim
 from heliograph.simulation.network import Network
 
@@ -78,10 +79,11 @@ def mesh_arrivals(network: Network, fusion: str, horizon: int, key: int | jax.Ar
 def _draw_arrivals(edges: Edges, key: jax.Array, steps: np.ndarray) -> jax.Array:
     """Draw what arrives by the edges alone, so that all rules share a program."""
 
-    def body(state: tuple[PyTree, ...], k: jax.Array) -> tuple[tuple[PyTree, ...], jax.Array]:
+    def draw_step(state: tuple[PyTree, ...], k: jax.Array) -> tuple[tuple[PyTree, ...], jax.Array]:
+        """Draw what arrives at step k."""
         return edges.draw(state, key, k)
 
-    drawn: jax.Array = jax.lax.scan(body, edges.init(key), jnp.asarray(steps))[1]
+    drawn: jax.Array = jax.lax.scan(draw_step, edges.init(key), jnp.asarray(steps))[1]
     return drawn
 
 
@@ -124,8 +126,13 @@ def mesh_errors(
         claimed.append(claim)
         last = joint
     nodes, n = len(mesh.nodes), actual[0].shape[-1]
-    of_errors = error_claim(fusion, network.meshes[fusion], network)
-    return MeshErrors(mesh.nodes, np.stack(actual), np.stack(claimed), last.reshape(nodes, n, nodes, n), of_errors)
+    return MeshErrors(
+        nodes=mesh.nodes,
+        actual=np.stack(actual),
+        claimed=np.stack(claimed),
+        joint=last.reshape(nodes, n, nodes, n),
+        claim=error_claim(fusion, network.meshes[fusion], network),
+    )
 
 
 def errors_over_time(
@@ -137,34 +144,35 @@ def errors_over_time(
     covariance, moments = start.covariance, start.plant
     nodes, n = start.mean.shape
     joint = np.tile(moments[1], (nodes, nodes))
-    follows = mesh.needs_joint
+    needs_joint = mesh.needs_joint
     for k, (arrived, u_k) in enumerate(zip(flags, u, strict=True)):
-        blocks = np.asarray(blocks_of(joint.reshape(nodes, n, nodes, n), mesh.senders)) if follows else None
+        blocks = np.asarray(blocks_of(joint.reshape(nodes, n, nodes, n), mesh.senders)) if needs_joint else None
         with jax.enable_x64(True):
-            parts = to_numpy(_parts(mesh, covariance, blocks, moments, arrived, u_k, np.asarray(k)))
+            parts = to_numpy(_compute_parts(mesh, covariance, blocks, moments, arrived, u_k, np.asarray(k)))
         joint = _propagate_joint(mesh, joint, parts, arrived)
         covariance, moments = parts.gains.covariance, parts.plant
         error = np.einsum("iaib->iab", joint.reshape(nodes, n, nodes, n)).copy()
-        yield joint, error, error if follows else covariance
+        yield joint, error, error if needs_joint else covariance
 
 
 @quickly_compiled
-def _parts(
+def _compute_parts(
     mesh: Mesh, covariance: np.ndarray, blocks: np.ndarray | None, moments: PyTree, arrived: np.ndarray,
     u: np.ndarray, k: np.ndarray,
 ) -> MeshStep:  # fmt: skip
+    """Return step k without the estimates, with all components measured; arguments as of `Mesh.parts`."""
     there = np.ones((len(mesh.senders), mesh.observation_model.size), dtype=bool)
     return mesh.parts(covariance, blocks, moments, there, arrived, u, k)
 
 
 def _propagate_joint(mesh: Mesh, joint: np.ndarray, parts: MeshStep, arrived: np.ndarray) -> np.ndarray:
-    """Return the joint covariance (N, N) after a step."""
+    """Return the joint covariance (N, N) of all errors after a step, by sparse matrices; N = nodes n."""
     gains, present, senders = parts.gains, mesh.edges.present, mesh.senders
     # Rounds that only intersect: e_i + sum_j C_ij (e_j - e_i).
     for number, weights in enumerate(parts.exchanges):
-        held = np.where(arrived[:, number, :, None, None], weights.front[:, None] @ weights.parts, 0.0)
-        held[:, 0] = np.eye(held.shape[-1]) - held[:, 1:].sum(axis=1)
-        joint = np.asarray(propagate_by_mode(scatter_blocks(held, senders, present), joint, 0.0))
+        mixing = np.where(arrived[:, number, :, None, None], weights.front[:, None] @ weights.parts, 0.0)
+        mixing[:, 0] = np.eye(mixing.shape[-1]) - mixing[:, 1:].sum(axis=1)
+        joint = np.asarray(propagate_by_mode(scatter_blocks(mixing, senders, present), joint, 0.0))
     m = scatter_blocks(error_transitions(gains, parts.motion.matrix), senders, present)
     # Measurements of neighbours, or of all whose measurement a node has after all rounds.
     there = arrived[:, 0] & present
@@ -182,7 +190,7 @@ def best_possible(
     arrived: Bool[ArrayLike, "horizon node rounds degree"] | int,
     inputs: Float[ArrayLike, "horizon inputs"] | None = None,
 ) -> Float[np.ndarray, "node n n"]:
-    """Bound below the covariance of every node's error after the last step, which no linear rule can beat.
+    """Return a lower bound on the covariance of every node's error after the last step, which no linear rule can beat.
 
     z_j(k - a) can be at node i only if a message carried it there since; a Riccati recursion from the plant's initial
     covariance uses all that can be there, oldest first. Where all is Gaussian no rule at all is better.
@@ -237,7 +245,10 @@ def models(mesh: Mesh, covariance: np.ndarray, moments: PyTree, u: np.ndarray, k
 
 
 def _extend_reach(known: Any, mesh: Mesh, present: np.ndarray) -> Any:
-    """Return the matrix of what is known through one exchange more, earlier: a one where some message carried it."""
+    """Return whose data each node has if one more exchange, before all others, is counted.
+
+    `known`: sparse (node, node), a one where the data of the column's node reach the row's.
+    """
     receiver, column = np.nonzero(present)
     ones = np.ones(len(receiver), dtype=np.int32)
     step = scipy.sparse.csr_array((ones, (receiver, mesh.senders[receiver, column])), shape=known.shape)
@@ -289,7 +300,7 @@ def freeze(
 
 
 def mesh_named(network: Network, fusion: str) -> Mesh:
-    """Build the named fusion between neighbours, of few enough nodes."""
+    """Return the fusion of this name between neighbours; raise if there is none, or if it has over 2,000 nodes."""
     instance("network", network, Network, "a Network")
     if not isinstance(fusion, str) or fusion not in network.meshes:
         raise fail("fusion", f"one between neighbours, of {list(network.meshes)}", repr(fusion))
@@ -300,7 +311,7 @@ def mesh_named(network: Network, fusion: str) -> Mesh:
 
 
 def _check_arrivals(mesh: Mesh, arrived: Any) -> Bool[np.ndarray, "horizon node rounds degree"]:
-    """Return the flags of each step, all of them where a number of steps is given."""
+    """Return checked flags of what arrives at each step; of a number of steps, those where everything does."""
     if mesh.edges.past:
         raise fail("errors between neighbours before any data", "messages that arrive at once or are lost", "late ones")
     shape = (len(mesh.senders), mesh.edges.rounds, mesh.senders.shape[1])

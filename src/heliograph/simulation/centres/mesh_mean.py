@@ -20,6 +20,7 @@ from heliograph.fusion.mesh.gains import NodeGains
 from heliograph.fusion.mesh.graph import graph_of
 from heliograph.fusion.mesh.joint import blocks_of, error_transitions, joint_after, measurement_weights, scatter_blocks
 from heliograph.fusion.mesh.neighbour_rules import FrozenWeights
+from heliograph.fusion.rules import AbstractFusion
 from heliograph.linear.jump_system import propagate_by_mode
 from heliograph.model.channel import Channel
 from heliograph.numerics.check import check_count, fail
@@ -32,7 +33,7 @@ from heliograph.simulation.centres.mesh_check import error_claim
 from heliograph.simulation.centres.mesh_errors import MeshErrors, mesh_named, models
 from heliograph.simulation.network import Network
 
-NODES, DEGREE = 200, 10  # of which patterns are listed
+NODES, DEGREE = 200, 10  # most nodes and neighbours of one node whose patterns are listed: 2^degree rows a node
 
 
 class Patterns(NamedTuple):
@@ -79,11 +80,7 @@ def mean_mesh_errors(
     links = {} if between.link is None else edge_links(between.link, graph)
     chances = [_get_known_probability(name, link) for name, link in links.items()] or [1.0] * len(graph.edges)
     patterns = _list_patterns(mesh, np.array(chances))
-    # A row of the mesh for each pattern of each node.
-    rule = between.rule.placed(graph)
-    rule = jax.tree.map(lambda leaf: leaf[..., patterns.node] if eqx.is_array(leaf) else leaf, rule)
-    bucket = Rows(rule, np.arange(len(patterns.node)), mesh.senders.shape[1])
-    rows = eqx.tree_at(lambda m: (m.senders, m.buckets), mesh, (mesh.senders[patterns.node], (bucket,)))
+    rows = _repeat_by_pattern(mesh, between.rule.placed(graph), patterns)
     with jax.enable_x64(True):
         start = to_numpy(mesh.init())
     # J_k -> J_k+1 by the formula above: gains of every pattern from J_k, then means over the patterns.
@@ -99,8 +96,21 @@ def mean_mesh_errors(
         n = len(step.motion.shift)
         errors.append(np.einsum("iaib->iab", joint.reshape(len(names), n, len(names), n)).copy())
         covariance = np.asarray(gains.covariance)[patterns.start]
-    claim = error_claim(fusion, between, network)
-    return MeshErrors(names, np.stack(errors), np.stack(errors), joint.reshape(len(names), n, len(names), n), claim)
+    return MeshErrors(
+        nodes=names,
+        actual=np.stack(errors),
+        claimed=np.stack(errors),
+        joint=joint.reshape(len(names), n, len(names), n),
+        claim=error_claim(fusion, between, network),
+    )
+
+
+def _repeat_by_pattern(mesh: Mesh, rule: AbstractFusion, patterns: Patterns) -> Mesh:
+    """Return the mesh with a row for each pattern of each node; `rule`: placed on the nodes, its arrays' last axis."""
+    rule = jax.tree.map(lambda leaf: leaf[..., patterns.node] if eqx.is_array(leaf) else leaf, rule)
+    bucket = Rows(rule, np.arange(len(patterns.node)), mesh.senders.shape[1])
+    repeated: Mesh = eqx.tree_at(lambda m: (m.senders, m.buckets), mesh, (mesh.senders[patterns.node], (bucket,)))
+    return repeated
 
 
 @quickly_compiled
@@ -113,8 +123,8 @@ def _compute_gains(
     """
     information = rows.sum_of(jnp.asarray(step.data.information), jnp.asarray(patterns.present))
     complete = jnp.asarray(step.information)[patterns.node]
-    held = jnp.asarray(blocks)[patterns.node]
-    return rows.gains(jnp.asarray(covariance), held, jnp.asarray(patterns.present), step.motion,
+    blocks_by_pattern = jnp.asarray(blocks)[patterns.node]
+    return rows.gains(jnp.asarray(covariance), blocks_by_pattern, jnp.asarray(patterns.present), step.motion,
                       information, complete)  # fmt: skip
 
 
@@ -134,22 +144,27 @@ def _average_joint(
     m, f = np.asarray(error_transitions(gains, step.motion.matrix)), np.asarray(gains.innovation)
     w = np.asarray(measurement_weights(gains.gain, patterns.present))
     # i != j: J_ij+ = E[M_i] J E[M_j]' + E[F_i] Q E[F_j]' + sum_l E[K_il] R_l E[K_jl]'.
-    held = mean(w)
-    everywhere = [scatter_blocks(x, mesh.senders, mesh.edges.present) for x in (mean(m), held @ s[mesh.senders], held)]
-    after = joint_after(joint, everywhere[0], mean(f), q, *everywhere[1:])
+    mean_w = mean(w)
+    scattered = [
+        scatter_blocks(x, mesh.senders, mesh.edges.present) for x in (mean(m), mean_w @ s[mesh.senders], mean_w)
+    ]
+    after = joint_after(joint, scattered[0], mean(f), q, *scattered[1:])
     # i = j: J_ii+ = E[M_r J M_r' + F_r Q F_r' + sum_l K_rl R_l K_rl'], with J of the neighbourhood of i.
     flat = m.swapaxes(1, 2).reshape(len(m), n, degree * n)
     inside = blocks.reshape(count, degree * n, degree * n)[patterns.node]
     noise = np.einsum("rdab,rdbc,rdec->rae", w, s[mesh.senders][patterns.node], w)
-    same = mean(propagate_by_mode(flat, inside, propagate_by_mode(f, q, noise)))
-    whole = after.reshape(count, n, count, n)
-    items = np.arange(count)
-    whole[items, :, items, :] = same
+    diagonal = mean(propagate_by_mode(flat, inside, propagate_by_mode(f, q, noise)))
+    blocks_after = after.reshape(count, n, count, n)  # a view: writing here changes `after`
+    nodes = np.arange(count)
+    blocks_after[nodes, :, nodes, :] = diagonal
     return np.asarray(after)
 
 
 def _list_patterns(mesh: Mesh, chances: np.ndarray) -> Patterns:
-    """List the patterns of every node; `chances` of arrival of all edges, receiver after receiver."""
+    """Return all patterns of what may arrive at every node, with their probabilities.
+
+    `chances`: probability of arrival of every edge, receiver after receiver.
+    """
     counts = mesh.edges.present[:, 1:].sum(axis=1)
     if len(counts) > NODES or counts.max() > DEGREE:
         raise fail("mean errors between neighbours", f"at most {NODES} nodes of at most {DEGREE} neighbours",
@@ -158,12 +173,12 @@ def _list_patterns(mesh: Mesh, chances: np.ndarray) -> Patterns:
     present: list[list[bool]] = []
     probability: list[float] = []
     start: list[int] = []
-    for i, mine in enumerate(np.split(chances, np.cumsum(counts)[:-1])):
+    for i, of_node in enumerate(np.split(chances, np.cumsum(counts)[:-1])):
         start.append(len(rows))
-        for flags in product(*[[True] if p == 1 else [True, False] for p in mine]):
+        for flags in product(*[[True] if p == 1 else [True, False] for p in of_node]):
             rows.append(i)
             present.append([True, *flags, *[False] * (mesh.senders.shape[1] - 1 - len(flags))])
-            probability.append(float(np.prod(np.where(flags, mine, 1 - mine))))
+            probability.append(float(np.prod(np.where(flags, of_node, 1 - of_node))))
     return Patterns(np.array(rows), np.array(present), np.array(probability), np.array(start))
 
 

@@ -15,7 +15,7 @@ from heliograph.simulation.stepping import centre_filter
 @readable
 @dataclass(frozen=True)
 class NamedFilter:
-    """A filter of a network, where it stands, and names of the numbers that it receives.
+    """A filter of a network as it runs alone, the place where it stands, and the names of the numbers it receives.
 
     Args:
         place: name of its node, "fused" of the centre.
@@ -62,7 +62,7 @@ def find_filter_by_name(network: Network, name: str, node: str | None = None) ->
 
 
 def _find_at_centre(network: Network, name: str) -> NamedFilter:
-    """Return a central filter, or the filter of a fusion by reports."""
+    """Return the filter of this name at the centre: a central filter, or the one of a fusion by reports."""
     fused = network.fused[name]
     if isinstance(fused, AbstractFilter):
         names = [f"{node}_{part}" for node in network.names for part in network.nodes[node].received_names]
@@ -70,8 +70,8 @@ def _find_at_centre(network: Network, name: str) -> NamedFilter:
     if not fused.rule.uses_reports:
         rule = type(fused.rule).__name__
         expected = "a central filter or a fusion by AllReports(), whose centre is a filter of what arrives"
-        instead = f"take {fused.filter!r} of the nodes, or fuse by AllReports()"
-        raise fail(f"filter {name!r}", expected, f"one by {rule}, which weighs finished estimates: {instead}")
+        advice = f"take {fused.filter!r} of the nodes, or fuse by AllReports()"
+        raise fail(f"filter {name!r}", expected, f"one by {rule}, which weighs finished estimates: {advice}")
     return NamedFilter(FUSED, centre_filter(network, name), tuple(_name_reports(network, fused)))
 
 

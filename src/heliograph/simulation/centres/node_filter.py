@@ -30,11 +30,12 @@ from heliograph.simulation.claims import premise_at
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node, ReceivingNode
 
-_quantized = compile_in_float64(quantize_estimate)  # each message of a service: one program, not twenty
+# Compiled as one program, since a service calls it for each message.
+_quantize_message = compile_in_float64(quantize_estimate)
 
 
 class NodeState(NamedTuple):
-    """State of a node: before the step, which is what its message of this step says, the inputs of it, and now."""
+    """State of a node: `before` the last step, as its message of that step says it, the step's inputs, and `now`."""
 
     before: MeshState
     inputs: Array
@@ -95,26 +96,29 @@ class NodeFilter(AbstractSizedFilter):
 
     @in_float64
     def sent(self, before: MeshState) -> tuple[jax.Array, jax.Array]:
-        """Mean (n,) and covariance (n, n) in a message about the estimate before a step, quantized where it is."""
+        """Return the mean (n,) and covariance (n, n) that a message about the estimate before a step holds."""
         message = before.mean[0], before.covariance[0]
-        return message if self.quantizer is None else _quantized(self.quantizer, *message)
+        return message if self.quantizer is None else _quantize_message(self.quantizer, *message)
 
     def _gather_measurements(self, z: jax.Array, before: MeshState) -> tuple[list[jax.Array], MeshState]:
-        """Return the measurements of node and neighbours, and their estimates, of mean NaN where none came."""
-        n, at_place = len(self.states), self.measured[0]
-        sensed, means, covariances = [z[:at_place]], [before.mean[0]], [before.covariance[0]]
+        """Take z apart: return the measurements of node and neighbours, and their estimates.
+
+        Where no message came, the mean is NaN, and the covariance any regular one: the node's own.
+        """
+        n, end = len(self.states), self.measured[0]
+        sensed, means, covariances = [z[:end]], [before.mean[0]], [before.covariance[0]]
+        # Of each neighbour mean (n), covariance (n n) and measurement (size).
         for size in self.measured[1:]:
-            mean, rest = z[at_place : at_place + n], z[at_place + n : at_place + n + n * n]
-            at_place += n + n * n + size
-            sensed.append(z[at_place - size : at_place])
-            # A message without an estimate is none: any regular covariance does for it.
-            arrives = ~jnp.any(jnp.isnan(rest))
+            mean, covariance, measured = jnp.split(z[end : end + n + n * n + size], [n, n + n * n])
+            end += n + n * n + size
+            sensed.append(measured)
+            arrives = ~jnp.any(jnp.isnan(covariance))
             means.append(jnp.where(arrives, mean, jnp.nan))
-            covariances.append(jnp.where(arrives, symmetrize(rest.reshape(n, n)), covariances[0]))
+            covariances.append(jnp.where(arrives, symmetrize(covariance.reshape(n, n)), covariances[0]))
         return sensed, before._replace(mean=jnp.stack(means), covariance=jnp.stack(covariances))
 
     def _make_state(self, before: MeshState, z: jax.Array, u: Array, k: Step) -> NodeState:
-        """Return the state after a measurement: what was before it, the input, and the estimates of all nodes now."""
+        """Return the state after a step with measurement z: the state before, the inputs, and the new estimate."""
         sensed, all_nodes = self._gather_measurements(z, before)
         everything = jnp.ones((1, 1, len(sensed)), dtype=bool)
         now, _ = self.mesh.step(all_nodes, [x[None] for x in sensed], everything, jnp.asarray(u), jnp.asarray(k))
@@ -152,7 +156,7 @@ def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
         needs_joint=False,
         claim=network.claims()[node][fusion],
     )
-    made = NodeFilter(
+    alone = NodeFilter(
         mesh=mesh,
         measured=sizes,
         quantizer=next(iter(between.quantizers((node,))), None),
@@ -160,10 +164,10 @@ def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
         claim=mesh.claim,
         states=network.states,
         inputs=network.inputs,
-        received=sizes[0] + sum(_numbers(len(network.states), size) for size in sizes[1:]),
+        received=sizes[0] + sum(_count_numbers(len(network.states), size) for size in sizes[1:]),
     )
     # The claim is that of the whole network, which stands here for the node's own part of it.
-    return believing(made, premise_at(network, node))
+    return believing(alone, premise_at(network, node))
 
 
 def _check_alone(what: str, network: Network, between: Fusion) -> None:
@@ -195,11 +199,11 @@ def node_network(network: Network, node: str) -> Network:
     if text("node", node) not in nodes:
         raise fail("node", f"one of fusion {name!r}: {', '.join(nodes)}", repr(node))
     senders = (network.meshes[name].neighbours or {})[node]
-    received = {j: _numbers(len(network.states), network.nodes[j].received) for j in senders}
+    received = {j: _count_numbers(len(network.states), network.nodes[j].received) for j in senders}
     parts = {j: ReceivingNode({}, size, (), False) for j, size in received.items()}
     return Network(network.plant, {node: network.nodes[node], **parts}, {name: node_filter(network, name, node)})
 
 
-def _numbers(n: int, size: int) -> int:
-    """Return the numbers of a neighbour's message: mean, covariance, measurement."""
+def _count_numbers(n: int, size: int) -> int:
+    """Return how many numbers a neighbour's message has: mean (n), covariance (n, n) and measurement (size)."""
     return n + n * n + size

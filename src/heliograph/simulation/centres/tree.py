@@ -116,7 +116,7 @@ def relay_tree(
         blocks = [_slice(numbers, slice(i, i + width)) for i in range(0, count, width)]
         block_results = [to_numpy(_propagate_leaves((plant, name, node, degree), block, u)) for block in blocks]
         covariances, weights, level = (list(leaves) for leaves in zip(*block_results, strict=True))
-        level_covariances, used, shared = [np.concatenate(covariances)], [np.concatenate(weights)], _join_levels(level)
+        level_covariances, used, shared = [np.concatenate(covariances)], [np.concatenate(weights)], _join_blocks(level)
         # ErrorSources by level up to the root.
         while True:
             level_covariances.append(np.asarray(shared.covariances()))
@@ -132,7 +132,10 @@ def relay_tree(
 def _propagate_leaves(
     leaf: tuple[AnyPlant, str, Callable[[object], Node], int], numbers: PyTree, u: np.ndarray
 ) -> tuple[Array, Array, ErrorSources]:
-    """Propagate the leaves of one block: covariances of their errors, weights of the relays above, and these."""
+    """Propagate the leaves of one block over all steps.
+
+    Returns: covariances of the leaves' errors (leaf, n, n), weights of the relays above them, and the relays' errors.
+    """
     plant, name, node, degree = leaf
     # All leaves of the block from their numbers.
     nodes = eqx.filter_vmap(node)(numbers)
@@ -140,9 +143,16 @@ def _propagate_leaves(
     channels = eqx.filter_vmap(lambda values: describe_channel(node(values).channel))(numbers)
     alike = StackedFilters(nodes.filters[name], 0, 1, count)
     size = nodes.filters[name].received
-    observe = Apart((ObservationModel(nodes.sensor, channels),), np.arange(count), size)
-    centre = Centre(plant, observe, {}, np.arange(count), ((0, 0),), size, "exact")
-    quiet = jnp.zeros((count, size))
+    centre = Centre(
+        plant=plant,
+        observation_model=Apart((ObservationModel(nodes.sensor, channels),), np.arange(count), size),
+        rules={},
+        order=np.arange(count),
+        sources=((0, 0),),
+        size=size,
+        claim="exact",
+    )
+    zeros = jnp.zeros((count, size))  # measurements: covariances depend on none
 
     # Errors by their sources, over the horizon.
     state = alike.init()
@@ -150,8 +160,8 @@ def _propagate_leaves(
     begin = initial_factors(centre.init([gaussian_of(state).mean]).errors, n * len(u))
     factors = centre.factors(
         (state, begin),
-        lambda states, u_k, k: alike.matrices(centre.read, states, 0, quiet, u_k, k),
-        lambda states, u_k, k: alike.step(states, quiet, u_k, k)[0],
+        lambda states, u_k, k: alike.matrices(centre.read, states, 0, zeros, u_k, k),
+        lambda states, u_k, k: alike.step(states, zeros, u_k, k)[0],
         u,
     )
     level = factors.errors
@@ -173,21 +183,25 @@ def _relay(children: ErrorSources) -> tuple[jax.Array, ErrorSources]:
 
 
 def _fuse(children: ErrorSources) -> tuple[jax.Array, ErrorSources]:
+    """Return the best weights (n, child, n) of these children, and the error of their weighted estimate."""
     children = ErrorSources(*map(jnp.asarray, children))
     weights = matrix_weights(children.joint())
     return weights, ErrorSources(*children.weigh(weights))
 
 
-def _join_levels(levels: list[ErrorSources]) -> ErrorSources:
-    return ErrorSources(*(np.concatenate(leaves) for leaves in zip(*levels, strict=True)))
+def _join_blocks(blocks: list[ErrorSources]) -> ErrorSources:
+    """Return the errors of the relays above all blocks, one after another."""
+    return ErrorSources(*(np.concatenate(leaves) for leaves in zip(*blocks, strict=True)))
 
 
 def _pad_to_degree(weights: np.ndarray, degree: int) -> np.ndarray:
+    """Return a relay's weights (n, child, n) with zeros for the children that it lacks."""
     return np.pad(weights, ((0, 0), (0, degree - weights.shape[1]), (0, 0)))
 
 
-def _slice(numbers: PyTree, which: int | slice) -> PyTree:
-    return jax.tree.map(lambda leaf: leaf[which], numbers)
+def _slice(numbers: PyTree, rows: int | slice) -> PyTree:
+    """Return some rows of every array."""
+    return jax.tree.map(lambda leaf: leaf[rows], numbers)
 
 
 def _count_leaves(numbers: PyTree) -> int:

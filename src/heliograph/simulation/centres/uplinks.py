@@ -58,7 +58,8 @@ class InFlight(NamedTuple):
 class Uplinks(Module):
     """All uplinks of one fusion: quantizers stacked, channels by structure, delays and intervals by node.
 
-    Shapes: delay (node, ages), every (node,). `links`: the centre's model of them.
+    `delay` (node, ages): probability of each delay in steps. `every` (node,): steps from one report to the next.
+    `links`: the centre's model of them.
     """
 
     groups: tuple[ChannelGroup, ...]
@@ -72,8 +73,8 @@ class Uplinks(Module):
     @property
     def rows(self) -> np.ndarray:
         """Places of the numbers that may arrive among (age, node, m) flattened."""
-        there = np.arange(max(self.received)) < np.array(self.received)[:, None]
-        return np.flatnonzero(np.broadcast_to(there, (self.delay.shape[1], *there.shape)))
+        exists = np.arange(max(self.received)) < np.array(self.received)[:, None]
+        return np.flatnonzero(np.broadcast_to(exists, (self.delay.shape[1], *exists.shape)))
 
     def init(self) -> InFlight:
         """Return the state with no report in transit."""
@@ -94,12 +95,13 @@ class Uplinks(Module):
         for group in self.groups:
             places = jnp.asarray(group.places)
 
-            def single(channel: Channel, source: jax.Array, law: jax.Array) -> tuple[jax.Array, jax.Array]:
-                drawn, late = jax.random.split(draw_key(key, k, source, CHANNEL))
-                return at(channel, k).sample(drawn), jax.random.choice(late, len(law), p=law)
+            def draw_link(channel: Channel, source: jax.Array, law: jax.Array) -> tuple[jax.Array, jax.Array]:
+                """Draw the channel's matrix (m + 1, n + 1) and the delay of one node, of probabilities `law`."""
+                of_channel, of_delay = jax.random.split(draw_key(key, k, source, CHANNEL))
+                return at(channel, k).sample(of_channel), jax.random.choice(of_delay, len(law), p=law)
 
-            both = eqx.filter_vmap(single, in_axes=(eqx.if_array(0), 0, 0))
-            h, late = both(group.channel, group.checksums, jnp.asarray(self.delay)[places])
+            draw_links = eqx.filter_vmap(draw_link, in_axes=(eqx.if_array(0), 0, 0))
+            h, late = draw_links(group.channel, group.checksums, jnp.asarray(self.delay)[places])
             size = h.shape[1] - 1
             gain = gain.at[places, :size].set(h[:, :-1, :-1])
             offset = offset.at[places, :size].set(h[:, :-1, -1])
@@ -126,7 +128,7 @@ class Uplinks(Module):
         if reports is None or set(reports) != set(nodes):
             got = "none" if reports is None else list(reports)
             raise fail(f"reports of fusion {name!r}", f"those of {list(nodes)}", got)
-        # Received values as offsets, with gains of zero.
+        # z = 0 m + offset: the recorded values are offsets of links without gain.
         values, delay = np.full((steps, count, m), np.nan), np.tile(self.fixed_delay, (steps, 1))
         for i, node in enumerate(nodes):
             sent, size = reports[node], self.received[i]
@@ -161,16 +163,16 @@ class Uplinks(Module):
         step = jnp.asarray(k + 1, means.dtype)
         sending = (jnp.floor(step / self.every) * self.every == step)[:, None]
         values, traffic = jnp.where(sending, means, jnp.nan), {}
-        beyond = jnp.zeros(len(means), dtype=bool)
+        saturated = jnp.zeros(len(means), dtype=bool)
         # Quantized reports; an infinite number stands for one that saturated.
         if self.quantizers is not None:
             quantize = eqx.filter_vmap(lambda q, s, mean: q.step(s, mean), in_axes=(eqx.if_array(0), 0, 0))
             quantizers, sent = quantize(self.quantizers, state.quantizers, values)
             state, values = state._replace(quantizers=quantizers), sent.value
-            beyond = jnp.any(sent.saturated, axis=1)
+            saturated = jnp.any(sent.saturated, axis=1)
             traffic = {"saturated": sent.saturated, "symbols": jnp.where(sending, sent.symbols, 0)}
         z = jnp.einsum("imn,in->im", drawn.gain, values) + drawn.offset
-        return state, jnp.where(beyond[:, None], jnp.inf, z), traffic
+        return state, jnp.where(saturated[:, None], jnp.inf, z), traffic
 
     def arrive(self, state: InFlight, sent: jax.Array, delay: Array) -> tuple[InFlight, jax.Array]:
         """Return the next state, and what arrives now of this step's reports and earlier ones, (age, node, m)."""
@@ -182,21 +184,21 @@ class Uplinks(Module):
 
 def uplinks_of(fusion: Fusion, nodes: Sequence[str], n: int) -> Uplinks:
     """Build the uplinks of these nodes to a centre that receives reports of n numbers."""
-    mine, quantizers = fusion.links(nodes), fusion.quantizers(nodes)
-    ages = max(len(link.delay) for link in mine)
-    channels = [perfect(n) if link.channel is None else link.channel for link in mine]
-    # None are random where all links are deterministic.
-    random = any(link.channel is not None or np.max(link.delay) < 1 for link in mine)
+    links, quantizers = fusion.links(nodes), fusion.quantizers(nodes)
+    ages = max(len(link.delay) for link in links)
+    channels = [perfect(n) if link.channel is None else link.channel for link in links]
+    # Without a channel, and with one certain delay each, nothing is drawn.
+    random = any(link.channel is not None or np.max(link.delay) < 1 for link in links)
     named = {f"{node} to the fusion centre": channel for node, channel in zip(nodes, channels, strict=True)}
     # Received numbers of each node, and bounds on the quantizers' errors.
-    received = tuple(link.received(n) for link in mine)
+    received = tuple(link.received(n) for link in links)
     error = np.stack([q.error(n) for q in quantizers]) if quantizers else np.zeros((len(nodes), n))
     return Uplinks(
         groups=channel_groups(named) if random else (),
         quantizers=stack(quantizers) if quantizers else None,
         links=_model_links([describe_channel(channel) for channel in channels], received, error),
-        delay=np.stack([np.pad(link.delay, (0, ages - len(link.delay))) for link in mine]),
-        every=np.array([link.every for link in mine], float),  # numbers of a program: other intervals share it
+        delay=np.stack([np.pad(link.delay, (0, ages - len(link.delay))) for link in links]),
+        every=np.array([link.every for link in links], float),  # arguments of the program, which others share
         received=received,
         n=n,
     )
@@ -212,11 +214,13 @@ def _model_links(
 
 def _read_links(known: Sequence[PyTree], received: Sequence[int], error: np.ndarray) -> ReportModel:
     """Return the moments of all uplinks as arrays, with zeros for what a node receives less than others."""
-    more = [(0, max(received) - size) for size in received]
-    gain = np.stack([np.pad(link.mean_gain, (a, (0, 0))) for link, a in zip(known, more, strict=True)])
-    offset = np.stack([np.pad(link.offset, a) for link, a in zip(known, more, strict=True)])
-    spread = [np.pad(link.nominal.center, (a, a, (0, 0), (0, 0))) for link, a in zip(known, more, strict=True)]
-    return ReportModel(gain, offset, np.stack(spread), error)
+    gains, offsets, spreads = [], [], []
+    for link, size in zip(known, received, strict=True):
+        padding = (0, max(received) - size)
+        gains.append(np.pad(link.mean_gain, (padding, (0, 0))))
+        offsets.append(np.pad(link.offset, padding))
+        spreads.append(np.pad(link.nominal.center, (padding, padding, (0, 0), (0, 0))))
+    return ReportModel(np.stack(gains), np.stack(offsets), np.stack(spreads), error)
 
 
 @readable

@@ -15,9 +15,9 @@ from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor
 from heliograph.numerics.check import fail, instance, show_value
 from heliograph.numerics.module import readable
-from heliograph.numerics.shares import average_correlated
 from heliograph.numerics.types import Array, ArrayLike, Float, Int
 from heliograph.random_affine.told import AbstractTold
+from heliograph.simulation.declared.innovation_tests import LEVEL, InnovationTests, examine_innovations
 from heliograph.simulation.declared.refit import (
     Declared,
     Place,
@@ -30,11 +30,8 @@ from heliograph.simulation.declared.refit import (
     refit_scales,
     refit_with_bias,
 )
-from heliograph.simulation.results.whiteness import whitened_innovations
 from heliograph.simulation.runs.over_runs import over_runs
 
-LEVEL = 0.01  # of each test
-LAGS = 10
 FEWEST = 20  # rows with values, below which nothing is judged
 MOST = 2000  # rows that decide
 CLASSES = 4  # of declared variances, at most
@@ -208,41 +205,30 @@ def judge_declared_links(
 def _judge_link(
     filter: ToldFilter, link: int, z: Float[np.ndarray, "steps received"], u: Float[np.ndarray, "steps inputs"]
 ) -> tuple[DeclaredJudgement | None, int]:
-    """Judge one link; None where too few of its values came, and how many rows had some."""
+    """Return the judgement of one link, None where too few of its values came; and how many rows had some."""
     declared, classes = _classify(filter, link, z, u)
     heard = int(np.sum(classes >= 0))
     if heard < FEWEST:
         return None, heard
-    before = _test(declared, filter, classes)
+    before = examine_innovations(declared, filter, classes)
     if not before.contradicts:
-        plain = np.ones(declared.classes)
-        return _judgement(declared, classes, (before, before), (plain, plain, plain), None), heard
+        ones = np.ones(declared.classes)
+        return _make_judgement(declared, classes, (before, before), (ones, ones, ones), None), heard
     refit = refit_scales(declared)
-    again = _test(declared, refit_filter(declared, refit.logs), classes)
-    bias = _find_bias(declared, refit) if again.p_value < LEVEL else None
-    ends = [[find_end(declared, refit, c, sign) for c in range(declared.classes)] for sign in (-1, 1)]
-    scales = np.exp(refit.logs), np.exp(ends[0]), np.exp(ends[1])
-    return _judgement(declared, classes, (before, again), scales, bias), heard
+    after = examine_innovations(declared, refit_filter(declared, refit.logs), classes)
+    bias = _find_bias(declared, refit) if after.p_value < LEVEL else None
+    low, high = ([find_end(declared, refit, c, sign) for c in range(declared.classes)] for sign in (-1, 1))
+    scales = np.exp(refit.logs), np.exp(low), np.exp(high)
+    return _make_judgement(declared, classes, (before, after), scales, bias), heard
 
 
-class _Tested(NamedTuple):
-    """Mean squares of each class with their interval, and the correlation over one message with the p-value of all."""
-
-    nis: list[tuple[float, float, float]]
-    correlation: float
-    p_value: float
-
-    @property
-    def contradicts(self) -> bool:
-        return self.p_value < LEVEL or any(not low <= nis <= high for nis, low, high in self.nis)
-
-
-class _Noises(eqx.Module):
-    """Variances of the noises that a told link declares."""
+class _DeclaredNoises(eqx.Module):
+    """The variances of a told link's noises as a function of the numbers that it is told."""
 
     told: AbstractTold
 
     def __call__(self, numbers: Array) -> Array:
+        """Return the variances, one after another."""
         return declared_noises(self.told.believed(numbers))
 
 
@@ -253,69 +239,42 @@ def _declared_variances(place: Place, z: Float[np.ndarray, "steps received"]) ->
     """
     numbers = z[:, place.numbers]
     complete = ~np.isnan(numbers).any(axis=1)[:, None]
-    variances = np.asarray(over_runs(_Noises(place.told), np.where(complete, numbers, np.asarray(place.told.typical))))
+    filled = np.where(complete, numbers, np.asarray(place.told.typical))
+    variances = np.asarray(over_runs(_DeclaredNoises(place.told), filled))
     return np.asarray(np.where(complete, variances, np.nan))
 
 
 def _classify(
     filter: ToldFilter, link: int, z: Float[np.ndarray, "steps received"], u: Float[np.ndarray, "steps inputs"]
 ) -> tuple[Declared, Int[np.ndarray, " steps"]]:
-    """Return the recording with the link's classes of declared variances, and that of each row: -1 of one not used."""
+    """Divide a link's rows into classes of similar declared variances.
+
+    Returns: the recording with the edges of the classes, and the class of each row, -1 of a row that is not used.
+    """
     z, place = z.copy(), find_place(filter, link)
     with np.errstate(all="ignore"):
-        for other in list_declaring(filter):  # what gives no law would spoil the state
-            where = find_place(filter, other)
-            law = np.all(_declared_variances(where, z) > 0, axis=1, keepdims=True)
-            z[~law & np.isin(np.arange(z.shape[1]), where.values + where.numbers)] = np.nan
+        # Messages whose numbers give no positive variance count as lost: they would spoil the filter's state.
+        for number in list_declaring(filter):
+            declaring = find_place(filter, number)
+            valid = np.all(_declared_variances(declaring, z) > 0, axis=1, keepdims=True)
+            z[~valid & np.isin(np.arange(z.shape[1]), declaring.values + declaring.numbers)] = np.nan
         variances = _declared_variances(place, z)
-        size = np.mean(np.log(variances), axis=1)
-    heard = ~np.isnan(size) & ~np.isnan(z[:, place.values]).all(axis=1)
+        log_size = np.mean(np.log(variances), axis=1)
+    heard = ~np.isnan(log_size) & ~np.isnan(z[:, place.values]).all(axis=1)
+    # Edges at quantiles, so that each class has as many rows, and at least EACH numbers.
     count = int(np.sum(~np.isnan(z[heard][:, place.values])))
-    most = min(CLASSES, len(np.unique(size[heard])), max(count // EACH, 1))
-    inner = np.quantile(size[heard], np.arange(1, most) / most, method="lower") if heard.any() else []
-    edges = np.array([edge for edge in np.unique(inner) if edge < size[heard].max()])
+    classes = min(CLASSES, len(np.unique(log_size[heard])), max(count // EACH, 1))
+    inner = np.quantile(log_size[heard], np.arange(1, classes) / classes, method="lower") if heard.any() else []
+    edges = np.array([edge for edge in np.unique(inner) if edge < log_size[heard].max()])
+    # Median deviation of each output; of values that are no outputs one by one the geometric mean for all.
     outputs = variances.shape[1] if place.outputs is None else len(place.outputs)
     usual = np.sqrt(np.median(variances[heard], axis=0)) if heard.any() else np.ones(variances.shape[1])
     deviation = usual if len(usual) == outputs else np.full(outputs, np.exp(np.mean(np.log(usual))))
-    return Declared(filter, link, edges, deviation, z, u), np.where(heard, np.searchsorted(edges, size), -1)
-
-
-def _test(declared: Declared, filter: ToldFilter, classes: Int[np.ndarray, " steps"]) -> _Tested:
-    """Test the innovations of a filter: their mean squares by class, and their correlation over messages."""
-    white = whitened_innovations(declared.z, filter, declared.u)[:, declared.place.values]
-    tail, nis = LEVEL / declared.classes / 2, list[tuple[float, float, float]]()
-    for number in range(declared.classes):
-        squares = white[classes == number] ** 2
-        count = int(np.sum(~np.isnan(squares)))
-        mean = float(np.nansum(squares) / count)
-        if filter.knows_gain:
-            low, high = (
-                (2 * scipy.special.gammaincinv(count / 2, p) / count for p in (tail, 1 - tail)) if count else (0, 1)
-            )
-        else:
-            error = average_correlated(np.nanmean(squares, axis=1))[1]
-            low, high = 1 + error * scipy.special.ndtri(tail), 1 - error * scipy.special.ndtri(tail)
-        nis.append((mean, float(low), float(high)))
-    return _Tested(nis, *_correlate(white[classes >= 0], filter.knows_gain))
-
-
-def _correlate(white: Float[np.ndarray, "rows m"], exact: bool) -> tuple[float, float]:
-    """Correlation over one message, and the p-value of those over up to ten; `exact`: innovations are independent."""
-    rows, count = len(white), int(np.sum(~np.isnan(white)))
-    lags = min(LAGS, rows // 10)
-    power = np.nansum(white**2)
-    products = [white[lag:] * white[:-lag] for lag in range(1, lags + 1)]
-    r = np.array([np.nansum(product) for product in products]) / power
-    if exact:
-        squared = count * (rows + 2) * r**2 / (rows - np.arange(1, lags + 1))
-    else:
-        sums = [average_correlated(np.nansum(product, axis=1)) for product in products]
-        squared = np.array([(mean / error) ** 2 if error > 0 else 0.0 for mean, error in sums])
-    return float(r[0]), float(scipy.special.gammaincc(lags / 2, np.sum(squared) / 2))
+    return Declared(filter, link, edges, deviation, z, u), np.where(heard, np.searchsorted(edges, log_size), -1)
 
 
 def _find_bias(declared: Declared, scales: Refit) -> DeclaredBias | None:
-    """Fit a bias of each output beside the scales; None where the likelihood does not take it, at 1 %."""
+    """Return the bias of each output that fits beside the scales; None where it is not significant, at 1 %."""
     filter = declared.filter
     vary = not (isinstance(filter.plant, AbstractPlant) and isinstance(filter.sensor, AbstractSensor))
     if vary or declared.place.outputs is None:
@@ -324,34 +283,67 @@ def _find_bias(declared: Declared, scales: Refit) -> DeclaredBias | None:
     gain = best.likelihood - scales.likelihood
     if gain < scipy.special.gammainccinv(1, LEVEL):  # half of a chi-squared number with two degrees of freedom
         return None
+    # best.logs: scale of each class, then the bias's deviation over the root of its memory, then the memory.
     count = declared.classes
     rate, time = np.exp(best.logs[count:])
     low, high = (float(np.exp(find_end(declared, best, count + 1, sign))) for sign in (-1, 1))
-    highest = max(find_end(declared, best, number, 1) for number in range(count))
-    white, most = (float(np.exp(-log / 2)) for log in (np.max(best.logs[:count]), highest))
-    return DeclaredBias(rate * np.sqrt(time) * declared.deviation, float(time), low, high, white, most, gain)
+    # A scale s = (white / declared deviation)^2: declared over white is s^-1/2, smallest for the largest s.
+    largest, largest_end = (
+        np.max(best.logs[:count]),
+        max(find_end(declared, best, number, 1) for number in range(count)),
+    )
+    return DeclaredBias(
+        deviation=rate * np.sqrt(time) * declared.deviation,
+        time=float(time),
+        time_low=low,
+        time_high=high,
+        times_white=float(np.exp(-largest / 2)),
+        times_white_low=float(np.exp(-largest_end / 2)),
+        gain=gain,
+    )
 
 
-def _judgement(
+def _make_judgement(
     declared: Declared,
     classes: Int[np.ndarray, " steps"],
-    tested: tuple[_Tested, _Tested],
+    tested: tuple[InnovationTests, InnovationTests],
     scales: tuple[np.ndarray, np.ndarray, np.ndarray],
     bias: DeclaredBias | None,
 ) -> DeclaredJudgement:
-    """Put together what was found, class by class."""
-    before, again = tested
+    """Return the judgement of what was found, class by class.
+
+    `tested`: before and after the refit. `scales`: of each class, with the ends of their intervals.
+    """
+    before, after = tested
     place, results = declared.place, []
     for number, (nis, low, high) in enumerate(before.nis):
         rows = declared.z[classes == number]
         size = np.exp(np.mean(np.log(_declared_variances(place, rows)), axis=1))
         count = int(np.sum(~np.isnan(rows[:, place.values])))
-        ends = (float(values[number]) for values in scales)
-        results.append(DeclaredClass(float(size.min()), float(size.max()), count, nis, low, high, *ends))
+        scale, scale_low, scale_high = (float(values[number]) for values in scales)
+        results.append(
+            DeclaredClass(
+                low=float(size.min()),
+                high=float(size.max()),
+                numbers=count,
+                nis=nis,
+                nis_low=low,
+                nis_high=high,
+                scale=scale,
+                scale_low=scale_low,
+                scale_high=scale_high,
+            )
+        )
     names = first(declared.filter.sensor).outputs
-    outputs = tuple(names[i] for i in place.outputs or ())
-    correlations = before.correlation, before.p_value, again.correlation, again.p_value
-    return DeclaredJudgement(outputs, tuple(results), *correlations, bias)
+    return DeclaredJudgement(
+        outputs=tuple(names[i] for i in place.outputs or ()),
+        classes=tuple(results),
+        correlation=before.correlation,
+        p_value=before.p_value,
+        refit_correlation=after.correlation,
+        refit_p_value=after.p_value,
+        bias=bias,
+    )
 
 
 def _say_bias(bias: DeclaredBias, unit: str) -> list[str]:
@@ -385,5 +377,5 @@ def _say_scale(one: DeclaredClass, several: bool) -> list[str]:
 
 
 def _round(value: float) -> str:
-    """Return a number of two digits, as it is said."""
+    """Return a number, rounded to two digits, as text."""
     return f"{float(f'{value:.2g}'):,.15g}"

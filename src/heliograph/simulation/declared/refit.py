@@ -90,13 +90,13 @@ def find_place(filter: ToldFilter, link: int) -> Place:
     before = sum(affine.memory.announced for affine in maps[:link])
     columns = list(range(before, before + maps[link].memory.announced))
     of_link = np.flatnonzero(numbers_of_outputs(first(filter.link))[:, columns].any(axis=1)).tolist()
-    whole = len(of_link) == len(filter.values)
+    whole = len(of_link) == len(filter.values)  # all that is received comes over this link
     outputs = list(range(len(sensor.outputs))) if whole else of_link
     return Place(
-        maps[link],
-        [filter.numbers[column] for column in columns],
-        [filter.values[row] for row in of_link],
-        outputs if whole or len(sensor.outputs) == len(filter.values) else None,
+        told=maps[link],
+        numbers=[filter.numbers[column] for column in columns],
+        values=[filter.values[row] for row in of_link],
+        outputs=outputs if whole or len(sensor.outputs) == len(filter.values) else None,
     )
 
 
@@ -114,6 +114,7 @@ class ScaledNoise(eqx.Module):
         scale = jnp.asarray(self.scales)[jnp.sum(size > jnp.asarray(self.edges))]
 
         def rescale(leaf: object) -> object:
+            """Return a noise with its covariance scaled; anything else as it is."""
             return Gaussian(scale * leaf.covariance, leaf.mean) if isinstance(leaf, AbstractNoise) else leaf
 
         scaled: AbstractRandomAffine = jax.tree.map(rescale, link, is_leaf=_is_noise)
@@ -133,7 +134,7 @@ def list_declaring(filter: ToldFilter) -> list[int]:
 
 @in_float64
 def _declares(affine: Told) -> bool:
-    """Return whether a map takes its Gaussian noise from the number that it is told."""
+    """Return whether a map takes its Gaussian noise from the number it is told: moving the number moves the noise."""
     if isinstance(affine.make, GainTold):
         return False
     typical = np.asarray(affine.typical)
@@ -143,6 +144,7 @@ def _declares(affine: Told) -> bool:
 
 
 def _list_noises(link: AbstractRandomAffine) -> list[AbstractNoise]:
+    """Return all noises inside a link."""
     return [leaf for leaf in jax.tree.leaves(link, is_leaf=_is_noise) if _is_noise(leaf)]
 
 
@@ -151,17 +153,18 @@ def _is_noise(leaf: object) -> bool:
 
 
 def refit_filter(declared: Declared, logs: Array) -> ToldFilter:
-    """Return the filter with the link's noise scaled, and a bias of each of its outputs with two numbers more.
+    """Return the filter with the link's noise scaled, and a bias of each of its outputs where two numbers describe one.
 
     Args:
         declared: the filter and the recording.
-        logs: logarithms of the scale of each class, and of a bias its deviation, in units of that declared, over the
-            root of its memory, which data tell better than the deviation, and its memory, in the time of the plant
-            (classes,) or (classes + 2,).
+        logs: logarithms of the scale of each class (classes,). With a bias (classes + 2,): then of its deviation over
+            the root of its memory, in units of the deviation declared, which data tell better than the deviation
+            itself; and of its memory, in the time of the plant.
     """
     filter, numbers, place = declared.filter, jnp.exp(jnp.asarray(logs)), declared.place
 
     def rescale(leaf: object) -> object:
+        """Return the judged link's map with its noise scaled; anything else as it is."""
         if not isinstance(leaf, Told) or leaf.memory.identity != place.told.memory.identity:
             return leaf
         scaled = ScaledNoise(leaf.make, declared.edges, numbers[: declared.classes])
@@ -203,15 +206,15 @@ class Refit(NamedTuple):
 
 def refit_scales(declared: Declared) -> Refit:
     """Fit the scale of each class, with everything else as the filter has it."""
-    return _search(declared, np.zeros(declared.classes))
+    return _maximise(declared, np.zeros(declared.classes))
 
 
 def refit_with_bias(declared: Declared, scales: Refit) -> Refit:
     """Fit the scales, and deviation and memory of a bias of each output, from scales without one."""
     step = usual_step(declared)
-    white = scales.logs - np.log(4)
+    white = scales.logs - np.log(4)  # the search begins with three quarters of the variance in the bias
     starts = [np.append(white, [(np.mean(scales.logs) - np.log(step)) / 2, np.log(time * step)]) for time in TIMES]
-    return max((_search(declared, start) for start in starts), key=lambda refit: refit.likelihood)
+    return max((_maximise(declared, start) for start in starts), key=lambda refit: refit.likelihood)
 
 
 def usual_step(declared: Declared) -> float:
@@ -231,28 +234,34 @@ def find_end(declared: Declared, best: Refit, number: int, sign: int) -> float:
         number: which of the numbers.
         sign: 1 for the upper end, -1 for the lower one.
     """
-    others = best
+    constrained = best
 
-    def fall(distance: float) -> float:
-        nonlocal others
-        start = others.logs.copy()
+    def miss(distance: float) -> float:
+        """Return by how much the likelihood has fallen at this distance, less what it falls at the end."""
+        nonlocal constrained  # each search starts from the last one's result
+        start = constrained.logs.copy()
         start[number] = best.logs[number] + sign * distance
-        others = _search(declared, start, fixed=number)
-        return best.likelihood - others.likelihood - REACH
+        constrained = _maximise(declared, start, fixed=number)
+        return best.likelihood - constrained.likelihood - REACH
 
+    # Doubled until the end is passed, then halved.
     near, far = 0.0, 0.25
-    while fall(far) < 0:
+    while miss(far) < 0:
         near, far = far, 2 * far
         if far > FARTHEST:
             return sign * np.inf
     while far - near > CLOSE:
         middle = (near + far) / 2
-        near, far = (middle, far) if fall(middle) < 0 else (near, middle)
+        near, far = (middle, far) if miss(middle) < 0 else (near, middle)
     return float(best.logs[number] + sign * far)
 
 
-def _search(declared: Declared, start: Float[np.ndarray, " numbers"], fixed: int | None = None) -> Refit:
-    """Climb the likelihood from a start, all numbers free but one that is fixed."""
+def _maximise(declared: Declared, start: Float[np.ndarray, " numbers"], fixed: int | None = None) -> Refit:
+    """Return the maximum of the likelihood found from a start.
+
+    `start`: logarithms of each class's scale and, with a bias, its two, as of `refit_filter`. `fixed`: the index of one
+    that stays; None if all are free.
+    """
     # Limits of the logarithms: FARTHEST nats either way; of a bias's memory FAST steps and SLOW recordings.
     free = np.arange(len(start)) != fixed
     low, high = np.full(len(start), -FARTHEST), np.full(len(start), FARTHEST)
@@ -261,18 +270,18 @@ def _search(declared: Declared, start: Float[np.ndarray, " numbers"], fixed: int
         low[-1], high[-1] = np.log(FAST * step), np.log(SLOW * len(declared.z) * step)
     likelihood, steps = Likelihood(declared), DIFFERENCE * np.eye(len(start))[free]
 
-    def lost(logs: Float[np.ndarray, " free"]) -> tuple[float, Float[np.ndarray, " free"]]:
+    def compute_loss(logs: Float[np.ndarray, " free"]) -> tuple[float, Float[np.ndarray, " free"]]:
         """Return -l and its slope by central differences, all points in one call."""
         every = start.copy()
         every[free] = logs
-        points = np.clip(np.stack([every, *(every + steps), *(every - steps)]), low, high)  # flat beyond
+        points = np.clip(np.stack([every, *(every + steps), *(every - steps)]), low, high)  # flat beyond the limits
         values = -np.nan_to_num(over_runs(likelihood, points), nan=-LOST)
         above, below = np.split(values[1:], 2)
         return float(values[0]), (above - below) / (2 * DIFFERENCE)
 
     if not free.any():
-        return Refit(start, -lost(start[free])[0])
-    found = scipy.optimize.minimize(lost, start[free], jac=True, method="BFGS", options={"gtol": SLOPE})
+        return Refit(start, -compute_loss(start[free])[0])
+    found = scipy.optimize.minimize(compute_loss, start[free], jac=True, method="BFGS", options={"gtol": SLOPE})
     logs = start.copy()
     logs[free] = found.x
     return Refit(np.clip(logs, low, high), -float(found.fun))

@@ -72,6 +72,7 @@ def _describe_node(network: HasNodes, name: str, claims: Mapping[str, str]) -> s
 
 
 def _list_senders(relays: RelayNetwork | None, name: str) -> str:
+    """Return in words who sends to a node in any slot."""
     slots = () if relays is None else relays.slots
     return join_names(list(dict.fromkeys(sender for slot in slots for sender in slot.get(name, {}))))
 
@@ -89,7 +90,7 @@ def list_shared(network: HasNodes) -> list[str]:
         for row, memory in zip(places[name].tolist(), memories(channel).values(), strict=True):
             nodes.setdefault(row, []).append(name)
             names[row] = type(memory).__name__ if memory.name is None else repr(memory.name)
-    return [f"fading {names[row]}: {join_names(of)}" for row, of in nodes.items() if len(of) > 1]
+    return [f"fading {names[row]}: {join_names(sharing)}" for row, sharing in nodes.items() if len(sharing) > 1]
 
 
 def list_rounded(network: HasNodes) -> list[str]:
@@ -106,20 +107,23 @@ def text_of(network: HasNodes) -> str:
 
 
 def short_text_of(network: HasNodes) -> str:
-    """Return the diagram in as many and as long lines as any object is shown in; … stands for what is left out."""
+    """Return the diagram cut to the lines, and their length, that any object is shown in; … stands for the rest."""
     lines = _format_lines(network)
-    left = len(lines) - LINES
-    lines = [*lines[: LINES - 1], f"… {left + 1} more lines (heliograph check shows all)"] if left > 0 else lines
+    if len(lines) > LINES:
+        hidden = len(lines) - (LINES - 1)
+        lines = [*lines[: LINES - 1], f"… {hidden} more lines (heliograph check shows all)"]
     return "\n".join(cut(line) for line in lines)
 
 
 def _format_lines(network: HasNodes) -> list[str]:
+    """Return the title, and a line for each part with its name in a column."""
     parts = diagram(network)
     width = max(len(line.name) for line in parts)
     return [_make_title(network), *(f"{line.name:{width}}  {line.words}" for line in parts)]
 
 
 def _make_title(network: HasNodes) -> str:
+    """Return a title such as "Network of 3 nodes"."""
     return f"Network of {len(network.nodes)} node{'s' * (len(network.nodes) > 1)}"
 
 

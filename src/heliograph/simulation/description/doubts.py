@@ -69,8 +69,10 @@ def doubts_before_data(network: Network) -> list[Doubt]:
     lines += [Doubt(False, f"digits: {words}; make tables {DOUBLE}") for words in list_rounded(network)]
     lines += [Doubt(False, f"shared, so that losses come together: {words}") for words in list_shared(network)]
     lines += [Doubt(False, f"by XLA, which takes longer: {words}") for words in list_fallbacks(network)]
-    if those := list_sequential(network):
-        lines.append(Doubt(False, f"row by row however long a recording is, since not linear in its data: {those}"))
+    if sequential := list_sequential(network):
+        lines.append(
+            Doubt(False, f"row by row however long a recording is, since not linear in its data: {sequential}")
+        )
     lines += [*_find_declared_noise(network), *_find_reservations(network), *_find_overloads(network)]
     parts = separate_nodes(network)
     if len(parts) > 1:
@@ -98,10 +100,12 @@ def _find_unobservable(network: Network) -> Iterator[Doubt]:
     if not np.isfinite(matrix).all():
         yield Doubt(False, "observability: not judged, the derivatives of plant or sensors are no numbers")
         return
-    # Rows and states by their size, so that no unit matters.
-    rows = matrix / np.where(size := np.linalg.norm(matrix, axis=1, keepdims=True), size, 1.0)
-    columns = np.where(size := np.linalg.norm(rows, axis=0), size, 1.0)
-    _, singular, right = np.linalg.svd(rows / columns)
+    # Rows and then columns scaled to length 1, so that no unit matters; rows of zeros stay.
+    lengths = np.linalg.norm(matrix, axis=1, keepdims=True)
+    rows = matrix / np.where(lengths > 0, lengths, 1.0)
+    lengths = np.linalg.norm(rows, axis=0)
+    _, singular, right = np.linalg.svd(rows / np.where(lengths > 0, lengths, 1.0))
+    # States with a part in the null space.
     rank = int(np.sum(singular > HIDDEN * max(singular[0], 1e-300)))
     hidden = np.abs(right[rank:]).max(axis=0, initial=0.0) > np.sqrt(HIDDEN)
     names = [repr(name) for name, unseen in zip(network.states, hidden, strict=True) if unseen]
@@ -145,15 +149,19 @@ def _warn_if_unbounded(network: Network, what: str, serious: bool) -> Iterator[D
 def _find_unheard(network: Network) -> Iterator[Doubt]:
     """Yield sums of links whose mean gains cancel, and links of mean gain zero; linear filters hear nothing of them."""
     for name, node in network.nodes.items():
-        if not isinstance(node, Node) or not isinstance(channel := first(node.channel), Superposed):
+        if not isinstance(node, Node):
             continue
+        channel = first(node.channel)
+        if not isinstance(channel, Superposed):
+            continue
+        # E z = sum_i E[G_i] y_i, y_i the outputs that link i carries: by states where the sensor is a matrix.
         links = [np.asarray(redraw_modes_each_step(link).moments(1).mean)[:-1, :-1] for link in channel.maps]
         matrix = matrix_of(first(node.sensor)) if not channel.past else None
         sensed = np.eye(channel.inputs) if matrix is None else np.asarray(matrix)
-        heard = [mean @ sensed[list(at)] for mean, at in zip(links, channel.places, strict=True)]
+        heard = [mean @ sensed[list(outputs)] for mean, outputs in zip(links, channel.places, strict=True)]
         if not np.any(np.abs(sum(heard)) > CANCELLED * sum(np.abs(mean) for mean in heard)):
-            say = "a linear filter learns nothing of it; compensate phases and signs at the transmitters"
-            yield Doubt(True, f"unheard: what adds up at {name!r} has mean gain 0: {say}")
+            advice = "a linear filter learns nothing of it; compensate phases and signs at the transmitters"
+            yield Doubt(True, f"unheard: what adds up at {name!r} has mean gain 0: {advice}")
             continue
         silent = [f"link{i}" for i, mean in enumerate(links, 1) if not np.any(mean)]
         if silent:
@@ -162,10 +170,13 @@ def _find_unheard(network: Network) -> Iterator[Doubt]:
 
 def _find_declared_noise(network: Network) -> Iterator[Doubt]:
     """Yield the nodes whose messages declare their noise, which is true as far as a recording says."""
-    names = [name for name, node in network.nodes.items() if isinstance(node, Node) for filter in node.filters.values()
-             if isinstance(filter, ToldFilter) and list_declaring(filter)]  # fmt: skip
+    names = []
+    for name, node in network.nodes.items():
+        told = [one for one in node.filters.values() if isinstance(one, ToldFilter)] if isinstance(node, Node) else []
+        if any(list_declaring(one) for one in told):
+            names.append(name)
     if names:
-        who = join_names([repr(name) for name in dict.fromkeys(names)])
+        who = join_names([repr(name) for name in names])
         yield Doubt(
             False, f"declared: noise is taken as the messages of {who} say it; `heliograph run --report` judges it"
         )
@@ -190,9 +201,10 @@ def _find_other_beliefs(network: Network) -> Iterator[Doubt]:
         if belief.parts == (CHANNEL,) and belief.node in forgetful.get(belief.filter, ()):
             continue  # said already, with what to do
         alike.setdefault((belief.lowered, belief.filter, belief.parts), []).append(belief)
-    for (lowered, _, _), of in alike.items():
-        more = f" (and at {join_names([repr(belief.node) for belief in of[1:]])})" if len(of) > 1 else ""
-        yield Doubt(lowered, f"another world: {of[0].words}{more}{', so that its claim is nominal' * lowered}")
+    for (lowered, _, _), beliefs in alike.items():
+        more = f" (and at {join_names([repr(belief.node) for belief in beliefs[1:]])})" if len(beliefs) > 1 else ""
+        consequence = ", so that its claim is nominal" if lowered else ""
+        yield Doubt(lowered, f"another world: {beliefs[0].words}{more}{consequence}")
 
 
 def _find_forgetful_filters(network: Network) -> Iterator[Doubt]:
@@ -205,7 +217,7 @@ def _find_forgetful_filters(network: Network) -> Iterator[Doubt]:
 
 
 def _leave_out_told(channel: AbstractRandomAffine) -> AbstractRandomAffine:
-    """Return a channel as it is once its receiver is told: what is told is no memory that it has to have."""
+    """Return a channel as its receiver knows it: what it is told at typical values, since that takes no memory."""
     link, _, numbers = separate_told(channel)
     return believe_typical(link) if numbers else channel
 

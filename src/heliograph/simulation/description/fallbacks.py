@@ -10,7 +10,7 @@ from heliograph.engine.choice import explain_refusal
 from heliograph.filters.base import AbstractFilter
 from heliograph.model.sensor import without_output_names
 from heliograph.numerics.types import PyTree
-from heliograph.simulation.centres.mesh import DENSE, build_mesh
+from heliograph.simulation.centres.mesh_building import DENSE, build_mesh
 from heliograph.simulation.network import Network
 
 SHOWN = 3  # of many that are refused for one reason
@@ -21,13 +21,13 @@ def list_fallbacks(network: Network) -> list[str]:
     by_reason: dict[str, list[str]] = {}
     for who, why in (*_find_refused_filters(network), *_find_refused_meshes(network)):
         by_reason.setdefault(why, []).append(who)
-    return [f"{_join(those)}: {why}" for why, those in by_reason.items()]
+    return [f"{_join(refused)}: {why}" for why, refused in by_reason.items()]
 
 
 def list_sequential(network: Network) -> str:
     """Return which filters go row by row however long a recording is, "" if none does: those not linear in its data."""
-    those = [who for who, filter in _list_filters(network) if not filter.is_linear]
-    return _join(those) if those else ""
+    sequential = [who for who, filter in _list_filters(network) if not filter.is_linear]
+    return _join(sequential) if sequential else ""
 
 
 def _list_filters(network: Network) -> Iterator[tuple[str, AbstractFilter]]:
@@ -49,6 +49,7 @@ def _find_refused_filters(network: Network) -> Iterator[tuple[str, str]]:
 
 
 def _step(filter: AbstractFilter, *arguments: jax.Array) -> PyTree:
+    """Return what one step of a filter does, as it would be compiled."""
     state, z, u, k = arguments
     return filter.step(state, z, u, k)
 
@@ -62,5 +63,6 @@ def _find_refused_meshes(network: Network) -> Iterator[tuple[str, str]]:
 
 
 def _join(names: list[str]) -> str:
+    """Return names in words, the first SHOWN of many and how many more there are."""
     more = len(names) - SHOWN
     return f"{', '.join(names[:SHOWN])} and {more} more" if more > 0 else join_names(names)

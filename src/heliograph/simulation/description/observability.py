@@ -28,7 +28,8 @@ def make_observability_matrix(
     """Return d(y_1, ..., y_steps)/dx_0 at a state, all sensors stacked, with inputs of 1."""
     u = jnp.ones(len(plant.inputs))
 
-    def outputs(x: jax.Array) -> jax.Array:
+    def compute_outputs(x: jax.Array) -> jax.Array:
+        """Return y_1, ..., y_steps of all sensors from x_0, without noise."""
         results = []
         for _ in range(steps):
             x = plant.transition(x, u)
@@ -36,4 +37,4 @@ def make_observability_matrix(
         return jnp.concatenate(results)
 
     with jax.enable_x64(True):
-        return np.asarray(jax.jacfwd(outputs)(jnp.asarray(state)))
+        return np.asarray(jax.jacfwd(compute_outputs)(jnp.asarray(state)))

@@ -54,17 +54,18 @@ def _warn_unseen_at_end(network: Network, record: Record) -> Iterator[str]:
     for node, label, filter, sensors in _find_filters(network):
         if not isinstance(getattr(filter, "transform", None), Linearization):
             continue
-        if all(is_linear(plant, sensor) for sensor in sensors) or any(first(one) is not one for one in sensors):
+        varies = any(first(sensor) is not sensor for sensor in sensors)
+        if varies or all(is_linear(plant, sensor) for sensor in sensors):
             continue
         means = np.asarray(record.estimates[node][label].mean)
         if len(means) <= LAST or not np.all(np.isfinite(means[[-1 - LAST, -1]])):
             continue
         # Over one step first, which is cheap: hardly any recording ends so.
-        here, start, end = [first(sensor) for sensor in sensors], np.asarray(plant.initial_mean), means[-1]
-        if not np.any(_find_shown(plant, here, start, 1) & ~_find_shown(plant, here, end, 1)):
+        constant, start, end = [first(sensor) for sensor in sensors], np.asarray(plant.initial_mean), means[-1]
+        if not np.any(_find_shown(plant, constant, start, 1) & ~_find_shown(plant, constant, end, 1)):
             continue
-        unseen = _find_shown(plant, here, start) & ~_find_shown(plant, here, end)
-        unseen &= ~_find_shown(plant, here, means[-1 - LAST])
+        unseen = _find_shown(plant, constant, start) & ~_find_shown(plant, constant, end)
+        unseen &= ~_find_shown(plant, constant, means[-1 - LAST])
         for i in np.flatnonzero(unseen):
             name = network.states[i]
             if name not in limited:
@@ -88,19 +89,19 @@ def _warn_at_limits(network: Network, record: Record) -> Iterator[str]:
         for place, *limits in limited.limits:
             mean = np.asarray(estimate.mean)[:, place]
             deviation = np.sqrt(np.maximum(np.asarray(estimate.covariance)[:, place, place], 0.0))
-            for limit in filter(np.isfinite, limits):
-                at = (np.abs(mean - limit) <= HELD * (1 + CLOSE) * deviation) & (deviation > 0)
-                at &= np.ptp(limits) > APART * deviation
-                if np.count_nonzero(at) > MOST * len(mean):
+            for limit in (end for end in limits if np.isfinite(end)):
+                held = (np.abs(mean - limit) <= HELD * (1 + CLOSE) * deviation) & (deviation > 0)
+                held &= np.ptp(limits) > APART * deviation
+                if np.count_nonzero(held) > MOST * len(mean):
                     yield (
                         f"{node}/{label}: {network.states[place]!r} is held at its limit {limit:g} in "
-                        f"{np.count_nonzero(at)} of {len(mean)} rows, as where what arrives puts it beyond: if it is "
+                        f"{np.count_nonzero(held)} of {len(mean)} rows, as where what arrives puts it beyond: if it is "
                         "not there, a sensor, the plant or the limit is off"
                     )
 
 
 def _find_filters(network: Network) -> Iterator[tuple[str, str, AbstractFilter, Sequence[AnySensor]]]:
-    """Yield every filter that claims a covariance, with its places and the sensors that it hears."""
+    """Yield (node, name, filter, sensors that it hears) of every filter that claims a covariance."""
     every = list_sensors(network)
     for name, node in network.nodes.items():
         sensors = [node.sensor] if isinstance(node, Node) else every

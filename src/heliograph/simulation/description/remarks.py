@@ -13,14 +13,14 @@ Place = tuple[str, str]  # node and filter
 
 
 def find_remarking(network: Network) -> tuple[Place, ...]:
-    """Return the places of the filters that may say something."""
+    """Return the places of the filters that may remark on their state."""
     places = [place for place in network.places if network.nodes[place[0]].filters[place[1]].remarks]
     fused = [(FUSED, name) for name, one in network.fused.items() if isinstance(one, AbstractFilter) and one.remarks]
     return *places, *fused
 
 
 def list_remarks(network: Network, state: PyTree) -> Iterator[tuple[Place, Remark]]:
-    """Yield what each filter that may say something says of its state, with its place.
+    """Yield each remark that a filter makes on its state, with the filter's place.
 
     Args:
         network: the network.
@@ -34,6 +34,7 @@ def list_remarks(network: Network, state: PyTree) -> Iterator[tuple[Place, Remar
             yield (node, name), fusion.remark(central[name])
             continue
         place = network.places[node, name]
+        # A stack has all nodes of its first filter, then all of its second, and so on.
         row = place.filter * len(network.groups[network.kinds[place.kind].group]) + place.node
         of_filter = jax.tree.map(lambda leaf, r=row: leaf[r], alike[place.kind])
         yield (node, name), network.nodes[node].filters[name].remark(of_filter)

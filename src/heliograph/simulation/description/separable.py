@@ -34,6 +34,7 @@ def separate_nodes(network: Network) -> list[list[str]]:
 
 
 def _mask_measured(sensor: object) -> Bool[np.ndarray, " states"]:
+    """Return which states a linear sensor measures."""
     assert isinstance(sensor, LinearSensor)
     return np.asarray(np.any(np.asarray(sensor.matrix) != 0, axis=0))
 

@@ -16,7 +16,7 @@ Traced = tuple[Callable[..., Any], tuple[np.ndarray, ...]]
 
 
 def find_rounded_parts(network: HasNodes) -> dict[tuple[float, float], list[str]]:
-    """Return rounded numbers, as they were meant and as they are, with the parts of the network that hold them."""
+    """Return {(number as it was meant, as it is rounded): names of the parts of the network that hold it}."""
     parts: dict[tuple[float, float], list[str]] = {}
     seen: dict[int, tuple[float, float] | None] = {}  # of models, which nodes may share
     for name, model, functions in _yield_models(network):
@@ -29,17 +29,15 @@ def find_rounded_parts(network: HasNodes) -> dict[tuple[float, float], list[str]
 
 
 def _yield_models(network: HasNodes) -> Iterator[tuple[str, object, list[Traced]]]:
-    """Yield the models of a network, and their functions with arguments for these."""
+    """Yield (name, model, its functions with arguments for each) of plant, sensors, channels and what is shared."""
     plant, x, u = first(network.plant), np.zeros(len(network.states)), np.zeros(len(network.inputs))
     yield "plant", network.plant, [(plant.transition, (x, u)), (plant.noise_covariance, (u,))]
     for name, node in network.nodes.items():
         if isinstance(node, Node):
-            measured: list[Traced] = (
-                []
-                if isinstance(node.sensor, LinearSensor)
-                else [(first(node.sensor).typical(network.inputs).measure, (x,))]
-            )
-            yield f"sensor of {name}", node.sensor, measured
+            functions: list[Traced] = []
+            if not isinstance(node.sensor, LinearSensor):
+                functions = [(first(node.sensor).typical(network.inputs).measure, (x,))]
+            yield f"sensor of {name}", node.sensor, functions
             yield f"channel of {name}", node.channel, []
     if network.common is not None:
         yield "sensor and channel of all nodes", network.common, []
@@ -48,6 +46,7 @@ def _yield_models(network: HasNodes) -> Iterator[tuple[str, object, list[Traced]
 
 
 def _list_arrays(model: object, functions: list[Traced]) -> Iterator[Any]:
+    """Yield the arrays of a model, and those that its functions hold."""
     yield from (x for x in jax.tree.leaves(model) if isinstance(x, jax.Array | np.ndarray) and not is_traced(x))
     for function, arguments in functions:
         yield from _collect_arrays(function, *arguments)

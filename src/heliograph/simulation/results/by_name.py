@@ -33,7 +33,7 @@ def reports_by_name(
 
 
 def _name_arrivals(network: Network, name: str, arrived: np.ndarray) -> dict[str, SentReports]:
-    """Messages that arrived from each node's neighbours, 1 (or their ages) or NaN (..., rounds times neighbours)."""
+    """Return by node what arrived from its neighbours (..., rounds times neighbours): 1 or the age, NaN if lost."""
     neighbours = network.meshes[name].neighbours or {}
     reports = {}
     for i, node in enumerate(network.mesh_nodes(name)):
@@ -83,7 +83,7 @@ def collect_modes(network: Network, batch: PyTree) -> dict[tuple[str, str], np.n
 
 
 def collect_weighed(network: Network, batch: PyTree) -> dict[str, dict[str, Weighed]]:
-    """Innovations by component of the filters that weigh, by node and filter, from (time, filter, node, m) by kind."""
+    """Return the innovations of the filters that weigh, by node and filter, from (time, filter, node, m) by kind."""
     parts = batch.get("weighed", ())
     weighed: dict[str, dict[str, Weighed]] = {}
     for (node, name), (kind, f, i) in network.places.items() if parts else ():

@@ -125,18 +125,18 @@ def _normalise_square(
 
     `size`: what x is a difference of, for its rounding.
     """
-    # A missing component: zero, of variance 1, correlated with nothing.
-    there, n = ~np.isnan(x), x.shape[-1]
-    both = there[..., :, None] & there[..., None, :]
-    filled = np.where(both, covariance, np.eye(n) * ~there[..., None, :])
-    parts = filled.reshape(-1, n, n), np.where(there, x, 0.0).reshape(-1, n), np.nan_to_num(size).reshape(-1, n)
-    value = np.asarray(_measure_distances(*parts)).reshape(x.shape[:-1])
-    # Each missing component added nothing: 0^2 / 1.
-    return np.asarray(np.where(there.any(axis=-1), value, np.nan))
+    # A missing component counts as zero, of variance 1, correlated with nothing: it adds 0^2 / 1.
+    present, n = ~np.isnan(x), x.shape[-1]
+    both_present = present[..., :, None] & present[..., None, :]
+    filled = np.where(both_present, covariance, np.eye(n) * ~present[..., None, :])
+    errors, sizes = np.where(present, x, 0.0), np.nan_to_num(size)
+    squares = _square_distances(filled.reshape(-1, n, n), errors.reshape(-1, n), sizes.reshape(-1, n))
+    return np.asarray(np.where(present.any(axis=-1), np.asarray(squares).reshape(x.shape[:-1]), np.nan))
 
 
 @compile_on_call
-def _measure_distances(a: Array, x: Array, size: Array) -> Array:
+def _square_distances(a: Array, x: Array, size: Array) -> Array:
+    """Return x' A^-1 x of each row."""
     return jax.vmap(squared_distance)(jnp.asarray(a), jnp.asarray(x), jnp.asarray(size))
 
 
@@ -187,22 +187,22 @@ def consistency(
     by_step = np.divide(total.sum(axis=0), count, out=np.full(len(count), np.nan), where=count > 0)
     quantiles = np.array([(1 - level) / 2, (1 + level) / 2])
     ends = _bound_mean(freedom.sum(), present.sum(), quantiles)
-    every = np.stack([_bound_mean(f, c, quantiles) for f, c in zip(freedom.sum(axis=0), count, strict=True)])
-    apart = np.where(present, rows - total.sum() / present.sum(), 0.0)
-    correlation = _autocorrelation(apart, min(check_count("lags", lags), len(count) - 1))
+    ends_by_step = np.stack([_bound_mean(f, c, quantiles) for f, c in zip(freedom.sum(axis=0), count, strict=True)])
+    deviations = np.where(present, rows - total.sum() / present.sum(), 0.0)
+    correlation = _autocorrelation(deviations, min(check_count("lags", lags), len(count) - 1))
     return Consistency(
         mean=float(total.sum() / present.sum()),
         expected=float(freedom.sum() / present.sum()),
         interval=(float(ends[0]), float(ends[1])),
         means=by_step,
-        intervals=every,
+        intervals=ends_by_step,
         autocorrelation=correlation,
         autocorrelation_bound=float(scipy.special.ndtri(quantiles[1]) / np.sqrt(present.sum())),
     )
 
 
 def _bound_mean(degrees: float, count: int, quantiles: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
-    """Return the quantiles of the mean of `count` values with so many degrees of freedom together."""
+    """Return quantiles of the mean of `count` chi-squared values with so many degrees of freedom in all."""
     return np.asarray(2 * scipy.special.gammaincinv(degrees / 2, quantiles) / count) if count else np.full(2, np.nan)
 
 

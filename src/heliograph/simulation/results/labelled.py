@@ -17,10 +17,10 @@ if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
-LEVELS = ["node", "filter", "quantity", "component", "other"]
+LEVELS = ["node", "filter", "quantity", "component", "other"]  # of a table's columns
 Column = tuple[str, str, str, str, str]
 COVARIANCE: dict[str, Claim] = {f"covariance ({claim})": claim for claim in STRENGTH}
-SENT = ("saturated", "symbols")
+SENT = ("saturated", "symbols")  # fields of an Uplink
 MODES = "mode probability"
 
 
@@ -66,19 +66,20 @@ def record_fields(frame: "pd.DataFrame") -> dict[str, Any]:
     columns: dict[tuple[str, str, str], list[int]] = {}
     for i, column in enumerate(frame.columns):
         columns.setdefault(column[:3], []).append(i)
-    values = {key: frame.iloc[:, which].to_numpy().reshape(*lead, -1) for key, which in columns.items()}
+    values = {key: frame.iloc[:, places].to_numpy().reshape(*lead, -1) for key, places in columns.items()}
     # States as the truth, else the first mean, has them.
-    named = next((which for (_, _, quantity), which in columns.items() if quantity in ("truth", "mean")), [])
+    named = next((places for (_, _, quantity), places in columns.items() if quantity in ("truth", "mean")), [])
     states = tuple(frame.columns[i][3] for i in named)
     measurements = {node: z for (node, _, quantity), z in values.items() if quantity == "measurement"}
     estimates: dict[str, dict[str, Estimate]] = {node: {} for node in measurements}
     uplinks: dict[str, list[str]] = {}
     for (node, name, quantity), value in values.items():
         if quantity in COVARIANCE:
-            covariance = value.reshape(*lead, len(states), len(states))
-            moments = values[node, name, "mean"], covariance
-            modes, order = values.get((node, name, MODES)), [frame.columns[i][4] for i in columns[node, name, "mean"]]
+            # The last level numbers the states of attitudes.
+            order = [frame.columns[i][4] for i in columns[node, name, "mean"]]
             attitude = tuple(order.index(str(i)) for i in range(len(order) - order.count("")))
+            moments = values[node, name, "mean"], value.reshape(*lead, len(states), len(states))
+            modes = values.get((node, name, MODES))
             estimate = Estimate(*moments, COVARIANCE[quantity], modes, attitude=attitude)
             estimates.setdefault(node, {})[name] = estimate
         elif quantity == SENT[0]:
@@ -125,7 +126,7 @@ def _label_estimate(node: str, name: str, estimate: Estimate, states: Sequence[s
 
 def modes_of(estimates: Mapping[str, Mapping[str, Estimate]]) -> int:
     """Return the largest number of modes that a filter weighs; 0 where none weighs any."""
-    return max((read_modes(e).shape[-1] for of in estimates.values() for e in of.values()), default=0)
+    return max((read_modes(e).shape[-1] for filters in estimates.values() for e in filters.values()), default=0)
 
 
 def read_modes(estimate: Estimate) -> np.ndarray:
@@ -138,8 +139,8 @@ def without_padding(modes: np.ndarray | None) -> np.ndarray | None:
     """Return the modes' probabilities without those that are NaN at all times; None where nothing is left."""
     if modes is None:
         return None
-    there = ~np.isnan(modes).all(axis=tuple(range(modes.ndim - 1)))
-    return modes[..., there] if there.any() else None
+    used = ~np.isnan(modes).all(axis=tuple(range(modes.ndim - 1)))
+    return modes[..., used] if used.any() else None
 
 
 TIME = "time"
@@ -245,22 +246,22 @@ class FilterLabels:
                 for node, by_filter in self.by_node.items() for name, result in by_filter.items()]  # fmt: skip
 
     def fill(self, name: str, parts: Iterable[Placed[ArrayLike]]) -> np.ndarray:
-        """Fill a field with parts at their places along node, or node and filter; NaN where there is none.
+        """Return the array of a field with these parts at their places along node, or node and filter; NaN elsewhere.
 
         A part that is shorter than its axis, as measurements of a node may be, fills the beginning.
         """
         sizes = {"node": len(self.nodes), "filter": len(self.filters), "state": len(self.states)}
         sizes |= {"other": len(self.states), **self.rows, **self.lengths}
         axes = axes_of(name, list(self.rows))
-        whole, begin = np.full([sizes[axis] for axis in axes], np.nan), axes.index("node")
+        array, node_axis = np.full([sizes[axis] for axis in axes], np.nan), axes.index("node")
         for place, part in parts:
-            lengths = np.shape(part)[begin:]
-            where: Any = (*(slice(None),) * begin, *place, *map(slice, lengths))
-            whole[where] = part
-        return whole
+            lengths = np.shape(part)[node_axis:]
+            index: Any = (*(slice(None),) * node_axis, *place, *map(slice, lengths))
+            array[index] = part
+        return array
 
     def of_filters(self, name: str, value: Callable[[Any], ArrayLike]) -> np.ndarray:
-        """Fill a field with a value of each result at its place."""
+        """Return the array of a field with a value of each result at its place."""
         return self.fill(name, self.place(value))
 
     def claims(self) -> np.ndarray:
@@ -287,9 +288,8 @@ class FilterLabels:
         # Places of the senders in each fusion, -1 for none.
         senders, n, first = self.senders, len(self.states), next(iter(self.uplinks.values()))
         positions = np.full((len(self.uplinks), len(senders)), -1, dtype=np.int64)
-        leads = {name: getattr(first, name) for name in SENT}
-        parts = {name: np.zeros((*values.shape[: len(self.rows)], *positions.shape, n), values.dtype)
-                 for name, values in leads.items()}  # fmt: skip
+        like = {name: getattr(first, name) for name in SENT}
+        parts = {name: np.zeros((*v.shape[: len(self.rows)], *positions.shape, n), v.dtype) for name, v in like.items()}
         # Values by fusion and sender.
         for i, uplink in enumerate(self.uplinks.values()):
             for j, node in enumerate(uplink.nodes):
@@ -316,7 +316,7 @@ class FilterLabels:
         if any(state in units for state in self.states):
             coordinates["unit"] = (["state"], text([units.get(state, "") for state in self.states]))
         # Attributes for people; the claims are a variable too.
-        claims = [f"{node}/{name}: {result.claim}" for node, of in self.by_node.items() for name, result in of.items()]
+        claims = [f"{node}/{name}: {result.claim}" for node, r in self.by_node.items() for name, result in r.items()]
         attributes = {
             "title": title,
             "heliograph": heliograph.__version__,

@@ -17,10 +17,11 @@ def find_overloads(network: object) -> Overloads:
     """
     if not isinstance(network, Network):
         return {}
-    found = {
-        name: {
+    found: Overloads = {}
+    for name, node in network.nodes.items():
+        by_filter = {
             label: filter.overload for label, filter in node.filters.items() if isinstance(filter, LinearWordsFilter)
         }
-        for name, node in network.nodes.items()
-    }
-    return {name: of for name, of in found.items() if of}
+        if by_filter:
+            found[name] = by_filter
+    return found

@@ -20,18 +20,18 @@ if TYPE_CHECKING:  # an extra
 def choose_filters(
     known: Mapping[str, Mapping[str, object]], node: str | None, filters: Sequence[str] | None
 ) -> tuple[str, list[str]]:
-    """Choose the node and its filters to draw: the first with any, and all."""
-    there = [name for name, mine in known.items() if mine]
-    if not there or node not in (None, *there):
-        raise fail("node", f"one with filters: {', '.join(there) or 'there is none'}", repr(node))
-    chosen = there[0] if node is None else node
-    mine = list(known[chosen]) if filters is None else list(filters)
-    strange = [name for name in mine if name not in known[chosen]]
-    if strange or not mine:
+    """Return the node to draw, by default the first with filters, and its filters, by default all; raise at others."""
+    with_filters = [name for name, by_filter in known.items() if by_filter]
+    if not with_filters or node not in (None, *with_filters):
+        raise fail("node", f"one with filters: {', '.join(with_filters) or 'there is none'}", repr(node))
+    chosen = with_filters[0] if node is None else node
+    names = list(known[chosen]) if filters is None else list(filters)
+    unknown = [name for name in names if name not in known[chosen]]
+    if unknown or not names:
         raise fail(
-            f"filters of {chosen}", f"some of {', '.join(known[chosen])}", repr(strange[0]) if strange else "none"
+            f"filters of {chosen}", f"some of {', '.join(known[chosen])}", repr(unknown[0]) if unknown else "none"
         )
-    return chosen, mine
+    return chosen, names
 
 
 def state_places(states: Sequence[str] | None, known: Sequence[str]) -> list[int]:
@@ -66,10 +66,10 @@ def check_run(run: int, runs: int | None) -> None:
 
 
 def draw_state(
-    panel: "Axes", time: np.ndarray, estimates: Mapping[str, Estimate], which: tuple[Any, int], sigmas: float
+    panel: "Axes", time: np.ndarray, estimates: Mapping[str, Estimate], run_and_state: tuple[Any, int], sigmas: float
 ) -> None:
     """Draw one state of several estimates, of a run, with bands of +-`sigmas` claimed deviations."""
-    run, i = which
+    run, i = run_and_state
     for number, (name, estimate) in enumerate(estimates.items()):
         mean, variance = np.asarray(estimate.mean)[run][..., i], np.asarray(estimate.covariance)[run][..., i, i]
         deviation = np.sqrt(np.where(variance >= 0, variance, np.nan))
@@ -93,7 +93,10 @@ def draw_modes(
     clock: tuple[np.ndarray, Mapping[str, str]],
 ) -> "Axes":
     """Draw the probabilities of the modes of a node's filters: a colour for each filter, a style for each mode."""
-    weighing = {of: {f: e for f, e in mine.items() if e.modes is not None} for of, mine in estimates.items()}
+    weighing = {
+        name: {label: e for label, e in by_filter.items() if e.modes is not None}
+        for name, by_filter in estimates.items()
+    }
     node, chosen = choose_filters(weighing, node, filters)
     panel, styles = make_panels(None if axes is None else [axes], 1, *clock)[0], ("-", "--", ":", "-.")
     for number, name in enumerate(chosen):

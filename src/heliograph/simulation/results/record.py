@@ -164,11 +164,11 @@ class Record(Saved):
     def check_filter(self, node: str, name: str) -> None:
         """Raise ValueError unless the node has a filter of this name."""
         if name not in self.estimates.get(node, {}):
-            known = [f"{element}/{of}" for element, filters in self.estimates.items() for of in filters]
+            known = [f"{element}/{label}" for element, filters in self.estimates.items() for label in filters]
             raise fail("node and filter", f"one of {', '.join(known)}", f"{node}/{name}")
 
     def rmse(self, node: str, name: str) -> dict[str, float]:
-        """Root mean square error of each state over runs and the steps whose truth is known, in that state's unit.
+        """Return the root mean square error of each state, in its unit, over runs and the steps whose truth is known.
 
         Raises:
             ValueError: a recording has no truth, or there is no such filter.
@@ -203,7 +203,7 @@ class Record(Saved):
         """
         self.check_filter(node, name)
         if name not in self.weighed.get(node, {}):
-            weighing = [f"{element}/{of}" for element, filters in self.weighed.items() for of in filters]
+            weighing = [f"{element}/{label}" for element, filters in self.weighed.items() for label in filters]
             raise fail("node and filter", f"one that weighs, of a recording: {weighing}", f"{node}/{name}")
         return self.weighed[node][name].summarise()
 
@@ -247,8 +247,8 @@ class Record(Saved):
         check_title(dataset, RECORD)
         lead, nodes = ["run", TIME] if "run" in dataset.dims else [TIME], names_of(dataset, "node")
         measurement, length = read_values(dataset, "measurement", lead), read_values(dataset, "length", lead)
-        there = np.flatnonzero(read_values(dataset, "estimated", lead))
-        estimates: dict[str, dict[str, Estimate]] = {nodes[i]: {} for i in there}
+        estimated = np.flatnonzero(read_values(dataset, "estimated", lead))
+        estimates: dict[str, dict[str, Estimate]] = {nodes[i]: {} for i in estimated}
         fields = ("mean", "covariance", *(["modes"] if "modes" in dataset else []))
         for node, name, claim, values in each_filter(dataset, fields, lead):
             estimates[node][name] = read_estimate(dataset, claim, values)
@@ -313,12 +313,12 @@ class Record(Saved):
         node, filters = choose_filters(self.estimates, node, filters)
         places = state_places(states, self.states)
         check_run(run, self.runs)
-        which: Any = ... if self.runs is None else run
+        of_run: Any = ... if self.runs is None else run
         drawn = make_panels(axes, len(places), self.time, self.units)
         for panel, i in zip(drawn, places, strict=True):
-            draw_state(panel, self.time, {name: self.estimates[node][name] for name in filters}, (which, i), sigmas)
+            draw_state(panel, self.time, {name: self.estimates[node][name] for name in filters}, (of_run, i), sigmas)
             if self.truth is not None:
-                draw_truth(panel, self.time, self.truth[which][..., i])
+                draw_truth(panel, self.time, self.truth[of_run][..., i])
             panel.set_ylabel(label_with_unit(self.states[i], self.units))
         legend_outside(drawn[0])
         return drawn

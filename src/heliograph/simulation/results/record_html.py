@@ -65,12 +65,12 @@ def draw_record(record: Trajectories) -> str:
     one = record if runs is None else record.of_run(0)
     filters = dict(list(one.estimates[node].items())[:FILTERS])
     chosen = np.unique(np.linspace(0, rows - 1, min(rows, POINTS)).round().astype(int))
-    left = len(one.estimates[node]) - len(filters), len(one.states) - PANELS
-    more = [f"{count} more {what}" for count, what in zip(left, ("filters", "states"), strict=True) if count > 0]
-    more += [f"{len(chosen)} rows of {rows} drawn"] if len(chosen) < rows else []
+    left_out = {"filters": len(one.estimates[node]) - len(filters), "states": len(one.states) - PANELS}
+    notes = [f"{count} more {what}" for what, count in left_out.items() if count > 0]
+    notes += [f"{len(chosen)} rows of {rows} drawn"] if len(chosen) < rows else []
     panels = [_draw_panel(one, filters, i, chosen) for i in range(min(len(one.states), PANELS))]
     times = "".join(f"<span>{escape(_print_time(record.time[k]))}</span>" for k in (0, -1))
-    note = f"<div>{escape('; '.join(more))}</div>" if more else ""
+    note = f"<div>{escape('; '.join(notes))}</div>" if notes else ""
     return (
         '<div style="max-width:640px;font-size:13px;line-height:1.4">'
         f"<div><b>{escape(visible(title))}</b>, node {escape(visible(node))}</div>{_make_legend(filters, one)}"
@@ -99,16 +99,17 @@ def _draw_panel(record: Trajectories, filters: Mapping[str, Estimate], state: in
     truth = None if record.truth is None else np.asarray(record.truth)[chosen, state]
     low, high = _find_range([part for curve in curves for part in curve] + ([] if truth is None else [truth]))
 
-    def scaled(values: np.ndarray) -> np.ndarray:
+    def to_height(values: np.ndarray) -> np.ndarray:
+        """Return the heights of values in the drawing, downwards from the top."""
         return HIGH * (high - values) / (high - low)
 
     parts = []
     for colour, (mean, lower, upper) in zip(COLOURS, curves, strict=False):
         parts += [f'<path d="{d}" fill="{colour}" fill-opacity="0.2" stroke="none"/>'
-                  for d in _draw_outlines(scaled(lower), scaled(upper))]  # fmt: skip
-        parts.append(_draw_line(scaled(mean), colour))
+                  for d in _draw_outlines(to_height(lower), to_height(upper))]  # fmt: skip
+        parts.append(_draw_line(to_height(mean), colour))
     if truth is not None:
-        parts.append(_draw_line(scaled(truth), "currentColor", ' stroke-dasharray="4 3"'))
+        parts.append(_draw_line(to_height(truth), "currentColor", ' stroke-dasharray="4 3"'))
     (mean, _, upper), *_ = curves
     last = f"{mean[-1]:.4g}" + (f" ± {upper[-1] - mean[-1]:.2g}" if np.isfinite(upper[-1]) else "")
     name = escape(visible(label_with_unit(record.states[state], record.units)))
@@ -154,13 +155,13 @@ def _split_at_gaps(finite: np.ndarray) -> Iterator[np.ndarray]:
     yield from (piece for piece in np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1) if len(piece))
 
 
-def _draw_line(y: np.ndarray, colour: str, more: str = "") -> str:
-    """Return a curve, broken where there is no value."""
+def _draw_line(y: np.ndarray, colour: str, attributes: str = "") -> str:
+    """Return a curve as an SVG path with more attributes, broken where there is no value."""
     x = _places(len(y))
     d = "".join("M" + "L".join(f"{x[k]:.1f} {y[k]:.2f}" for k in piece) for piece in _split_at_gaps(np.isfinite(y)))
     return (
         f'<path d="{d}" fill="none" stroke="{colour}" stroke-width="1.5" vector-effect="non-scaling-stroke"'
-        f' stroke-linecap="round"{more}/>'
+        f' stroke-linecap="round"{attributes}/>'
     )
 
 

@@ -32,9 +32,9 @@ Result = TypeVar("Result", default=Record)  # of the reducer; a record where the
 
 @readable
 class OfStep(NamedTuple):
-    """Results of one step of one run.
+    """Results of one step of one run, as a reducer makes them.
 
-    Each step's results are stacked, but `ever` is one for all steps.
+    Those of all steps are stacked, but `ever`, which is one for the whole run.
 
     Args:
         sums: numbers that are summed over runs.
@@ -60,7 +60,7 @@ class AbstractReducer(Module, Generic[Result]):
         raise unwritten(self, "of_step")
 
     def summed(self, sums: OfStep, common: OfStep, count: np.ndarray) -> PyTree:
-        """Return the carry after all runs, from sums by batch (time, ..., batch) over `count` runs each.
+        """Return what `finish` takes of all runs, from sums by batch (time, ..., batch) over `count` runs each.
 
         `common` says of each part whether it is the same in all runs: it stands in the sums as of one run, (time, ...).
         """
@@ -158,7 +158,13 @@ def trajectories_record(network: Network, batch: PyTree, time: np.ndarray) -> Re
     }
     uplinks, reports = uplinks_by_name(network, batch["uplinks"]), reports_by_name(network, batch["reports"])
     return Record(
-        time, network.states, batch["truth"], measurements, estimates, uplinks, reports=reports,
+        time=time,
+        states=network.states,
+        truth=batch["truth"],
+        measurements=measurements,
+        estimates=estimates,
+        uplinks=uplinks,
+        reports=reports,
         transmissions=transmissions_of(network, batch.get("transmissions", {})),
         weighed=collect_weighed(network, batch),
-    )  # fmt: skip
+    )

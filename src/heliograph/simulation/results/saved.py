@@ -92,17 +92,18 @@ def save(dataset: "xr.Dataset", path: str | Path) -> None:
         ModuleNotFoundError: an extra is not installed.
     """
     path = file_path("file of results", path)
-    kind = _find_package(path)
-    import_module(kind)
+    package = _find_package(path)
+    import_module(package)
     # Names as text that any file can hold; floats without a fill value.
     plain = dataset.assign_coords(
         {name: (c.dims, _map_names(quote_for_file, c), c.attrs) for name, c in _texts(dataset)}
     )
     encoding: Any = {name: {"_FillValue": None} for name in plain.variables if plain[name].dtype.kind == "f"}
     if dataset["time"].dtype.kind == "M":
+        # Nanoseconds, so that no date is rounded.
         encoding["time"] = {"units": "nanoseconds since 1970-01-01", "dtype": "int64"}
     # A folder, or a file, that replaces an earlier one when it is complete.
-    if kind == "zarr":
+    if package == "zarr":
         check_replaceable(path, MARK)
         with whole_folder(path) as folder, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # that the format's text does not have strings or consolidation yet
@@ -121,14 +122,14 @@ def open_dataset(path: str | Path) -> "xr.Dataset":
         ModuleNotFoundError: an extra is not installed.
     """
     path = file_path("file of results", path)
-    kind = _find_package(path)
-    import_module(kind)
+    package = _find_package(path)
+    import_module(package)
     import xarray as xr
 
     if not path.exists():
         raise fail(str(path), "a file of results", "nothing of that name")
     try:
-        with xr.open_dataset(path, engine=kind, decode_timedelta=False) as stored:
+        with xr.open_dataset(path, engine=package, decode_timedelta=False) as stored:
             dataset = stored.load()
     except (OSError, ValueError, KeyError) as error:
         raise fail(str(path), "a file of results that can be read", f"{type(error).__name__}: {error}") from None

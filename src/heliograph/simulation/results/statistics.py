@@ -53,7 +53,8 @@ class ErrorStatistics:
         step = 0 if self.failed is None else int(np.argmax(self.failed > 0))
         return f"no valid {what} from step {step} in {self.failed_runs} of {self.runs} runs"
 
-    def _tell(self) -> None:
+    def _warn_of_failures(self) -> None:
+        """Warn where figures are NaN since some run had no valid estimate."""
         if self.failed_runs:
             warnings.warn(self.failure, stacklevel=3)
 
@@ -85,34 +86,34 @@ class ErrorStatistics:
 
     def mean_trace(self) -> float:
         """Return the mean over time of the trace of the claimed covariance."""
-        self._tell()
+        self._warn_of_failures()
         return float(np.trace(self.claimed(), axis1=-2, axis2=-1).mean())
 
     def rmse(self) -> tuple[float, float]:
-        """Root of the mean over runs and steps of the squared error summed over the state, and its standard error.
+        """Return the root of the mean over runs and steps of the squared error of all states, and its standard error.
 
         The error of a root: se(mse) / (2 rmse), with se(mse) from the batch means.
         """
-        self._tell()
+        self._warn_of_failures()
         squared = np.trace(self.outer, axis1=-2, axis2=-1).mean(axis=1)
         return _root_mean(squared, self.count)
 
     def rmse_by_state(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the root mean squared error of each state over runs and steps, and its standard error: (n,), (n,)."""
-        self._tell()
+        self._warn_of_failures()
         squared = np.diagonal(self.outer, axis1=-2, axis2=-1).mean(axis=1)
         results = [_root_mean(squared[:, i], self.count) for i in range(squared.shape[1])]
         return np.array([root for root, _ in results]), np.array([error for _, error in results])
 
     def deviation_by_state(self) -> np.ndarray:
         """Return the root of the mean over runs and steps of each state's claimed variance, (n,)."""
-        self._tell()
+        self._warn_of_failures()
         variance = np.diagonal(self.claimed(), axis1=-2, axis2=-1).mean(axis=0)
         return np.sqrt(np.where(variance >= 0, variance, np.nan))
 
     def rmse_over_time(self) -> np.ndarray:
         """Return the root mean squared error at each step, (time,)."""
-        self._tell()
+        self._warn_of_failures()
         rmse: np.ndarray = np.sqrt(np.trace(self.actual(), axis1=-2, axis2=-1))
         return rmse
 
@@ -121,7 +122,7 @@ class ErrorStatistics:
 
         The interval is from the batch means, so correlation over time within a run does not matter.
         """
-        self._tell()
+        self._warn_of_failures()
         n = self.outer.shape[-1]
         mean, error = _average_batches(self.nees.mean(axis=1) / n, self.count)
         width = (
@@ -130,7 +131,7 @@ class ErrorStatistics:
         return mean, mean - width, mean + width
 
     def worst_direction(self) -> "WorstDirection":
-        """Largest ratio d' E[e e'] d / d' E[B] d over steps and directions d, evaluated on runs that did not choose d.
+        """Return the largest ratio d' E[e e'] d / d' E[B] d over steps and directions d, on runs that did not choose d.
 
         The even batches choose step and direction, the odd batches measure the ratio there, and the reverse; so the
         ratio is not biased by the search. `z` is the excess over 1 in standard errors. NaN where some error or bound is
@@ -143,7 +144,7 @@ class ErrorStatistics:
             raise fail("worst direction", "at least 4 runs", self.runs)
         outer, covariance = self.outer, self.covariance
         broken = ~(np.isfinite(outer) & np.isfinite(covariance)).all(axis=(0, 2, 3))
-        self._tell()
+        self._warn_of_failures()
         if np.any(broken):
             undefined = np.full(outer.shape[-1], np.nan)
             return WorstDirection(np.nan, np.nan, int(np.argmax(broken)), undefined)
@@ -153,15 +154,18 @@ class ErrorStatistics:
     def _estimate_worst_ratio(
         self, held_out: np.ndarray, outer: np.ndarray, covariance: np.ndarray
     ) -> "WorstDirection":
-        """Find the direction of largest error over claim in one half of the runs; return its ratio in the other."""
+        """Return the ratio in the batches held out, in the direction of largest error over claim in the others.
+
+        `held_out` (batch,); `outer` and `covariance` (batch, time, n, n).
+        """
+        # Step and direction of the largest ratio in the batches that choose.
         chosen = ~held_out & (self.count > 0)
         actual, claimed = outer[chosen].sum(axis=0), covariance[chosen].sum(axis=0)
-        # Step and direction of the largest ratio in the other half of the batches.
         values, directions = _solve_generalised_eigen(actual, claimed)
         step = int(np.argmax(values[:, -1]))
         d = directions[step, :, -1]
+        # Its ratio in those held out.
         judged = held_out & (self.count > 0)
-        # Ratio in this half.
         error = np.einsum("i,bij,j->b", d, outer[judged, step], d)
         bound = np.einsum("i,bij,j->b", d, covariance[judged, step], d)
         ratio = float(error.sum() / bound.sum())
@@ -200,11 +204,11 @@ def pool(statistics: Sequence[ErrorStatistics]) -> ErrorStatistics:
     if not nodes or any(not np.array_equal(s.count, nodes[0].count) for s in nodes):
         raise fail("pooled statistics", "statistics of the same runs", f"{len(nodes)} that differ")
     return ErrorStatistics(
-        nodes[0].count,
-        np.concatenate([s.pairs for s in nodes], axis=1),
-        np.concatenate([s.claimed_pairs for s in nodes], axis=1),
-        np.concatenate([s.nees for s in nodes], axis=1),
-        weakest([s.claim for s in nodes]),
+        count=nodes[0].count,
+        pairs=np.concatenate([s.pairs for s in nodes], axis=1),
+        claimed_pairs=np.concatenate([s.claimed_pairs for s in nodes], axis=1),
+        nees=np.concatenate([s.nees for s in nodes], axis=1),
+        claim=weakest([s.claim for s in nodes]),
         failed=np.concatenate([np.zeros(s.nees.shape[1]) if s.failed is None else s.failed for s in nodes]),
         failed_runs=max(s.failed_runs for s in nodes),
     )
@@ -255,12 +259,13 @@ def _root_mean(sums: np.ndarray, count: np.ndarray) -> tuple[float, float]:
 def _solve_generalised_eigen(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the eigenvalues and vectors of A d = value B d for stacks of symmetric A and positive semidefinite B.
 
-    Each component is in units of its B_ii, and where that is zero of its A_ii.
+    Each component is in units of its root of B_ii, and where that is zero of its root of A_ii. With W' B W = I the
+    eigenvalues are those of W' A W; the vectors d = W times its eigenvectors.
     """
-    deviations = [np.sqrt(np.maximum(np.diagonal(m, axis1=-2, axis2=-1), 0.0)) for m in (b, a)]
-    unit = np.where(deviations[0] > 0, deviations[0], np.where(deviations[1] > 0, deviations[1], 1.0))
-    both = unit[..., :, None] * unit[..., None, :]
-    values, vectors = np.linalg.eigh(b / both)
-    root = vectors / np.sqrt(np.maximum(values, np.finfo(float).eps))[..., None, :]
-    inner, rotated = np.linalg.eigh(np.swapaxes(root, -1, -2) @ (a / both) @ root)
-    return inner, (root @ rotated) / unit[..., None]
+    of_b, of_a = (np.sqrt(np.maximum(np.diagonal(m, axis1=-2, axis2=-1), 0.0)) for m in (b, a))
+    unit = np.where(of_b > 0, of_b, np.where(of_a > 0, of_a, 1.0))
+    scale = unit[..., :, None] * unit[..., None, :]
+    eigenvalues, vectors = np.linalg.eigh(b / scale)
+    whitening = vectors / np.sqrt(np.maximum(eigenvalues, np.finfo(float).eps))[..., None, :]
+    values, rotated = np.linalg.eigh(np.swapaxes(whitening, -1, -2) @ (a / scale) @ whitening)
+    return values, (whitening @ rotated) / unit[..., None]

@@ -76,20 +76,23 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
         uplinks = {name: score.uplink for name, score in self.get(FUSED, {}).items() if score.uplink}
         labels = FilterLabels(list(self), self, self.states, rows, batches, uplinks)
 
-        def variances(matrices: np.ndarray) -> np.ndarray:
-            return np.diagonal(matrices, axis1=-2, axis2=-1)
+        def variances(covariances: np.ndarray) -> np.ndarray:
+            """Return the diagonals (..., n) of covariances (..., n, n)."""
+            return np.diagonal(covariances, axis1=-2, axis2=-1)
 
-        fill, nothing = labels.of_filters, np.full(rows[TIME], np.nan)
+        # fill(name, read): what `read` returns of each filter's score, along the axes of this field.
+        fill, none_failed = labels.of_filters, np.full(rows[TIME], np.nan)
         claimed = fill("deviation", lambda s: variances(s.claimed()))
-        # Sums by batch, from which the statistics can be restored, then figures.
         fields = {
+            # Sums by batch, from which the statistics can be restored.
             "runs": first.count,
             "errors": fill("errors", lambda s: matrices(s.pairs)),
             "claimed": fill("claimed", lambda s: matrices(s.claimed_pairs)),
             "nees": fill("nees", lambda s: s.nees),
             "claim": labels.claims(),
-            "failed": fill("failed", lambda s: nothing if s.failed is None else s.failed),
+            "failed": fill("failed", lambda s: none_failed if s.failed is None else s.failed),
             "failed_runs": fill("failed_runs", lambda s: s.failed_runs),
+            # Figures.
             "rmse": np.sqrt(fill("rmse", lambda s: variances(s.actual()))),
             "deviation": np.sqrt(np.where(claimed >= 0, claimed, np.nan)),
             "nees_per_dimension": fill("nees_per_dimension", lambda s: s.nees.sum(axis=0) / s.runs / n),
@@ -124,7 +127,7 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
         return cls(results, tuple(states), read_units(dataset))
 
     def to_pandas(self) -> "pd.DataFrame":
-        """Table: a row for each node and filter, with claim, runs, RMSE, NEES, their errors, and figures by state.
+        """Return the table: a row for each node and filter, with claim, runs, RMSE, NEES, errors, and figures by state.
 
         Raises:
             ModuleNotFoundError: without pandas (extra "results").
@@ -182,18 +185,19 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
         return drawn
 
     def failures(self) -> list[str]:
-        """List filters without a valid estimate in some run, a line each, as for a record.
+        """Return a line for each filter without a valid estimate in some run, and for each uplink that saturated.
 
-        One line more for each uplink that saturated. Smoothed estimates likewise, after "smoothed".
+        Those of smoothed estimates come first and begin with "smoothed".
         """
         lines = [] if self.smoothed is None else [f"smoothed {line}" for line in self.smoothed.failures()]
         for node, filters in self.items():
             lines += [f"{node}/{name}: {score.failure}" for name, score in filters.items() if score.failed_runs]
             for name, score in filters.items():
-                for single, share in (score.uplink.saturated_share() if score.uplink else {}).items():
+                shares = score.uplink.saturated_share() if score.uplink else {}
+                for sender, share in shares.items():
                     if share:
                         lines.append(
-                            f"{node}/{name}: the quantizer of node {single} saturated in {share:.2%} of samples"
+                            f"{node}/{name}: the quantizer of node {sender} saturated in {share:.2%} of samples"
                         )
         return lines
 
@@ -215,6 +219,10 @@ def _summarise(score: "ErrorStatistics", states: Sequence[str]) -> Mapping[str, 
         "nees low": low,
         "nees high": high,
     }
-    for state, single, spread, claimed in by_state:
-        total |= {f"rmse of {state}": single, f"rmse error of {state}": spread, f"claimed of {state}": claimed}
+    for state, rmse_of_state, error_of_state, claimed in by_state:
+        total |= {
+            f"rmse of {state}": rmse_of_state,
+            f"rmse error of {state}": error_of_state,
+            f"claimed of {state}": claimed,
+        }
     return total

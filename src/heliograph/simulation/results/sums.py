@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from operator import itemgetter
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,15 +25,17 @@ from heliograph.simulation.runs.over_runs import over_runs
 
 
 class Sums(NamedTuple):
-    """Sums over runs: of pairs e_i e_j (time, part, pair, batch), of e' B^-1 e, of claimed covariances, of symbols.
+    """Sums over runs of all filters' estimates, which lie along one axis `part`; run r goes to batch r mod BATCHES.
 
-    Run r goes to batch r mod BATCHES. A covariance that all runs share is summed once, without batches.
+    `runs` (batch,): their number. `pairs` (time, part, pair, batch): sums of e_i e_j, i <= j. `nees` (time, part,
+    batch): of e' B^-1 e. `claimed` (time, part, pair, batch): of covariances that differ between runs, the first parts;
+    `shared` (time, part, pair): of those that all runs share, the other parts, summed once, without batches.
 
     failed (time, 2, part): runs whose mean is not finite, and whose error has no distance by the covariance, which is
     then not finite or indefinite; failed_runs (2, 1, part): in how many runs this happened at some step.
 
-    `order`: whose estimates the parts are, kinds first and then fused ones; the first `by_run` have covariances that
-    differ between runs.
+    `order`: whose estimates the parts are, by number: kinds first and then fused ones. The first `by_run` of these have
+    covariances that differ between runs.
     """
 
     runs: np.ndarray
@@ -62,19 +64,19 @@ class Statistics(AbstractReducer[StatisticsByName]):
         errors = [replace(estimate, mean=mean).error(truth) for estimate, mean in zip(parts, means, strict=True)]
         distances = jax.vmap(squared_distance, in_axes=(0, 0, None))
         nees = [distances(b, e, truth) for b, e in zip(claimed, errors, strict=True)]
-        joined, distance = jnp.concatenate(errors), jnp.concatenate(nees)
-        finite = jnp.all(jnp.isfinite(joined), axis=1)
-        bad = jnp.stack([~finite, jnp.isnan(distance)])
+        all_errors, all_nees = jnp.concatenate(errors), jnp.concatenate(nees)
+        finite = jnp.all(jnp.isfinite(all_errors), axis=1)
+        failed = jnp.stack([~finite, jnp.isnan(all_nees)])
         # Pairs i <= j of symmetric matrices.
         rows, columns = np.triu_indices(n)
         sums = {
-            "pairs": joined[:, rows] * joined[:, columns],
-            "nees": distance,
+            "pairs": all_errors[:, rows] * all_errors[:, columns],
+            "nees": all_nees,
             "claimed": tuple(b[:, rows, columns] for b in claimed),
-            "failed": bad,
+            "failed": failed,
             "uplinks": step["uplinks"],
         }
-        return OfStep(sums, bad)
+        return OfStep(sums=sums, ever=failed)
 
     def summed(self, sums: OfStep, common: OfStep, count: np.ndarray) -> Sums:
         """Return the carry after all runs: filters with a covariance of their own in each run first, the others last.
@@ -84,53 +86,53 @@ class Statistics(AbstractReducer[StatisticsByName]):
             common: for each of these whether all runs share it, so that it is the value of one run.
             count: number of runs in each batch.
         """
-        # Values that all runs share count once per run.
-        shared = common.sums["claimed"]
+        # Values that all runs share count once per run; but for claimed covariances, which stay apart below.
+        is_shared = common.sums["claimed"]
         totals, ever = jax.tree.map(
-            lambda leaf, same: leaf[..., None] * count if same else leaf,
+            lambda leaf, is_common: leaf[..., None] * count if is_common else leaf,
             (sums.sums | {"claimed": ()}, sums.ever),
             (common.sums | {"claimed": ()}, common.ever),
         )
-        # Order of the filters' parts: those whose claimed covariance differs between runs come first.
+        # Order of the kinds: those whose claimed covariance differs between runs come first (False < True).
         claimed = sums.sums["claimed"]
-        order = tuple(sorted(range(len(shared)), key=shared.__getitem__))
+        order = tuple(sorted(range(len(is_shared)), key=is_shared.__getitem__))
+        # The same order for the columns of all other sums, each kind's estimates side by side.
         sizes = [values.shape[1] for values in claimed]
-        places = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
-        in_order = np.concatenate([places[i] for i in order])
-        # Claimed covariances of both kinds, each begun by none, for there may be none of a kind.
+        columns_of_kind = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
+        columns = np.concatenate([columns_of_kind[i] for i in order])
+        # Claimed covariances by run, and of all runs; each begins with an array of none, since there may be none.
         steps, _, pairs, _ = totals["pairs"].shape
-        by_batch: Any = count
-        by_run: list[Any] = [np.zeros((steps, 0, pairs, BATCHES)), *(claimed[i] for i in order if not shared[i])]
-        of_all: list[Any] = [np.zeros((steps, 0, pairs)), *(claimed[i] * count.sum() for i in order if shared[i])]
-        claimed_by_run: Any = np.concatenate(by_run, axis=1)
-        claimed_by_all: Any = np.concatenate(of_all, axis=1)
+        by_run = [np.zeros((steps, 0, pairs, BATCHES)), *(claimed[i] for i in order if not is_shared[i])]
+        of_all = [np.zeros((steps, 0, pairs)), *(claimed[i] * count.sum() for i in order if is_shared[i])]
         return Sums(
-            runs=by_batch,
-            pairs=totals["pairs"][:, in_order],
-            nees=totals["nees"][:, in_order],
-            claimed=claimed_by_run,
-            shared=claimed_by_all,
-            failed=np.sum(totals["failed"], axis=-1)[:, :, in_order],
-            failed_runs=np.sum(ever, axis=-1)[:, None, in_order],
+            runs=count,
+            pairs=totals["pairs"][:, columns],
+            nees=totals["nees"][:, columns],
+            claimed=np.concatenate(by_run, axis=1),
+            shared=np.concatenate(of_all, axis=1),
+            failed=np.sum(totals["failed"], axis=-1)[:, :, columns],
+            failed_runs=np.sum(ever, axis=-1)[:, None, columns],
             uplinks=jax.tree.map(lambda leaf: np.sum(leaf, axis=-1), totals["uplinks"]),
             order=order,
-            by_run=shared.count(False),
+            by_run=is_shared.count(False),
         )
 
     def finish(self, carry: Sums, collected: PyTree, network: Network) -> StatisticsByName:
         """Make the statistics by node and filter."""
         # Sums by kind and fusion, then by name.
-        every = network.kinds + network.mesh_kinds
-        count, parts = _split(carry, [(len(f), len(network.groups[g])) for g, f in every])
-        kinds = len(every)
-        named = {"estimates": parts[:kinds], "fused": dict(zip(sorted(network.fused), parts[kinds:], strict=True))}
-        axes = enumerate((-3, -2, -3, -2, -2))
-        items = [split_by_name(network, named, itemgetter(i), axis) for i, axis in axes]
+        all_kinds = network.kinds + network.mesh_kinds
+        count, parts = _split(carry, [(len(kind.filters), len(network.groups[kind.group])) for kind in all_kinds])
+        of_kinds, of_fused = parts[: len(all_kinds)], parts[len(all_kinds) :]
+        named = {"estimates": of_kinds, "fused": dict(zip(sorted(network.fused), of_fused, strict=True))}
+        # Axis of the filters in pairs, NEES, claims, and the two of failures.
+        filter_axes = enumerate((-3, -2, -3, -2, -2))
+        sums_by_name = [split_by_name(network, named, itemgetter(i), axis) for i, axis in filter_axes]
         # Statistics with their claims, then those of the quantizers.
         statistics = StatisticsByName({}, network.states)
         for node, claims in network.claims().items():
             statistics[node] = {
-                name: _make_statistics(count, [v[node][name] for v in items], claim) for name, claim in claims.items()
+                name: _make_statistics(count, [sums[node][name] for sums in sums_by_name], claim)
+                for name, claim in claims.items()
             }
         for name, uplink in uplinks_by_name(network, carry.uplinks).items():
             fused = statistics[FUSED][name]
@@ -158,22 +160,27 @@ class Statistics(AbstractReducer[StatisticsByName]):
 def _make_statistics(count: np.ndarray, sums: Sequence[np.ndarray], claim: Claim) -> ErrorStatistics:
     """Return the statistics of one filter from its sums over runs."""
     pairs, nees, claimed, failed, failed_runs = sums
-    which = 0 if claim == "none" else slice(None)  # no distance where no covariance is claimed
-    by_step, runs = np.max(np.atleast_2d(failed[which]), axis=0), float(np.max(failed_runs[which]))
-    return ErrorStatistics(count, pairs, claimed, nees, claim, failed=by_step, failed_runs=round(runs))
+    tests = 0 if claim == "none" else slice(None)  # means alone are tested where no covariance is claimed
+    return ErrorStatistics(
+        count=count,
+        pairs=pairs,
+        claimed_pairs=claimed,
+        nees=nees,
+        claim=claim,
+        failed=np.max(np.atleast_2d(failed[tests]), axis=0),
+        failed_runs=round(float(np.max(failed_runs[tests]))),
+    )
 
 
 def _split(carry: Sums, kinds: list[tuple[int, int]]) -> tuple[np.ndarray, list[tuple[np.ndarray, ...]]]:
-    """Split the sums into runs by batch, and for each kind and fused estimate its sums, mean claims and failures.
+    """Return the runs by batch, and (pairs, NEES, mean claims, failures, failed runs) of each kind and fused estimate.
 
-    The sums are those of pairs of errors and of NEES; claims are covariances that differ by run, or are shared.
-    Axes (batch, time, filter, node, pair) for the kinds, without filter and node for what is fused; views.
+    `kinds`: numbers of filters and of nodes of each kind; estimates beyond them are fused ones. Axes (batch, time,
+    filter, node, pair) for the kinds, without filter and node for what is fused; failures without batch. Views.
     """
-    # The axis of batches first.
+    # The axis of batches first: views, in which it is last in memory.
     sums = carry.runs, carry.pairs, carry.nees, carry.claimed
-    count, pairs, nees, varying = (
-        np.moveaxis(np.asarray(values), -1, 0) for values in sums
-    )  # views: they are last in memory
+    count, pairs, nees, varying = (np.moveaxis(np.asarray(values), -1, 0) for values in sums)
     # Mean claimed covariances.
     varying = varying / np.maximum(count, 1.0).reshape(-1, *[1] * (varying.ndim - 1))
     failed, failed_runs = np.asarray(carry.failed).swapaxes(0, 1), np.asarray(carry.failed_runs)
@@ -183,10 +190,10 @@ def _split(carry: Sums, kinds: list[tuple[int, int]]) -> tuple[np.ndarray, list[
     for position, i in enumerate(carry.order):
         axes = kinds[i] if i < len(kinds) else ()
         rows = slice(start, start + int(np.prod(axes)))
-        offset = varying.shape[2] if position >= carry.by_run else 0
-        claimed = (shared if offset or position >= carry.by_run else varying)[
-            :, :, rows.start - offset : rows.stop - offset
-        ]
+        if position < carry.by_run:
+            claimed = varying[:, :, rows]
+        else:  # the shared ones are counted from the first of them
+            claimed = shared[:, :, rows.start - varying.shape[2] : rows.stop - varying.shape[2]]
         split[i] = tuple(
             a.reshape(*a.shape[:2], *axes, *a.shape[3:])
             for a in (pairs[:, :, rows], nees[:, :, rows], claimed, failed[:, :, rows], failed_runs[:, :, rows])
@@ -210,7 +217,7 @@ def error_statistics(record: Record, node: str, name: str) -> ErrorStatistics:
     if record.truth is None or record.truth.ndim != 3:
         raise fail("error statistics", "Monte Carlo trajectories with truth", "a single recording")
     # The filter's estimates.
-    known = [(element, of) for element, filters in record.estimates.items() for of in filters]
+    known = [(element, label) for element, filters in record.estimates.items() for label in filters]
     if not (isinstance(node, str) and isinstance(name, str) and (node, name) in known):
         raise fail("node and filter", f"one of {known}", show_value((node, name)))
     estimate = record.estimates[node][name]
@@ -227,7 +234,7 @@ def error_statistics(record: Record, node: str, name: str) -> ErrorStatistics:
 
 
 def _reduce_run(truth: Array, mean: Array, covariance: Array, attitude: tuple[int, ...]) -> OfStep:
-    """Reduce one run of a record."""
+    """Return the sums of one run's estimates of one filter, by step, as a simulation makes them."""
     estimate = Estimate(mean, covariance, "none", attitude=attitude)
     steps = {"truth": truth, "estimates": (), "fused": {"": estimate}, "uplinks": {}}
     return reduce_rows(Statistics(), steps)

@@ -52,7 +52,7 @@ class MemoryTest:
 
     @staticmethod
     def of(white: Float[np.ndarray, "steps m"], lags: int, claimed: bool) -> "MemoryTest":
-        """Test whitened innovations; their power only where they are in units of a filter's claim (`claimed`).
+        """Return the test of whitened innovations; their power only where they are in units of a claim (`claimed`).
 
         Raises:
             ValueError: too few steps for the lags, nothing but zeros, innovations beyond all numbers.
@@ -70,17 +70,22 @@ class MemoryTest:
         parts = [average_correlated(_average_components(white[:-t] * white[t:])) for t in range(1, lags + 1)]
         correlation, error = (np.array(column) / size for column in zip(*parts, strict=True))
         # Lag 1 by itself; all lags for the predictable share (Yule and Walker).
-        p_value = (
-            float(2 * scipy.special.ndtr(-abs(correlation[0]) / error[0]))
-            if error[0] > 0
-            else float(correlation[0] == 0)
-        )
+        if error[0] > 0:
+            p_value = float(2 * scipy.special.ndtr(-abs(correlation[0]) / error[0]))
+        else:
+            p_value = float(correlation[0] == 0)
         # All together: a sum of squares, where an error that few numbers tell is no less than that of independent ones.
         sure = correlation / np.maximum(error, 1 / np.sqrt(np.count_nonzero(~np.isnan(white).all(axis=1))))
-        p_of_all = float(scipy.special.chdtrc(lags, np.sum(sure**2)))
-        share = float(correlation @ np.linalg.lstsq(scipy.linalg.toeplitz([1.0, *correlation[:-1]]), correlation)[0])
-        power = (size * unit * unit, size_error * unit * unit) if claimed else (np.nan, np.nan)
-        return MemoryTest(correlation, error, p_value, p_of_all, share, *power)
+        share = correlation @ np.linalg.lstsq(scipy.linalg.toeplitz([1.0, *correlation[:-1]]), correlation)[0]
+        return MemoryTest(
+            correlation=correlation,
+            standard_error=error,
+            p_value=p_value,
+            p_value_of_all=float(scipy.special.chdtrc(lags, np.sum(sure**2))),
+            predictable=float(share),
+            power=size * unit * unit if claimed else np.nan,
+            power_error=size_error * unit * unit if claimed else np.nan,
+        )
 
 
 def memory_test(
@@ -112,7 +117,7 @@ def memory_test(
 
 
 def _standardise(data: ArrayLike) -> Float[np.ndarray, "steps m"]:
-    """Return the innovations of unknown covariance, each component in units of its deviation."""
+    """Return innovations (steps, m) of unknown covariance, each component in units of its own root mean square."""
     values = array("innovations", data, (None,) * max(rank("innovations", data), 1), missing=True)
     value = values[:, None] if values.ndim == 1 else values
     largest = np.max(np.nan_to_num(np.abs(value)), axis=0, initial=0.0)  # before the square, which may overflow
@@ -126,7 +131,7 @@ def whitened_innovations(
     filter: AbstractFilter,
     inputs: Float[ArrayLike, "steps inputs"] | None = None,
 ) -> Float[np.ndarray, "steps m"]:
-    """Innovations of a recording in units of the filter's claim: white and of variance 1 where the claim holds.
+    """Return innovations of a recording in units of the filter's claim: white and of variance 1 where it holds.
 
     L^-1 (z - E z), where L L' is the claimed covariance; NaN where nothing arrived, or nothing new could, and where a
     filter that weighs gave less than half of a component's weight.
@@ -144,8 +149,8 @@ def whitened_innovations(
 
 def _average_components(parts: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, " steps"]:
     """Return the mean over the components that are not NaN; NaN where none is."""
-    there = np.sum(~np.isnan(parts), axis=1)
-    return np.asarray(np.where(there > 0, np.nansum(parts, axis=1) / np.maximum(there, 1), np.nan))
+    count = np.sum(~np.isnan(parts), axis=1)
+    return np.asarray(np.where(count > 0, np.nansum(parts, axis=1) / np.maximum(count, 1), np.nan))
 
 
 def score_innovations(
@@ -176,15 +181,17 @@ def score_innovations(
 def _whiten_innovations(filter: AbstractFilter, z: Array, u: Array) -> PyTree:
     """Run a filter; return each row's log-likelihood, and its innovation made white, NaN where nothing arrived."""
 
-    def single(state: PyTree, innovation: Innovation, k: jax.Array) -> tuple[jax.Array, jax.Array]:
-        there = ~jnp.isnan(innovation.value)
+    def score_row(state: PyTree, innovation: Innovation, k: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return one row's log-likelihood and its whitened innovation (m,)."""
+        used = ~jnp.isnan(innovation.value)
         if innovation.weight is not None:  # what a filter left out, or nearly, does not count against it
-            there &= innovation.weight >= HALF
-        covariance = jnp.where(there[:, None] & there, innovation.covariance, jnp.diag(jnp.where(there, 0.0, 1.0)))
-        white = whiten(covariance, jnp.where(there, innovation.value, 0.0))
-        return jnp.asarray(innovation.log_likelihood), jnp.where(there, white, jnp.nan)
+            used &= innovation.weight >= HALF
+        # Components that are not used: 0 of variance 1, correlated with none.
+        covariance = jnp.where(used[:, None] & used, innovation.covariance, jnp.diag(jnp.where(used, 0.0, 1.0)))
+        white = whiten(covariance, jnp.where(used, innovation.value, 0.0))
+        return jnp.asarray(innovation.log_likelihood), jnp.where(used, white, jnp.nan)
 
-    return filter.scan(z, u, single)
+    return filter.scan(z, u, score_row)
 
 
 _by_xla = quickly_compiled(_whiten_innovations)

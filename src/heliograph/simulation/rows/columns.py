@@ -72,20 +72,28 @@ class FilterColumns(NamedTuple):
 
 
 def columns_of(network: Network, outputs: Flat) -> tuple[FilterColumns, ...]:
-    """Locate each filter's estimate, by reading a row that holds its own column numbers as a row of estimates."""
+    """Return the columns of each filter's outputs: a row of the column numbers, read by name as outputs are."""
     numbered = jax.tree.map(lambda leaf: leaf.astype(int), outputs.tree(np.arange(float(outputs.size))))
     mean = split_by_name(network, numbered, attrgetter("mean"), -3)
     covariance = split_by_name(network, numbered, attrgetter("covariance"), -4)
     judged, weighed = _collect_judgements(network, numbered), _collect_weights(network, numbered)
-    modes = {name: (int(at[0]), int(at[-1]) + 1) for name, at in collect_modes(network, numbered).items()}
+    modes = {name: (int(c[0]), int(c[-1]) + 1) for name, c in collect_modes(network, numbered).items()}
     tested = {(FUSED, name): TestedAt(*map(int, columns)) for name, columns in numbered["tested"].items()}
     return tuple(
-        FilterColumns(node, name, claim, int(mean[node][name].flat[0]), int(covariance[node][name].flat[0]),
-              judged[node].get(name), weighed.get((node, name)), tested.get((node, name)),
-              modes.get((node, name)))
+        FilterColumns(
+            node=node,
+            filter=name,
+            claim=claim,
+            mean=int(mean[node][name].flat[0]),
+            covariance=int(covariance[node][name].flat[0]),
+            judgement=judged[node].get(name),
+            weighed=weighed.get((node, name)),
+            tested=tested.get((node, name)),
+            modes=modes.get((node, name)),
+        )
         for node, filters in network.claims().items()
         for name, claim in filters.items()
-    )  # fmt: skip
+    )
 
 
 def _collect_weights(network: Network, outcome: PyTree) -> dict[tuple[str, str], WeighedAt]:
@@ -95,7 +103,8 @@ def _collect_weights(network: Network, outcome: PyTree) -> dict[tuple[str, str],
         for name, (kind, f, i) in network.places.items()
         if outcome["weighed"][kind] is not None
     }
-    central = {(FUSED, name): list(at) for name, at in outcome["weighed_centrally"].items() if at is not None}
+    centrally = outcome["weighed_centrally"].items()
+    central = {(FUSED, name): list(columns) for name, columns in centrally if columns is not None}
     return {
         name: WeighedAt(*(tuple(map(int, field)) for field in columns)) for name, columns in (parts | central).items()
     }
@@ -104,7 +113,7 @@ def _collect_weights(network: Network, outcome: PyTree) -> dict[tuple[str, str],
 def _collect_judgements(network: Network, outcome: PyTree) -> dict[str, dict[str, JudgementAt]]:
     """Return the columns of each part of a judgement, by node and filter."""
     judged = {"estimates": outcome["judged"], "fused": {}}
-    parts = [split_by_name(network, judged, partial(_part, i), -2) for i in range(len(JudgementAt._fields))]
+    parts = [split_by_name(network, judged, partial(_read_field, i), -2) for i in range(len(JudgementAt._fields))]
     by_node = {
         node: {name: JudgementAt(*(int(field[node][name]) for field in parts)) for name in filters}
         for node, filters in parts[0].items()
@@ -115,5 +124,6 @@ def _collect_judgements(network: Network, outcome: PyTree) -> dict[str, dict[str
     }
 
 
-def _part(i: int, judged: PyTree) -> np.ndarray:
+def _read_field(i: int, judged: PyTree) -> np.ndarray:
+    """Return field i of a judgement."""
     return np.asarray(judged[i])

@@ -41,13 +41,14 @@ class RowHistory(NamedTuple):
         return jax.tree.map(lambda leaf: leaf[row], self.state)
 
     def interval(self, row: jax.Array, dt: int) -> jax.Array:
-        """Return the inputs of a plant of continuous time since the row before, as held then."""
-        held, passed = self.held[row - 1], self.parts(row)[2] - self.parts(row - 1)[2]
-        return jnp.concatenate([held[:dt], passed[None], held[dt:]])
+        """Return the inputs (held ones, with the time since the row before at place `dt`) that led to a row."""
+        held = self.held[row - 1]
+        (_, _, time), (_, _, time_before) = self.parts(row), self.parts(row - 1)
+        return jnp.concatenate([held[:dt], (time - time_before)[None], held[dt:]])
 
     def at_step(self, row: jax.Array, k: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return measurements and inputs at step k, which is the row's or one between it and the row before."""
-        received, given, last = self.parts(row)
-        there, held = k == last.astype(self.step.dtype), self.held[row - 1]
-        u = jnp.where(there, jnp.where(jnp.isnan(given), held, given), held)
-        return jnp.where(there, received, jnp.nan), u
+        received, given, step_of_row = self.parts(row)
+        is_row, held = k == step_of_row.astype(self.step.dtype), self.held[row - 1]
+        u = jnp.where(is_row, jnp.where(jnp.isnan(given), held, given), held)
+        return jnp.where(is_row, received, jnp.nan), u

@@ -30,7 +30,7 @@ NetworkSmootherStep: TypeAlias = "tuple[dict[int, SmootherStep], dict[str, Smoot
 
 
 class Sweep(Module):
-    """The filters of a network that can be smoothed, by `kinds`, and their fusions."""
+    """What a sweep back over rows computes with: the filters that can be smoothed, by `kinds`, and their fusions."""
 
     network_step: NetworkStep
     fusions: tuple[StackedFusions, ...]
@@ -68,7 +68,7 @@ def _map_filters(function: Callable[..., object], steps: NetworkSmootherStep, *r
 
 
 StepOfRow: TypeAlias = "tuple[jax.Array, jax.Array]"  # a row, and a step at it or before it
-Into: TypeAlias = "Callable[[Sweep, RowHistory, StepOfRow], NetworkSmootherStep]"
+StepInto: TypeAlias = "Callable[[Sweep, RowHistory, StepOfRow], NetworkSmootherStep]"
 
 
 @lru_cache
@@ -81,66 +81,70 @@ def sweep_back(static: Static, dt: int | None) -> tuple[Callable[..., PyTree], C
     time counts steps; begin > 0.
     """
     # Continuous time: one step per row. Discrete time: also the steps between the rows.
-    into, earlier = (_into_step, _earlier_step) if dt is None else (_into_row(dt), _earlier_row)
+    step_into: StepInto = _step_into_step if dt is None else _make_step_into_row(dt)
+    find_earlier = _find_earlier_step if dt is None else _find_earlier_row
 
     def run(numbers: list[jax.Array], history: RowHistory, span: jax.Array) -> PyTree:
         """Smooth rows `begin` to `stop` from the last one back; return the outputs of the first."""
         sweep: Sweep = static.filled(numbers)
         begin, stop = span
         last = stop - 1, history.step[stop - 1]
-        count = stop - 1 - begin if dt is not None else last[1] - history.step[begin]
-        # Shapes of a smoother step, without computing one.
-        blank = jax.tree.map(
-            lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(lambda: into(sweep, history, last))
-        )
+        count = stop - 1 - begin if dt is not None else history.step[stop - 1] - history.step[begin]
+        # Zeros of the shapes of a smoother step, without computing one.
+        shapes = jax.eval_shape(lambda: step_into(sweep, history, last))
+        zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
-        # One step back: x_k|N from x_(k+1)|N and the smoother step into row k + 1; at the last row x_N|N.
-        def single(
+        def step_back(
             i: jax.Array, carry: tuple[StepOfRow, NetworkSmootherStep, PyTree]
         ) -> tuple[StepOfRow, NetworkSmootherStep, PyTree]:
-            now, steps, later = carry
-            before = into(sweep, history, now)
-            passed = _map_filters(lambda step, later: step.back(later), steps, later)
-            ends = _map_filters(lambda step: step.end, before)
-            later = jax.tree.map(lambda a, b: jnp.where(i == 0, a, b), ends, passed)
-            return earlier(history, now), before, later
+            """Go one step back: x_k|N from x_(k+1)|N and the smoother step into k + 1; at first, i = 0, x_N|N."""
+            place, steps_after, later = carry
+            steps = step_into(sweep, history, place)
+            passed = _map_filters(lambda step, later: step.back(later), steps_after, later)
+            ends = _map_filters(lambda step: step.end, steps)
+            later = jax.tree.map(lambda end, back: jnp.where(i == 0, end, back), ends, passed)
+            return find_earlier(history, place), steps, later
 
-        begun = last, blank, _map_filters(lambda step: step.end, blank)
-        _, steps, later = jax.lax.fori_loop(0, count + 1, single, begun)
+        start = last, zeros, _map_filters(lambda step: step.end, zeros)
+        _, steps, later = jax.lax.fori_loop(0, count + 1, step_back, start)
         return sweep.outputs(steps, later)
 
     return run, jax.jit(run, compiler_options=understood())
 
 
-def _into_row(dt: int) -> Into:
-    """Return what computes the smoother step into a row from the one before it, `dt` the place of the interval in u."""
+def _make_step_into_row(dt: int) -> StepInto:
+    """Return the function that computes the smoother step into a row; `dt`: place of the time between rows in u."""
 
-    def into(sweep: Sweep, history: RowHistory, at: StepOfRow) -> NetworkSmootherStep:
-        row, _ = at
+    def step_into_row(sweep: Sweep, history: RowHistory, place: StepOfRow) -> NetworkSmootherStep:
+        """Return the smoother step into a row from the state after the row before."""
+        row, _ = place
         state, received = sweep.start(history, row - 1), history.parts(row)[0]
         return sweep.step(history, row, state, received, history.interval(row, dt), history.step[row])[1]
 
-    return into
+    return step_into_row
 
 
-def _earlier_row(history: RowHistory, at: StepOfRow) -> StepOfRow:
-    """Return the row before."""
-    return at[0] - 1, history.step[at[0] - 1]
+def _find_earlier_row(history: RowHistory, place: StepOfRow) -> StepOfRow:
+    """Return the row before, with its step."""
+    row, _ = place
+    return row - 1, history.step[row - 1]
 
 
-def _into_step(sweep: Sweep, history: RowHistory, at: StepOfRow) -> NetworkSmootherStep:
-    """Compute the smoother step at step k, by way of the steps without measurements since the row before."""
-    row, k = at
+def _step_into_step(sweep: Sweep, history: RowHistory, place: StepOfRow) -> NetworkSmootherStep:
+    """Return the smoother step at step k, by way of the steps without measurements since the row before."""
+    row, k = place
 
-    def single(j: jax.Array, state: PyTree) -> PyTree:
+    def step_on(j: jax.Array, state: PyTree) -> PyTree:
+        """Step the filters' states by step j."""
         return sweep.step(history, row, state, *history.at_step(row, j), j)[0]
 
-    state = jax.lax.fori_loop(history.step[row - 1] + 1, k, single, sweep.start(history, row - 1))
+    state = jax.lax.fori_loop(history.step[row - 1] + 1, k, step_on, sweep.start(history, row - 1))
     return sweep.step(history, row, state, *history.at_step(row, k), k)[1]
 
 
-def _earlier_step(history: RowHistory, at: StepOfRow) -> StepOfRow:
-    row, k = at
+def _find_earlier_step(history: RowHistory, place: StepOfRow) -> StepOfRow:
+    """Return step k - 1, and the row that it is of or leads to."""
+    row, k = place
     return jnp.where(k - 1 == history.step[row - 1], row - 1, row), k - 1
 
 
@@ -181,6 +185,7 @@ class RowSmoother:
         self._programs = dict[tuple[int, str], Callable[[RowHistory, np.ndarray], PyTree]]()
 
     def _fuses(self, fusion: StackedFusions, kinds: tuple[int, ...]) -> bool:
+        """Return whether a fusion takes nothing but estimates of these kinds, as they are."""
         return fusion.quantizers is None and all(kind in kinds for source in fusion.sources for kind, _ in source)
 
     def _find_program(self, history: RowHistory) -> Callable[[RowHistory, np.ndarray], PyTree]:
@@ -193,7 +198,7 @@ class RowSmoother:
                 self._programs[key] = lambda *arguments: to_numpy(self._by_xla(self._numbers, *arguments))
             else:
                 code = choice.code.with_first(*self._numbers)
-                self._programs[key] = lambda *arguments: _only(code(*jax.tree.leaves(arguments)))
+                self._programs[key] = lambda *arguments: _take_only_run(code(*jax.tree.leaves(arguments)))
         return self._programs[key]
 
     def estimates(self, history: RowHistory, begin: int, stop: int) -> dict[str, dict[str, Estimate]]:
@@ -214,18 +219,20 @@ class RowSmoother:
         return {node: filters for node, filters in results.items() if filters}
 
 
-def _only(results: PyTree) -> PyTree:
-    """Return the results of the one run of several."""
+def _take_only_run(results: PyTree) -> PyTree:
+    """Return the results of a single run without their axis of runs."""
     return map_arrays(lambda leaf: leaf[0, ...], results)
 
 
-def _estimate_of(outputs: Estimate, claim: Claim, where: tuple[int, ...]) -> Estimate:
-    modes = None if outputs.modes is None else np.asarray(outputs.modes)[where]
-    mean, covariance = (np.asarray(part)[where] for part in (outputs.mean, outputs.covariance))
+def _estimate_of(outputs: Estimate, claim: Claim, index: tuple[int, ...]) -> Estimate:
+    """Return the estimate at an index (filter, node) of stacked ones, with this claim where it is sound."""
+    modes = None if outputs.modes is None else np.asarray(outputs.modes)[index]
+    mean, covariance = (np.asarray(part)[index] for part in (outputs.mean, outputs.covariance))
     return lower_unsound_claim(Estimate(mean, covariance, claim, modes, attitude=outputs.attitude))
 
 
 def _get_filter(network: Network, kind: int, name: str) -> AbstractFilter:
+    """Return a filter of a kind at the first node of its group."""
     return network.nodes[network.groups[network.kinds[kind].group][0]].filters[name]
 
 

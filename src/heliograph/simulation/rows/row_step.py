@@ -26,8 +26,9 @@ from heliograph.simulation.stepping import AllFilters, initial_states
 
 OUTPUTS = "estimates", "fused", "judged", "judged_centrally", "weighed", "weighed_centrally", "tested"
 TEXTS = 16  # programs held as text, of up to a megabyte each
-TOGETHER, WIDTH = 16, 512  # rows of one turn of XLA's loop, which fill the vectors of a processor; rows of one call
-NUMBERS_TOGETHER, NUMBERS = 2**14, 2**18  # of long rows no more: one costs about itself
+TOGETHER = 16  # rows of one turn of XLA's loop, which fill the vectors of a processor
+WIDTH = 512  # rows of one call, at most
+NUMBERS_TOGETHER, NUMBERS = 2**14, 2**18  # in the rows of a turn and of a call: of long rows fewer are taken
 
 
 class NetworkStep(Module):
@@ -101,10 +102,10 @@ class RowStep:
         _check_reports(filters)
         start = initial_states(filters)
         numbers, static = cast(NetworkStep(network, filters))
-        self._like = tuple(_like(leaf.shape, leaf.dtype) for leaf in numbers)
+        self._shapes = tuple(_make_shape(leaf.shape, leaf.dtype) for leaf in numbers)
         self.state = flat_like(start)
         self._layout = Layout(static, self.state, received, inputs)
-        self.outputs = flat_like(_trace_step(self._layout, self._like).out_info[1])
+        self.outputs = flat_like(_trace_step(self._layout, self._shapes).out_info[1])
         self.columns = columns_of(network, self.outputs)
         self.start = np.concatenate([np.zeros(0), *(np.ravel(leaf).astype(float) for leaf in jax.tree.leaves(start))])
         # Native code with the network's numbers filled in, where it takes the step.
@@ -126,7 +127,10 @@ class RowStep:
 
     @property
     def _block(self) -> tuple[int, int]:
-        """Return the number of rows of a call of XLA's program, and of those of a turn; the layout alone decides."""
+        """Return how many rows a call of XLA's program takes, and how many one turn of its loop.
+
+        The layout alone decides, so that a result depends on no number of rows.
+        """
         longest = max(self._layout.size, self.state.size + self.outputs.size)
         together = min(max(NUMBERS_TOGETHER // longest, 1), TOGETHER)
         turns = min(max(NUMBERS // (together * longest), 1), WIDTH // together)
@@ -148,7 +152,7 @@ class RowStep:
     @cached_property
     def program(self) -> str:
         """Return the step as text, which two processes compare to see that they compute the same."""
-        return _text(self._layout, self._like)
+        return _text(self._layout, self._shapes)
 
     def history(
         self,
@@ -178,8 +182,9 @@ class RowStep:
         if self._code is not None:
             stepped: np.ndarray = self._code(rows)
             return stepped
+        # Blocks of rows, the last filled up; of its turns no more run than have rows.
         width, together = (1, 1) if alone else self._block
-        run = _compile_xla(self._layout, self.outputs, width, together, self._block[1] == 1)
+        run = _compile_xla(self._layout, self.outputs, width, together, is_long=self._block[1] == 1)
         done, filled = np.empty((len(rows), self.state.size + self.outputs.size)), np.zeros((width, rows.shape[1]))
         for begin in range(0, len(rows), width):
             count = min(width, len(rows) - begin)
@@ -212,15 +217,15 @@ class OneRowStep:
 
 
 def _check_reports(filters: AllFilters) -> None:
-    """Refuse fusions whose reports get lost by chance: a row says what a node measured, not which report arrived."""
+    """Raise ValueError for reports lost by chance: a row says what a node measured, not which report arrived."""
     for name, link in filters.reporting.items():
         if link.uplinks.groups:
             expected = "reports that arrive as they are sent, or the fusion as a filter (centre_filter)"
             raise fail(f"timeline: fusion {name!r}", expected, "links that chance has a part in")
 
 
-def _like(shape: tuple[int, ...], dtype: Any) -> Any:
-    """Return a placeholder from which JAX traces an array."""
+def _make_shape(shape: tuple[int, ...], dtype: Any) -> Any:
+    """Return a placeholder for an array of this shape and type, for JAX to trace with."""
     return jax.ShapeDtypeStruct(shape, dtype)  # type: ignore[no-untyped-call]
 
 
@@ -229,6 +234,7 @@ def _make_step(layout: Layout) -> Any:
     """Return the function of one row to states and outputs, traced once for the outputs' layout, code and text."""
 
     def step(numbers: list[jax.Array], row: jax.Array) -> tuple[PyTree, PyTree]:
+        """Step a row of the network that has these numbers as its arrays; return states and outputs."""
         stepped: tuple[PyTree, PyTree] = layout.static.filled(numbers).step(*layout.parts(row))
         return stepped
 
@@ -240,6 +246,7 @@ def _make_row_function(layout: Layout) -> Any:
     """Return the function of one row to another, the same one for layouts that are equal."""
 
     def step(numbers: list[jax.Array], row: jax.Array) -> jax.Array:
+        """Step a row; return states and outputs side by side."""
         return jnp.concatenate([row_of(tree) for tree in _make_step(layout)(numbers, row)])
 
     return step
@@ -248,7 +255,7 @@ def _make_row_function(layout: Layout) -> Any:
 def _trace_step(layout: Layout, numbers: tuple[jax.ShapeDtypeStruct, ...]) -> Any:
     """Return the traced step of a row, which JAX holds for networks that differ in numbers alone."""
     with jax.enable_x64(True):
-        return _make_step(layout).trace(list(numbers), _like((layout.size,), np.float64))
+        return _make_step(layout).trace(list(numbers), _make_shape((layout.size,), np.float64))
 
 
 @lru_cache(TEXTS)
@@ -259,20 +266,24 @@ def _text(layout: Layout, numbers: tuple[jax.ShapeDtypeStruct, ...]) -> str:
 
 @lru_cache
 def _compile_xla(layout: Layout, outputs: Flat, width: int, together: int, is_long: bool) -> PyTree:
-    """Compile (numbers, rows, turns) to rows as a loop over rows side by side, so that results depend on no turns.
+    """Return XLA's program (numbers, rows, turns) -> stepped rows: a loop, of whose turns each steps `together` rows.
 
-    `is_long`: a row is so long that it is stepped alone, which compilation would take longer than all steps to come.
+    The number of turns is an argument, so that one program serves any number of rows up to `width`. `is_long`: rows so
+    long that each is stepped alone; to optimise their program would take longer than all steps to come.
     """
     step = _make_row_function(layout)
 
     def run(numbers: list[jax.Array], rows: jax.Array, turns: jax.Array) -> jax.Array:
-        def turn(i: jax.Array, done: jax.Array) -> jax.Array:
+        """Step the rows of the first `turns` turns; others stay zero."""
+
+        def step_rows(i: jax.Array, done: jax.Array) -> jax.Array:
+            """Step the rows of turn i, and put them among those done."""
             some = jax.lax.dynamic_slice_in_dim(rows, i * together, together)
             stepped = jax.vmap(lambda row: step(numbers, row))(some)
             return jax.lax.dynamic_update_slice_in_dim(done, stepped, i * together, 0)
 
         columns = layout.state.size + outputs.size
-        stepped: jax.Array = jax.lax.fori_loop(0, turns, turn, jnp.zeros((width, columns)))
+        stepped: jax.Array = jax.lax.fori_loop(0, turns, step_rows, jnp.zeros((width, columns)))
         return stepped
 
     return jax.jit(run, compiler_options=in_haste() if is_long else understood())

@@ -16,7 +16,7 @@ from heliograph.numerics.types import PyTree
 def simulate_trajectories(
     init: Callable[[jax.Array], PyTree], step: Callable[..., tuple[PyTree, PyTree]], keys: jax.Array, rows: PyTree
 ) -> PyTree:
-    """Outputs of `step(carry, key, row)` from `init(key)` on, (run, time, ...); (1, time, ...) if common to all runs.
+    """Return outputs of `step(carry, key, row)` from `init(key)` on, (run, time, ...); (1, time, ...) if common.
 
     The axis of runs is the last one of every array inside: a processor works through them contiguously.
     """
@@ -28,23 +28,27 @@ def simulate_trajectories(
         lambda carry, key, row: step(jax.tree.unflatten(tree, carry), key, row), return_shape=True
     )(example_carry, keys[0], example)
     body = _drop_unused(traced)
-    known = [False] * len(jax.tree.leaves(example))
-    # Parts of the carry that depend on the key, as a fixed point; then those of the outputs.
-    spread = _unchanging(lambda marks: _dependent(body, [*marks, True, *known])[: len(example_carry)], varies)
-    differ = _dependent(body, [*spread, True, *known])[len(example_carry) :]
-    row_axes: list[int | None] = [None] * len(known)
-    # The step for all runs: an axis of runs only where values differ.
-    advance = jax.vmap(jaxpr_as_fun(body), in_axes=[*_axes(spread), 0, *row_axes], out_axes=_axes([*spread, *differ]))
+    row_varies = [False] * len(jax.tree.leaves(example))
+    # Parts of the carry that depend on the key at some step, as a fixed point; then those of the outputs.
+    carry_varies = _find_fixed_point(
+        lambda marks: _dependent(body, [*marks, True, *row_varies])[: len(example_carry)], varies
+    )
+    output_varies = _dependent(body, [*carry_varies, True, *row_varies])[len(example_carry) :]
+    # The step for all runs: an axis of runs only where values differ. The arguments are carry, key and row.
+    in_axes = [*_axes(carry_varies), 0, *_axes(row_varies)]
+    advance = jax.vmap(jaxpr_as_fun(body), in_axes=in_axes, out_axes=_axes([*carry_varies, *output_varies]))
 
-    def scanned(carry: list[jax.Array], row: PyTree) -> tuple[list[jax.Array], list[jax.Array]]:
+    def step_all(carry: list[jax.Array], row: PyTree) -> tuple[list[jax.Array], list[jax.Array]]:
+        """Step all runs."""
         results = advance(*carry, keys, *jax.tree.leaves(row))
         return results[: len(example_carry)], results[len(example_carry) :]
 
-    begin = [jnp.broadcast_to(leaf[..., None], (*leaf.shape, len(keys))) if s and not v else leaf
-             for leaf, v, s in zip(start, varies, spread, strict=True)]  # fmt: skip
-    outcome = jax.lax.scan(scanned, begin, rows)[1]
+    # What is common at first and differs later begins as copies.
+    begin = [jnp.broadcast_to(leaf[..., None], (*leaf.shape, len(keys))) if later and not now else leaf
+             for leaf, now, later in zip(start, varies, carry_varies, strict=True)]  # fmt: skip
+    outcome = jax.lax.scan(step_all, begin, rows)[1]
     # The axis of runs first again.
-    outputs = [jnp.moveaxis(leaf, -1, 0) if d else leaf[None] for leaf, d in zip(outcome, differ, strict=True)]
+    outputs = [jnp.moveaxis(leaf, -1, 0) if v else leaf[None] for leaf, v in zip(outcome, output_varies, strict=True)]
     return jax.tree.unflatten(jax.tree.structure(shape[1]), outputs)
 
 
@@ -56,17 +60,18 @@ def each_run(function: Callable[[PyTree], PyTree], values: PyTree) -> PyTree:
     leaves, tree = jax.tree.flatten(values)
     runs = max(len(leaf) for leaf in leaves)
     varies = [len(leaf) == runs for leaf in leaves]
-    some = [leaf[0] for leaf in leaves]
-    # Which results depend on values of single runs.
-    traced, shape = jax.make_jaxpr(lambda *leaves: function(jax.tree.unflatten(tree, leaves)), return_shape=True)(*some)
-    expected = range(len(traced.jaxpr.outvars))
-    tells = [_any_of(varies, dce_jaxpr(traced.jaxpr, [i == j for j in expected])[1]) for i in expected]
+    of_first = [leaf[0] for leaf in leaves]
+    # Which results depend on values of single runs: those that, alone, keep an operand that varies.
+    traced, shape = jax.make_jaxpr(lambda *leaves: function(jax.tree.unflatten(tree, leaves)), return_shape=True)(
+        *of_first
+    )
+    results = range(len(traced.jaxpr.outvars))
+    result_varies = [_any_of(varies, dce_jaxpr(traced.jaxpr, [i == j for j in results])[1]) for i in results]
     # The axis of runs last inside, first outside.
-    over = jax.vmap(
-        jaxpr_as_fun(traced), in_axes=_axes(varies), out_axes=_axes(tells), axis_size=runs
-    )  # runs last, as everywhere
-    given = [jnp.moveaxis(leaf, 0, -1) if v else leaf[0] for leaf, v in zip(leaves, varies, strict=True)]
-    outputs = [jnp.moveaxis(leaf, -1, 0) if t else leaf[None] for leaf, t in zip(over(*given), tells, strict=True)]
+    apply = jax.vmap(jaxpr_as_fun(traced), in_axes=_axes(varies), out_axes=_axes(result_varies), axis_size=runs)
+    arguments = [jnp.moveaxis(leaf, 0, -1) if v else leaf[0] for leaf, v in zip(leaves, varies, strict=True)]
+    outcome = apply(*arguments)
+    outputs = [jnp.moveaxis(leaf, -1, 0) if v else leaf[None] for leaf, v in zip(outcome, result_varies, strict=True)]
     return jax.tree.unflatten(jax.tree.structure(shape), outputs)
 
 
@@ -79,6 +84,7 @@ def read_by(function: Callable[[PyTree], PyTree], values: PyTree) -> list[PyTree
 
 
 def _any_of(varies: Sequence[bool], used: Sequence[bool]) -> bool:
+    """Return whether something that varies is used."""
     return any(v and u for v, u in zip(varies, used, strict=True))
 
 
@@ -111,11 +117,12 @@ def _dependent(program: ClosedJaxpr, inputs: Sequence[bool]) -> list[bool]:
     return [not isinstance(v, Literal) and v in marked for v in program.jaxpr.outvars]
 
 
-def _unchanging(following: Callable[[list[bool]], list[bool]], marks: list[bool]) -> list[bool]:
-    """Return the fixed point of the marks of a carry under a step."""
-    more = [a or b for a, b in zip(marks, following(marks), strict=True)]
-    return marks if more == marks else _unchanging(following, more)
+def _find_fixed_point(step: Callable[[list[bool]], list[bool]], marks: list[bool]) -> list[bool]:
+    """Return the marks of a carry that steps do not change any more; a step only adds marks."""
+    more = [before or after for before, after in zip(marks, step(marks), strict=True)]
+    return marks if more == marks else _find_fixed_point(step, more)
 
 
 def _axes(varies: Sequence[bool]) -> list[int | None]:
+    """Return the axis of runs for `jax.vmap`: the last of what varies, none of the rest."""
     return [-1 if v else None for v in varies]

@@ -34,8 +34,10 @@ def one_processor() -> bool:
 class RunLanes:
     """Carries of all lanes, and their advance over the blocks of a chunk.
 
+    A lane is a row of blocks that are summed one after another; its carry is the sum so far.
+
     `alone` advances one lane over blocks (count, BLOCK) of runs, `together` all lanes at once, with a leading axis.
-    `one_by_one`: programs that decompose large matrices, of which two at once wait for each other's threads forever.
+    `one_by_one`: for programs that decompose large matrices: two at once wait for each other's threads forever.
     """
 
     def __init__(
@@ -55,13 +57,14 @@ class RunLanes:
         runs = self.first_run + BLOCK * numbers[:, None] + np.arange(BLOCK)
         lanes = [np.flatnonzero(numbers % self.count == lane) for lane in range(self.count)]
         recorded = self._run_on_devices(runs, lanes) if self.wide else self._run_in_threads(runs, lanes)
-        used = np.concatenate(lanes)
-        return jax.tree.map(lambda *parts: _order_blocks(np.concatenate(parts), used), *recorded)
+        dealt = np.concatenate(lanes)
+        return jax.tree.map(lambda *parts: _order_blocks(np.concatenate(parts), dealt), *recorded)
 
     def _run_in_threads(self, runs: np.ndarray, lanes: list[np.ndarray]) -> list[PyTree]:
         """Run each lane in a thread of its own, carrying its sums on; return what is recorded of each run, by lane."""
 
-        def go(lane: int) -> PyTree:
+        def advance_lane(lane: int) -> PyTree:
+            """Advance one lane over its blocks."""
             with jax.enable_x64(True):
                 carry = self.start() if self.carries[lane] is None else self.carries[lane]
                 self.carries[lane], recorded = self.alone(runs[lanes[lane]], carry)
@@ -69,16 +72,16 @@ class RunLanes:
 
         if self.pool is None:
             self.pool = ThreadPoolExecutor(1 if self.one_by_one else min(self.count, os.cpu_count() or 1))
-        return list(self.pool.map(go, [lane for lane, mine in enumerate(lanes) if len(mine)]))
+        return list(self.pool.map(advance_lane, [lane for lane, blocks in enumerate(lanes) if len(blocks)]))
 
     def _run_on_devices(self, runs: np.ndarray, lanes: list[np.ndarray]) -> list[PyTree]:
         """Run one lane on each device, carrying their sums on; return what is recorded of each run, by lane."""
         shared = NamedSharding(Mesh(np.array(jax.devices()), ("lane",)), PartitionSpec("lane"))  # type: ignore[no-untyped-call]
         if isinstance(self.carries, list):
-            every = jax.tree.map(lambda leaf: np.stack([leaf] * self.count), to_numpy(self.start()))
-            self.carries = jax.device_put(every, shared)
-        dealt = jax.device_put(np.stack([runs[mine] for mine in lanes]), shared)
-        self.carries, recorded = self.together(dealt, self.carries)
+            carries = jax.tree.map(lambda leaf: np.stack([leaf] * self.count), to_numpy(self.start()))
+            self.carries = jax.device_put(carries, shared)
+        runs_by_lane = jax.device_put(np.stack([runs[blocks] for blocks in lanes]), shared)
+        self.carries, recorded = self.together(runs_by_lane, self.carries)
         on_host = to_numpy(recorded)
         return [jax.tree.map(lambda leaf: leaf[lane], on_host) for lane in range(self.count)]  # noqa: B023
 
@@ -107,16 +110,20 @@ def is_shared(leaf: PyTree) -> bool:
 
 @partial(jax.jit, donate_argnums=0)
 def added(total: PyTree, more: PyTree) -> PyTree:
-    """Add in place: of many nodes these are hundreds of megabytes, which take longer to allocate than to add."""
+    """Return the sums of two trees, in the memory of the first; values that all runs share stay as they are.
+
+    In place, since of many nodes these are hundreds of megabytes, which take longer to allocate than to add.
+    """
     return jax.tree.map(lambda a, b: b if is_shared(b) else a + b, total, more, is_leaf=is_shared)
 
 
 def advance_in_chunks(
     advance: Callable[[int, int], PyTree], lanes: int, wide: bool, runs: tuple[int, int], progress: Progress | None
 ) -> list[PyTree]:
-    """Advance over all blocks; `runs`: their number, and that of a chunk, between which there is progress.
+    """Advance over all blocks, chunk by chunk, with progress between; return what each chunk collected.
 
-    A chunk has fewer blocks than there are lanes, or a multiple of their number.
+    `runs`: how many there are, and how many a chunk has. A chunk has fewer blocks than there are lanes, or a multiple
+    of their number.
     """
     count, chunk = runs
     blocks = -(-min(chunk, count) // BLOCK)
@@ -135,8 +142,8 @@ def batch_counts(first_run: int, stop: int) -> np.ndarray:
     return np.bincount(np.arange(first_run, stop) % BATCHES, minlength=BATCHES).astype(float)
 
 
-def _order_blocks(recorded: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Return the blocks (lane by lane, BLOCK, ...) as runs in the order of the blocks."""
+def _order_blocks(recorded: np.ndarray, dealt: np.ndarray) -> np.ndarray:
+    """Return blocks (block, BLOCK, ...) that came lane by lane, `dealt` their numbers, as runs in order."""
     ordered = np.empty_like(recorded)
-    ordered[used] = recorded
+    ordered[dealt] = recorded
     return ordered.reshape(recorded.shape[0] * recorded.shape[1], *recorded.shape[2:])  # a length may be zero

@@ -30,8 +30,8 @@ from heliograph.simulation.world import World
 from straightline import Unsupported, accumulate
 
 PROGRAMS = 64  # whose code is held at once
-PLAIN = (0.0, 1.0, -1.0)  # numbers that are known in a program,
-FEW = 64  # of arrays of so many numbers at most
+PLAIN = (0.0, 1.0, -1.0)  # numbers that are known when a program is made, to save operations
+FEW = 64  # numbers of an array at most of which that holds
 
 
 def compile_runs(
@@ -57,21 +57,21 @@ def compile_runs(
         raise Unsupported(f"keys of type {key.dtype}")
     # Arrays are arguments; everything else is part of the program.
     leaves, tree = jax.tree.flatten((world, later, inputs, reducer))
-    held = tuple(not eqx.is_array(leaf) for leaf in leaves)
-    fixed = tuple(leaf if h else None for leaf, h in zip(leaves, held, strict=True))
-    arrays = [np.asarray(leaf) for leaf, h in zip(leaves, held, strict=True) if not h]
+    is_fixed = tuple(not eqx.is_array(leaf) for leaf in leaves)
+    fixed = tuple(leaf if f else None for leaf, f in zip(leaves, is_fixed, strict=True))
+    arrays = [np.asarray(leaf) for leaf, f in zip(leaves, is_fixed, strict=True) if not f]
     # One program for networks of one structure.
     try:
-        made = _find_program(
-            tree, held, fixed, tuple(map(_Known.of, arrays)), bool(jax.threefry_partitionable.value), precision
+        compiled = _find_program(
+            tree, is_fixed, fixed, tuple(map(_Known.of, arrays)), bool(jax.threefry_partitionable.value), precision
         )
     except TypeError as error:
         if "unhashable" not in str(error):
             raise
         raise Unsupported("a network with an object that cannot be compared with another") from None
-    if isinstance(made, Unsupported):
-        raise Unsupported(made.operation, made.where)
-    program, form = made
+    if isinstance(compiled, Unsupported):
+        raise Unsupported(compiled.operation, compiled.where)
+    program, form = compiled
     lanes = min(LANES, -(-runs // BLOCK))
     collected, sums, variables = program.memory(runs, lanes, min(lanes, os.cpu_count() or 1))
     collected *= 2 if precision == "float32" else 1  # results are handed back in double precision
@@ -126,39 +126,42 @@ def _is_given(array: np.ndarray) -> bool:
 @lru_cache(PROGRAMS)
 def _find_program(
     tree: Any,
-    held: tuple[bool, ...],
+    is_fixed: tuple[bool, ...],
     fixed: tuple[Any, ...],
     known: tuple[_Known, ...],
     counting: bool,
     precision: Precision,
 ) -> tuple[Any, Any] | Unsupported:
-    """Cached `_compile_program`, or why there is none. It depends on JAX's way to count draws, `counting`."""
+    """Return what `_compile_program` does, cached; returned and not raised, so cached too, is why there is none.
+
+    `counting` is only part of the cache's key: what is traced depends on JAX's way of counting draws.
+    """
     try:
-        return _compile_program(tree, held, fixed, known, precision)
+        return _compile_program(tree, is_fixed, fixed, known, precision)
     except Unsupported as error:
         return Unsupported(error.operation, error.where)  # without its traceback, which holds the program
 
 
 def _compile_program(
-    tree: Any, held: tuple[bool, ...], fixed: tuple[Any, ...], known: tuple[_Known, ...], precision: Precision
+    tree: Any, is_fixed: tuple[bool, ...], fixed: tuple[Any, ...], known: tuple[_Known, ...], precision: Precision
 ) -> tuple[Any, Any]:
     """Compile the code of networks of one structure; also return the structure of what is collected of a run.
 
-    `held` and `fixed`: the leaves that are no arrays, such as a user's functions.
+    `is_fixed`: which leaves of the tree are no arrays, such as a user's functions; `fixed`: these, None for arrays.
     """
-    form: list[Any] = []
+    form: list[Any] = []  # filled when `run` is traced
 
-    # One run, from the key, the arrays and the run's number.
     def run(key: jax.Array, *leaves: Any) -> tuple[PyTree, PyTree]:
         """Simulate one run from the program's arrays and the run's number; return what is summed, and what is kept."""
         *arrays, number = leaves
         items = iter(arrays)
-        whole = [value if h else next(items) for value, h in zip(fixed, held, strict=True)]
-        world, later, inputs, reducer = jax.tree.unflatten(tree, whole)
+        leaves_of_tree = [value if f else next(items) for value, f in zip(fixed, is_fixed, strict=True)]
+        world, later, inputs, reducer = jax.tree.unflatten(tree, leaves_of_tree)
         run_key, u = jax.random.fold_in(key, number), jnp.asarray(inputs)
-        reduced = (
-            _run(world, u, reducer, run_key) if later is None else _collect_smoothed(world, later, u, reducer, run_key)
-        )
+        if later is None:
+            reduced = _run(world, u, reducer, run_key)
+        else:
+            reduced = _collect_smoothed(world, later, u, reducer, run_key)
         summed = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=float), (reduced.sums, reduced.ever))
         form[:] = [jax.tree.structure(OfStep(summed[0], summed[1], reduced.collected))]
         return summed, reduced.collected
@@ -181,6 +184,7 @@ def _run(world: World, inputs: jax.Array, reducer: AbstractReducer[Any], key: ja
     """Collect the results of a run: stacked over time, but for flags that hold if true at any step."""
 
     def step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, OfStep]:
+        """Step the world, and reduce the step."""
         state, outputs = _step_world(world, state, key, row)
         return state, reducer.of_step(outputs)
 
@@ -194,6 +198,7 @@ def _collect_smoothed(
     """Collect the results of a run's filtered and smoothed estimates, from the whole run with its smoother steps."""
 
     def step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
+        """Step the world; the step is reduced later, with what comes after it."""
         return _step_world(world, state, key, row)
 
     _, outputs = jax.lax.scan(step, world.init(key), (jnp.arange(len(inputs)), inputs))
@@ -218,14 +223,12 @@ def simulate_natively(
     nodes that share nothing but the plant: they are simulated a few at a time.
     """
     # Smoothing, few nodes, or nodes that share something: one program.
-    whole = smoothing is not None or len(network.names) <= NODES or not is_apart(network)
-    if whole or type(reducer).joined is AbstractReducer.joined:
+    is_whole = smoothing is not None or len(network.names) <= NODES or not is_apart(network)
+    if is_whole or type(reducer).joined is AbstractReducer.joined:  # that of the base class cannot join parts
         code = try_native(lambda: code_of_network(network, inputs, key, reducer, runs, smoothing, precision=precision))
-        return (
-            None
-            if code is None
-            else finish(reducer, _run_chunks(code, first_run, runs, chunk, progress), network, smoothing)
-        )
+        if code is None:
+            return None
+        return finish(reducer, _run_chunks(code, first_run, runs, chunk, progress), network, smoothing)
     # Many independent nodes: one program for a few of them, with other numbers.
     results, parts, memory = [], count_parts(network), list[list[np.ndarray]]()
     for number, (some, world) in enumerate(split_nodes(network)):
@@ -234,11 +237,13 @@ def simulate_natively(
         if code is None:
             return None
 
-        def shown(done: int, total: int) -> None:
+        def show_progress(done: int, total: int) -> None:
+            """Show the progress of this part as that of the whole."""
             if progress is not None:
                 progress((number * total + done) // parts, total)  # noqa: B023
 
-        results.append(finish(reducer, _run_chunks(code, first_run, runs, chunk, shown, memory), some, None))
+        recorded = _run_chunks(code, first_run, runs, chunk, show_progress, memory)
+        results.append(finish(reducer, recorded, some, None))
     return reducer.joined(results, network)
 
 
@@ -252,8 +257,8 @@ def code_of_network(
     precision: Precision = "float64",
 ) -> Native:
     """Make the native code of a network's runs, as `compile_runs` of its world; a part of it may be smoothed."""
-    filters = AllFilters(network, smoothing and smoothing.kinds)
-    later = smoothing and smoothing.smoother(filters)
+    filters = AllFilters(network, None if smoothing is None else smoothing.kinds)
+    later = None if smoothing is None else smoothing.smoother(filters)
     return compile_runs(build_world(network, filters), inputs, key, reducer, runs, later, precision=precision)
 
 
@@ -265,7 +270,7 @@ def _run_chunks(
     progress: Progress | None,
     memory: list[list[np.ndarray]] | None = None,
 ) -> Recorded:
-    """Sums over all runs, and what is collected of them, chunk by chunk; `memory` as that of `NativeLanes`."""
+    """Return the sums over all runs, and what is collected of them, chunk by chunk; `memory` as of `NativeLanes`."""
     lanes = NativeLanes(code, first_run, first_run + runs, [] if memory is None else memory)
     parts = advance_in_chunks(lanes.advance, LANES, False, (runs, chunk), progress)
     return lanes.total()._replace(collected=lanes.joined(parts))

@@ -34,27 +34,30 @@ class NativeLanes:
     def advance(self, start: int, blocks: int) -> list[np.ndarray | None]:
         """Simulate `blocks` blocks from number `start` on; return the collected results of their runs in order."""
         numbers = np.arange(start, start + blocks)
-        dealt = {lane: self._runs(numbers[numbers % LANES == lane]) for lane in range(LANES)}
-        used = [lane for lane, runs in dealt.items() if len(runs)]
+        runs_of_lane = {lane: self._list_runs(numbers[numbers % LANES == lane]) for lane in range(LANES)}
+        used = [lane for lane, runs in runs_of_lane.items() if len(runs)]
 
-        def go(lane: int) -> list[np.ndarray | None]:
+        def simulate_lane(lane: int) -> list[np.ndarray | None]:
+            """Add a lane's runs to its sums; return what is collected of them."""
             sums = self.sums[lane] = self.sums[lane] or self.code.begun.zeros(self.memory)
-            some: list[np.ndarray | None] = self.code.begun.add(dealt[lane], sums)
-            return some
+            collected: list[np.ndarray | None] = self.code.begun.add(runs_of_lane[lane], sums)
+            return collected
 
-        collected = list(threads().map(go, used))
-        order = np.argsort(np.concatenate([dealt[lane] for lane in used]), kind="stable")
-        together = (
-            None if blocks[0] is None else np.concatenate(blocks)[order] for blocks in zip(*collected, strict=True)
-        )
-        return [None if one is None else to_double(one) for one in together]
+        collected_by_lane = list(threads().map(simulate_lane, used))
+        # Each leaf of all lanes, as runs in order; None where all runs share it.
+        order = np.argsort(np.concatenate([runs_of_lane[lane] for lane in used]), kind="stable")
+        leaves: list[np.ndarray | None] = []
+        for parts in zip(*collected_by_lane, strict=True):
+            leaves.append(None if parts[0] is None else to_double(np.concatenate(parts)[order]))
+        return leaves
 
-    def _runs(self, blocks: np.ndarray) -> np.ndarray:
+    def _list_runs(self, blocks: np.ndarray) -> np.ndarray:
+        """Return the runs of these blocks, without those beyond the last."""
         runs = (self.first_run + BLOCK * blocks[:, None] + np.arange(BLOCK)).ravel()
         return runs[runs < self.stop]
 
     def total(self) -> Recorded:
-        """Sums over all runs, by batch."""
+        """Return the sums over all runs, by batch, and give their memory back."""
         code = self.code.begun
         used = [sums for sums in self.sums if sums is not None]
         totals = iter(code.total(used))
@@ -62,8 +65,8 @@ class NativeLanes:
         leaves, common = [], []
         # Results that all runs share stand as of one run.
         for fixed, is_summed in zip(code.shared, code.summed, strict=True):
-            own = next(totals) if is_summed and fixed is None else None
-            leaves.append(own if fixed is None else to_double(fixed))
+            by_batch = next(totals) if is_summed and fixed is None else None
+            leaves.append(by_batch if fixed is None else to_double(fixed))
             common.append(fixed is not None)
         sums, same = (jax.tree.unflatten(self.code.tree, x) for x in (leaves, common))
         return Recorded(sums, same, batch_counts(self.first_run, self.stop), None)
@@ -71,11 +74,13 @@ class NativeLanes:
     def joined(self, parts: Sequence[list[np.ndarray | None]]) -> PyTree:
         """Return the collected results of all runs, (run, ...); a view of one where they share it."""
         leaves: list[Any] = []
-        for fixed, *single in zip(self.code.begun.shared, *parts, strict=True):
+        for fixed, *chunks in zip(self.code.begun.shared, *parts, strict=True):
             if fixed is not None:
                 leaves.append(np.broadcast_to(to_double(fixed), (self.stop - self.first_run, *fixed.shape)))
-            else:
-                leaves.append(None if single[0] is None else np.concatenate(single) if len(single) > 1 else single[0])
+            elif len(chunks) > 1 and chunks[0] is not None:
+                leaves.append(np.concatenate(chunks))
+            else:  # one chunk is not copied; None is what is not collected
+                leaves.append(chunks[0])
         return jax.tree.unflatten(self.code.tree, leaves).collected
 
 

@@ -27,7 +27,7 @@ NODES = 4  # simulated by one program: the plant is simulated again for each so 
 
 
 def is_apart(network: Network) -> bool:
-    """Test whether nodes, each with filters, share nothing but the plant: no fusion, sensor, hop or memory."""
+    """Return whether all nodes have filters and share nothing but the plant: no fusion, sensor, hop or memory."""
     nodes = [node for node in network.nodes.values() if isinstance(node, Node) and node.filters]
     fused = network.fused or network.meshes
     return len(nodes) == len(network.nodes) and not fused and not any(first(n.channel).remembers for n in nodes)
@@ -58,11 +58,12 @@ def split_nodes(network: Network) -> Iterator[tuple[Network, World]]:
 
 
 def _on_host(leaf: PyTree) -> PyTree:
+    """Return an array of a device as one of NumPy; anything else as it is."""
     return np.asarray(leaf) if isinstance(leaf, jax.Array) else leaf
 
 
 def _select_nodes(network: Network, names: tuple[str, ...]) -> Network:
-    """Return the network of some nodes of one structure; the whole network is checked, and so are they."""
+    """Return the network of some nodes of one structure, unchecked, since the whole network is."""
     group = next(g for g, members in enumerate(network.groups) if names[0] in members)
     kinds = tuple(Kind(0, kind.filters) for kind in network.kinds if kind.group == group)
     size = network.nodes[names[0]].received
@@ -91,10 +92,11 @@ def _select_rows(world: World, nodes: slice) -> World:
     """Return the world of some nodes, all of one structure: their rows of all that is stacked."""
     assert isinstance(world.medium, SeparateChannels)
 
-    def rows(leaf: PyTree) -> PyTree:
+    def select(leaf: PyTree) -> PyTree:
+        """Return the nodes' rows of an array."""
         return leaf[nodes] if eqx.is_array(leaf) else leaf
 
-    medium = SeparateChannels(jax.tree.map(rows, world.medium.groups))
+    medium = SeparateChannels(jax.tree.map(select, world.medium.groups))
     alike = tuple(_select_of_kind(stacked, nodes) for stacked in world.filters.alike)
     return World(world.plant, medium, _with_fields(world.filters, alike=alike))
 
@@ -103,11 +105,18 @@ def _select_of_kind(stacked: StackedFilters, nodes: slice) -> StackedFilters:
     """Return the filters of some nodes; they are stacked filter by filter, node after node for each."""
     count = len(range(*nodes.indices(stacked.nodes)))
 
-    def rows(leaf: PyTree) -> PyTree:
+    def select(leaf: PyTree) -> PyTree:
+        """Return the nodes' rows of an array (filter and node, ...), for each filter."""
         if not eqx.is_array(leaf):
             return leaf
         by_filter = leaf.reshape(stacked.count, stacked.nodes, *leaf.shape[1:])
         return by_filter[:, nodes].reshape(stacked.count * count, *leaf.shape[1:])
 
-    filters = jax.tree.map(rows, stacked.filters)
-    return StackedFilters(filters, stacked.group, stacked.count, count, stacked.smooths, stacked.judges)
+    return StackedFilters(
+        filters=jax.tree.map(select, stacked.filters),
+        group=stacked.group,
+        count=stacked.count,
+        nodes=count,
+        smooths=stacked.smooths,
+        judges=stacked.judges,
+    )

@@ -51,24 +51,25 @@ def _apply_by_xla(function: Callable[..., PyTree], values: list[np.ndarray], wid
     share = -(-runs // (width * cores))  # blocks of each core
     width = -(-runs // (share * cores))  # no wider than it need be: few runs are left to fill up
 
-    def work(core: int) -> PyTree:
+    def compute_share(core: int) -> PyTree:
+        """Return the results of one core's runs: `share` blocks of `width` runs, filled up and cut again."""
         first, last = core * share * width, min((core + 1) * share * width, runs)
         parts = [_pad_runs(a[first:last], share * width).reshape(share, width, *a.shape[1:]) for a in values]
         with jax.enable_x64(True):
-            outputs = to_numpy(_blocks(function, parts))
+            outputs = to_numpy(_map_blocks(function, parts))
         return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[: last - first], outputs)
 
     # Each core computes its blocks, then copies them to their place.
-    computed = list(threads().map(work, range(-(-runs // (share * width)))))
-    whole = jax.tree.map(lambda leaf: np.empty((runs, *leaf.shape[1:]), leaf.dtype), computed[0])
+    computed = list(threads().map(compute_share, range(-(-runs // (share * width)))))
+    results = jax.tree.map(lambda leaf: np.empty((runs, *leaf.shape[1:]), leaf.dtype), computed[0])
 
-    def copy_back(core: int) -> None:  # copied by all cores too: large results take their time
-        into, blocks = jax.tree.leaves(whole), jax.tree.leaves(computed[core])
-        for target, leaf in zip(into, blocks, strict=True):
+    def copy_back(core: int) -> None:
+        """Copy one core's results to their place, all cores at once since large results take their time."""
+        for target, leaf in zip(jax.tree.leaves(results), jax.tree.leaves(computed[core]), strict=True):
             target[core * share * width :][: len(leaf)] = leaf
 
     list(threads().map(copy_back, range(len(computed))))
-    return whole
+    return results
 
 
 def _read_numbers(value: PyTree) -> np.ndarray:
@@ -89,5 +90,6 @@ def _pad_runs(values: np.ndarray, count: int) -> np.ndarray:
 
 
 @fully_optimised
-def _blocks(function: Callable[..., PyTree], parts: list[PyTree]) -> PyTree:
+def _map_blocks(function: Callable[..., PyTree], parts: list[PyTree]) -> PyTree:
+    """Apply the function of one run to blocks (block, run, ...), one block after another."""
     return jax.lax.map(lambda block: jax.vmap(function)(*block), parts)

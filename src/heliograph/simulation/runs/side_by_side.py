@@ -100,22 +100,23 @@ class StackedFilters(Module):
         `skip` (filter, node): reasons not to use them.
         """
 
-        def single(
+        def step_one(
             filter: AbstractFilter, state: PyTree, z: jax.Array, skip: jax.Array | None
         ) -> tuple[PyTree, StepOutput]:
+            """Step one filter of one node."""
             return filter_step(filter, state, z, u, k, self.smooths, self.judges, skip)
 
         reasons = None if skip is None else skip.reshape(-1)
-        both = map_all(single, self.count * self.nodes)
-        after, known = both(self.filters, states, jnp.tile(z, (self.count, 1)), reasons)
-        return after, jax.tree.map(lambda leaf: leaf.reshape(self.count, len(z), *leaf.shape[1:]), known)
+        step_all = map_all(step_one, self.count * self.nodes)
+        after, outputs = step_all(self.filters, states, jnp.tile(z, (self.count, 1)), reasons)
+        return after, jax.tree.map(lambda leaf: leaf.reshape(self.count, len(z), *leaf.shape[1:]), outputs)
 
     def matrices(
         self, read: Callable[..., object], states: PyTree, f: int, z: jax.Array, u: jax.Array, k: jax.Array
     ) -> PyTree:
-        """Apply `read` to this step of filter f at each node, from the states before it; (node, ...)."""
-        mine = slice(f * self.nodes, (f + 1) * self.nodes)
-        filters, states = jax.tree.map(lambda leaf: leaf[mine] if eqx.is_array(leaf) else leaf, (self.filters, states))
+        """Return read(filter, state, z, u, k) of filter number f at each node, from the states before step k."""
+        rows = slice(f * self.nodes, (f + 1) * self.nodes)
+        filters, states = jax.tree.map(lambda leaf: leaf[rows] if eqx.is_array(leaf) else leaf, (self.filters, states))
         return map_all(lambda node, state, z: read(node, state, z, u, k), self.nodes)(filters, states, z)
 
 
@@ -125,23 +126,25 @@ def initial_state(filter: AbstractFilter) -> PyTree:
 
 
 def map_all(function: Callable[..., PyTree], size: int) -> Callable[..., PyTree]:
-    """Vectorise a function of one of what is stacked; some hold no array from which the number could be read.
+    """Return the function of stacks of `size` that applies a function of one to each; its arguments are arrays' rows.
 
-    A single one is not vectorised: its function takes half as long to trace as the same over one axis more.
+    `size` is given, since a stack may hold no array. One alone is not vectorised: that takes half as long to trace.
     """
     if size == 1:
         return partial(_apply_to_one, function)
-    over: Callable[..., PyTree] = eqx.filter_vmap(function, in_axes=eqx.if_array(0), axis_size=size)
-    return over
+    apply: Callable[..., PyTree] = eqx.filter_vmap(function, in_axes=eqx.if_array(0), axis_size=size)
+    return apply
 
 
 def _apply_to_one(function: Callable[..., PyTree], *stacked: PyTree) -> PyTree:
-    """Apply a function of one run to arrays that hold one run only, without the cost of `vmap`."""
+    """Apply a function of one to a stack of one, without the cost of `vmap`."""
 
-    def only(leaf: PyTree) -> PyTree:
+    def drop_axis(leaf: PyTree) -> PyTree:
+        """Return the only row of an array."""
         return jax.lax.squeeze(leaf, (0,)) if eqx.is_array(leaf) else leaf
 
-    def alone(leaf: PyTree) -> PyTree:
+    def add_axis(leaf: PyTree) -> PyTree:
+        """Return an array as the only row of another."""
         return jax.lax.expand_dims(leaf, (0,)) if eqx.is_array(leaf) else leaf
 
-    return jax.tree.map(alone, function(*jax.tree.map(only, stacked)))
+    return jax.tree.map(add_axis, function(*jax.tree.map(drop_axis, stacked)))

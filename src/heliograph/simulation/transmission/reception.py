@@ -1,7 +1,7 @@
 """Transmission from the plant to the filters: each node's sensor and channel, or relays that transmit in slots."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -66,11 +66,8 @@ class NodeGroup(Module):
     """Sensors and channels of a group of nodes, stacked; checksums of the names identify their draws.
 
     `reference_filter`: filters that are fed back to the sensors; their estimates stand at `informed_at` (kind, filter).
-
-    `trigger`: when they send; its prediction is that of a filter too, the `reference_filter`.
-
-    `encoder`: of the words that they send; the `channel` then carries their bits, which the `reader` puts together.
-
+    `trigger`: when they send; its prediction is that of a filter too, the `reference_filter`. `encoder`: of the words
+    that they send; the `channel` then carries their bits, which the `reader` puts together.
     Shapes: checksums (node,), memories (node, memories of a channel) and modes (node, memories of a sensor): checksums
     of the channels' and sensors' memories.
     """
@@ -112,7 +109,8 @@ class SeparateChannels(AbstractMedium):
     def init(self, key: jax.Array) -> PyTree:
         """Return states of the channels and of the feedback, by group, with a leading node axis."""
 
-        def single(group: NodeGroup) -> LinkState:
+        def start_node(group: NodeGroup) -> LinkState:
+            """Return the initial state of one node's link."""
             feed_back = None if group.reference_filter is None else _first_mean(group.reference_filter)
             outputs = len(first(group.sensor).outputs)
             sender = None if group.trigger is None else group.trigger.start(outputs)
@@ -120,7 +118,8 @@ class SeparateChannels(AbstractMedium):
             return LinkState(start(group.channel, key, group.checksums, group.memories), feed_back, sender, modes)
 
         return tuple(
-            () if isinstance(group, Silent) else map_all(single, len(group.checksums))(group) for group in self.groups
+            () if isinstance(group, Silent) else map_all(start_node, len(group.checksums))(group)
+            for group in self.groups
         )
 
     def receive(
@@ -128,49 +127,51 @@ class SeparateChannels(AbstractMedium):
     ) -> tuple[PyTree, ObservationModel]:
         """Measure x, subtract the reference of sensors with feedback, and deliver through the channels."""
 
-        def receive_one(group: NodeGroup, reach: LinkState) -> tuple[LinkState, jax.Array]:
+        def receive_one(group: NodeGroup, link: LinkState) -> tuple[LinkState, jax.Array]:
             """Measure x at one node, let its trigger decide, and deliver through its channel."""
-            sensor = condition_on_memories(at(group.sensor, k), reach.modes).under(group.inputs, u)
-            modes = move_modes(group.sensor, reach.modes, key, k, group.modes)
+            sensor = condition_on_memories(at(group.sensor, k), link.modes).under(group.inputs, u)
+            modes = move_modes(group.sensor, link.modes, key, k, group.modes)
             y = measure(sensor, x, draw_key(key, k, group.checksums, SENSOR))
-            if isinstance(group.reference_filter, FedBackFilter) and reach.feed_back is not None:
-                y = y - group.reference_filter.reference(reach.feed_back, u, k)
-            y, z, memory = _send(group, reach.memory, y, key, k)
-            if group.trigger is None or reach.sender is None:
-                return LinkState(memory, reach.feed_back, modes=modes), z
-            # The sender decides, by its own reference.
-            sender = reach.sender
-            if (
-                group.trigger.reference == "prediction"
-                and group.reference_filter is not None
-                and reach.feed_back is not None
-            ):
-                sender = sender._replace(reference=group.reference_filter.reference(reach.feed_back, u, k))
+            reference: jax.Array | None = None
+            if group.reference_filter is not None and link.feed_back is not None:
+                reference = group.reference_filter.reference(link.feed_back, u, k)
+            if isinstance(group.reference_filter, FedBackFilter) and reference is not None:
+                y = y - reference
+            y, z, memory = _send(group, link.memory, y, key, k)
+            if group.trigger is None or link.sender is None:
+                return LinkState(memory, link.feed_back, modes=modes), z
+            # The sender decides, by its own reference or the filter's prediction.
+            sender = link.sender
+            if group.trigger.reference == "prediction" and reference is not None:
+                sender = sender._replace(reference=reference)
             drawn = draw_key(key, k, group.checksums, TRIGGER)
             sender, z = group.trigger.transmit(sender, y, z, drawn, k)
-            return LinkState(memory, reach.feed_back, sender, modes), z
+            return LinkState(memory, link.feed_back, sender, modes), z
 
-        results = [
-            (reach, jnp.zeros((group.count, 0)))
-            if isinstance(group, Silent)
-            else map_all(receive_one, len(group.checksums))(group, reach)
-            for group, reach in zip(self.groups, state, strict=True)
-        ]
+        def receive_group(group: NodeGroup | Silent, link: PyTree) -> tuple[PyTree, jax.Array]:
+            """Return the links of one group after the step, and what its nodes receive."""
+            if isinstance(group, Silent):
+                return link, jnp.zeros((group.count, 0))
+            return cast(tuple[PyTree, jax.Array], map_all(receive_one, len(group.checksums))(group, link))
+
+        results = [receive_group(group, link) for group, link in zip(self.groups, state, strict=True)]
         return tuple(after for after, _ in results), tuple(z for _, z in results)
 
     def feed_back(self, state: PyTree, estimates: Sequence[Estimate]) -> PyTree:
         """Feed the present estimate of each filter back to its sensor."""
-        return tuple(
-            reach
-            if group.informed_at is None
-            else reach._replace(feed_back=estimates[group.informed_at[0]].mean[group.informed_at[1]])
-            for group, reach in zip(self.groups, state, strict=True)
-        )
+
+        def feed_group(group: NodeGroup | Silent, link: PyTree) -> PyTree:
+            if group.informed_at is None:
+                return link
+            kind, f = group.informed_at
+            return link._replace(feed_back=estimates[kind].mean[f])
+
+        return tuple(feed_group(group, link) for group, link in zip(self.groups, state, strict=True))
 
     def reasons(self, state: PyTree) -> dict[str, jax.Array]:
         """Return the reasons for which senders that decide transmitted at this step, by group, (node, m)."""
-        links = ((g, reach) for g, reach in enumerate(state) if isinstance(reach, LinkState))
-        return {str(g): reach.sender.last for g, reach in links if reach.sender is not None}
+        links = ((g, link) for g, link in enumerate(state) if isinstance(link, LinkState))
+        return {str(g): link.sender.last for g, link in links if link.sender is not None}
 
 
 def _send(
@@ -180,13 +181,13 @@ def _send(
     if group.encoder is None or group.reader is None:
         memory, z = deliver(group.channel, memory, y, key, k, group.checksums, group.memories)
         return y, z, memory
-    outputs = len(y)
     words, numbers = group.encoder.send(y, draw_key(key, k, group.checksums, DITHER))
     memory, received = deliver(group.channel, memory, numbers, key, k, group.checksums, group.memories)
-    return words, group.reader.read(group.encoder, outputs, received), memory
+    return words, group.reader.read(group.encoder, len(y), received), memory
 
 
 def _first_mean(filter: AbstractFilter) -> jax.Array:
+    """Return a filter's mean before the first step."""
     return jnp.asarray(filter.estimate(filter.init()).mean)
 
 
@@ -270,31 +271,33 @@ class Slots(AbstractMedium):
         return Relayed(jnp.stack(means) if means else state.estimates, state.hops)
 
     def _sum_without_memory(self, k: jax.Array, sent: dict[str, jax.Array], key: jax.Array) -> dict[str, jax.Array]:
-        """Sum at each listener through hops without memory; NaN where nobody transmits to it."""
-        # Slots of one structure share a branch; numbers of each slot within it.
-        kinds: dict[object, list[int]] = {}
+        """Return the sum at each listener through hops without memory; NaN where nobody transmits to it."""
+        # Slots of one structure share a branch.
+        slots_alike: dict[object, list[int]] = {}
         for number, slot in enumerate(self.relays.slots):
-            kinds.setdefault(structure(slot), []).append(number)
-        kind, position = np.zeros((2, len(self.relays.slots)), dtype=int)  # of each slot: its branch, and where in it
-        for i, numbers in enumerate(kinds.values()):
-            kind[numbers], position[numbers] = i, np.arange(len(numbers))
-        branches = [self._make_branch([self.relays.slots[i] for i in numbers]) for numbers in kinds.values()]
+            slots_alike.setdefault(structure(slot), []).append(number)
+        # Of each slot its branch, and its place within it.
+        branch, position = np.zeros((2, len(self.relays.slots)), dtype=int)
+        for i, numbers in enumerate(slots_alike.values()):
+            branch[numbers], position[numbers] = i, np.arange(len(numbers))
+        branches = [self._make_branch([self.relays.slots[i] for i in numbers]) for numbers in slots_alike.values()]
         # The branch of this step's slot.
-        now = k % len(kind)
+        slot_now = k % len(branch)
         received: dict[str, jax.Array] = jax.lax.switch(
-            jnp.asarray(kind)[now], branches, jnp.asarray(position)[now], k, sent, key
+            jnp.asarray(branch)[slot_now], branches, jnp.asarray(position)[slot_now], k, sent, key
         )
         return received
 
     def _make_branch(self, slots: Sequence[Mapping[str, Mapping[str, Channel]]]) -> Callable[..., dict[str, jax.Array]]:
         """Return the function that computes what each listener receives in these slots."""
-        # a hop that is an OverTime is read at the step; stacking slots would read it at the slot
-        single: PyTree = slots[0] if len(slots) == 1 else over_time(slots)
+        # A single slot is not stacked: its hops may vary over time, and are read at the step.
+        stacked: PyTree = slots[0] if len(slots) == 1 else over_time(slots)
 
         def branch(
             position: jax.Array, k: jax.Array, sent: dict[str, jax.Array], key: jax.Array
         ) -> dict[str, jax.Array]:
-            slot: PyTree = at(single, position) if isinstance(single, OverTime) else single
+            """Return what each listener receives in the slot at this position."""
+            slot: PyTree = at(stacked, position) if isinstance(stacked, OverTime) else stacked
             listeners = zip(self.relays.filters, self.relays.received, strict=True)
             return {name: _receive_sum(slot.get(name, {}), name, size, k, sent, key) for name, size in listeners}
 
@@ -336,9 +339,10 @@ def make_reception(network: Network) -> AbstractMedium:
     # A sensor and a channel for each node, stacked by group.
     nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     memories_of = memory_places({name: (node.sensor, node.channel) for name, node in nodes.items()}, network.plant)
+    groups = [[name for name in names if name in nodes] for names in network.groups]
     return SeparateChannels(tuple(
-        _stack_group(network, {name: nodes[name] for name in names}, memories_of) if names[0] in nodes
-        else Silent(len(names)) for names in network.groups
+        _stack_group(network, {name: nodes[name] for name in sensing}, memories_of) if sensing else Silent(len(names))
+        for sensing, names in zip(groups, network.groups, strict=True)
     ))  # fmt: skip
 
 
@@ -346,34 +350,43 @@ def _make_slots(network: Network, relays: RelayNetwork) -> Slots:
     """Build the transmission through relays that send in slots."""
     listeners = {name: i for i, name in enumerate(relays.filters)}
     return Slots(
-        relays,
-        tuple(network.places[name, LOCAL] for name in relays.relays),
-        tuple(tuple(listeners[name] for name in names) for names in network.groups),
-        memory_places({name: hop for name, (_, _, _, hop) in _find_hops_with_memory(relays).items()}),
+        relays=relays,
+        estimates_at=tuple(network.places[name, LOCAL] for name in relays.relays),
+        groups=tuple(tuple(listeners[name] for name in names) for names in network.groups),
+        memories=memory_places({name: hop for name, (_, _, _, hop) in _find_hops_with_memory(relays).items()}),
     )
 
 
 def _stack_group(network: Network, nodes: Mapping[str, Node], memories_of: Mapping[str, np.ndarray]) -> NodeGroup:
-    """Stack the nodes of a group; `memories_of` each, the places of what sensor and channel remember."""
-    name, one = next(iter(nodes.items()))
+    """Return the nodes of a group, stacked; `memories_of` each node: places of its sensor's and channel's memories."""
+    first_name, first_node = next(iter(nodes.items()))
     # Sensor, channel, and where their draws and memories stand.
     pairs = [(without_output_names(node.sensor), _carrying_channel(node)) for node in nodes.values()]
-    sensor, channel = stack([_drop_names(pair, memories_of[key]) for pair, key in zip(pairs, nodes, strict=True)])
+    # Memories are told apart by their places: without their names the nodes stack.
+    pairs = [drop_names(pair) if len(memories_of[key]) else pair for pair, key in zip(pairs, nodes, strict=True)]
+    sensor, channel = stack(pairs)
     rows_of = [_split_places((node.sensor, node.channel), memories_of[key]) for key, node in nodes.items()]
     of_sensor, memory_rows = (np.stack(parts) for parts in zip(*rows_of, strict=True))
     # What a sender that decides knows: its filter, its rule.
-    knows: str | None = one.informed_by or one.predictor
+    filter_name: str | None = first_node.informed_by or first_node.predictor
     reference: PyTree = None
-    if knows is not None:
-        reference = stack([without_output_names(node.filters[knows]) for node in nodes.values()])
-    informed_at = None if knows is None else network.places[name, knows][:2]
+    if filter_name is not None:
+        reference = stack([without_output_names(node.filters[filter_name]) for node in nodes.values()])
     triggers: PyTree = [node.trigger for node in nodes.values()]
-    trigger = None if triggers[0] is None else stack(triggers)
     encoders: PyTree = [node.encoder for node in nodes.values()]
-    encoder, reader = (None, None) if encoders[0] is None else (stack(encoders), reader_of(one.channel))
-    checksums = np.array([checksum(key) for key in nodes], dtype=np.uint32)
-    return NodeGroup(sensor, network.inputs, channel, checksums, memory_rows, of_sensor,
-                     reference, trigger, encoder, informed_at, reader)  # fmt: skip
+    return NodeGroup(
+        sensor=sensor,
+        inputs=network.inputs,
+        channel=channel,
+        checksums=np.array([checksum(key) for key in nodes], dtype=np.uint32),
+        memories=memory_rows,
+        modes=of_sensor,
+        reference_filter=reference,
+        trigger=None if triggers[0] is None else stack(triggers),
+        encoder=None if encoders[0] is None else stack(encoders),
+        informed_at=None if filter_name is None else network.places[first_name, filter_name][:2],
+        reader=None if encoders[0] is None else reader_of(first_node.channel),
+    )
 
 
 def _carrying_channel(node: Node) -> Channel:
@@ -381,12 +394,8 @@ def _carrying_channel(node: Node) -> Channel:
     return node.channel if node.encoder is None else in_bits(node.encoder, node.channel)
 
 
-def _drop_names(observed: tuple[AnySensor, Channel], places: np.ndarray) -> tuple[AnySensor, Channel]:
-    return drop_names(observed) if len(places) else observed
-
-
 def _split_places(observed: tuple[AnySensor, Channel], places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the places of the memories of a sensor, and of its channel, of those of both together."""
+    """Split the places of the memories of sensor and channel together: return those of the sensor, of the channel."""
     by_identity = dict(zip(memories(observed), places, strict=True))
     of_sensor, of_channel = ([by_identity[identity] for identity in memories(part)] for part in observed)
     return np.array(of_sensor, np.uint32), np.array(of_channel, np.uint32)

@@ -55,6 +55,7 @@ def _transmit_all(channel: Channel, y: Float[Array, "steps m"], seed: Array) -> 
     key = jax.random.key(seed)
 
     def step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, jax.Array]:
+        """Draw the channel, h = [G n; 0 1], and send row k."""
         k, y_k = row
         missing = jnp.isnan(y_k)
         state, h = at(channel, k).draw(state, draw_key(key, k, SENDER, CHANNEL))
@@ -70,7 +71,7 @@ _by_xla = quickly_compiled(_transmit_all)
 
 
 def arrivals(record: Record, network: Network, run: int = 0) -> list[Arrival]:
-    """List what was received in one run, (node, sequence, time, values, arrival), in the order of arrival.
+    """Return what was received in one run, (node, sequence, time, values, arrival), in the order of arrival.
 
     Times are steps from 0. A value belongs to the step at which it was sent, which is its sequence number too: by a
     constant delay, or by its time stamp. A value that is received twice has one number, and two channel noises.
@@ -92,10 +93,10 @@ def arrivals(record: Record, network: Network, run: int = 0) -> list[Arrival]:
     # Node by node; a value of step k - delay arrives at step k.
     for name, z in record.measurements.items():
         values = z if z.ndim == 2 else z[check_count("run", run, 0)]
-        values, late = _separate_delays(name, network.nodes[name], values)
-        there = ~np.isnan(values).all(axis=1) & ~np.isnan(late)
-        for k in np.flatnonzero(there):
-            sent = int(k - late[k])
+        values, delays = _separate_delays(name, network.nodes[name], values)
+        arrived = ~np.isnan(values).all(axis=1) & ~np.isnan(delays)
+        for k in np.flatnonzero(arrived):
+            sent = int(k - delays[k])
             if sent >= 0:
                 results.append((name, sent, float(sent), values[k], float(k)))
     return sorted(results, key=lambda event: event[-1])

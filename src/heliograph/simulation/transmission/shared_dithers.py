@@ -26,8 +26,10 @@ def refuse_shared_dithers(network: Network, z: Mapping[str, Float[np.ndarray, "s
             continue
         places = [place for place in find_places(node.channel) if place != FLAG]
         for component in dict.fromkeys(places):  # copies of a word have one dither
+            # Dithers stand at the end of what is received.
             drawn = z[name][:, node.received - len(places) + places.index(component)]
-            came, sender = drawn[~np.isnan(drawn)], f"{name}.{node.outputs[component]}"
-            if len(came) >= FEWEST and seen.setdefault(came.tobytes(), sender) != sender:
-                expected = "others than those of " + seen[came.tobytes()] + ", as encoder.dithers(node, numbers) draws"
+            dithers, sender = drawn[~np.isnan(drawn)], f"{name}.{node.outputs[component]}"
+            if len(dithers) >= FEWEST and seen.setdefault(dithers.tobytes(), sender) != sender:
+                first_sender = seen[dithers.tobytes()]
+                expected = f"others than those of {first_sender}, as encoder.dithers(node, numbers) draws"
                 raise fail(f"dithers of {sender}", expected, "the same")

@@ -34,31 +34,32 @@ PLANT = "plant"  # whose memories others may share, with a name or without
 
 
 def memory_places(channels: Mapping[str, PyTree], plant: PyTree = ()) -> dict[str, np.ndarray]:
-    """Places of each channel's memories among all keys: by their names, or by the channel where they have none.
+    """Return by channel the numbers that seed its memories' draws: equal ones for memories that are shared.
 
-    A channel may be any tree of models, such as a sensor and its channel; what is a memory of the plant's too is that.
+    They come from the memories' names, or from the channel's where these have none. A channel may be any tree of
+    models, such as a sensor and its channel; a memory that the plant has too is the plant's.
 
     Raises:
         ValueError: one name for memories that differ.
     """
     of_plant = {identity: i for i, identity in enumerate(memories(plant))}
-    _ = memories((plant, tuple({id(c): c for c in channels.values()}.values())))
-    held = {id(channel): memories(channel) for channel in {id(c): c for c in channels.values()}.values()}
+    # One object under many names is looked at once.
+    objects = {id(channel): channel for channel in channels.values()}
+    memories((plant, tuple(objects.values())))  # raises where one name stands for memories that differ
+    held = {key: memories(channel) for key, channel in objects.items()}
     unique_memories(memory for by_identity in held.values() for memory in by_identity.values())
-    return {
-        name: np.array(
-            [
-                checksum(_place_of(memory, i, name, of_plant))
-                for i, (identity, memory) in enumerate(by_identity.items())
-            ],
-            dtype=np.uint32,
-        )
-        for name, by_identity in ((name, held[id(channel)]) for name, channel in channels.items())
-    }
+    places = {}
+    for name, channel in channels.items():
+        sources = [_name_source(m, i, name, of_plant) for i, m in enumerate(held[id(channel)].values())]
+        places[name] = np.array([checksum(source) for source in sources], dtype=np.uint32)
+    return places
 
 
-def _place_of(memory: AbstractMemory, i: int, name: str, of_plant: Mapping[str, int]) -> str:
-    """Return what a memory's draws are seeded by: its name, the plant's number of it, or the channel's."""
+def _name_source(memory: AbstractMemory, i: int, name: str, of_plant: Mapping[str, int]) -> str:
+    """Return the name by which a memory's draws are seeded: its own, the plant's number of it, or the channel's.
+
+    `i`: number of the memory in the channel `name`.
+    """
     if memory.name is not None:
         return memory.identity
     if memory.identity in of_plant:
@@ -79,28 +80,35 @@ class ChannelGroup(Module):
 
 
 def channel_groups(channels: Mapping[str, Channel]) -> tuple[ChannelGroup, ...]:
-    """Stack channels by structure, names of memories aside; a group has one copy of each channel, and rows by name."""
+    """Return the channels by structure, those of one stacked with a row for each name; names of memories aside."""
     listed, memories = list(channels.values()), list(memory_places(channels).values())
     checksums = np.array([checksum(name) for name in channels], dtype=np.uint32)
-    # Of each structure its channels, by identity: one object under many names is looked at once.
-    kinds = {id(channel): drop_names(channel) for channel in {id(c): c for c in listed}.values()}
-    alike: dict[object, dict[int, int]] = {}
-    for which, kind in kinds.items():
-        same = alike.setdefault(structure(kind), {})
-        same[which] = len(same)
+    # Rows of each structure's channels by their identity: one object under many names is stacked once.
+    unnamed = {key: drop_names(channel) for key, channel in {id(c): c for c in listed}.items()}
+    rows_by_structure: dict[object, dict[int, int]] = {}
+    for key, channel in unnamed.items():
+        row_of = rows_by_structure.setdefault(structure(channel), {})
+        row_of[key] = len(row_of)
     # A group for each structure: its channels stacked, then one row for each name that has one of them.
     groups = []
-    for same in alike.values():
-        places = np.array([e for e, channel in enumerate(listed) if id(channel) in same])
-        rows = np.array([same[id(listed[e])] for e in places])
-        kind = stack([kinds[which] for which in same])
-        channel = jax.tree.map(lambda leaf, rows=rows: leaf[rows] if eqx.is_array(leaf) else leaf, kind)
-        groups.append(ChannelGroup(channel, checksums[places], np.stack([memories[e] for e in places]), places))
+    for row_of in rows_by_structure.values():
+        places = np.array([i for i, channel in enumerate(listed) if id(channel) in row_of])
+        rows = np.array([row_of[id(listed[i])] for i in places])
+        stacked = stack([unnamed[key] for key in row_of])
+        channel = jax.tree.map(lambda leaf, rows=rows: leaf[rows] if eqx.is_array(leaf) else leaf, stacked)
+        groups.append(
+            ChannelGroup(
+                channel=channel,
+                checksums=checksums[places],
+                memories=np.stack([memories[i] for i in places]),
+                places=places,
+            )
+        )
     return tuple(groups)
 
 
 class Late(NamedTuple):
-    """State of a late channel, and the signals sent before, the last first."""
+    """State of a late channel: of the `channel` itself, and the `line` of signals sent before, the last first."""
 
     channel: PyTree
     line: jax.Array
@@ -108,10 +116,10 @@ class Late(NamedTuple):
 
 def start(channel: Channel, key: jax.Array, source: Number, shared: Places) -> PyTree:
     """Return a channel's state before the first step."""
-    now, link_key = at(channel, 0), draw_key(key, 0, source, CHANNEL_START)
+    link, link_key = at(channel, 0), draw_key(key, 0, source, CHANNEL_START)
     keys = [draw_key(key, 0, memory, MEMORY_START) for memory in shared]
-    state = init_with_shared_memories(now, link_key, keys) if len(shared) else now.init(link_key)
-    return Late(state, jnp.zeros(now.past * signal_size(now))) if now.past else state
+    state = init_with_shared_memories(link, link_key, keys) if len(shared) else link.init(link_key)
+    return Late(state, jnp.zeros(link.past * signal_size(link))) if link.past else state
 
 
 def start_modes(models: PyTree, key: jax.Array, shared: Places) -> tuple[jax.Array, ...]:
@@ -132,19 +140,23 @@ def move_modes(
 def deliver(
     channel: Channel, state: PyTree, y: jax.Array, key: jax.Array, k: jax.Array, source: Number, shared: Places
 ) -> tuple[PyTree, jax.Array]:
-    """Draw the channel at step k and apply it to y, a late one to past signals too: next state and output."""
-    now, link_key = at(channel, k), draw_key(key, k, source, CHANNEL)
-    if now.past:
+    """Draw the channel at step k and apply it to y, a late one to past signals too; return next state and output.
+
+    `source`: number that seeds its own draws; `shared`: numbers that seed those of its memories.
+    """
+    link, link_key = at(channel, k), draw_key(key, k, source, CHANNEL)
+    if link.past:
         line = jnp.concatenate([y, state.line])
-        after, h = _advance_memory(now, state.channel, key, k, link_key, shared)
+        after, h = _draw_link(link, state.channel, key, k, link_key, shared)
         return Late(after, line[: -len(y)]), apply(h, line)
-    state, h = _advance_memory(now, state, key, k, link_key, shared)
+    state, h = _draw_link(link, state, key, k, link_key, shared)
     return state, apply(h, y)
 
 
-def _advance_memory(
-    now: AbstractRandomAffine, state: PyTree, key: jax.Array, k: jax.Array, link_key: jax.Array, shared: Places
+def _draw_link(
+    link: AbstractRandomAffine, state: PyTree, key: jax.Array, k: jax.Array, link_key: jax.Array, shared: Places
 ) -> tuple[PyTree, jax.Array]:
+    """Draw a link, its memories by keys of their own; return its next state and its matrix."""
     if not len(shared):
-        return now.draw(state, link_key)
-    return draw_with_shared_memories(now, state, link_key, [draw_key(key, k, memory, MEMORY) for memory in shared])
+        return link.draw(state, link_key)
+    return draw_with_shared_memories(link, state, link_key, [draw_key(key, k, memory, MEMORY) for memory in shared])

@@ -1,0 +1,96 @@
+"""Checks of what a node's sender does: a trigger or an encoder that fits its sensor, channel and filters."""
+
+from collections.abc import Mapping
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.event.event_filter import EventFilter
+from heliograph.filters.event.stochastic import StochasticEventFilter
+from heliograph.filters.wrappers.fed_back import FedBackFilter
+from heliograph.model.channel import Channel
+from heliograph.model.over_time import first
+from heliograph.model.sensor import AbstractSensor
+from heliograph.model.trigger import AbstractTrigger, Periodic
+from heliograph.model.words.encoder import Words
+from heliograph.model.words.route import FLAG, find_places
+from heliograph.numerics.check import fail, show_value
+from heliograph.random_affine.base import AbstractRandomAffine, all_inner_maps
+from heliograph.random_affine.words.flips import Flips
+
+
+def compares_with_prediction(filter: AbstractFilter, trigger: AbstractTrigger) -> bool:
+    """Return whether this is a filter of a sender that compares with its prediction."""
+    return isinstance(filter, EventFilter | StochasticEventFilter) and filter.trigger.reference == "prediction"
+
+
+def check_trigger(
+    trigger: AbstractTrigger, sensor: AbstractSensor, channel: AbstractRandomAffine, filters: Mapping[str, object]
+) -> None:
+    """Raise ValueError unless a trigger fits the sensor, the channel and the filters of a node.
+
+    Raises:
+        ValueError: numbers for another count of components; a channel that is late, or that does not carry each
+            component for itself where each is sent alone; no filter whose prediction the sender could know.
+    """
+    check_type("trigger", trigger, AbstractTrigger)
+    # The trigger, the sensor and the channel fit.
+    trigger.check_outputs(len(sensor.outputs))
+    if sensor.circular:
+        raise fail("trigger", "a sensor without angles", list(sensor.circular))
+    if channel.past:
+        raise fail(
+            "channel of a node with a trigger", "one that is not late", f"one late by up to {channel.past} steps"
+        )
+    if trigger.region == "each" and channel.outputs != len(sensor.outputs):
+        raise fail("channel of components that are each sent alone", f"{len(sensor.outputs)} outputs", channel.outputs)
+    # A sender that compares with a prediction knows one filter.
+    if any(isinstance(filter, FedBackFilter) for filter in filters.values()):
+        raise fail("trigger", "no filter that is fed back", "one")
+    if trigger.reference == "prediction" and not any(
+        isinstance(filter, AbstractFilter) and compares_with_prediction(filter, trigger) for filter in filters.values()
+    ):
+        raise fail("node whose sender compares with a prediction", "an event_filter with this trigger", list(filters))
+
+
+def check_encoder(
+    encoder: Words,
+    sensor: AbstractSensor,
+    channel: Channel,
+    trigger: AbstractTrigger | None,
+    filters: Mapping[str, object],
+) -> None:
+    """Raise ValueError unless an encoder fits the sensor, channel, trigger and filters of a node.
+
+    Raises:
+        ValueError: a range for another count of components, angles, words that are amplified, a trigger whose ends do
+            not share what it compares with, a filter that is fed back.
+    """
+    check_type("encoder", encoder, Words)
+    encoder.check_outputs(len(sensor.outputs))
+    if sensor.circular:
+        raise fail("encoder", "a sensor without angles", list(sensor.circular))
+    if any(isinstance(filter, FedBackFilter) for filter in filters.values()):
+        raise fail("encoder", "no filter that is fed back", "one")
+    find_places(channel)  # raises where words are amplified
+    if trigger is not None and not isinstance(trigger, Periodic):
+        if encoder.subtracts:
+            raise fail("trigger of a node with an encoder", "a dither that is not taken off, or Periodic", "subtracted")
+        if flips_words(first(channel)):
+            expected = "a link without flipped bits (erasure for a checksum), as both ends share the word; or Periodic"
+            raise fail("trigger of a node with an encoder", expected, type(trigger).__name__)
+
+
+def count_subtracted_dithers(encoder: Words, channel: Channel) -> int:
+    """Return how many dithers a receiver is told to subtract: one for each component that arrives but flags."""
+    return sum(place != FLAG for place in find_places(channel)) if encoder.subtracts else 0
+
+
+def flips_words(channel: AbstractRandomAffine) -> bool:
+    """Test whether a channel of words may flip bits."""
+    links = [link for link in [channel, *all_inner_maps(channel)] if isinstance(link, Flips)]
+    return any(float(link.error.moment(1)) > 0 for link in links)
+
+
+def check_type(name: str, value: object, expected: type) -> None:
+    """Refuse an object of another class, in one line."""
+    if not isinstance(value, expected):
+        raise fail(name, f"{'an' if expected.__name__[0] in 'AEIOU' else 'a'} {expected.__name__}", show_value(value))
