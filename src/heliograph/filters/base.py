@@ -301,7 +301,7 @@ class AbstractSizedFilter(AbstractFilter):
 
 @compile_on_call
 def _step(filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree) -> tuple[PyTree, Estimate]:
-    """Predict, correct and estimate: compiled body of `AbstractFilter.step`."""
+    """Predict, correct and return state and estimate: compiled body of `AbstractFilter.step`."""
     after, _ = filter.correct(filter.predict(state, u, k), z, k)
     return after, filter.after_step(after, k)
 
@@ -324,7 +324,7 @@ def step_with_judgement(
 def _step_with_smoother(
     filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree
 ) -> tuple[PyTree, SmootherStep]:
-    """Compiled body of `AbstractFilter.step_with_smoother`."""
+    """Predict, correct and return state and smoother step: compiled body of `AbstractFilter.step_with_smoother`."""
     prior = filter.predict(state, u, k)
     after, innovation = filter.correct(prior, z, k)
     return after, make_smoother_step(filter, StepTrace(state, prior, after, innovation, z, u, k))
@@ -358,6 +358,7 @@ def estimates(estimate: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(estimate)
     def call(filter: AbstractFilter, state: PyTree) -> R:
+        """Call the method, and say so if the state is none."""
         return call_with_state(filter, state, run)
 
     return cast(Callable[P, R], call)
@@ -368,11 +369,15 @@ def _check_calls(
     check: Callable[[AbstractFilter, ArrayLike], Float[Array, " length"]],
     call_checked: Callable[..., R],
 ) -> Callable[P, R]:
-    """Make a filter's method check its data and its step number, name a wrong state, and run compiled."""
+    """Return a filter's method, compiled, that first checks its data and step number, and names a wrong state.
+
+    `check` returns the data as an array of the filter's length; `call_checked` calls the compiled method.
+    """
     run = cast(Callable[..., R], compile_on_call(function))
 
     @wraps(function)
     def call(filter: AbstractFilter, state: PyTree, data: ArrayLike = (), k: Step = 0) -> R:
+        """Check the arguments and call the method."""
         return call_checked(filter, state, run, check(filter, data), step_number(filter, k))
 
     return cast(Callable[P, R], call)

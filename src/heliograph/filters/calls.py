@@ -25,16 +25,17 @@ def call_with_state(filter: Any, state: PyTree, function: Callable[..., R], *dat
     try:
         return function(filter, state, *data)
     except (AttributeError, IndexError, TypeError, ValueError):
-        # A user's call says it, of the state that was given; those within its trace only fail.
+        # Only a user's own call names the state; calls inside a trace pass the error on.
         if is_traced(state) or _describe_structure(state) == _describe_structure(filter.init()):
             raise
         raise fail("state", "one of the filter's, as its init() returns", show_value(state)) from None
 
 
 def call_with_inputs(filter: Any, state: PyTree, function: Callable[..., R], *data: PyTree) -> R:
-    """Call `function(filter, state, *data)`, of which u and k are the last, and judge what the plant makes of u.
+    """Call `function(filter, state, *data)`, whose last data are u and k, and raise if the plant cannot take u.
 
-    The plant's functions are judged in the same compiled call; what is traced is judged by whoever traces it.
+    Whether u spoils the plant's functions is computed in the same compiled call. Inside a trace nothing is judged:
+    whoever traces does that.
 
     Raises:
         ValueError: a state of another form than the filter's; a covariance of the noise, or a matrix, that is none.
@@ -54,6 +55,7 @@ def _judge_inputs_too(function: Callable[..., R]) -> Callable[..., tuple[R, Arra
 
     @compile_on_call
     def call(filter: Any, state: PyTree, *data: PyTree) -> tuple[R, Array]:
+        """Call the function, and test the inputs u at step k."""
         return function(filter, state, *data), do_inputs_spoil(filter, filter.inputs, *data[-2:])
 
     return call

@@ -39,7 +39,7 @@ CHUNKS = 16  # at least: two cores with eight lanes each
 PROBES = 8  # joints at which forgetting is tried before all rows are filtered
 BLOCKS = 64  # places in a pass without data
 
-Which = slice | np.ndarray  # chunks, by their places
+Which = slice | np.ndarray  # some of the chunks, by their numbers
 
 
 class Lengths(NamedTuple):
@@ -62,7 +62,7 @@ class Pass(NamedTuple):
 
 
 class Begun(NamedTuple):
-    """The state with which each chunk begins (chunks, ...), its first row (chunks,), and how long chunks are.
+    """How chunks begin: the state of each (chunks, ...), its first row (chunks,), and how long chunks are.
 
     `settled`: the state in which chunks of complete rows stay but for their means, None where it was not found, and
     which chunks it covers (chunks,); `complete`: which rows lack no number.
@@ -128,7 +128,11 @@ def sum_in_chunks(recursion: Recursion, start: PyTree, rows: PyTree) -> Pass | N
 
 
 def begin_chunks(recursion: Recursion, start: PyTree, rows: PyTree) -> Begun | None:
-    """Find the state with which each chunk of rows begins; None where rows are few, or it is forgotten too late."""
+    """Return how each chunk of rows begins; None where rows are few, or a start is forgotten too late.
+
+    The shortest chunks of LADDER before whose first row the start is forgotten; first with settled covariances, which
+    cost less, then without.
+    """
     total = len(jax.tree.leaves(rows)[0])
     for lengths in LADDER:
         if total < CHUNKS * lengths.chunk:
@@ -137,32 +141,41 @@ def begin_chunks(recursion: Recursion, start: PyTree, rows: PyTree) -> Begun | N
         complete = find_complete(rows[0], lengths.ahead)
         whole = complete.cover(first, lengths.chunk)
         settled = find_settled(recursion, start, rows, lengths.ahead) if np.mean(whole) > 0.5 else None
-        for held in dict.fromkeys([settled is not None, False]):
-            law = settled if held else None
+        for law in [None] if settled is None else [settled, None]:
             states = _begin_with(Reach(recursion, rows, complete, law), start, first[1:])
             if states is not None:
                 covered = whole & (False if law is None else law.covers(states))
-                return Begun(states, first, lengths, law, covered, complete)
+                return Begun(
+                    states=states, first=first, lengths=lengths, settled=law, covered=covered, complete=complete
+                )
     return None
 
 
 def _predict_blocks(recursion: Recursion, state: PyTree, rows: PyTree, first: Array) -> tuple[PyTree, PyTree]:
-    """Return what a state holds beside its Gaussians, which no data change, after all blocks, and before each."""
+    """Return what a state holds beside its Gaussians, which no data change, after all blocks, and before each.
 
-    def predict(state: PyTree, row: tuple[PyTree, Array]) -> tuple[PyTree, None]:
+    `rows` (block, row, ...), of which the first has the number `first`.
+    """
+
+    def predict_row(state: PyTree, row: tuple[PyTree, Array]) -> tuple[PyTree, None]:
+        """Predict over one row."""
         return recursion.predict(state, *row), None
 
-    def block(state: PyTree, now: tuple[PyTree, Array]) -> tuple[PyTree, PyTree]:
-        return jax.lax.scan(predict, state, now)[0], beside_gaussians(state)
+    def predict_block(state: PyTree, rows: tuple[PyTree, Array]) -> tuple[PyTree, PyTree]:
+        """Predict over one block; what the state held before it is the output."""
+        return jax.lax.scan(predict_row, state, rows)[0], beside_gaussians(state)
 
     blocks, size = jax.tree.leaves(rows)[0].shape[:2]
     k = (first + jnp.arange(blocks * size)).reshape(blocks, size)
-    last, before = jax.lax.scan(block, jax.tree.map(jnp.asarray, state), (rows, k))
+    last, before = jax.lax.scan(predict_block, jax.tree.map(jnp.asarray, state), (rows, k))
     return beside_gaussians(last), before
 
 
 class Reach(NamedTuple):
-    """States some rows behind others: of blocks of a recording's rows, or all of them settled but for the means."""
+    """Computes the state before a row from one some rows earlier, for many rows side by side.
+
+    `settled`: covariances that stay as they are, of which only means are computed; None where they are not known.
+    """
 
     recursion: Recursion
     rows: PyTree
@@ -175,9 +188,9 @@ class Reach(NamedTuple):
         return self.complete.size
 
     def states_before(self, places: Int[np.ndarray, " n"], starts: PyTree, begun: bool = False) -> PyTree | None:
-        """Return the states before these rows, begun `ahead` rows before them; None without native code.
+        """Return the states before the rows `places`, from states `ahead` rows earlier; None without native code.
 
-        `starts` has a state for each `ahead` rows of the recording, or, where they have `begun`, for each place.
+        `starts` has a state for every `ahead` rows of the recording; where `begun`, one for each of `places` instead.
         """
         first = places - self.ahead
         windows = take_windows(self.rows, first, self.ahead)
@@ -196,6 +209,7 @@ class Reach(NamedTuple):
         return results
 
     def _pass(self, states: PyTree, windows: PyTree, first: Int[np.ndarray, " n"]) -> PyTree | None:
+        """Return the states after windows of rows, row by row; None without native code."""
         choice = choose_code(end_of_rows, (self.recursion, states, windows, first), [False, True, True, True])
         return None if choice.code is None else choice.results()
 
@@ -218,9 +232,9 @@ def _begin_with(reach: Reach, start: PyTree, first: Int[np.ndarray, " chunks"]) 
 
 
 def _is_forgotten(reach: Reach, starts: PyTree, first: Int[np.ndarray, " chunks"]) -> bool | None:
-    """Test at some joints whether most have forgotten their start `ahead` rows later; None without native code.
+    """Return whether at most of some joints the start is forgotten `ahead` rows later; None without native code.
 
-    Begun twice as many rows ahead, half of them leave of the start as much as the other half has to forget.
+    It is where a state begun `ahead` rows before agrees with one begun twice as many rows before.
     """
     probes = first[:: -(-len(first) // PROBES)]
     once, early = (reach.states_before(places, starts) for places in (probes, probes - reach.ahead))
@@ -233,11 +247,12 @@ def _is_forgotten(reach: Reach, starts: PyTree, first: Int[np.ndarray, " chunks"
 
 def _with_moments_before_data(recursion: Recursion, start: PyTree, rows: PyTree, ahead: int) -> PyTree | None:
     """Return starts, one each `ahead` rows, with what a state holds there beside its Gaussians."""
+    # BLOCKS blocks of `ahead` rows at a time.
     parts, state, size = list[PyTree](), start, BLOCKS * ahead
     for begin in range(0, len(jax.tree.leaves(rows)[0]), size):
-        now = jax.tree.map(lambda leaf: leaf.reshape(BLOCKS, ahead, *leaf.shape[2:]),
-                           take_windows(rows, np.array([begin]), size))  # fmt: skip
-        choice = choose_code(_predict_blocks, (recursion, state, now, np.asarray(begin)), [False] * 4)
+        blocks = jax.tree.map(lambda leaf: leaf.reshape(BLOCKS, ahead, *leaf.shape[2:]),
+                              take_windows(rows, np.array([begin]), size))  # fmt: skip
+        choice = choose_code(_predict_blocks, (recursion, state, blocks, np.asarray(begin)), [False] * 4)
         if choice.code is None:
             return None
         last, before = jax.tree.map(lambda leaf: leaf[0, ...], choice.results())
@@ -262,21 +277,23 @@ OF_SUMS = Programs(sum_chunk, sum_settled, lambda settled, sums: sums)
 def _scan_all(recursion: Recursion, start: PyTree, rows: PyTree, programs: Programs) -> Pass | None:
     """Filter all chunks side by side, each from the state with which it is thought to begin.
 
-    Those of which the chunk before ends in another state are filtered again, in their order. Outputs are by chunk
+    Then filter again, in order, each chunk that began otherwise than the one before it ends. Outputs are by chunk
     (chunks, ...). None where rows are few, where they forget too late, and without native code.
     """
     begun = begin_chunks(recursion, start, rows)
     if begun is None:
         return None
-    total, split = len(jax.tree.leaves(rows)[0]), take_windows(rows, begun.first, begun.lengths.chunk)
+    total, chunks = len(jax.tree.leaves(rows)[0]), take_windows(rows, begun.first, begun.lengths.chunk)
 
     def scan(states: PyTree, which: Which) -> PyTree:
-        arguments = recursion, states, take(split, which), begun.first[which], np.asarray(total)
+        """Return the results of some chunks from these states, (chunk, ...); flags say what differs between chunks."""
+        arguments = recursion, states, take(chunks, which), begun.first[which], np.asarray(total)
         choice = choose_code(programs.full, arguments, [False, True, True, True, False])
         return None if choice.code is None else choice.results()
 
     def scan_means(settled: Settled) -> PyTree:
-        arguments = recursion, settled, means_of(begun.states), split, begun.first, np.asarray(total)
+        """Return the results of all chunks, as if they were settled but for the means."""
+        arguments = recursion, settled, means_of(begun.states), chunks, begun.first, np.asarray(total)
         choice = choose_code(programs.settled, arguments, [False, False, True, True, True, False])
         if choice.code is None:
             return None
@@ -286,7 +303,7 @@ def _scan_all(recursion: Recursion, start: PyTree, rows: PyTree, programs: Progr
     results = scan_chunks(begun, scan, scan_means)
     if results is None:
         return None
-    mend_chunks(scan, begun.states, lambda results: results[0], results)
+    mend_chunks(scan, begun.states, lambda results: results[0], results)  # changes the arrays of `results`
     last, outputs = results
     return Pass(jax.tree.map(lambda leaf: leaf[-1, ...], last), outputs)
 
@@ -313,7 +330,7 @@ def scan_chunks(
 def mend_chunks(
     scan: Callable[[PyTree, slice], PyTree], begun: PyTree, ends_of: Callable[[PyTree], PyTree], results: PyTree
 ) -> None:
-    """Scan those chunks again, in their order, that began otherwise than the one before them ends; change `results`.
+    """Scan each chunk again, in order, that began otherwise than the one before it ends; change `results` in place.
 
     Args:
         scan: results of some chunks, from the states with which these begin.
@@ -326,16 +343,16 @@ def mend_chunks(
     for c in range(1, len(wrong) + 1):
         if not wrong[c - 1]:
             continue
-        here = slice(c, c + 1)
-        replace_chunk(results, here, scan(take(ends, slice(c - 1, c)), here))
+        chunk = slice(c, c + 1)
+        replace_chunk(results, chunk, scan(take(ends, slice(c - 1, c)), chunk))
         if c < len(wrong):
-            wrong[c] = not agree(take(ends, here), take(begun, slice(c + 1, c + 2)), among=begun)[0]
+            wrong[c] = not agree(take(ends, chunk), take(begun, slice(c + 1, c + 2)), among=begun)[0]
 
 
-def replace_chunk(results: PyTree, here: Which, again: PyTree) -> None:
-    """Put results of a chunk that was computed again in the place of those it had."""
-    for held, new in zip(jax.tree.leaves(results), jax.tree.leaves(again), strict=True):
-        held[here] = new
+def replace_chunk(results: PyTree, which: Which, new_results: PyTree) -> None:
+    """Overwrite the results of some chunks with new ones, in place."""
+    for held, new in zip(jax.tree.leaves(results), jax.tree.leaves(new_results), strict=True):
+        held[which] = new
 
 
 def take_windows(rows: PyTree, begin: Int[np.ndarray, " n"], length: int) -> PyTree:
@@ -345,6 +362,7 @@ def take_windows(rows: PyTree, begin: Int[np.ndarray, " n"], length: int) -> PyT
     within = not np.any(begin % length) and bool(np.all(begin + length <= total))
 
     def take_from(leaf: np.ndarray) -> np.ndarray:
+        """Return the windows of one array: views of it where they follow one another."""
         if one_by_one:
             missing = np.repeat(leaf[-1:], max(len(begin) * length - total, 0), axis=0)
             joined = np.concatenate([leaf, missing]) if len(missing) else leaf[: len(begin) * length]
@@ -363,5 +381,5 @@ def take_windows(rows: PyTree, begin: Int[np.ndarray, " n"], length: int) -> PyT
 
 
 def take(states: PyTree, which: Which) -> PyTree:
-    """Take some of what has a leading axis."""
+    """Return some entries, along the leading axis of every array."""
     return jax.tree.map(lambda leaf: leaf[which], states)

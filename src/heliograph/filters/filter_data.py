@@ -119,13 +119,15 @@ def scan_with_last_state(
     It begins with `state`, that before any row unless given, at the row of number `begin`.
     """
 
-    def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:
+    def step(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:
+        """Predict and correct over one row."""
         k, z_k, u_k = row
         after, innovation = filter.correct(filter.predict(state, u_k, k), z_k, k)
         return after, output(after, innovation, k)
 
     start = jax.tree.map(jnp.asarray, filter.init() if state is None else state)
-    last, outputs = jax.lax.scan(body, start, (jnp.asarray(begin) + jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)))
+    numbers = jnp.asarray(begin) + jnp.arange(len(z))
+    last, outputs = jax.lax.scan(step, start, (numbers, jnp.asarray(z), jnp.asarray(u)))
     return last, outputs
 
 
@@ -141,8 +143,8 @@ def run_over_data(filter: SteppedFilter, z: ArrayLike, u: ArrayLike | None, afte
     if before is not None and clock is not None and len(clock):
         _check_later(before, clock)
     start = () if before is None else (before.state, np.asarray(begin))
-    whole = filter_in_chunks(filter, rows_z, rows_u, _tell_estimate, *start)
-    state, outputs = whole or compute_once(_compute_filtered, _by_xla, (filter, rows_z, rows_u, *start))
+    in_chunks = filter_in_chunks(filter, rows_z, rows_u, _collect_row, *start)
+    state, outputs = in_chunks or compute_once(_compute_filtered, _by_xla, (filter, rows_z, rows_u, *start))
     mean, covariance, innovation, modes, counts = outputs
     lost = find_lost(mean, 1)
     if lost.any():
@@ -153,10 +155,20 @@ def run_over_data(filter: SteppedFilter, z: ArrayLike, u: ArrayLike | None, afte
     last, spacing = (float(end - 1), np.nan) if clock is None else (clock[-1], usual_spacing(clock))
     months = 0 if clock is None else usual_months(clock)
     origin = Origin(filter, state, end, last_input(np.asarray(rows_u)), last, spacing, months=months)
+    if counts is not None:
+        _warn_of_few_particles(counts)
     return Filtered(
-        mean, covariance, innovation.value, innovation.covariance, innovation.log_likelihood, filter.claim,
-        innovation.weight, origin, modes, _warn_of_few(counts),
-    )  # fmt: skip
+        means=mean,
+        covariances=covariance,
+        innovations=innovation.value,
+        innovation_covariances=innovation.covariance,
+        log_likelihoods=innovation.log_likelihood,
+        claim=filter.claim,
+        weights=innovation.weight,
+        origin=origin,
+        modes=modes,
+        effective_numbers=counts,
+    )
 
 
 def _origin_of(filter: SteppedFilter, after: Filtered) -> Origin:
@@ -171,6 +183,7 @@ def _origin_of(filter: SteppedFilter, after: Filtered) -> Origin:
 
 
 def _shapes_of(state: PyTree) -> tuple[object, list[tuple[int, ...]]]:
+    """Return the form of a filter's state, and the shapes of its arrays."""
     leaves, form = jax.tree.flatten(state)
     return form, [np.shape(leaf) for leaf in leaves]
 
@@ -181,27 +194,24 @@ def _check_later(before: Origin, clock: np.ndarray) -> None:
         raise fail("measurements", f"rows behind {before.time}, the last one before them", str(clock[0]))
 
 
-def _warn_of_few(counts: Array | None) -> Array | None:
-    """Warn where the effective number of particles is below FEW, and return the numbers."""
-    if counts is None:
-        return None
+def _warn_of_few_particles(counts: Array) -> None:
+    """Warn where the effective number of particles (steps,) is below FEW."""
     few = np.flatnonzero(np.asarray(counts) < FEW)
     if len(few):
         least = float(np.min(np.asarray(counts)))
         said = f"particle_filter: fewer than {FEW} particles count after {len(few)} of the rows, first row {few[0] + 1}"
         warnings.warn(f"{said} ({least:.2g} at least); take more of them", stacklevel=4)
-    return counts
 
 
 def _compute_filtered(
     filter: SteppedFilter, z: Array, u: Array, state: PyTree | None = None, begin: Array | int = 0
 ) -> PyTree:
     """Filter all rows and return the results stacked: compiled body of `run_over_data`."""
-    return scan_with_last_state(filter, z, u, partial(_tell_estimate, filter), state, begin)
+    return scan_with_last_state(filter, z, u, partial(_collect_row, filter), state, begin)
 
 
-def _tell_estimate(filter: SteppedFilter, state: PyTree, innovation: Innovation, k: jax.Array) -> PyTree:
-    """Return the estimate of a row, and its innovation."""
+def _collect_row(filter: SteppedFilter, state: PyTree, innovation: Innovation, k: jax.Array) -> PyTree:
+    """Return what is kept of a row: mean, covariance, innovation, probabilities of modes, number of particles."""
     estimate = filter.after_step(state, k)
     return estimate.mean, estimate.covariance, innovation, estimate.modes, getattr(state, "effective_number", None)
 
@@ -229,4 +239,5 @@ def check_data(
 
 
 def _tables(measurements: object, inputs: object) -> dict[str, object]:
+    """Return the tables of a call by the names that errors use."""
     return {"measurements": measurements, "inputs": inputs}

@@ -45,6 +45,7 @@ def ball_moments(centre: jax.Array, variance: jax.Array, radius: jax.Array, insi
     angle = low + (high - low) * NODES
     e = radius * jnp.sin(angle)
     others = jax.lax.map(lambda r: ball_moments(centre[1:], variance[1:], r, inside), radius * jnp.cos(angle))
+    # log of the node's weight in t, of de_1 / dt = radius cos(t), and of the density of e_1.
     weight = jnp.log(WEIGHTS * (high - low) * radius * jnp.cos(angle) / deviation) - np.log(2 * np.pi) / 2
     weight = weight - ((e - first) / deviation) ** 2 / 2
     mean = jnp.concatenate([e[:, None], others.mean], axis=1)
@@ -61,7 +62,7 @@ def ball_moments(centre: jax.Array, variance: jax.Array, radius: jax.Array, insi
 
 
 def truncate_to_ball(parts: GaussianSum, directions: jax.Array, radius: jax.Array, inside: bool) -> GaussianSum:
-    """Cut each Gaussian to |D x| <= radius, or to where it is more, and take the Gaussian of the same moments.
+    """Return each Gaussian cut to |D x| <= radius (`inside`), or to where it is more, with the moments kept.
 
     With Cov(D x) = V diag(s) V', e = V' D x has independent components. Of those that are known to vary, x is given
     exactly, and then E e and Cov e enter with K = Cov(x, e) diag(s)^-1: mean m + K (E e - V' D m), and columns K more.
@@ -90,7 +91,7 @@ def truncate_to_ball(parts: GaussianSum, directions: jax.Array, radius: jax.Arra
 
 
 def _truncate_component(centre: jax.Array, variance: jax.Array, radius: jax.Array, inside: bool) -> BallMoments:
-    """Cut one component to within the radius, (1, ...), or below and above it, (2, ...)."""
+    """Return the moments of one component within the radius, (1, ...), or below and above it, (2, ...)."""
     deviation = jnp.sqrt(variance)
     edge = jnp.array([-1.0, 1.0]) * radius
     if inside:
@@ -105,7 +106,8 @@ def _truncate_component(centre: jax.Array, variance: jax.Array, radius: jax.Arra
 
 
 def _join_pieces(pieces: BallMoments) -> BallMoments:
-    """Join the pieces: moments of their mixture."""
+    """Return the moments of the mixture of pieces, (piece, ...)."""
+    # Masses relative to the largest one; where none has any, equal shares.
     top = jnp.max(pieces.log_mass)
     top = jnp.where(jnp.isfinite(top), top, 0.0)
     weight = jnp.exp(pieces.log_mass - top)

@@ -24,7 +24,7 @@ class EventBelief(NamedTuple):
 
     @property
     def components(self) -> tuple[jax.Array, Gaussian]:
-        """The mixture: weights (H,), and the Gaussians of (x, r)."""
+        """Weights (H,), and the Gaussians of (x, r)."""
         return self.weight, self.gaussian
 
     @property

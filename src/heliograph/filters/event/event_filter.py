@@ -107,10 +107,10 @@ class EventFilter(AbstractSizedFilter):
         return EventBelief.of(self._pad_sum(prior_sum), begun, jnp.asarray(False))
 
     def _pad_sum(self, one: GaussianSum) -> GaussianSum:
-        """Pad a sum of one Gaussian with others that have no weight."""
+        """Return a sum of one Gaussian, padded to the filter's number of Gaussians with copies of no weight."""
         count = self._count_known_references + (self.lost if self.reference_may_be_lost else 0)
-        every: GaussianSum = jax.tree.map(lambda leaf: jnp.repeat(leaf, count, axis=0), one)
-        return every._replace(log_weight=jnp.where(jnp.arange(count) == 0, one.log_weight[0], -jnp.inf))
+        copies: GaussianSum = jax.tree.map(lambda leaf: jnp.repeat(leaf, count, axis=0), one)
+        return copies._replace(log_weight=jnp.where(jnp.arange(count) == 0, one.log_weight[0], -jnp.inf))
 
     @property
     def region(self) -> SilentRegion:
@@ -119,10 +119,10 @@ class EventFilter(AbstractSizedFilter):
 
     @property
     def _count_known_references(self) -> int:
-        """Count the Gaussians of known reference: pieces of the interval, and of the outside if it may be silent."""
-        return self.known + (
-            self.region.outside_parts(self.senders[0]) if self.loses and not self.reference_may_be_lost else 0
-        )
+        """Number of Gaussians of known reference: pieces of the interval, and of the outside if it may be silent."""
+        if not self.loses or self.reference_may_be_lost:
+            return self.known
+        return self.known + self.region.outside_parts(self.senders[0])
 
     @predicts
     def predict(self, state: EventBelief, u: ArrayLike = (), k: Step = 0) -> EventBelief:
@@ -130,13 +130,13 @@ class EventFilter(AbstractSizedFilter):
         plant, u, start = at(self.plant, k), jnp.asarray(u), second_moments_at_start(self.plant)
         both = jax.vmap(lambda x: predict_jointly(plant, self.transform, x, u, start))(state.gaussian)
         if self.trigger.reference == "prediction":
-            expected, places = (
-                self.reference(self._merge_state(state).mean, u, k),
-                len(self.states) + np.arange(self.outputs),
-            )
-            both = jax.vmap(lambda x: set_known_components(x, places, expected))(both)
+            expected = self.reference(self._merge_state(state).mean, u, k)
+            of_reference = len(self.states) + np.arange(self.outputs)
+            both = jax.vmap(lambda x: set_known_components(x, of_reference, expected))(both)
+        # The modes move from the second step on: the initial law is that of the first step.
         rows = jnp.asarray(at(self.channel, k).transition)
         label = jnp.einsum("hsiac,ij->hsjac", state.label, jnp.where(state.moved, rows, jnp.eye(len(rows))))
+        # Ages grow by one, but for the heartbeat's, which the last value keeps until another one is sent.
         if self.trigger.heartbeat is not None:
             older = jnp.concatenate([jnp.zeros_like(label[..., :1, :]), label[..., :-1, :]], axis=-2)
             age, oldest = jnp.arange(self.ages)[:, None], self.trigger.heartbeat
@@ -144,7 +144,7 @@ class EventFilter(AbstractSizedFilter):
         return EventBelief(state.weight, both, label, state.begun, jnp.asarray(True))
 
     def reference(self, mean: jax.Array, u: ArrayLike, k: Step) -> jax.Array:
-        """Prediction of y at step k that both ends compute, from the estimate after the step before and the input."""
+        """Return the prediction of y at step k that both ends compute, from the mean after the step before and u."""
         return predict_signal(at(self.plant, k), at(self.sensor, k), mean, u)
 
     @corrects
@@ -156,16 +156,16 @@ class EventFilter(AbstractSizedFilter):
         parts, begun, start = state.parts, state.begun, second_moments_at_start(self.plant)
         total, value, covariance = jnp.zeros(()), [], []
         # Senders one after the other, each with its value or its silence.
-        for s, those in enumerate(self.senders):
-            mine = values[those] if len(self.senders) > 1 else values
+        for s, components in enumerate(self.senders):
+            received = values[components] if len(self.senders) > 1 else values
             lost = losses[s] if len(losses) else jnp.asarray(jnp.nan)
             augmented = augment(plant, sensor, self.transform, parts, start)
-            arrived = jnp.any(~jnp.isnan(mine))
-            after, expected, spread = self._condition_on_sender(augmented, channel, mine, lost, s, begun[s])
-            whole = log_total(after.log_weight)
-            total, parts = total + whole, after.scale_weights(-whole)
+            arrived = jnp.any(~jnp.isnan(received))
+            after, expected, spread = self._condition_on_sender(augmented, channel, received, lost, s, begun[s])
+            log_likelihood = log_total(after.log_weight)
+            total, parts = total + log_likelihood, after.scale_weights(-log_likelihood)
             begun = begun.at[s].set(begun[s] | (arrived if self.trigger.reference == "acknowledged" else True))
-            value.append(mine - expected)
+            value.append(received - expected)
             covariance.append(spread)
         innovation = Innovation(*_append_losses(jnp.concatenate(value), covariance, losses), total)
         return EventBelief.of(parts, begun, state.moved), innovation
@@ -195,12 +195,16 @@ class EventFilter(AbstractSizedFilter):
     def _condition_on_silence(
         self, augmented: GaussianSum, channel: SideInformation, lost: jax.Array, s: int, begun: jax.Array
     ) -> GaussianSum:
-        """Condition the sum on silence: nothing was sent, or it was sent and lost."""
+        """Condition the sum on silence: nothing was sent, or it was sent and lost.
+
+        `lost`: whether the receiver was told of a loss, or how many; NaN where it was not.
+        """
         n, m, sender = len(self.states), self.outputs, self.senders[s]
-        as_it_was, label = np.r_[0 : n + m], augmented.label[:, s]
+        state_and_reference, label = np.r_[0 : n + m], augmented.label[:, s]
+        # Labels of what is silent unless |y - r| > delta; of what was sent for that and lost; of what was due and lost.
         waiting, due = self._label_sending(label, begun)
         loss = self._loss_probability(channel, s)[:, None, None]
-        dropped, forced = (_relabel_sent(which * loss, True) for which in (waiting, due))
+        dropped, forced = (_relabel_sent(sent * loss, lost=True) for sent in (waiting, due))
         if self.trigger.losses == "known":
             waiting = jnp.where(lost > 0, 0.0, waiting)
             dropped, forced = (jnp.where(lost > 0, label, 0.0) for label in (dropped, forced))
@@ -212,7 +216,7 @@ class EventFilter(AbstractSizedFilter):
             if self.loses:
                 outside = self.region.truncate_outside(augmented.relabel_sender(s, dropped + forced), sender, 1.0)
                 slots = concatenate([slots, merge_groups(outside, self.region.outside_parts(sender))])
-            return self._keep_if_impossible(slots.select_components(as_it_was), augmented)
+            return self._keep_if_impossible(slots.select_components(state_and_reference), augmented)
 
         # Reference that may be a value that was lost: not sent, with the reference as it was ...
         unsent = augmented.relabel_sender(s, waiting)
@@ -226,11 +230,11 @@ class EventFilter(AbstractSizedFilter):
             self._find_new_reference(sender)
         )
         few = reduce_parts(
-            concatenate([others.select_components(as_it_was), fresh]),
+            concatenate([others.select_components(state_and_reference), fresh]),
             self.lost,
             slice(n + sender.start, n + sender.stop),
         )
-        return self._keep_if_impossible(concatenate([slots.select_components(as_it_was), few]), augmented)
+        return self._keep_if_impossible(concatenate([slots.select_components(state_and_reference), few]), augmented)
 
     def _condition_on_value(
         self, augmented: GaussianSum, channel: SideInformation, z: jax.Array, lost: jax.Array, s: int, begun: jax.Array
@@ -265,11 +269,11 @@ class EventFilter(AbstractSizedFilter):
         for sent, link in zip(map(merge_groups, by_mode[count:]), links, strict=True):
             received = predict_received(sent.gaussian, link, sender, self.outputs)
             signals.append(GaussianSum(sent.log_weight, received, jnp.zeros((1, 1))))
-        # One sum again, with a new reference.
-        whole = merge_groups(concatenate(by_mode[:count]).select_components(self._find_new_reference(sender)))
-        whole = whole.relabel_sender(s, _relabel_sent(whole.label[:, s], False))
+        # One Gaussian again, with a new reference.
+        merged = merge_groups(concatenate(by_mode[:count]).select_components(self._find_new_reference(sender)))
+        merged = merged.relabel_sender(s, _relabel_sent(merged.label[:, s], lost=False))
         signal = merge_groups(concatenate(signals)).gaussian
-        return self._pad_sum(whole), signal.mean[0], signal.covariance[0]
+        return self._pad_sum(merged), signal.mean[0], signal.covariance[0]
 
     def _select_sent(self, used: GaussianSum, s: int, begun: jax.Array) -> GaussianSum:
         """Restrict each Gaussian to where its sender must send: |y - r| > delta, or anywhere at a heartbeat.
@@ -293,12 +297,12 @@ class EventFilter(AbstractSizedFilter):
 
     def _loss_probability(self, channel: SideInformation, s: int) -> jax.Array:
         """Return the probability that what a sender transmits is lost, for each mode of the link (M,)."""
-        mine = self.senders[s] if len(self.senders) > 1 else slice(None)
-        lost = ~jnp.any(jnp.asarray(channel.present)[:, mine], axis=1)
+        components = self.senders[s] if len(self.senders) > 1 else slice(None)
+        lost = ~jnp.any(jnp.asarray(channel.present)[:, components], axis=1)  # by pattern of arrivals
         return jnp.asarray(channel.chance) @ lost.astype(float)
 
     def _find_new_reference(self, sender: slice) -> np.ndarray:
-        """Places in (x, r, y) of the next (x, r): y in place of r for the components that the sender transmits."""
+        """Return the places in (x, r, y) of the next (x, r): y in place of r for the components of the sender."""
         n, m = len(self.states), self.outputs
         places: np.ndarray = np.r_[0 : n + m]
         if self.trigger.needs_reference:
@@ -316,18 +320,18 @@ class EventFilter(AbstractSizedFilter):
     @estimates
     def estimate(self, state: EventBelief) -> Estimate:
         """Return the mean and covariance of the whole sum."""
-        whole = self._merge_state(state)
-        return Estimate(whole.mean, whole.covariance, self.claim)
+        merged = self._merge_state(state)
+        return Estimate(merged.mean, merged.covariance, self.claim)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return the one of the joined sums' moments around the update."""
+        """Return the smoother step of one Gaussian with the moments of each sum around the update."""
         return smoother_step_by_transform(self, step.map_states(self._merge_state), first(self.plant))
 
     def _merge_state(self, state: EventBelief) -> Gaussian:
         """Merge the sum into one Gaussian of the plant's state."""
-        whole = take_leading(merge_groups(state.parts).gaussian, len(self.states))
-        first: Gaussian = jax.tree.map(lambda leaf: leaf[0], whole)
-        return first
+        merged = take_leading(merge_groups(state.parts).gaussian, len(self.states))  # a stack of one
+        only: Gaussian = jax.tree.map(lambda leaf: leaf[0], merged)
+        return only
 
 
 def _relabel_sent(label: jax.Array, lost: bool) -> jax.Array:

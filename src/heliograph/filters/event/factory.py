@@ -113,18 +113,17 @@ def _describe_channel(channel: Channel) -> tuple[SideInformation | OverTime, np.
 
 
 def _decide_claim(plant: AnyPlant, sensor: AnySensor, channel: Channel, trigger: StochasticTrigger | Periodic) -> Claim:
-    """Claim of the one-Gaussian filter: exact if it is the posterior (schedule: its two moments), else nominal."""
+    """Return the claim of the one-Gaussian filter: exact if it is the posterior (by schedule: its moments)."""
     steps = unstack(_describe_channel(channel)[0])
     if not is_linear(plant, sensor) or uncertain_chain(channel) or not all(_has_known_gain(step) for step in steps):
         return "nominal"
     if isinstance(trigger, Periodic):
         return lower_by_noise("exact", plant, sensor, channel)
-    hidden = trigger.losses == "unknown" and any(_may_lose(step) for step in steps)
-    return (
-        "exact"
-        if all(_arrival_determines_y(s) for s in steps) and _has_gaussian_noise(plant, sensor) and not hidden
-        else "nominal"
-    )
+    # Silence keeps a Gaussian one, where it is no hidden loss; that a value was sent must say nothing more than it.
+    losses_are_hidden = trigger.losses == "unknown" and any(_may_lose(step) for step in steps)
+    determined = all(_arrival_determines_y(step) for step in steps)
+    is_exact = determined and _has_gaussian_noise(plant, sensor) and not losses_are_hidden
+    return "exact" if is_exact else "nominal"
 
 
 def _may_lose(channel: SideInformation) -> bool:
@@ -138,7 +137,10 @@ def _has_known_gain(channel: SideInformation) -> bool:
 
 
 def _gain_and_noise_spread(channel: SideInformation) -> np.ndarray:
-    """Return spread of gain and noise by mode and pattern, with what rounding leaves of a known gain set to zero."""
+    """Return the spread of gain and noise by mode and pattern, zero where it is rounding of a known gain.
+
+    E[G G'] - M M' of a known gain M is not more than some eps of |M M'|.
+    """
     gain, spread = np.asarray(channel.mean)[..., :-1], np.asarray(channel.spread)
     size = np.abs(gain[..., :, None, :, None] * gain[..., None, :, None, :])
     size = np.pad(size, [(0, 0)] * (size.ndim - 2) + [(0, 1)] * 2)
@@ -153,6 +155,7 @@ def _has_gaussian_noise(*models: PyTree) -> bool:
 
 def _arrival_determines_y(channel: SideInformation) -> bool:
     """Return whether y follows from whatever arrives, without noise: then that it was sent says nothing more."""
+    # (mode, pattern) that can occur, of patterns in which something arrives.
     possible = [(j, a) for j, a in np.argwhere(np.asarray(channel.chance) > 0) if channel.present[a].any()]
     for j, a in possible:
         gain, rows = np.asarray(channel.mean)[j, a, :, :-1], np.asarray(channel.present)[a]
@@ -165,13 +168,15 @@ def _arrival_determines_y(channel: SideInformation) -> bool:
 
 def _has_same_law_in_every_mode(channel: SideInformation) -> bool:
     """Return whether what arrives has the same mean and spread in every mode in which it can arrive."""
-    possible = np.asarray(channel.chance) > 0
-    return all(
-        np.array_equal(moment[rows, a], np.broadcast_to(moment[rows, a][:1], moment[rows, a].shape))
-        for moment in (np.asarray(channel.mean), np.asarray(channel.spread))
-        for a, rows in enumerate(possible.T)
-        if channel.present[a].any() and rows.any()
-    )
+    possible = np.asarray(channel.chance) > 0  # (mode, pattern of arrivals)
+    for a, modes in enumerate(possible.T):
+        if not channel.present[a].any() or not modes.any():
+            continue
+        for moment in (np.asarray(channel.mean), np.asarray(channel.spread)):
+            by_mode = moment[modes, a]
+            if not np.array_equal(by_mode, np.broadcast_to(by_mode[:1], by_mode.shape)):
+                return False
+    return True
 
 
 def _delivers_y_unchanged(channel: SideInformation) -> bool:
@@ -179,12 +184,13 @@ def _delivers_y_unchanged(channel: SideInformation) -> bool:
     m, p = channel.mean.shape[-2], channel.mean.shape[-1] - 1
     if m != p:
         return False
-    parts = [(j, a) for j, a in np.argwhere(np.asarray(channel.chance) > 0) if channel.present[a].all()]
-    whole = np.all(channel.present, axis=1) | ~np.any(channel.present, axis=1)
-    plain = np.eye(m, p + 1)
-    return bool(whole.all()) and all(
-        np.array_equal(channel.mean[j, a], plain) and not np.any(channel.spread[j, a]) for j, a in parts
-    )
+    all_or_nothing = np.all(channel.present, axis=1) | ~np.any(channel.present, axis=1)
+    if not all_or_nothing.all():
+        return False
+    # E[(G, n)] = (I, 0) without spread, in each mode in which something arrives.
+    arriving = [(j, a) for j, a in np.argwhere(np.asarray(channel.chance) > 0) if channel.present[a].all()]
+    identity = np.eye(m, p + 1)
+    return all(np.array_equal(channel.mean[j, a], identity) and not np.any(channel.spread[j, a]) for j, a in arriving)
 
 
 def _check_threshold_rule(
@@ -216,6 +222,8 @@ def _has_independent_losses(channel: SideInformation) -> bool:
         return False
     arrives = chance[0] @ np.asarray(channel.present)
     product = np.prod(np.where(channel.present, arrives, 1 - arrives), axis=1)
-    plain = [np.array_equal(channel.mean[0, a][channel.present[a]], np.eye(m, m + 1)[channel.present[a]])
-             and not np.any(channel.spread[0, a]) for a in range(chance.shape[1]) if chance[0, a] > 0]  # fmt: skip
-    return all(plain) and np.allclose(product, chance[0], rtol=0, atol=1e-12)
+    for a in np.flatnonzero(chance[0] > 0):
+        rows = channel.present[a]
+        if not np.array_equal(channel.mean[0, a][rows], np.eye(m, m + 1)[rows]) or np.any(channel.spread[0, a]):
+            return False
+    return np.allclose(product, chance[0], rtol=0, atol=1e-12)

@@ -55,10 +55,11 @@ class GaussianSum(NamedTuple):
         if np.array_equal(places, np.arange(len(places))):
             return self._replace(gaussian=take_leading(self.gaussian, len(places)))
 
-        def keep_one(x: Gaussian) -> Gaussian:
+        def select(x: Gaussian) -> Gaussian:
+            """Select components of one Gaussian."""
             return from_columns(x.mean[places], Columns(x.root[places], x.variances))
 
-        return self._replace(gaussian=jax.vmap(keep_one)(self.gaussian))
+        return self._replace(gaussian=jax.vmap(select)(self.gaussian))
 
 
 def safe_log(x: jax.Array) -> jax.Array:
@@ -117,6 +118,7 @@ def _merge_groups(parts: GaussianSum, groups: int) -> GaussianSum:
     """Merge the components of each group into one Gaussian: compiled body of `merge_groups`."""
 
     def merge_group(parts: GaussianSum) -> GaussianSum:
+        """Merge one group; where no component has weight, all count alike."""
         total = log_total(parts.log_weight)
         share = jnp.exp(parts.log_weight - jnp.where(jnp.isfinite(total), total, 0.0))
         share = jnp.where(jnp.isfinite(total), share, 1 / len(share))
@@ -163,8 +165,8 @@ def _merge_cheapest_pair(parts: GaussianSum, ends: tuple[int, int]) -> GaussianS
     def replace_pair(values: jax.Array, joined: jax.Array) -> jax.Array:
         """Put the pair joined in the first one's place and the last Gaussian in the second one's: one fewer."""
         one_each = (-1, *[1] * (values.ndim - 1))  # a mask of Gaussians, beside their numbers
-        last_moved = jnp.where(is_second.reshape(one_each), values[-1:], values)
-        return jnp.where(is_first.reshape(one_each), joined, last_moved)[:-1]
+        with_last_moved = jnp.where(is_second.reshape(one_each), values[-1:], values)
+        return jnp.where(is_first.reshape(one_each), joined, with_last_moved)[:-1]
 
     fewer: GaussianSum = jax.tree.map(replace_pair, parts, merged)
     return fewer

@@ -42,10 +42,11 @@ class LinkMoments(NamedTuple):
 def augment(
     plant: AbstractPlant, sensor: AbstractSensor, transform: AbstractTransform, parts: GaussianSum, start: jax.Array
 ) -> GaussianSum:
-    """Augment each Gaussian of (x, r) by y = h(x) + v; `start` (n,) is E[x_i^2] before any data."""
+    """Return each Gaussian of (x, r) as one of (x, r, y), y = h(x) + v; `start` (n,) is E[x_i^2] before any data."""
     n = len(start)
 
     def augment_one(both: Gaussian) -> Gaussian:
+        """Append y, which depends on x alone, to one Gaussian."""
         signal = signal_of(plant, sensor, transform, take_leading(both, n), start)
         slopes = jnp.pad(signal.slopes, ((0, 0), (0, len(both.mean) - n)))
         return append_rows(
@@ -58,19 +59,20 @@ def augment(
 def predict_jointly(
     plant: AbstractPlant, transform: AbstractTransform, both: Gaussian, u: jax.Array, start: jax.Array
 ) -> Gaussian:
-    """Move (x, r) by one step of the plant; `start` (n,) is E[x_i^2] before any data."""
+    """Return the Gaussian of (f(x, u) + w, r): r stays; `start` (n,) is E[x_i^2] before any data."""
     n = len(start)
-    rest = len(both.mean) - n
+    length_of_r = len(both.mean) - n
     image = image_of(plant, transform, take_leading(both, n), u)
     noise = sum_unexplained(image, process_noise(plant, u, start))
-    slopes = jnp.concatenate([jnp.pad(image.slopes, ((0, 0), (0, rest))), both.root[n:]])
-    fresh = Columns(jnp.pad(noise.matrix, ((0, rest), (0, 0))), noise.weights)
+    # Rows of x by the slopes of f, rows of r as they are; noise of x alone.
+    slopes = jnp.concatenate([jnp.pad(image.slopes, ((0, 0), (0, length_of_r))), both.root[n:]])
+    noise_of_both = Columns(jnp.pad(noise.matrix, ((0, length_of_r), (0, 0))), noise.weights)
     mean = jnp.concatenate([image.mean + plant.noise_mean(), both.mean[n:]])
-    return from_columns(mean, join_columns(Columns(slopes, both.variances), fresh))
+    return from_columns(mean, join_columns(Columns(slopes, both.variances), noise_of_both))
 
 
 def set_known_components(x: Gaussian, places: np.ndarray, values: jax.Array) -> Gaussian:
-    """Set the components at `places` to known values, of variance zero."""
+    """Return the Gaussian with the components at `places` replaced by known values, of variance zero."""
     root = x.root.at[places].set(np.eye(len(x.mean))[places])
     variances = x.variances.at[places].set(0.0)
     return Gaussian(x.mean.at[places].set(values), below_diagonal(root), variances)
@@ -85,10 +87,14 @@ def condition_parts(
     m: int,
     delivers: bool,
 ) -> GaussianSum:
-    """Condition each Gaussian of (x, r, y) on z = G y + n, and multiply its weight by the density of z."""
+    """Condition each Gaussian of (x, r, y) on z = G y + n, and multiply its weight by the density of z.
+
+    `m`: length of y. `delivers`: what arrives is y itself, so that y is known afterwards.
+    """
     size = parts.gaussian.mean.shape[1]
 
     def update_one(x: Gaussian) -> tuple[Gaussian, jax.Array]:
+        """Return one Gaussian given z, and log of the density of z."""
         expected, slopes, noise = _transform_by_link(x, link.select_sender(sender, m), m)
         after, innovations = condition_on_observation(x, slopes, z - expected, noise, arrived)
         if delivers:  # y is z, to the last digit
@@ -100,9 +106,10 @@ def condition_parts(
 
 
 def predict_received(x: Gaussian, link: LinkMoments, sender: slice, m: int) -> Gaussian:
-    """Predict z = G y + n from each Gaussian of (x, r, y)."""
+    """Return the Gaussian of z = G y + n from each Gaussian of (x, r, y)."""
 
     def receive_one(x: Gaussian) -> Gaussian:
+        """Predict z from one Gaussian."""
         expected, slopes, noise = _transform_by_link(x, link.select_sender(sender, m), m)
         return from_columns(expected, join_columns(Columns(slopes, x.variances), noise))
 

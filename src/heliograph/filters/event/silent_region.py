@@ -39,7 +39,7 @@ class SilentRegion(NamedTuple):
         return 2 * len(range(self.outputs)[sender]) + self.is_ball
 
     def _error_directions(self, sender: slice) -> list[tuple[jax.Array, jax.Array]]:
-        """For each component of a sender, the row d with d'(x, r, y) = y - r, and its threshold delta."""
+        """Return for each component of a sender the row d with d'(x, r, y) = y - r, and its threshold delta."""
         n, m = self.states, self.outputs
         delta = jnp.broadcast_to(jnp.asarray(self.trigger.delta), (m,))
         unit = jnp.eye(n + 2 * m)
@@ -50,26 +50,28 @@ class SilentRegion(NamedTuple):
     ) -> tuple[GaussianSum, GaussianSum]:
         """Truncate to |y - r| <= delta: `known` piece by piece of the interval, then merged; `unknown` as a whole."""
         (direction, delta), *rest = self._error_directions(sender)
+        # Each known Gaussian once for each piece [low, high] of the first component's interval, piece after piece.
         size, edges = len(known.log_weight), np.linspace(-1.0, 1.0, self.known + 1)
         low, high = (np.repeat(ends, size) for ends in (edges[:-1], edges[1:]))
-        every = concatenate([known] * self.known)
+        cut = concatenate([known] * self.known)
         if self.is_ball:
-            every = truncate_between(every, direction, low * delta, high * delta) if self.known > 1 else every
-            every = self._truncate_to_ball(concatenate([every, unknown]), sender, 1.0, True)
+            if self.known > 1:
+                cut = truncate_between(cut, direction, low * delta, high * delta)
+            cut = self._truncate_to_ball(concatenate([cut, unknown]), sender, 1.0, inside=True)
         else:
-            whole = np.ones(len(unknown.log_weight))
-            low, high = np.append(low, -whole), np.append(high, whole)
-            every = truncate_between(concatenate([every, unknown]), direction, low * delta, high * delta)
+            ones = np.ones(len(unknown.log_weight))
+            low, high = np.append(low, -ones), np.append(high, ones)
+            cut = truncate_between(concatenate([cut, unknown]), direction, low * delta, high * delta)
             for direction, delta in rest:
-                every = truncate_between(every, direction, -delta, delta)
+                cut = truncate_between(cut, direction, -delta, delta)
         count = size * self.known
-        return merge_groups(every.take(0, count), self.known), every.take(count)
+        return merge_groups(cut.take(0, count), self.known), cut.take(count)
 
     def truncate_outside(self, parts: GaussianSum, sender: slice, scale: float) -> GaussianSum:
-        """Truncate each Gaussian to |y - r| > delta, as `outside_parts` pieces, one after the other.
+        """Truncate each Gaussian to |y - r| > scale delta, as `outside_parts` pieces, one after the other.
 
-        The first component that is, above or below, those before it inside; of a ball these are what is outside of the
-        box around it, and then what the ball leaves of the box.
+        Two pieces for each component: it is above or below, and those before it are inside. Of a ball these are what
+        is outside of the box around it; one piece more is what the ball leaves of the box.
         """
         outside, errors = [], self._error_directions(sender)
         for i, (direction, delta) in enumerate(errors, 1):
@@ -77,7 +79,9 @@ class SilentRegion(NamedTuple):
             outside.append(truncate_outside(parts, direction, edge))
             if i < len(errors) or self.is_ball:
                 parts = truncate_between(parts, direction, -edge, edge)
-        return concatenate([*outside, self._truncate_to_ball(parts, sender, scale, False)] if self.is_ball else outside)
+        if self.is_ball:
+            outside.append(self._truncate_to_ball(parts, sender, scale, inside=False))
+        return concatenate(outside)
 
     def _truncate_to_ball(self, parts: GaussianSum, sender: slice, scale: float, inside: bool) -> GaussianSum:
         """Truncate each Gaussian to |y - r| <= scale delta (`inside`), or to where it is more."""

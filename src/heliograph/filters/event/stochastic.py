@@ -29,7 +29,10 @@ from heliograph.numerics.types import Array, ArrayLike, Float
 
 
 class StochasticBelief(NamedTuple):
-    """The state (n,) given the data, the modes' law (M,) and the shared reference (m,) of the sender."""
+    """The state (n,) given the data, the modes' law (M,) and the shared reference (m,) of the sender.
+
+    `moved`: whether a step was predicted already: the modes move from the second on.
+    """
 
     gaussian: Gaussian
     law: Float[jax.Array, " M"]
@@ -79,7 +82,7 @@ class StochasticEventFilter(AbstractSizedFilter):
         return StochasticBelief(moved, law, reference, jnp.asarray(True))
 
     def reference(self, mean: jax.Array, u: ArrayLike, k: Step) -> jax.Array:
-        """Prediction of y at step k that both ends compute, from the estimate after the step before and the input."""
+        """Return the prediction of y at step k that both ends compute, from the mean after the step before and u."""
         return predict_signal(at(self.plant, k), at(self.sensor, k), mean, u)
 
     @corrects
@@ -93,20 +96,20 @@ class StochasticEventFilter(AbstractSizedFilter):
 
         # A value: each mode's update, joined.
         modes = len(state.law)
-        sent = replicate(signal, modes)
-        posteriors, weight, innovation = correct_in_every_mode(sent, channel, jnp.arange(modes), state.law, values)
-        came = merge_groups(GaussianSum(safe_log(weight), posteriors, jnp.eye(len(weight))[:, None]))
+        signals = replicate(signal, modes)
+        posteriors, weight, innovation = correct_in_every_mode(signals, channel, jnp.arange(modes), state.law, values)
+        by_value = merge_groups(GaussianSum(safe_log(weight), posteriors, jnp.eye(len(weight))[:, None]))
         # Nothing: silence, or a link that is down.
-        log_silent, quiet = self._condition_on_silence(prior, signal, state.reference, k)
-        silent = _sum_of_one_gaussian(log_silent, quiet, state.law)
-        nothing = self._mix_silence_and_outage(prior, silent, state.law, channel, down)
+        log_silent, given_silence = self._condition_on_silence(prior, signal, state.reference, k)
+        silent = _sum_of_one_gaussian(log_silent, given_silence, state.law)
+        by_nothing = self._mix_silence_and_outage(prior, silent, state.law, channel, down)
         # Which of the two it is, with its likelihood.
         if isinstance(self.trigger, StochasticTrigger):
             link = self._average_link(channel, state.law)
             innovation = self._condition_on_sending(innovation, link, signal, state.reference, log_silent)
         arrived = jnp.any(~jnp.isnan(values))
-        log_nothing = jnp.maximum(nothing.log_weight[0], np.log(FLOOR))  # of what the rule forbids
-        after = jax.tree.map(lambda a, b: jnp.where(arrived, a, b), came, nothing)
+        log_nothing = jnp.maximum(by_nothing.log_weight[0], np.log(FLOOR))  # of what the rule forbids
+        after = jax.tree.map(lambda a, b: jnp.where(arrived, a, b), by_value, by_nothing)
         value, covariance = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
         total = jnp.where(arrived, innovation.log_likelihood, log_nothing)
         if len(down):
@@ -129,11 +132,12 @@ class StochasticEventFilter(AbstractSizedFilter):
         is_complete = ~jnp.any(jnp.isnan(value))
         shift, change = self._change_by_sending(link, signal, reference, log_silent)
         complete = jnp.where(is_complete, value, 0.0), jnp.where(is_complete, covariance, jnp.eye(len(value)))
-        log_sent = self._log_probability_sent(link[0], signal, reference, *complete)
+        gain, _ = link
+        log_sent = self._log_probability_sent(gain, signal, reference, *complete)
         return Innovation(
-            jnp.where(is_complete, value - shift, value),
-            jnp.where(is_complete, covariance + change, covariance),
-            innovation.log_likelihood + jnp.where(is_complete, log_sent, 0.0),
+            value=jnp.where(is_complete, value - shift, value),
+            covariance=jnp.where(is_complete, covariance + change, covariance),
+            log_likelihood=innovation.log_likelihood + jnp.where(is_complete, log_sent, 0.0),
         )
 
     def _mix_silence_and_outage(
@@ -144,12 +148,12 @@ class StochasticEventFilter(AbstractSizedFilter):
         parts = [silent.relabel_sender(0, law[None] * (1 - lost))]
         if self.loses:
             parts.append(_sum_of_one_gaussian(jnp.zeros(()), prior, law).relabel_sender(0, law[None] * lost))
+        # A flag that says which of the two it was leaves one of them.
         if len(down):
-            up = jnp.where(down[0] > 0, -jnp.inf, 0.0)
-            parts = [
-                parts[0].scale_weights(up),
-                *(cause.scale_weights(jnp.where(down[0] > 0, 0.0, -jnp.inf)) for cause in parts[1:]),
-            ]
+            by_silence, *by_outage = parts
+            is_down = down[0] > 0
+            parts = [by_silence.scale_weights(jnp.where(is_down, -jnp.inf, 0.0))]
+            parts += [part.scale_weights(jnp.where(is_down, 0.0, -jnp.inf)) for part in by_outage]
         return merge_groups(concatenate(parts))
 
     def _average_link(self, channel: SideInformation, law: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -163,7 +167,7 @@ class StochasticEventFilter(AbstractSizedFilter):
     def _change_by_sending(
         self, link: tuple[jax.Array, jax.Array], signal: Signal, reference: jax.Array, log_silent: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Return the change of z's predicted mean and covariance as it was sent: values far from r are, more often.
+        """Return the change of z's predicted mean and covariance given that it was sent, as values far from r are.
 
         Of y ~ N(m, S) the share s is silent, with mean m + d and covariance S_s, so that of what is sent the mean is
         m - s d / (1 - s) and the second moment about m is (S - s (S_s + d d')) / (1 - s).
@@ -172,10 +176,10 @@ class StochasticEventFilter(AbstractSizedFilter):
         # Of y.
         silent = jnp.minimum(jnp.exp(log_silent), 1 - FLOOR)
         y = _law_of_signal(signal)
-        _, quiet = self._observe_silence(y, y.root, zero_covariance(len(mean)), mean, reference)
-        d = quiet.mean - mean
+        _, given_silence = self._observe_silence(y, y.root, zero_covariance(len(mean)), mean, reference)
+        d = given_silence.mean - mean
         shift = -silent * d / (1 - silent)
-        about = (total - silent * (quiet.covariance + jnp.outer(d, d))) / (1 - silent) - total
+        about = (total - silent * (given_silence.covariance + jnp.outer(d, d))) / (1 - silent) - total
         # Of z: the mean gain, and the spread, which acts on second moments of (y, 1).
         second = about + jnp.outer(mean, shift) + jnp.outer(shift, mean)
         second = jnp.block([[second, shift[:, None]], [shift, jnp.zeros(1)]])
@@ -196,7 +200,7 @@ class StochasticEventFilter(AbstractSizedFilter):
     def _observe_silence(
         self, x: Gaussian, slopes: jax.Array, noise: Columns, expected: jax.Array, reference: jax.Array
     ) -> tuple[jax.Array, Gaussian]:
-        """Condition x on silence: r = y + v, Cov v = W^-1, y = expected + slopes xi + noise; log P(silent) too."""
+        """Return log P(silent), and x given silence: r = y + v, Cov v = W^-1, y = expected + slopes xi + noise."""
         noise = join_columns(noise, eliminate(self._inverse_weight()))
         after, innovations = condition_on_observation(x, slopes, reference - expected, noise)
         size = jnp.abs(reference) + jnp.abs(expected)
@@ -216,7 +220,7 @@ class StochasticEventFilter(AbstractSizedFilter):
     def _condition_on_silence(
         self, prior: Gaussian, signal: Signal, reference: jax.Array, k: Step
     ) -> tuple[jax.Array, Gaussian]:
-        """Condition the prior on silence while the link is up; return log P(silent) too."""
+        """Return log P(silent) while the link is up, and the prior given silence."""
         if isinstance(self.trigger, Periodic):
             due = jnp.asarray(k) % self.trigger.period == self.trigger.phase
             return jnp.where(due, -jnp.inf, 0.0), prior
@@ -224,16 +228,16 @@ class StochasticEventFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: StochasticBelief) -> Estimate:
-        """Return the Gaussian."""
+        """Return the mean and covariance of the Gaussian."""
         return Estimate(state.gaussian.mean, state.gaussian.covariance, self.claim)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return the Gaussian's, around the update."""
+        """Return the smoother step of the Gaussian around the update."""
         return smoother_step_by_transform(self, step, first(self.plant))
 
 
 def _law_of_signal(signal: Signal) -> Gaussian:
-    """Return the law of y itself, before z."""
+    """Return the Gaussian of the signal y itself, before z."""
     return from_columns(signal.mean, join_columns(Columns(signal.slopes, signal.prior.variances), signal.noise))
 
 

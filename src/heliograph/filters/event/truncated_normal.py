@@ -9,9 +9,8 @@ import numpy as np
 
 from straightline import operation
 
-REACH = (
-    74.0  # density beyond sqrt(t^2 + REACH), t the interval's point nearest 0, is exp(-REACH / 2) = 8e-17 of that at t
-)
+# The density beyond sqrt(t^2 + REACH), t the interval's point nearest 0, is below exp(-REACH / 2) = 8e-17 of that at t.
+REACH = 74.0
 NODES, WEIGHTS = (array / 2 for array in np.polynomial.legendre.leggauss(40))
 NODES = NODES + 0.5  # on (0, 1)
 
@@ -33,19 +32,20 @@ Moments = Callable[..., TruncatedNormal]
 
 
 def _compute_pair_by_pair(moments: Moments) -> Moments:
-    """Make the moments one operation, so that native code holds their code once, for all pairs (lower, upper)."""
+    """Return the function as one operation, of which native code holds the code once, for PAIR intervals at a time."""
 
-    def native(*ends: jax.Array) -> TruncatedNormal:
+    def compute_in_loop(*ends: jax.Array) -> TruncatedNormal:
+        """Compute the moments pair after pair, or one by one of an odd number."""
         width = 1 if ends[0].size % PAIR else PAIR
-        every = jax.lax.map(lambda pair: moments(*pair), [end.reshape(-1, width) for end in ends])
-        return TruncatedNormal(*(moment.reshape(ends[0].shape) for moment in every))
+        results = jax.lax.map(lambda pair: moments(*pair), [end.reshape(-1, width) for end in ends])
+        return TruncatedNormal(*(moment.reshape(ends[0].shape) for moment in results))
 
-    return operation(native)(moments)
+    return operation(compute_in_loop)(moments)
 
 
 @_compute_pair_by_pair
 def truncated_normal(lower: jax.Array, upper: jax.Array) -> TruncatedNormal:
-    """Log mass, mean and variance of N(0, 1) cut to [lower, upper], either of which may be infinite.
+    """Return log mass, mean and variance of N(0, 1) cut to [lower, upper], either of which may be infinite.
 
     The closed forms are differences of larger numbers: 1 + (a phi(a) - b phi(b)) / Z - m^2 is wrong, or negative, far
     from 0 and where the interval is short. Instead the density is integrated about t, the point of the interval that is
@@ -96,7 +96,7 @@ def truncated_normal(lower: jax.Array, upper: jax.Array) -> TruncatedNormal:
 
 @_compute_pair_by_pair
 def upper_tail(lower: jax.Array) -> TruncatedNormal:
-    """Log mass, mean and variance of N(0, 1) above `lower`: `truncated_normal` by a tenth of its operations.
+    """Return log mass, mean and variance of N(0, 1) above `lower`, by a tenth of `truncated_normal`'s operations.
 
     With the hazard h = phi(a) / Q(a) the mean is h, the variance 1 - h (h - a). Far out both lose digits, but by
     Laplace h = a + u_1 / a with u_n = n / (1 + u_{n+1} / a^2), and the variance is u_1 (u_2 - u_1) / a^2, which loses
@@ -111,12 +111,12 @@ def upper_tail(lower: jax.Array) -> TruncatedNormal:
     mass = jax.scipy.special.erfc(a / np.sqrt(2)) / 2
     hazard = jnp.exp(-(a**2) / 2) / (np.sqrt(2 * np.pi) * mass)
     near = TruncatedNormal(jnp.log(mass), hazard, 1 - hazard * (hazard - a))
-    # Far out.
+    # Far out: u_n = n / (1 + x u_{n+1}), x = 1 / a^2, from u = 0 at DEPTH down to u_2 and u_1.
     a = jnp.maximum(lower, FAR)
-    x, above, below = 1 / (a * a), jnp.zeros_like(a), jnp.ones_like(a)
+    x, numerator, denominator = 1 / (a * a), jnp.zeros_like(a), jnp.ones_like(a)
     for n in range(DEPTH, 1, -1):
-        above, below = n * below, below + x * above
-    second = above / below
+        numerator, denominator = n * denominator, denominator + x * numerator
+    second = numerator / denominator
     first = 1 / (1 + x * second)
     mean = a + first / a
     log_mass = -(a**2) / 2 - np.log(2 * np.pi) / 2 - jnp.log(mean)

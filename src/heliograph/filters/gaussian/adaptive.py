@@ -131,9 +131,10 @@ class AdaptiveFilter(AbstractWrapper):
 
 
 class VariationalUpdate(NamedTuple):
-    """State and variances' law after one update; predicted covariance of z by those before; weights of components.
+    """Result of one update: the state, a and b of the variances' law, predicted covariance of z, weights of components.
 
-    By those that were learned from a value itself no value would be far from what was expected.
+    The covariance is by the variances known before: by those learned from a value itself no value would be far from
+    what was expected.
     """
 
     state: Gaussian
@@ -168,6 +169,7 @@ def _variational_update(
     shape, scale = memory * state[0] + prior_weight, memory * state[1] + prior_weight * variance
     after_shape = shape + 0.5
     e = jnp.where(arrived, z - before.signal - center, 0.0)
+    # `weight` is used, `shown` reported; `received` are the components whose weight is not zero.
     noise, weight, shown, received = scale / shape, jnp.ones_like(e), jnp.ones_like(e), arrived
     residual = e
     # Variational Bayes: an update with R = b / a, then b from what is known of the noise's square.
@@ -207,9 +209,9 @@ def _scale_law(law: NoiseBranches, ratio: jax.Array) -> NoiseBranches:
 def adaptive_filter(filter: AbstractFilter, memory: ArrayLike = 0.98) -> AdaptiveFilter:
     """Return the filter with the noise variances of its sensor learned on line, each forgetting with `memory` a step.
 
-    Forgetting goes towards the filter's own variance, which also remains after
-    losses, and never towards none. The process noise is taken as true: a Q that is too small is absorbed by R (learn Q
-    first, with `fit`).
+    What is forgotten is replaced by the filter's own variance, never by zero; a component that does not arrive keeps
+    what was learned. The process noise is taken as true: a Q that is too small is absorbed by R (learn Q first, with
+    `fit`).
 
     Claim: "nominal".
 
@@ -236,10 +238,11 @@ def adaptive_filter(filter: AbstractFilter, memory: ArrayLike = 0.98) -> Adaptiv
 
 
 def _find_sensor_noise(filter: GaussianFilter) -> ReceivedNoise | OverTime:
-    """Find the sensor's noise as it arrives behind the filter's channel."""
+    """Return the sensor's noise as it arrives behind the filter's channel, for each step where these vary."""
 
-    def arriving(sensor: AbstractSensor, channel: SecondOrder) -> ReceivedNoise:
+    def describe(sensor: AbstractSensor, channel: SecondOrder) -> ReceivedNoise:
+        """Return the noise of one step."""
         return describe_outlier_noise(sensor.noise, None, channel, True)
 
-    noise: ReceivedNoise | OverTime = at_each_step(arriving, filter.sensor, filter.channel)
+    noise: ReceivedNoise | OverTime = at_each_step(describe, filter.sensor, filter.channel)
     return noise

@@ -8,8 +8,14 @@ import jax.numpy as jnp
 
 from heliograph.factors.changes import settle
 from heliograph.factors.columns import Columns, columns_of, join_columns, rounding_of, triangularise
-from heliograph.factors.gaussian import Gaussian, Image, from_covariance, predict_affine, sum_unexplained
-from heliograph.factors.gaussian import add_noise_to_image as transformed
+from heliograph.factors.gaussian import (
+    Gaussian,
+    Image,
+    add_noise_to_image,
+    from_covariance,
+    predict_affine,
+    sum_unexplained,
+)
 from heliograph.filters.base import (
     AbstractSizedFilter,
     FilterAngles,
@@ -72,12 +78,12 @@ class AbstractBeliefFilter(AbstractSizedFilter):
         return Estimate(mean, state.covariance, self.claim, attitude=self.attitude)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return the law of the state before the step given its prediction, and that after the update."""
+        """Return the smoother step: the law of the state before given the one after, and that after the update."""
         return smoother_step_by_transform(self, step, self)
 
 
 class HasStart(Protocol):
-    """A plant, or a filter that starts from another law."""
+    """What has a law of the first state: a plant, or a filter that starts from another law."""
 
     initial_mean: Array
     initial_covariance: Array
@@ -86,8 +92,8 @@ class HasStart(Protocol):
 def second_moments_at_start(plant: AnyPlant, start: HasStart | None = None) -> Float[jax.Array, " n"]:
     """Return E[x_i^2] at the start plus Var w_i of a step, (n,): how large the numbers are that rounding acts on.
 
-    Of the plant's first step, and of its law at the start or of another one, of an unknown one what is known; a noise
-    that depends on inputs counts where it is added.
+    `start`: whose law of the first state counts, by default the plant's; of a law that is partly unknown, the known
+    part. A noise that depends on inputs counts where it is added.
     """
     first_step = at(plant, 0)
     if isinstance(first_step, ModalPlant):  # the largest of the models
@@ -103,13 +109,13 @@ def second_moments_at_start(plant: AnyPlant, start: HasStart | None = None) -> F
 
 
 def process_noise(plant: AbstractPlant, u: jax.Array, start: jax.Array) -> Columns:
-    """Return the factors of Cov w, and of the rounding of a state that had the second moments `start`, (n,)."""
-    own = plant.noise.columns if isinstance(plant.noise, AbstractNoise) else columns_of(plant.noise_covariance(u))
-    return triangularise(join_columns(own, rounding_of(start + jnp.diagonal(plant.noise_covariance(u)))))
+    """Return factors of Cov w plus the rounding of a state that had the second moments `start`, (n,)."""
+    w = plant.noise.columns if isinstance(plant.noise, AbstractNoise) else columns_of(plant.noise_covariance(u))
+    return triangularise(join_columns(w, rounding_of(start + jnp.diagonal(plant.noise_covariance(u)))))
 
 
 def image_of(plant: AbstractPlant, transform: AbstractTransform, x: Gaussian, u: jax.Array) -> Image:
-    """Return f(x, u), exactly where it is linear."""
+    """Return the moments of f(x, u), exactly where it is linear, else by the transform."""
     if isinstance(plant, LinearPlant):
         return linear_image(plant.transition_matrix(u), plant.transition(x.mean, u), x)
     return move_about_mean(plant, transform, x, u)[1]
@@ -118,18 +124,19 @@ def image_of(plant: AbstractPlant, transform: AbstractTransform, x: Gaussian, u:
 def predict_gaussian(
     plant: AbstractPlant, transform: AbstractTransform, x: Gaussian, u: jax.Array, start: jax.Array
 ) -> Gaussian:
-    """Return f(x, u) + w."""
+    """Return the Gaussian of f(x, u) + w; `start` (n,) is E[x_i^2] before any data, which rounding acts on."""
     noise = process_noise(plant, u, start)
     if isinstance(plant, LinearPlant):
         return predict_affine(x, plant.transition_matrix(u), plant.shift(u), noise)
     middle, image = move_about_mean(plant, transform, x, u)
-    return settle(plant.manifold, middle, transformed(image._replace(mean=image.mean + plant.noise_mean()), noise))
+    image = image._replace(mean=image.mean + plant.noise_mean())
+    return settle(plant.manifold, middle, add_noise_to_image(image, noise))
 
 
 def move_about_mean(
     plant: AbstractPlant, transform: AbstractTransform, x: Gaussian, u: jax.Array
 ) -> tuple[jax.Array, Image]:
-    """Return f(x, u) and the state about which its moments are: of attitudes their mean on the group.
+    """Return the state about which the moments of f(x, u) are, and these: of attitudes about their mean on the group.
 
     The mean of attitudes m is where changes from it have the mean 0. m_0 = f(m, u), m_(i+1) = m_i plus the mean change
     from m_i: the error shrinks by the square of the attitudes' deviation in each.

@@ -76,10 +76,10 @@ def observe_by_young(signal: Signal, channel: SecondOrder, z: ArrivedInnovation,
     slopes, of_state, of_noise = _select_received(signal, channel, present)
     w = augmented_second_moment(signal.second, signal.mean, 1.0)
     base, shift = channel.spread(w, present), channel.shift(w, present)
-    # The scalars of least trace.
+    # The scalars of least trace; C = Cov(x, z).
     cross = (slopes * prior.variances) @ prior.root.T
-    whole = jnp.trace(prior.covariance)
-    parts = base + unit_variance_where_absent(present), shift, of_state + of_noise, cross @ cross.T, whole
+    trace = jnp.trace(prior.covariance)
+    parts = base + unit_variance_where_absent(present), shift, of_state + of_noise, cross @ cross.T, trace
     beta = trace_minimising_scalars(young_fixed_point_map, scalars, parts)
     a, b = jnp.where(jnp.any(present), 1 + beta[0], 1.0), 1 + beta[1]
     # The same bound as a Kalman update.
@@ -102,11 +102,11 @@ def observe_by_zero_mean(signal: Signal, channel: SecondOrder, z: ArrivedInnovat
     """
     prior, present = signal.prior, z.present
     slopes, of_state, _ = _select_received(signal, channel, present)
-    # E[y y'] divided: yhat yhat' is known, Cov y is not.
-    known_part = augmented_second_moment(signal.second - signal.covariance, signal.mean, 1.0)
-    unknown_part = augmented_second_moment(signal.covariance, jnp.zeros_like(signal.mean), 0.0)
-    base = channel.power(unknown_part, present) + channel.spread(known_part, present)
-    shift = channel.shift(unknown_part, present)
+    # E[y y'] = yhat yhat' + Cov y: the gain's correlation is unknown with the error alone.
+    mean_part = augmented_second_moment(signal.second - signal.covariance, signal.mean, 1.0)
+    covariance_part = augmented_second_moment(signal.covariance, jnp.zeros_like(signal.mean), 0.0)
+    base = channel.power(covariance_part, present) + channel.spread(mean_part, present)
+    shift = channel.shift(covariance_part, present)
     # Power of the prior error that the received components explain: columns Cov(x, y) N^-T of Cov y = N diag(s) N'.
     used = mask_received(channel, present)[:, None]
     signals = join_columns(Columns(signal.slopes, prior.variances), signal.noise)
@@ -134,7 +134,7 @@ def _select_received(
 
 
 def unit_variance_where_absent(present: jax.Array) -> jax.Array:
-    """Return unit variance for components that did not arrive, so that the reduced system keeps its full size."""
+    """Return a diagonal (m, m): 1 for components that did not arrive, so that the system keeps its full size."""
     return jnp.diag(jnp.where(present, 0.0, 1.0))
 
 

@@ -84,18 +84,23 @@ class SensorAboutCenter(AbstractSensor):
 def _evaluate_about(
     function: Callable[[jax.Array], jax.Array], e: jax.Array, center: Array, level: Array, unit: float
 ) -> jax.Array:
-    """Return f(center + e) - level with what rounding takes; its derivative is that of f."""
+    """Return f(center + e) - level, with the digits that rounding would take; its derivative is that of f.
+
+    `unit`: eps of the precision.
+    """
 
     @jax.custom_jvp
-    def about(e: jax.Array) -> jax.Array:
+    def evaluate(e: jax.Array) -> jax.Array:
+        """Evaluate f in two parts, high and low."""
         value = compensate(function, unit)(split_sum(jnp.asarray(center), e))
         return jnp.asarray((value.high - level) + value.low)
 
-    @about.defjvp
+    @evaluate.defjvp
     def _(primals: tuple[jax.Array], tangents: tuple[jax.Array]) -> tuple[jax.Array, jax.Array]:
-        return about(*primals), jax.jvp(lambda e: function(center + e), primals, tangents)[1]
+        """Differentiate f itself."""
+        return evaluate(*primals), jax.jvp(lambda e: function(center + e), primals, tangents)[1]
 
-    value: jax.Array = about(e)
+    value: jax.Array = evaluate(e)
     return value
 
 
@@ -137,26 +142,29 @@ class CentredFilter(AbstractWrapper):
         plant, center, u = at(self.base.plant, k), jnp.asarray(state.high), jnp.asarray(u)
         unit, x = unit_of(center), state.about_center
         if isinstance(plant, LinearPlant):
-            middle = compensate(lambda c: plant.transition_matrix(u) @ c, unit)(Compensated(center))
-            after = _about_zero(self.base).predict(x, u, k)
-            return center_gaussian(middle.high, after._replace(mean=after.mean + middle.low))
-        middle = compensate(lambda c: plant.transition(c, u), unit)(Compensated(center, x.mean))
-        moved = eqx.tree_at(lambda f: f.plant, _about_zero(self.base), _plant_about(plant, center, middle.high, unit))
-        return center_gaussian(middle.high, moved.predict(x, u, k))
+            # F (c + e) = (F c, in two parts) + F e.
+            center_after = compensate(lambda c: plant.transition_matrix(u) @ c, unit)(Compensated(center))
+            after = _start_at_zero(self.base).predict(x, u, k)
+            return center_gaussian(center_after.high, after._replace(mean=after.mean + center_after.low))
+        # The plant about the center, evaluated with what rounding takes.
+        center_after = compensate(lambda c: plant.transition(c, u), unit)(Compensated(center, x.mean))
+        plant_about_center = _center_plant(plant, center, center_after.high, unit)
+        base = eqx.tree_at(lambda f: f.plant, _start_at_zero(self.base), plant_about_center)
+        return center_gaussian(center_after.high, base.predict(x, u, k))
 
     @corrects
     def correct(self, state: CentredGaussian, z: ArrayLike, k: Step = 0) -> tuple[CentredGaussian, Innovation]:
         """Correct about the origin, by what differs from the signal that it has."""
         sensor, channel, center = at(self.base.sensor, k), at(self.base.channel, k), jnp.asarray(state.high)
         unit, z = unit_of(center), jnp.asarray(z)
-        base, signal = _about_zero(self.base), compensate(sensor.measure, unit)(Compensated(center))
+        base, signal = _start_at_zero(self.base), compensate(sensor.measure, unit)(Compensated(center))
         if not self.known_gain:
             signal = Compensated(jnp.zeros_like(signal.high), jnp.zeros_like(signal.high))
         z = z - channel.mean_gain @ signal.high
         if isinstance(sensor, LinearSensor) and self.known_gain:
             z = z - channel.mean_gain @ signal.low
         else:
-            base = eqx.tree_at(lambda f: f.sensor, base, _sensor_about(sensor, center, signal.high, unit))
+            base = eqx.tree_at(lambda f: f.sensor, base, _center_sensor(sensor, center, signal.high, unit))
         after, innovation = base.correct(state.about_center, z, k)
         return center_gaussian(center, after), innovation
 
@@ -188,12 +196,12 @@ def center_filter(filter: AbstractBeliefFilter) -> AbstractFilter:
     return believing(centred, base.premise)
 
 
-def _about_zero(base: Any) -> Any:
-    """Return the filter with a start at 0: numbers are as large as its deviations."""
+def _start_at_zero(base: Any) -> Any:
+    """Return the filter with an initial mean of 0, so that its numbers are as large as its deviations."""
     return eqx.tree_at(lambda f: f.initial_mean, base, np.zeros(np.shape(base.initial_mean)))
 
 
-def _plant_about(model: AbstractPlant, center: Array, level: Array, unit: float) -> PlantAboutCenter:
+def _center_plant(model: AbstractPlant, center: Array, level: Array, unit: float) -> PlantAboutCenter:
     """Return the plant of deviations from a center, whose state starts at zero."""
     return PlantAboutCenter(
         model=model, center=center, level=level, unit=unit, noise=model.noise, deviation=None,
@@ -202,7 +210,7 @@ def _plant_about(model: AbstractPlant, center: Array, level: Array, unit: float)
     )  # fmt: skip
 
 
-def _sensor_about(model: AbstractSensor, center: Array, level: Array, unit: float) -> SensorAboutCenter:
+def _center_sensor(model: AbstractSensor, center: Array, level: Array, unit: float) -> SensorAboutCenter:
     """Return the sensor of deviations from a center."""
     return SensorAboutCenter(
         model=model, center=center, level=level, unit=unit, noise=model.noise, outputs=model.outputs,

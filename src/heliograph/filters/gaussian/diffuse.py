@@ -65,12 +65,12 @@ class DiffuseFilter(AbstractSizedFilter):
         sensor, z = at(self.sensor, k), jnp.asarray(z)
         matrix, noise = jnp.asarray(sensor.matrix), sensor.noise.columns
         value = z - matrix @ state.mean - jnp.asarray(sensor.noise.mean)
-        after, heard = observe_diffuse(state, matrix, value, noise)
-        covariance, unknown = project_diffuse(state, matrix)
-        shown = jnp.where(unknown, jnp.nan, value)
-        there = ~jnp.isnan(shown)
-        total = jnp.where(there[:, None] & there, covariance + noise.covariance, jnp.nan)
-        return after, Innovation(shown, total, heard.log_likelihood)
+        after, observed = observe_diffuse(state, matrix, value, noise)
+        covariance, hears_unknown = project_diffuse(state, matrix)
+        innovation = jnp.where(hears_unknown, jnp.nan, value)
+        present = ~jnp.isnan(innovation)
+        total = jnp.where(present[:, None] & present, covariance + noise.covariance, jnp.nan)
+        return after, Innovation(innovation, total, observed.log_likelihood)
 
     @estimates
     def estimate(self, state: Diffuse) -> Estimate:
@@ -78,11 +78,11 @@ class DiffuseFilter(AbstractSizedFilter):
         return Estimate(state.mean, state.covariance, self.claim)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return Rauch's way back at two levels."""
+        """Return the Rauch-Tung-Striebel step, with finite and infinite factors."""
         plant, u = at(self.plant, step.k), jnp.asarray(step.u)
         noise = triangularise(process_noise(plant, u, second_moments_at_start(self.plant)))
-        ahead = jnp.asarray(step.prior.mean)
-        back = condition_on_next_diffuse(step.before, plant.transition_matrix(u), ahead, noise)
+        predicted = jnp.asarray(step.prior.mean)
+        back = condition_on_next_diffuse(step.before, plant.transition_matrix(u), predicted, noise)
         return SmootherStep(as_gaussian(step.after), back, claim=self.claim)
 
 
@@ -92,7 +92,7 @@ def has_unknown_start(plant: AnyPlant) -> bool:
 
 
 def diffuse_filter(plant: AnyPlant, sensor: AnySensor) -> DiffuseFilter:
-    """Build the filter of a plant with an unknown start; `kalman_filter` has checked that both are linear."""
+    """Return the filter of a plant with an unknown start; raise at models that vary or are not linear."""
     check_linear("Kalman filter from an unknown start", plant, sensor)
     if isinstance(plant, OverTime):
         raise fail("plant with an unknown start", "one that does not vary over time", "one in over_time")

@@ -88,7 +88,7 @@ class GaussianFilter(AbstractBeliefFilter):
             u: inputs, the same of all runs.
         """
 
-        def body(state: Gaussian, row: tuple[jax.Array, ...]) -> tuple[Gaussian, tuple[jax.Array, ...]]:
+        def step(state: Gaussian, row: tuple[jax.Array, ...]) -> tuple[Gaussian, tuple[jax.Array, ...]]:
             k, z_k, u_k = row
             prior = self.predict(state, u_k, k)
             channel, y = at(self.channel, k), self.predict_signal(prior, k)
@@ -97,11 +97,11 @@ class GaussianFilter(AbstractBeliefFilter):
 
         def expect(z: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
             start, rows = jax.tree.map(jnp.asarray, self.init()), (jnp.arange(len(z)), z, jnp.asarray(u))
-            mean, covariance, near = jax.lax.scan(body, start, rows)[1]
+            mean, covariance, near = jax.lax.scan(step, start, rows)[1]
             return mean, covariance, near
 
-        many = jnp.ndim(z) == 3
-        return (jax.vmap(expect) if many else expect)(jnp.asarray(z))
+        several_runs = jnp.ndim(z) == 3
+        return (jax.vmap(expect) if several_runs else expect)(jnp.asarray(z))
 
     @corrects
     def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
@@ -168,8 +168,10 @@ def _make_gaussian_filter(
     initial_covariance: ArrayLike | None,
     trusted: bool,
 ) -> GaussianFilter:
-    """Check the parts, describe the channel by second moments without its memory, and decide the claim."""
-    # Checks, and the prior.
+    """Return the Gaussian filter of checked parts, on the channel's second moments without its memory, with its claim.
+
+    `trusted`: whether the channel is the true one, so that more than "nominal" may be claimed.
+    """
     start = check_plant(plant)
     instance("update", update, AbstractUpdate, "one such as Polytope()")
     channel = make_perfect_channel(sensor) if channel is None else channel
@@ -214,7 +216,7 @@ def gaussian_filter(
     initial_mean: Float[ArrayLike, " n"] | None = None,
     initial_covariance: Float[ArrayLike, "n n"] | None = None,
 ) -> "GaussianFilter":
-    """Gaussian filter on its channel's second moments, with any transform (`Cubature()`, `PolynomialMoments(2)`, ...).
+    """Return the Gaussian filter on its channel's second moments with any transform, such as `PolynomialMoments(2)`.
 
     Args:
         plant: the plant, n states.

@@ -95,7 +95,14 @@ class GivingInFilter(AbstractSizedFilter):
         """Return the belief before any data."""
         start, zero = self.base.init(), jnp.zeros(())
         return WatchedBelief(
-            start, start, jnp.zeros(self.received), zero, zero, zero, zero + NEVER, jnp.zeros(len(self.states))
+            believed=start,
+            rival=start,
+            refused=jnp.zeros(self.received),
+            elapsed=zero,
+            evidence=zero,
+            given_in=zero,
+            step=zero + NEVER,
+            moved=jnp.zeros(len(self.states)),
         )
 
     @predicts
@@ -110,37 +117,37 @@ class GivingInFilter(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: WatchedBelief, z: ArrayLike, k: Step = 0) -> tuple[WatchedBelief, Innovation]:
-        """Correct the gate's state, and its rival with what the gate refused too; take that up if it is time."""
+        """Correct the gate's state, and its rival with what the gate refused too; believe the rival if it is time."""
         z = jnp.asarray(z)
         arrived = ~jnp.isnan(z)
         after, innovation = self.base.correct(state.believed, z, k)
-        left_out = arrived & (_weight_of(innovation) < 0.5)
+        left_out = arrived & (_weight_of(innovation) < 0.5)  # a gate's weights are 0 and 1
         refused = jnp.where(arrived, jnp.where(left_out, state.refused + 1, 0.0), state.refused)
         suspect = refused > 0
         # The rival, opened where it would refuse what the gate does.
         prior = _choose(jnp.any(state.refused > 0), state.rival, state.believed)
         opened = self._open(prior, z, left_out, k)
-        rival, believing = self.base.correct(opened, z, k)
-        evidence = state.evidence + self._compare(believing, innovation, arrived & ~suspect)
-        # Given in: for long enough, and not contradicted.
+        rival, rival_innovation = self.base.correct(opened, z, k)
+        evidence = state.evidence + self._compare(rival_innovation, innovation, arrived & ~suspect)
+        # It gives in after refusals for long enough, unless the other numbers contradict the rival.
         gives_in = self._is_long(refused, state.elapsed) & (evidence > -CONTRADICTED)
-        kept = jnp.any(suspect) & ~gives_in
-        angles = self.angles_used().states
+        rival_continues = jnp.any(suspect) & ~gives_in
+        jump = nearest(rival.mean, after.mean, self.angles_used().states) - after.mean
         chosen = _choose(gives_in, rival, after)
         belief = WatchedBelief(
-            chosen,
-            _choose(kept, rival, chosen),
-            jnp.where(gives_in, 0.0, refused),
-            jnp.where(kept, state.elapsed, 0.0),
-            jnp.where(kept, evidence, 0.0),
-            state.given_in + gives_in,
-            jnp.where(gives_in, jnp.asarray(k, dtype=float), state.step),
-            jnp.where(gives_in, nearest(rival.mean, after.mean, angles) - after.mean, state.moved),
+            believed=chosen,
+            rival=_choose(rival_continues, rival, chosen),
+            refused=jnp.where(gives_in, 0.0, refused),
+            elapsed=jnp.where(rival_continues, state.elapsed, 0.0),
+            evidence=jnp.where(rival_continues, evidence, 0.0),
+            given_in=state.given_in + gives_in,
+            step=jnp.where(gives_in, jnp.asarray(k, dtype=float), state.step),
+            moved=jnp.where(gives_in, jump, state.moved),
         )
-        return belief, _choose(gives_in, believing, innovation)
+        return belief, _choose(gives_in, rival_innovation, innovation)
 
     def _is_long(self, refused: jax.Array, elapsed: jax.Array) -> jax.Array:
-        """Ask whether a number has been refused for long enough in a row."""
+        """Return whether a number has been refused for long enough in a row: often enough, or over enough time."""
         long = jnp.zeros((), dtype=bool)
         if self.after is not None:
             long = long | jnp.any(refused >= self.after)
@@ -149,16 +156,16 @@ class GivingInFilter(AbstractSizedFilter):
         return long
 
     def _open(self, prior: Gaussian, z: jax.Array, left_out: jax.Array, k: Step) -> Gaussian:
-        """Open a state for the numbers that were left out and that it would leave out too."""
+        """Return a state, wider where that lets it use numbers that were left out and that it would leave out too."""
         predicted, _ = self.base.predict_received(prior, k)
         noise, rule = at(self.base.noise, k), _gate_of(self.base)
         # Innovation e, its variance S, and V = Var t of the state alone.
         total = predicted.columns.diagonal + jnp.diagonal(jnp.asarray(noise.covariance))
         e = nearest(z, predicted.signal, self.base.received_angles) - predicted.signal - noise.center
         of_state = predicted.slopes**2 @ predicted.prior.variances
-        wants = left_out & (e**2 > rule.c * total) & (of_state > 0)
+        needs_room = left_out & (e**2 > rule.c * total) & (of_state > 0)
         # delta of each number that is to be used, (n, m); each state by itself.
-        change = _most_probable_change(predicted, jnp.where(wants, e, 0.0), of_state)
+        change = _most_probable_change(predicted, jnp.where(needs_room, e, 0.0), of_state)
         n = len(self.states)
         wider = Columns(jnp.eye(n), n / jnp.minimum(rule.c, 1.0) * jnp.sum(change**2, axis=1))
         return from_columns(predicted.prior.mean, join_columns(predicted.prior.columns, wider))
@@ -167,6 +174,7 @@ class GivingInFilter(AbstractSizedFilter):
         """Return the log density of the numbers that count under the rival less that under the gate."""
 
         def log_density(innovation: Innovation) -> jax.Array:
+            """Return the log density of each number that counts, of squares up to the gate's limit c, without 2 pi."""
             variance = jnp.diagonal(jnp.asarray(innovation.covariance))
             variance = jnp.where(counts, variance, 1.0)
             squared = jnp.where(counts, jnp.asarray(innovation.value), 0.0) ** 2 / variance
@@ -190,24 +198,26 @@ class GivingInFilter(AbstractSizedFilter):
 
 
 def _most_probable_change(predicted: PredictedMeasurement, e: jax.Array, of_state: jax.Array) -> jax.Array:
-    """Return Cov(x, t_i) e_i / V_i in column i (n, m)."""
+    """Return the most probable change of the state that explains each innovation: Cov(x, t_i) e_i / V_i, (n, m)."""
     prior = predicted.prior
-    with_t = prior.root @ (prior.variances[:, None] * predicted.slopes.T)
-    return jnp.asarray(with_t * (e / jnp.where(of_state > 0, of_state, 1.0)))
+    cross = prior.root @ (prior.variances[:, None] * predicted.slopes.T)
+    return jnp.asarray(cross * (e / jnp.where(of_state > 0, of_state, 1.0)))
 
 
 def _weight_of(innovation: Innovation) -> jax.Array:
+    """Return the weights of the received numbers (m,)."""
     return jnp.asarray(innovation.weight)
 
 
 def _gate_of(base: RobustFilter) -> Gate:
+    """Return the rule of a filter whose rule is a gate."""
     assert isinstance(base.rule, Gate)
     return base.rule
 
 
-def _choose(first: jax.Array, one: Any, other: Any) -> Any:
-    """Return one tree of arrays where `first`, else the other."""
-    return jax.tree.map(lambda a, b: jnp.where(first, a, b), one, other)
+def _choose(condition: jax.Array, if_true: Any, if_false: Any) -> Any:
+    """Return one of two trees of arrays."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), if_true, if_false)
 
 
 def give_in(base: RobustFilter, rule: Gate) -> GivingInFilter:

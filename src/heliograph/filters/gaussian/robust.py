@@ -190,7 +190,7 @@ class RobustFilter(AbstractBeliefFilter):
             law = noise.law(sensed)
             after = score_update(before, z, law)
             center, variance = law.mean_and_variance()
-            return after.state, _innovation_about_mean(before, z, center, jnp.diag(variance), after, True)
+            return after.state, _innovation_about_mean(before, z, center, jnp.diag(variance), after, by_law=True)
         after = update_weighted(before, z, noise.center, columns_of(noise.covariance), self.rule)
         return after.state, _innovation_about_mean(before, z, noise.center, noise.covariance, after)
 
@@ -215,7 +215,7 @@ def signal_without_noise(
 
 
 def predict_behind_channel(signal: Signal, channel: SecondOrder) -> PredictedMeasurement:
-    """Through the channel: t with mean M y + b and slopes M times the signal's; gain and plain noise are its noise."""
+    """Return t = G y + n behind a channel: mean M E y + b, slopes M times the signal's, noise of gain and channel."""
     gain = jnp.asarray(channel.mean_gain)
     mean = gain @ signal.mean + channel.offset
     return PredictedMeasurement(signal.prior, mean, gain @ signal.slopes, make_received_noise(signal, channel))
@@ -229,7 +229,10 @@ def _innovation_about_mean(
     after: ScoreUpdate,
     by_law: bool = False,
 ) -> Innovation:
-    """Innovation about the noise's mean with the covariance that the law says; the score's density is the mixture's."""
+    """Return the innovation about the noise's mean, with the covariance that the law says.
+
+    Its density is Gaussian, or `by_law` that of the mixture, which the score update has.
+    """
     present = ~jnp.isnan(z)
     expected = before.signal + center
     value, covariance = z - expected, before.columns.covariance + noise

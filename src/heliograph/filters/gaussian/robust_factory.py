@@ -45,7 +45,7 @@ def robust_filter(
     initial_mean: ArrayLike | None = None,
     initial_covariance: ArrayLike | None = None,
 ) -> "RobustFilter | GivingInFilter":
-    """Filter whose estimate no single outlier can take far, for noise laws such as `StudentT` and `Contaminated`.
+    """Return the filter whose estimate no single outlier takes far, for noises like `StudentT` and `Contaminated`.
 
     Without a rule, the score update: the exact posterior mean and covariance of each component, for a Gaussian prior
     and the law's Gaussian branches. `rule` instead weighs each component before one joint update: `Huber(c)`,

@@ -51,7 +51,7 @@ class ScoreUpdate(NamedTuple):
 
 
 def score_update(before: PredictedMeasurement, z: jax.Array, law: NoiseBranches) -> ScoreUpdate:
-    """Exact posterior moments of one component after another, for a Gaussian prior and a noise of Gaussian branches.
+    """Return exact posterior moments, component after component, for a Gaussian prior and noise of Gaussian branches.
 
     With s_j = V_ii + r_j (at least `least`), u_j = (e - m_j) / s_j and q_j in proportion to p_j N(e; m_j, s_j), the
     score g = sum q_j u_j: t_i moves by V_ii g, its variance becomes V_ii (sum q_j r_j / s_j + V_ii Var_q u), a sum of
@@ -79,7 +79,7 @@ def score_update(before: PredictedMeasurement, z: jax.Array, law: NoiseBranches)
 
 
 class _Score(NamedTuple):
-    """g, the share of t's variance that is left, sum q_j / s_j and log density of an innovation."""
+    """Score of one component: slope g, share of t's variance that is left, weight sum q_j / s_j, and log density."""
 
     slope: jax.Array
     left: jax.Array
@@ -88,19 +88,23 @@ class _Score(NamedTuple):
 
 
 def _compute_score(e: jax.Array, v: jax.Array, log_share: jax.Array, mean: jax.Array, noise: jax.Array) -> _Score:
-    """Return the score of an innovation e about a t of variance v, with branches (branches,) of the noise."""
-    total = v + noise
-    reach = LARGEST * jnp.sqrt(jnp.max(total))
-    apart = jnp.clip(e, -reach, reach) - mean
-    u = apart / total
-    logs = log_share - (apart * u + jnp.log(2 * jnp.pi * total)) / 2
+    """Return the score of an innovation e about a t of variance v, with branches (branches,) of the noise.
+
+    `log_share`, `mean`, `noise`: log probability, mean and variance of each branch; symbols as of `score_update`.
+    """
+    s = v + noise
+    reach = LARGEST * jnp.sqrt(jnp.max(s))
+    difference = jnp.clip(e, -reach, reach) - mean
+    u = difference / s
+    # q_j in proportion to p_j N(e; m_j, s_j), relative to the largest.
+    logs = log_share - (difference * u + jnp.log(2 * jnp.pi * s)) / 2
     top = jnp.max(logs)
     q = jnp.exp(logs - top)
-    whole = jnp.sum(q)
-    q = q / whole
+    total = jnp.sum(q)
+    q = q / total
     g = q @ u
-    left = q @ (jnp.maximum(noise, 0.0) / total) + v * (q @ (u - g) ** 2)
-    return _Score(g, left, q @ (1 / total), top + jnp.log(whole))
+    left = q @ (jnp.maximum(noise, 0.0) / s) + v * (q @ (u - g) ** 2)
+    return _Score(slope=g, left=left, weight=q @ (1 / s), log_density=top + jnp.log(total))
 
 
 @readable
@@ -108,7 +112,7 @@ class AbstractWeights(Module):
     """Rule that weighs each component of a measurement: its noise r becomes r / w in one joint update."""
 
     def weights(self, e: jax.Array, squared: jax.Array, scale: jax.Array) -> jax.Array:
-        """w (m,) of innovations e, their squares over the innovation variance d^2, and the noise's variance r."""
+        """Return w (m,) from innovations e, e^2 over the innovation variance, and the noise's variance `scale`."""
         raise unwritten(self, "weights")
 
     def iterate(
@@ -123,7 +127,7 @@ class AbstractWeights(Module):
 def update_weighted(
     before: PredictedMeasurement, z: jax.Array, center: jax.Array, noise: Columns, rule: AbstractWeights
 ) -> ScoreUpdate:
-    """One joint update with noise r_ij / sqrt(w_i w_j), of mean `center`; a component of weight zero is missing."""
+    """Return one joint update with noise r_ij / sqrt(w_i w_j), of mean `center`; without components of weight zero."""
     arrived = ~jnp.isnan(z)
     e = jnp.where(arrived, z - before.signal - center, 0.0)
     w, shown = rule.iterate(before, noise, e, arrived)
@@ -153,20 +157,20 @@ def expected_squared_residuals(
 def branch_precision(
     before: PredictedMeasurement, e: jax.Array, scale: jax.Array, law: NoiseBranches
 ) -> tuple[jax.Array, jax.Array]:
-    """Expected precision sum q_j r / r_j (m,) of each component's noise, in units of r, and the mean that it is about.
+    """Return the expected precision sum q_j r / r_j (m,) of each component's noise, in units of r, and its mean.
 
     q_j is the probability of branch j given the component alone.
     """
     log_share, mean, variance, least = law
     total = jnp.maximum(before.columns.diagonal[:, None] + variance, least)
-    apart = e[:, None] - mean
-    logs = log_share - (apart**2 / total + jnp.log(total)) / 2
+    difference = e[:, None] - mean
+    logs = log_share - (difference**2 / total + jnp.log(total)) / 2
     q = jnp.exp(logs - jnp.max(logs, axis=1, keepdims=True))
     precision = q * scale[:, None] / least
-    whole = jnp.sum(precision, axis=1)
-    return whole / jnp.sum(q, axis=1), jnp.sum(precision * mean, axis=1) / whole
+    sum_of_precisions = jnp.sum(precision, axis=1)
+    return sum_of_precisions / jnp.sum(q, axis=1), jnp.sum(precision * mean, axis=1) / sum_of_precisions
 
 
 def _stack_entries(entries: list[jax.Array]) -> jax.Array:
-    """Stack scalars along one axis; of a single one no operation is needed."""
+    """Return scalars as an array (m,), of length 0 where there are none."""
     return jnp.stack(entries) if entries else jnp.zeros(0)

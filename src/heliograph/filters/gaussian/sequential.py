@@ -67,8 +67,10 @@ class SequentialFilter(AbstractSizedFilter):
             arrays, rest = eqx.partition(stack(self.filters), eqx.is_array)
 
             def correct(belief: Gaussian, node: tuple[PyTree, jax.Array]) -> tuple[Gaussian, Innovation]:
-                node_filter: GaussianFilter = eqx.combine(node[0], rest)
-                return node_filter.correct(belief, node[1], k)
+                """Correct with one node's measurement."""
+                numbers, measurement = node
+                filter_of_node: GaussianFilter = eqx.combine(numbers, rest)
+                return filter_of_node.correct(belief, measurement, k)
 
             state, innovation = jax.lax.scan(correct, state, (arrays, z.reshape(len(self.filters), -1)))
             return state, _join_innovations(
@@ -88,11 +90,12 @@ class SequentialFilter(AbstractSizedFilter):
         return Estimate(posterior.mean, posterior.covariance, self.claim)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return the one around all nodes' updates."""
+        """Return the smoother step around all nodes' updates."""
         return replace(smoother_step_by_transform(self.filters[0], step, self.filters[0]), claim=self.claim)
 
 
 def _join_innovations(parts: Sequence[Innovation]) -> Innovation:
+    """Return the innovations of nodes, one after another, as one: each is given those before it."""
     covariance = jax.scipy.linalg.block_diag(*(innovation.covariance for innovation in parts))
     total = jnp.sum(jnp.stack([jnp.asarray(innovation.log_likelihood) for innovation in parts]))
     return Innovation(jnp.concatenate([innovation.value for innovation in parts]), covariance, total)

@@ -32,7 +32,7 @@ LOST = 100  # roundings of its variance, which elimination leaves of a combinati
 
 
 class ArrivedInnovation(NamedTuple):
-    """Innovation z - E z (m,), and which components arrived (m,): one that is no number is not a missing one."""
+    """Innovation z - E z (m,), and which components arrived (m,): an innovation may be NaN though its z arrived."""
 
     innovation: jax.Array
     present: jax.Array
@@ -54,7 +54,7 @@ class Signal(NamedTuple):
 
     @property
     def covariance(self) -> jax.Array:
-        """Cov y (p, p), with the sensor's noise."""
+        """Covariance Cov y (p, p) of the signal, with the sensor's noise."""
         return join_columns(Columns(self.slopes, self.prior.variances), self.noise).covariance
 
     @property
@@ -98,10 +98,10 @@ def signal_of(
 
 
 def signal_size_at_start(sensor: LinearSensor, start: jax.Array) -> jax.Array:
-    """Return (|H| root E[x x'] + |E v|)^2 + Cov v of the state at the start, (p,): size of the terms summed in y.
+    """Return (|H| root E[x_i^2] + |E v|)^2 + Var v at the start, (p,): size of the terms that are summed in y.
 
-    Not of the prior: on data no covariance of a linear filter depends, and before them moments grow without end where
-    only inputs hold a plant.
+    `start`: E[x_i^2] before any data, (n,). Not of the prior: covariances of a linear filter depend on no data, and
+    moments before data grow without end where only inputs hold a plant.
     """
     law = sensor.noise
     reach = jnp.abs(jnp.asarray(sensor.matrix)) @ square_root(start) + jnp.abs(jnp.asarray(law.mean))
@@ -112,9 +112,9 @@ def signal_size_at_start(sensor: LinearSensor, start: jax.Array) -> jax.Array:
 def make_received_noise(signal: Signal, channel: SecondOrder) -> Columns:
     """Return the noise of z given the state, under the nominal law: M v, n, the spread of the gain, and rounding.
 
-    A combination of outputs free of v and n is known to eps of it: these are made triangular, of known numbers once.
-    What the random gain adds, E[(G - M) y y' (G - M)'], is formed and eliminated: of a combination free of it, that
-    leaves a hundred eps.
+    The noises v and n are made triangular, so that a combination of outputs free of both is known to eps. What the
+    random gain adds, E[(G - M) y y' (G - M)'], is formed as a matrix and eliminated, which leaves a hundred eps in a
+    combination free of it.
     """
     return noise_behind_gain(signal, jnp.asarray(channel.mean_gain), channel.gain_spread, channel.noise)
 
@@ -127,12 +127,12 @@ def noise_behind_gain(signal: Signal, gain: jax.Array, gain_spread: Array, link:
 
 
 def gain_noise(gain_spread: Array, second: jax.Array, mean: jax.Array) -> Columns:
-    """Factor E[(G - M) y y' (G - M)'], m columns, from E[y y'] and E[y]."""
+    """Return factors of E[(G - M) y y' (G - M)'], m columns, from E[y y'] and E[y]."""
     return factor_spread(contract(gain_spread, augmented_second_moment(second, mean, 1.0)))
 
 
 def factor_spread(spread: jax.Array) -> Columns:
-    """Factor a covariance that was formed as a matrix, by elimination; below a hundred eps of it counts as zero."""
+    """Return factors of a covariance that was formed as a matrix; what is below a hundred eps of it counts as zero."""
     return eliminate(spread, LOST * unit_of(spread))
 
 

@@ -50,7 +50,10 @@ class AbstractTransform(Module):
         return Transformed(image.mean, image.columns.covariance, cross)
 
     def image(self, function: Function, x: Gaussian) -> Image:
-        """The same as slopes in xi of x = m + L xi and the rest, uncorrelated with it; by default from `apply`."""
+        """Return the moments of f(x) as slopes in xi of x = m + L xi, and a rest uncorrelated with xi.
+
+        By default from `apply`.
+        """
         return image_of_moments(self.apply(function, x.mean, jnp.asarray(x.covariance)), x)
 
 
@@ -76,9 +79,10 @@ class Cubature(AbstractTransform):
         n = len(x.mean)
         steps = square_root(n * x.variances)
         ahead, behind = evaluate_beside_mean(function, x, steps)
+        # Odd and even parts are (f(m + s) -+ f(m - s)) / 2: sums without the half are twice as large.
         even = ahead + behind
         middle = jnp.sum(even, axis=1) * (1 / n)
-        weights = np.full(n, 1 / (4 * n))  # of what is twice as large
+        weights = np.full(n, 1 / (4 * n))
         curvature = Columns(even - middle[:, None], weights)
         return Image(middle / 2, Columns(ahead - behind, weights), 2 * steps, curvature)
 
@@ -107,7 +111,7 @@ class Linearization(AbstractTransform):
 
 
 def linear_image(matrix: Array, mean: jax.Array, x: Gaussian) -> Image:
-    """Image of a linear function with this matrix and this value at the mean, which every transform reproduces."""
+    """Return the image of a linear function with this matrix and this value at the mean, exact by every transform."""
     return image_by_slopes(mean, jnp.asarray(matrix @ x.root), x)
 
 

@@ -77,12 +77,13 @@ class Unscented(AbstractTransform):
         scale = alpha**2 * (n + kappa)
         steps, here = square_root(scale * x.variances), function(x.mean)
         ahead, behind = (values - here[:, None] for values in evaluate_beside_mean(function, x, steps))
+        # Sums and differences are twice a_j and b_j.
         even = ahead + behind
         middle = jnp.sum(even, axis=1) * (1 / n)
         shift = middle * (n / (2 * scale))
-        weights = jnp.full(n, 1 / (4 * scale))  # of what is twice as large
-        of_shift = jnp.append(weights, alpha**2 * kappa / n + beta)
-        curvature = Columns(jnp.concatenate([even - middle[:, None], shift[:, None]], axis=1), of_shift)
+        weights = jnp.full(n, 1 / (4 * scale))
+        with_shift = jnp.append(weights, alpha**2 * kappa / n + beta)
+        curvature = Columns(jnp.concatenate([even - middle[:, None], shift[:, None]], axis=1), with_shift)
         return Image(here + shift, Columns(ahead - behind, weights), 2 * steps, curvature)
 
 
@@ -98,7 +99,7 @@ def unscented_filter(
     initial_mean: "Float[ArrayLike, ' n'] | None" = None,
     initial_covariance: "Float[ArrayLike, 'n n'] | None" = None,
 ) -> "GaussianFilter":
-    """Unscented Kalman filter (UKF) on its channel's second moments; the points are redrawn after each prediction.
+    """Return the unscented Kalman filter (UKF) on its channel's second moments; points are redrawn after predictions.
 
     By default the points are those of `cubature_filter`, sqrt(n) deviations from the mean, and so are the means; the
     covariance has Merwe's beta = 2 besides, by which that of a quadratic function of one Gaussian number is exact, so

@@ -67,9 +67,8 @@ class NodeGroup(Module):
 
     `reference_filter`: filters that are fed back to the sensors; their estimates stand at `informed_at` (kind, filter).
     `trigger`: when they send; its prediction is that of a filter too, the `reference_filter`. `encoder`: of the words
-    that they send; the `channel` then carries their bits, which the `reader` puts together.
-    Shapes: checksums (node,), memories (node, memories of a channel) and modes (node, memories of a sensor): checksums
-    of the channels' and sensors' memories.
+    that they send; the `channel` then carries their bits, which the `reader` puts together. Shapes: checksums
+    (node,), memories (node, memories of a channel) and modes (node, memories of a sensor), which are numbers that seed.
     """
 
     sensor: AnySensor
