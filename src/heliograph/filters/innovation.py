@@ -66,21 +66,21 @@ def innovation_of_means(
         within: mean over the components of their innovation covariances (m, m).
         density: log-likelihood of z under the mixture.
     """
-    # About the first: of values so large that all are equal nothing is left, and no rounding to be squared.
-    apart = value - value[0]
-    mean = value[0] + weight @ apart
-    apart = apart - weight @ apart
-    covariance = within + jnp.einsum("a,ai,aj->ij", weight, apart, apart)
-    nothing = jnp.all(jnp.isnan(mean))  # then the density is 1, to rounding
-    return Innovation(mean, covariance, jnp.where(nothing, 0.0, density))
+    # About the first one, so that equal values, however large, leave no rounding to be squared.
+    difference = value - value[0]
+    mean = value[0] + weight @ difference
+    deviation = difference - weight @ difference
+    covariance = within + jnp.einsum("a,ai,aj->ij", weight, deviation, deviation)
+    none_arrived = jnp.all(jnp.isnan(mean))  # then the density is 1, to rounding
+    return Innovation(mean, covariance, jnp.where(none_arrived, 0.0, density))
 
 
 def posterior_weights(
     weight: "Float[Array, ' parts']", likelihood: "Float[Array, ' parts']"
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Weights p_a N(z; ...) of a mixture's components, the log-likelihood of z, and whether all components exclude z.
+    """Return posterior weights p_a N(z; ...) of a mixture, log-likelihood of z, and whether all components exclude z.
 
-    The weights stay as they are where all exclude z, with a likelihood of -inf each.
+    `likelihood`: log N(z; ...) of each component, -inf where it excludes z. Where all do, the weights stay as they are.
     """
     # log p_a N(z; ...), and -inf of a component that is impossible, whatever it says.
     possible = jnp.asarray(weight) > 0
@@ -99,7 +99,7 @@ class Weighed(NamedTuple):
     weight: Array
 
     def summarise(self) -> "tuple[InnovationSummary, ...]":
-        """Summarise them over time, one output after the other.
+        """Return a summary over time for each output, one after the other.
 
         Intervals count N values that are correlated over time as N (1 - a) / (1 + a), a the correlation of neighbours:
         of the share Wilson's, with a of being down-weighted or not, since outliers come in runs behind a moving mean;
@@ -150,16 +150,16 @@ class InnovationSummary(NamedTuple):
     squared: float
 
     def __str__(self) -> str:
-        """One line, such as "7 of 200 down-weighted (2 % to 7 %), bias 0.14 +- 0.05"."""
+        """Return one line, such as "7 of 200 down-weighted (2 % to 7 %), bias 0.14 +- 0.05"."""
         if not self.received:
             return f"received 0 of {self.expected}"
         share = f"({100 * self.share.low:.2g} % to {100 * self.share.high:.2g} %)"
         half = (self.bias_high - self.bias_low) / 2
-        bias, error = (round_to(number, half / 1.96) for number in (self.bias, half))
+        bias, error = (round_to(number, half / NORMAL) for number in (self.bias, half))
         return f"{self.down_weighted} of {self.received} down-weighted {share}, bias {bias} +- {error}"
 
     def describe_left_out(self, filter: str, output: str) -> list[str]:
-        """Warn in a line where a filter left out most values of an output, which outliers are not; else empty."""
+        """Return a line of warning where a filter left out most values of an output, which outliers are not."""
         if not self.share.low > MOST:
             return []
         return [
@@ -169,7 +169,9 @@ class InnovationSummary(NamedTuple):
 
     @staticmethod
     def find_outlying(summaries: "Sequence[InnovationSummary]") -> list[int]:
-        """Outputs of which more values are down-weighted than of the others together, by an interval of the difference.
+        """Return the numbers of outputs of which more values are down-weighted than of the others together.
+
+        By an interval of the difference of both shares.
 
         Shares p with intervals (l, u), of one output and of the others together: p_1 - p_2 is above 0 by more than
         sqrt((p_1 - l_1)^2 + (u_2 - p_2)^2). Of outputs that are alike some 3 of 100 are named.
@@ -196,16 +198,29 @@ class InnovationSummary(NamedTuple):
 def _summarise_output(value: Float[np.ndarray, " time"], variance: np.ndarray, weight: np.ndarray) -> InnovationSummary:
     """Summarise one output's innovations (time,): counts, down-weighted share and median, each with its interval."""
     arrived = np.isfinite(value)
-    e, w, d2 = value[arrived], weight[arrived], value[arrived] ** 2 / variance[arrived]
+    e, w, squares = value[arrived], weight[arrived], value[arrived] ** 2 / variance[arrived]
     down, count = int(np.sum(w < HALF)), len(e)
     if not count:
-        return InnovationSummary(len(value), 0, 0, wilson(0, 0), 0.0, *[float("nan")] * 5)
-    # What counts as independent: neighbours that are alike say less.
-    independent = count_independent(np.argsort(np.argsort(e)).astype(float))
-    # The median's interval holds the quantiles between which it lies with 95 %.
-    reach = NORMAL / (2 * np.sqrt(independent))
-    low, middle, high = np.quantile(e, [max(0.5 - reach, 0.0), 0.5, min(0.5 + reach, 1.0)])
-    doubted = count_independent((w < HALF).astype(float))
-    share = wilson(down / count * doubted, doubted)
-    numbers = (float(x) for x in (w.mean(), middle, low, high, d2.mean()))
-    return InnovationSummary(len(value), count, down, share, doubted, *numbers)
+        nan = float("nan")
+        return InnovationSummary(
+            expected=len(value), received=0, down_weighted=0, share=wilson(0, 0), independent=0.0,
+            weight=nan, bias=nan, bias_low=nan, bias_high=nan, squared=nan,
+        )  # fmt: skip
+    # The median lies with 95 % between the quantiles 1/2 -+ 1.96 / (2 sqrt N), N values that count as independent.
+    independent_ranks = count_independent(np.argsort(np.argsort(e)).astype(float))
+    reach = NORMAL / (2 * np.sqrt(independent_ranks))
+    low, median, high = np.quantile(e, [max(0.5 - reach, 0.0), 0.5, min(0.5 + reach, 1.0)])
+    # The same of being down-weighted.
+    independent = count_independent((w < HALF).astype(float))
+    return InnovationSummary(
+        expected=len(value),
+        received=count,
+        down_weighted=down,
+        share=wilson(down / count * independent, independent),
+        independent=independent,
+        weight=float(w.mean()),
+        bias=float(median),
+        bias_low=float(low),
+        bias_high=float(high),
+        squared=float(squares.mean()),
+    )

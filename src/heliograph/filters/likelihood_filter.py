@@ -38,8 +38,6 @@ def likelihood_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, line
         if words := link.in_words():
             raise fail("channel of a network to be learned", "perfect() beside an unknown start", words)
         return kalman_filter(plant, sensor)
-    return (
-        linear_filter(plant, sensor, channel)
-        if flag("linear", linear)
-        else cubature_filter(plant, sensor, without_memory(channel))
-    )
+    if flag("linear", linear):
+        return linear_filter(plant, sensor, channel)
+    return cubature_filter(plant, sensor, without_memory(channel))

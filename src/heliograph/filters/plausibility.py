@@ -5,7 +5,6 @@ An implausible value is never used: a live estimator, a timeline and a recording
 
 from collections.abc import Callable, Sequence
 from enum import IntEnum
-from functools import reduce
 from typing import NamedTuple, TypeVar
 
 import jax
@@ -54,7 +53,7 @@ INPUT = "with it the mean loses its digits to rounding"
 
 
 def greatest_distance(dtype: np.dtype) -> float:
-    """Return squared distance beyond which an update loses its digits: LIMIT squared, 1 / eps where that is less."""
+    """Return the squared distance beyond which an update loses its digits: LIMIT squared or, if less, 1 / eps."""
     return min(LIMIT**2, 1 / float(np.finfo(dtype).eps))
 
 
@@ -82,9 +81,10 @@ class Judgement(NamedTuple):
         claim: Claim, states: tuple[PyTree, PyTree], estimates: tuple[Estimate, Estimate], spoilt: Array
     ) -> "Judgement":
         """Judge a prediction by itself, from states and estimates before and after it, as a step without data."""
-        (before, prior), (was, expected), nothing = states, estimates, jnp.zeros(0)
-        empty = Innovation(nothing, jnp.zeros((0, 0)), jnp.zeros(()))
-        return judge_step(claim, (before, prior, prior), (was, expected, expected), empty, nothing, False, spoilt)
+        (before, prior), (estimate_before, prediction), no_data = states, estimates, jnp.zeros(0)
+        empty = Innovation(no_data, jnp.zeros((0, 0)), jnp.zeros(()))
+        three = estimate_before, prediction, prediction  # before, after prediction, after a correction by nothing
+        return judge_step(claim, (before, prior, prior), three, empty, no_data, of_atoms=False, spoilt=spoilt)
 
     @staticmethod
     def judge_correction(
@@ -97,7 +97,7 @@ class Judgement(NamedTuple):
 
     @staticmethod
     def find_far(innovation: Innovation) -> jax.Array:
-        """Mask of the components e_j that are beyond the bound of their own deviations, |e_j| > 1e6 sqrt(S_jj)."""
+        """Return which components e_j are beyond the bound of their own deviations, |e_j| > 1e6 sqrt(S_jj)."""
         variances = jnp.diagonal(jnp.asarray(innovation.covariance))
         return jnp.abs(innovation.value) > LIMIT * jnp.sqrt(jnp.maximum(variances, 0.0))
 
@@ -119,7 +119,7 @@ class Judgement(NamedTuple):
 
     @staticmethod
     def is_spoilt(reason: float) -> bool:
-        """Test whether a state or a prediction is no number: then some function of the model gave none."""
+        """Return whether the reason is a state or a prediction that is no number: a function of the model gave none."""
         return reason in (Reason.UNSOUND, Reason.PREDICTION)
 
     @staticmethod
@@ -134,7 +134,7 @@ class Judgement(NamedTuple):
 
     @staticmethod
     def why_values(votes: Float[np.ndarray, "filters 4"]) -> str | None:
-        """Explain why a measurement is implausible: some filter judges it so, and no filter that can judge disagrees.
+        """Return why a measurement is implausible, None unless some filter judges it so and none that can disagrees.
 
         A single filter that has diverged, and judges all values implausible, does not exclude them for the others: it
         alone skips them. A filter that claims no covariance judges nothing but its state.
@@ -148,7 +148,7 @@ class Judgement(NamedTuple):
 
     @staticmethod
     def why_inputs(votes: Float[np.ndarray, "filters 4"]) -> str | None:
-        """Explain why inputs are implausible, by the same rule."""
+        """Return why inputs are implausible, None unless some filter judges them so and none that can disagrees."""
         predicted = votes[:, 2] == Reason.PREDICTION
         bad = (votes[:, 3] > 0) | predicted
         if not bad.any() or (~bad & ~np.isnan(votes[:, 3])).any():
@@ -221,9 +221,9 @@ def _judge_value(innovation: Innovation, z: Float[Array, " m"], of_atoms: bool) 
     distance, count = jnp.sum(every), jnp.sum(present.astype(value.dtype))
     # Far: components larger than expected, beyond the bound of this precision.
     larger = present & ~(jnp.abs(z) <= jnp.abs(expected))
-    squares, determined = (
-        _squared_distances_in_turn(value, covariance, larger, size) if len(value) > 1 else (every, certain)
-    )
+    squares, determined = every, certain
+    if len(value) > 1:
+        squares, determined = _squared_distances_in_turn(value, covariance, larger, size)
     free = jnp.where(larger & ~determined, squares, 0.0)
     most = greatest_distance(value.dtype)
     far = jnp.any((free > most) | (larger & jnp.isinf(value))) | (jnp.sum(free) > most)
@@ -253,13 +253,16 @@ def _is_sound_correction(estimates: Estimate, claim: Claim, before: Estimate) ->
     """Return whether all is finite, and no variance is below zero by more than rounding of the covariance before."""
     if claim == "none":
         return _is_finite_number(estimates, claim)
-    left, whole = jnp.diagonal(jnp.asarray(estimates.covariance)), jnp.diagonal(jnp.asarray(before.covariance))
-    rounded = rounding(NEGATIVE_TOLERANCE, left) * jnp.where(jnp.isfinite(whole), jnp.abs(whole), 0.0)
-    return _is_finite_number(estimates, claim) & ~jnp.any(left < -rounded)
+    variances_after = jnp.diagonal(jnp.asarray(estimates.covariance))
+    variances_before = jnp.diagonal(jnp.asarray(before.covariance))
+    # The rounding of a difference is as large as what it was taken from.
+    size = jnp.where(jnp.isfinite(variances_before), jnp.abs(variances_before), 0.0)
+    rounded = rounding(NEGATIVE_TOLERANCE, variances_after) * size
+    return _is_finite_number(estimates, claim) & ~jnp.any(variances_after < -rounded)
 
 
 def _is_sound_prediction(prior: Estimate, claim: Claim) -> jax.Array:
-    """True if all is finite and no variance negative, to the rounding of the largest, which may have moved there."""
+    """Return whether all is finite and no variance negative, to the rounding of the largest, which may enter it."""
     if claim == "none":
         return _is_finite_number(prior, claim)
     variances = jnp.diagonal(jnp.asarray(prior.covariance))
@@ -268,13 +271,16 @@ def _is_sound_prediction(prior: Estimate, claim: Claim) -> jax.Array:
 
 
 def _overflows(before: PyTree, after: PyTree) -> jax.Array:
-    """Test whether some number of a state became infinite."""
-    pairs = zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True)
-    items = [jnp.any(jnp.isinf(jnp.asarray(b)) & ~jnp.isinf(jnp.asarray(a))) for a, b in pairs if _is_real_array(b)]
-    return reduce(jnp.logical_or, items, jnp.asarray(False))
+    """Return whether some number of a state became infinite."""
+    overflows = jnp.asarray(False)
+    for old, new in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True):
+        if _is_real_array(new):
+            overflows |= jnp.any(jnp.isinf(jnp.asarray(new)) & ~jnp.isinf(jnp.asarray(old)))
+    return overflows
 
 
 def _is_real_array(leaf: Array) -> bool:
+    """Return whether an array is of real numbers, not of integers, flags or keys."""
     return bool(jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.floating))
 
 

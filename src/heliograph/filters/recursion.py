@@ -49,12 +49,13 @@ def linear_start(filter: Any) -> PyTree | None:
 def scan_chunk(recursion: Recursion, state: PyTree, rows: PyTree, first: Array, count: Array) -> tuple[PyTree, PyTree]:
     """Scan rows from number `first` on; from row `count` on, behind the end of the data, the state stays."""
 
-    def body(state: PyTree, row: tuple[PyTree, Array]) -> tuple[PyTree, PyTree]:
+    def step(state: PyTree, row: tuple[PyTree, Array]) -> tuple[PyTree, PyTree]:
+        """Step over one row."""
         data, k = row
         after, output = recursion.step(state, data, k)
         return select_state(k < count, after, state), output
 
-    return jax.lax.scan(body, jax.tree.map(jnp.asarray, state), (rows, number_rows(rows, first)))
+    return jax.lax.scan(step, jax.tree.map(jnp.asarray, state), (rows, number_rows(rows, first)))
 
 
 def sum_chunk(recursion: Recursion, state: PyTree, rows: PyTree, first: Array, count: Array) -> tuple[PyTree, PyTree]:
@@ -83,12 +84,13 @@ def sum_rows(
 
 
 def end_of_rows(recursion: Recursion, state: PyTree, rows: PyTree, first: Array) -> PyTree:
-    """Return the state after some rows alone."""
+    """Return the state after some rows, of which the first has the number `first`, and nothing of the rows."""
 
-    def body(state: PyTree, row: tuple[PyTree, Array]) -> tuple[PyTree, None]:
+    def step(state: PyTree, row: tuple[PyTree, Array]) -> tuple[PyTree, None]:
+        """Step over one row."""
         return recursion.step(state, *row)[0], None
 
-    return jax.lax.scan(body, jax.tree.map(jnp.asarray, state), (rows, number_rows(rows, first)))[0]
+    return jax.lax.scan(step, jax.tree.map(jnp.asarray, state), (rows, number_rows(rows, first)))[0]
 
 
 def number_rows(rows: PyTree, first: Array) -> Array:

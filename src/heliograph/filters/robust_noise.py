@@ -78,39 +78,41 @@ class ReceivedNoise(Module):
         least = power * self.variance + self.late_variance
         variance = least + (power - gain**2) * mean * (mean + 2 * signal)
         return NoiseBranches(
-            jnp.asarray(self.log_share),
-            jnp.asarray(gain * mean + self.late_mean),
-            jnp.asarray(variance),
-            jnp.asarray(least),
+            log_share=jnp.asarray(self.log_share),
+            mean=jnp.asarray(gain * mean + self.late_mean),
+            variance=jnp.asarray(variance),
+            least=jnp.asarray(least),
         )
 
 
 def separate_outlier_noise(
-    sensor: AnySensor, channel: Channel, apart: bool
+    sensor: AnySensor, channel: Channel, independent: bool
 ) -> tuple[SecondOrder | OverTime, ReceivedNoise | OverTime]:
-    """Separate moments of z without the noise that may hold outliers from that noise as it arrives at the filter.
+    """Return moments of z without the noise that may hold outliers, and that noise as it arrives at the filter.
 
-    `apart`: components are taken one after another, and must be independent.
+    `independent`: whether its components must be independent, since they are used one after another.
 
     Raises:
         ValueError: components of the noise that are correlated or mixed by the channel, no noise that could be weighed.
     """
 
     def describe(step: AbstractRandomAffine) -> SecondOrder:
+        """Return the moments of one step's channel without its outliers."""
         return Polytope().describe(step.detach_outliers()[0])
 
-    def arriving(sensor: AbstractSensor, step: AbstractRandomAffine, plain: SecondOrder) -> ReceivedNoise:
-        return describe_outlier_noise(sensor.noise, step.detach_outliers()[1], plain, apart)
+    def describe_noise(sensor: AbstractSensor, step: AbstractRandomAffine, plain: SecondOrder) -> ReceivedNoise:
+        """Return the noise that may hold outliers at one step, as it arrives."""
+        return describe_outlier_noise(sensor.noise, step.detach_outliers()[1], plain, independent)
 
     plain: SecondOrder | OverTime = at_each_step(describe, channel)
-    noise: ReceivedNoise | OverTime = at_each_step(arriving, sensor, channel, plain)
+    noise: ReceivedNoise | OverTime = at_each_step(describe_noise, sensor, channel, plain)
     return plain, noise
 
 
 def describe_outlier_noise(
-    sensed: AbstractNoise, late: AbstractNoise | None, plain: SecondOrder, apart: bool
+    sensed: AbstractNoise, late: AbstractNoise | None, plain: SecondOrder, independent: bool
 ) -> ReceivedNoise:
-    """Describe the noise as it arrives: the sensor's behind the channel `plain`, and `late`, that of the last hop.
+    """Return the noise as it arrives: the sensor's behind the channel `plain`, and `late`, that of the last hop.
 
     Raises:
         ValueError: components that are correlated where they may not be, or mixed; no noise that could be weighed.
@@ -125,7 +127,7 @@ def describe_outlier_noise(
     center = plain.mean_gain @ base.mean
     if last is not None:
         covariance, center = covariance + last.covariance, center + last.mean
-    _check_weighable(covariance, apart)
+    _check_weighable(covariance, independent)
     # Branches of the sensor's noise, and their pairs with those of the last hop's.
     log_share, mean, variance = (values[source] for values in sensed.branches())
     late_mean: Array = np.zeros(mean.shape)
@@ -142,7 +144,7 @@ def describe_outlier_noise(
 
 
 def _find_noisy_outputs(squares: Array, covariance: Array, plain: SecondOrder) -> np.ndarray:
-    """Find the sensor's output whose noise each received component brings, (m,).
+    """Return the sensor's output whose noise each received component brings, (m,).
 
     Raises:
         ValueError: one that brings the noise of several.
@@ -161,7 +163,7 @@ def _find_noisy_outputs(squares: Array, covariance: Array, plain: SecondOrder) -
     return np.asarray(np.argmax(brought, axis=1))
 
 
-def _check_weighable(covariance: Array, apart: bool) -> None:
+def _check_weighable(covariance: Array, independent: bool) -> None:
     """Raise ValueError where no noise could be weighed, or where components are correlated and may not be.
 
     Nor may they be tied: other weights would make another combination of them the one without noise, a wrong one.
@@ -175,7 +177,7 @@ def _check_weighable(covariance: Array, apart: bool) -> None:
     deviation = np.sqrt(variance)  # the product of two large variances may overflow
     correlations = covariance / np.outer(deviation, deviation)
     off = np.abs(correlations - np.eye(len(variance)))
-    if apart and np.any(off > TOLERANCE):
+    if independent and np.any(off > TOLERANCE):
         expected = "independent components (Huber, InverseMultiquadric, WoLF and Gate take correlated ones)"
         raise fail("noise of a robust filter", expected, f"a correlation of {off.max():.3g}")
     if (least := np.linalg.eigvalsh(correlations)[0]) < REGULAR:
@@ -184,18 +186,21 @@ def _check_weighable(covariance: Array, apart: bool) -> None:
 
 
 def _combine_branches(sensed: Branches, late: Branches) -> tuple[Array, ...]:
-    """Combine every branch of the sensor with every one of the last hop: log probabilities add, moments are listed."""
+    """Return all pairs of a branch of the sensor and one of the last hop, (m, pairs) each.
+
+    Log probabilities, means and variances of the sensor's, means and variances of the last hop's.
+    """
     xp = library(sensed, late)
     shape = (len(sensed.mean), sensed.mean.shape[1], late.mean.shape[1])
 
-    def every(value: Array, first: bool) -> Array:
-        wide = value[:, :, None] if first else value[:, None]
-        flat: Array = xp.broadcast_to(wide, shape).reshape(shape[0], -1)
-        return flat
+    def repeat(values: Array, axis: int) -> Array:
+        """Return values (m, branches) for all pairs, the same along this axis of (m, sensor's, last hop's)."""
+        pairs: Array = xp.broadcast_to(xp.expand_dims(values, axis), shape).reshape(shape[0], -1)
+        return pairs
 
-    shares = every(sensed.log_share, True) + every(late.log_share, False)
-    return (shares, every(sensed.mean, True), every(sensed.variance, True), every(late.mean, False),
-            every(late.variance, False))  # fmt: skip
+    log_share = repeat(sensed.log_share, axis=2) + repeat(late.log_share, axis=1)
+    sensed_moments = repeat(sensed.mean, axis=2), repeat(sensed.variance, axis=2)
+    return log_share, *sensed_moments, repeat(late.mean, axis=1), repeat(late.variance, axis=1)
 
 
 def _student_degrees(sensed: AbstractNoise, late: AbstractNoise | None) -> Vector:

@@ -42,20 +42,21 @@ class Settled(NamedTuple):
         return with_means(repeat_state(self.state, len(means[0])), means)
 
     def rows_of(self, varying: list[np.ndarray]) -> PyTree:
-        """Return what is kept of rows (chunks, rows, ...), of those of its leaves that vary."""
+        """Return what is kept of rows (chunks, rows, ...), from the leaves that vary; the others are common."""
         chunks, rows = varying[0].shape[:2]
         leaves, form = jax.tree.flatten(self.outputs)
 
         def fill(leaf: np.ndarray) -> np.ndarray:
+            """Return a leaf that does not vary, once for each row."""
             return repeat_row(leaf, chunks * rows).reshape(chunks, rows, *leaf.shape)
 
-        filled = [leaf if v else fill(leaf) for leaf, v in zip(leaves, self.varies, strict=True)]
+        filled = [leaf if varies else fill(leaf) for leaf, varies in zip(leaves, self.varies, strict=True)]
         return self._replace(outputs=jax.tree.unflatten(form, filled)).row_of(varying)
 
     def row_of(self, varying: list[Any]) -> PyTree:
-        """Return what is kept of a row, of those of its leaves that vary."""
-        given, leaves = iter(varying), jax.tree.leaves(self.outputs)
-        joined = [next(given) if v else leaf for leaf, v in zip(leaves, self.varies, strict=True)]
+        """Return what is kept of a row, from those of its leaves that vary; the others are common."""
+        next_varying, leaves = iter(varying), jax.tree.leaves(self.outputs)
+        joined = [next(next_varying) if varies else leaf for leaf, varies in zip(leaves, self.varies, strict=True)]
         return jax.tree.unflatten(jax.tree.structure(self.outputs), joined)
 
     def varying_of(self, output: PyTree) -> list[Any]:
@@ -94,34 +95,43 @@ def settled_of(varies: tuple[bool, ...], after_windows: PyTree, outputs: PyTree)
         outputs: what is kept of the last row of either (1, 2, ...).
     """
     halfway, end = (jax.tree.map(lambda leaf, at=at: leaf[:, at], after_windows) for at in (0, 1))
-    # Means follow the data; all else must stand still.
-    still = [np.zeros_like(mean) for mean in means_of(end)]
-    if not agree(with_means(end, still), with_means(halfway, still), ROUNDING)[0]:
+    # Means follow the data, and are left out; all else must be the same.
+    zero_means = [np.zeros_like(mean) for mean in means_of(end)]
+    if not agree(with_means(end, zero_means), with_means(halfway, zero_means), ROUNDING)[0]:
         return None
-    one, last = jax.tree.map(lambda leaf: leaf[0, ...], end), jax.tree.map(lambda leaf: leaf[0, 1, ...], outputs)
-    return Settled(one, last, varies)
+    # Of the axes (run, window) one run, and the second window.
+    state = jax.tree.map(lambda leaf: leaf[0, ...], end)
+    last_outputs = jax.tree.map(lambda leaf: leaf[0, 1, ...], outputs)
+    return Settled(state, last_outputs, varies)
 
 
 def _settle(recursion: Recursion, start: PyTree, row: PyTree, numbers: Array) -> tuple[PyTree, PyTree]:
     """Repeat a row over two windows of numbers (2, rows): states, and what is kept of each one's last row (2, ...)."""
-    Now = tuple[PyTree, PyTree]  # a state, and what is kept of the row before it
+    AfterRow = tuple[PyTree, PyTree]  # a state, and what is kept of the row before it
 
-    def step(now: Now, k: Any) -> tuple[Now, Any]:
-        return step_settled(recursion, now[0], means_of(now[0]), row, k), None
+    def step(after_row: AfterRow, k: Any) -> tuple[AfterRow, Any]:
+        """Step over the row as number k."""
+        state, _ = after_row
+        return step_settled(recursion, state, means_of(state), row, k), None
 
-    def scan_window(now: Now, window: Any) -> tuple[Now, Now]:
-        end, _ = jax.lax.scan(step, now, window)
+    def scan_window(after_row: AfterRow, window: Any) -> tuple[AfterRow, AfterRow]:
+        """Step over one window of numbers; its end is kept."""
+        end, _ = jax.lax.scan(step, after_row, window)
         return end, end
 
     state = jax.tree.map(jnp.asarray, start)
+    # Before the first row zeros stand for what is kept, of the same shapes.
     shapes = jax.eval_shape(lambda: step((state, None), numbers[0, 0])[0][1])
-    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-    both: Now = jax.lax.scan(scan_window, (state, nothing), numbers)[1]
-    return both
+    zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    ends: AfterRow = jax.lax.scan(scan_window, (state, zeros), numbers)[1]
+    return ends
 
 
 def find_varying(recursion: Recursion, start: PyTree, row: PyTree) -> tuple[bool, ...] | None:
-    """Return which leaves of what is kept of a complete row depend on data; None if of the state not means alone do."""
+    """Return which leaves of what is kept of a complete row depend on data.
+
+    None if more than the means of the state depends on data, or without native code.
+    """
     rows, means = jax.tree.map(lambda leaf: leaf[None], row), [np.asarray(mean)[None] for mean in means_of(start)]
     arguments = recursion, start, means, rows, np.zeros(1, int)
     choice = choose_code(step_settled, arguments, [False, False, True, True, True])
@@ -149,12 +159,13 @@ def scan_settled(
     From row `count` on, behind the end of the data, the means stay.
     """
 
-    def body(means: list[jax.Array], row: tuple[PyTree, Array]) -> tuple[list[jax.Array], list[jax.Array]]:
+    def step(means: list[jax.Array], row: tuple[PyTree, Array]) -> tuple[list[jax.Array], list[jax.Array]]:
+        """Step over one row."""
         data, k = row
         after, outputs = step_settled(recursion, settled.state, means, data, k)
         return select_state(k < count, means_of(after), means), settled.varying_of(outputs)
 
-    return jax.lax.scan(body, [jnp.asarray(mean) for mean in means], (rows, number_rows(rows, first)))
+    return jax.lax.scan(step, [jnp.asarray(mean) for mean in means], (rows, number_rows(rows, first)))
 
 
 def sum_settled(
@@ -172,28 +183,29 @@ def sum_settled(
 def end_of_settled_rows(
     recursion: Recursion, settled: Settled, means: Sequence[Array], rows: PyTree, first: Array
 ) -> list[jax.Array]:
-    """Return the means after some complete rows alone."""
+    """Return the means after some complete rows, of which the first has the number `first`, and nothing of the rows."""
 
-    def body(means: list[jax.Array], row: tuple[PyTree, Array]) -> tuple[list[jax.Array], None]:
+    def step(means: list[jax.Array], row: tuple[PyTree, Array]) -> tuple[list[jax.Array], None]:
+        """Step over one row."""
         return means_of(step_settled(recursion, settled.state, means, *row)[0]), None
 
-    return jax.lax.scan(body, [jnp.asarray(mean) for mean in means], (rows, number_rows(rows, first)))[0]
+    return jax.lax.scan(step, [jnp.asarray(mean) for mean in means], (rows, number_rows(rows, first)))[0]
 
 
 class CompleteRows(NamedTuple):
-    """Which rows of measurements lack no number: how many blocks of `size` rows, before each and before the end, do."""
+    """Which blocks of `size` rows of measurements lack no number: `before`[i] of the first i blocks are complete."""
 
     size: int
     before: Int[np.ndarray, " blocks+1"]
 
     def cover(self, begin: Int[np.ndarray, " n"], length: int) -> Bool[np.ndarray, " n"]:
-        """Test which windows of rows lack none; begin and length are multiples of the size."""
-        first, end = (np.minimum(at // self.size, len(self.before) - 1) for at in (begin, begin + length))
+        """Return which windows of rows lack no number; begin and length are multiples of the size."""
+        first, end = (np.minimum(row // self.size, len(self.before) - 1) for row in (begin, begin + length))
         return np.asarray(self.before[end] - self.before[first] == end - first)
 
 
 def find_complete(z: PyTree, size: int) -> CompleteRows:
-    """Find which blocks of rows of measurements (rows, ...) lack no number."""
+    """Return which blocks of `size` rows of measurements (rows, ...) lack no number."""
     total = len(jax.tree.leaves(z)[0])
     begin, complete = np.arange(0, total, size), np.ones(-(-total // size), bool)
     with np.errstate(over="ignore", invalid="ignore"):  # a sum of huge numbers is taken for one that lacks some

@@ -120,18 +120,25 @@ class SmootherStep(Module):
         """Return the state after this step as an earlier state that is yet to be carried ahead."""
         n = len(self.after.mean)
         return EarlierState(
-            self.after.mean, jnp.eye(n), jnp.zeros_like(self.after.lower), Columns(jnp.eye(n), jnp.zeros(n))
+            mean=self.after.mean,
+            link=jnp.eye(n),
+            lower=jnp.zeros_like(self.after.lower),
+            noise=Columns(jnp.eye(n), jnp.zeros(n)),
         )
 
     def ahead(self, point: EarlierState) -> EarlierState:
         """Condition an earlier state on this step's data too.
 
-        Before the step x = m + K e + d, so that x_j = mean + M L^-1 (K e + d) + noise, of which the data tell e alone.
+        Before the step x = m + K e + d, e the change of the state after it and d what that does not tell. So
+        x_j = mean + M L^-1 (K e + d) + noise, of which the data tell e alone: M L^-1 d joins the noise.
         """
         before = self.before
         noise = Columns(point.through(before.left.root), before.left.variances)
         after = EarlierState(
-            point.mean, point.through(before.gain), before.lower, triangularise(join_columns(point.noise, noise))
+            mean=point.mean,
+            link=point.through(before.gain),
+            lower=before.lower,
+            noise=triangularise(join_columns(point.noise, noise)),
         )
         change = self.manifold.unsettle(before.ahead, self.after.mean) - before.ahead
         after = after._replace(mean=point.mean + after.through(change[:, None])[:, 0])
@@ -147,8 +154,8 @@ class SmootherStep(Module):
 
     def reached(self, point: EarlierState) -> Gaussian:
         """Return the mean and covariance of an earlier state given all data up to this step."""
-        now = Columns(point.through(self.after.root), self.after.variances)
-        return from_columns(point.mean, join_columns(now, point.noise))
+        explained = Columns(point.through(self.after.root), self.after.variances)
+        return from_columns(point.mean, join_columns(explained, point.noise))
 
     def with_data(self, mean_before: jax.Array, mean_prior: jax.Array, mean_after: jax.Array) -> Self:
         """Return the same step with other data of the same arrivals: other means."""
@@ -170,7 +177,7 @@ class SmootherStep(Module):
 
 
 def gaussian_of(state: PyTree) -> Any:
-    """Return the Gaussian that a filter's state holds beside what it adds; a state that holds none is it itself."""
+    """Return the Gaussian that a filter's state holds in a field `gaussian`, or the state if it has no such field."""
     return getattr(state, "gaussian", state)
 
 

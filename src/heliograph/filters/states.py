@@ -30,18 +30,20 @@ class Slopes(NamedTuple):
 def agree(
     states: PyTree, others: PyTree, tolerance: float = TOLERANCE, among: PyTree | None = None
 ) -> Bool[np.ndarray, " n"]:
-    """Test whether states (n, ...) are the same to a share of a deviation, and to some roundings of each number.
+    """Return which states (n, ...) are the same as others, to a share of a deviation and some roundings of each number.
 
-    Those of a mean that is far from zero enter all others, by the innovations. Derivatives are measured by the
+    The rounding of a mean far from zero enters all means, by the innovations. Derivatives are measured by the
     deviations of their Gaussian as well, and as shares of the largest such derivative in the same number: of those
     `among` which they are, or of the others.
     """
+    # (number, other number, allowed difference besides roundings)
     pairs = [(a, b, np.zeros(())) for a, b in zip(*map(_leaves_beside, (states, others)), strict=True)]
     sizes = _size_slopes(others if among is None else among)
     for x, y in zip(*map(_moving_parts, (states, others)), strict=True):
         if isinstance(y, Gaussian):
             deviation, outer = _deviations(y)
             ratio = np.abs(y.mean) / np.where(deviation > 0, deviation, np.inf)
+            # Largest mean in its deviations.
             far = np.max(ratio, axis=-1, keepdims=True, initial=0.0)
         size = 1.0 if isinstance(y, Gaussian) else next(sizes)
         p, q = np.asarray(x.covariance), np.asarray(y.covariance)
@@ -76,9 +78,9 @@ def _are_near(a: np.ndarray, b: np.ndarray, within: np.ndarray) -> Bool[np.ndarr
     return near
 
 
-def select_state(condition: Array, one: PyTree, other: PyTree) -> PyTree:
+def select_state(condition: Array, if_true: PyTree, if_false: PyTree) -> PyTree:
     """Return one state where a condition holds, else the other."""
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), one, other)
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), if_true, if_false)
 
 
 def gaussians_of(state: PyTree) -> list[Gaussian]:
@@ -93,19 +95,22 @@ def means_of(state: PyTree) -> list[Any]:
 
 def with_means(state: PyTree, means: Sequence[Any]) -> PyTree:
     """Return a state whose Gaussians, and their derivatives, have other means."""
-    rest = iter(means)
+    next_mean = iter(means)
     return jax.tree.map(
-        lambda part: part._replace(mean=next(rest)) if _is_moving(part) else part, state, is_leaf=_is_moving
+        lambda part: part._replace(mean=next(next_mean)) if _is_moving(part) else part, state, is_leaf=_is_moving
     )
 
 
 def beside_gaussians(state: PyTree) -> PyTree:
-    """Return what a state holds beside its Gaussians and their derivatives, in their place nothing."""
+    """Return what a state holds beside its Gaussians and their derivatives, with () in their places."""
     return jax.tree.map(lambda part: () if _is_moving(part) else part, state, is_leaf=_is_moving)
 
 
 def with_gaussians(beside: PyTree, state: PyTree) -> PyTree:
-    """Return the Gaussians of a state and their derivatives, and beside them what another one holds there."""
+    """Return a state with its Gaussians and their derivatives, and with `beside` in place of the rest.
+
+    `beside` is what `beside_gaussians` returns.
+    """
     parts = iter(_leaves_beside(beside))
     return jax.tree.map(lambda part: part if _is_moving(part) else next(parts), state, is_leaf=_is_moving)
 
@@ -116,9 +121,11 @@ def _moving_parts(state: PyTree) -> list[Any]:
 
 
 def _is_moving(part: Any) -> bool:
+    """Return whether a part of a state is a Gaussian or its derivatives."""
     return isinstance(part, Gaussian | Slopes)
 
 
 def _leaves_beside(state: PyTree) -> list[np.ndarray]:
+    """Return the arrays that a state holds beside its Gaussians and their derivatives."""
     leaves: list[np.ndarray] = jax.tree.leaves(beside_gaussians(state))
     return leaves

@@ -11,7 +11,7 @@ from heliograph.numerics.types import Array, ArrayLike, Float
 
 def check_vector(name: str, value: ArrayLike, length: int | None) -> Float[Array, " length"]:
     """Return real numbers along one axis as an array of floats; a scalar is accepted for a length of one."""
-    expected = "numbers" if length is None else "1 number" if length == 1 else f"{length} numbers"
+    expected = "numbers" if length is None else f"{length} number{'s' * (length != 1)}"
     try:
         numbers: Array = np.asarray(fill_masked(value))
     except jax.errors.TracerArrayConversionError:

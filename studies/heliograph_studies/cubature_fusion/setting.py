@@ -40,7 +40,7 @@ class LooseInterval(AbstractUpdate):
         Raises:
             ValueError: a channel that is not a chain of scalar hops.
         """
-        return interval_description(channel, lambda hop: hop.second + (hop.mean - hop.mean_radius) ** 2)
+        return interval_description(channel, lambda hop: hop.largest_second + (hop.mean - hop.mean_radius) ** 2)
 
     def described(self) -> AbstractUpdate:
         """Young's bound, as for a polytope."""

@@ -69,12 +69,13 @@ class AbstractUpdate(Module):
         if type(self).condition is AbstractUpdate.condition:
             raise unwritten(self, "correct")
 
-        def moved(innovation: jax.Array) -> tuple[jax.Array, Gaussian]:
+        def update(innovation: jax.Array) -> tuple[jax.Array, Gaussian]:
+            """Return the mean after an update with this innovation, whose derivative is the gain, and the posterior."""
             z = ArrivedInnovation(innovation, present)
             after = self.condition(signal, channel, z, condition_on_received(signal, channel, z)[0])
             return jnp.asarray(after.mean), after
 
-        gain, after = jax.jacfwd(moved, has_aux=True)(jnp.zeros(len(present)))
+        gain, after = jax.jacfwd(update, has_aux=True)(jnp.zeros(len(present)))
         return gain, jnp.asarray(after.covariance)
 
     def condition(self, signal: Signal, channel: SecondOrder, z: ArrivedInnovation, nominal: Gaussian) -> Gaussian:
@@ -127,7 +128,7 @@ class Polytope(AbstractUpdate):
         return observe_by_young(signal, channel, z, self.scalars) if channel.uncertain else nominal
 
     def claim(self, uncertain: bool) -> Claim:
-        """Return "upper" where the law is uncertain."""
+        """Return "upper" where the law is uncertain, else "exact"."""
         return "upper" if uncertain else "exact"
 
 
@@ -161,7 +162,7 @@ class ZeroMean(AbstractUpdate):
         return observe_by_zero_mean(signal, channel, z, self.scalar) if channel.uncertain else nominal
 
     def claim(self, uncertain: bool) -> Claim:
-        """ "nominal" where the law is uncertain: behind a law that is off, E[e | data] is not 0 after a correction."""
+        """Return "nominal" where the law is uncertain, since E[e | data] is not 0 after a correction; else "exact"."""
         return "nominal" if uncertain else "exact"
 
 
@@ -188,7 +189,9 @@ class Interval(AbstractUpdate):
         Raises:
             ValueError: a channel that is not a chain of scalar hops.
         """
-        return interval_description(channel, lambda hop: hop.second - max(abs(hop.mean) - hop.mean_radius, 0.0) ** 2)
+        return interval_description(
+            channel, lambda hop: hop.largest_second - max(abs(hop.mean) - hop.mean_radius, 0.0) ** 2
+        )
 
     def described(self) -> AbstractUpdate:
         """Return Young's bound, as for a polytope."""
@@ -204,26 +207,30 @@ class Interval(AbstractUpdate):
 
 
 class HopRange(NamedTuple):
-    """Amplitude of one hop, E g with its radius, the largest E g^2, and its noise's covariance (m, m)."""
+    """Range of one hop a g: amplitude a, E g with its radius, the largest E g^2, and its noise's covariance (m, m)."""
 
     amplitude: float
     mean: float
     mean_radius: float
-    second: float
+    largest_second: float
     noise: np.ndarray
 
 
 def _describe_hop(hop: AbstractRandomAffine) -> HopRange:
-    """Describe one hop by intervals of E g and E g^2; refuse one that is not one gain with zero-mean noise."""
+    """Return the range of one hop's moments; raise if it is not one gain for all components, with zero-mean noise."""
     if not isinstance(hop, GainAndNoise) or not _is_multiple_of_identity(hop.matrix) or np.any(hop.noise.mean):
         raise fail("interval bound", "a chain of hops, each one gain for all components and zero-mean noise", hop)
     # Probabilities p_i within r_i: E g within sum |v_i| r_i of its nominal value, E g^2 at most sum v_i^2 r_i above.
     law, mean_radius, second_radius = hop.law, 0.0, 0.0
     if isinstance(law, Discrete):
         mean_radius, second_radius = float(np.abs(law.values) @ law.radius), float(law.values**2 @ law.radius)
-    amplitude = float(hop.matrix[0, 0])
-    mean, second = float(law.moment(1)), float(law.moment(2))
-    return HopRange(amplitude, mean, mean_radius, second + second_radius, np.asarray(hop.noise.covariance))
+    return HopRange(
+        amplitude=float(hop.matrix[0, 0]),
+        mean=float(law.moment(1)),
+        mean_radius=mean_radius,
+        largest_second=float(law.moment(2)) + second_radius,
+        noise=np.asarray(hop.noise.covariance),
+    )
 
 
 def _is_multiple_of_identity(matrix: jax.Array | np.ndarray) -> bool:
@@ -232,30 +239,32 @@ def _is_multiple_of_identity(matrix: jax.Array | np.ndarray) -> bool:
 
 
 def interval_description(channel: AbstractRandomAffine, variance: Callable[[HopRange], float]) -> SecondOrder:
-    """Combine hops: V <- var S + (|m| + r)^2 V for the spread, S <- s S for the power, N <- (a^2 s) N + Q for noise.
+    """Return the worst cases of a chain of hops, from the range of each.
 
-    `variance` is the bound on var g of a hop.
+    Hop after hop: V <- var S + (|m| + r)^2 V for the spread, S <- s S for the power, N <- (a^2 s) N + Q for the noise,
+    s the largest E g^2. `variance` returns the bound on var g of a hop.
     """
     hops = [_describe_hop(hop) for hop in channel.in_series]
     # The recursion over the hops.
     spread, power, noise = 0.0, 1.0, np.zeros_like(hops[0].noise)
     for hop in hops:
         spread = variance(hop) * power + (abs(hop.mean) + hop.mean_radius) ** 2 * spread
-        power *= hop.second
-        noise = hop.amplitude**2 * hop.second * noise + hop.noise
+        power *= hop.largest_second
+        noise = hop.amplitude**2 * hop.largest_second * noise + hop.noise
     # Shift of the mean gain: prod (|m| + r) - prod |m|.
     amplitude = float(np.prod([hop.amplitude for hop in hops]))
     nominal = float(np.prod([abs(hop.mean) for hop in hops]))
     shift = float(np.prod([abs(hop.mean) + hop.mean_radius for hop in hops])) - nominal
     gain = amplitude * float(np.prod([hop.mean for hop in hops])) * np.eye(len(noise))
 
-    def scaled(value: float, constant: np.ndarray) -> QuadraticMap:
+    def make_map(value: float, constant: np.ndarray) -> QuadraticMap:
+        """Return the map Y -> amplitude^2 value Y + constant of second moments of (y, 1)."""
         center = np.zeros((len(noise), len(noise), len(noise) + 1, len(noise) + 1))
         center[..., :-1, :-1] = amplitude**2 * value * symmetric_product(np.eye(len(noise)), np.eye(len(noise)))
         center[..., -1, -1] = constant
         return QuadraticMap(center, np.zeros_like(center))
 
     zero = np.zeros_like(noise)
-    parts = scaled(spread + shift**2, noise), scaled(shift**2, zero), scaled(power, zero)
+    parts = make_map(spread + shift**2, noise), make_map(shift**2, zero), make_map(power, zero)
     mean = np.concatenate([gain, np.zeros((len(noise), 1))], axis=1)
     return describe_second_moments(mean, *parts, nominal_spread(channel), shift > 0)

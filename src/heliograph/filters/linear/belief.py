@@ -61,7 +61,7 @@ def predict_belief(belief: LinearBelief, step: PlantMotion) -> LinearBelief:
 
 
 def _within_range(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Limit moments without data to finite numbers: those of an unstable plant grow for ever.
+    """Return moments without data, limited to numbers whose squares are finite: an unstable plant's grow for ever.
 
     Behind a known gain nothing depends on them.
     """

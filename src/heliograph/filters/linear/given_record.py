@@ -66,13 +66,14 @@ class LinearFilterOfRecord(AbstractSizedFilter):
         """Correct the filter's own state; S and P are those of this recording."""
 
         def correct_mean(mean: jax.Array, value: jax.Array) -> tuple[jax.Array, jax.Array]:
+            """Return the corrected mean and the innovation, from the predicted mean and z."""
             gaussian = state.own.gaussian._replace(mean=mean)
             after, innovation = self.filter.correct(state.own._replace(gaussian=gaussian), value, k)
             return after.gaussian.mean, jnp.nan_to_num(innovation.value)
 
         mean, P = state.own.gaussian.mean, jnp.asarray(state.covariance)
         after, own = self.filter.correct(state.own, z, k)
-        # The gain K and the slope H of what is expected, by the filter's own arithmetic.
+        # The gain K, and H, the derivative of what is expected of z by the mean, from the filter's own arithmetic.
         arrived = ~jnp.isnan(own.value)
         (_, gain), (slope, _) = jax.jacfwd(correct_mean, (0, 1))(mean, jnp.asarray(z))
         H, K = jnp.where(arrived[:, None], -slope, 0.0), jnp.where(arrived, gain, 0.0)

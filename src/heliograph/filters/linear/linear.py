@@ -99,9 +99,9 @@ class LinearFilter(AbstractSizedFilter):
         return Estimate(state.gaussian.mean, state.gaussian.covariance, self.claim)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return the law of the state before the step given its prediction: the state moves with a white noise.
+        """Return the smoother step of x+ = A x + b + w; w is white and independent of gains and past draws.
 
-        That no random gain and no draw of the past tells of, so that Rauch's recursion is the best linear one.
+        So the Rauch-Tung-Striebel recursion is the best linear one.
         """
         move = motion_of_plant(at(self.plant, step.k), jnp.asarray(step.u), second_moments_at_start(self.plant))
         moved = move.matrix @ step.before.gaussian.root, move.noise
@@ -143,10 +143,10 @@ class LinearFilter(AbstractSizedFilter):
 
 
 def signal_before_data(state: LinearBelief, sensor: LinearSensor, start: jax.Array) -> Signal:
-    """Return y = C x + v with its mean before any data and E[y y'], and slopes of the estimate.
+    """Return the moments of y = C x + v before any data, E y and E[y y'], with the slopes of the estimate's error.
 
-    They depend only on the error covariance and on the state's moments before data, not on the estimate: derivatives
-    with respect to the estimate do not involve them.
+    They depend on the error covariance and the state's moments before data alone, not on the estimate, so that
+    derivatives by the estimate do not involve them.
     """
     matrix, law = jnp.asarray(sensor.matrix), sensor.noise
     mean, explained = matrix @ state.state_mean + law.mean, matrix @ state.state_covariance @ matrix.T
@@ -159,10 +159,13 @@ def signal_before_data(state: LinearBelief, sensor: LinearSensor, start: jax.Arr
 def correct_linear(
     state: LinearBelief, sensor: LinearSensor, channel: SecondOrder, rule: Polytope, z: jax.Array, start: jax.Array
 ) -> tuple[LinearBelief, Innovation]:
-    """Correct with the components of z that arrived: the signal's mean by the estimate, all else before any data."""
-    before = signal_before_data(state, sensor, start)
-    now = before._replace(mean=jnp.asarray(sensor.matrix @ state.gaussian.mean + sensor.noise.mean))
-    after, innovation = correct_signal(now, channel, rule, z, unknown=before)
+    """Correct with the components of z that arrived.
+
+    What is expected of z is by the estimate; gain and covariance are by the moments before any data.
+    """
+    before_data = signal_before_data(state, sensor, start)
+    by_estimate = before_data._replace(mean=jnp.asarray(sensor.matrix @ state.gaussian.mean + sensor.noise.mean))
+    after, innovation = correct_signal(by_estimate, channel, rule, z, unknown=before_data)
     return state._replace(gaussian=after), innovation
 
 
@@ -254,7 +257,7 @@ def _make_behind_memory(plant: AnyPlant, sensor: AnySensor, channel: Channel) ->
 
 
 def _make_of_jump_system(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> AbstractFilter:
-    """Return the filter of a plant or sensor that has modes; what it cannot say of the link is refused."""
+    """Return the filter of a plant or sensor that has modes; raise behind links that lose or have uncertain laws."""
     if first(channel).erases:
         expected = "a link without losses where plant or sensor has modes (a row that is lost is NaN; imm_filter else)"
         raise fail("channel of a linear filter", expected, "an erasure")
@@ -290,13 +293,14 @@ def memoryless_filter(
     forgets, matters = without_memory(channel), memory_matters(channel)
 
     def make(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> LinearFilter:
+        """Return the filter of a channel without memory, with its claim."""
         ignoring = linear_filter(plant, sensor, channel, update)
         assert isinstance(ignoring, LinearFilter)  # a channel without delay or memory has no other
         return _claim_nominal(ignoring) if matters else ignoring
 
     # Delays: the same filter for the system enlarged by past signals.
-    late = check_maps("channel", [first(forgets)])[0].past
-    return build_behind_delays(plant, sensor, forgets, make) if late else make(plant, sensor, forgets)
+    is_late = check_maps("channel", [first(forgets)])[0].past
+    return build_behind_delays(plant, sensor, forgets, make) if is_late else make(plant, sensor, forgets)
 
 
 def as_current_filter(

@@ -120,45 +120,45 @@ class PlannedFilter(AbstractSizedFilter):
         return replace(self, past=OverTime(steps))
 
     def _estimate(self, mean: Float[Array, " N"], stage: Step) -> Estimate:
+        """Return the estimate of the plant's state, with the covariance of this stage."""
         x = mean if self.projection is None else self.projection @ mean
         return Estimate(x, jnp.asarray(self.covariances)[stage], self.claim)
 
 
 def _convert_stage(state: PlannedMean, stage: Step) -> jax.Array:
+    """Return a stage in the integer type that the state has."""
     return jnp.asarray(stage, dtype=jnp.asarray(state.stage).dtype)
 
 
 def plan_filter(
     filter: AbstractFilter, inputs: Float[Array, "horizon inputs"], projection: Array | None = None
 ) -> PlannedFilter:
-    """Run a filter over complete data and record its matrices; its state is a Gaussian, or holds one.
+    """Return a filter with its matrices recorded for these inputs and complete data.
 
-    Only the mean may depend on data, and affinely: then F, K and C are derivatives, the same at every mean.
-    `projection` (n, N) maps the filter's mean to the plant's states.
+    Its state is a Gaussian, or holds one. Only the mean may depend on data, and affinely: then F, K and C are
+    derivatives, the same at every mean. `projection` (n, N) maps the filter's mean to the plant's states.
     """
     arguments = filter, array("inputs", inputs, (None, len(filter.inputs))), projection
-    return (
-        _record_matrices(*arguments)
-        if is_traced(arguments)
-        else compute_once(_record_matrices, _plan_by_xla, arguments, SHORT)
-    )
+    if is_traced(arguments):
+        return _record_matrices(*arguments)
+    return cast(PlannedFilter, compute_once(_record_matrices, _plan_by_xla, arguments, SHORT))
 
 
 def _record_matrices(filter: AbstractFilter, inputs: Array, projection: Array | None) -> PlannedFilter:
     """Scan a filter over zeros and return the gains and covariances of every step as a `PlannedFilter`."""
     # Complete data of zeros: the matrices do not depend on their values.
-    quiet = jnp.zeros(filter.received)
+    zeros = jnp.zeros(filter.received)
 
-    def body(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, tuple[LinearStep, jax.Array]]:
-        step, prior, after = plan_step(filter, state, quiet, row[1], row[0])
-        return after, (
-            step,
-            jnp.stack([_project_covariance(prior, projection), _project_covariance(after, projection)]),
-        )
+    def record_step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, tuple[LinearStep, jax.Array]]:
+        """Step the filter; the output is the step's matrices, and the covariances before and after correction."""
+        k, u = row
+        step, prior, after = plan_step(filter, state, zeros, u, k)
+        covariances = jnp.stack([_project_covariance(prior, projection), _project_covariance(after, projection)])
+        return after, (step, covariances)
 
     start = filter.init()
     start = jax.tree.map(jnp.asarray, start)
-    _, (steps, covariances) = jax.lax.scan(body, start, (jnp.arange(len(inputs)), jnp.asarray(inputs)))
+    _, (steps, covariances) = jax.lax.scan(record_step, start, (jnp.arange(len(inputs)), jnp.asarray(inputs)))
     # Covariances in the order of `PlannedMean.stage`.
     in_order = covariances.reshape(-1, *covariances.shape[2:])
     by_stage = jnp.concatenate([_project_covariance(start, projection)[None], in_order])
@@ -178,16 +178,17 @@ def plan_step(
     filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step
 ) -> tuple[LinearStep, PyTree, PyTree]:
     """Return matrices of a step from this state, whatever its mean, and the states after prediction and correction."""
-    # F and f: the prior mean is affine in the mean.
-    none = jnp.zeros_like(gaussian_of(state).mean)
+    # F and f: the prior mean is affine in the mean, so that f is its value and F its derivative at 0.
+    zero_mean = jnp.zeros_like(gaussian_of(state).mean)
 
     def predict(mean: jax.Array) -> tuple[jax.Array, PyTree]:
+        """Return the predicted mean, and the predicted state."""
         prior = filter.predict(_with_mean(state, mean), u, k)
         return jnp.asarray(gaussian_of(prior).mean), prior
 
-    transition, prior = jax.jacfwd(predict, has_aux=True)(none)
+    transition, prior = jax.jacfwd(predict, has_aux=True)(zero_mean)
     # K and C: derivatives of posterior mean and innovation.
-    (_, gain), (output, _), after, innovation = _correction_slopes(filter, prior, none, z, k)
+    (_, gain), (output, _), after, innovation = _correction_slopes(filter, prior, zero_mean, z, k)
     step = LinearStep(
         transition=transition,
         drift=jnp.asarray(gaussian_of(prior).mean),
@@ -207,9 +208,10 @@ def _with_mean(state: PyTree, mean: jax.Array) -> PyTree:
 def _correction_slopes(
     filter: AbstractFilter, prior: PyTree, mean: jax.Array, z: jax.Array, k: Step
 ) -> tuple[tuple[jax.Array, ...], tuple[jax.Array, ...], PyTree, Innovation]:
-    """Differentiate the corrected mean and the innovation by prior mean and z; return slopes and both themselves."""
+    """Return derivatives of the corrected mean, and of the innovation, each by (prior mean, z), and both themselves."""
 
     def correct(mean: jax.Array, z: jax.Array) -> tuple[tuple[jax.Array, jax.Array], PyTree]:
+        """Return corrected mean and innovation, and the objects that hold them."""
         after, innovation = filter.correct(_with_mean(prior, mean), z, k)
         return (jnp.asarray(gaussian_of(after).mean), jnp.asarray(innovation.value)), (after, innovation)
 
@@ -218,7 +220,7 @@ def _correction_slopes(
 
 
 def linear_step(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step) -> LinearStep:
-    """Return the matrices of one step of a filter of which only the mean depends on data; of z only the gaps matter.
+    """Return the matrices of one step of a filter of which only the mean depends on data; z says what arrived.
 
     Where a component did not arrive, the columns of the gain and the rows of output and offset are zero.
     """
@@ -257,7 +259,12 @@ def linearise_step(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.A
     present = ~jnp.isnan(z)
     output = jnp.where(present[:, None], -output, 0.0)
     total = jnp.where(present[:, None] & present, innovation.covariance, 0.0)
-    return Linearised(x.mean, jnp.where(present, gain, 0.0), output, total - output @ x.covariance @ output.T)
+    return Linearised(
+        predicted=x.mean,
+        gain=jnp.where(present, gain, 0.0),
+        output=output,
+        noise=total - output @ x.covariance @ output.T,
+    )
 
 
 def _project_covariance(state: PyTree, projection: Array | None) -> jax.Array:

@@ -51,8 +51,11 @@ class MeanBeforeData(Module):
 
 
 @in_float64
-def centre_of(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> MeanBeforeData | None:
-    """Return the mean of a linear model's state; None where it is zero throughout or a gain is random."""
+def mean_before_data(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> MeanBeforeData | None:
+    """Return E[x_0], A_k, b_k and G_k C_k of a linear model, from which E x_k and E z_k follow before any data.
+
+    None where E x is zero throughout, or a gain is random.
+    """
     plants, sensors, channels = unstack(plant), unstack(sensor), unstack(channel)
     if not all(c.has_known_gain for c in channels):
         return None
@@ -62,9 +65,13 @@ def centre_of(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> MeanBefor
         return None
     count = max(len(sensors), len(channels))
     pairs = zip(_repeat(sensors, count), _repeat(channels, count), strict=False)
-    received = [np.asarray(c.moments(1).mean[:-1, :-1]) @ _matrix(s) for s, c in pairs]
+    # E z = E[G] C E x, without the channel's offset: its last row and column are left out.
+    received = [np.asarray(c.moments(1).mean[:-1, :-1]) @ _matrix_of(s) for s, c in pairs]
     return MeanBeforeData(
-        start, _stack_over_time([_matrix(p) for p in plants]), _stack_over_time(drifts), _stack_over_time(received)
+        start=start,
+        transition=_stack_over_time([_matrix_of(p) for p in plants]),
+        drift=_stack_over_time(drifts),
+        received=_stack_over_time(received),
     )
 
 
@@ -83,16 +90,19 @@ def _centre_plant(plant: AbstractPlant) -> LinearPlant:
     return LinearPlant(plant.matrix, noise, center, law, plant.input_matrix, plant.states, plant.inputs)
 
 
-def _matrix(model: AbstractPlant | AbstractSensor) -> np.ndarray:
+def _matrix_of(model: AbstractPlant | AbstractSensor) -> np.ndarray:
+    """Return the matrix A or C of a linear plant or sensor."""
     assert isinstance(model, LinearPlant | LinearSensor)  # checked before
     return np.asarray(model.matrix)
 
 
 def _repeat(items: list[T], count: int) -> list[T]:
+    """Return `count` items: a single one is that of all steps."""
     return items * count if len(items) == 1 else items
 
 
 def _stack_over_time(values: list[np.ndarray]) -> Array | OverTime:
+    """Return the values of all steps as one model of them; a single value is constant."""
     return values[0] if len(values) == 1 else OverTime(np.array(values))
 
 
@@ -209,9 +219,10 @@ def _add_mean(estimate: Estimate, mean: Float[Array, " n"]) -> Estimate:
 
 def _select_degree_one(innovation: Innovation, z: Float[Array, " m"], degree: int) -> Innovation:
     """Return the innovation of z itself, out of that of its monomials."""
+    # z_i is the monomial of exponent 1 in z_i and degree - 1 in the constant, the last factor.
     m, places = len(z), position(len(z) + 1, degree)
-    values = np.array([places[(*(int(i == j) for j in range(m)), degree - 1)] for i in range(m)])
-    value, covariance = innovation.value[values], innovation.covariance[values][:, values]
+    of_z = np.array([places[(*(int(i == j) for j in range(m)), degree - 1)] for i in range(m)])
+    value, covariance = innovation.value[of_z], innovation.covariance[of_z][:, of_z]
     return Innovation(value, covariance, log_density(value, covariance, jnp.abs(z)))
 
 
@@ -254,9 +265,9 @@ def _lift_about_mean(
 ) -> tuple[MeanBeforeData | None, LinearSystem]:
     """Lift the model to monomials up to `degree`, about its mean where the gain is known."""
     check_model(plant, sensor, channel)
-    centre = centre_of(plant, sensor, channel)
-    about = plant if centre is None else centre_plant(plant)
-    return centre, lifted_system(about, sensor, channel, degree, horizon)
+    centre = mean_before_data(plant, sensor, channel)
+    centred_plant = plant if centre is None else centre_plant(plant)
+    return centre, lifted_system(centred_plant, sensor, channel, degree, horizon)
 
 
 def _is_steady(plant: AnyPlant, sensor: AnySensor, channel: Channel, system: LinearSystem) -> bool:
@@ -269,7 +280,7 @@ def _is_steady(plant: AnyPlant, sensor: AnySensor, channel: Channel, system: Lin
 def scheduled_polynomial_filter(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon: int, degree: int = 2
 ) -> PolynomialFilter:
-    """Polynomial filter with saved gains: for complete data, as `polynomial_filter` at a fraction of the cost per step.
+    """Return the polynomial filter with saved gains: `polynomial_filter` for complete data, at a fraction of its cost.
 
     Args:
         plant: a linear plant without inputs, n states.
@@ -367,8 +378,8 @@ def memory_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon:
     # The linear filter's gains are needed for the moments of its products with z.
     centre, system = _lift_about_mean(plant, sensor, channel, 1, horizon)
     linear = lmmse(system, claim)
-    about = plant if centre is None else centre_plant(plant)
-    products = lmmse(quadratic_system_with_linear_estimate(about, sensor, channel, linear), linear.claim)
+    centred_plant = plant if centre is None else centre_plant(plant)
+    products = lmmse(quadratic_system_with_linear_estimate(centred_plant, sensor, channel, linear), linear.claim)
     names = first(plant).states
     filter = MemoryFilter(ScheduledFilter(linear, names), ScheduledFilter(products, names), products.claim, centre)
     return believing(filter, Premise(plant, sensor, channel, order=4))

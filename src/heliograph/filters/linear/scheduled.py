@@ -81,11 +81,11 @@ class ScheduledFilter(AbstractSizedFilter):
         g: Gains = at(self.gains, k)
         s = state.value
         return ScheduleState(
-            g.transition @ s + g.offset,
-            g.output @ s + g.output_offset,
-            g.expected @ s + g.expected_offset,
-            state.complete,
-            jnp.asarray(2 * k + 1, dtype=state.stage.dtype),
+            value=g.transition @ s + g.offset,
+            mean=g.output @ s + g.output_offset,
+            expected=g.expected @ s + g.expected_offset,
+            complete=state.complete,
+            stage=jnp.asarray(2 * k + 1, dtype=state.stage.dtype),
         )
 
     @corrects
@@ -94,13 +94,13 @@ class ScheduledFilter(AbstractSizedFilter):
         g: Gains = at(self.gains, k)
         z = jnp.asarray(z)
         present = ~jnp.isnan(z)
-        observed = jnp.where(present, z - state.expected, 0.0)
+        innovation = jnp.where(present, z - state.expected, 0.0)
         after = ScheduleState(
-            state.value + g.gain @ observed,
-            state.mean + g.direct @ observed,
-            state.expected,
-            state.complete & jnp.all(present | jnp.asarray(self.unused)[k]),
-            jnp.asarray(2 * k + 2, dtype=state.stage.dtype),
+            value=state.value + g.gain @ innovation,
+            mean=state.mean + g.direct @ innovation,
+            expected=state.expected,
+            complete=state.complete & jnp.all(present | jnp.asarray(self.unused)[k]),
+            stage=jnp.asarray(2 * k + 2, dtype=state.stage.dtype),
         )
         return after, gaussian_innovation(z, state.expected, jnp.where(state.complete, g.innovation, jnp.nan))
 
@@ -110,16 +110,17 @@ class ScheduledFilter(AbstractSizedFilter):
         return self._estimate(state, state.stage)
 
     def after_step(self, state: ScheduleState, k: Step) -> Estimate:
-        """Estimate after step k, with the covariance of that step, common to all runs."""
+        """Return the estimate after step k, with the covariance of that step, common to all runs."""
         return self._estimate(state, 2 * k + 2)
 
     def _estimate(self, state: ScheduleState, stage: Step) -> Estimate:
+        """Return the mean, with the covariance of this stage while all has arrived."""
         claimed = jnp.where(state.complete, jnp.asarray(self.covariances)[stage], jnp.nan)
         return Estimate(state.mean, claimed, self.claim)
 
 
 def _gains_for_expected_measurement(g: Gains) -> Gains:
-    """Gains of a step without data: e = G s + g takes the place of z in s+ = F s + K z + c and xhat = L s + J z + d."""
+    """Return the gains of a step without data: e = G s + g for z in s+ = F s + K z + c and xhat = L s + J z + d."""
     return g._replace(
         transition=g.transition + g.gain @ g.expected,
         offset=g.offset + np.einsum("tim,tm->ti", g.gain, g.expected_offset),
@@ -204,44 +205,47 @@ def _factor_noises(system: LinearSystem) -> SystemNoises:
     else one that repeats another would measure, without noise, the state times what rounding left of their difference.
     """
     s = system.steps
-    moved, sent = _second_moments_of_steps(system)
+    of_states, of_received = _second_moments_of_steps(system)
 
-    def columns(covariances: np.ndarray, seconds: np.ndarray, lost: np.ndarray) -> Columns:
+    def factor(covariances: np.ndarray, seconds: np.ndarray, lost: np.ndarray) -> Columns:
+        """Return the factors of noises (time, n, n), with the rounding of numbers of second moments (time, n)."""
         rounding = seconds + np.diagonal(covariances, axis1=1, axis2=2)
         return _factor_with_rounding(columns_of_each(covariances), rounding, lost)
 
-    process = columns(np.asarray(s.process), moved, np.zeros(moved.shape))
-    return SystemNoises(process, columns(np.asarray(s.noise), sent, system.received_rounding))
+    process = factor(np.asarray(s.process), of_states, np.zeros(of_states.shape))
+    return SystemNoises(process, factor(np.asarray(s.noise), of_received, system.received_rounding))
 
 
 @compile_in_float64
-def _factor_with_rounding(own: Columns, seconds: Array, lost: Array) -> Columns:
+def _factor_with_rounding(noise: Columns, seconds: Array, lost: Array) -> Columns:
     """Return the factors of each step's noise, the rounding of numbers of these second moments, and what was lost.
 
-    Shapes: own (steps, n, columns), seconds and lost (steps, n).
+    Shapes: noise (steps, n, columns), seconds and lost (steps, n), variances lost already.
     """
 
-    def of_step(own: Columns, seconds: jax.Array, lost: jax.Array) -> Columns:
-        return triangularise(join_columns(own, rounding_of(seconds), Columns(np.eye(len(lost)), lost)))
+    def factor_step(noise: Columns, seconds: jax.Array, lost: jax.Array) -> Columns:
+        """Return the factors of one step."""
+        return triangularise(join_columns(noise, rounding_of(seconds), Columns(np.eye(len(lost)), lost)))
 
-    each: Callable[..., Columns] = jax.vmap(of_step)
-    return each(own, seconds, lost)
+    factor_steps: Callable[..., Columns] = jax.vmap(factor_step)
+    return factor_steps(noise, seconds, lost)
 
 
 def _second_moments_of_steps(system: LinearSystem) -> tuple[np.ndarray, np.ndarray]:
-    """(|A| root E[y y'] + |a|)^2 of each next state (time, N), and the same of what is received: sizes for rounding.
+    """Return (|A| root E[y_i^2] + |a|)^2 of each next state (time, N), and the same of what is received (time, m).
 
-    By the moments before any data, since parts of a system that start at zero do not stay there.
+    They are the sizes of what is summed, for its rounding. By the moments before any data, since parts of a system that
+    start at zero do not stay there; limited to numbers whose squares are finite.
     """
     s, mean, covariance = system.steps, system.mean, system.covariance
     largest = float(np.finfo(float).max) ** 0.5
-    moved, sent = [], []
+    of_states, of_received = [], []
     for k in range(len(s.transition)):
         reach = np.sqrt(mean**2 + np.diagonal(covariance))
-        moved.append(np.minimum(np.abs(s.transition[k]) @ reach + np.abs(s.drift[k]), largest**0.5) ** 2)
+        of_states.append(np.minimum(np.abs(s.transition[k]) @ reach + np.abs(s.drift[k]), largest**0.5) ** 2)
         mean = np.clip(s.transition[k] @ mean + s.drift[k], -(largest**0.5), largest**0.5)
-        moved_covariance = s.transition[k] @ covariance @ s.transition[k].T + s.process[k]
-        covariance = np.clip(moved_covariance, -largest, largest)
+        covariance = s.transition[k] @ covariance @ s.transition[k].T + s.process[k]
+        covariance = np.clip(covariance, -largest, largest)
         reach = np.sqrt(mean**2 + np.diagonal(covariance))
-        sent.append(np.minimum(np.abs(s.output[k]) @ reach + np.abs(s.offset[k]), largest**0.5) ** 2)
-    return np.stack(moved), np.stack(sent)
+        of_received.append(np.minimum(np.abs(s.output[k]) @ reach + np.abs(s.offset[k]), largest**0.5) ** 2)
+    return np.stack(of_states), np.stack(of_received)

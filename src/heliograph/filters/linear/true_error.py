@@ -93,32 +93,39 @@ def true_error(
     square = np.outer(mean, mean)
     square[:total, :total] += begin.initial_covariance
     moments, true = np.asarray(initial)[:, None, None] * square, []
-    # Error x - xhat = row r; one prediction and one correction per step.
-    row = np.concatenate([np.eye(n, total + 1), -projection], axis=1)
+    # Error x - xhat = D r; one prediction and one correction per step.
+    difference = np.concatenate([np.eye(n, total + 1), -projection], axis=1)
     for k in range(horizon):
-        rows = np.eye(len(moments)) if k == 0 else np.asarray(at(world, k).transition)
-        moments = _propagate_moments(moments, at(plant, k), at(planned.steps, k), u[k], rows)
+        transition = np.eye(len(moments)) if k == 0 else np.asarray(at(world, k).transition)
+        moments = _propagate_moments(moments, at(plant, k), at(planned.steps, k), u[k], transition)
         moments = _correct_moments(moments, at(sensor, k), at(world, k), at(planned.steps, k))
-        true.append(row @ moments.sum(axis=0) @ row.T)
+        true.append(difference @ moments.sum(axis=0) @ difference.T)
     return TrueError(start.states, np.asarray(planned.covariances)[2 : 2 * horizon + 1 : 2], np.array(true))
 
 
 def _propagate_moments(
     moments: np.ndarray, plant: LinearPlant, step: LinearStep, u: np.ndarray, rows: np.ndarray
 ) -> np.ndarray:
-    """Propagate joint moments through x+ = A x + b + w, s- = F s + f, and a transition of the modes."""
-    n, given, size = len(plant.states), jnp.asarray(u), moments.shape[-1]
+    """Propagate E[r r' 1{mode}] (M, size, size), r = (x, 1, s), by x+ = A x + b + w, s- = F s + f and the modes' chain.
+
+    `rows`: transition matrix of the modes (M, M).
+    """
+    n, inputs, size = len(plant.states), jnp.asarray(u), moments.shape[-1]
+    # r+ = [A b 0; 0 1 0; 0 f F] r + (w, 0, 0).
     move, noise = np.zeros((2, size, size))
-    move[:n, :n], move[n, n] = plant.transition_matrix(given), 1.0
-    move[:n, n] = plant.shift(given)
+    move[:n, :n], move[n, n] = plant.transition_matrix(inputs), 1.0
+    move[:n, n] = plant.shift(inputs)
     move[n + 1 :, n + 1 :], move[n + 1 :, n] = step.transition, step.drift
-    noise[:n, :n] = plant.noise_covariance(given)
+    noise[:n, :n] = plant.noise_covariance(inputs)
     before = mix_modes(rows, moments)
     return np.asarray(propagate_by_mode(move, before, before[:, n, n, None, None] * noise))
 
 
 def _correct_moments(moments: np.ndarray, sensor: LinearSensor, world: ChannelByMode, step: LinearStep) -> np.ndarray:
-    """Propagate moments through s = s- + K (z - C s- - c), z = (G, n) of the mode times y~ = C~ x~ + v."""
+    """Propagate moments through s = s- + K (z - C s- - c), with z = (G, n) y~, of the mode, and y~ = C~ (x, 1) + v.
+
+    `moments`: E[r r' 1{mode}] (M, size, size), r = (x, 1, s).
+    """
     p, n = sensor.matrix.shape
     gain, mean, law = np.asarray(step.gain), np.asarray(world.mean), moments[:, n, n, None, None]
     measure, noise = np.zeros((p + 1, n + 1)), np.zeros((p + 1, p + 1))

@@ -82,10 +82,8 @@ class AdditiveModalFilter(AbstractModalFilter):
     def init(self) -> AdditiveBelief:
         """Return the prior, independent of the modes: Cov(zeta) = Gamma x E[x~ x~'], less E[x~] E[x~]' of x~ itself."""
         start = at(self.plant, 0)
-        spread, laws = (
-            pad_with_zeros(jnp.asarray(start.initial_covariance)),
-            tuple(jnp.asarray(law) for law in self.initial),
-        )
+        spread = pad_with_zeros(jnp.asarray(start.initial_covariance))
+        laws = tuple(jnp.asarray(law) for law in self.initial)
         second = spread.at[-1, -1].set(1.0)
         parts = [spread, *(jnp.kron(_indicator_covariance(law), second) for law in laws if len(law) > 1)]
         centre = jnp.asarray(start.initial_mean)
@@ -99,11 +97,10 @@ class AdditiveModalFilter(AbstractModalFilter):
         rows = self._transition_matrices(state, k)
         # F zeta about the moving centre.
         centred = state.gaussian.mean - self._mean_from_centre(state.centre)
-        mean = predict_by_mode(centred[:, None], move, _function_transition(rows).T)[:, 0] + self._mean_from_centre(
-            centre
-        )
-        root, fresh = self._transition_factors(state, u, k)
-        after = from_columns(mean, join_columns(Columns(root, state.gaussian.variances), fresh))
+        moved = predict_by_mode(centred[:, None], move, _function_transition(rows).T)[:, 0]
+        mean = moved + self._mean_from_centre(centre)
+        root, noise_of_zeta = self._transition_factors(state, u, k)
+        after = from_columns(mean, join_columns(Columns(root, state.gaussian.variances), noise_of_zeta))
         second = move @ state.second @ move.T + noise
         return AdditiveBelief(after, second, _next_laws(state.laws, rows), centre, jnp.asarray(True))
 
@@ -119,9 +116,9 @@ class AdditiveModalFilter(AbstractModalFilter):
         return state._replace(gaussian=after), innovation
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return the law of zeta before the step given its prediction."""
-        slopes, fresh = self._transition_factors(step.before, step.u, step.k)
-        moved, projection = (slopes, triangularise(fresh)), self._projection_to_state()
+        """Return the smoother step of zeta+ = F zeta + noise."""
+        slopes, noise = self._transition_factors(step.before, step.u, step.k)
+        moved, projection = (slopes, triangularise(noise)), self._projection_to_state()
         return smoother_step_of(step, moved, self.claim, projection=projection)
 
     def _projection_to_state(self) -> Float[np.ndarray, "n N"]:
@@ -152,16 +149,17 @@ class AdditiveModalFilter(AbstractModalFilter):
         They are those of C x A~ E[x~ x~'] A~' + Gamma+ x Q~, with C = sum_i P(i) Cov(1{next} | i) of each chain.
         """
         move, rows = centred_transition(at(self.plant, k), u, state.centre)[0], self._transition_matrices(state, k)
-        random = [
+        # C of each chain, and of all of them as columns.
+        jump_covariances = [
             jnp.einsum("i,ijl->jl", law, covariance_of_mode(chain)[:, 1:, 1:])
             for law, chain in zip(state.laws, rows, strict=True)
         ]
-        jumps, carried = _block_diagonal_columns(np.zeros((1, 0)), random), factor_spread(move @ state.second @ move.T)
+        jumps = _block_diagonal_columns(np.zeros((1, 0)), jump_covariances)
+        carried = factor_spread(move @ state.second @ move.T)
         by_jumps = Columns(kron(jumps.matrix, carried.matrix), outer(jumps.weights, carried.weights).reshape(-1))
-        fresh = join_columns(
-            by_jumps, self.process_noise_by_mode(u, k, _second_moment_of_functions(_next_laws(state.laws, rows)))
-        )
-        return predict_by_mode(state.gaussian.root, move, _function_transition(rows).T), fresh
+        next_gamma = _second_moment_of_functions(_next_laws(state.laws, rows))
+        noise = join_columns(by_jumps, self.process_noise_by_mode(u, k, next_gamma))
+        return predict_by_mode(state.gaussian.root, move, _function_transition(rows).T), noise
 
     def _measurement_model(self, state: AdditiveBelief, k: Step) -> MeasurementModel:
         """Return z = common + H zeta + v, H from Hbar and the D_a, and columns of Cov v."""
@@ -196,8 +194,8 @@ class AdditiveModalFilter(AbstractModalFilter):
 def _gains_by_function(terms: Sequence[ChannelByMode], laws: Laws) -> jax.Array:
     """Return Hbar and all D_a, stacked: (1 + functions, m, p + 1)."""
     means = [jnp.asarray(term.mean) for term in terms]
-    whole = sum(jnp.einsum("j,jmp->mp", law, mean) for law, mean in zip(laws, means, strict=True))
-    return jnp.concatenate([jnp.asarray(whole)[None], *(mean[1:] - mean[:1] for mean in means)])
+    total_mean = sum(jnp.einsum("j,jmp->mp", law, mean) for law, mean in zip(laws, means, strict=True))
+    return jnp.concatenate([jnp.asarray(total_mean)[None], *(mean[1:] - mean[:1] for mean in means)])
 
 
 def _next_laws(laws: Laws, rows: Laws) -> Laws:
@@ -227,13 +225,13 @@ def _block_diagonal_columns(one: np.ndarray, covariances: Sequence[jax.Array]) -
     factors = [factor_spread(covariance) for covariance in covariances if len(covariance)]
     weights = jnp.concatenate([jnp.ones(one.shape[1]), *(factor.weights for factor in factors)])
     rows = sum(len(factor.matrix) for factor in factors)
-    whole: jax.Array = block_diag(*(factor.matrix for factor in factors)).reshape(rows, -1)
-    top = jnp.concatenate([jnp.asarray(one), np.zeros((1, whole.shape[1]))], axis=1)
-    return Columns(jnp.concatenate([top, jnp.pad(whole, ((0, 0), (one.shape[1], 0)))]), weights)
+    blocks: jax.Array = block_diag(*(factor.matrix for factor in factors)).reshape(rows, -1)
+    top = jnp.concatenate([jnp.asarray(one), np.zeros((1, blocks.shape[1]))], axis=1)
+    return Columns(jnp.concatenate([top, jnp.pad(blocks, ((0, 0), (one.shape[1], 0)))]), weights)
 
 
 def additive_modal_filter(plant: AnyPlant, sensor: AnySensor, terms: Sequence[Channel]) -> AdditiveModalFilter:
-    """Best linear filter behind the sum of these terms, each with all outputs and inputs, which share no memory."""
+    """Return the best linear filter behind the sum of these terms, each with all outputs, which share no memory."""
     laws, models = zip(*(channels_by_mode(term) for term in terms), strict=True)
     claim: Claim = "exact" if all(claim_of_modes(term) == "exact" for term in terms) else "nominal"
     sizes = make_sizes(claim, first(plant), first(terms[0]).outputs)

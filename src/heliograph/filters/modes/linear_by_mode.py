@@ -43,10 +43,11 @@ def centred_measurement(sensor: LinearSensor, centre: jax.Array) -> tuple[jax.Ar
 
 
 def noise_in_mode(plant: LinearPlant, u: ArrayLike, start: jax.Array) -> Columns:
-    """Return the covariance of the process noise of x~, with the rounding of the state and of the mode's indicator."""
-    own = process_noise(plant, jnp.asarray(u), start)
-    one = rounding_of(np.ones(1))
-    return Columns(jax.scipy.linalg.block_diag(own.matrix, one.matrix), jnp.append(own.weights, one.weights))
+    """Return factors of the process noise of x~ = (x, 1), with the rounding of the state and of the indicator."""
+    w = process_noise(plant, jnp.asarray(u), start)
+    of_indicator = rounding_of(np.ones(1))
+    matrix = jax.scipy.linalg.block_diag(w.matrix, of_indicator.matrix)
+    return Columns(matrix, jnp.append(w.weights, of_indicator.weights))
 
 
 def pad_with_zeros(a: jax.Array) -> jax.Array:
@@ -80,8 +81,8 @@ def centred_motion(
         centre: c (n,).
         arriving: E[(x - c, 1) 1{mode j}] of the mode that moves (M, n + 1).
     """
-    parts = [transition_with_constant(plant, jnp.asarray(u)) for plant in plants]
-    moves, noises = (jnp.stack([parts[mode][i] for mode in modes]) for i in range(2))
+    by_plant = [transition_with_constant(plant, jnp.asarray(u)) for plant in plants]
+    moves, noises = (jnp.stack(matrices) for matrices in zip(*(by_plant[mode] for mode in modes), strict=True))
     at_centre = moves[:, :-1] @ jnp.append(centre, 1.0)
     if len(plants) == 1:
         return MotionByMode(moves.at[:, :-1, -1].set(0.0), noises, at_centre[0])
@@ -105,5 +106,6 @@ def centred_sensing(
     sensors: Sequence[LinearSensor], modes: Sequence[int], centre: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Return C~_j and R~_j of the centred state in each mode (M, p + 1, n + 1), (M, p + 1, p + 1)."""
-    parts = [centred_measurement(sensor, centre) for sensor in sensors]
-    return jnp.stack([parts[mode][0] for mode in modes]), jnp.stack([parts[mode][1] for mode in modes])
+    by_sensor = [centred_measurement(sensor, centre) for sensor in sensors]
+    measures, noises = zip(*(by_sensor[mode] for mode in modes), strict=True)
+    return jnp.stack(measures), jnp.stack(noises)

@@ -36,11 +36,14 @@ class AbstractMerging(Module):
         return parts
 
     def mixing_weights(self, weight: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Weights (K, G) of the components in G mixtures, and those (K, M) of the components that these become."""
+        """Return how components are mixed before a move: weights (K, G) of K components in G mixtures.
+
+        And the weights (K, M) of the components after the move. `rows`: transition matrix (M, M) of the modes.
+        """
         raise unwritten(self, "mixing")
 
     def moves(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return, of each component after the prediction, which mixture it was and which mode moved it."""
+        """Return for each component after the prediction which mixture it was before, and which mode moved it."""
         places = np.arange(modes)
         return places, places
 
@@ -70,7 +73,7 @@ class MergeByNextMode(AbstractMerging):
     """One Gaussian per mode, mixed by the mode that the chain comes from (IMM)."""
 
     def mixing_weights(self, weight: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Component j becomes the mixture of all components that lead to mode j."""
+        """Mix, for each mode j, all components that lead to it."""
         mixed = weight @ rows
         return mixed, jnp.diag(jnp.sum(mixed, axis=0))
 
@@ -84,7 +87,7 @@ class MergeByMode(AbstractMerging):
         return True
 
     def mixing_weights(self, weight: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Components keep the mode of their last update."""
+        """Mix nothing: components keep the mode of their last update."""
         return weight, jnp.sum(weight, axis=0)[:, None] * rows
 
     def update_pairs(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
@@ -140,8 +143,8 @@ class MergePairs(AbstractMerging):
 def normalise_columns(weight: jax.Array) -> jax.Array:
     """Divide weights (components, mixtures) by their column sums; equal weights where a column is zero."""
     law = jnp.sum(weight, axis=0)
-    some = law > float(np.finfo(law.dtype).tiny)  # the reciprocal of less is infinite
-    return jnp.where(some, weight * (1 / jnp.where(some, law, 1.0)), 1 / len(weight))
+    positive = law > float(np.finfo(law.dtype).tiny)  # the reciprocal of less is infinite
+    return jnp.where(positive, weight * (1 / jnp.where(positive, law, 1.0)), 1 / len(weight))
 
 
 def mix_and_predict(
@@ -152,7 +155,11 @@ def mix_and_predict(
     u: jax.Array,
     start: jax.Array,
 ) -> Gaussian:
-    """f(x, u) + w of each mixture (components, mixtures), by two moments; a linear plant moves the parts first."""
+    """Return the two moments of f(x, u) + w, x from each mixture of `parts` by weights (components, mixtures).
+
+    A linear plant is applied to the parts before they are mixed, so that only these are moved. `start` (n,) is
+    E[x_i^2] before any data.
+    """
     share = normalise_columns(weight)
     if not isinstance(plant, LinearPlant):
         mixtures = jax.vmap(partial(merge_mixture, parts), in_axes=1)(share)
@@ -161,11 +168,12 @@ def mix_and_predict(
     means = jax.vmap(lambda mean: matrix @ mean + plant.shift(u))(parts.mean)
     spreads = jax.vmap(lambda x: x.columns.through(matrix).covariance)(parts)
 
-    def mix(weights: jax.Array) -> Gaussian:
+    def mix_moved(weights: jax.Array) -> Gaussian:
+        """Return one mixture of the moved parts, with the process noise."""
         mean, covariance = moments_of_mixture(means, spreads, weights)
         return from_covariance_by_elimination(mean, covariance + noise)
 
-    moved: Gaussian = jax.vmap(mix, in_axes=1)(share)
+    moved: Gaussian = jax.vmap(mix_moved, in_axes=1)(share)
     return moved
 
 
@@ -179,23 +187,26 @@ def move_by_law(
     u: jax.Array,
     start: jax.Array,
 ) -> Gaussian:
-    """Move mixtures (components, mixtures) of Gaussians by the plants of modes: component c is mixture moves[0][c].
+    """Mix Gaussians by weights (components, mixtures), and move them by the plants of modes.
 
-    plant_of: which plant moves in each mode. Where all modes have one plant, each mixture is moved once.
+    `moves`: of each component after the move the mixture that it was, and the mode that moves it. `plant_of`: which
+    plant each mode has. Where all have one, each mixture is moved once.
     """
-    source, mode = moves
+    mixture_of, mode_of = moves
     if len(plants) == 1:
         moved = mix_and_predict(plants[0], transform, parts, weight, u, start)
-        same = np.array_equal(source, np.arange(weight.shape[1]))
-        return moved if same else jax.tree.map(lambda leaf: leaf[source], moved)
+        in_order = np.array_equal(mixture_of, np.arange(weight.shape[1]))
+        return moved if in_order else jax.tree.map(lambda leaf: leaf[mixture_of], moved)
+    # Plant after plant, the components that it moves; then all of them in order again.
     mixtures = mix(parts, normalise_columns(weight))
-    which, results = plant_of[mode], []
+    plant_of_component, results = plant_of[mode_of], []
     for number, plant in enumerate(plants):
-        mine = source[which == number]
-        results.append(_predict_each(plant, transform, jax.tree.map(lambda leaf, mine=mine: leaf[mine], mixtures),
-                                     u, start))  # fmt: skip
-    place = np.argsort(np.concatenate([np.flatnonzero(which == number) for number in range(len(plants))]))
-    joined: Gaussian = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[place], *results)
+        sources = mixture_of[plant_of_component == number]
+        before = jax.tree.map(lambda leaf, sources=sources: leaf[sources], mixtures)
+        results.append(_predict_each(plant, transform, before, u, start))
+    moved_order = np.concatenate([np.flatnonzero(plant_of_component == number) for number in range(len(plants))])
+    order = np.argsort(moved_order)
+    joined: Gaussian = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[order], *results)
     return joined
 
 
@@ -222,6 +233,7 @@ def _predict_each(
     matrix, noise = plant.transition_matrix(u), process_noise(plant, u, start).covariance
 
     def move(mean: jax.Array, covariance: jax.Array) -> Gaussian:
+        """Move one pair of moments."""
         return from_covariance_by_elimination(matrix @ mean + plant.shift(u), matrix @ covariance @ matrix.T + noise)
 
     moved: Gaussian = jax.vmap(move)(*x)

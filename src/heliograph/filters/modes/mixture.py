@@ -125,8 +125,8 @@ class MixtureFilter(AbstractSizedFilter):
         prior, size = state.law[c.mode] * jnp.asarray(c.weight), square_root(second_moments_at_start(self.plant))
         present = ~jnp.isnan(z)
 
-        # Kalman update of one combination, with the rounding of what it says of the state.
         def condition(gain: jax.Array, offset: jax.Array, noise: Columns) -> tuple[Gaussian, tuple[jax.Array, ...]]:
+            """Return one combination's update, and log-likelihood, count of exact components, innovation and Cov z."""
             slopes, value = gain @ x.root, wrap_angles(z - gain @ x.mean - offset, self.observed_angles)
             noise = join_columns(noise, rounding_of((jnp.abs(gain) @ size) ** 2))
             after, innovations = condition_on_observation(x, slopes, value, noise, present)
@@ -151,17 +151,15 @@ class MixtureFilter(AbstractSizedFilter):
         return Estimate(wrap_angles(x.mean, first(self.plant).angles), x.covariance, self.claim)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return the law of the state before the step given its prediction."""
+        """Return the smoother step of x+ = A x + b + w, of the one Gaussian before and after."""
         plant, u = at(self.plant, step.k), jnp.asarray(step.u)
-        moved = (
-            plant.transition_matrix(u) @ step.before.gaussian.root,
-            process_noise(plant, u, second_moments_at_start(self.plant)),
-        )
-        return smoother_step_of(step, moved, "nominal", plant.manifold)
+        slopes = plant.transition_matrix(u) @ step.before.gaussian.root
+        noise = process_noise(plant, u, second_moments_at_start(self.plant))
+        return smoother_step_of(step, (slopes, noise), "nominal", plant.manifold)
 
 
 def drop_below_point_mass(likelihood: Float[Array, " a"], certain: Int[Array, " a"]) -> Float[Array, " a"]:
-    """Set to -inf the log-likelihood of combinations whose density another one's point mass outweighs.
+    """Return log-likelihoods, -inf for combinations whose density another one's point mass outweighs.
 
     `certain` counts the components that a combination determines exactly: it has a point mass there, against which a
     density is negligible.
@@ -175,7 +173,7 @@ def drop_below_point_mass(likelihood: Float[Array, " a"], certain: Int[Array, " 
 @believes
 @takes_told
 def mixture_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, resolution: float = 0.0) -> MixtureFilter:
-    """Filter on the full laws of gains and noises with finitely many values, with one Gaussian after each step.
+    """Return the filter on the full laws of gains and noises of finitely many values, with one Gaussian a step.
 
     Gains may be constant or discrete, noises of finite support (used atom by atom) or Gaussian. Behind links with
     memory it propagates the modes' probabilities, with one Gaussian for all; `imm_filter` and `gpb2_filter` have one
@@ -226,14 +224,26 @@ def _joint_modes_of(channel: AbstractRandomAffine) -> JointModes:
 
 
 def _list_combinations(sensor: AnySensor, now: JointModes, before: JointModes, floor: float) -> AtomCombinations:
-    """List all atoms of z = G (C x + v) + n by mode, with the variance `floor` added to each noise."""
+    """Return all combinations of atoms of z = G (C x + v) + n by mode, with the variance `floor` added to each noise.
+
+    `before`: the modes of the step before, whose chain leads to this step.
+    """
     assert isinstance(sensor, LinearSensor)  # checked before
-    received = GainAndNoise(Constant(1.0), sensor.matrix, sensor.noise)
-    atoms = [(c, i) for i, m in enumerate(now.maps) for c in Series([received, m]).list_atoms()]
-    parts = [(c, i) for c, i in atoms if is_traced(c.weight) or c.weight > 0]
-    if len(parts) > COMPONENT_LIMIT:
-        raise fail("mixture filter", f"at most {COMPONENT_LIMIT:,} combinations of atoms", f"{len(parts):,}")
-    mode = np.array([i for _, i in parts])
-    weight, gain, offset, noise = (stack_parts(column) for column in zip(*(c for c, _ in parts), strict=True))
-    noise = noise + floor * np.eye(noise.shape[-1])
-    return AtomCombinations(weight, gain, offset, columns_of_each(noise), mode, before.transition)
+    sensed = GainAndNoise(Constant(1.0), sensor.matrix, sensor.noise)
+    atoms, modes = [], []
+    for mode, link in enumerate(now.maps):
+        for atom in Series([sensed, link]).list_atoms():
+            if is_traced(atom.weight) or atom.weight > 0:
+                atoms.append(atom)
+                modes.append(mode)
+    if len(atoms) > COMPONENT_LIMIT:
+        raise fail("mixture filter", f"at most {COMPONENT_LIMIT:,} combinations of atoms", f"{len(atoms):,}")
+    weight, gain, offset, noise = (stack_parts(column) for column in zip(*atoms, strict=True))
+    return AtomCombinations(
+        weight=weight,
+        gain=gain,
+        offset=offset,
+        noise=columns_of_each(noise + floor * np.eye(noise.shape[-1])),
+        mode=np.array(modes),
+        transition=before.transition,
+    )

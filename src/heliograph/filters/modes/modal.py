@@ -182,8 +182,8 @@ class ModalFilter(AbstractJointModalFilter):
         # F zeta about the moving centre.
         centred = state.gaussian.mean - mean_from_centre(state.law, state.centre)
         mean = predict_by_mode(centred[:, None], motion.moves, rows)[:, 0] + mean_from_centre(law, motion.centre)
-        root, fresh = self._transition_factors(state, u, k)
-        after = from_columns(mean, join_columns(Columns(root, state.gaussian.variances), fresh))
+        root, noise = self._transition_factors(state, u, k)
+        after = from_columns(mean, join_columns(Columns(root, state.gaussian.variances), noise))
         moments = propagate_by_mode(motion.moves, arriving, law[:, None, None] * motion.noises)
         return ModalBelief(after, moments, motion.centre, jnp.asarray(True))
 
@@ -210,8 +210,8 @@ class ModalFilter(AbstractJointModalFilter):
         parts = among.matrix.reshape(*moves.shape[:2], -1)
         drawn = Columns((moves @ parts).reshape(among.matrix.shape), among.weights)
         start = second_moments_at_start(self.plant)
-        own = noise_by_mode(plants, self.plant_modes, u, start, state.law @ rows)
-        return predict_by_mode(state.gaussian.root, moves, rows), join_columns(drawn, own)
+        of_process = noise_by_mode(plants, self.plant_modes, u, start, state.law @ rows)
+        return predict_by_mode(state.gaussian.root, moves, rows), join_columns(drawn, of_process)
 
     def _plants(self, k: Step) -> tuple[LinearPlant, ...]:
         """Return the laws of motion of a step."""
@@ -237,9 +237,9 @@ class ModalFilter(AbstractJointModalFilter):
         return MeasurementModel(concatenate_modes(matrix), common, join_columns(plain, rounding, gain_noise))
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return the law of zeta before the step given its prediction."""
-        slopes, fresh = self._transition_factors(step.before, step.u, step.k)
-        moved, projection = (slopes, triangularise(fresh)), self._projection_to_state()
+        """Return the smoother step of zeta+ = F zeta + noise."""
+        slopes, noise = self._transition_factors(step.before, step.u, step.k)
+        moved, projection = (slopes, triangularise(noise)), self._projection_to_state()
         return smoother_step_of(step, moved, self.claim, projection=projection)
 
 
@@ -260,9 +260,9 @@ def covariance_of_mode(rows: jax.Array) -> jax.Array:
 
 
 def separate_modes(among: jax.Array) -> Columns:
-    """Columns (M s) of a covariance whose parts of size s sum to zero over the modes, from all modes but the last.
+    """Return columns (M s, ...) of a covariance over all M modes, whose parts of size s sum to zero over the modes.
 
-    Shapes: among (M - 1, s, M - 1, s).
+    `among` (M - 1, s, M - 1, s): the covariance of all modes but the last, whose part is minus the sum of theirs.
     """
     others, size = among.shape[:2]
     factors = factor_spread(among.reshape(others * size, others * size))
@@ -272,8 +272,8 @@ def separate_modes(among: jax.Array) -> Columns:
 def known_noise(channel: ChannelByMode, sent: Sequence[Columns], law: jax.Array) -> Columns:
     """Return the columns of sum_j P(j) (Hbar_j Cov(v_j) Hbar_j' + Cov n_j) (m, m), which no signal scales."""
     gains = jnp.asarray(channel.mean)[:, :, :-1]
-    through = [own.through(gain).times(p) for gain, own, p in zip(gains, sent, law, strict=True)]
-    return join_columns(*through, side_by_side(channel.noise, law))
+    received = [noise.through(gain).times(p) for gain, noise, p in zip(gains, sent, law, strict=True)]
+    return join_columns(*received, side_by_side(channel.noise, law))
 
 
 def rounding_of_received(gains: jax.Array, sent: jax.Array) -> Columns:
@@ -341,13 +341,14 @@ def concatenate_modes(output: jax.Array) -> jax.Array:
 def modal_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> ModalFilter:
     """Return the best linear filter where links, plant or sensor have modes; `linear_filter` has checked the parts."""
     models = first(plant), first(sensor)
-    which = joint_modes(first(channel), beside=models).beside
+    # The plant's and the sensor's model in each joint mode.
+    by_mode = joint_modes(first(channel), beside=models).beside
     claim = lower_by_noise(claim_of_modes(channel), *models_of(models[0]), *models_of(models[1]))
     return ModalFilter(
         plant=drop_names(plant),
         sensor=drop_names(sensor),
-        plant_modes=find_models("plant", plant, [own for own, _ in which]),
-        sensor_modes=find_models("sensor", sensor, [own for _, own in which]),
+        plant_modes=find_models("plant", plant, [model for model, _ in by_mode]),
+        sensor_modes=find_models("sensor", sensor, [model for _, model in by_mode]),
         **fields_of_joint_modes(plant, sensor, channel, claim),
     )
 
@@ -359,7 +360,7 @@ def fields_of_joint_modes(plant: AnyPlant, sensor: AnySensor, channel: Channel, 
 
 
 def channels_by_mode(channel: Channel, beside: PyTree = ()) -> tuple[Float[Array, " M"], ChannelByMode | OverTime]:
-    """Law of the modes at the first step, and the observation model of each; links without memory have one mode.
+    """Return the law of the modes at the first step, and the channel by mode; links without memory have one mode.
 
     `beside`: plant and sensor, whose modes come before the channel's.
     """
@@ -373,7 +374,9 @@ def channel_by_mode(now: JointModes, before: JointModes) -> ChannelByMode:
     mean = stack_parts([m.moments(1).mean[:-1] for m in now.maps])
     gains, noises = zip(*(divide_spread(nominal_spread(m).center) for m in now.maps), strict=True)
     noise = Columns(*(stack_parts(part) for part in zip(*noises, strict=True)))
-    return ChannelByMode(before.transition, before.radius, mean, stack_parts(gains), noise)
+    return ChannelByMode(
+        transition=before.transition, radius=before.radius, mean=mean, gain_spread=stack_parts(gains), noise=noise
+    )
 
 
 def claim_of_modes(channel: Channel) -> Claim:

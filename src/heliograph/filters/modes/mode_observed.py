@@ -35,9 +35,10 @@ from heliograph.random_affine.moments.second_moments import SecondOrder, describ
 
 
 class ModeObservedBelief(NamedTuple):
-    """Posterior, the prior of the last correction, the measurement used then, and the plant's motion since.
+    """Belief given the data, and what the last correction is repeated from once its mode is known.
 
-    Shapes: z (m,).
+    `before`: its prior; `z` (m,): the measurement used then; `move`: the plant's motion since. `begun`: once there was
+    a correction.
     """
 
     belief: LinearBelief
@@ -71,11 +72,15 @@ class ModeObservedFilter(AbstractSizedFilter):
     def init(self) -> ModeObservedBelief:
         """Return the belief before any data."""
         belief = prior_belief(at(self.plant, 0))
-        nothing = jnp.full(first(self.channel).outputs, jnp.nan)
         n = len(belief.gaussian.mean)
-        none = jnp.zeros((n, n))
-        still = PlantMotion(jnp.eye(n), jnp.zeros(n), none, Columns(none, jnp.zeros(n)))
-        return ModeObservedBelief(belief, belief, nothing, still, jnp.asarray(False))
+        zeros = jnp.zeros((n, n))
+        return ModeObservedBelief(
+            belief=belief,
+            before=belief,
+            z=jnp.full(first(self.channel).outputs, jnp.nan),
+            move=PlantMotion(jnp.eye(n), jnp.zeros(n), zeros, Columns(zeros, jnp.zeros(n))),
+            begun=jnp.asarray(False),
+        )
 
     @predicts
     def predict(self, state: ModeObservedBelief, u: ArrayLike = (), k: Step = 0) -> ModeObservedBelief:
@@ -91,14 +96,14 @@ class ModeObservedFilter(AbstractSizedFilter):
         m = channel.outputs
         z, published = observed[:m], observed[m:]
         is_known = ~jnp.any(jnp.isnan(published)) | (~state.begun if self.late else False)
-        certain = jnp.nan_to_num(published)
+        modes = jnp.nan_to_num(published)
         if self.late:
             # The states that came are those of the step before: use them there first.
-            redone = self._redo_last_step(state, certain, k)
+            redone = self._redo_last_step(state, modes, k)
             prior = jax.tree.map(lambda a, b: jnp.where(is_known & state.begun, a, b), redone, state.belief)
-            described = self._describe_next_mode(state.begun, certain, k)
+            described = self._describe_next_mode(state.begun, modes, k)
         else:
-            prior, described = state.belief, _condition_channel(channel, certain)
+            prior, described = state.belief, _condition_channel(channel, modes)
         # Update with z, which is not used where a state is missing.
         usable = jnp.where(is_known, z, jnp.nan)
         after, innovation = correct_linear(prior, sensor, described, Polytope(), z, second_moments_at_start(self.plant))
@@ -108,7 +113,7 @@ class ModeObservedFilter(AbstractSizedFilter):
         for mode in published:
             flag_innovation, spread = append_flag(spread, mode)
             value = jnp.append(value, flag_innovation)
-        belief = ModeObservedBelief(after, prior, usable, state.move, jnp.asarray(True))
+        belief = ModeObservedBelief(belief=after, before=prior, z=usable, move=state.move, begun=jnp.asarray(True))
         return belief, Innovation(value, spread, innovation.log_likelihood)
 
     def _redo_last_step(self, state: ModeObservedBelief, modes: jax.Array, k: Step) -> LinearBelief:
@@ -135,28 +140,27 @@ class ModeObservedFilter(AbstractSizedFilter):
 
 
 def _condition_channel(channel: AbstractRandomAffine, numbers: jax.Array) -> SecondOrder:
-    """Condition the channel on the memories' states, given as numbers; return its second moments."""
-    held = memories(channel).values()
-    return _nominal_moments(
-        condition_on_memories(channel, [m.state_from_number(number) for m, number in zip(held, numbers, strict=True)])
-    )
+    """Return the second moments of the channel given the memories' states, as numbers."""
+    states = [m.state_from_number(number) for m, number in zip(memories(channel).values(), numbers, strict=True)]
+    return _nominal_moments(condition_on_memories(channel, states))
 
 
 def _predict_channel(
     last: AbstractRandomAffine | None, channel: AbstractRandomAffine, numbers: jax.Array
 ) -> SecondOrder:
     """Return the moments of the channel given the memories' states one step before; without them, of the first step."""
+    # Of each memory its possible next states, with their probabilities: (state, weight) pairs.
     choices = []
     for (identity, memory), number in zip(memories(channel if last is None else last).items(), numbers, strict=True):
-        choices.append(
-            memory.next_state_quadrature(
-                None if last is None else memory.state_from_number(number), channel.degree_in(identity)
-            )
-        )
-    chosen = list(product(*(range(len(weights)) for _, weights in choices)))
-    maps = [condition_on_memories(channel, [choices[i][0][j] for i, j in enumerate(places)]) for places in chosen]
-    weights = [prod(choices[i][1][j] for i, j in enumerate(places)) for places in chosen]
-    return _nominal_moments(Mixture(maps, jnp.stack([jnp.asarray(w) for w in weights])))
+        state = None if last is None else memory.state_from_number(number)
+        states, weights = memory.next_state_quadrature(state, channel.degree_in(identity))
+        choices.append([(states[j], weights[j]) for j in range(len(weights))])
+    # The channel is the mixture over all combinations.
+    maps, probabilities = [], []
+    for combination in product(*choices):
+        maps.append(condition_on_memories(channel, [state for state, _ in combination]))
+        probabilities.append(jnp.asarray(prod(weight for _, weight in combination)))
+    return _nominal_moments(Mixture(maps, jnp.stack(probabilities)))
 
 
 def _nominal_moments(channel: AbstractRandomAffine) -> SecondOrder:
@@ -168,7 +172,7 @@ def _nominal_moments(channel: AbstractRandomAffine) -> SecondOrder:
 
 
 def mode_known_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> ModeObservedFilter:
-    """Best linear filter with side information: the current modes or drifting gains of the links arrive with z.
+    """Return the best linear filter with side information: current modes or drifting gains of links arrive with z.
 
     Its measurements are those of `with_flag(link)`; a `Node` refuses flags of the step before.
 
@@ -189,7 +193,7 @@ def mode_known_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> M
 
 
 def mode_late_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> ModeObservedFilter:
-    """Best linear filter with delayed side information: the links' modes or drifting gains of the step before.
+    """Return the best linear filter with late side information: the links' modes or drifting gains of the step before.
 
     Its measurements are those of `with_flag(link, late=True)`; a `Node` refuses flags of the same step.
 
@@ -215,21 +219,18 @@ def _make_mode_observed_filter(plant: AnyPlant, sensor: AnySensor, channel: Chan
     if any(step.erases for step in unstack(channel) if isinstance(step, AbstractRandomAffine)):
         expected = "a channel without erasures (side_information_filter with flags=np.eye(modes) takes them)"
         raise fail("filter that observes the mode", expected, "one that loses packets")
-    # Received: z and one number per memory.
     start = first(plant)
     check_link(first(sensor), first(channel), len(start.states))
+    # A late mode says what follows by the chain: nominal where the chain is uncertain.
+    claim = "nominal" if late and uncertain_chain(channel) else claim_of_modes(channel)
+    # Received: z and one number per memory.
+    received_numbers = first(channel).outputs + len(memories(channel))
     filter = ModeObservedFilter(
         plant=plant,
         sensor=sensor,
         channel=channel,
         late=late,
-        **make_sizes(
-            lower_by_noise(
-                "nominal" if late and uncertain_chain(channel) else claim_of_modes(channel), plant, sensor, channel
-            ),
-            start,
-            first(channel).outputs + len(memories(channel)),
-        ),
+        **make_sizes(lower_by_noise(claim, plant, sensor, channel), start, received_numbers),
     )
     received = at_each_step(lambda link: with_flag(link, late=late), channel) if memories(channel) else channel
     return believing(filter, Premise(plant, sensor, received))

@@ -31,21 +31,22 @@ def describe_modes(
 
 
 def _check_random(channel: SideInformation) -> None:
-    """Check that z has a density in every combination of mode and pattern, for an x that has one."""
+    """Raise unless z has a density in every combination of mode and pattern of arrivals, for an x that has one."""
     for j, a in np.argwhere(np.asarray(channel.chance) > 0):
+        # M M' plus the spread at Y = I is regular where every combination of the rows that arrive is random.
         rows, gain = np.flatnonzero(channel.present[a]), np.asarray(channel.mean[j, a])[:, :-1]
-        random = (gain @ gain.T + np.einsum("ilaa->il", np.asarray(channel.spread[j, a])))[np.ix_(rows, rows)]
-        if np.linalg.matrix_rank(random) < len(rows):
+        second = (gain @ gain.T + np.einsum("ilaa->il", np.asarray(channel.spread[j, a])))[np.ix_(rows, rows)]
+        if np.linalg.matrix_rank(second) < len(rows):
             raise fail("filter of modes", "outputs that are random in every mode (give the links noise)", f"mode {j}")
 
 
 def find_models(kind: str, model: Any, by_mode: Sequence[Any]) -> tuple[int, ...]:
-    """Return which of a plant's or sensor's models each joint mode has."""
+    """Return for each joint mode the number of the plant's or sensor's model in it, 0 for one that has no modes."""
     if isinstance(model, OverTime) and isinstance(first(model), ModalPlant | ModalSensor):
         raise fail(kind, "one whose models are the same at all steps", "modes in over_time")
     if not isinstance(model, ModalPlant | ModalSensor):
         return (0,) * len(by_mode)
-    return tuple(next(i for i, own in enumerate(model.models) if own is one) for one in by_mode)
+    return tuple(next(i for i, known in enumerate(model.models) if known is one) for one in by_mode)
 
 
 def fields_of_mode_filters(

@@ -190,18 +190,20 @@ class MultipleModelFilter(AbstractSizedFilter):
     def signals(self, parts: Gaussian, pairs: tuple[np.ndarray, np.ndarray], k: Step) -> Signal:
         """Return the signal of each pair (component, mode): of the mode's sensor under the component's prior."""
         plant, sensors = models_of(at(self.plant, k))[0], models_of(at(self.sensor, k))
-        (i, j), start = pairs, second_moments_at_start(self.plant)
-        which, results = np.array(self.sensor_modes)[j], list[Signal]()
+        (component, mode), start = pairs, second_moments_at_start(self.plant)
+        sensor_of_pair, results = np.array(self.sensor_modes)[mode], list[Signal]()
+        # Sensor after sensor: of each component once, then one for each of the sensor's pairs.
         for number, sensor in enumerate(sensors):
-            mine = np.unique(i[which == number])
-            own = parts if len(mine) == len(parts.mean) else jax.tree.map(lambda leaf, mine=mine: leaf[mine], parts)
-            signals = jax.vmap(lambda x, sensor=sensor: signal_of(plant, sensor, self.transform, x, start))(own)
-            back = np.searchsorted(mine, i[which == number])
-            results.append(jax.tree.map(lambda leaf, back=back: leaf[back], signals))
+            of_pairs = component[sensor_of_pair == number]
+            once = np.unique(of_pairs)
+            priors = parts if len(once) == len(parts.mean) else jax.tree.map(lambda leaf, i=once: leaf[i], parts)
+            signals = jax.vmap(lambda x, sensor=sensor: signal_of(plant, sensor, self.transform, x, start))(priors)
+            index = np.searchsorted(once, of_pairs)
+            results.append(jax.tree.map(lambda leaf, index=index: leaf[index], signals))
         if len(results) == 1:
             return results[0]
-        place = np.argsort(np.concatenate([np.flatnonzero(which == number) for number in range(len(sensors))]))
-        joined: Signal = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[place], *results)
+        order = np.argsort(np.concatenate([np.flatnonzero(sensor_of_pair == number) for number in range(len(sensors))]))
+        joined: Signal = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[order], *results)
         return joined
 
     @estimates
@@ -216,12 +218,12 @@ class MultipleModelFilter(AbstractSizedFilter):
         plants, modes = models_of(at(self.plant, step.k)), len(self.initial)
         law = self._law_of(step.after)
         known, pairs, weights, ways = self._describe_pairs(step, law)
-        whole = step.map_states(_merge_mixture)
+        merged = step.map_states(_merge_mixture)
         moments: Any = None
         if len(plants) == 1:
-            moments = smoother_step_by_transform(self, whole, first(self.plant)).before
+            moments = smoother_step_by_transform(self, merged, first(self.plant)).before
         return ModalSmootherStep(
-            whole.after, moments, claim=self.claim, manifold=first(self.plant).manifold, law=law, known=known,
+            merged.after, moments, claim=self.claim, manifold=first(self.plant).manifold, law=law, known=known,
             ways=ways, pairs=jax.tree.map(lambda leaf: leaf.reshape(modes, modes, *leaf.shape[1:]), pairs),
             weights=weights,
         )  # fmt: skip
@@ -231,9 +233,10 @@ class MultipleModelFilter(AbstractSizedFilter):
         return ModalLaw(self.merging.by_mode(state.gaussian, state.weight), state.law)
 
     def _describe_pairs(self, step: StepTrace, after: ModalLaw) -> tuple[Gaussian, Gaussian, jax.Array, BackwardGain]:
-        """Return what ratios are to, the pairs (M^2, n) that the future is told to, their weights, and the ways back.
+        """Return what a smoother by pairs needs: Gaussians by mode, pairs (M^2, n), their weights, and the ways back.
 
-        Where pairs are corrected before they are merged, they have taken z, and the ratio is to the filtered modes.
+        The Gaussians are those that the smoothed modes are compared with: predicted ones, or filtered ones where pairs
+        take z before they are merged. The pairs are those that observe what the future says.
         """
         modes, k, before = len(self.initial), step.k, self._law_of(step.before)
         plants, start = models_of(at(self.plant, k)), second_moments_at_start(self.plant)
@@ -255,19 +258,19 @@ class MultipleModelFilter(AbstractSizedFilter):
 
 
 def _merge_mixture(state: ModalBeliefs) -> Gaussian:
-    """Merge the mixture: mean and covariance of the state."""
+    """Return one Gaussian with the mean and covariance of the mixture."""
     weights, parts = state.components
     return merge_mixture(parts, weights)
 
 
 def replicate(x: T, count: int) -> T:
     """Replicate an object `count` times along a new first axis."""
-    every: T = jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf)[None], count, axis=0), x)
-    return every
+    copies: T = jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf)[None], count, axis=0), x)
+    return copies
 
 
 def align_angles(plant: AbstractPlant, mean: jax.Array, weight: jax.Array) -> jax.Array:
-    """Unwrap the angles of means (components, n) to lie near those of the most probable, so that they average."""
+    """Return means (components, n) with angles near those of the most probable component, so that they average."""
     return plant.near(mean, mean[jnp.argmax(weight)]) if plant.circular else mean
 
 
@@ -311,7 +314,7 @@ def imm_filter(
 def gpb1_filter(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, transform: AbstractTransform | None = None, nodes: int = NODES
 ) -> MultipleModelFilter:
-    """First-order generalised pseudo-Bayes filter behind links with memory: one Gaussian and the modes' probabilities.
+    """Return the first-order generalised pseudo-Bayes filter behind links with memory: one Gaussian, and modes' law.
 
     M updates a step; the correlation of state and mode is not propagated.
 
@@ -340,7 +343,9 @@ def gpb1_filter(
 def gpb2_filter(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, transform: AbstractTransform | None = None, nodes: int = NODES
 ) -> MultipleModelFilter:
-    """Second-order generalised pseudo-Bayes filter: a Gaussian per mode, each updated in every next mode, M^2 updates.
+    """Return the second-order generalised pseudo-Bayes filter: a Gaussian per mode, updated in every next mode.
+
+    M^2 updates a step.
 
     Args:
         plant: the plant, n states.

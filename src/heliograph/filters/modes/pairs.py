@@ -52,7 +52,7 @@ class ModalLaw(NamedTuple):
 
 
 class Moved(NamedTuple):
-    """Gaussians of the mode before, moved by the mode after: (M, M, n) of each pair, and the ways back."""
+    """Gaussians of the mode before, moved by the mode after, (M, M, n) by pair, and the smoother gains back."""
 
     gaussian: Gaussian
     back: BackwardGain
@@ -66,14 +66,15 @@ def move_pairs(
     u: jax.Array,
     start: jax.Array,
 ) -> Moved:
-    """Move each of M Gaussians by the plant of each of M modes."""
+    """Return each of M Gaussians moved by the plant of each of M modes; `plant_of`: which plant each mode has."""
 
     def move(plant: AbstractPlant, x: Gaussian) -> Moved:
+        """Move one Gaussian by one plant."""
         image = image_of(plant, transform, x, u)
         rest = sum_unexplained(image, process_noise(plant, u, start))
         mean = image.mean + plant.noise_mean()
-        ahead = from_columns(mean, join_columns(image.explained, rest))
-        return Moved(ahead, condition_on_next_state(x, image.slopes, mean, rest))
+        predicted = from_columns(mean, join_columns(image.explained, rest))
+        return Moved(predicted, condition_on_next_state(x, image.slopes, mean, rest))
 
     by_plant = [jax.vmap(lambda x, plant=plant: move(plant, x))(parts) for plant in plants]
     pairs: Moved = jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=1)[:, plant_of], *by_plant)
@@ -94,23 +95,29 @@ class Observation(NamedTuple):
 def ratio_of(later: Gaussian, known: Gaussian) -> Observation:
     """Return the ratio of two Gaussians, N(later) / N(known), as an observation of a state that has `known`.
 
-    Rows are scaled by sqrt(1 - e), so that no noise is infinite.
+    V and e as in the module's words: V' Q V = I with Q = Cov known, V' S V = diag(e) with S = Cov later. Rows are
+    scaled by sqrt(1 - e), so that no noise is infinite.
     """
-    whole = jnp.sum(known.root**2 * known.variances, axis=1)
-    free = known.variances > SINGULAR * whole
-    scale = jnp.where(free, 1 / jnp.sqrt(jnp.where(free, known.variances, 1.0)), 0.0)
+    # Whitening W of `known`, W Q W' = I, zero in components that are known exactly.
+    variances = jnp.sum(known.root**2 * known.variances, axis=1)
+    varies = known.variances > SINGULAR * variances
+    scale = jnp.where(varies, 1 / jnp.sqrt(jnp.where(varies, known.variances, 1.0)), 0.0)
     n, lower = len(known.mean), unit_lower(known.lower)
-    white = scale[:, None] * decorrelate(lower, jnp.eye(n))
-    root = white @ later.root
-    size = (root * later.variances) @ root.T + jnp.diag(jnp.where(free, 0.0, 1.0))
-    e, turn = eigh(size)
+    whitening = scale[:, None] * decorrelate(lower, jnp.eye(n))
+    # W S W' = T diag(e) T', V' = T' W; what is known exactly has e = 1, so that it is told nothing.
+    root = whitening @ later.root
+    e, turn = eigh((root * later.variances) @ root.T + jnp.diag(jnp.where(varies, 0.0, 1.0)))
     gained = 1 - jnp.maximum(e, 0.0)
     tells = gained > NOTHING
     share = jnp.sqrt(jnp.where(tells, gained, 1.0))
-    axes = turn.T @ white
+    axes = turn.T @ whitening
     rows = share[:, None] * axes
     value = rows @ known.mean + axes @ (later.mean - known.mean) / share
-    return Observation(rows, jnp.where(tells, value, jnp.nan), jnp.where(tells, jnp.maximum(e, 0.0), 1.0))
+    return Observation(
+        rows=rows,
+        value=jnp.where(tells, value, jnp.nan),
+        noise=jnp.where(tells, jnp.maximum(e, 0.0), 1.0),
+    )
 
 
 class ModalSmootherStep(SmootherStep):
@@ -135,14 +142,15 @@ class ModalSmootherStep(SmootherStep):
     def back(self, later: ModalLaw) -> ModalLaw:  # type: ignore[override]
         """Smooth the modes before the step from those after it, both given the same later data."""
         near = nearest(later.gaussian.mean, self.known.mean, self.angles)
-        said = jax.vmap(ratio_of)(later.gaussian._replace(mean=near), self.known)
+        observations = jax.vmap(ratio_of)(later.gaussian._replace(mean=near), self.known)
 
-        def observe(x: Gaussian, seen: Observation) -> tuple[Gaussian, jax.Array]:
-            noise, expected = Columns(jnp.eye(len(x.mean)), seen.noise), seen.rows @ x.mean
-            after, innovation = condition_on_measurement(x, seen.rows @ x.root, noise, seen.value, expected)
+        def observe(x: Gaussian, observed: Observation) -> tuple[Gaussian, jax.Array]:
+            """Condition one pair on what the future says of its later mode; return it and the log-likelihood."""
+            noise, expected = Columns(jnp.eye(len(x.mean)), observed.noise), observed.rows @ x.mean
+            after, innovation = condition_on_measurement(x, observed.rows @ x.root, noise, observed.value, expected)
             return after, jnp.asarray(innovation.log_likelihood)
 
-        after, score = jax.vmap(jax.vmap(observe), in_axes=(0, None))(self.pairs, said)
+        after, score = jax.vmap(jax.vmap(observe), in_axes=(0, None))(self.pairs, observations)
         # P(i, j | all): of each later mode, the share of each mode before.
         possible = self.weights > 0
         logs = jnp.where(possible, jnp.log(jnp.where(possible, self.weights, 1.0)) + score, -jnp.inf)
@@ -150,6 +158,7 @@ class ModalSmootherStep(SmootherStep):
         shares = jnp.where(possible, jnp.exp(logs - jnp.where(jnp.isfinite(most), most, 0.0)), 0.0)
         total = jnp.sum(shares, axis=0)
         joint = later.law * shares / jnp.where(total > 0, total, 1.0)
+        # Each pair back to its mode before, then merged over the modes after.
         before = jax.vmap(jax.vmap(rts_step))(self.ways, after)
         merged = jax.vmap(merge_mixture)(before, normalise_columns(joint.T).T)
         law = jnp.sum(joint, axis=1)

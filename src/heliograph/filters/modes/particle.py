@@ -128,12 +128,12 @@ class ParticleFilter(AbstractSizedFilter):
         after = after._replace(mean=align_angles(plant, after.mean, weight))
         # Systematic resampling.
         key = fold_in_bits(state.key, z)
-        chosen = resample_systematically(weight, jax.random.uniform(key, (), weight.dtype))
-        poor = effective_number(weight) < self.particles / 2
-        which = jnp.where(poor, chosen, jnp.arange(self.particles))
-        weight = jnp.where(poor, 1 / self.particles, weight)
-        kept: Gaussian = jax.tree.map(lambda leaf: leaf[which], after)
-        return Particles(kept, state.mode[which], weight, key, state.moved), mixed
+        resampled = resample_systematically(weight, jax.random.uniform(key, (), weight.dtype))
+        too_few = effective_number(weight) < self.particles / 2
+        indices = jnp.where(too_few, resampled, jnp.arange(self.particles))
+        weight = jnp.where(too_few, 1 / self.particles, weight)
+        kept: Gaussian = jax.tree.map(lambda leaf: leaf[indices], after)
+        return Particles(kept, state.mode[indices], weight, key, state.moved), mixed
 
     @estimates
     def estimate(self, state: Particles) -> Estimate:
@@ -159,7 +159,7 @@ def particle_filter(
     resample: float = 0.5,
     drawn: "Sequence[str] | None" = None,
 ) -> "AnyParticleFilter":
-    """Particle filter: of the state, of named states, or behind links with memory of their modes (Rao-Blackwell).
+    """Return a particle filter: of the state, of named states, or of the modes of links with memory (Rao-Blackwell).
 
     Of the state: N points with weights, for any plant, and any sensor and link without memory whose noise has a
     density: x_i is drawn from a proposal q, and its weight multiplied by p(z | x_i) p(x_i | before) / q(x_i). Of the

@@ -43,27 +43,31 @@ class SideInformation(Module):
 
 
 def describe_by_pattern(steps: Sequence[JointModes], flags: Float[np.ndarray, "M F"]) -> list[SideInformation]:
-    """Moments of the channel at each step by mode and pattern of arrivals, the patterns being those of all steps."""
-    by_step = [[m.list_outcomes() for m in step.maps] for step in steps]
-    distinct = {tuple(o.arrived) for modes in by_step for parts in modes for o in parts}
-    patterns = sorted(distinct, key=lambda kind: (sum(kind), kind))
+    """Return the channel at each step by mode and pattern of arrivals, the patterns being those of all steps.
+
+    `flags`: P(flag | mode).
+    """
+    outcomes_by_step = [[mode.list_outcomes() for mode in step.maps] for step in steps]
+    distinct = {tuple(o.arrived) for modes in outcomes_by_step for outcomes in modes for o in outcomes}
+    patterns = sorted(distinct, key=lambda pattern: (sum(pattern), pattern))  # those in which fewer arrive first
     before = [steps[0], *steps[:-1]]
     return [
-        _describe_step_by_pattern(modes, patterns, last, flags) for modes, last in zip(by_step, before, strict=True)
+        _describe_step_by_pattern(outcomes, patterns, step_before, flags)
+        for outcomes, step_before in zip(outcomes_by_step, before, strict=True)
     ]
 
 
 def _describe_step_by_pattern(
-    outcomes: list[list[Outcome]], kinds: list[tuple[bool, ...]], before: JointModes, flags: Float[np.ndarray, "M F"]
+    outcomes: list[list[Outcome]], patterns: list[tuple[bool, ...]], before: JointModes, flags: Float[np.ndarray, "M F"]
 ) -> SideInformation:
-    """Return the probability and conditional moments of one step, from each mode's list of loss patterns."""
+    """Return the channel of one step, from the outcomes of each mode; `before`: the modes of the step before."""
     m, p = outcomes[0][0].map.outputs, outcomes[0][0].map.inputs + 1
-    shape = (len(outcomes), len(kinds))
+    shape = (len(outcomes), len(patterns))
     # Sums over the outcomes of each mode: P, P E[(G, n)] and P E[(G, n) x (G, n)].
     chance, mean, second = np.zeros(shape), np.zeros((*shape, m, p)), np.zeros((*shape, m, m, p, p))
     for j, of_mode in enumerate(outcomes):
         for outcome in of_mode:
-            a, (first_order, second_order) = kinds.index(tuple(outcome.arrived)), second_moments(outcome.map)
+            a, (first_order, second_order) = patterns.index(tuple(outcome.arrived)), second_moments(outcome.map)
             chance[j, a] += outcome.probability
             mean[j, a] += outcome.probability * first_order
             second[j, a] += outcome.probability * second_order
@@ -73,12 +77,19 @@ def _describe_step_by_pattern(
     spread = second - np.array([[symmetric_product(gain, gain) for gain in row] for row in mean])
     gains, noises = zip(*(divide_spread(part) for row in spread for part in row), strict=True)
     noise = Columns(*(np.reshape(part, (*shape, *np.shape(part[0]))) for part in zip(*noises, strict=True)))
-    present = np.array(kinds).reshape(len(kinds), m)
-    return SideInformation(before.transition, present, chance, mean, np.reshape(gains, spread.shape), noise, flags)
+    return SideInformation(
+        transition=before.transition,
+        present=np.array(patterns).reshape(len(patterns), m),
+        chance=chance,
+        mean=mean,
+        gain_spread=np.reshape(gains, spread.shape),
+        noise=noise,
+        flags=flags,
+    )
 
 
 class HasPatterns(Protocol):
-    """Whatever knows by pattern which components arrive, and the pattern's chance in each mode."""
+    """A channel by pattern of arrivals: which components arrive in each, and the pattern's chance in each mode."""
 
     @property
     def present(self) -> Bool[Array, "A m"]:
@@ -97,8 +108,8 @@ def pattern_of(channel: HasPatterns, arrived: Bool[Array, " m"]) -> jax.Array:
 
 
 def append_flag(covariance: jax.Array, flag: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Innovation of a flag, which is known and not estimated: 0, or NaN if missing; uncorrelated with everything."""
-    nis = jnp.where(jnp.isnan(flag), jnp.nan, 0.0)
-    lost = jnp.isnan(jnp.append(jnp.diagonal(covariance), nis))
-    wide = jnp.pad(covariance, ((0, 1), (0, 1)))
-    return nis, jnp.where(lost[:, None] | lost, jnp.nan, jnp.nan_to_num(wide))
+    """Return the innovation of a flag, 0 as it is known, NaN if it is missing, and the covariance with it appended."""
+    innovation = jnp.where(jnp.isnan(flag), jnp.nan, 0.0)
+    lost = jnp.isnan(jnp.append(jnp.diagonal(covariance), innovation))
+    padded = jnp.pad(covariance, ((0, 1), (0, 1)))
+    return innovation, jnp.where(lost[:, None] | lost, jnp.nan, jnp.nan_to_num(padded))

@@ -106,10 +106,8 @@ class SideInformationFilter(AbstractSizedFilter):
     def init(self) -> SideInformationBelief:
         """Return the prior, independent of the mode."""
         start, law = at(self.plant, 0), jnp.asarray(self.initial)
-        prior, unit = (
-            from_covariance(start.initial_mean, start.initial_covariance),
-            np.eye(len(self.states) + 1)[:, -1:],
-        )
+        prior = from_covariance(start.initial_mean, start.initial_covariance)
+        unit = np.eye(len(self.states) + 1)[:, -1:]
         # q in each mode of x - c and of what is known there, x~ = (0, 1) and e = (1{mode} - p) x (0, 1).
         x = jnp.concatenate([jnp.pad(prior.root, ((0, 1), (0, 0))), unit], axis=1)
         constant = jnp.zeros_like(x).at[:, -1:].set(unit)
@@ -132,18 +130,20 @@ class SideInformationFilter(AbstractSizedFilter):
         errors = jax.vmap(lambda e: predict_by_mode(e, move, rows))(errors)
         x = jax.vmap(lambda x: move @ x)(x)
 
-        def to(chosen: jax.Array, e: jax.Array, x: jax.Array) -> jax.Array:
-            return jnp.concatenate([e + kron(chosen[:, None], x), x])
+        def move_columns(change: jax.Array, e: jax.Array, x: jax.Array) -> jax.Array:
+            """Return q+ = (e+, x~+) of one transition i -> j, without noise; `change`: 1_j - p_i."""
+            return jnp.concatenate([e + kron(change[:, None], x), x])
 
         # From all modes to each: their columns side by side, and the process noise.
         noise = noise_in_mode(plant, u, second_moments_at_start(self.plant))
 
-        def into(j: jax.Array, chances: jax.Array, law: jax.Array) -> Columns:
-            moved = Columns(jax.vmap(to)(j - rows, errors, x), weights)
-            own = Columns(kron(jnp.append(j, 1.0)[:, None], noise.matrix), law * noise.weights)
-            return triangularise(join_columns(side_by_side(moved, chances), own))
+        def collect_into(one_j: jax.Array, chances: jax.Array, probability: jax.Array) -> Columns:
+            """Return E[q+ q+' 1{mode j}], from the chances of i -> j and the probability of j."""
+            moved = Columns(jax.vmap(move_columns)(one_j - rows, errors, x), weights)
+            process = Columns(kron(jnp.append(one_j, 1.0)[:, None], noise.matrix), probability * noise.weights)
+            return triangularise(join_columns(side_by_side(moved, chances), process))
 
-        moments = jax.vmap(into)(jnp.eye(modes), rows.T, law)
+        moments = jax.vmap(collect_into)(jnp.eye(modes), rows.T, law)
         mean = predict_by_mode(state.mean[:, None], move, rows)[:, 0]
         return _make_belief(mean, moments, centre, jnp.asarray(True))
 
@@ -168,20 +168,15 @@ class SideInformationFilter(AbstractSizedFilter):
         links = jax.tree.map(
             lambda part: jnp.asarray(part)[:, pattern], (channel.mean, channel.gain_spread, channel.noise)
         )
-        after, innovations, innovation = _project_on_data(
-            prior,
-            excess,
-            _describe_received(
-                prior, sensor, signal_size_at_start(sensor, second_moments_at_start(self.plant)), *links
-            ),
-            z,
-        )
+        size = signal_size_at_start(sensor, second_moments_at_start(self.plant))
+        received = _describe_received(prior, sensor, size, *links)
+        after, innovations, innovation = _project_on_data(prior, excess, received, z)
         likelihood = innovations.log_density(arrived, jnp.abs(z) + jnp.abs(innovation.mean))
         value = jnp.where(arrived, innovation.mean, jnp.nan)
         covariance = jnp.where(arrived[:, None] & arrived, innovation.covariance, jnp.nan)
         if self.flagged:
-            nis, covariance = append_flag(covariance, flag)
-            value = jnp.append(value, nis)
+            flag_innovation, covariance = append_flag(covariance, flag)
+            value = jnp.append(value, flag_innovation)
         return after, Innovation(value, covariance, likelihood)
 
     @estimates
@@ -237,12 +232,14 @@ def _describe_received(
 ) -> ReceivedModel:
     """Return what is received of zeta: the output matrix, the mean output, and the noise in each mode.
 
+    `size` (p,): of the numbers that are summed in y, for rounding. `gains`, `gain_spread`, `link`: the channel by mode.
     Cov(z | zeta) in mode j is T_j(E[y y' 1{j}]) + P(j) (Hbar_j R~ Hbar_j' + Cov n_j), and the rounding of z.
     """
     (measure, noise), (_, x, weights) = centred_measurement(sensor, state.centre), _split_columns(state)
     law = _mode_probabilities(x, weights)
 
-    def noise_of(gain: jax.Array, spread: jax.Array, link: Columns, x: Columns, p: jax.Array) -> Columns:
+    def describe_noise(gain: jax.Array, spread: jax.Array, link: Columns, x: Columns, p: jax.Array) -> Columns:
+        """Return the noise of z in one mode, of probability p."""
         sent = x.through(measure).covariance + p * noise
         plain = join_columns(sensor.noise.columns.through(gain[:, :-1]), link).times(p)
         rounding = rounding_of((jnp.abs(gain[:, :-1]) @ square_root(size)) ** 2).times(p)
@@ -251,15 +248,16 @@ def _describe_received(
     # Output matrix of zeta less the mean output; modes of probability zero have none.
     output, common = subtract_mean_output(gains @ measure, law)
     output = concatenate_modes(jnp.where(law[:, None, None] > 0, output, 0.0))
-    return ReceivedModel(output, common, jax.vmap(noise_of)(gains, gain_spread, link, Columns(x, weights), law))
+    return ReceivedModel(output, common, jax.vmap(describe_noise)(gains, gain_spread, link, Columns(x, weights), law))
 
 
 def _project_on_data(
     state: SideInformationBelief, excess: jax.Array, received: ReceivedModel, z: jax.Array
 ) -> tuple[SideInformationBelief, Innovations, PredictedInnovation]:
-    """Project zeta on (1, s, z): what these say of e goes from e to s, column by column.
+    """Project zeta on (1, s, z): what these say of the error e goes from e to the estimate s.
 
-    Before the side information (1, s) said nothing of e: what they say now is by what the weights grew, `excess`.
+    Before the side information (1, s) said nothing of e: what they say now is by what the weights grew, `excess`
+    (M, q). Returns the state after, the innovations of z in turn, and z's innovation with its covariance.
     """
     errors, x, weights = _split_columns(state)
     m, count, modes, arrived = len(z), len(state.mean), len(weights), ~jnp.isnan(z)
@@ -285,8 +283,8 @@ def _project_on_data(
     rows, values, variances = gram_schmidt_first(rows, values, weights, m)
     innovations = Innovations(values[:m], variances, jnp.diagonal(expected.covariance))
     # Factors of each mode.
-    left = jnp.moveaxis(rows[m:].reshape(count, modes, -1), 1, 0)
-    moments = jax.vmap(triangularise)(Columns(jnp.concatenate([left, x], axis=1), weights.reshape(modes, -1)))
+    remaining = jnp.moveaxis(rows[m:].reshape(count, modes, -1), 1, 0)
+    moments = jax.vmap(triangularise)(Columns(jnp.concatenate([remaining, x], axis=1), weights.reshape(modes, -1)))
     return _make_belief(-values[m:], moments, state.centre, state.moved), innovations, expected
 
 
@@ -299,9 +297,9 @@ def _join_modes(*parts: jax.Array) -> jax.Array:
 def gram_schmidt_first(
     rows: jax.Array, numbers: jax.Array, weights: jax.Array, count: int
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Weighted Gram-Schmidt: orthogonalise all rows against the first `count`, in turn, with the same on `numbers`.
+    """Orthogonalise all rows against the first `count` in turn, by weighted Gram-Schmidt, and do the same to `numbers`.
 
-    Returns rows, numbers and the variances (count,) of the first ones given those above them.
+    Returns: rows, numbers, and the variances (count,) of the first rows given those above them.
     """
     variances = []
     for i in range(count):
@@ -359,7 +357,7 @@ def side_information_filter(
 
 @cache_by_object
 def _describe_channel_by_mode(channel: Channel) -> tuple[Float[Array, " M"], list[SideInformation], bool]:
-    """Describe a channel: modes' initial probabilities, moments at each step, and whether all is known."""
+    """Return the modes' initial probabilities, the channel by mode at each step, and whether all laws are known."""
     steps = [joint_modes(c) for c in unstack(channel)]
     is_known = all(m.corner_count() == 1 for step in steps for m in step.maps) and not uncertain_chain(channel)
     return steps[0].initial, describe_by_pattern(steps, np.ones((len(steps[0].initial), 1))), is_known

@@ -84,7 +84,7 @@ class UncertainModalFilter(AbstractJointModalFilter):
         return UncertainBelief(after, second, centre, law, low, high, jnp.asarray(True))
 
     def _chain_and_radius(self, state: UncertainBelief, k: Step) -> tuple[jax.Array, jax.Array]:
-        """Chain of the modes and the radius of its entries; before the first prediction the mode stays as it is."""
+        """Return the modes' transition matrix and the radius of its entries; before the first prediction I and 0."""
         channel = at(self.channel, k)
         rows = jnp.where(state.moved, jnp.asarray(channel.transition), jnp.eye(len(state.law)))
         return rows, jnp.where(state.moved, jnp.asarray(channel.radius), 0.0)
@@ -93,24 +93,22 @@ class UncertainModalFilter(AbstractJointModalFilter):
         self, state: UncertainBelief, u: ArrayLike, k: Step
     ) -> tuple[jax.Array, jax.Array, Columns]:
         """Return F L, b, and the columns of (1 + 1/b) D + W, of Sigma- = (1 + b) F Sigma F' + (1 + 1/b) D + W."""
-        move, (rows, radius) = (
-            centred_transition(at(self.plant, k), u, state.centre)[0],
-            self._chain_and_radius(state, k),
-        )
+        move, _, _ = centred_transition(at(self.plant, k), u, state.centre)
+        rows, radius = self._chain_and_radius(state, k)
         # Bounds on Cov(1{next} | i) and on Delta_i Delta_i', over all laws of the mode.
         carried = move @ state.second @ move.T
-        chosen, wandering = (
+        of_jumps, of_chain = (
             _bound_mean(matrices, *_find_middle_law(state.low, state.high)) for matrices in _bound_moves(rows, radius)
         )
         # Young's inequality, b = root(tr D / tr F Sigma F').
         root, weights = predict_by_mode(state.gaussian.root, move, rows), state.gaussian.variances
-        young = jnp.sqrt(_divide_or_zero(jnp.trace(wandering) * jnp.trace(carried), jnp.sum(root**2 @ weights)))
-        wide = chosen + jnp.where(young > 0, 1 + 1 / jnp.where(young > 0, young, 1.0), 0.0) * wandering
+        young = jnp.sqrt(_divide_or_zero(jnp.trace(of_chain) * jnp.trace(carried), jnp.sum(root**2 @ weights)))
+        of_both = of_jumps + jnp.where(young > 0, 1 + 1 / jnp.where(young > 0, young, 1.0), 0.0) * of_chain
         # Columns of (1 + 1 / b) D and of the bound W on the covariance of the noise.
         low, high = _bound_next_law(rows, radius, state.low, state.high)
-        among = separate_modes(jnp.einsum("jl,ab->jalb", wide[:-1, :-1], carried))
-        own = self.process_noise_by_mode(u, k, factor_spread(_bound_diagonal(low, high)))
-        return root, young, join_columns(among, own)
+        by_modes = separate_modes(jnp.einsum("jl,ab->jalb", of_both[:-1, :-1], carried))
+        of_process = self.process_noise_by_mode(u, k, factor_spread(_bound_diagonal(low, high)))
+        return root, young, join_columns(by_modes, of_process)
 
     @corrects
     def correct(self, state: UncertainBelief, z: ArrayLike, k: Step = 0) -> tuple[UncertainBelief, Innovation]:
@@ -128,7 +126,7 @@ class UncertainModalFilter(AbstractJointModalFilter):
         return state._replace(gaussian=after), innovation
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return the law of zeta before the step; the filter's bound is not proved for smoothed estimates."""
+        """Return the smoother step of zeta+ = F zeta + noise; nominal, as the bound is not proved for smoothing."""
         slopes, young, fresh = self._transition_factors(step.before, step.u, step.k)
         noise = triangularise(join_columns(Columns(slopes, young * step.before.gaussian.variances), fresh))
         moved, projection = (slopes, noise), self._projection_to_state()
@@ -141,17 +139,17 @@ def _divide_or_zero(numerator: jax.Array, denominator: jax.Array) -> jax.Array:
 
 
 def _bound_moves(rows: jax.Array, radius: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Bound Cov(1{next} | i) and Delta_i Delta_i', for each mode i and every Delta_i.
+    """Return bounds on Cov(1{next} | i) and on Delta_i Delta_i' (M, M, M), for each mode i and every Delta_i.
 
     Cov = sum_j (pi_j + Delta_j)(e_j - pi)(e_j - pi)' - Delta Delta'; and Delta Delta' <= P diag(r_j sum r) P, with P
     the projection that removes the mean, since Delta = P Delta and |Delta_j Delta_l| <= r_j r_l.
     """
     modes = len(rows)
-    apart = jnp.eye(modes)[None] - rows[:, None, :]  # [i, j] = e_j - pi_i
-    chosen = jnp.einsum("ij,ija,ijb->iab", rows + radius, apart, apart)
-    centred = jnp.eye(modes) - 1 / modes
+    difference = jnp.eye(modes)[None] - rows[:, None, :]  # [i, j] = e_j - pi_i
+    of_jumps = jnp.einsum("ij,ija,ijb->iab", rows + radius, difference, difference)
+    centring = jnp.eye(modes) - 1 / modes  # P
     sizes = radius * jnp.sum(radius, axis=1, keepdims=True)
-    return chosen, jnp.einsum("aj,ij,jb->iab", centred, sizes, centred)
+    return of_jumps, jnp.einsum("aj,ij,jb->iab", centring, sizes, centring)
 
 
 def _find_middle_law(low: jax.Array, high: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -162,14 +160,14 @@ def _find_middle_law(low: jax.Array, high: jax.Array) -> tuple[jax.Array, jax.Ar
 
 
 def _bound_mean(matrices: jax.Array, middle: jax.Array, reach: jax.Array) -> jax.Array:
-    """Bound sum_i p_i X_i for all laws p: sum_i middle_i X_i + sum_i reach_i |X_i - mean of all|."""
+    """Return a bound on sum_i p_i X_i for all laws p: sum_i middle_i X_i + sum_i reach_i |X_i - mean of all|."""
     values, vectors = jax.vmap(eigh)(matrices - jnp.mean(matrices, axis=0))
     sizes = (vectors * jnp.abs(values)[:, None, :]) @ vectors.swapaxes(1, 2)
     return jnp.einsum("i,iab->ab", middle, matrices) + jnp.einsum("i,iab->ab", reach, sizes)
 
 
 def _bound_diagonal(low: jax.Array, high: jax.Array) -> jax.Array:
-    """Bound diag(p) for all laws p, tight in the direction of x, which is that of equal entries.
+    """Return a bound on diag(p) for all laws p, tight in the direction of x, which is that of equal entries.
 
     delta = p - middle sums to 0, so with u = (1, ..., 1) / root M and P = I - u u':
     diag(delta) = P diag(delta) P + u d' + d u' with d = delta / root M, and u d' + d u' <= e u u' + d d' / e.
@@ -185,20 +183,20 @@ def _bound_diagonal(low: jax.Array, high: jax.Array) -> jax.Array:
 
 
 def _bound_next_law(rows: jax.Array, radius: jax.Array, low: jax.Array, high: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Bound every mode's next probability over the laws between `low` and `high`."""
+    """Return the least and the greatest probability of every mode one step later, over laws between low and high."""
     least, most = jnp.clip(rows - radius, 0.0, 1.0), jnp.clip(rows + radius, 0.0, 1.0)
-    return -jax.vmap(_largest_payoff, (1, None, None))(-least, low, high), jax.vmap(_largest_payoff, (1, None, None))(
-        most, low, high
-    )
+    largest_by_mode = jax.vmap(_largest_payoff, (1, None, None))
+    return -largest_by_mode(-least, low, high), largest_by_mode(most, low, high)
 
 
 def _largest_payoff(payoff: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
     """Return max p payoff over low <= p <= high, sum p = 1: the remaining mass goes to the largest payoffs first."""
+    # earlier[i, j]: i is served before j, by payoff and then by number.
     number = jnp.arange(len(payoff))
     earlier = (payoff[:, None] > payoff) | ((payoff[:, None] == payoff) & (number[:, None] < number))
     room = high - low
-    given = jnp.clip(1 - jnp.sum(low) - room @ earlier, 0.0, room)
-    return (low + given) @ payoff
+    added = jnp.clip(1 - jnp.sum(low) - room @ earlier, 0.0, room)
+    return (low + added) @ payoff
 
 
 def uncertain_modal_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> UncertainModalFilter:

@@ -14,7 +14,7 @@ from jax.extend import core
 
 from heliograph.numerics.float64 import in_float64
 
-KNOWN, GIVEN, AFFINE, OTHER = -1, 0, 1, 2
+KNOWN, GIVEN, AFFINE, OTHER = -1, 0, 1, 2  # degrees, in their order
 MOVES = ("reshape", "broadcast_in_dim", "transpose", "squeeze", "slice", "concatenate", "rev", "copy", "expand_dims",
          "split", "stack", "unstack")  # fmt: skip
 LOOKUPS = ("gather", "dynamic_slice")  # the first operand is moved, by indices
@@ -46,8 +46,8 @@ def is_affine(function: Callable[..., jax.Array], x: np.ndarray, places: Sequenc
     program = jax.make_jaxpr(function)(x, *rest)
     degree = np.full(x.shape, GIVEN)
     degree[list(places)] = AFFINE
-    given = [_Traced(np.full(np.shape(other), GIVEN)) for other in rest]
-    return all(np.all(result.degree <= AFFINE) for result in _trace_degrees(program, [_Traced(degree), *given]))
+    arguments = [_Traced(degree), *(_Traced(np.full(np.shape(argument), GIVEN)) for argument in rest)]
+    return all(np.all(result.degree <= AFFINE) for result in _trace_degrees(program, arguments))
 
 
 def _trace_degrees(program: core.ClosedJaxpr, arguments: Sequence[_Traced]) -> list[_Traced]:
@@ -56,6 +56,7 @@ def _trace_degrees(program: core.ClosedJaxpr, arguments: Sequence[_Traced]) -> l
     values.update(zip(program.jaxpr.constvars, map(_constant, program.consts), strict=True))
 
     def read(atom: Any) -> _Traced:
+        """Return the degrees of an operand: a literal number, or a result of an earlier operation."""
         return _constant(atom.val) if isinstance(atom, core.Literal) else values[atom]
 
     for equation in program.jaxpr.eqns:
@@ -65,31 +66,33 @@ def _trace_degrees(program: core.ClosedJaxpr, arguments: Sequence[_Traced]) -> l
 
 
 def _constant(value: Any) -> _Traced:
+    """Return the degrees of a known array."""
     return _Traced(np.full(np.asarray(value).shape, KNOWN), value)
 
 
 def _degrees_of_operation(equation: Any, x: list[_Traced]) -> list[_Traced]:
-    """Return the degrees of the results of one operation."""
+    """Return the degrees of the results of one operation on operands x."""
     name, params = equation.primitive.name, equation.params
+
+    def compute(arrays: list[Any]) -> list[Any]:
+        """Return the results of the operation on these arrays."""
+        results = equation.primitive.bind(*(jnp.asarray(array) for array in arrays), **params)
+        return list(results) if equation.primitive.multiple_results else [results]
+
     if name in CALLS:
-        inner = params[CALLS[name]]
-        return _trace_degrees(inner, x)
-    if all(one.value is not None for one in x):
-        values = equation.primitive.bind(*(jnp.asarray(one.value) for one in x), **params)
-        return [_constant(value) for value in (values if equation.primitive.multiple_results else [values])]
+        return _trace_degrees(params[CALLS[name]], x)
+    # Known operands give known results, given ones given results.
+    if all(operand.value is not None for operand in x):
+        return [_constant(value) for value in compute([operand.value for operand in x])]
     shapes = [out.aval.shape for out in equation.outvars]
-    if all(np.all(one.degree <= GIVEN) for one in x):
+    if all(np.all(operand.degree <= GIVEN) for operand in x):
         return [_Traced(np.full(shape, GIVEN)) for shape in shapes]
-    if name in MOVES or (name in LOOKUPS and all(one.value is not None for one in x[1:])):
-        moved = (
-            [one.degree for one in x[:1]] + [one.value for one in x[1:]]
-            if name in LOOKUPS
-            else [one.degree for one in x]
-        )
-        degrees = equation.primitive.bind(*(jnp.asarray(one) for one in moved), **params)
-        return [
-            _Traced(np.asarray(degree)) for degree in (degrees if equation.primitive.multiple_results else [degrees])
-        ]
+    # Operations that move numbers move their degrees alike.
+    if name in MOVES:
+        return [_Traced(np.asarray(degree)) for degree in compute([operand.degree for operand in x])]
+    if name in LOOKUPS and all(index.value is not None for index in x[1:]):
+        moved = compute([x[0].degree, *(index.value for index in x[1:])])
+        return [_Traced(np.asarray(degree)) for degree in moved]
     return [_Traced(np.broadcast_to(_degree_of_arithmetic(name, params, x), shape)) for shape in shapes]
 
 
@@ -120,14 +123,16 @@ def _degree_of_arithmetic(name: str, params: dict[str, Any], x: list[_Traced]) -
 
 
 def _of_product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the degrees of products of numbers of degrees a and b."""
     return np.where(np.minimum(a, b) <= GIVEN, np.maximum(a, b), OTHER)
 
 
 def _degree_of_contraction(a: _Traced, b: _Traced, dimensions: Any) -> np.ndarray:
     """Return the degrees of sums of products, in which a known zero takes its product away."""
 
-    def count(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-        return np.asarray(jax.lax.dot_general(one.astype(float), other.astype(float), dimensions))
+    def count(of_a: np.ndarray, of_b: np.ndarray) -> np.ndarray:
+        """Return for each sum how many of its products have both of these properties."""
+        return np.asarray(jax.lax.dot_general(of_a.astype(float), of_b.astype(float), dimensions))
 
     affine = count(a.degree >= AFFINE, ~b.is_zero) + count(~a.is_zero, b.degree >= AFFINE)
     other = count(a.degree >= OTHER, ~b.is_zero) + count(~a.is_zero, b.degree >= OTHER)

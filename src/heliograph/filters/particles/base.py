@@ -20,7 +20,7 @@ State = TypeVar("State", bound=tuple[Any, ...])
 
 
 class Resampled(NamedTuple):
-    """Which particles go on (N,), and their log weights (N,)."""
+    """Result of a resampling: numbers of the particles that go on (N,), and their log weights (N,)."""
 
     which: jax.Array
     log_weight: jax.Array
@@ -56,10 +56,10 @@ class AbstractStateParticleFilter(AbstractSizedFilter):
     def resampled(self, log_weight: jax.Array, key: jax.Array) -> Resampled:
         """Resample systematically where the effective number is too small; else all particles go on as they are."""
         weight = jax.nn.softmax(log_weight)
-        poor = effective_number(weight) < jnp.asarray(self.resample) * self.particles
-        start, every = jax.random.uniform(key, (), weight.dtype), jnp.arange(self.particles)
-        which = jax.lax.cond(poor, resample_systematically, lambda *_: every, weight, start)
-        return Resampled(which, jnp.where(poor, 0.0, log_weight))
+        too_few = effective_number(weight) < jnp.asarray(self.resample) * self.particles
+        start, all_particles = jax.random.uniform(key, (), weight.dtype), jnp.arange(self.particles)
+        which = jax.lax.cond(too_few, resample_systematically, lambda *_: all_particles, weight, start)
+        return Resampled(which, jnp.where(too_few, 0.0, log_weight))
 
 
 def keep_unused(used: jax.Array, updated: State, before: State) -> State:

@@ -33,19 +33,20 @@ def build_partly_drawn(
 ) -> PartlyDrawnFilter:
     """Return the particle filter that draws modes and the named states (None: all), the rest a Gaussian in each."""
     start = models_of(instance("plant", first(plant), AbstractPlant, "a plant"))[0]
-    for senses in models_of(instance("sensor", first(sensor), AbstractSensor, "a sensor")):
-        senses.refuse_inputs("particle_filter")
-        check_link(senses, first(channel), len(start.states), moments=False)
-    chosen = _places_of(start, drawn)
-    _check_linear_given(plant, sensor, chosen)
-    # One chain of the modes of plant, sensor and links; the density of z in each, at each step.
+    for model in models_of(instance("sensor", first(sensor), AbstractSensor, "a sensor")):
+        model.refuse_inputs("particle_filter")
+        check_link(model, first(channel), len(start.states), moments=False)
+    drawn_places = _places_of(start, drawn)
+    _check_linear_given(plant, sensor, drawn_places)
+    # One chain of the modes of plant, sensor and links: joint.beside has plant and sensor in each joint mode.
     joint = joint_modes(first(channel), nodes, beside=(first(plant), first(sensor)))
-    which = find_models("sensor", sensor, [own for _, own in joint.beside])
+    sensor_modes = find_models("sensor", sensor, [model for _, model in joint.beside])
+    # The density of z in each mode, for each step that sensor or channel has.
     steps = steps_covered((sensor, channel)) or 1
     densities = []
-    for own, link in zip(list_steps(sensor, steps), list_steps(channel, steps), strict=True):
+    for sensor_of_step, link in zip(list_steps(sensor, steps), list_steps(channel, steps), strict=True):
         maps = joint_modes(link, nodes, beside=(first(plant), first(sensor))).maps
-        densities.append(find_received_density([models_of(own)[i] for i in which], maps))
+        densities.append(find_received_density([models_of(sensor_of_step)[i] for i in sensor_modes], maps))
     return PartlyDrawnFilter(
         plant=drop_names(plant),
         sensor=drop_names(sensor),
@@ -54,10 +55,10 @@ def build_partly_drawn(
         transition=joint.transition,
         resample=np.asarray(scalar("resample", resample, 0.0, 1.0)),
         observed_angles=find_received_angles(plant, sensor, channel),
-        plant_modes=find_models("plant", plant, [own for own, _ in joint.beside]),
-        sensor_modes=which,
-        order=(*chosen, *(i for i in range(len(start.states)) if i not in chosen)),
-        drawn=len(chosen),
+        plant_modes=find_models("plant", plant, [model for model, _ in joint.beside]),
+        sensor_modes=sensor_modes,
+        order=(*drawn_places, *(i for i in range(len(start.states)) if i not in drawn_places)),  # drawn ones first
+        drawn=len(drawn_places),
         particles=check_count("particles", particles),
         optimal=proposal == "optimal",
         seed=np.asarray(check_count("seed", seed, 0)),
@@ -77,7 +78,7 @@ def _places_of(start: AbstractPlant, drawn: Sequence[str] | None) -> tuple[int, 
 
 def _check_linear_given(plant: AnyPlant, sensor: AnySensor, drawn: tuple[int, ...]) -> None:
     """Raise ValueError unless, given the drawn states, the rest is Gaussian and moves and is measured linearly."""
-    for model in [one for step in unstack(plant) for one in models_of(step)]:
+    for model in [model for step in unstack(plant) for model in models_of(step)]:
         rest = [i for i in range(len(model.states)) if i not in drawn]
         names = [model.states[i] for i in rest]
         if isinstance(model.noise, AbstractNoise) and not isinstance(model.noise, Gaussian):
@@ -91,7 +92,7 @@ def _check_linear_given(plant: AnyPlant, sensor: AnySensor, drawn: tuple[int, ..
         if not isinstance(model, LinearPlant) and not is_affine(model.transition, model.initial_mean, rest, u):
             expected = f"states given which the plant is linear in {names}, as its operations show (draw more)"
             raise fail("drawn", expected, f"{[model.states[i] for i in drawn]}")
-        for sensing in [one for step in unstack(sensor) for one in models_of(step)]:
+        for sensing in [model for step in unstack(sensor) for model in models_of(step)]:
             if not isinstance(sensing, LinearSensor) and not is_affine(sensing.measure, model.initial_mean, rest):
                 expected = f"states given which the sensor is linear in {names}, as its operations show (draw more)"
                 raise fail("drawn", expected, f"{[model.states[i] for i in drawn]}")

@@ -13,33 +13,37 @@ LOG_TURN = float(np.log(2 * np.pi))
 
 
 def slopes_given(function: Callable[[jax.Array], jax.Array], x: Gaussian, drawn: int) -> tuple[jax.Array, jax.Array]:
-    """Return f(mean), and the slopes (m, n) of f in xi of x = m + L xi, 0 in the first `drawn` entries: known ones."""
+    """Return f(mean), and the slopes (m, n) of f in xi of x = m + L xi; `drawn`: leading states that are known.
 
-    def of_rest(rest: jax.Array) -> jax.Array:
-        return function(jnp.concatenate([x.mean[:drawn], rest]))
+    The slopes in the drawn states are 0, since these have no variance.
+    """
 
-    rest = x.mean[drawn:]
-    slopes = jax.jacfwd(of_rest)(rest) @ x.root[drawn:, drawn:]
-    return of_rest(rest), jnp.pad(slopes, ((0, 0), (drawn, 0)))
+    def of_others(others: jax.Array) -> jax.Array:
+        """Return f of the states that are not drawn, with the drawn ones at their means."""
+        return function(jnp.concatenate([x.mean[:drawn], others]))
+
+    others = x.mean[drawn:]
+    slopes = jax.jacfwd(of_others)(others) @ x.root[drawn:, drawn:]
+    return of_others(others), jnp.pad(slopes, ((0, 0), (drawn, 0)))
 
 
 def condition_on_draw(x: Gaussian, draw: jax.Array) -> Gaussian:
-    """Return x given its leading states, which are drawn: their means plus L sqrt(d) times the draw (drawn,)."""
+    """Return x given its leading states, drawn as mean + L sqrt(variance) draw; draw (drawn,) is standard normal."""
     drawn = len(draw)
     xi = square_root(x.variances[:drawn]) * draw
     return x._replace(mean=x.mean + x.root[:, :drawn] @ xi, variances=x.variances.at[:drawn].set(0.0))
 
 
 def find_certain(x: Gaussian, d: jax.Array) -> jax.Array:
-    """Return which of the leading states, given those before them, have no variance but rounding's (drawn,)."""
+    """Return which of the leading states d, given those before them, have no variance but rounding's (drawn,)."""
     drawn = len(d)
-    whole = x.root[:drawn, :drawn] ** 2 @ x.variances[:drawn] + d**2
-    certain: jax.Array = x.variances[:drawn] <= (UNITS * drawn * unit_of(d)) ** 2 * whole
+    second = x.root[:drawn, :drawn] ** 2 @ x.variances[:drawn] + d**2
+    certain: jax.Array = x.variances[:drawn] <= (UNITS * drawn * unit_of(d)) ** 2 * second
     return certain
 
 
 def condition_on_leading(x: Gaussian, d: jax.Array, certain: jax.Array) -> tuple[Gaussian, jax.Array]:
-    """Return x given its leading states d (drawn,), and log N(d) of those that are not certain given others."""
+    """Return x given its leading states d (drawn,), and log of their density; `certain` ones have none and count 0."""
     drawn = len(d)
     xi = decorrelate(x.root[:drawn, :drawn], (d - x.mean[:drawn])[:, None])[:, 0]
     variances = jnp.where(certain, 1.0, x.variances[:drawn])

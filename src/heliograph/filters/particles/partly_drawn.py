@@ -31,7 +31,8 @@ from heliograph.filters.particles.draws import (
     find_certain,
     slopes_given,
 )
-from heliograph.filters.particles.proposal import SAFE, noise_columns
+from heliograph.filters.particles.proposal import PRIOR_SHARE, noise_columns
+from heliograph.filters.particles.received_density import Atoms
 from heliograph.filters.particles.resampling import draw_normals, effective_number, fold_in_bits
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.modes_of_motion import models_of
@@ -105,12 +106,12 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
     def init(self) -> PartlyDrawn:
         """Return the law of x_0 in every particle; its drawn states are drawn unless a linear plant moves them."""
         start, n, modes = models_of(at(self.plant, 0))[0], self.particles, len(self.initial)
-        key, own = jax.random.split(jax.random.PRNGKey(self.seed))
+        key, key_of_states = jax.random.split(jax.random.PRNGKey(self.seed))
         order = np.array(self.order)
         x = from_covariance(start.initial_mean[order], start.initial_covariance[order][:, order])
         x = jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf)[None], n, axis=0), x)
         if not self._is_linear(models_of(at(self.plant, 0))):
-            x = self._draw_states(x, own)
+            x = self._draw_states(x, key_of_states)
         log_mode = jnp.tile(jnp.log(jnp.asarray(self.initial)), (n, 1))
         return PartlyDrawn(_repeat_for_modes(x, modes), log_mode, jnp.zeros(n), key, jnp.asarray(False))
 
@@ -118,18 +119,17 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
     def predict(self, state: PartlyDrawn, u: Any = (), k: Step = 0) -> PartlyDrawn:
         """Resample where the effective number is too small, then move each particle's Gaussian by every mode's law."""
         plants, u = models_of(at(self.plant, k)), jnp.asarray(u)
-        key, choice, own, of_mode = jax.random.split(jax.random.fold_in(state.key, 0), 4)
+        key, key_of_choice, key_of_states, key_of_mode = jax.random.split(jax.random.fold_in(state.key, 0), 4)
         # What no measurement has drawn is drawn now; at the first step of a linear plant the start stays a Gaussian.
-        mode = draw_index(state.log_mode, jax.random.uniform(of_mode, (self.particles,), dtype=float))
-        every = jnp.arange(self.particles)
-        held: Gaussian = jax.tree.map(lambda leaf: leaf[every, mode], state.gaussian)
-        x = self._draw_states(held, own)
+        mode = draw_index(state.log_mode, jax.random.uniform(key_of_mode, (self.particles,), dtype=float))
+        in_mode: Gaussian = jax.tree.map(lambda leaf: leaf[jnp.arange(self.particles), mode], state.gaussian)
+        x = self._draw_states(in_mode, key_of_states)
         if self._is_linear(plants):
-            x = jax.tree.map(lambda new, old: jnp.where(state.moved, new, old), x, held)
-        which, log_weight = self.resampled(state.log_weight, choice)
+            x = jax.tree.map(lambda new, old: jnp.where(state.moved, new, old), x, in_mode)
+        which, log_weight = self.resampled(state.log_weight, key_of_choice)
         x, mode = jax.tree.map(lambda leaf: leaf[which], (x, mode))
         # The law after the step in each mode that may follow.
-        by_model = [jax.vmap(lambda one, plant=plant: self._move(plant, one, u))(x) for plant in plants]
+        by_model = [jax.vmap(lambda particle, plant=plant: self._move(plant, particle, u))(x) for plant in plants]
         moved: Gaussian = jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=1)[:, self.plant_modes, ...], *by_model)
         chance = jnp.where(state.moved, jnp.asarray(self.transition)[mode], jnp.asarray(self.initial))
         return PartlyDrawn(moved, jnp.log(chance), log_weight, key, jnp.asarray(True))
@@ -139,20 +139,22 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         return all(isinstance(plant, LinearPlant) and not plant.circular for plant in plants)
 
     def _draw_states(self, x: Gaussian, key: jax.Array) -> Gaussian:
-        """Draw the drawn states of Gaussians (N, n): x given them."""
+        """Return Gaussians (N, n) given their drawn states, which are drawn here."""
         draws = draw_normals(key, (self.particles, self.drawn))
         return jax.vmap(condition_on_draw)(x, draws)
 
     def _move(self, plant: AbstractPlant, x: Gaussian, u: jax.Array) -> Gaussian:
-        """Return the law of f(x) + w; f is affine in what of x has a variance."""
+        """Return the law of f(x) + w of one particle; f is affine in what of x has a variance."""
         order = np.array(self.order)
-        noise, fixed = noise_columns(plant, u), 0 if self._is_linear([plant]) else self.drawn
+        # Of a linear plant the drawn states may have a variance still; of others they are known.
+        noise, known = noise_columns(plant, u), 0 if self._is_linear([plant]) else self.drawn
 
         def move(x: jax.Array) -> jax.Array:
+            """Return f(x), drawn states first in x and in the result."""
             return plant.transition(self._in_plants_order(x), u)[order]
 
-        mean, slopes = slopes_given(move, x, fixed)
-        spread = Columns(slopes[:, fixed:], x.variances[fixed:])
+        mean, slopes = slopes_given(move, x, known)
+        spread = Columns(slopes[:, known:], x.variances[known:])
         return from_columns(
             mean + plant.noise_mean()[order], join_columns(spread, Columns(noise.matrix[order], noise.weights))
         )
@@ -166,19 +168,16 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         """Draw mode and drawn states with z, weight each particle by p(z) p / q, and condition the rest on z."""
         z, sensors, density = jnp.asarray(z), models_of(at(self.sensor, k)), at(self.density, k)
         atoms, chance = density.given_arrivals(z)
-        overall = jax.vmap(lambda one: one.moments())(atoms)
-        received = Received(
-            z, jnp.asarray(atoms.weight), jnp.asarray(atoms.gain), jnp.asarray(atoms.offset),
-            jax.vmap(columns_of_each)(jnp.asarray(atoms.noise)), (*overall[:2], columns_of_each(overall[2])),
-        )  # fmt: skip
+        received = self._describe_received(z, atoms)
         # That nothing or only a part arrived says something of the mode.
         log_mode = state.log_mode + jnp.log(chance)
         before = jax.nn.logsumexp(jax.nn.log_softmax(state.log_weight)[:, None] + log_mode)
         key = fold_in_bits(state.key, z)
-        own, of_choice = jax.random.split(jax.random.fold_in(key, 2))
-        draws = draw_normals(own, (self.particles, self.drawn))
-        uniform = jax.random.uniform(of_choice, (self.particles, 3), dtype=float)
-        x, mode, log_ratio = jax.vmap(partial(self._weigh, sensors, received))(state.gaussian, log_mode, draws, uniform)
+        key_of_states, key_of_choice = jax.random.split(jax.random.fold_in(key, 2))
+        draws = draw_normals(key_of_states, (self.particles, self.drawn))
+        uniform = jax.random.uniform(key_of_choice, (self.particles, 3), dtype=float)
+        draw_and_weigh = jax.vmap(partial(self._draw_and_weigh, sensors, received))
+        x, mode, log_ratio = draw_and_weigh(state.gaussian, log_mode, draws, uniform)
         log_weight = state.log_weight + log_ratio
         density_of_z = jax.nn.logsumexp(jax.nn.log_softmax(state.log_weight) + log_ratio) - before
         # All weights zero: the row is not used.
@@ -193,6 +192,18 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         after = keep_unused(used, updated, state._replace(key=key))
         return after, self._innovation(sensors, received, state.gaussian, state.weight, log_mode, density_of_z)
 
+    def _describe_received(self, z: jax.Array, atoms: Atoms) -> Received:
+        """Return what arrived, with the atoms of each mode, and with one Gaussian in their place."""
+        gain, offset, noise = jax.vmap(lambda of_mode: of_mode.moments())(atoms)
+        return Received(
+            z=z,
+            weight=jnp.asarray(atoms.weight),
+            gain=jnp.asarray(atoms.gain),
+            offset=jnp.asarray(atoms.offset),
+            noise=jax.vmap(columns_of_each)(jnp.asarray(atoms.noise)),
+            overall=(gain, offset, columns_of_each(noise)),
+        )
+
     def _angles_in_order(self, plant: AbstractPlant) -> Angles:
         """Return the places of the angles, drawn states first."""
         return tuple(i for i, place in enumerate(self.order) if place in plant.angles)
@@ -204,7 +215,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
             return sensors[0].measure(position)
         return jnp.stack([sensor.measure(position) for sensor in sensors])[jnp.array(self.sensor_modes)[mode]]
 
-    def _weigh(
+    def _draw_and_weigh(
         self,
         sensors: Sequence[AbstractSensor],
         received: Received,
@@ -228,7 +239,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         """
         share = self._prior_share(sensors, received)
         modes = jnp.arange(len(self.initial))
-        posterior, alpha = jax.vmap(lambda j, own: self._linearised_posterior(sensors, received, j, own))(modes, x)
+        posterior, alpha = jax.vmap(lambda j, x_j: self._linearised_posterior(sensors, received, j, x_j))(modes, x)
         alpha = jnp.where(jnp.isnan(alpha), -jnp.inf, alpha) + log_mode
         possible = jnp.max(alpha) > -jnp.inf
         log_posterior_mode = alpha - jnp.where(possible, jax.nn.logsumexp(alpha), 0.0)
@@ -250,21 +261,26 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
 
     def _prior_share(self, sensors: Sequence[AbstractSensor], received: Received) -> float:
         """Return the share of particles that are drawn without z."""
-        exact = all(isinstance(sensor, LinearSensor) for sensor in sensors) and received.weight.shape[1] == 1
-        return 1.0 if not self.optimal else 0.0 if exact else SAFE
+        if not self.optimal:
+            return 1.0
+        is_exact = all(isinstance(sensor, LinearSensor) for sensor in sensors) and received.weight.shape[1] == 1
+        return 0.0 if is_exact else PRIOR_SHARE
 
     def _linearised_posterior(
         self, sensors: Sequence[AbstractSensor], received: Received, mode: jax.Array, x: Gaussian
     ) -> tuple[Gaussian, jax.Array]:
-        """Return x given z = gain h(x) + n in this mode, and log N(z): h by its slopes, n as one Gaussian."""
+        """Return x given z in this mode, and the log density of z, of z = gain h(x) + n.
+
+        h is linearised at the mean, in all states; n is one Gaussian in place of the atoms.
+        """
         gain, offset, noise = jax.tree.map(lambda leaf: leaf[mode], received.overall)
-        y, slopes = slopes_given(partial(self._measure, sensors, mode), x, 0)
+        y, slopes = slopes_given(partial(self._measure, sensors, mode), x, drawn=0)
         return self._condition(x, gain @ slopes, gain @ y + offset, noise, received.z)
 
     def _condition(
         self, x: Gaussian, slopes: jax.Array, expected: jax.Array, noise: Columns, z: jax.Array
     ) -> tuple[Gaussian, jax.Array]:
-        """Condition x on z = expected + slopes xi + v, and return log N(z) too."""
+        """Return x given z = expected + slopes xi + v, and the log density of z."""
         value = nearest(z - expected, jnp.zeros(len(z)), self.observed_angles)
         after, innovations = condition_on_observation(x, slopes, value, noise, ~jnp.isnan(z))
         return after, innovations.log_density(~jnp.isnan(z), jnp.abs(z) + jnp.abs(expected))
@@ -272,17 +288,18 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
     def _condition_on_atoms(
         self, sensors: Sequence[AbstractSensor], received: Received, mode: jax.Array, x: Gaussian, uniform: jax.Array
     ) -> tuple[Gaussian, jax.Array]:
-        """Condition x, of which the drawn states are known, on z: draw one atom of its density; log p(z) of all."""
+        """Return x, whose drawn states are known, given z and an atom drawn by its probability; and log p(z) of all."""
         y, slopes = slopes_given(partial(self._measure, sensors, mode), x, self.drawn)
 
-        def of_atom(gain: jax.Array, offset: jax.Array, noise: Columns) -> tuple[Gaussian, jax.Array]:
+        def condition_on_atom(gain: jax.Array, offset: jax.Array, noise: Columns) -> tuple[Gaussian, jax.Array]:
+            """Return x given z of one atom, and the log density of z."""
             return self._condition(x, gain @ slopes, gain @ y + offset, noise, received.z)
 
         atoms = jax.tree.map(lambda leaf: leaf[mode], (received.gain, received.offset, received.noise))
-        after, each = jax.vmap(of_atom)(*atoms)
-        each = jnp.where(jnp.isnan(each), -jnp.inf, each) + jnp.log(received.weight[mode])
-        atom = draw_index(each[None], uniform[None])[0]
-        return jax.tree.map(lambda leaf: leaf[atom], after), jax.nn.logsumexp(each)
+        after, densities = jax.vmap(condition_on_atom)(*atoms)
+        densities = jnp.where(jnp.isnan(densities), -jnp.inf, densities) + jnp.log(received.weight[mode])
+        atom = draw_index(densities[None], uniform[None])[0]
+        return jax.tree.map(lambda leaf: leaf[atom], after), jax.nn.logsumexp(densities)
 
     def _innovation(
         self,
@@ -296,19 +313,20 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         """Return z less its mean over particles, modes and atoms, to first order in h, its covariance, and log p(z)."""
         present = ~jnp.isnan(received.z)
 
-        def of_mode(mode: jax.Array, own: Gaussian) -> tuple[jax.Array, jax.Array]:
-            y, slopes = slopes_given(partial(self._measure, sensors, mode), own, 0)
+        def predict_in_mode(mode: jax.Array, x: Gaussian) -> tuple[jax.Array, jax.Array]:
+            """Return innovations (atoms, m) and their covariances of one particle in one mode."""
+            y, slopes = slopes_given(partial(self._measure, sensors, mode), x, drawn=0)
             gain = received.gain[mode]
             value = nearest(
                 received.z - gain @ y - received.offset[mode], jnp.zeros(len(present)), self.observed_angles
             )
-            spread = jax.vmap(lambda g: Columns(g @ slopes, own.variances).covariance)(gain)
+            spread = jax.vmap(lambda g: Columns(g @ slopes, x.variances).covariance)(gain)
             noise = jax.vmap(lambda matrix, weights: Columns(matrix, weights).covariance)(
                 *jax.tree.map(lambda leaf: leaf[mode], received.noise)
             )
             return value, jnp.where(present[:, None] & present, spread + noise, jnp.nan)
 
-        value, total = jax.vmap(jax.vmap(of_mode), in_axes=(None, 0))(jnp.arange(len(self.initial)), x)
+        value, total = jax.vmap(jax.vmap(predict_in_mode), in_axes=(None, 0))(jnp.arange(len(self.initial)), x)
         share = weight[:, None, None] * jax.nn.softmax(log_mode, axis=1)[:, :, None] * received.weight
         # Particles where h(x) is no number count not at all.
         valid = jnp.all(jnp.isfinite(value) | ~present, axis=-1)
@@ -331,16 +349,16 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         for i in places:
             size = share * jnp.exp(-covariances[:, i, i] / 2)
             mean = mean.at[i].set(jnp.arctan2(size @ jnp.sin(flat[:, i]), size @ jnp.cos(flat[:, i])))
-        apart = wrap_angles(flat - mean, places)
+        difference = wrap_angles(flat - mean, places)
         # Second moments about this mean.
-        center, covariance = moments_of_mixture(apart, covariances, share)
+        center, covariance = moments_of_mixture(difference, covariances, share)
         covariance = covariance + jnp.outer(center, center)
-        back = np.argsort(self.order)
+        plants_order = np.argsort(self.order)
         modes = jnp.sum(weight, axis=0) if len(self.initial) > 1 else None
-        return Estimate(mean[back], covariance[back][:, back], self.claim, modes)
+        return Estimate(mean[plants_order], covariance[plants_order][:, plants_order], self.claim, modes)
 
 
 def _repeat_for_modes(x: Gaussian, modes: int) -> Gaussian:
     """Return Gaussians (N, n) as those of every mode (N, M, n)."""
-    every: Gaussian = jax.tree.map(lambda leaf: jnp.repeat(leaf[:, None], modes, axis=1), x)
-    return every
+    repeated: Gaussian = jax.tree.map(lambda leaf: jnp.repeat(leaf[:, None], modes, axis=1), x)
+    return repeated

@@ -1,6 +1,7 @@
 """Where particles are drawn with a measurement: from the law of the noise given it, a tenth from the prior.
 
-Notation: x+ = m + G e, e ~ N(0, I), and z = M (h(m) + H G e) + c + r, r ~ N(0, R), to first order.
+Notation: x+ = m + G e, e ~ N(0, I), and z = M (h(m) + H G e) + c + r, r ~ N(0, R), to first order: m the `center`, G
+the `root` of the process noise, H the sensor's slopes, M the link's mean gain. G may be singular, R is regular.
 """
 
 from typing import NamedTuple
@@ -16,7 +17,7 @@ from heliograph.model.sensor import AbstractSensor, LinearSensor
 from heliograph.numerics.angle import Angles, nearest
 from heliograph.random_affine.noise import AbstractNoise
 
-SAFE = 0.1  # share of the proposal that is the prior: weights are then bounded, where h saturates too
+PRIOR_SHARE = 0.1  # of the proposal: weights are then bounded, where h saturates too
 LOG_TURN = float(np.log(2 * np.pi))
 
 
@@ -33,7 +34,7 @@ class Moved(NamedTuple):
 
 
 class Proposed(NamedTuple):
-    """Positions (N, n) that were drawn with the measurement, and log N(e; 0, I) / q(e) of each (N,)."""
+    """Positions (N, n) drawn with the measurement; corrections of the log weights, log N(e; 0, I) / q(e) (N,)."""
 
     position: jax.Array
     correction: jax.Array
@@ -44,41 +45,43 @@ def propose(
 ) -> Proposed:
     """Draw x = center + G e of each particle, e near what z says of it, and weigh it for not being drawn from N(0, I).
 
-    e is of q = N(C' S^-1 r, I - C' S^-1 C), its law given z, with C = M H G, S = C C' + R and r = z - E z: M the mean
-    gain of the link, H the slopes of the sensor, R the noise of z. In coordinates e of the plant's noise, so that its
-    covariance G G' may be singular; (I + C' R^-1 C)^-1 is the covariance of q in other words. Where the sensor is not
-    linear or the noise has several atoms, a share SAFE of q is N(0, I).
+    e is of q = N(C' S^-1 r, I - C' S^-1 C), its law given z, with C = M H G, S = C C' + R and r = z - E z. The
+    covariance of q is (I + C' R^-1 C)^-1 too. Where the sensor is not linear or the noise has several atoms, a share
+    PRIOR_SHARE of q is N(0, I).
 
     Returns:
         States, and log N(e; 0, I) - log q(e) of each.
     """
-    safe = 0.0 if isinstance(sensor, LinearSensor) and len(atoms.weight) == 1 else SAFE
+    is_exact = isinstance(sensor, LinearSensor) and len(atoms.weight) == 1
+    prior_share = 0.0 if is_exact else PRIOR_SHARE
     gain, offset, noise = atoms.moments()
     arrived = ~jnp.isnan(z)
     noise = jnp.where(arrived[:, None] & arrived, noise, jnp.eye(len(z)))
     count = moved.center.shape[:1]
-    chosen = jax.random.uniform(key, count, dtype=float) < safe if safe else jnp.zeros(count, bool)
+    from_prior = jnp.zeros(count, bool) if is_exact else jax.random.uniform(key, count, dtype=float) < prior_share
 
-    def one(center: jax.Array, draw: jax.Array, from_prior: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def propose_one(center: jax.Array, draw: jax.Array, from_prior: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return the position of one particle, and the correction of its log weight."""
         slope = jnp.asarray(sensor.matrix) if isinstance(sensor, LinearSensor) else jax.jacfwd(sensor.measure)(center)
         columns = jnp.where(arrived[:, None], gain @ slope @ moved.root, 0.0)
-        rest = nearest(z - gain @ sensor.measure(center) - offset, jnp.zeros(len(z)), angles)
+        innovation = nearest(z - gain @ sensor.measure(center) - offset, jnp.zeros(len(z)), angles)
         # The law of e given z, by its precision L L'.
         scaled = jnp.linalg.solve(noise, columns)
         lower = jnp.linalg.cholesky(jnp.eye(len(center)) + columns.T @ scaled)
         # As matrices, which are the same of all particles where the sensor is linear.
         kalman_gain = jax.scipy.linalg.cho_solve((lower, True), scaled.T)
         spread = jax.scipy.linalg.solve_triangular(lower.T, jnp.eye(len(center)), lower=False)
-        mean = kalman_gain @ jnp.where(arrived, rest, 0.0)
-        told = mean + spread @ draw
-        e = jnp.where(from_prior | ~jnp.all(jnp.isfinite(told)), draw, told)
+        mean = kalman_gain @ jnp.where(arrived, innovation, 0.0)
+        from_posterior = mean + spread @ draw
+        e = jnp.where(from_prior | ~jnp.all(jnp.isfinite(from_posterior)), draw, from_posterior)
         # log N(e; 0, I) - log q(e), without the constants that both have.
         log_prior = -e @ e / 2
-        log_told = -jnp.sum((lower.T @ (e - mean)) ** 2) / 2 + jnp.sum(jnp.log(jnp.diagonal(lower)))
-        log_q = log_told if not safe else jnp.logaddexp(jnp.log(1 - safe) + log_told, jnp.log(safe) + log_prior)
+        log_q = -jnp.sum((lower.T @ (e - mean)) ** 2) / 2 + jnp.sum(jnp.log(jnp.diagonal(lower)))
+        if not is_exact:
+            log_q = jnp.logaddexp(jnp.log(1 - prior_share) + log_q, jnp.log(prior_share) + log_prior)
         return center + moved.root @ e, jnp.where(jnp.isfinite(log_q), log_prior - log_q, 0.0)
 
-    return Proposed(*jax.vmap(one)(moved.center, moved.draws, chosen))
+    return Proposed(*jax.vmap(propose_one)(moved.center, moved.draws, from_prior))
 
 
 def noise_columns(plant: AbstractPlant, u: jax.Array) -> Columns:

@@ -44,19 +44,21 @@ class Atoms(Module):
         present = ~jnp.isnan(z)
         both = present[:, None] & present
 
-        def of_atom(gain: jax.Array, offset: jax.Array, noise: jax.Array) -> jax.Array:
+        def compute_log_density(gain: jax.Array, offset: jax.Array, noise: jax.Array) -> jax.Array:
+            """Return log N(z; gain y + offset, noise) of one atom (N,)."""
             expected = y @ gain.T + offset
             valid = jnp.all(jnp.isfinite(expected) | ~present, axis=1)
             value = nearest(z - expected, jnp.zeros(len(z)), angles)
             value = jnp.where(valid[:, None] & present, value, 0.0)
-            # Whitened by the factor of the noise, of what did not arrive the unit.
+            # Whitened by the factor of the noise; what did not arrive has variance 1.
             factor = jnp.linalg.cholesky(jnp.where(both, noise, jnp.eye(len(z))))
             white = value @ jax.scipy.linalg.solve_triangular(factor, jnp.eye(len(z)), lower=True).T
-            size = 2 * jnp.sum(jnp.log(jnp.diagonal(factor))) + LOG_TURN * jnp.sum(present)
-            return jnp.where(valid, -(jnp.sum(white**2, axis=1) + size) / 2, -jnp.inf)
+            log_determinant = 2 * jnp.sum(jnp.log(jnp.diagonal(factor))) + LOG_TURN * jnp.sum(present)
+            return jnp.where(valid, -(jnp.sum(white**2, axis=1) + log_determinant) / 2, -jnp.inf)
 
-        each = jax.vmap(of_atom)(jnp.asarray(self.gain), jnp.asarray(self.offset), jnp.asarray(self.noise))
-        total = jax.nn.logsumexp(jnp.log(jnp.asarray(self.weight))[:, None] + each, axis=0)
+        atoms = jnp.asarray(self.gain), jnp.asarray(self.offset), jnp.asarray(self.noise)
+        by_atom = jax.vmap(compute_log_density)(*atoms)
+        total = jax.nn.logsumexp(jnp.log(jnp.asarray(self.weight))[:, None] + by_atom, axis=0)
         return jnp.where(jnp.isnan(total), -jnp.inf, total)
 
     def moments(self) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -94,25 +96,26 @@ def find_received_density(
             of several, without noise.
     """
     by_mode = [{tuple(outcome.arrived): outcome for outcome in channel.list_outcomes()} for channel in channels]
-    sets = sorted({arrived for outcomes in by_mode for arrived in outcomes}, key=lambda one: (sum(one), one))
-    # A set that cannot arrive in a mode has a chance of 0 there, and any atoms: those of another.
-    listed = [
-        [_list_atoms(sensor, outcomes.get(arrived, next(iter(outcomes.values())))) for arrived in sets]
-        for sensor, outcomes in zip(sensors, by_mode, strict=True)
-    ]
-    most = max(len(atoms) for of_mode in listed for atoms in of_mode)
-    padded = [[_stack_atoms(atoms, most) for atoms in of_mode] for of_mode in listed]
+    sets = sorted({arrived for outcomes in by_mode for arrived in outcomes}, key=lambda flags: (sum(flags), flags))
+    # Atoms and chance by mode and set. A set that cannot arrive in a mode has a chance of 0, and atoms of another set.
+    atoms_by_mode, chance = [], []
+    for sensor, outcomes in zip(sensors, by_mode, strict=True):
+        any_outcome = next(iter(outcomes.values()))
+        atoms_by_mode.append([_list_atoms(sensor, outcomes.get(arrived, any_outcome)) for arrived in sets])
+        chance.append([outcomes[arrived].probability if arrived in outcomes else 0.0 for arrived in sets])
+    # Stacked along (mode, set, atom), with as many atoms everywhere.
+    most = max(len(atoms) for of_mode in atoms_by_mode for atoms in of_mode)
+    padded = [[_stack_atoms(atoms, most) for atoms in of_mode] for of_mode in atoms_by_mode]
     stacked = [jax.tree.map(lambda *leaves: np.stack(leaves), *of_mode) for of_mode in padded]
-    chance = [[outcomes[one].probability if one in outcomes else 0.0 for one in sets] for outcomes in by_mode]
     return ReceivedDensity(
-        np.array(sets, dtype=bool),
-        np.array(chance, dtype=float),
-        jax.tree.map(lambda *leaves: np.stack(leaves), *stacked),
+        present=np.array(sets, dtype=bool),
+        chance=np.array(chance, dtype=float),
+        atoms=jax.tree.map(lambda *leaves: np.stack(leaves), *stacked),
     )
 
 
 def _list_atoms(sensor: AbstractSensor, outcome: Outcome) -> list[Component]:
-    """List the atoms of one set of arrivals, each with noise in all that arrives."""
+    """Return the atoms of one set of arrivals; raise unless each has noise in all that arrives."""
     outputs = len(sensor.outputs)
     received = GainAndNoise(Constant(1.0), np.eye(outputs), sensor.noise)
     try:

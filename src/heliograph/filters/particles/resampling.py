@@ -11,7 +11,7 @@ MANY = 10_000  # normal numbers, more than a program of native code draws at onc
 
 
 def invert_distribution(law: jax.Array, uniform: jax.Array) -> jax.Array:
-    """Invert each distribution function at a uniform number: the index that it draws."""
+    """Return the index that a uniform number draws by the law: where the distribution function passes the number."""
     return jnp.searchsorted(jnp.cumsum(law)[:-1], uniform).astype(int)
 
 
@@ -21,10 +21,11 @@ def resample_systematically(weight: jax.Array, start: jax.Array) -> jax.Array:
 
 
 def draw_normals(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
-    """Draw standard normal numbers for particles; of MANY on in single precision, two from each 64 bits.
+    """Return standard normal numbers.
 
-    Those have 2^23 values, at most 5.3, and take a third of the time. XLA computes all programs that draw so many;
-    of fewer the values must be those of native code too, to the last digits.
+    From MANY numbers on in single precision, two from each 64 random bits: 2^23 distinct values, |x| <= 5.3, in a
+    third of the time. Only XLA runs draws of that size; smaller ones run in native code too, and must agree to the
+    last digit.
     """
     size = math.prod(shape)
     if size < MANY:

@@ -64,8 +64,8 @@ class StateParticleFilter(AbstractStateParticleFilter):
     def init(self) -> StateParticles:
         """Draw the particles from the law of x_0."""
         plant, n = at(self.plant, 0), self.particles
-        key, own = jax.random.split(jax.random.PRNGKey(self.seed))
-        x = jax.vmap(plant.sample_initial)(jax.random.split(own, n))
+        key, key_of_start = jax.random.split(jax.random.PRNGKey(self.seed))
+        x = jax.vmap(plant.sample_initial)(jax.random.split(key_of_start, n))
         size = x.shape[1]
         law = Moved(x, jnp.zeros((size, size)), jnp.zeros((n, size))) if self.optimal else None
         return StateParticles(x, jnp.zeros(n), law, key, jnp.asarray(False))
@@ -74,20 +74,21 @@ class StateParticleFilter(AbstractStateParticleFilter):
     def predict(self, state: StateParticles, u: ArrayLike = (), k: Step = 0) -> StateParticles:
         """Resample where the effective number is too small, then move each particle with a noise of its own."""
         plant, u = at(self.plant, k), jnp.asarray(u)
-        key, choice, own = jax.random.split(jax.random.fold_in(state.key, 0), 3)
-        which, log_weight = self.resampled(state.log_weight, choice)
-        center = jax.vmap(lambda one: plant.transition(one, u))(state.position[which])
+        key, key_of_choice, key_of_noise = jax.random.split(jax.random.fold_in(state.key, 0), 3)
+        which, log_weight = self.resampled(state.log_weight, key_of_choice)
+        center = jax.vmap(lambda x: plant.transition(x, u))(state.position[which])
         if isinstance(plant.noise, AbstractNoise) and not isinstance(plant.noise, Gaussian):
-            noise = jax.vmap(lambda one: plant.sample_noise(one, u))(jax.random.split(own, self.particles))
+            keys = jax.random.split(key_of_noise, self.particles)
+            noise = jax.vmap(lambda key: plant.sample_noise(key, u))(keys)
             position = wrap_angles(center + noise, plant.angles)
             return StateParticles(position, log_weight, None, key, jnp.asarray(True))
-        draws = draw_normals(own, center.shape)
+        draws = draw_normals(key_of_noise, center.shape)
         center, root = center + plant.noise_mean(), _root_of(noise_columns(plant, u))
         position = wrap_angles(center + draws @ root.T, plant.angles)
-        law = self._law(plant, state, Moved(center, root, draws), u) if self.optimal else None
+        law = self._find_law_of_move(plant, state, Moved(center, root, draws), u) if self.optimal else None
         return StateParticles(position, log_weight, law, key, jnp.asarray(True))
 
-    def _law(self, plant: AbstractPlant, state: StateParticles, moved: Moved, u: jax.Array) -> Moved:
+    def _find_law_of_move(self, plant: AbstractPlant, state: StateParticles, moved: Moved, u: jax.Array) -> Moved:
         """Return the law of x+ of each particle; at the first step of a linear plant that of x_0 and w together.
 
         So a first measurement that is far more precise than x_0 leaves more than few of the particles.
@@ -95,10 +96,10 @@ class StateParticleFilter(AbstractStateParticleFilter):
         if not isinstance(plant, LinearPlant) or plant.deviation is not None or plant.circular:
             return moved
         start = at(self.plant, 0)
-        both = columns_of(start.initial_covariance).through(plant.transition_matrix(u))
+        start_moved = columns_of(start.initial_covariance).through(plant.transition_matrix(u))
         mean = plant.transition(jnp.asarray(start.initial_mean), u) + plant.noise_mean()
         center = jnp.where(state.moved, moved.center, mean)
-        root = jnp.where(state.moved, moved.root, _root_of(join_columns(both, noise_columns(plant, u))))
+        root = jnp.where(state.moved, moved.root, _root_of(join_columns(start_moved, noise_columns(plant, u))))
         return moved._replace(center=center, root=root)
 
     @corrects
@@ -115,7 +116,7 @@ class StateParticleFilter(AbstractStateParticleFilter):
             received = jax.vmap(sensor.measure)(position)
         likelihood = atoms.log_densities(received, z, self.observed_angles) + correction
         density = jax.nn.logsumexp(jax.nn.log_softmax(state.log_weight) + likelihood)
-        # Nothing is left to draw.
+        # The positions are drawn: no law is left to draw them from.
         law = None if state.law is None else state.law._replace(center=position, root=jnp.zeros_like(state.law.root))
         log_weight = relative_to_largest(state.log_weight + likelihood)
         used = ~jnp.all(jnp.isnan(z)) & (density > -jnp.inf)
@@ -137,10 +138,10 @@ class StateParticleFilter(AbstractStateParticleFilter):
         expected, present = jax.vmap(atoms.expected)(predicted), ~jnp.isnan(z)
         value = nearest(z - expected, jnp.zeros(len(z)), self.observed_angles).reshape(-1, len(z))
         value = nearest(value, value[jnp.argmax(weight)], self.observed_angles)
-        both = (weight[:, None] * jnp.asarray(atoms.weight)).ravel()
+        weight_of_both = (weight[:, None] * jnp.asarray(atoms.weight)).ravel()
         within = jnp.einsum("a,aij->ij", jnp.asarray(atoms.weight), jnp.asarray(atoms.noise))
         within = jnp.where(present[:, None] & present, within, jnp.nan)
-        return innovation_of_means(both, value, within, density)
+        return innovation_of_means(weight_of_both, value, within, density)
 
     @estimates
     def estimate(self, state: StateParticles) -> Estimate:
@@ -149,8 +150,8 @@ class StateParticleFilter(AbstractStateParticleFilter):
         mean = weight @ x
         for i in angles:
             mean = mean.at[i].set(jnp.arctan2(weight @ jnp.sin(x[:, i]), weight @ jnp.cos(x[:, i])))
-        apart = wrap_angles(x - mean, angles)
-        return Estimate(mean, (apart * weight[:, None]).T @ apart, self.claim)
+        deviation = wrap_angles(x - mean, angles)
+        return Estimate(mean, (deviation * weight[:, None]).T @ deviation, self.claim)
 
 
 def _root_of(columns: Columns) -> jax.Array:
@@ -163,10 +164,10 @@ def build_state_particles(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, particles: int, seed: int, proposal: str, resample: float
 ) -> StateParticleFilter:
     """Return the particle filter of the state, as `particle_filter` takes what it is made of."""
-    start, senses = instance("plant", first(plant), AbstractPlant, "a plant"), first(sensor)
-    instance("sensor", senses, AbstractSensor, "a sensor")
-    senses.refuse_inputs("particle_filter")
-    check_link(senses, first(channel), len(start.states), moments=False)
+    start, first_sensor = instance("plant", first(plant), AbstractPlant, "a plant"), first(sensor)
+    instance("sensor", first_sensor, AbstractSensor, "a sensor")
+    first_sensor.refuse_inputs("particle_filter")
+    check_link(first_sensor, first(channel), len(start.states), moments=False)
     if proposal not in PROPOSALS:
         raise fail("proposal", "'optimal' or 'prior'", repr(proposal))
     if proposal == "optimal":

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.event.truncated_normal import truncated_normal
-from heliograph.filters.words.edges import ADDED, ROOT, SMOOTH, Smooth
+from heliograph.filters.words.edges import ADDED, ROOT_TWO_PI, SMOOTH, Smooth
 from heliograph.filters.words.merged import sum_merged, sum_overloads
 from heliograph.filters.words.sums import FINE, REACH, Grid, Prior, Sums, multiply_bits, tabulate
 
@@ -23,16 +23,17 @@ NARROW = 1e-3  # of a deviation: the density is linear over a cell of this half 
 LEAST = 1e-3  # width, in deviations, of the dither by which edges are smoothed: less changes nothing
 
 
-def sum_by_edges(t: jax.Array, jumps: jax.Array, here: jax.Array, width: jax.Array, smooth: Smooth) -> Sums:
-    """Sum over the edges at t, across which L jumps upwards by `jumps`; L is `here` at t = 0.
+def sum_by_edges(t: jax.Array, jumps: jax.Array, at_zero: jax.Array, width: jax.Array, smooth: Smooth) -> Sums:
+    """Return the sums M, E[t L], E[t^2 L] of a likelihood L that is constant but for jumps at the edges t.
 
+    `jumps`: L above each edge less L below it. `at_zero`: L(0). `width`: of the dither, in deviations.
     M = L(0) + sum_{t >= 0} J Q(t) - sum_{t < 0} J Q(-t), E[t L] = sum J phi(t), E[t^2 L] = M + sum J t phi(t).
 
-    Shapes: t (edges,), jumps (..., edges), here (...), of several likelihoods at once.
+    Shapes: t (edges,), jumps (..., edges), at_zero (...), of several likelihoods at once.
     """
     sign = jnp.where(t < 0, -1.0, 1.0)
     step = smooth(jnp.abs(t), jnp.maximum(width, LEAST))
-    mass = here + jumps @ (sign * step.beyond)
+    mass = at_zero + jumps @ (sign * step.beyond)
     return Sums(mass, jumps @ step.density, mass + jumps @ (sign * step.slope))
 
 
@@ -56,9 +57,11 @@ def sum_neighbours(
     size = tables.shape[1]
 
     def weigh_bits_above(block: jax.Array) -> jax.Array:
+        """Return the likelihood of the bits above a block for each combination, times its probability."""
         return weights * jnp.stack([multiply_bits(pair[BLOCK:], start / size + block) for pair in pairs])
 
     def add_block(carried: tuple[Sums, jax.Array], block: jax.Array) -> tuple[tuple[Sums, jax.Array], None]:
+        """Add the edges of one block: those above each of its words."""
         total, above = carried
         following = weigh_bits_above(block + 1)
         likelihood = above @ tables
@@ -67,14 +70,15 @@ def sum_neighbours(
         jumps = jnp.concatenate([likelihood[..., 1:], after[..., None]], axis=-1) - likelihood
         edges = start + size * block + np.arange(-0.5, size)
         t = (grid.low + edges * grid.step - prior.mean) / prior.deviation
-        begun = (t[:-1] < 0) | ((block == 0) & (np.arange(size) == 0))
-        ended = (t[1:] < 0) & ((block < blocks - 1) | (np.arange(size) < size - 1))
-        here = jnp.sum(jnp.where(begun & ~ended, likelihood, 0.0), axis=-1)
-        sums = sum_by_edges(t[1:], jumps, here, grid.step / prior.deviation, SMOOTH[dither])
+        # The word that holds t = 0: it begins below and ends above, where the end words have no end.
+        begins_below = (t[:-1] < 0) | ((block == 0) & (np.arange(size) == 0))
+        ends_below = (t[1:] < 0) & ((block < blocks - 1) | (np.arange(size) < size - 1))
+        at_zero = jnp.sum(jnp.where(begins_below & ~ends_below, likelihood, 0.0), axis=-1)
+        sums = sum_by_edges(t[1:], jumps, at_zero, grid.step / prior.deviation, SMOOTH[dither])
         return (total.plus(sums), following), None
 
-    none = Sums(*jnp.zeros((3, *weights.shape[:-1])))
-    (sums, _), _ = jax.lax.scan(add_block, (none, weigh_bits_above(jnp.zeros(()))), jnp.arange(blocks, dtype=float))
+    zero = Sums(*jnp.zeros((3, *weights.shape[:-1])))
+    (sums, _), _ = jax.lax.scan(add_block, (zero, weigh_bits_above(jnp.zeros(()))), jnp.arange(blocks, dtype=float))
     return sums
 
 
@@ -86,9 +90,10 @@ def sum_window(
     start = jnp.floor((prior.mean - REACH * prior.deviation - grid.low) / (grid.step * 2**BLOCK)) * 2**BLOCK
     start = jnp.clip(start, 0.0, 2.0**grid.bits - count)
     sums = sum_neighbours(pairs, weights, start, WINDOW, grid, prior, dither)
+    # The word that was received, where it is none of these.
     outside = (received < start) | (received >= start + count)
-    own = weights @ jnp.stack([multiply_bits(pair, received) for pair in pairs])
-    return sums.plus(sum_cell(own * outside, received, grid, prior, dither))
+    likelihood = weights @ jnp.stack([multiply_bits(pair, received) for pair in pairs])
+    return sums.plus(sum_cell(likelihood * outside, received, grid, prior, dither))
 
 
 def sum_cell(likelihood: jax.Array, index: jax.Array, grid: Grid, prior: Prior, dither: str) -> Sums:
@@ -99,8 +104,8 @@ def sum_cell(likelihood: jax.Array, index: jax.Array, grid: Grid, prior: Prior, 
         t = jnp.where(jnp.array([True, False]) & (index <= 0), -40.0, t)
         t = jnp.where(jnp.array([False, True]) & (index >= 2.0**grid.bits - 1), 40.0, t)
     jumps = likelihood[..., None] * jnp.array([1.0, -1.0])
-    here = likelihood * ((t[0] < 0) & (t[1] >= 0))
-    return sum_by_edges(t, jumps, here, grid.step / prior.deviation, SMOOTH[dither])
+    at_zero = likelihood * ((t[0] < 0) & (t[1] >= 0))
+    return sum_by_edges(t, jumps, at_zero, grid.step / prior.deviation, SMOOTH[dither])
 
 
 class Change(NamedTuple):
@@ -120,18 +125,18 @@ def change_by_sums(sums: Sums) -> Change:
 
 
 def widen(prior: Prior, grid: Grid, dither: str) -> tuple[Prior, jax.Array]:
-    """Return the law of y + d, taken for Gaussian as D is small, and its variance in that of y."""
+    """Return the law of y + d, taken for Gaussian as the step D is small, and its variance over that of y."""
     wide = 1 + ADDED[dither] * (grid.step / prior.deviation) ** 2
     return Prior(prior.mean, prior.deviation * jnp.sqrt(wide)), wide
 
 
 def narrow(change: Change, wide: jax.Array) -> Change:
-    """Return what is known of y from what is known of y + d."""
+    """Return what is known of y from what is known of y + d, whose variance is `wide` times that of y."""
     return Change(change.log_mass, change.shift / jnp.sqrt(wide), 1 - (1 - change.ratio) / wide)
 
 
 def change_by_cell(index: jax.Array, grid: Grid, prior: Prior, dither: str) -> Change:
-    """Condition y on the word of number `index`, no bit of which can have flipped; `bits` 0: words without end."""
+    """Return what the word of number `index` does to y, where no bit can have flipped."""
     wider, wide = widen(prior, grid, dither)
     cut = narrow(_cut_to_cell(index, grid, wider), wide)
     if not ADDED[dither]:
@@ -145,7 +150,10 @@ def change_by_cell(index: jax.Array, grid: Grid, prior: Prior, dither: str) -> C
 
 
 def _cut_to_cell(index: jax.Array, grid: Grid, prior: Prior) -> Change:
-    """Condition y on its cell, by the ends; by the centre where the difference of ends would lose digits."""
+    """Return what it does to y to lie in a cell: by its ends, or its centre where their difference would lose digits.
+
+    The end cells of words of so many `bits` reach to infinity; bits 0: words without end.
+    """
     centre = (grid.low + index * grid.step - prior.mean) / prior.deviation
     half = grid.step / prior.deviation / 2
     lower, upper = centre - half, centre + half
@@ -154,7 +162,9 @@ def _cut_to_cell(index: jax.Array, grid: Grid, prior: Prior) -> Change:
         upper = jnp.where(index >= 2.0**grid.bits - 1, jnp.inf, upper)
     narrow_cell = (half * (1 + jnp.abs(centre)) < NARROW) & jnp.isfinite(lower) & jnp.isfinite(upper)
     cut = truncated_normal(jnp.where(narrow_cell, -1.0, lower), jnp.where(narrow_cell, 1.0, upper))
-    log_mass = -(centre**2) / 2 - np.log(ROOT) + jnp.log(2 * half)
+    # Of a short cell of half width h about c, the density is linear: mass 2 h phi(c), mean - c = -c h^2 / 3 and
+    # variance h^2 / 3.
+    log_mass = -(centre**2) / 2 - np.log(ROOT_TWO_PI) + jnp.log(2 * half)
     short = Change(log_mass, centre * (1 - half**2 / 3), half**2 / 3)
     return Change(*(jnp.where(narrow_cell, a, b) for a, b in zip(short, cut, strict=True)))
 
@@ -162,7 +172,7 @@ def _cut_to_cell(index: jax.Array, grid: Grid, prior: Prior) -> Change:
 def change_by_bits(
     pairs: list[jax.Array], weights: jax.Array, received: jax.Array, grid: Grid, prior: Prior, dither: str
 ) -> Change:
-    """Condition y on what was received of its bits.
+    """Return what the received bits of a word do to y.
 
     Args:
         pairs: likelihoods of a zero and a one of each bit (bits, 2), for each combination of error rates.
@@ -172,19 +182,20 @@ def change_by_bits(
         prior: of y.
         dither: of the encoder.
     """
-
     if grid.bits <= TABLE:
         blocks = 2 ** max(grid.bits - BLOCK, 0)
         return change_by_sums(sum_neighbours(pairs, weights, jnp.zeros(()), blocks, grid, prior, dither))
 
-    def wide_words() -> Change:
+    def change_by_wide_words() -> Change:
+        """Sum word by word within the prior's reach."""
         return change_by_sums(sum_window(pairs, weights, received, grid, prior, dither))
 
-    def fine_words() -> Change:
+    def change_by_fine_words() -> Change:
+        """Sum over cells of several words each."""
         wider, wide = widen(prior, grid, dither)
         sums = [sum_merged(pair, received, grid, wider).plus(sum_overloads(pair, grid, wider)) for pair in pairs]
         merged = Sums(*(weights @ jnp.stack(terms) for terms in zip(*sums, strict=True)))
         return narrow(change_by_sums(merged), wide)
 
-    change: Change = jax.lax.cond(grid.step >= FINE * prior.deviation, wide_words, fine_words)
+    change: Change = jax.lax.cond(grid.step >= FINE * prior.deviation, change_by_wide_words, change_by_fine_words)
     return change

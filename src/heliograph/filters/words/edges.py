@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-ROOT = np.sqrt(2 * np.pi)
+ROOT_TWO_PI = np.sqrt(2 * np.pi)
 CENTRE = 3.75  # of x = a / root 2, where c is 0
 POWERS = (
     1.2375126308378275,
@@ -37,9 +37,10 @@ POWERS = (
 
 
 class Steps(NamedTuple):
-    """A step from 0 to 1 at t, smoothed by a dither: E of it, of t times it less E of it times 0, and so on.
+    """What a step of a likelihood from 0 to 1 at |t| = a adds to the sums, smoothed by a dither.
 
-    beyond: P(t' > a) of a standard normal t' plus dither, a = |t|; density: its derivative; slope: of that, negative.
+    beyond: Q(a) = P(t' > a) of a standard normal t' plus dither; density: -Q'(a); slope: Q''(a), without dither
+    a phi(a).
     """
 
     beyond: jax.Array
@@ -51,7 +52,7 @@ Smooth = Callable[[jax.Array, jax.Array], Steps]
 
 
 def tail_and_density(a: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Q(a) = P(t > a) and phi(a) of a >= 0, with one exponential and one reciprocal; both to 5e-16 of themselves.
+    """Return Q(a) = P(t > a) and phi(a) of a >= 0, with one exponential and one reciprocal, to 5e-16 of themselves.
 
     With x = a / root 2 and c = (x - K) / (x + K), (1 + 2 x) e^(x^2) erfc x is smooth in c from -1 to 1.
 
@@ -64,39 +65,46 @@ def tail_and_density(a: jax.Array) -> tuple[jax.Array, jax.Array]:
     ratio = jnp.full_like(a, POWERS[-1])
     for power in POWERS[-2::-1]:
         ratio = ratio * c + power
-    return ratio * ((x + CENTRE) * reciprocal) * (falling / 2), falling * (1 / ROOT)
+    return ratio * ((x + CENTRE) * reciprocal) * (falling / 2), falling * (1 / ROOT_TWO_PI)
 
 
 def signed_tail_and_density(a: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Q(a) and phi(a) of any a."""
+    """Return Q(a) and phi(a) of any a."""
     q, density = tail_and_density(jnp.abs(a))
     return jnp.where(a < 0, 1 - q, q), density
 
 
 def step_as_it_is(a: jax.Array, width: jax.Array) -> Steps:
-    """No dither: Q, phi and a phi."""
+    """Return a step without dither: Q, phi and a phi."""
     q, density = tail_and_density(a)
     return Steps(q, density, a * density)
 
 
 def step_by_uniform(a: jax.Array, width: jax.Array) -> Steps:
-    """A uniform dither of width D: differences over D of I(a) = E(t - a)+ = phi - a Q, of Q and of phi."""
+    """Return a step by a uniform dither of width D: differences over D of I(a) = E(t - a)+ = phi - a Q, Q and phi."""
     low, high = a - width / 2, a + width / 2
-    (q, p), (q_above, p_above) = (signed_tail_and_density(x) for x in (low, high))
-    return Steps((p - low * q - p_above + high * q_above) / width, (q - q_above) / width, (p - p_above) / width)
+    (q_low, p_low), (q_high, p_high) = (signed_tail_and_density(x) for x in (low, high))
+    return Steps(
+        beyond=(p_low - low * q_low - p_high + high * q_high) / width,
+        density=(q_low - q_high) / width,
+        slope=(p_low - p_high) / width,
+    )
 
 
 def step_by_triangle(a: jax.Array, width: jax.Array) -> Steps:
-    """A triangular dither: second differences of E((t - a)+)^2 / 2 = ((1 + a^2) Q - a phi)/2, of I and of Q."""
-    q, p = zip(*(signed_tail_and_density(x) for x in (a - width, a, a + width)), strict=True)
-    x = a - width, a, a + width
+    """Return a step by a triangular dither: second differences of E((t - a)+)^2 / 2 = ((1 + a^2) Q - a phi)/2, I, Q."""
+    tails, squares, means = [], [], []
+    for x in (a - width, a, a + width):
+        q, p = signed_tail_and_density(x)
+        tails.append(q)
+        means.append(p - x * q)  # I(x)
+        squares.append(((1 + x * x) * q - x * p) / 2)
 
     def second_difference(values: list[jax.Array]) -> jax.Array:
+        """Return (f(a - D) - 2 f(a) + f(a + D)) / D^2."""
         return (values[0] - 2 * values[1] + values[2]) / width**2
 
-    squares = [((1 + x_ * x_) * q_ - x_ * p_) / 2 for x_, q_, p_ in zip(x, q, p, strict=True)]
-    rest = [p_ - x_ * q_ for x_, q_, p_ in zip(x, q, p, strict=True)]
-    return Steps(second_difference(squares), second_difference(rest), second_difference(list(q)))
+    return Steps(beyond=second_difference(squares), density=second_difference(means), slope=second_difference(tails))
 
 
 SMOOTH: dict[str, Smooth] = {

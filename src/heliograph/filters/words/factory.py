@@ -30,7 +30,7 @@ from heliograph.random_affine.words.rounded import Rounded, find_rounded
 
 
 class Alphabet(NamedTuple):
-    """The words of each component: a word, the step and the centre, bits (0 without end), and the dither."""
+    """The words of each component: the lowest (or any one), step and centre (m,); bits, 0 for words without end."""
 
     low: np.ndarray
     step: np.ndarray
@@ -124,12 +124,12 @@ def word_filter(
     words = _alphabet_of(first(sensor), encoder)
     places = find_places(channel)
     links = at_each_step(describe_link, channel)
-    certain = all(is_free_of_flips(link) for link in unstack(links))
-    if encoder is None and not certain:
+    no_flips = all(is_free_of_flips(link) for link in unstack(links))
+    if encoder is None and not no_flips:
         raise fail("encoder", "Words, whose bits the channel flips", "none")
     rule = Cubature() if transform is None else instance("transform", transform, AbstractTransform, "a transform")
     dithers = sum(place != FLAG for place in places) if words.dither == "subtracted" else 0
-    one = WordFilter(
+    one_gaussian = WordFilter(
         plant=plant,
         transform=rule,
         initial_mean=start.initial_mean,
@@ -143,8 +143,8 @@ def word_filter(
         places=places,
         bits=words.bits,
         dither=words.dither,
-        certain=certain,
+        certain=no_flips,
         **make_sizes("nominal", start, len(places) + dithers),
     )
-    filter: AbstractFilter = one if certain or hypotheses == 1 else keep_two_hypotheses(one)
+    filter: AbstractFilter = one_gaussian if no_flips or hypotheses == 1 else keep_two_hypotheses(one_gaussian)
     return believing(filter, Premise(plant, sensor, channel, encoder=encoder, order=None))

@@ -60,9 +60,10 @@ class LinearWordsFilter(AbstractWrapper):
     def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
         """Correct with the words that arrived, as numbers."""
         after, innovation = self.base.correct(state, self._as_numbers(jnp.asarray(z)), k)
-        lacking = self.received - len(self.centres)
-        value = jnp.concatenate([jnp.asarray(innovation.value), jnp.full(lacking, jnp.nan)])
-        covariance = jnp.pad(innovation.covariance, ((0, lacking), (0, lacking)), constant_values=jnp.nan)
+        # Dithers have no innovation.
+        dithers = self.received - len(self.centres)
+        value = jnp.concatenate([jnp.asarray(innovation.value), jnp.full(dithers, jnp.nan)])
+        covariance = jnp.pad(innovation.covariance, ((0, dithers), (0, dithers)), constant_values=jnp.nan)
         return after, Innovation(value, covariance, innovation.log_likelihood)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
@@ -70,13 +71,17 @@ class LinearWordsFilter(AbstractWrapper):
         return self.base.smoother_step(step._replace(z=self._as_numbers(jnp.asarray(step.z))))
 
     def _as_numbers(self, z: jax.Array) -> jax.Array:
-        """Return z = q' - c - E[g] d."""
+        """Return q' - c - E[g] d of the received words and dithers, E[g] of the mode that was told."""
         values = z[: len(self.centres)] - jnp.asarray(self.centres)
         if self.received == len(self.centres):
             return values
         gains = jnp.asarray(self.gains)
-        gain = gains[0] if self.flag is None else jnp.where(z[self.flag] == jnp.arange(len(gains)), 1.0, 0.0) @ gains
-        gain = gain if self.flag is None else jnp.where(jnp.isnan(z[self.flag]), jnp.nan, gain)
+        if self.flag is None:
+            gain = gains[0]
+        else:
+            mode = z[self.flag]
+            gain = jnp.where(mode == jnp.arange(len(gains)), 1.0, 0.0) @ gains
+            gain = jnp.where(jnp.isnan(mode), jnp.nan, gain)
         return values.at[np.array(self.words)].add(-gain * z[len(self.centres) :])
 
 
@@ -109,7 +114,7 @@ def build_behind_words(
         )
     # The sensor of y - c with rounding, and the filter of numbers behind it.
     gaussian = _is_gaussian(plant, sensor) and not first(channel).past and not remembers  # filters of modes use bounds
-    rounded = at_each_step(lambda one: _round_sensor(one, encoder, gaussian, fades), sensor)
+    rounded = at_each_step(lambda of_step: _round_sensor(of_step, encoder, gaussian, fades), sensor)
     base = make(plant, rounded, numbers)
     overload = bound_overload(plant, rounded, numbers, encoder, places)
     refuse_overload(overload)
@@ -130,6 +135,7 @@ def build_behind_words(
 
 
 def _claim_of(overload: Overload) -> Claim:
+    """Return "exact" where overload changes the rms error by 1 % at most, else "nominal"."""
     return "exact" if float(np.max(overload.bound, initial=0.0)) <= SEEN else "nominal"
 
 
@@ -155,7 +161,7 @@ def _mean_gains(numbers: Channel) -> np.ndarray:
 
 
 def _is_gaussian(plant: AnyPlant, sensor: AnySensor) -> bool:
-    """Test whether what the sensor measures is Gaussian before any data."""
+    """Return whether what the sensor measures is Gaussian before any data."""
     laws: list[object] = [first(plant).deviation]
-    laws += [one.noise for one in unstack(plant)] + [one.noise for one in unstack(sensor)]
+    laws += [step.noise for step in unstack(plant)] + [step.noise for step in unstack(sensor)]
     return all(isinstance(law, Gaussian) for law in laws if isinstance(law, AbstractNoise))

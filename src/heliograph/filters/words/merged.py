@@ -4,16 +4,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.words.edges import ROOT, signed_tail_and_density
+from heliograph.filters.words.edges import ROOT_TWO_PI, signed_tail_and_density
 from heliograph.filters.words.sums import FINE, REACH, Grid, Prior, Sums, multiply_bits, tabulate
 
 MERGED = 4  # bits of neighbouring cells whose likelihoods are those of the bits above times one table
 BLOCKS = 10  # of cells of an eighth to a quarter of a deviation within the reach, which may begin a block earlier
-Carried = tuple[Sums, jax.Array, jax.Array, jax.Array]
+Carried = tuple[Sums, jax.Array, jax.Array, jax.Array]  # sums, e^(-a^2 / (2 v)), r and a of a block's first cell
 
 
 def sum_merged(pairs: jax.Array, received: jax.Array, grid: Grid, prior: Prior) -> Sums:
-    """Sum over cells of 2^b fine words, between an eighth and a quarter of a deviation wide, without the overloads.
+    """Return the sums over cells of 2^b fine words, an eighth to a quarter of a deviation wide, without the overloads.
 
     Within a merged cell the low bits say that y is about mu with a variance v, a Gaussian as the prior: with
     pi = l_1 / (l_0 + l_1) of each low bit, mu = first word + D sum 2^j pi and v = D^2 (sum 4^j pi (1 - pi) + 1/12).
@@ -42,21 +42,24 @@ def sum_merged(pairs: jax.Array, received: jax.Array, grid: Grid, prior: Prior) 
     start = jnp.maximum(start, 0.0)
 
     def away_of(cell: jax.Array) -> jax.Array:
+        """Return how far the mean of a cell is from the prior's, in the prior's deviations."""
         return (grid.low + (cell * size + mean) * grid.step - prior.mean) / prior.deviation
 
-    upper, home = _shift_bits(pairs, level), jnp.floor(received / size)
+    upper, received_cell = _shift_bits(pairs, level), jnp.floor(received / size)
     sums = _sum_blocks(upper, start / block, away_of(start), width, wide)
     # The cell of the received word, where it is none of them.
-    own = multiply_bits(upper, home) * ((home < start) | (home >= start + BLOCKS * block))
-    own = own * jnp.exp(-(away_of(home) ** 2) / (2 * wide))
-    whole, first, second = (total + own * away_of(home) ** power for power, total in enumerate(sums))
-    scale = inner * grid.step / (prior.deviation * ROOT * jnp.sqrt(wide))
+    is_outside = (received_cell < start) | (received_cell >= start + BLOCKS * block)
+    likelihood = multiply_bits(upper, received_cell) * is_outside
+    likelihood = likelihood * jnp.exp(-(away_of(received_cell) ** 2) / (2 * wide))
+    mass, first, second = (total + likelihood * away_of(received_cell) ** power for power, total in enumerate(sums))
+    # Of the product of both Gaussians: E t = a / wide, E t^2 = a^2 / wide^2 + 1 - 1 / wide.
+    scale = inner * grid.step / (prior.deviation * ROOT_TWO_PI * jnp.sqrt(wide))
     first, second = first / wide, second / wide**2
-    return Sums(scale * whole, scale * first, scale * (second + whole * (1 - 1 / wide)))
+    return Sums(scale * mass, scale * first, scale * (second + mass * (1 - 1 / wide)))
 
 
 def _sum_blocks(pairs: jax.Array, number: jax.Array, away: jax.Array, width: jax.Array, wide: jax.Array) -> Sums:
-    """Sum the likelihoods of cells, times e^(-a^2 / (2 wide)), that times a, and that times a^2, block after block.
+    """Return the sums over cells of likelihood times e^(-a^2 / (2 wide)), of that times a, and times a^2.
 
     Of the cell j of a block, whose first is at a, e^(-(a + j w)^2 / (2 v)) is e^(-a^2 / (2 v)) r^j e^(-(j w)^2 / (2 v))
     with r = e^(-a w / v): a polynomial in r with the same coefficients in all blocks. From block to block the first
@@ -82,6 +85,7 @@ def _sum_blocks(pairs: jax.Array, number: jax.Array, away: jax.Array, width: jax
     shrink = jnp.exp(-(2**MERGED) * width**2 / wide)
 
     def add_block(carried: Carried, block: jax.Array) -> tuple[Carried, None]:
+        """Add one block: three polynomials in r by Horner's rule, and their terms about the block's first cell."""
         sums, density, ratio, a = carried
         inside = coefficients[-1]
         for row in range(2**MERGED - 2, -1, -1):
@@ -100,7 +104,10 @@ def _sum_blocks(pairs: jax.Array, number: jax.Array, away: jax.Array, width: jax
 
 
 def _shift_bits(pairs: jax.Array, count: jax.Array) -> jax.Array:
-    """Return the likelihoods of the bits from number `count` on (bits, 2), above the last ones of a sure zero."""
+    """Return the likelihoods of the bits from number `count` on (bits, 2), filled with bits that are surely zero.
+
+    By shifts of 1, 2, 4, ... as the binary digits of `count` say, which is known at run time only.
+    """
     shifted, rest, step = pairs, count, 1
     while step < len(pairs):
         half = jnp.floor(rest / 2)
@@ -111,7 +118,7 @@ def _shift_bits(pairs: jax.Array, count: jax.Array) -> jax.Array:
 
 
 def sum_overloads(pair: jax.Array, grid: Grid, prior: Prior) -> Sums:
-    """Sum over y beyond both ends of the range, where all bits are zeros or ones."""
+    """Return the sums over y beyond both ends of the range, where all bits are zeros or ones."""
     ends = jnp.array([0.0, 2.0**grid.bits - 1])
     outwards = jnp.array([-1.0, 1.0])
     t = (grid.low + (ends + outwards / 2) * grid.step - prior.mean) / prior.deviation

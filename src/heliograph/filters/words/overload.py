@@ -59,7 +59,9 @@ class Overload(NamedTuple):
 def bound_overload(
     plant: AnyPlant, sensor: AnySensor, numbers: Channel, encoder: Words, places: tuple[int, ...]
 ) -> Overload:
-    """Bound what overload does to a linear filter: the difference of the rms errors is at most
+    """Return how often words overload, and a bound on what that does to a linear filter.
+
+    The difference of the rms errors is at most
 
         sum_j |((I - K H) A)^j K| sqrt(E g^2) D sqrt(sum_{m >= 1} (2m - 1) P(|y + d - c| > a + (m - 1/2) D))
 
@@ -73,11 +75,11 @@ def bound_overload(
         places: component of each output of the channel.
     """
     link = at(numbers, 0)
-    late = link.past or link.remembers or any(place < 0 for place in places)
+    no_bound = link.past or link.remembers or any(place < 0 for place in places)
     horizon = min(STEPS, steps_covered((plant, sensor, numbers)) or STEPS)
     outputs = len(at(sensor, 0).outputs)
     step, half = encoder.each(encoder.step, outputs), encoder.each(encoder.high - encoder.low, outputs) / 2
-    links = None if late else _links(numbers, horizon)
+    links = None if no_bound else _list_links(numbers, horizon)
     system, signals = _describe_system(plant, sensor, links, horizon)
     tails = np.array([_count_beyond(mean, variance, half, step, encoder.dither) for mean, variance in signals])
     probability = tails[:, 0].max(axis=0)
@@ -99,7 +101,7 @@ def _describe_system(
     x, spread = mean, covariance
     parts, signals = list[Steps](), list[tuple[np.ndarray, np.ndarray]]()
     for k in range(horizon):
-        (a, b, q), (c, shift, source, rounding), link = _at_step(plant, sensor, links, k)
+        (a, b, q), (c, shift, source, rounding), link = _read_step(plant, sensor, links, k)
         x, spread = a @ x + b, a @ spread @ a.T + q
         y, explained = c @ x + shift, c @ spread @ c.T
         signals.append((y, np.diag(explained + source)))
@@ -111,18 +113,17 @@ def _describe_system(
     return system, signals
 
 
-def _links(numbers: Channel, horizon: int) -> list[SecondOrder]:
+def _list_links(numbers: Channel, horizon: int) -> list[SecondOrder]:
     """Return the second moments of the channel at each step."""
     links = [second_order(link) for link in unstack(numbers)]
     return links if len(links) > 1 else links * horizon
 
 
-def _at_step(
+def _read_step(
     plant: AnyPlant, sensor: AnySensor, links: list[SecondOrder] | None, k: int
 ) -> tuple[Motion, Sensing, SecondOrder | None]:
     """Return motion, sensor and link at a step; those of step 0 where nothing varies."""
-    moves, senses = at(plant, k), at(sensor, k)
-    return _motion(moves), _sensing(senses), None if links is None else links[k]
+    return _motion(at(plant, k)), _sensing(at(sensor, k)), None if links is None else links[k]
 
 
 @cache_by_object
@@ -156,7 +157,10 @@ def _describe_step(motion: Motion, senses: Motion, link: SecondOrder, signal: tu
 def _count_beyond(
     mean: np.ndarray, variance: np.ndarray, half: np.ndarray, step: np.ndarray, dither: str
 ) -> Float[np.ndarray, "beyond outputs"]:
-    """P(|y + d - c| > a + (m - 1/2) D), m = 1, 2, ..., of a Gaussian y, averaged over the dither."""
+    """Return P(|y + d - c| > a + (m - 1/2) D), m = 1, 2, ..., of a Gaussian y - c, averaged over the dither d.
+
+    `mean`, `variance`: of y - c (outputs,); `half`: a; `step`: D.
+    """
     ends = half + (np.arange(1, BEYOND + 1)[:, None] - 0.5) * step
     deviation = np.sqrt(np.maximum(variance, np.finfo(float).tiny))
     if dither == "none":
@@ -177,16 +181,20 @@ def _count_beyond(
 def _bound_error(
     system: LinearSystem, excess: Float[np.ndarray, "steps outputs"], links: list[SecondOrder], places: tuple[int, ...]
 ) -> float:
-    """Return the bound of the error relative to the rms, the largest over states and steps."""
+    """Return the bound of the error relative to the rms, the largest over states and steps.
+
+    `excess`: D sqrt(sum_m (2m - 1) P(...)) of each component at each step.
+    """
     gains = lmmse(system).gains
     worst, n = 0.0, system.mean.size
-    terms = np.zeros((0, n, len(places)))  # ((I - K H) A)^j K e of each output
+    terms = np.zeros((0, n, len(places)))  # ((I - K H) A)^j K e of each output, one row for each j
     for k in range(system.horizon):
         power = np.asarray(links[k].power.center)
-        size = np.sqrt(np.maximum(np.einsum("iikk->i", power[..., :-1, :-1]), 0.0))
-        fresh = gains.gain[k] * (size * excess[k][list(places)])
-        terms = gains.transition[k] @ terms[np.abs(terms).max(axis=(1, 2), initial=0.0) > 1e-12 * np.abs(fresh).max()]
-        terms = np.concatenate([terms, fresh[None]])
+        root_power = np.sqrt(np.maximum(np.einsum("iikk->i", power[..., :-1, :-1]), 0.0))  # sqrt(E g^2)
+        newest = gains.gain[k] * (root_power * excess[k][list(places)])
+        # Terms that have become rounding are left out.
+        counts = np.abs(terms).max(axis=(1, 2), initial=0.0) > 1e-12 * np.abs(newest).max()
+        terms = np.concatenate([gains.transition[k] @ terms[counts], newest[None]])
         rms, most = np.sqrt(np.diag(gains.covariance[k])), np.abs(terms).sum(axis=(0, 2))
         worst = max(worst, float(np.max(np.divide(most, rms, out=np.zeros(n), where=rms > 0))))
     return worst

@@ -45,9 +45,9 @@ class LinkOfBits(Module):
         weights = jnp.asarray(self.weights)
         if self.flag is None:
             return weights[0]
-        told = z[self.flag]
-        chosen = jnp.where(jnp.isnan(told), 1 / len(weights), told == np.arange(len(weights)))
-        return chosen @ weights
+        mode = z[self.flag]
+        probabilities = jnp.where(jnp.isnan(mode), 1 / len(weights), mode == np.arange(len(weights)))
+        return probabilities @ weights
 
     def pairs(self, received: Pairs) -> list[Pairs]:
         """Return for each combination what the received bits say of those that were sent, (components, bits, 2)."""
@@ -55,7 +55,7 @@ class LinkOfBits(Module):
 
 
 def describe_link(channel: AbstractRandomAffine) -> LinkOfBits:
-    """Describe a channel of words by its laws with known error rates.
+    """Return a channel of words as its possible laws, each with known error rates, and their probabilities.
 
     Raises:
         ValueError: a channel that is late, modes that are not told, more than 64 combinations of error rates.
@@ -71,16 +71,14 @@ def describe_link(channel: AbstractRandomAffine) -> LinkOfBits:
     if not told:
         expected = "one without memory, or with modes of one chain that are told last: hg.model.with_flag(link)"
         raise fail("channel of a word filter", expected, "modes that are not told")
-    links, rows = list[AbstractRandomAffine](), list[np.ndarray]()
-    for given in told:
-        fixed = _fix_rates(given)
-        links += [link for _, link in fixed]
-        rows.append(np.array([share for share, _ in fixed], dtype=float))
+    # The combinations of all modes, one mode after another; each mode has probabilities for its own.
+    combinations = [_fix_rates(in_mode) for in_mode in told]
+    links = [link for of_mode in combinations for _, link in of_mode]
     weights = np.zeros((len(told), len(links)))
     start = 0
-    for mode, row in enumerate(rows):
-        weights[mode, start : start + len(row)] = row
-        start += len(row)
+    for mode, of_mode in enumerate(combinations):
+        weights[mode, start : start + len(of_mode)] = [share for share, _ in of_mode]
+        start += len(of_mode)
     return LinkOfBits(tuple(links), weights, channel.outputs - 1)
 
 
@@ -89,14 +87,16 @@ def list_told_modes(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]
     parts = channel.in_parallel
     flags = [part for part in parts if isinstance(part, ModeOutput)]
     chains = {link.memory.identity: link.memory for link in _list_modes(channel)}
-    told = len(flags) == 1 and set(chains) == {flags[0].memory.identity}
-    if not told or parts[-1] is not flags[0] or len(parts) < 2:
+    # One flag, of the only chain, and last.
+    is_told = len(flags) == 1 and set(chains) == {flags[0].memory.identity}
+    if not is_told or parts[-1] is not flags[0] or len(parts) < 2:
         return []
     modes = next(iter(chains.values())).modes
     return [Stack([_choose_mode(part, mode) for part in parts[:-1]]) for mode in range(modes)]
 
 
 def _list_modes(link: AbstractRandomAffine) -> list[Modes]:
+    """Return all maps with modes inside a link, itself included."""
     inside = [mode for inner in inner_maps(link) for mode in _list_modes(inner)]
     return [link, *inside] if isinstance(link, Modes) else inside
 
@@ -109,13 +109,13 @@ def _choose_mode(link: AbstractRandomAffine, mode: int) -> AbstractRandomAffine:
 
 
 def _fix_rates(link: AbstractRandomAffine) -> list[tuple[float, AbstractRandomAffine]]:
-    """List the combinations of error rates and choices of a link, each with its probability."""
+    """Return the combinations of error rates and choices of a link: (probability, link with these)."""
     if isinstance(link, Flips):
         atoms = link.error.list_atoms()
         return [(float(share), Flips(Constant(p), link.dimension, link.per_message)) for share, p in atoms]
     if isinstance(link, Mixture):
         shares = zip(np.asarray(link.choice.probabilities), link.maps, strict=True)
-        return [(float(share) * p, fixed) for share, one in shares for p, fixed in _fix_rates(one)]
+        return [(float(share) * p, fixed) for share, chosen in shares for p, fixed in _fix_rates(chosen)]
     inner = [_fix_rates(part) for part in inner_maps(link)]
     if prod(len(fixed) for fixed in inner) > MOST:
         raise fail("channel of a word filter", f"at most {MOST} combinations of error rates", "more")
@@ -167,9 +167,10 @@ def _multiply(factors: Sequence[jax.Array], shape: tuple[int, ...]) -> jax.Array
 
 def is_free_of_flips(link: LinkOfBits) -> bool:
     """Test whether no bit is ever flipped."""
-    return all(float(flips.error.moment(1)) == 0 for one in link.links for flips in _list_flips(one))
+    return all(float(flips.error.moment(1)) == 0 for law in link.links for flips in _list_flips(law))
 
 
 def _list_flips(link: AbstractRandomAffine) -> list[Flips]:
+    """Return all flips inside a link, itself included."""
     inside = [flips for inner in inner_maps(link) for flips in _list_flips(inner)]
     return [link, *inside] if isinstance(link, Flips) else inside

@@ -10,7 +10,7 @@ FINE = 0.25  # of a deviation: finer words are merged
 
 
 class Sums(NamedTuple):
-    """M, E[t L] and E[t^2 L]."""
+    """Sums M = E L, E[t L] and E[t^2 L] of a likelihood L of y, over the prior of t = (y - mean) / deviation."""
 
     mass: jax.Array
     first: jax.Array

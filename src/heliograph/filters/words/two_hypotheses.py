@@ -80,8 +80,8 @@ class TwoHypothesesFilter(AbstractSizedFilter):
         base, z, n = self.base, jnp.asarray(z), len(self.states)
         words = base.read(z, at(base.links, k))
 
-        # The joint law of the state and what is measured, under each hypothesis.
         def append_measured(part: Gaussian) -> Gaussian:
+            """Return the joint law of the state and what is measured, under one hypothesis."""
             signal = base.measure(part, k)
             noise = triangularise_noise(join_columns(signal.noise, rounding_of(signal.size)))
             return append_rows(part, signal.mean, signal.slopes, noise)
@@ -115,6 +115,7 @@ class TwoHypothesesFilter(AbstractSizedFilter):
         """
 
         def split(part: Gaussian) -> tuple[Gaussian, jax.Array]:
+            """Return one hypothesis given each answer, right or not (2, ...), and the chances of word and answer."""
             row = part.root[len(self.states) + i]
             prior = self.base.prior_of(part, i)
             change = self.base.condition_by_leading_bits(i, words, prior, LEADING)
@@ -122,6 +123,7 @@ class TwoHypothesesFilter(AbstractSizedFilter):
             possible = (mass > SURE * jnp.sum(mass)) & (prior.deviation > 0)
 
             def impose(possible: jax.Array, shift: jax.Array, ratio: jax.Array) -> Gaussian:
+                """Return the hypothesis with these moments of y_i, as it is where the answer is impossible."""
                 shift, ratio = jnp.where(possible, shift, 0.0), jnp.where(possible, ratio, 1.0)
                 return impose_moments_of_combination(part, row, shift * prior.deviation, jnp.maximum(ratio, 0.0))
 
@@ -135,11 +137,14 @@ class TwoHypothesesFilter(AbstractSizedFilter):
         flat = jax.tree.map(lambda leaf: leaf.reshape(4, *leaf.shape[2:]), parts)
 
         def merge(chosen: jax.Array) -> tuple[Gaussian, jax.Array]:
-            chance = jnp.where(chosen, mass, 0.0).ravel()
-            whole = jnp.sum(chance)
-            rest = jnp.where(total > 0, mass.ravel() / jnp.where(total > 0, total, 1.0), 0.25)
-            shares = jnp.where(whole > 0, chance / jnp.where(whole > 0, whole, 1.0), rest)
-            return merge_mixture(flat, shares), whole
+            """Merge the chosen of the four parts; return their probability too. Without any, merge all."""
+            chosen_mass = jnp.where(chosen, mass, 0.0).ravel()
+            probability = jnp.sum(chosen_mass)
+            shares_of_all = jnp.where(total > 0, mass.ravel() / jnp.where(total > 0, total, 1.0), 0.25)
+            shares = jnp.where(
+                probability > 0, chosen_mass / jnp.where(probability > 0, probability, 1.0), shares_of_all
+            )
+            return merge_mixture(flat, shares), probability
 
         merged, weights = jax.vmap(merge)(jnp.stack([right, ~right]))
         used = words.present[i] & (total > 0)

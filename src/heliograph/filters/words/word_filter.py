@@ -71,9 +71,9 @@ class WordFilter(AbstractBeliefFilter):
         for i in range(len(self.low)):
             row, prior = joint.root[n + i], self.prior_of(joint, i)
             change = self._condition(i, words, prior)
-            there = words.present[i] & jnp.isfinite(change.log_mass) & (prior.deviation > 0)
-            row = jnp.where(there, row, 0.0)
-            shift, ratio = jnp.where(there, change.shift, 0.0), jnp.where(there, change.ratio, 1.0)
+            changes = words.present[i] & jnp.isfinite(change.log_mass) & (prior.deviation > 0)
+            row = jnp.where(changes, row, 0.0)
+            shift, ratio = jnp.where(changes, change.shift, 0.0), jnp.where(changes, change.ratio, 1.0)
             joint = impose_moments_of_combination(joint, row, shift * prior.deviation, ratio)
             total = total + jnp.where(words.present[i], change.log_mass, 0.0)
         total = jnp.where(words.are_words, total, -jnp.inf)
@@ -90,38 +90,38 @@ class WordFilter(AbstractBeliefFilter):
         return signal_of(plant, sensor, self.transform, state, second_moments_at_start(self.plant, self))
 
     def read(self, z: jax.Array, link: LinkOfBits) -> "Received":
-        """Read which words were received, and what their bits say of those that were sent.
+        """Return which words were received, and what their bits say of those that were sent.
 
         z has the received words, and flags of modes among them, as `places` says; behind these, where dither is
         subtracted, the dither of each word. A word is the number i of low + i spacing.
         """
         outputs = len(self.places)
         rows = [i for i, place in enumerate(self.places) if place != FLAG]
-        places = np.array([self.places[i] for i in rows])
-        d = z[outputs:] if len(z) > outputs else jnp.zeros(len(rows))
-        index = (z[np.array(rows)] - jnp.asarray(self.low)[places]) / jnp.asarray(self.spacing)[places]
-        there = ~jnp.isnan(index) & ~jnp.isnan(d)
-        number = jnp.round(jnp.where(there, index, 0.0))
+        component = np.array([self.places[i] for i in rows])  # of each word
+        dither = z[outputs:] if len(z) > outputs else jnp.zeros(len(rows))
+        index = (z[np.array(rows)] - jnp.asarray(self.low)[component]) / jnp.asarray(self.spacing)[component]
+        arrived = ~jnp.isnan(index) & ~jnp.isnan(dither)
+        number = jnp.round(jnp.where(arrived, index, 0.0))
         # What arrives must be a word, up to the rounding of low and of low + i D, both in units of D.
-        size = jnp.abs(number) + jnp.abs(jnp.asarray(self.low) / jnp.asarray(self.spacing))[places]
+        size = jnp.abs(number) + jnp.abs(jnp.asarray(self.low) / jnp.asarray(self.spacing))[component]
         tolerance = OFF + 8 * np.finfo(index.dtype).eps * size
-        wrong = jnp.abs(jnp.where(there, index, 0.0) - number) > tolerance
+        no_word = jnp.abs(jnp.where(arrived, index, 0.0) - number) > tolerance
         if self.bits:
-            wrong = wrong | (number < 0) | (number > 2.0**self.bits - 1)
-        # The first copy of each component, and its dither, which all copies share.
-        count = len(self.low)
-        copies = [[j for j, place in enumerate(places) if place == i] for i in range(count)]
-        first_copy = [_pick_first([(there[j], number[j], d[j]) for j in of]) for of in copies]
-        present = jnp.stack([came for came, _, _ in first_copy])
-        numbers, dithers = (jnp.stack([one[part] for one in first_copy]) for part in (1, 2))
-        # P(received | sent 0) and P(received | sent 1) of each bit, by each route of the link, and the routes' weights.
+            no_word = no_word | (number < 0) | (number > 2.0**self.bits - 1)
+        # The first copy of each component that arrived, and its dither, which all copies share.
+        first_copies = []
+        for i in range(len(self.low)):
+            copies = np.flatnonzero(component == i)
+            first_copies.append(_pick_first([(arrived[j], number[j], dither[j]) for j in copies]))
+        present, numbers, dithers = (jnp.stack(values) for values in zip(*first_copies, strict=True))
+        # P(received | sent 0) and P(received | sent 1) of each bit, by each law of the link, and the laws' weights.
         pairs, weights = list[jax.Array](), jnp.ones(1)
         if not self.certain:
             bit = jnp.mod(jnp.floor(number[:, None] / 2.0 ** np.arange(self.bits)), 2.0)
-            sure = jnp.stack([1 - bit, bit], axis=-1)
-            pairs = link.pairs(jnp.where(there[:, None, None], sure, 1.0))
+            received_bits = jnp.stack([1 - bit, bit], axis=-1)
+            pairs = link.pairs(jnp.where(arrived[:, None, None], received_bits, 1.0))
             weights = link.weigh(z[:outputs])
-        return Received(numbers, dithers, present, pairs, weights, ~jnp.any(wrong & there))
+        return Received(numbers, dithers, present, pairs, weights, ~jnp.any(no_word & arrived))
 
     def prior_of(self, joint: Gaussian, i: int) -> Prior:
         """Return the law of y_i in that of the state and y."""
@@ -129,23 +129,23 @@ class WordFilter(AbstractBeliefFilter):
         return Prior(joint.mean[place], jnp.sqrt(joint.root[place] ** 2 @ joint.variances))
 
     def condition_by_leading_bits(self, i: int, words: "Received", prior: Prior, leading: int) -> Change:
-        """Condition y_i on its word and on whether the word was right in its `leading` bits: (right, not)."""
-        pairs, bits = [one[i] for one in words.pairs], np.arange(self.bits)
+        """Return what its word does to y_i, if the word was right in its `leading` bits and if not, (2,) each."""
+        pairs, bits = [pair[i] for pair in words.pairs], np.arange(self.bits)
         bit = jnp.mod(jnp.floor(words.numbers[i] / 2.0**bits), 2.0)
         as_received = jnp.stack([1 - bit, bit], axis=-1)
-        sure = jnp.where((bits >= self.bits - leading)[:, None], as_received, 1.0)
-        # Both answers from the same sums: of all likelihoods, and of those that are right.
-        both = [*pairs, *(pair * sure for pair in pairs)]
+        if_right = jnp.where((bits >= self.bits - leading)[:, None], as_received, 1.0)
+        # Both answers from the same sums, of all likelihoods and of those that are right: not right is all less right.
+        all_and_right = [*pairs, *(pair * if_right for pair in pairs)]
         right, wrong = jnp.append(0 * words.weights, words.weights), jnp.append(words.weights, -words.weights)
         weights = jnp.stack([right, wrong])
-        return change_by_bits(both, weights, words.numbers[i], self._grid(i, words), prior, self.dither)
+        return change_by_bits(all_and_right, weights, words.numbers[i], self._grid(i, words), prior, self.dither)
 
     def _condition(self, i: int, words: "Received", prior: Prior) -> Change:
-        """Condition y_i on what was received of its word."""
+        """Return what was received of its word does to y_i."""
         grid = self._grid(i, words)
         if self.certain:
             return change_by_cell(words.numbers[i], grid, prior, self.dither)
-        pairs = [one[i] for one in words.pairs]
+        pairs = [pair[i] for pair in words.pairs]
         return change_by_bits(pairs, words.weights, words.numbers[i], grid, prior, self.dither)
 
     def _grid(self, i: int, words: "Received") -> Grid:
@@ -160,18 +160,20 @@ class WordFilter(AbstractBeliefFilter):
         mean = signal.mean - jnp.asarray(self.centre)
         noise = join_columns(signal.noise, Columns(np.eye(len(self.low)), error))
         second = signal.covariance + jnp.diag(error) + jnp.outer(mean, mean)
-        about = signal._replace(mean=mean, noise=noise, second=second)
+        about_centre = signal._replace(mean=mean, noise=noise, second=second)
         rows = np.array([i for i, place in enumerate(self.places) if place != FLAG])
         places = np.array(self.places)[rows]
         gain = jnp.asarray(numbers.mean_gain)
         values = z[rows] - jnp.asarray(self.centre)[places]
-        taken = jnp.sum(gain, axis=1) * z[len(self.places) :] if len(z) > len(self.places) else 0.0
-        value = values - taken - (gain @ mean + jnp.asarray(numbers.offset))
-        covariance = innovation_covariance(about, numbers)
-        there = ~jnp.isnan(value)
-        covariance = jnp.where(there[:, None] & there, covariance, jnp.nan)
-        whole = jnp.full((len(z), len(z)), jnp.nan).at[rows[:, None], rows].set(covariance)
-        return Innovation(jnp.full(len(z), jnp.nan).at[rows].set(value), whole, total)
+        # Dithers that are subtracted pass the link's mean gain, as the words do.
+        dithers = jnp.sum(gain, axis=1) * z[len(self.places) :] if len(z) > len(self.places) else 0.0
+        value = values - dithers - (gain @ mean + jnp.asarray(numbers.offset))
+        covariance = innovation_covariance(about_centre, numbers)
+        present = ~jnp.isnan(value)
+        covariance = jnp.where(present[:, None] & present, covariance, jnp.nan)
+        # At the places of words; NaN elsewhere.
+        covariance_of_all = jnp.full((len(z), len(z)), jnp.nan).at[rows[:, None], rows].set(covariance)
+        return Innovation(jnp.full(len(z), jnp.nan).at[rows].set(value), covariance_of_all, total)
 
 
 class Received(NamedTuple):
