@@ -71,9 +71,9 @@ class AllReports(AbstractInformedFusion):
     def fuse_step(self, state: ReportsBelief, happened: CentreStep, means: Means) -> tuple[ReportsBelief, Fused]:
         """Predict plant and all errors, then correct with the reports; one that is NaN did not arrive."""
         nodes, n = means.shape
-        after, _ = correct_with_reports(
-            propagate_errors(state, happened, lossless_links(nodes, n)), jnp.asarray(means)[None]
-        )
+        prior = propagate_errors(state, happened, lossless_links(nodes, n))
+        # The means are the reports, all of age 0.
+        after, _ = correct_with_reports(prior, jnp.asarray(means)[None])
         return after, estimate_state(after, n)
 
 
@@ -89,10 +89,10 @@ def initial_belief(errors: ErrorMoments, delays: int, received: int, quantized: 
     Every error is that of x_0 then, up to a constant; nothing has been sent.
     """
     nodes, n = errors.bias.shape
-    unsent = (0, nodes * n * delays)
+    padding = (0, nodes * n * delays)  # zeros for past reports
     start = columns_of(errors.state_covariance)
-    root = jnp.pad(jnp.tile(jnp.asarray(start.matrix), (1 + nodes, 1)), (unsent, (0, 0)))
-    mean = jnp.pad(errors.mean.reshape(-1), unsent)
+    root = jnp.pad(jnp.tile(jnp.asarray(start.matrix), (1 + nodes, 1)), (padding, (0, 0)))
+    mean = jnp.pad(errors.mean.reshape(-1), padding)
     shapes = (received, n), (received,), (received, received), (n,)
     past = PastReports(*(jnp.zeros((delays + 1, nodes, *shape)) for shape in shapes))
     spill = jnp.zeros((len(mean), len(mean))) if quantized else None
@@ -100,7 +100,11 @@ def initial_belief(errors: ErrorMoments, delays: int, received: int, quantized: 
 
 
 class ReportLine(NamedTuple):
-    """Linear map of (zeta, reports sent one step ago, two steps ago, ...): x - e_i goes before them. `F @ columns`."""
+    """Linear map of (zeta, reports sent one step ago, two steps ago, ...); `F @ columns` applies it.
+
+    It moves zeta by its step, puts the reports x - e_i of the step before in front of the past ones, and drops the
+    oldest.
+    """
 
     transition: ErrorMap
 
@@ -119,16 +123,16 @@ def propagate_errors(state: ReportsBelief, happened: CentreStep, links: ReportMo
     """Predict zeta+ = F zeta + f + B w - K nu; then each node sends x - e_i."""
     step, errors = happened
     nodes, n, _ = step.gain.shape
-    length, moved = len(state.gaussian.mean), len(step.shift)
+    length, size = len(state.gaussian.mean), len(step.shift)  # of the state with past reports, and of zeta
     # Noise: w is common to all, nu enters by each node's gain; estimates are known to the rounding of x.
     noise = join_columns(
         columns_of(step.process).through(step.of_noise),
-        _factor_measurement_noise(step.gain, step.received).through(np.eye(moved, nodes * n, -n)),
+        _factor_measurement_noise(step.gain, step.received).through(np.eye(size, nodes * n, -n)),
         rounding_of(jnp.tile(_square_mean(errors), 1 + nodes)),
     )
     # Past reports move on by one place, without a noise.
     line = ReportLine(step.transition)
-    shift, noise = jnp.pad(step.shift, (0, length - moved)), noise.through(np.eye(length, moved))
+    shift, noise = jnp.pad(step.shift, (0, length - size)), noise.through(np.eye(length, size))
     spill = None if state.spill is None else symmetric(propagate_by_mode(line, state.spill, 0.0))
     return ReportsBelief(
         predict_affine(state.gaussian, line, shift, noise), _prepend_present(state.past, errors, links), spill
@@ -136,7 +140,7 @@ def propagate_errors(state: ReportsBelief, happened: CentreStep, links: ReportMo
 
 
 def _square_mean(errors: ErrorMoments) -> Float[jax.Array, " n"]:
-    """Return E[x_i^2] before any data."""
+    """Return E[x_i^2] of each component of the plant's state, before any data (n,)."""
     return jnp.asarray(errors.state_mean**2 + jnp.diagonal(errors.state_covariance))
 
 
@@ -153,9 +157,12 @@ def correct_with_reports(
     """Correct with the reports that arrived, by their age in steps; NaN for those that did not arrive now.
 
     With zeta- = F zeta and errors mu of quantizers, |mu| <= D, the gain K is that for mu white and even, D^2 / 3; the
-    error then is (I - K O) e - K n, whose covariance is carried along, and -K mu, within `spill`. What reports before
-    determine of a report is measured anew with slopes of rounding alone: K takes an eps of its variance for noise, so
-    that K times these slopes is an eps too.
+    error then is (I - K O) e - K n, whose covariance is carried along, and -K mu, within `spill`; O maps the state to
+    the reports, n is their noise. A report that earlier ones determine is measured again, with slopes O root that are
+    rounding: K takes an eps of its variance for noise, so that K times these slopes is an eps too.
+
+    Returns:
+        The state after, and the law of the reports before they arrived.
     """
     x, past, values = state.gaussian, state.past, jnp.ravel(reports)
     output, offset = _make_output_matrix(past, len(x.mean)), jnp.ravel(past.offset)
@@ -182,8 +189,8 @@ def _compute_gain(
     quantized = (past.gain * (past.error**2 / 3)[..., None, :]) @ past.gain.swapaxes(-1, -2)
     noise = past.noise + quantized + one * (unit_of(terms) * terms**2)[..., None]
     # What did not arrive has slopes of zero and a noise of its own.
-    there = present.reshape(shape)
-    noise = jnp.where(there[..., :, None] & there[..., None, :], noise, one)
+    arrived = present.reshape(shape)
+    noise = jnp.where(arrived[..., :, None] & arrived[..., None, :], noise, one)
     slopes = jnp.where(present[:, None], output @ x.root, 0.0)
     return jnp.where(present, gain_of(x, slopes, _factor_each(noise)), 0.0)
 
@@ -196,21 +203,22 @@ def estimate_state(state: ReportsBelief, n: int) -> Fused:
 
 
 def _prepend_present(past: PastReports, errors: ErrorMoments, links: ReportModel) -> PastReports:
-    """Put the present reports before those of earlier steps."""
+    """Put the present reports before those of earlier steps, and drop the oldest."""
     mean = errors.state_mean - errors.bias
     blocks = jnp.einsum("iaib->iab", errors.joint)
     # E m m' of each node's estimate m = x - e, by the covariances of x and e and of both.
-    both = errors.with_state + jnp.swapaxes(errors.with_state, 1, 2)
-    second = errors.state_covariance - both + blocks + mean[:, :, None] * mean[:, None]
-    # Noise of the reports: the spread of the links on what is sent, and the quantizers' error.
+    cross = errors.with_state + jnp.swapaxes(errors.with_state, 1, 2)
+    second = errors.state_covariance - cross + blocks + mean[:, :, None] * mean[:, None]
+    # Second moments of what is sent, of (m_i, 1), with the quantizers' error.
     error = jnp.asarray(links.error)
-    known = jax.vmap(lambda s, m: augmented_second_moment(s, m, 1.0))(second, mean)
-    known = jax.vmap(widen)(known, jnp.pad(error, ((0, 0), (0, 1))))
-    # A link without spread adds no noise, whatever is sent: along estimates nobody knows the moments of that.
-    spreads = jnp.any(jnp.asarray(links.spread) != 0, axis=(1, 2, 3, 4))
-    noise = jnp.einsum("iabcd,icd->iab", links.spread, jnp.where(spreads[:, None, None], known, 0.0))
-    new = PastReports(jnp.asarray(links.gain), jnp.asarray(links.offset), noise, error)
-    return PastReports(*(jnp.concatenate([a[None], b[:-1]]) for a, b in zip(new, past, strict=True)))
+    sent = jax.vmap(lambda s, m: augmented_second_moment(s, m, 1.0))(second, mean)
+    sent = jax.vmap(widen)(sent, jnp.pad(error, ((0, 0), (0, 1))))
+    # Noise of the reports: the spread of the links on what is sent. A link without spread adds none, whatever is sent,
+    # also where the moments of that are unknown: along the estimates of one run.
+    has_spread = jnp.any(jnp.asarray(links.spread) != 0, axis=(1, 2, 3, 4))
+    noise = jnp.einsum("iabcd,icd->iab", links.spread, jnp.where(has_spread[:, None, None], sent, 0.0))
+    present = PastReports(jnp.asarray(links.gain), jnp.asarray(links.offset), noise, error)
+    return PastReports(*(jnp.concatenate([new[None], old[:-1]]) for new, old in zip(present, past, strict=True)))
 
 
 def _make_output_matrix(past: PastReports, length: int) -> Float[jax.Array, "M N"]:
@@ -221,17 +229,21 @@ def _make_output_matrix(past: PastReports, length: int) -> Float[jax.Array, "M N
     """
     ages, nodes, m, n = past.gain.shape
     size = nodes * n
-    now = np.concatenate([np.tile(np.eye(n), (nodes, 1)), -np.eye(size)], axis=1)
-    before = np.eye(length - n - size, length, n + size)
-    sent = np.concatenate([np.pad(now, ((0, 0), (0, length - n - size))), before]).reshape(ages, nodes, n, length)
+    # What was sent, as linear functions of s: x - e_i at this step, and what s holds of the steps before.
+    sent_now = np.concatenate([np.tile(np.eye(n), (nodes, 1)), -np.eye(size)], axis=1)
+    sent_now = np.pad(sent_now, ((0, 0), (0, length - n - size)))
+    sent_before = np.eye(length - n - size, length, n + size)
+    sent = np.concatenate([sent_now, sent_before]).reshape(ages, nodes, n, length)
     return jnp.einsum("aimn,ainN->aimN", past.gain, sent).reshape(ages * nodes * m, length)
 
 
 def _factor_measurement_noise(gain: Float[jax.Array, "node n m"], noise: Array) -> Columns:
-    """Return the columns of K_i S_ij K_j', as many as measurements; S_ij is zero between nodes that share nothing."""
+    """Return the factors of K_i S_ij K_j', a column for each measurement; S_ij = 0 between nodes that share nothing."""
     nodes, _, m = gain.shape
-    each = noise.ndim == 3
-    received = _factor_each(jnp.asarray(noise)[None]) if each else columns_of(noise.reshape(nodes * m, nodes * m))
+    if noise.ndim == 3:
+        received = _factor_each(jnp.asarray(noise)[None])
+    else:
+        received = columns_of(noise.reshape(nodes * m, nodes * m))
     return received.through(_place_on_diagonal(gain[None]))
 
 
@@ -252,7 +264,7 @@ def _place_on_diagonal(blocks: Float[jax.Array, "age node a b"]) -> Float[jax.Ar
 
 
 def _cauchy_bound(into: Float[jax.Array, "N S"], error: Float[jax.Array, " S"]) -> Float[jax.Array, "N N"]:
-    """Return B with (B mu)(B mu)' <= B s diag(D) B' for |mu| <= D, s = sum D over what B uses (Cauchy)."""
+    """Return B s diag(D) B', which bounds (B mu)(B mu)' for |mu| <= D; s = sum D over what B uses (Cauchy)."""
     used = jnp.where(jnp.any(into != 0, axis=0), error, 0.0)
     return jnp.sum(used) * (into * used) @ into.T
 
@@ -260,6 +272,6 @@ def _cauchy_bound(into: Float[jax.Array, "N S"], error: Float[jax.Array, " S"]) 
 def _bound_sum(a: jax.Array, b: jax.Array) -> jax.Array:
     """Return (1 + s / r) A + (1 + r / s) B >= E[(u + v)(u + v)'], of least trace: r^2 = tr A, s^2 = tr B (Young)."""
     r, s = jnp.sqrt(jnp.trace(a)), jnp.sqrt(jnp.trace(b))
-    both = (r > 0) & (s > 0)
-    ratio = jnp.where(both, s / jnp.where(r > 0, r, 1.0), 1.0)
-    return jnp.where(both, (1 + ratio) * a + (1 + 1 / ratio) * b, a + b)
+    are_positive = (r > 0) & (s > 0)
+    ratio = jnp.where(are_positive, s / jnp.where(r > 0, r, 1.0), 1.0)
+    return jnp.where(are_positive, (1 + ratio) * a + (1 + 1 / ratio) * b, a + b)

@@ -21,7 +21,7 @@ from heliograph.numerics.linalg import cholesky, rounding, symmetric, symmetrize
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array, Float
 
-SAME = 1e-13  # relative: two matrices that say the same after a few products
+SAME = 1e-13  # relative difference of two numbers that are the same but for the rounding of a few products
 
 
 class Motion(NamedTuple):
@@ -136,16 +136,19 @@ def initial_errors(
 
 def error_step(filters: LinearStep, motion: Motion, observation: Observation) -> ErrorStep:
     """Return the step of the errors of linear filters; `filters` has a leading axis of nodes."""
+    # K, U = I - K C and L = K (M - C) of each node, with the letters of the first lines of this file.
     gain, keep, n = jnp.asarray(filters.gain), filters.keep(), len(motion.shift)
-    astray = gain @ _subtract(observation.gain, filters.output)
-    moves = _subtract(jnp.broadcast_to(motion.matrix, filters.transition.shape), filters.transition)
-    shifts = _subtract(jnp.broadcast_to(motion.shift, filters.drift.shape), filters.drift)
-    shift = _apply(keep, shifts) - astray @ jnp.asarray(motion.shift)
+    wrong_gain = gain @ _subtract(observation.gain, filters.output)
+    # A - F, and U (b - f) - L b - K (o - c).
+    matrices = _subtract(jnp.broadcast_to(motion.matrix, filters.transition.shape), filters.transition)
+    drifts = _subtract(jnp.broadcast_to(motion.shift, filters.drift.shape), filters.drift)
+    shift = _apply(keep, drifts) - wrong_gain @ jnp.asarray(motion.shift)
     shift = shift - _apply(gain, _subtract(observation.offset, filters.offset))
+    of_state = keep @ matrices - wrong_gain @ motion.matrix
     return ErrorStep(
-        transition=ErrorMap(motion.matrix, keep @ moves - astray @ motion.matrix, keep @ filters.transition),
+        transition=ErrorMap(motion.matrix, of_state, keep @ filters.transition),
         shift=jnp.concatenate([jnp.asarray(motion.shift), shift.reshape(-1)]),
-        of_noise=jnp.concatenate([jnp.eye(n), (keep - astray).reshape(-1, n)]),
+        of_noise=jnp.concatenate([jnp.eye(n), (keep - wrong_gain).reshape(-1, n)]),
         process=motion.noise,
         gain=gain,
         received=observation.noise,
@@ -229,17 +232,17 @@ def initial_factors(errors: ErrorMoments, sources: int) -> SourceFactors:
 def propagate_factors(factors: SourceFactors, step: ErrorStep, k: jax.Array) -> SourceFactors:
     """Propagate factors over step k: s gets the process noise, and the measurement noise where nodes share it."""
     nodes, n, m = step.gain.shape
-    new, added = step.of_noise @ cholesky(jnp.asarray(step.process)), jnp.zeros(())
+    new_roots, added = step.of_noise @ cholesky(jnp.asarray(step.process)), jnp.zeros(())
     # Shared measurement noise is a source, independent noise stays the node's.
     if step.received.ndim == 4:
         root = cholesky(jnp.asarray(step.received).reshape(nodes * m, nodes * m)).reshape(nodes, m, nodes * m)
-        sources = (-step.gain @ root).reshape(nodes * n, -1)
-        new = jnp.concatenate([new, jnp.pad(sources, ((n, 0), (0, 0)))], axis=1)
+        measured = (-step.gain @ root).reshape(nodes * n, -1)
+        new_roots = jnp.concatenate([new_roots, jnp.pad(measured, ((n, 0), (0, 0)))], axis=1)
     else:
         added = propagate_by_mode(step.gain, step.received, 0.0)
-    # The new sources of step k go to columns of their own.
+    # The new sources of step k go to columns of their own, behind those of x_0 and of the steps before.
     mean = step.transition @ factors.mean.reshape(-1) + step.shift
-    roots = jax.lax.dynamic_update_slice(step.transition @ factors.roots, new, (0, n + new.shape[1] * k))
+    roots = jax.lax.dynamic_update_slice(step.transition @ factors.roots, new_roots, (0, n + new_roots.shape[1] * k))
     independent = symmetrize(propagate_by_mode(step.transition.errors, factors.independent, added))
     return SourceFactors(mean.reshape(factors.mean.shape), roots, independent)
 

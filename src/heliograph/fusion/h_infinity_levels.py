@@ -51,7 +51,7 @@ def fused_error_norm(
     matrix: Float[ArrayLike, "outputs n"],
     errors: Float[ArrayLike, "N time n"],
 ) -> float:
-    """Bound on ||z - zhat|| of a weighted fusion of quantized estimates, zhat = M sum_i c_i xq_i.
+    """Return a bound on ||z - zhat|| of a weighted fusion of quantized estimates, zhat = M sum_i c_i xq_i.
 
     sum_i c_i (gamma_i ||w_i|| + ||M|| ||D_i||), since z - zhat = sum c_i (M e_i - M mu_i) and |mu_i| <= D_i by
     component; ||D_i|| is the root of the sum over steps and components. NaN where a quantizer saturated: its D is NaN,

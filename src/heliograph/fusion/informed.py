@@ -48,7 +48,7 @@ class AbstractInformedFusion(AbstractFusion):
         return False
 
     def claim(self, claims: list[Claim]) -> Claim:
-        """Refused: the local claims do not determine the joint covariance."""
+        """Refuse: the local claims do not determine the joint covariance."""
         raise self._refuse_without_joint()
 
     def combine(self, means: Means, covariances: Covariances) -> Fused:
@@ -100,9 +100,9 @@ class AbstractJointWeights(AbstractInformedFusion):
         """Return the weights of the neighbours' estimates that arrived, solved for these alone, and W P W'."""
         if believed.joint is None or self.with_mean:
             raise fail(f"fusion by {type(self).__name__} between neighbours", "with_mean=False", True)
-        chosen = self.arrived(believed.joint, believed.present)
+        weights = self.arrived(believed.joint, believed.present)
         return NeighbourWeights(
-            jnp.eye(len(chosen)), jnp.swapaxes(chosen, 0, 1), weigh_covariance(chosen, believed.joint)
+            jnp.eye(len(weights)), jnp.swapaxes(weights, 0, 1), weigh_covariance(weights, believed.joint)
         )
 
     def fuse_step(self, state: PyTree, happened: CentreStep, means: Means) -> tuple[PyTree, Fused]:
@@ -110,14 +110,14 @@ class AbstractJointWeights(AbstractInformedFusion):
         errors = happened.errors
         unbiased, joint = jnp.asarray(means) + errors.bias, errors.joint
         if self.with_mean:
-            # x - E x, the error of the plant's mean, behind those of the nodes.
+            # x - E x, the error of the plant's mean, behind those of the nodes: the first n rows and columns last.
             unbiased = jnp.concatenate([unbiased, errors.state_mean[None]])
             count, n = unbiased.shape
             joint = jnp.roll(errors.covariance, (-n, -n), (0, 1)).reshape(count, n, count, n)
-        chosen = self.weights(joint)
-        # W sums to I: of differences, since digits that W lacks would count against the size of the means.
-        mean = unbiased[0] + jnp.einsum("aib,ib->a", chosen, unbiased - unbiased[0])
-        return state, (mean, weigh_covariance(chosen, joint))
+        weights = self.weights(joint)
+        # W sums to I, so that differences of the means suffice: digits that W lacks then cost digits of these alone.
+        mean = unbiased[0] + jnp.einsum("aib,ib->a", weights, unbiased - unbiased[0])
+        return state, (mean, weigh_covariance(weights, joint))
 
 
 class MatrixWeights(AbstractJointWeights):
@@ -169,9 +169,9 @@ class DiagonalWeights(AbstractJointWeights):
         """Return weights of the neighbours' estimates that arrived; of few neighbours without a product of matrices."""
         if believed.joint is None or self.with_mean or len(believed.present) > WRITTEN:
             return super().neighbour_weights(believed)
-        chosen = component_weights(believed.joint, believed.present)
-        identity = jnp.eye(chosen.shape[1])
-        return NeighbourWeights(identity, chosen, weigh_covariance_by_component(chosen, believed.joint))
+        diagonals = component_weights(believed.joint, believed.present)
+        identity = jnp.eye(diagonals.shape[1])
+        return NeighbourWeights(identity, diagonals, weigh_covariance_by_component(diagonals, believed.joint))
 
 
 class ScalarWeights(AbstractJointWeights):

@@ -11,11 +11,11 @@ from heliograph.numerics.types import Float
 
 GAP = 1e-10  # certified relative excess of the trace over its minimum; rounding leaves about 1e-13
 LOOP = 1000  # units of rounding below which the certificate makes no progress
-ITERATIONS = 60  # of the interior point method; it needs about 12
-STEP_BACK = 0.99  # share of the way to the boundary
-KNOWN = 1e-8  # of a variance: what replaces zero, so that neither it nor the rounding of others exceeds this
+ITERATIONS = 60  # most of the interior point method, which needs about 12
+STEP_BACK = 0.99  # share of the way to the boundary that a step goes
+KNOWN = 1e-8  # share of a variance that replaces zero, so that neither it nor the rounding of others exceeds this
 HALVINGS = 50  # of the interval of one weight, which shrinks to 1e-15
-FLAT = 1e-15  # of its terms: a slope that is rounding
+FLAT = 1e-15  # share of its terms below which a slope is rounding
 
 
 def intersect(
@@ -25,15 +25,15 @@ def intersect(
 ) -> tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]:
     """Return x_0 + (sum w J)^-1 sum w J (x - x_0) and (sum w J)^-1, from information matrices J.
 
-    Differences of the means are used, since the matrices that multiply them have lost the digits that nearly dependent
-    components cost: the means themselves may be millions of deviations from zero.
+    x_0 is the first of the means. Differences from it are used, since the matrices that multiply them have lost the
+    digits that nearly dependent components cost: the means themselves may be millions of deviations from zero.
     """
     covariance = invert(_sum_weighted(weights, information))
-    off = jnp.einsum("k,kab,kb->a", weights, information, means - means[0])
-    return means[0] + covariance @ off, covariance
+    differences = jnp.einsum("k,kab,kb->a", weights, information, means - means[0])
+    return means[0] + covariance @ differences, covariance
 
 
-_Progress = tuple[jax.Array, jax.Array, jax.Array, jax.Array]  # weights, slack, whether to go on, iteration
+_Progress = tuple[jax.Array, jax.Array, jax.Array, jax.Array]  # weights, multipliers, whether to go on, iteration
 
 
 def trace_optimal_weights(information: Float[jax.Array, "count n n"]) -> Float[jax.Array, " count"]:
@@ -48,11 +48,12 @@ def trace_optimal_weights(information: Float[jax.Array, "count n n"]) -> Float[j
 
     def step(carry: _Progress) -> _Progress:
         w, slack, _, iteration = carry
-        value, gradient, hessian = _trace_derivatives(scaled, w)
-        slack = jnp.where(iteration == 0, gradient - jnp.min(gradient) + 0.1 * value, slack)
+        trace, gradient, hessian = _trace_derivatives(scaled, w)
+        # The first multipliers are positive, and nearly those of the gradient.
+        slack = jnp.where(iteration == 0, gradient - jnp.min(gradient) + 0.1 * trace, slack)
         moved = _take_newton_step(_Point(w, slack, gradient, hessian))
         # Certificate of the excess: weights below it stay where they are.
-        going = jnp.max(-gradient) > (1 + rounding(GAP, value, LOOP)) * value
+        going = jnp.max(-gradient) > (1 + rounding(GAP, trace, LOOP)) * trace
         w, slack = (jnp.where(going, new, old) for new, old in zip(moved, (w, slack), strict=True))
         return w, slack, going, iteration + 1
 
@@ -91,7 +92,8 @@ def _sum_weighted(w: Float[jax.Array, " count"], information: Float[jax.Array, "
 def _take_newton_step(point: _Point) -> tuple[jax.Array, jax.Array]:
     """Take one Newton step for g - s + m 1 = 0, sum w = 1, w s = target: eliminate s, then the multiplier m.
 
-    The target follows from where the step with target 0 would end (Mehrotra's predictor and corrector).
+    g is the gradient and s the multipliers of w >= 0. The target follows from where the step with target 0 would end
+    (Mehrotra's predictor and corrector). Returns the new weights and multipliers.
     """
     w, slack, gradient = point.weights, point.slack, point.gradient
     root = jnp.sqrt(w)  # scaled by it, the matrix stays well conditioned as weights vanish
@@ -101,16 +103,17 @@ def _take_newton_step(point: _Point) -> tuple[jax.Array, jax.Array]:
     ones = root * solve(root[:, None])[:, 0]
 
     def direction(target: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return the moves of w and s towards w s = target."""
         solved = root * solve((target / root - root * gradient)[:, None])[:, 0]
         move = solved - jnp.sum(solved) / jnp.sum(ones) * ones
         return move, (target - slack * move) / w - slack
 
-    # Predictor: the step with target 0.
-    present = jnp.mean(w * slack)
+    # Predictor: the step with target 0, and the mean of w s before it and where it would end.
+    before = jnp.mean(w * slack)
     move, slack_move = direction(jnp.zeros_like(w))
-    ahead = jnp.mean((w + _longest_step(w, move) * move) * (slack + _longest_step(slack, slack_move) * slack_move))
+    after = jnp.mean((w + _longest_step(w, move) * move) * (slack + _longest_step(slack, slack_move) * slack_move))
     # Corrector: centred, less the predictor's second-order term.
-    target = present * jnp.clip(ahead / present, 0.0, 1.0) ** 3 - move * slack_move
+    target = before * jnp.clip(after / before, 0.0, 1.0) ** 3 - move * slack_move
     move, slack_move = direction(target)
     length = jnp.minimum(_longest_step(w, move), _longest_step(slack, slack_move))
     w = w + length * move
@@ -119,8 +122,8 @@ def _take_newton_step(point: _Point) -> tuple[jax.Array, jax.Array]:
 
 def _longest_step(value: Float[jax.Array, " count"], move: Float[jax.Array, " count"]) -> Float[jax.Array, ""]:
     """Return the largest step, at most 1, that keeps value + step move positive."""
-    reach = jnp.where(move < 0, -value / jnp.where(move < 0, move, -1.0), jnp.inf)
-    return jnp.minimum(1.0, STEP_BACK * jnp.min(reach))
+    to_zero = jnp.where(move < 0, -value / jnp.where(move < 0, move, -1.0), jnp.inf)
+    return jnp.minimum(1.0, STEP_BACK * jnp.min(to_zero))
 
 
 def intersect_inversely(
@@ -136,11 +139,12 @@ def intersect_inversely(
     p_information, q_information = invert_covariances(both)
 
     def fused(w: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return V and C at the weight w."""
         common = invert_covariances((w * p + (1 - w) * q)[None])[0]
         return invert(p_information + q_information - common), common
 
-    # Bisection of the slope.
     def halve(_: jax.Array, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        """Return the half in which the slope changes its sign; its midpoint alone where the slope is flat there."""
         w = jnp.mean(jnp.stack(ends))
         covariance, common = fused(w)
         factor = covariance @ common
@@ -152,7 +156,7 @@ def intersect_inversely(
     # Covariance and mean at the best weight.
     w = (low + high) / 2
     covariance, common = fused(w)
-    # The two factors sum to the fused information: of differences, as above.
+    # The weights of the two means sum to I: a and a multiple of the difference, as in `intersect`.
     mean = a + covariance @ ((q_information - (1 - w) * common) @ (b - a))
     return restore_exact_components(mean, symmetric(covariance), jnp.stack([a, b]), both)
 
@@ -177,9 +181,10 @@ def invert_covariances(matrices: Float[jax.Array, "count n n"]) -> Float[jax.Arr
 
 def _invert_widened(a: jax.Array, least: jax.Array) -> jax.Array:
     """Invert a covariance whose variances are at least `least`."""
-    _, scales = factor(a)  # 1 / root of what those before it leave of a component: rounding where that is next to none
-    none = jnp.where((scales == 0) | (scales**2 * least > 1), 1.0, 0.0)
-    return invert(a + jnp.diag(none * least))
+    # 1 / root of the variance of each component given those before it; rounding where that is next to none.
+    _, scales = factor(a)
+    is_small = jnp.where((scales == 0) | (scales**2 * least > 1), 1.0, 0.0)
+    return invert(a + jnp.diag(is_small * least))
 
 
 def restore_exact_components(
@@ -212,7 +217,8 @@ def equal_shares(believed: NeighbourEstimates) -> Shared:
 def trace_shares(believed: NeighbourEstimates, power: float, improvements: int) -> Shared:
     """Return shares proportional to (tr P_j)^-power, or equal where these give the smaller trace; then improved.
 
-    The first alone ignore a neighbour of large variance who alone knows a mode. An improvement multiplies each share by
+    The first alone ignore a neighbour of large variance who alone knows some direction. An improvement multiplies each
+    share by
     the root of tr(P J_j P) / tr P, P = (sum pi J)^-1, which is 1 at the minimum where the share is positive.
 
     Source: Silvey, Titterington and Torsney, An algorithm for optimal designs on a finite design space (1978).
@@ -226,8 +232,8 @@ def trace_shares(believed: NeighbourEstimates, power: float, improvements: int) 
     shares = (best[0] + equal[0]) / 2
     for _ in range(improvements):
         covariance = intersect_shares(believed, shares)[1]
-        push = jnp.einsum("ab,jbc,ca->j", covariance, believed.information, covariance) / jnp.trace(covariance)
-        shares = shares * jnp.sqrt(jnp.maximum(push, 0.0))
+        ratio = jnp.einsum("ab,jbc,ca->j", covariance, believed.information, covariance) / jnp.trace(covariance)
+        shares = shares * jnp.sqrt(jnp.maximum(ratio, 0.0))
         shares = shares / shares.sum()
         best = _smaller_trace(best, intersect_shares(believed, shares))
     return best
@@ -245,6 +251,6 @@ def intersection_weights(believed: NeighbourEstimates, shared: Shared) -> Neighb
 
 
 def _smaller_trace(a: Shared, b: Shared) -> Shared:
-    """Return those shares whose intersection has the smaller trace."""
-    smaller = jnp.trace(a[1]) <= jnp.trace(b[1])
-    return jnp.where(smaller, a[0], b[0]), jnp.where(smaller, a[1], b[1])
+    """Return those shares, with their covariance, whose intersection has the smaller trace."""
+    is_first = jnp.trace(a[1]) <= jnp.trace(b[1])
+    return jnp.where(is_first, a[0], b[0]), jnp.where(is_first, a[1], b[1])

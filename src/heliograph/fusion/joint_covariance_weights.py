@@ -15,8 +15,8 @@ from heliograph.numerics.lapack import pseudo_solve, regular_solve
 from heliograph.numerics.linalg import WRITTEN, psd_solve, rounding, symmetric, symmetrize
 from heliograph.numerics.types import Array, Bool, Float
 
-RANK = 4096  # units of rounding of the largest eigenvalue: directions below have no error
-RIDGE = 1e-8  # of a variance: independent error that each estimate is taken to have besides
+RANK = 4096  # units of rounding of the largest eigenvalue: directions of smaller eigenvalues have no error
+RIDGE = 1e-8  # share of a variance that each estimate is taken to have as independent error besides
 
 
 Weights = Callable[..., Float[jax.Array, "n node n"]]
@@ -70,19 +70,23 @@ def solve_factored_weights(
 ) -> Float[jax.Array, "n node n"]:
     """Compute matrix weights of P = L L' + blockdiag(B_i) with every B_i positive definite, at a cost linear in nodes.
 
-    P^-1 E = B^-1 E - B^-1 L (I + L' B^-1 L)^-1 L' B^-1 E.
+    P^-1 E = B^-1 E - B^-1 L (I + L' B^-1 L)^-1 L' B^-1 E, with E = [I; ...; I].
+
+    Args:
+        shared: blocks of L, one for each node.
+        independent: B_i of each node.
     """
     nodes, n, sources = shared.shape
     # Whitened by B: L and E.
     factors = jnp.linalg.cholesky(jnp.asarray(independent))
     both = jnp.concatenate([jnp.asarray(shared), jnp.broadcast_to(jnp.eye(n), (nodes, n, n))], axis=-1)
     white = jax.lax.linalg.triangular_solve(factors, both, left_side=True, lower=True).reshape(nodes * n, -1)
-    common, e = white[:, :sources], white[:, sources:]
+    white_l, white_e = white[:, :sources], white[:, sources:]
     # Matrix inversion lemma, in the number of sources.
-    inner = jnp.linalg.cholesky(jnp.eye(sources) + common.T @ common)
-    reduced = e - common @ jax.scipy.linalg.cho_solve((inner, True), common.T @ e)
+    inner = jnp.linalg.cholesky(jnp.eye(sources) + white_l.T @ white_l)
+    reduced = white_e - white_l @ jax.scipy.linalg.cho_solve((inner, True), white_l.T @ white_e)
     # W = (E' P^-1 E)^-1 E' P^-1.
-    information = e.T @ reduced
+    information = white_e.T @ reduced
     back = jax.lax.linalg.triangular_solve(factors, reduced.reshape(nodes, n, n), left_side=True, lower=True,
                                            transpose_a=True)  # fmt: skip
     weights = jnp.linalg.solve(information, jnp.moveaxis(back, 2, 0).reshape(n, -1)).reshape(n, nodes, n)
@@ -113,7 +117,7 @@ def scalar_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n 
 
 
 def _weigh_components(weigh: Weights, joint: Float[jax.Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
-    """Return diagonal weights: those of each component of the state by itself."""
+    """Return diagonal weights: those that `weigh` gives to each component of the state by itself."""
     nodes, n = joint.shape[:2]
     component = jnp.stack([joint[:, a, :, a] for a in range(n)])
     weights = jax.vmap(lambda block: weigh(block.reshape(nodes, 1, nodes, 1))[0, :, 0])(component)
@@ -140,18 +144,18 @@ def solve_regularised_weights(
     """Return unbiased weights of least C (P + ridge D) C' for the estimates that arrived; the ridge keeps them bounded.
 
     C = (E' U^-1 E)^-1 E' U^-1, E = [I; ...; I], U = P + RIDGE D, D the mean of the variances: the best weights of
-    estimates with a little independent error more. Without it weights of nearly equal estimates, such as those of the
+    estimates with a little more independent error. Without it weights of nearly equal estimates, such as those of the
     first steps, grow without bound, and rounding with them. C P C' is the covariance whatever C is.
     """
     degree, n = joint.shape[:2]
-    there = present.astype(joint.dtype)
-    # In units of the deviations, absent ones apart.
-    variances = jnp.einsum("iaia,i->a", joint, there) / there.sum()
+    arrived = present.astype(joint.dtype)
+    # U in units of the deviations; the rows of absent estimates are those of I, and in E they are zero.
+    variances = jnp.einsum("iaia,i->a", joint, arrived) / arrived.sum()
     unit = jnp.sqrt(jnp.where(variances > 0, variances, 1.0))
-    both = there[:, None, None, None] * there[None, None, :, None]
+    both = arrived[:, None, None, None] * arrived[None, None, :, None]
     scaled = (both * joint / (unit[:, None, None] * unit)).reshape(degree * n, degree * n)
     total = scaled + jnp.diag(jnp.repeat(jnp.where(present, RIDGE, 1.0), n))
-    ones = (there[:, None, None] * jnp.eye(n)).reshape(degree * n, n)
+    ones = (arrived[:, None, None] * jnp.eye(n)).reshape(degree * n, n)
     # U^-1 E, and what makes the weights sum to I.
     solved = psd_solve(total, ones) if degree * n <= WRITTEN else regular_solve(total, ones)
     weights = (invert(ones.T @ solved) @ solved.T).reshape(n, degree, n)
@@ -171,19 +175,19 @@ def solve_regularised_weights_by_component(
 def component_weights(
     joint: Float[jax.Array, "degree n degree n"], present: Bool[jax.Array, " degree"]
 ) -> Float[jax.Array, "degree n"]:
-    """Return the diagonals c_i of the weights of each component by itself."""
+    """Return the diagonals c_i of the weights that are best for each component by itself."""
     component = jnp.stack([joint[:, a, :, a] for a in range(joint.shape[1])])
     return jax.vmap(_weigh_component, in_axes=(0, None), out_axes=1)(component, present.astype(joint.dtype))
 
 
 def _weigh_component(
-    joint: Float[jax.Array, "degree degree"], there: Float[jax.Array, " degree"]
+    joint: Float[jax.Array, "degree degree"], arrived: Float[jax.Array, " degree"]
 ) -> Float[jax.Array, " degree"]:
-    """Return c = U^-1 1 / 1' U^-1 1 over those that are there, by the factor of U, as `solve_regularised_weights`."""
-    mean = jnp.sum(there * jnp.diagonal(joint)) / jnp.sum(there)
-    # U, with those that are absent apart.
-    apart = jnp.where(there > 0, RIDGE * jnp.where(mean > 0, mean, 1.0), 1.0)
-    solved = psd_solve(there[:, None] * there * joint + jnp.diag(apart), there[:, None])[:, 0]
+    """Return c = U^-1 1 / 1' U^-1 1 over those that arrived (1, else 0), as `solve_regularised_weights` of n = 1."""
+    mean = jnp.sum(arrived * jnp.diagonal(joint)) / jnp.sum(arrived)
+    # What U adds to P; the rows of absent estimates are those of I.
+    ridge = jnp.where(arrived > 0, RIDGE * jnp.where(mean > 0, mean, 1.0), 1.0)
+    solved = psd_solve(arrived[:, None] * arrived * joint + jnp.diag(ridge), arrived[:, None])[:, 0]
     return solved / jnp.sum(solved)
 
 
@@ -198,5 +202,5 @@ def weigh_covariance_by_component(
 def solve_regularised_scalar_weights(
     joint: Float[jax.Array, "degree n degree n"], present: Bool[jax.Array, " degree"]
 ) -> Float[jax.Array, "n degree n"]:
-    """Return one number for each of those that are present, of least trace."""
+    """Return weights of one number for each estimate that is present, of least trace."""
     return _weigh_by_trace(partial(solve_regularised_weights, present=present), joint)

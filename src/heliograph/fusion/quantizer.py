@@ -64,7 +64,7 @@ class AbstractQuantizer(Module):
         raise unwritten(self, "step")
 
     def claim(self, claim: Claim) -> Claim:
-        """Claim of the widened covariance of a quantized estimate, from the claim of the estimate: "nominal" at most.
+        """Return the claim of a quantized estimate's widened covariance, from that of the estimate: at most "nominal".
 
         A quantizer that has an error bound for every value, known before any data, may claim "upper": that bound does
         not hold for values which are left out where it saturates.
@@ -72,7 +72,7 @@ class AbstractQuantizer(Module):
         return weakest([claim, "nominal"])
 
     def error(self, n: int) -> Float[Array, " n"]:
-        """Bound on |what arrives - x| by component that holds whatever the data, where anything arrives.
+        """Return a bound on |what arrives - x| by component that holds whatever the data, where anything arrives.
 
         Raises:
             ValueError: there is none.
@@ -92,7 +92,7 @@ Quantizer = TypeAliasType("Quantizer", AbstractQuantizer | OverTime)  # an OverT
 
 
 def widen(covariance: Float[Array, "n n"], error: Float[Array, "n"]) -> Float[jax.Array, "n n"]:
-    """Bound on the covariance of x - q, from that of x - xhat (or a bound) P, where |q - xhat| <= D by component.
+    """Return a bound on the covariance of x - q, from that of x - xhat (or a bound) P; |q - xhat| <= D by component.
 
     With q - xhat = mu: mu mu' <= s diag(D), s = sum D (Cauchy), the smallest trace of all such diagonal bounds. So
     E[(x - q)(x - q)'] <= (1 + t) P + (1 + 1/t) s diag(D) for every t > 0, with the smallest trace (r + s)^2 at
@@ -145,11 +145,11 @@ def check_range(name: str, amplitude: Parameter, scale: Parameter, levels: Float
     if is_traced(amplitude, scale):
         return
     with np.errstate(over="ignore", under="ignore"):
-        reach = np.asarray(amplitude) * scale
-        inside = np.isfinite(reach) & (reach / levels >= np.finfo(np.float64).tiny)
-    if not np.all(inside):
+        largest = np.asarray(amplitude) * scale
+        in_range = np.isfinite(largest) & (largest / levels >= np.finfo(np.float64).tiny)
+    if not np.all(in_range):
         least = np.finfo(np.float64).tiny * float(levels)
-        raise fail(name, f"from {least:.3g} to {np.finfo(np.float64).max:.3g}", reach.tolist())
+        raise fail(name, f"from {least:.3g} to {np.finfo(np.float64).max:.3g}", largest.tolist())
 
 
 class UniformQuantizer(AbstractQuantizer):
@@ -187,9 +187,8 @@ class UniformQuantizer(AbstractQuantizer):
     @in_float64
     def step(self, state: PyTree, value: ArrayLike) -> tuple[PyTree, Quantized]:
         """Quantize with the fixed amplitude."""
-        return state, _quantize_uniformly(
-            jnp.asarray(fill_masked(value), dtype=float), self.amplitude, self.levels, self.scale
-        )
+        x = jnp.asarray(fill_masked(value), dtype=float)
+        return state, _quantize_uniformly(x, self.amplitude, self.levels, self.scale)
 
     def error(self, n: int) -> Float[Array, " n"]:
         """Return half of a segment's length."""
@@ -201,7 +200,10 @@ class UniformQuantizer(AbstractQuantizer):
 def _quantize_uniformly(
     x: Float[jax.Array, "*n"], amplitude: Parameter, levels: Float[Array, ""], scale: Parameter
 ) -> Quantized:
-    """Return midpoint of the segment that holds x; d for values from d on and -d below -d, without a bound there."""
+    """Return the midpoint of the segment that holds x / scale; d from d on, and -d below -d, without a bound beyond.
+
+    d is the amplitude; what is returned is in the unit of x.
+    """
     scaled = x / scale
     inside = midpoint(segment_of(scaled, amplitude, levels), amplitude, levels)
     value = jnp.where(scaled >= amplitude, amplitude, jnp.where(scaled < -amplitude, -amplitude, inside))
@@ -311,24 +313,24 @@ class EscapeQuantizer(AbstractQuantizer):
     def encode(self, state: UplinkState, value: ArrayLike, restart: bool = False) -> Symbols:
         """Encode a value (n,), from the amplitude that both ends know, or from the first one."""
         x = jnp.asarray(fill_masked(value), dtype=float)
-        anew = jnp.broadcast_to(self._is_restart(state.number) | restart, x.shape)
-        amplitude = self._present_amplitude(state, anew)
+        restarts = jnp.broadcast_to(self._is_restart(state.number) | restart, x.shape)
+        amplitude = self._present_amplitude(state, restarts)
         # m = ceil(log2(|x| / d)) by exponents, without rounding.
         (x_fraction, x_power), (fraction, power) = jnp.frexp(x), jnp.frexp(amplitude)
         doublings = x_power - power + (jnp.abs(x_fraction) > fraction)  # smallest m with |x| <= d 2^m, exactly
         most = np.finfo(x.dtype).maxexp - power  # the largest that leaves d 2^m a number
-        known, beyond = ~jnp.isnan(x), jnp.isinf(x) | (doublings > most)
+        is_value, beyond = ~jnp.isnan(x), jnp.isinf(x) | (doublings > most)
         escapes = jnp.where(x != 0, jnp.clip(jnp.where(beyond, most, doublings), 0), 0)
         segment = segment_of(x, jnp.ldexp(amplitude, escapes), self.levels)
-        segment = jnp.where(beyond, jnp.where(x > 0, ABOVE, BELOW), jnp.where(known, segment, NOTHING))
+        segment = jnp.where(beyond, jnp.where(x > 0, ABOVE, BELOW), jnp.where(is_value, segment, NOTHING))
         numbers = jnp.broadcast_to(state.number, x.shape)
-        return Symbols(jnp.where(known, escapes, 0).astype(int), segment.astype(int), numbers, anew & known)
+        return Symbols(jnp.where(is_value, escapes, 0).astype(int), segment.astype(int), numbers, restarts & is_value)
 
     @in_float64
     def decode(self, state: UplinkState, symbols: Symbols) -> tuple[UplinkState, Quantized]:
         """Decode at the receiver: next state and value, from the present state and the symbols alone."""
         escapes, segment, number, restart = (jnp.asarray(symbol) for symbol in symbols)
-        restart, there, beyond = restart != 0, segment != NOTHING, segment <= BELOW
+        restart, is_sent, beyond = restart != 0, segment != NOTHING, segment <= BELOW
         # A missed number means a wrong amplitude, until a restart.
         synchronised = restart | (state.number == number)
         # Midpoint of the segment at the doubled amplitude d 2^m.
@@ -338,14 +340,14 @@ class EscapeQuantizer(AbstractQuantizer):
         largest = np.finfo(used.dtype).max
         # Next amplitude max(smallest, decay d 2^m + growth |sent|).
         following = jnp.clip(self.decay * used + self.growth * jnp.abs(sent), self.smallest, largest)
-        known = there & synchronised
-        value = jnp.where(known, sent, jnp.nan)
-        error = jnp.where(known & ~beyond, used / self.levels, jnp.nan)
+        is_decoded = is_sent & synchronised
+        value = jnp.where(is_decoded, sent, jnp.nan)
+        error = jnp.where(is_decoded & ~beyond, used / self.levels, jnp.nan)
         after = UplinkState(
-            jnp.where(known, following, state.amplitude),
-            jnp.where(there, jnp.where(synchronised, number + 1, LOST), state.number),
+            jnp.where(is_decoded, following, state.amplitude),
+            jnp.where(is_sent, jnp.where(synchronised, number + 1, LOST), state.number),
         )
-        return after, Quantized(value, error, known & beyond, escapes + 1)
+        return after, Quantized(value, error, is_decoded & beyond, escapes + 1)
 
     def _is_restart(self, number: Int[Array, "*n"]) -> Bool[Array, "*n"]:
         """Return whether the value of this number is sent from the first amplitude again."""
@@ -369,7 +371,7 @@ def _check_decay(value: ArrayLike) -> Parameter:
 
 
 def _check_growth(value: ArrayLike) -> Parameter:
-    """Return the growth of the amplitude, which must be above 1."""
+    """Return the growth of the amplitude with the sent value, which must not be negative."""
     growth = check_parameter("growth", value)
     if not isinstance(growth, jax.Array) and np.any(growth < 0):
         raise fail("growth", "no negative number", value)

@@ -73,13 +73,15 @@ class EventSending(AbstractQuantizer):
     def step(self, state: LastSent, value: ArrayLike) -> tuple[LastSent, Quantized]:
         """Send or stay silent; return what the receiver has after this step, NaN where it takes silence for a loss."""
         x = jnp.asarray(fill_masked(value), dtype=float)
-        there = ~jnp.any(jnp.isnan(x))
-        sent = there & (~state.any | jnp.any(jnp.abs(x - state.value) > self.threshold))
-        held = LastSent(jnp.where(sent, x, state.value), state.any | sent)
-        received = jnp.where(there & (sent | self.announced), held.value, jnp.nan)
-        error = jnp.where(jnp.isnan(received), jnp.nan, self.error(len(x)))
-        return held, Quantized(
-            received, error, jnp.zeros(len(x), dtype=bool), jnp.where(sent, jnp.ones(len(x), int), 0)
+        is_value = ~jnp.any(jnp.isnan(x))
+        sent = is_value & (~state.any | jnp.any(jnp.abs(x - state.value) > self.threshold))
+        last = LastSent(jnp.where(sent, x, state.value), state.any | sent)
+        received = jnp.where(is_value & (sent | self.announced), last.value, jnp.nan)
+        return last, Quantized(
+            value=received,
+            error=jnp.where(jnp.isnan(received), jnp.nan, self.error(len(x))),
+            saturated=jnp.zeros(len(x), dtype=bool),
+            symbols=jnp.where(sent, jnp.ones(len(x), int), 0),
         )
 
     def error(self, n: int) -> Float[Array, " n"]:
@@ -151,10 +153,12 @@ def check_reports(links: Sequence[ReportLink], quantizers: Sequence[Quantizer], 
     """Raise ValueError unless the links of the nodes, and their quantizers or none, fit reports of n numbers."""
     for link in links:
         instance("report link", link, ReportLink, "a ReportLink").check(n)
-    for link, quantizer in zip(links, quantizers, strict=False):  # none, or one for each link
+    # There are no quantizers, or one for each link.
+    for link, quantizer in zip(links, quantizers, strict=False):
         if isinstance(quantizer, OverTime):
             raise fail("quantizer of reports", "one that does not vary over time", "an OverTime")
-        quantizer.error(n)  # refuses another count of components than its own
+        # It raises where its error has no bound before any data.
+        quantizer.error(n)
         if quantizer.holds and not link.delivers(n):
             raise fail(f"reports through {type(quantizer).__name__}, whose silence is understood", "a report link "
                        "that loses, changes and delays by chance nothing that is sent", "another")  # fmt: skip

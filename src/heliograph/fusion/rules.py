@@ -120,14 +120,14 @@ def fuse(rule: AbstractFusion, estimates: list[Estimate], angles: "Sequence[int]
     rule.check(len(estimates))
     # Angles within half a turn of those of the first estimate.
     means = np.stack([np.asarray(fill_masked(e.mean)) for e in estimates], axis=-2)
-    which, attitude = manifold_among(angles, means.shape[-1])
+    places, attitude = manifold_among(angles, means.shape[-1])
     if attitude or any(estimate.attitude for estimate in estimates):
         raise fail("fusion", "estimates without attitudes", [estimate.attitude or attitude for estimate in estimates])
-    means = nearest(means, means[..., :1, :], which)
+    means = nearest(means, means[..., :1, :], places)
     # The rule, over all leading axes; the claim from those of the inputs.
     covariances = np.stack([np.asarray(fill_masked(e.covariance)) for e in estimates], axis=-3)
     mean, covariance = _combine_all(rule, means, covariances)
-    return Estimate(wrap_angles(np.asarray(mean), which), covariance, rule.claim([e.claim for e in estimates]))
+    return Estimate(wrap_angles(np.asarray(mean), places), covariance, rule.claim([e.claim for e in estimates]))
 
 
 @compile_on_call
@@ -360,11 +360,10 @@ class Fusion(Module):
                 raise fail(f"fusion through {type(first(quantizer)).__name__}", expected, type(self.rule).__name__)
         if self.by_report:
             if not self.rule.uses_reports:
-                raise fail(
-                    "fusion over report links", "a rule that uses reports (AllReports)", type(self.rule).__name__
-                )
+                expected = "a rule that uses reports (AllReports)"
+                raise fail("fusion over report links", expected, type(self.rule).__name__)
             check_reports(self.links(nodes), self._quantizers(nodes), n)
-        self.uplinks(nodes)
+        self.uplinks(nodes)  # raises where quantizers are of several kinds
 
     @property
     def by_report(self) -> bool:
@@ -372,7 +371,7 @@ class Fusion(Module):
         return self.uplink is not None or (self.rule.uses_reports and self.quantizer is not None)
 
     def links(self, nodes: Sequence[str]) -> list[ReportLink]:
-        """Links over which these nodes report, in the order of the nodes."""
+        """Return the links over which these nodes report, in the order of the nodes."""
         return spread_over_names("report links", ReportLink() if self.uplink is None else self.uplink, nodes)
 
     def quantizers(self, nodes: Sequence[str]) -> list[AbstractQuantizer]:
@@ -391,6 +390,7 @@ class Fusion(Module):
         """Return the claim of the fused covariance, from the claims of the filters."""
         if self.quantizer is None:
             return self.rule.claim(claims)
+        # All are of one kind, and that alone decides the claim.
         quantizer = next(iter(self.quantizer.values())) if isinstance(self.quantizer, Mapping) else self.quantizer
         kind = stacked(quantizer)
         return self.rule.claim([kind.claim(claim) for claim in claims])

@@ -11,8 +11,8 @@ from heliograph.numerics.check import DEFINITENESS_TOLERANCE, array, fail, rank
 from heliograph.numerics.linalg import cholesky
 from heliograph.numerics.types import Array, ArrayLike, Float
 
-ROUNDS = 30  # of weights for shares and shares for weights, each of which lowers the trace
-LEAST = 1e-12  # share of an estimate that is hardly used
+ROUNDS = 30  # of weights for the shares and shares for the weights, each of which lowers the trace
+LEAST = 1e-12  # share that an estimate keeps that is hardly used
 
 
 class SplitIntersection(AbstractIntersection):
@@ -62,29 +62,30 @@ class SplitIntersection(AbstractIntersection):
             raise fail("known part", f"that of {count} estimates", f"that of {len(self.known)}")
 
     def combine(self, means: Means, covariances: Covariances) -> Fused:
-        """Fuse by P(w) = known + diag(P^b_i / w_i), which bounds the joint covariance for all shares w that sum to 1.
+        """Fuse with the best weights W for P(w) = P^a + blockdiag(P^b_i / w_i), and the best shares w for W.
 
-        Weights W and shares are found in turn, each for the other: the best W for P(w), and w_i in proportion to
-        root(tr W_i P^b_i W_i'). The trace of W P(w) W' falls with each.
+        P^a is `known`, P^b_i what estimate i has beyond P^a_ii. Both are found in turn: W for P(w), then w_i in
+        proportion to root(tr W_i P^b_i W_i'). The trace of W P(w) W' falls with each.
         """
         known = jnp.asarray(self.known)
         count = len(means)
         items = jnp.arange(count)
         unknown = _add_rounding(covariances - known[items, :, items, :], covariances)
 
-        def bound(shares: jax.Array) -> jax.Array:
-            """Return P(w)."""
+        def bound_joint(shares: jax.Array) -> jax.Array:
+            """Return P(w), which bounds the joint covariance for all shares that sum to 1."""
             return known.at[items, :, items, :].add(unknown / shares[:, None, None])
 
-        def improve(_: int, shares: jax.Array) -> jax.Array:
-            weights = matrix_weights(bound(shares))
+        def improve_shares(_: int, shares: jax.Array) -> jax.Array:
+            """Return the best shares for the weights that are the best for these shares."""
+            weights = matrix_weights(bound_joint(shares))
             root = jnp.sqrt(jnp.maximum(jnp.einsum("aib,ibc,aic->i", weights, unknown, weights), 0.0))
             total = root.sum()
             return jnp.maximum(jnp.where(total > 0, root / jnp.where(total > 0, total, 1.0), shares), LEAST)
 
         # Alternating minimisation from equal shares.
-        shares = jax.lax.fori_loop(0, ROUNDS, improve, jnp.full(count, 1 / count))
-        joint = bound(shares / shares.sum())
+        shares = jax.lax.fori_loop(0, ROUNDS, improve_shares, jnp.full(count, 1 / count))
+        joint = bound_joint(shares / shares.sum())
         weights = matrix_weights(joint)
         # W x and W P(w) W'; NaN if some P^b_i is no covariance.
         sound = jnp.all(jnp.isfinite(jax.vmap(cholesky)(unknown)))
@@ -99,5 +100,5 @@ def _add_rounding(unknown: jax.Array, covariances: jax.Array) -> jax.Array:
     """
     n = unknown.shape[-1]
     rounding = UNITS * n * unit_of(covariances) * jnp.einsum("aii->ai", covariances)
-    there = jnp.any(unknown != 0, axis=(-1, -2), keepdims=True)
-    return unknown + jnp.where(there, rounding[..., None] * jnp.eye(n, dtype=unknown.dtype), 0.0)
+    is_some = jnp.any(unknown != 0, axis=(-1, -2), keepdims=True)
+    return unknown + jnp.where(is_some, rounding[..., None] * jnp.eye(n, dtype=unknown.dtype), 0.0)

@@ -63,5 +63,5 @@ class ZoomQuantizer(AbstractQuantizer):
         return following, sent
 
     def claim(self, claim: Claim) -> Claim:
-        """At most "nominal": the amplitude depends on the data, and may be small where errors are large."""
+        """Lower a claim to "nominal": the amplitude depends on the data, and may be small where errors are large."""
         return weakest([claim, "nominal"])

@@ -25,7 +25,7 @@ def smoother_steps(
     state: PyTree | None = None,
     first_step: int = 0,
 ) -> "tuple[PyTree, SmootherStep]":
-    """Step a filter over rows of data: its state after them, and its smoother steps stacked along time.
+    """Step a filter over rows of data; return its state after them, and its smoother steps stacked along time.
 
     Args:
         filter: a filter that can be smoothed.
@@ -63,9 +63,12 @@ def plan_with_past(filter: AbstractFilter, inputs: Array) -> AbstractFilter:
 
 
 def data_free_smoother_steps(filter: AbstractFilter, inputs: Array) -> SmootherStep:
-    """Smoother steps for z = 0: covariances and gains are right where none depends on data, means are placeholders."""
-    quiet = jnp.zeros((len(inputs), filter.received))
-    steps: SmootherStep = step_rows(filter, quiet, inputs, filter.init(), np.asarray(0))[1]
+    """Return the smoother steps for z = 0, of a filter whose covariances and gains depend on no data.
+
+    Their covariances and gains are those of all data; their means stand in for those that data will give.
+    """
+    zeros = jnp.zeros((len(inputs), filter.received))
+    steps: SmootherStep = step_rows(filter, zeros, inputs, filter.init(), np.asarray(0))[1]
     return steps
 
 
@@ -88,6 +91,7 @@ def sweep_means(steps: SmootherStep) -> jax.Array:
     """Estimate the mean of each step's state given all data: one backward pass."""
 
     def body(later: jax.Array, pair: tuple[SmootherStep, SmootherStep]) -> tuple[jax.Array, jax.Array]:
+        """Smooth the mean between two steps, given the smoothed one after both."""
         previous, step = pair
         mean = step.mean_back(later)
         return mean, _plant_mean(previous, mean)
@@ -114,9 +118,8 @@ def sweep_over_lag(steps: SmootherStep, lag: int | Int[Array, ""]) -> Estimate:
 
     # From the newest step that each one may use, as many steps back as the lag has.
     newest = take_steps(steps.end, jnp.minimum(times + lag, last))
-    estimate: Estimate = jax.vmap(lambda step, law: step.estimate_from(law))(
-        steps, jax.lax.fori_loop(0, lag, body, newest)
-    )
+    smoothed = jax.lax.fori_loop(0, lag, body, newest)
+    estimate: Estimate = jax.vmap(lambda step, law: step.estimate_from(law))(steps, smoothed)
     return estimate
 
 
@@ -125,6 +128,7 @@ def carry_ahead(steps: SmootherStep, step: int) -> Estimate:
     start = take_step(steps, step)
 
     def body(point: EarlierState, later_step: SmootherStep) -> tuple[EarlierState, Estimate]:
+        """Carry the state after `step` over a later one, and estimate it given the data up to there."""
         after = later_step.ahead(point)
         return after, start.estimate_from(start.settle(later_step.reached(after)))
 

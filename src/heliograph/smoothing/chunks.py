@@ -60,21 +60,33 @@ def smooth_in_chunks(filter: Any, z: Array, u: Array) -> SmoothedRows | None:
 def smooth_chunk(
     recursion: SmootherRows, state: PyTree, rows: PyTree, first: Array, end: Array, later: Gaussian, is_given: Array
 ) -> SmoothedChunk:
-    """Smooth a chunk by its rows and those behind it, up to row `end`; backwards from `later` there, if it is given."""
+    """Smooth a chunk by its own rows and those behind it, up to row `end`.
+
+    Args:
+        recursion: the filter over rows, and how many rows are the chunk's own.
+        state: the filter's state at the chunk's beginning.
+        rows: measurements and inputs of its own rows and those behind.
+        first: number of its first row.
+        end: number of the row before which the pass back begins.
+        later: the law from which it begins, if it `is_given`; else it is the filter's.
+        is_given: whether `later` is used.
+    """
     own = recursion.own
     after, steps = scan_chunk(recursion, state, take(rows, slice(own)), first, end)
-    last, behind = scan_chunk(recursion, after, take(rows, slice(own, None)), first + own, end)
+    last, steps_behind = scan_chunk(recursion, after, take(rows, slice(own, None)), first + own, end)
 
     def pass_back(law: Gaussian, item: tuple[SmootherStep, Array]) -> tuple[Gaussian, None]:
+        """Return the law before a row from that behind it; the same from row `end` on."""
         step, k = item
         return select_state(k < end, step.back(law), law), None
 
     def smooth(law: Gaussian, item: tuple[SmootherStep, Array]) -> tuple[Gaussian, Estimate]:
+        """Pass back over a row, and keep its estimate."""
         return pass_back(law, item)[0], item[0].estimate_from(law)
 
     k = first + jnp.arange(len(rows[0]))
     law = select_state(is_given, later, gaussian_of(last))
-    entered, _ = jax.lax.scan(pass_back, law, (behind, k[own:]), reverse=True)
+    entered, _ = jax.lax.scan(pass_back, law, (steps_behind, k[own:]), reverse=True)
     left, estimate = jax.lax.scan(smooth, entered, (steps, k[:own]), reverse=True)
     return SmoothedChunk(after, entered, left, estimate, steps.nis, steps.received)
 
@@ -91,6 +103,7 @@ def _smooth_all(recursion: SmootherRows, begun: Begun, rows: PyTree) -> Smoothed
     ends = np.minimum(begun.first + own + ahead, total)
 
     def smooth(states: PyTree, which: Which, later: Gaussian | None = None) -> SmoothedChunk | None:
+        """Smooth some chunks from these states; backwards from `later` at the end of their own rows, if given."""
         first = begun.first[which]
         end = ends[which] if later is None else first + own
         laws = gaussian_of(states) if later is None else later
@@ -99,8 +112,10 @@ def _smooth_all(recursion: SmootherRows, begun: Begun, rows: PyTree) -> Smoothed
         return None if choice.code is None else choice.results()
 
     def smooth_means(settled: Settled) -> SmoothedChunk | None:
+        """Smooth all chunks as if they were settled."""
         return smooth_settled_chunks(recursion, settled, begun, windows)
 
+    # Settled chunks are those whose rows are complete, their own and those behind, of which none are beyond the end.
     whole = begun.complete.cover(begun.first, own + ahead) & (begun.first + own + ahead <= total)
     begun = begun._replace(covered=begun.covered & whole)
     results = scan_chunks(begun, smooth, smooth_means)
@@ -114,6 +129,7 @@ def _smooth_all(recursion: SmootherRows, begun: Begun, rows: PyTree) -> Smoothed
             here, law = slice(c, c + 1), take(results.left, slice(c + 1, c + 2))
             state = take(results.end, slice(c - 1, c)) if c else take(begun.states, here)
             replace_chunk(results, here, smooth(state, here, law))
+            # This chunk is left by another law now, with which the one before it has to agree.
             if c:
                 wrong[c - 1] = not agree(take(results.entered, slice(c - 1, c)), take(results.left, here))[0]
     estimate, nis, received = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:total], results[3:])

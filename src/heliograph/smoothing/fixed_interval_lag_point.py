@@ -20,12 +20,15 @@ from heliograph.smoothing.backward_pass import carry_ahead, sweep_back, sweep_me
 
 BLOCKS = 10  # parts of a run, whose scatter gives the standard error of the NIS
 DEVIATIONS = 3.5  # standard errors of the mean NIS: fewer may be chance
-EXCESS = 1.05  # times the expected NIS: less does little harm
+EXCESS = 1.05  # ratio to the expected NIS from which on it is told: less does little harm
 
 
 @compile_on_call
 def nis_sums(steps: SmootherStep) -> Float[Array, "5"]:
-    """Sums over blocks of one run, s the sum of e' S^-1 e and h the number of components: s, h, s^2, s h, h^2."""
+    """Return sums over the blocks of one run of s, h, s^2, s h and h^2.
+
+    s is the sum of e' S^-1 e over a block, and h the number of components of e that arrived in it.
+    """
     if steps.nis is None or steps.received is None:
         return jnp.zeros(5)
     return sum_blocks(steps.nis, steps.received)
@@ -42,12 +45,16 @@ def sum_blocks(nis: Float[Array, " time"], received: Float[Array, " time"]) -> F
 
 
 def nis_test(sums: Float[np.ndarray, "5"]) -> tuple[float, float]:
-    """Mean NIS per component, 1 for a consistent filter, and its standard error from the scatter of the blocks."""
+    """Return the mean NIS per component, 1 for a consistent filter, and its standard error.
+
+    The error is that of a ratio, from the scatter of the blocks: the root of sum (s - ratio h)^2, over sum h.
+    """
     s, h, ss, sh, hh = (float(total) for total in sums)
     if not h:
         return 1.0, 0.0
     ratio = s / h
-    return ratio, float(np.sqrt(max(ss - 2 * ratio * sh + ratio**2 * hh, 0.0))) / h
+    squares = ss - 2 * ratio * sh + ratio**2 * hh
+    return ratio, float(np.sqrt(max(squares, 0.0))) / h
 
 
 def warn_if_inconsistent(name: str, sums: Float[np.ndarray, "5"]) -> None:

@@ -91,7 +91,7 @@ class PlannedSmoother(Module):
     estimate: Estimate
 
     def means(self, z: ArrayLike) -> Float[jax.Array, "time n"]:
-        """Smoothed means of one run's z (horizon, received), also for `hg.simulation.over_runs` and `jax.vmap`."""
+        """Return smoothed means of a run's z (horizon, received), also in `hg.simulation.over_runs` and `jax.vmap`."""
         return _smoothed_means(self, array("measurements", z, (len(self.inputs), self.filter.received), missing=True))
 
 

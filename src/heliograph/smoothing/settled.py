@@ -24,13 +24,18 @@ from heliograph.numerics.types import Array, PyTree
 
 
 class SmootherRows(Recursion):
-    """A filter over rows, of each of which its smoother step is kept; `own`: rows of a chunk."""
+    """A filter's recursion over rows, with the smoother step of each row as its output.
+
+    Args:
+        filter: the filter.
+        own: number of rows of a chunk, without those behind it that it is smoothed by.
+    """
 
     filter: Any
     own: int = eqx.field(static=True)
 
     def step(self, state: PyTree, row: tuple[Array, Array], k: Array) -> tuple[PyTree, SmootherStep]:
-        """Predict and correct."""
+        """Predict and correct; return the state after, and the smoother step with its squared innovation."""
         z, u = row
         prior = self.filter.predict(state, u, k)
         after, innovation = self.filter.correct(prior, z, k)
@@ -69,39 +74,55 @@ def smooth_settled_chunks(
     """Smooth chunks, as if all were settled, by their rows and those behind them (chunks, rows, ...).
 
     None where the smoothed law does not settle, or without native code.
+
+    Args:
+        recursion: the filter over rows.
+        settled: the state at which its covariance stands still, and its smoother step there.
+        begun: the states with which the chunks begin.
+        windows: rows of each chunk.
     """
+    # The smoothed law that stands still, by repeating the settled smoother step.
     back = BackRows(settled)
-    varying = [
-        np.asarray(leaf)[None] for leaf, v in zip(jax.tree.leaves(settled.outputs), settled.varies, strict=True) if v
-    ]
-    later = find_settled(back, settled.outputs.after, (varying, np.zeros((1, 0))), begun.lengths.ahead)
-    if later is None:
+    leaves = zip(jax.tree.leaves(settled.outputs), settled.varies, strict=True)
+    varying = [np.asarray(leaf)[None] for leaf, varies in leaves if varies]
+    smoothed = find_settled(back, settled.outputs.after, (varying, np.zeros((1, 0))), begun.lengths.ahead)
+    if smoothed is None:
         return None
-    arguments = recursion, back, later, means_of(begun.states), windows, begun.first
+    arguments = recursion, back, smoothed, means_of(begun.states), windows, begun.first
     choice = choose_code(_smooth_settled, arguments, [False, False, False, True, True, True])
     if choice.code is None:
         return None
-    end, behind, ahead, estimates, nis = choice.results()
-    received = np.full(nis.shape, settled.outputs.received)
+    end, entered, left, estimates, nis = choice.results()
     return SmoothedChunk(
-        settled.repeated(end), later.repeated(behind), later.repeated(ahead), later.rows_of(estimates), nis, received
+        end=settled.repeated(end),
+        entered=smoothed.repeated(entered),
+        left=smoothed.repeated(left),
+        estimate=smoothed.rows_of(estimates),
+        nis=nis,
+        received=np.full(nis.shape, settled.outputs.received),
     )
 
 
 def _smooth_settled(
-    recursion: SmootherRows, back: BackRows, later: Settled, means: Sequence[Array], rows: PyTree, first: Array
+    recursion: SmootherRows, back: BackRows, smoothed: Settled, means: Sequence[Array], rows: PyTree, first: Array
 ) -> tuple[PyTree, ...]:
-    """Smooth a settled chunk: means at its end, of the laws behind it and ahead, what varies of its estimates, NIS."""
+    """Smooth a settled chunk that begins with these means, by its own rows and those behind it.
+
+    Returns:
+        The filter's means at its end, the means of the smoothed laws by which it is entered and left, the leaves of its
+        estimates that vary (own, ...), and the squared innovations (own,).
+    """
     own, settled, end = recursion.own, back.settled, first + len(rows[0])
     after, steps = scan_settled(recursion, settled, means, take(rows, slice(own)), first, end)
-    last, behind = scan_settled(recursion, settled, after, take(rows, slice(own, None)), first + own, end)
+    last, steps_behind = scan_settled(recursion, settled, after, take(rows, slice(own, None)), first + own, end)
 
     def pass_back(means: list[jax.Array], varying: list[jax.Array]) -> tuple[list[jax.Array], list[jax.Array]]:
-        law, estimate = step_settled(back, later.state, means, (varying, jnp.zeros(0)), jnp.zeros((), int))
-        return means_of(law), later.varying_of(estimate)
+        """Return the smoothed means before a row from those behind it, and what varies of its estimate."""
+        law, estimate = step_settled(back, smoothed.state, means, (varying, jnp.zeros(0)), jnp.zeros((), int))
+        return means_of(law), smoothed.varying_of(estimate)
 
     law = [gaussian_of(with_means(settled.state, last)).mean]
-    entered, _ = jax.lax.scan(pass_back, law, behind, reverse=True)
+    entered, _ = jax.lax.scan(pass_back, law, steps_behind, reverse=True)
     left, estimates = jax.lax.scan(pass_back, entered, steps, reverse=True)
     nis = settled.row_of(steps).nis
     return after, entered, left, estimates, jnp.broadcast_to(nis, (own,))

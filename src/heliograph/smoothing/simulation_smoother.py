@@ -54,7 +54,7 @@ def simulation_smoother(
 
 @compile_in_float64
 def _draw_paths(filter: AbstractFilter, z: Array, u: Array, keys: jax.Array) -> jax.Array:
-    """Draw one path for each key, by one filter pass."""
+    """Draw one path for each key (draws, steps, n), by one filter pass."""
     _, steps = step_rows(filter, z, u, filter.init(), np.asarray(0))
     if steps.before is None:
         raise fail("paths", "a filter of one law of motion (rts_smoother takes several)", type(filter).__name__)
@@ -63,9 +63,10 @@ def _draw_paths(filter: AbstractFilter, z: Array, u: Array, keys: jax.Array) -> 
 
 
 def _draw_path_back(steps: SmootherStep, key: jax.Array) -> jax.Array:
-    """Draw one path back from the last step."""
+    """Draw one path (steps, n) back from the last step."""
 
     def body(later: jax.Array, pair: tuple[SmootherStep, SmootherStep, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        """Draw the filter's state between two steps, given the one drawn after both; keep the plant's."""
         previous, step, key = pair
         left, manifold = step.before.left, step.manifold
         mean = step.before.mean_given(manifold.unsettle(step.before.ahead, later))
@@ -86,6 +87,6 @@ def _draw_gaussian(law: Gaussian, key: jax.Array) -> jax.Array:
 
 
 def _plant_state(step: SmootherStep, x: jax.Array) -> jax.Array:
-    """Return the plant's state of the filter's."""
+    """Return the plant's state x of the filter's, angles between -pi and pi."""
     x = x if step.projection is None else step.projection @ x
     return wrap_angles(x if step.shift is None else x + step.shift, step.angles)

@@ -36,8 +36,8 @@ from heliograph.random_affine.moments.second_moments import SecondOrder
 
 Observe = Callable[[jax.Array], jax.Array]
 SIGNIFICANT = 9.0  # variances: a motion within three standard deviations of zero gives no information on time
-SHARE = 1e-3  # of the outputs' derivatives by an offset: with less unexplained by other states, it is unobservable
-RANK = 1e-12  # of the largest eigenvalue: directions below are unobservable
+SHARE = 1e-3  # of the outputs' derivatives by an offset: if other states leave less unexplained, it is unobservable
+RANK = 1e-12  # share of the largest eigenvalue: directions of smaller eigenvalues are unobservable
 
 
 class ClockBelief(NamedTuple):
@@ -67,7 +67,11 @@ class ClockFilter(AbstractWrapper):
       have not arrived for as many steps do not count, nor do those that carry noise only.
 
     If not, offset and drift keep mean and covariance, and the other states are corrected without knowledge of them
-    (Schmidt): K = 0 there, P+ = P - K C - C' K' + K S K'.
+    (Schmidt): K = 0 there, P+ = P - K C - C' K' + K S K', C = Cov(z, x).
+
+    Args:
+        base: the joint filter of plant and clocks.
+        offsets: place of each clock's offset in the state; its drift is the next state.
 
     Source: Schmidt (1966) for states that are considered; the observability matrix along a trajectory.
     """
@@ -83,9 +87,10 @@ class ClockFilter(AbstractWrapper):
     def init(self) -> ClockBelief:
         """Return the belief before any data."""
         start = self.base.init()
+        # No component counts before it arrives, and no clock has been observed.
         silence = jnp.full(self.received, len(self.states))
-        none = jnp.zeros(len(self.offsets), dtype=bool)
-        return ClockBelief(start, jnp.zeros(len(self.inputs)), silence, none)
+        observed = jnp.zeros(len(self.offsets), dtype=bool)
+        return ClockBelief(start, jnp.zeros(len(self.inputs)), silence, observed)
 
     @predicts
     def predict(self, state: ClockBelief, u: ArrayLike = (), k: Step = 0) -> ClockBelief:
@@ -107,8 +112,8 @@ class ClockFilter(AbstractWrapper):
         present, total = ~jnp.isnan(z), jnp.asarray(innovation_covariance(signal, channel))
         # Observability of each clock through the components that arrived recently.
         silence = jnp.where(present, 0, state.silence)
-        arrived_values = jnp.where((silence < len(self.states))[:, None], jnp.asarray(channel.mean_gain), 0.0)
-        observed = self._test_observable(state, lambda x: arrived_values @ sensor.measure(x), k) & jnp.any(present)
+        recent_gain = jnp.where((silence < len(self.states))[:, None], jnp.asarray(channel.mean_gain), 0.0)
+        observed = self._test_observable(state, lambda x: recent_gain @ sensor.measure(x), k) & jnp.any(present)
         # Schmidt: zero rows of the gain for offset and drift of a clock that is not observable.
         gain, _ = base.rule.correct(prior.covariance, signal, channel, present)
         gain = gain * self._mask_estimated(observed)[:, None]
@@ -118,47 +123,60 @@ class ClockFilter(AbstractWrapper):
         return belief, gaussian_innovation(z, expected, total)
 
     def _mask_estimated(self, observed: jax.Array) -> jax.Array:
-        """Return 1 for the states that are estimated, 0 for offset and drift of clocks that are not."""
-        values = jnp.ones(len(self.states))
+        """Return 1 for the states that are estimated, 0 for offset and drift of clocks that are not (n,)."""
+        mask = jnp.ones(len(self.states))
         for i, offset in enumerate(self.offsets):
-            values = values.at[offset : offset + 2].set(jnp.where(observed[i], 1.0, 0.0))
-        return values
+            mask = mask.at[offset : offset + 2].set(jnp.where(observed[i], 1.0, 0.0))
+        return mask
 
     def _test_observable(self, state: ClockBelief, observe: Observe, k: Step) -> jax.Array:
-        """Test whether each clock is observable: dy/dt is significant, and its derivatives are linearly independent."""
-        slope = jax.jacfwd(observe)
-        rate, curve = slope(state.gaussian.mean), jax.jacfwd(slope)(state.gaussian.mean)
-        seen = self._independent_shares(state, observe, k)
+        """Test whether each clock is observable (clocks,).
+
+        It is where dy/dt, the derivative by its offset, is significant against the uncertainty of the state, and where
+        the derivatives by the offset are linearly independent of those by the other states.
+        """
+        jacobian = jax.jacfwd(observe)
+        slopes, curvature = jacobian(state.gaussian.mean), jax.jacfwd(jacobian)(state.gaussian.mean)
+        independent = self._independent_shares(state, observe, k)
         observable = []
         for i, offset in enumerate(self.offsets):
-            variance = jnp.einsum("ri,ij,rj->r", curve[:, offset], state.gaussian.covariance, curve[:, offset])
-            moves = jnp.any(rate[:, offset] ** 2 > SIGNIFICANT * variance)
-            observable.append(moves & (seen[i] > SHARE))
+            # Variance of dy/do of each received component: dy/do is to first order linear in the state.
+            gradient = curvature[:, offset]
+            variance = jnp.einsum("ri,ij,rj->r", gradient, state.gaussian.covariance, gradient)
+            moves = jnp.any(slopes[:, offset] ** 2 > SIGNIFICANT * variance)
+            observable.append(moves & (independent[i] > SHARE))
         return jnp.stack(observable)
 
     def _independent_shares(self, state: ClockBelief, observe: Observe, k: Step) -> jax.Array:
-        """Return the share of the outputs' derivatives by each offset that is independent of the others'."""
+        """Return the share of the outputs' derivatives by each offset that is independent of those by other states.
+
+        The derivatives are those of the outputs at the next n steps by the present state, along the motion without
+        noise: the rows of the observability matrix O, of which O'O is summed up.
+        """
         plant, n = at(self.base.plant, k), len(self.states)
 
         def add_derivative(
             carry: tuple[jax.Array, jax.Array], _: None
         ) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
-            x, reach = carry
-            observed = jax.jacfwd(observe)(x) @ reach
+            x, from_present = carry  # the state at a later step, and its derivatives by the present state
+            rows = jax.jacfwd(observe)(x) @ from_present
             step = jax.jacfwd(lambda x: plant.transition(x, state.inputs))(x)
-            return (plant.transition(x, state.inputs), step @ reach), observed.T @ observed
+            return (plant.transition(x, state.inputs), step @ from_present), rows.T @ rows
 
         _, squares = jax.lax.scan(add_derivative, (state.gaussian.mean, jnp.eye(n)), None, length=n)
         return jnp.stack([_compute_unexplained_share(jnp.sum(squares, axis=0), offset) for offset in self.offsets])
 
 
 def _compute_unexplained_share(square: jax.Array, column: int) -> jax.Array:
-    """Return 1 - r' R^+ r, what other columns of O, of correlations R, leave unexplained of one; O'O = `square`."""
+    """Return 1 - r' R^+ r, the share of one column of O that the others leave unexplained; 0 of a column of zeros.
+
+    R are the correlations (cosines) of the other columns, r those of this column with them; O'O = `square`.
+    """
     lengths = jnp.sqrt(jnp.diagonal(square))
     scale = jnp.where(lengths > 0, 1 / jnp.where(lengths > 0, lengths, 1.0), 0.0)
     correlations = scale[:, None] * square * scale
-    others = [i for i in range(square.shape[0]) if i != column]
-    among, r = correlations[jnp.ix_(jnp.array(others), jnp.array(others))], correlations[jnp.array(others), column]
+    others = jnp.array([i for i in range(square.shape[0]) if i != column])
+    among, r = correlations[jnp.ix_(others, others)], correlations[others, column]
     values, vectors = eigh(among)
     is_used = values > RANK * values[-1]
     explained = jnp.sum(jnp.where(is_used, (vectors.T @ r) ** 2 / jnp.where(is_used, values, 1.0), 0.0))

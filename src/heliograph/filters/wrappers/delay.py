@@ -113,43 +113,51 @@ def _receive_at(state: LinearBelief, link: SecondOrder, start: int, length: int,
     """Receive r = G l + n and put it at `position` of the state.
 
     l is the part of the state, `length` numbers from `start` on, that has the signals under way to this link, at the
-    relay before it or at the sensor.
+    relay before it or at the sensor; M and b are the mean of G and n.
     """
-    # x+ = matrix x + shift: the received signal replaces what stands at its place.
+    # x+ = matrix x + shift: the received signal, of mean M l + b, replaces what stands at its place.
     gain, offset = jnp.asarray(link.mean_gain), jnp.asarray(link.offset)
     total, m = len(state.gaussian.mean), len(offset)
     line, place = slice(start, start + length), slice(position, position + m)
     matrix = jnp.eye(total).at[place, :].set(0.0).at[place, line].set(gain)
     shift = jnp.zeros(total).at[place].set(offset)
-    # E Cov(r | l): its random gain makes noise as large as l itself, of which no data are known here.
+    # E Cov(r | l), by the moments of l before any data: what a random gain adds as noise is in proportion to l itself.
     mean, covariance = state.state_mean[line], state.state_covariance[line, line]
-    spread = link_noise(link, covariance + jnp.outer(mean, mean), mean)
-    noise = Columns(jnp.zeros((total, spread.matrix.shape[1])).at[place].set(spread.matrix), spread.weights)
+    received = link_noise(link, covariance + jnp.outer(mean, mean), mean)
+    noise = Columns(jnp.zeros((total, received.matrix.shape[1])).at[place].set(received.matrix), received.weights)
     return predict_belief(state, PlantMotion(matrix, shift, noise.covariance, noise))
 
 
 def enlarge_by_relays(
     plant: AnyPlant, sensor: AnySensor, channel: Relayed
 ) -> tuple[AnyPlant, LinearSensor, Channel, tuple[tuple[int, int, int], ...]]:
-    """Enlarge the plant by all lines of past signals; return it with sensor, last link, and each relay's places."""
+    """Enlarge the plant by all lines of past signals, the sensor's first and then each relay's.
+
+    Returns:
+        The larger plant, the sensor of the last relay's line, the link behind that, and of each relay the line that it
+        receives and the place of its received signal, as `HeldFilter` has them.
+    """
     for stage in channel.stages:
         check_forgets("link of a relay that is late by chance", stage)
     # The sensor's line, then one line per relay behind it.
-    moved, _, _ = with_past(plant, sensor, channel.stages[0])
+    larger, _, _ = with_past(plant, sensor, channel.stages[0])
     start, lines = len(first(plant).states), []
-    total = len(first(moved).states)
+    total = len(first(larger).states)
     for i, (stage, later) in enumerate(zip(channel.stages, channel.stages[1:], strict=False)):
         lines.append((start, stage.inputs, total))
         start = total
         total += later.inputs
-        moved = at_each_step(partial(_append_relay_line, relay=i, size=stage.outputs, steps=later.past), moved)
+        larger = at_each_step(partial(_append_relay_line, relay=i, size=stage.outputs, steps=later.past), larger)
     # The receiver sees the line of the last relay.
-    last = LinearSensor(np.eye(total)[start:], np.zeros((total - start, total - start)), first(moved).states[start:])
-    return moved, last, place_on_delay_line(channel.stages[-1]), tuple(lines)
+    last = LinearSensor(np.eye(total)[start:], np.zeros((total - start, total - start)), first(larger).states[start:])
+    return larger, last, place_on_delay_line(channel.stages[-1]), tuple(lines)
 
 
 def _append_relay_line(plant: PyTree, relay: int, size: int, steps: int) -> LinearPlant | Plant:
-    """Enlarge the plant by the line of a relay, which shifts by one at each step."""
+    """Enlarge the plant by the line of a relay: what it received 0 to `steps` steps ago, `size` numbers each.
+
+    The line shifts by one place at each step, and leaves its first place empty for what is received.
+    """
     held = size * (1 + steps)
     names = [f"relay_{relay}_{j}_{d}_ago" for d in range(1 + steps) for j in range(size)]
     shift, nothing = np.kron(np.eye(1 + steps, k=-1), np.eye(size)), np.zeros((held, held))
@@ -173,7 +181,7 @@ def relayed_filter(plant: AnyPlant, channel: Relayed, base: AbstractFilter, line
 
 
 class LateState(NamedTuple):
-    """State of the filter at the time of the last received signal, the inputs since then, and the last step."""
+    """State of the filter `delay` steps ago, when the last received signal was sent, the inputs since, and the step."""
 
     base: PyTree
     inputs: Float[jax.Array, "delay inputs"]
@@ -202,10 +210,10 @@ class LateFilter(AbstractWrapper):
     @predicts
     def predict(self, state: LateState, u: ArrayLike = (), k: Step = 0) -> LateState:
         """Predict over step k - delay, with the input of that step."""
-        line = jnp.concatenate([state.inputs, jnp.asarray(u)[None]])
-        then = jnp.asarray(k) - self.delay
-        moved = self._predict_if_begun(state.base, line[0], then)
-        return LateState(moved, line[1:], jnp.asarray(k, dtype=state.step.dtype))
+        inputs = jnp.concatenate([state.inputs, jnp.asarray(u)[None]])  # of steps k - delay to k
+        sent_at = jnp.asarray(k) - self.delay
+        moved = self._predict_if_begun(state.base, inputs[0], sent_at)
+        return LateState(moved, inputs[1:], jnp.asarray(k, dtype=state.step.dtype))
 
     def _predict_if_begun(self, base: PyTree, u: jax.Array, k: jax.Array) -> PyTree:
         """Predict over step k, or return the state as it is where k < 0."""
@@ -215,10 +223,10 @@ class LateFilter(AbstractWrapper):
     @corrects
     def correct(self, state: LateState, z: ArrayLike, k: Step = 0) -> tuple[LateState, Innovation]:
         """Correct with what was sent at step k - delay; values received before the first signal say nothing."""
-        then = jnp.asarray(k) - self.delay
-        after, innovation = self.base.correct(state.base, z, jnp.maximum(then, 0))
-        base = jax.tree.map(lambda new, old: jnp.where(then >= 0, new, old), after, state.base)
-        likelihood = jnp.where(then >= 0, innovation.log_likelihood, 0.0)
+        sent_at = jnp.asarray(k) - self.delay
+        after, innovation = self.base.correct(state.base, z, jnp.maximum(sent_at, 0))
+        base = jax.tree.map(lambda new, old: jnp.where(sent_at >= 0, new, old), after, state.base)
+        likelihood = jnp.where(sent_at >= 0, innovation.log_likelihood, 0.0)
         return state._replace(base=base), Innovation(innovation.value, innovation.covariance, likelihood)
 
     @estimates
@@ -264,7 +272,8 @@ class KnownDelayFilter(AbstractWrapper):
     It estimates the past signals as well, so that a signal received twice counts once, with two channel noises: joint
     noise R 11' + N I. Given all delays it is the best linear estimate.
 
-    base: a filter of (x, y_k, ..., y_{k-D}) whose `channel` may be replaced by `channels` at a delay (0, ..., D).
+    base: a filter of (x, y_k, ..., y_{k-D}) whose `channel` may be replaced. channels: its channel at each delay, with
+    a leading axis of the delays 0, ..., D.
     """
 
     base: AbstractFilter
@@ -274,15 +283,16 @@ class KnownDelayFilter(AbstractWrapper):
     def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
         """Correct with the channel of the received delay; without a delay nothing is used."""
         z, delay = jnp.asarray(z)[:-1], jnp.asarray(z)[-1]
-        known, longest = ~jnp.isnan(delay), len(self.channels.offset) - 1
-        d = jnp.clip(jnp.where(known, delay, 0.0).astype(int), 0, longest)
-        here = jax.tree.map(lambda leaf: jnp.asarray(leaf)[d] if eqx.is_array(leaf) else leaf, self.channels)
-        base = eqx.tree_at(lambda filter: filter.channel, self.base, here)
+        is_known, longest = ~jnp.isnan(delay), len(self.channels.offset) - 1
+        d = jnp.clip(jnp.where(is_known, delay, 0.0).astype(int), 0, longest)
+        channel = jax.tree.map(lambda leaf: jnp.asarray(leaf)[d] if eqx.is_array(leaf) else leaf, self.channels)
+        base = eqx.tree_at(lambda filter: filter.channel, self.base, channel)
         after, innovation = base.correct(state, z, k)
-        used = jax.tree.map(lambda new, old: jnp.where(known, new, old), after, state)
-        flag_innovation, covariance = append_flag(innovation.covariance, delay)
-        likelihood = jnp.where(known, innovation.log_likelihood, 0.0)
-        return used, Innovation(jnp.append(innovation.value, flag_innovation), covariance, likelihood)
+        after = jax.tree.map(lambda new, old: jnp.where(is_known, new, old), after, state)
+        # The delay itself is a component of z too, of which the innovation tells nothing.
+        delay_innovation, covariance = append_flag(innovation.covariance, delay)
+        likelihood = jnp.where(is_known, innovation.log_likelihood, 0.0)
+        return after, Innovation(jnp.append(innovation.value, delay_innovation), covariance, likelihood)
 
 
 Make = Callable[[AnyPlant, AnySensor, Channel], AbstractFilter]
@@ -290,7 +300,10 @@ Make = Callable[[AnyPlant, AnySensor, Channel], AbstractFilter]
 
 @believes
 def build_behind_delays(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Make) -> AbstractFilter:
-    """Build a filter for a link that may be late from `make`, which builds one for a link without delay."""
+    """Build a filter for a link that may be late from `make`, which builds one for a link without delay.
+
+    With time stamps, and where the delay is random, past signals are states of the filter; a constant delay needs none.
+    """
     start, n = first(channel), len(first(plant).states)
     check_link(first(sensor), start, n, late=True)
     if isinstance(start, Delayed) and start.timestamped:
@@ -311,13 +324,13 @@ def _build_behind_relays(plant: AnyPlant, sensor: AnySensor, channel: Channel, m
 
 
 def _build_known_delay_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Make) -> KnownDelayFilter:
-    """Build the filter that receives each value's delay with it, one channel description for every delay."""
+    """Build the filter that receives each value's delay with it, with the channel's moments at every delay."""
     if not isinstance(channel, Delayed):
         raise fail("channel with time stamps", "one that does not vary", "one in over_time")
     check_forgets("link with time stamps", channel.link)
-    larger, everything, _ = with_past(plant, sensor, channel)
+    larger, past_signals, _ = with_past(plant, sensor, channel)
     links = [channel.given(d) for d in range(channel.past + 1)]
-    base, start = make(larger, everything, links[0]), first(plant)
+    base, start = make(larger, past_signals, links[0]), first(plant)
     return KnownDelayFilter(
         base=base,
         channels=stack([second_order(link) for link in links]),

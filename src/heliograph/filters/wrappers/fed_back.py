@@ -136,15 +136,11 @@ class FedBackFilter(AbstractWrapper):
     def correct(self, state: FedBackBelief, z: ArrayLike, k: Step = 0) -> tuple[FedBackBelief, Innovation]:
         """Correct with the measurement of y - r."""
         base = self.base
-        y = signal_of(
-            at(base.plant, k),
-            at(base.sensor, k),
-            base.transform,
-            state.gaussian,
-            second_moments_at_start(base.plant, base),
-        )
-        left = y.mean - state.reference
-        sent = y._replace(mean=left, second=y.covariance + jnp.outer(left, left))
+        plant, sensor = at(base.plant, k), at(base.sensor, k)
+        y = signal_of(plant, sensor, base.transform, state.gaussian, second_moments_at_start(base.plant, base))
+        # What is sent is y - r: of another mean and second moment, and the same covariance.
+        mean = y.mean - state.reference
+        sent = y._replace(mean=mean, second=y.covariance + jnp.outer(mean, mean))
         after, innovation = correct_signal(sent, at(base.channel, k), base.rule, jnp.asarray(z))
         return FedBackBelief(after, state.reference), innovation
 
@@ -159,7 +155,7 @@ def fed_back_filter(
 ) -> FedBackFilter:
     """Filter whose prediction is fed back to the sensor, which sends y less that prediction: z = G (y - r) + n.
 
-    A node that has this filter is simulated so. z is what arrives, nothing added back.
+    A node that has this filter is simulated so. z is what arrives: the filter does not add r to it.
 
     Args:
         plant: the plant; a linear plant and sensor need no transform.

@@ -75,10 +75,11 @@ class LimitedFilter(AbstractSizedFilter):
         """Correct the prediction, its mean held within the limits."""
         prior = state if _is_particles(state) else self._hold(state)
         after, innovation = self.base.correct(prior, z, k)
-        masses = self._condition(after)[0], self._condition(state)[0]
-        both = jnp.isfinite(masses[0]) & jnp.isfinite(masses[1])
-        more = jnp.where(both, masses[0] - masses[1], 0.0)
-        return after, replace(innovation, log_likelihood=innovation.log_likelihood + more)
+        # log P(within | z) - log P(within); nothing where one of them is 0 to rounding.
+        log_after, log_before = self._condition(after)[0], self._condition(state)[0]
+        both = jnp.isfinite(log_after) & jnp.isfinite(log_before)
+        change = jnp.where(both, log_after - log_before, 0.0)
+        return after, replace(innovation, log_likelihood=innovation.log_likelihood + change)
 
     @estimates
     def estimate(self, state: PyTree) -> Estimate:
@@ -136,6 +137,7 @@ class LimitedFilter(AbstractSizedFilter):
         return with_gaussian(state, hold(x))
 
     def _hold_one(self, x: Gaussian) -> Gaussian:
+        """Return one Gaussian with its mean held within the limits."""
         return hold_mean(x, self.limits)
 
     def _condition(self, state: PyTree) -> tuple[jax.Array, PyTree]:
@@ -153,14 +155,14 @@ class LimitedFilter(AbstractSizedFilter):
         if x.mean.ndim == 1:
             log_mass, inside = truncate_to_limits(jax.tree.map(lambda leaf: leaf[None], x), self.limits)
             return log_mass[0], with_gaussian(held, jax.tree.map(lambda leaf: leaf[0], inside))
-        # Of a mixture each Gaussian by itself, and their weights by the probability of each.
+        # Of a mixture each Gaussian by itself, and their weights by the probability of each to be within.
         log_masses, inside = truncate_to_limits(x, self.limits)
         weight = jnp.asarray(held.weight)
-        left = weight * jnp.exp(log_masses).reshape(-1, *[1] * (weight.ndim - 1))
-        mass = jnp.sum(left)
-        some = mass > 0
-        weight = jnp.where(some, left / jnp.where(some, mass, 1.0), weight)
-        log_mass = jnp.where(some, jnp.log(jnp.where(some, mass, 1.0)), -jnp.inf)
+        weight_within = weight * jnp.exp(log_masses).reshape(-1, *[1] * (weight.ndim - 1))
+        mass = jnp.sum(weight_within)
+        is_possible = mass > 0
+        weight = jnp.where(is_possible, weight_within / jnp.where(is_possible, mass, 1.0), weight)
+        log_mass = jnp.where(is_possible, jnp.log(jnp.where(is_possible, mass, 1.0)), -jnp.inf)
         return log_mass, held._replace(gaussian=inside, weight=weight)
 
     def _condition_particles(self, state: StateParticles) -> tuple[jax.Array, StateParticles]:
@@ -173,31 +175,34 @@ class LimitedFilter(AbstractSizedFilter):
         for place, low, high in self.limits:
             value = position[:, place]
             inside = inside & (low <= value) & (value <= high)
-            back = jnp.where(value < low, 2 * low - value, jnp.where(value > high, 2 * high - value, value))
-            mirrored = mirrored.at[:, place].set(jnp.clip(back, low, high))
-        left = jnp.where(inside, state.log_weight, -jnp.inf)
-        log_mass = jax.nn.logsumexp(left) - jax.nn.logsumexp(state.log_weight)
-        enough = jnp.sum(jnp.isfinite(left)) > position.shape[1]
-        top = jnp.where(enough, jnp.max(left), 0.0)
+            reflected = jnp.where(value < low, 2 * low - value, jnp.where(value > high, 2 * high - value, value))
+            mirrored = mirrored.at[:, place].set(jnp.clip(reflected, low, high))
+        weight_within = jnp.where(inside, state.log_weight, -jnp.inf)
+        log_mass = jax.nn.logsumexp(weight_within) - jax.nn.logsumexp(state.log_weight)
+        enough = jnp.sum(jnp.isfinite(weight_within)) > position.shape[1]
+        largest = jnp.where(enough, jnp.max(weight_within), 0.0)
         return log_mass, state._replace(
-            log_weight=jnp.where(enough, left - top, state.log_weight), position=jnp.where(enough, position, mirrored)
+            log_weight=jnp.where(enough, weight_within - largest, state.log_weight),
+            position=jnp.where(enough, position, mirrored),
         )
 
 
 def _is_particles(state: PyTree) -> bool:
+    """Return whether a filter's state, or that of the filter within one of sensor inputs, is of particles."""
     return isinstance(getattr(state, "base", state), StateParticles)
 
 
 def without_limits(plant: AnyPlant) -> AnyPlant:
     """Return the plant without limits of its states."""
 
-    def drop(step: AbstractPlant) -> AbstractPlant:
-        free = copy(step)
+    def drop_limits(limited: AbstractPlant) -> AbstractPlant:
+        """Return a copy of the plant at one step; modules are frozen, so it is set past that."""
+        free = copy(limited)
         object.__setattr__(free, "limits", ())
         return free
 
-    free: AnyPlant = at_each_step(drop, plant)
-    return free
+    unlimited: AnyPlant = at_each_step(drop_limits, plant)
+    return unlimited
 
 
 def keeps_limits(make: Callable[P, F]) -> Callable[P, F]:
@@ -210,6 +215,7 @@ def keeps_limits(make: Callable[P, F]) -> Callable[P, F]:
 
     @wraps(make)
     def build(*args: P.args, **kwargs: P.kwargs) -> F:
+        """Make the filter of a plant without limits, and put limits around it where the plant has some."""
         given = parameters.bind(*args, **kwargs)
         plant = given.arguments.get("plant")
         start = first(plant)

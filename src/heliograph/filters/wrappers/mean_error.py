@@ -25,7 +25,8 @@ from heliograph.random_affine.told import FreshNumbers, FreshReading, told_maps
 MOST = 20_000  # combinations of numbers that are summed over
 
 
-Carry = tuple[LinearBelief, jax.Array, jax.Array]  # a state, covariances by mode (modes, n, n), the modes' law
+# Of a step: a filter's state, covariances by mode (modes, n, n), and the modes' law (modes,).
+Carry = tuple[LinearBelief, jax.Array, jax.Array]
 
 
 class Contexts(NamedTuple):
@@ -74,11 +75,12 @@ def mean_error_bound(
 
 @compile_in_float64
 def _bound(filter: ToldFilter, contexts: Contexts, u: Array) -> jax.Array:
-    """Compiled body of `mean_error_bound`."""
+    """Return the bound on the mean covariance at each step (steps, n, n): compiled body of `mean_error_bound`."""
     start = filter.init()
     modes = len(contexts.initial)
 
-    def left(prior: LinearBelief, numbers: jax.Array, k: jax.Array) -> jax.Array:
+    def corrected_covariance(prior: LinearBelief, numbers: jax.Array, k: jax.Array) -> jax.Array:
+        """Return f(P, a), what a message with these numbers leaves; it does not depend on the values, here zero."""
         z = jnp.zeros(filter.received).at[np.array(filter.numbers)].set(numbers)
         after: LinearBelief = filter.correct(prior, z, k)[0]
         covariance: jax.Array = after.gaussian.covariance
@@ -88,17 +90,21 @@ def _bound(filter: ToldFilter, contexts: Contexts, u: Array) -> jax.Array:
         state, before, law = carry
         k, u_k = row
 
-        def of_mode(covariance: jax.Array, numbers: jax.Array, weights: jax.Array) -> tuple[LinearBelief, jax.Array]:
+        def step_in_mode(
+            covariance: jax.Array, numbers: jax.Array, weights: jax.Array
+        ) -> tuple[LinearBelief, jax.Array]:
+            """Return the prediction, and the mean covariance after it over the numbers that this mode may tell."""
             gaussian = from_covariance(state.gaussian.mean, covariance)
             prior = filter.predict(state._replace(gaussian=gaussian), u_k, k)
-            after = jax.vmap(lambda a: left(prior, a, k))(numbers)
+            after = jax.vmap(lambda a: corrected_covariance(prior, a, k))(numbers)
             return prior, jnp.tensordot(weights, after, 1)
 
-        priors, after = jax.vmap(of_mode)(before, jnp.asarray(contexts.numbers), jnp.asarray(contexts.weights))
-        following = law @ contexts.transition
-        back = law[:, None] * contexts.transition / jnp.where(following > 0, following, 1.0)  # P(i now | j then)
-        moved = jnp.einsum("ij,iab->jab", back, after)
-        return (jax.tree.map(lambda leaf: leaf[0], priors), moved, following), jnp.tensordot(law, after, 1)
+        priors, after = jax.vmap(step_in_mode)(before, jnp.asarray(contexts.numbers), jnp.asarray(contexts.weights))
+        next_law = law @ contexts.transition
+        back = law[:, None] * contexts.transition / jnp.where(next_law > 0, next_law, 1.0)  # P(i now | j next)
+        mixed = jnp.einsum("ij,iab->jab", back, after)
+        # All modes share the moments of the plant's state, so that one of their predictions goes on.
+        return (jax.tree.map(lambda leaf: leaf[0], priors), mixed, next_law), jnp.tensordot(law, after, 1)
 
     covariances = jnp.broadcast_to(start.gaussian.covariance, (modes, *start.gaussian.covariance.shape))
     carry = jax.tree.map(jnp.asarray, start), covariances, jnp.asarray(contexts.initial)
@@ -107,7 +113,10 @@ def _bound(filter: ToldFilter, contexts: Contexts, u: Array) -> jax.Array:
 
 
 def _list_contexts(filter: ToldFilter) -> Contexts:
-    """List the numbers that may be told, with their probabilities."""
+    """List the numbers that may be told, with their probabilities.
+
+    Those of a chain are its modes, one in each; those that are drawn anew are all combinations over the maps.
+    """
     memories = [affine.memory for affine in told_maps(first(filter.link))]
     chains = [memory for memory in memories if isinstance(memory, MarkovChain)]
     if chains:

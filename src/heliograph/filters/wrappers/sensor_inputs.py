@@ -88,8 +88,9 @@ class FilterOfInputs(AbstractWrapper):
         return self.base.attitude
 
     def _filter_under(self, u: Array, k: Step) -> AbstractFilter:
-        now = at(self.sensor, k).under(self.inputs, u)
-        filter: AbstractFilter = eqx.tree_at(lambda filter: filter.sensor, self.base, now)
+        """Return the filter within, of the sensor that the inputs u (inputs,) give at step k."""
+        sensor = at(self.sensor, k).under(self.inputs, u)
+        filter: AbstractFilter = eqx.tree_at(lambda filter: filter.sensor, self.base, sensor)
         return filter
 
 
@@ -103,16 +104,18 @@ def takes_sensor_inputs(make: Callable[P, F]) -> Callable[P, F]:
 
     @wraps(make)
     def build(*args: P.args, **kwargs: P.kwargs) -> F:
+        """Make the filter as it is, or one of inputs around it where the sensor depends on some."""
         given = parameters.bind(*args, **kwargs).arguments
         sensor = first(given.get("sensor"))
         if not isinstance(sensor, AbstractSensor) or not sensor.inputs:
             return make(*args, **kwargs)
         plant, sensor = given.pop("plant"), given.pop("sensor")
 
-        whole: Callable[..., AbstractFilter] = make
+        make_any: Callable[..., AbstractFilter] = make  # its parameters are not those of `build` any more
 
         def make_for(typical: AnySensor) -> AbstractFilter:
-            return whole(plant=plant, sensor=typical, **given)
+            """Make the filter of this sensor and of all other arguments."""
+            return make_any(plant=plant, sensor=typical, **given)
 
         return cast(F, _build(plant, sensor, given.get("channel"), make_for))
 
@@ -129,7 +132,8 @@ def _build(
             another step; a filter that keeps more of the sensor than itself.
     """
     start = first(plant)
-    names = start.inputs if isinstance(start, AbstractPlant) else first(sensor).inputs  # else it is refused as such
+    # What is no plant gets the sensor's own names here, so that `make` is what refuses it.
+    names = start.inputs if isinstance(start, AbstractPlant) else first(sensor).inputs
     typical = at_each_step(lambda single: single.typical(names), sensor)
     link = first(channel)
     if isinstance(link, AbstractRandomAffine) and link.past:

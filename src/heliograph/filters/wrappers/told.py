@@ -35,7 +35,7 @@ from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.moments.second_moments import second_order
 from heliograph.random_affine.told import believe_told, give_law, made_certain, numbers_of_outputs, told_maps
 
-ROUNDING = 1e-12  # of squared gains
+ROUNDING = 1e-12  # share of squared gains: a spread below it is rounding
 
 F = TypeVar("F", bound=AbstractFilter)
 P = ParamSpec("P")
@@ -82,17 +82,23 @@ class ToldFilter(AbstractWrapper):
         values, numbers = self._split(jnp.asarray(z))
         filter, is_law = self._filter_given(numbers, k)
         after, innovation = filter.correct(state, values, k)
-        # Numbers that give no law make the state none, so that the message is refused where it came in.
+        # Numbers that give no law make the state NaN, so that the message is refused where it came in.
         after = _spoil(after, ~is_law & ~jnp.all(jnp.isnan(values)))
-        # What is told is no measurement: like what did not arrive it is NaN in the innovation, and counts for no test.
-        received, values_at = len(self.values) + len(self.numbers), np.array(self.values)
-        value = jnp.full(received, jnp.nan).at[values_at].set(innovation.value)
+        return after, self._place_innovation(innovation)
+
+    def _place_innovation(self, innovation: Innovation) -> Innovation:
+        """Return the innovation of the values at their rows of z.
+
+        What is told is no measurement: like what did not arrive it is NaN in the innovation, and counts for no test.
+        """
+        received, rows = len(self.values) + len(self.numbers), np.array(self.values)
+        value = jnp.full(received, jnp.nan).at[rows].set(innovation.value)
         covariance = jnp.full((received, received), jnp.nan)
-        covariance = covariance.at[values_at[:, None], values_at].set(innovation.covariance)
+        covariance = covariance.at[rows[:, None], rows].set(innovation.covariance)
         weight = innovation.weight
         if weight is not None:
-            weight = jnp.full(received, jnp.nan).at[values_at].set(weight)
-        return after, Innovation(value, covariance, innovation.log_likelihood, weight)
+            weight = jnp.full(received, jnp.nan).at[rows].set(weight)
+        return Innovation(value, covariance, innovation.log_likelihood, weight)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the smoother step of the filter of the law that was told."""
@@ -136,15 +142,15 @@ class ToldFilter(AbstractWrapper):
         )
 
     def _split(self, z: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Values and numbers of a message; no value where a number is missing without which it means nothing."""
+        """Return values and numbers of a message; no value where a number is missing that it needs."""
         numbers = z[np.array(self.numbers)]
-        there = ~jnp.isnan(numbers) | self._optional
-        usable = jnp.all(there | ~numbers_of_outputs(first(self.link)), axis=1)
-        return jnp.where(usable, z[np.array(self.values)], jnp.nan), numbers
+        suffices = ~jnp.isnan(numbers) | self._optional
+        is_usable = jnp.all(suffices | ~numbers_of_outputs(first(self.link)), axis=1)
+        return jnp.where(is_usable, z[np.array(self.values)], jnp.nan), numbers
 
     @property
     def _optional(self) -> jax.Array:
-        """Which of the numbers that are told may be missing (numbers,)."""
+        """True for the numbers that may be missing, of all that are told (numbers,)."""
         return jnp.concatenate([jnp.full(m.memory.announced, m.optional) for m in told_maps(first(self.link))])
 
     def _filter_given(self, numbers: jax.Array, k: Step) -> tuple[AbstractFilter, jax.Array]:
@@ -162,8 +168,8 @@ def _spoil(state: PyTree, spoilt: jax.Array) -> PyTree:
     """Make all real numbers of a state NaN, or leave it as it is."""
 
     def spoil(leaf: jax.Array) -> jax.Array:
-        real = jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.floating)
-        return jnp.where(spoilt, jnp.nan, leaf) if real else leaf
+        is_real = jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.floating)
+        return jnp.where(spoilt, jnp.nan, leaf) if is_real else leaf
 
     return jax.tree.map(spoil, state)
 
@@ -219,6 +225,7 @@ def takes_told(make: Callable[P, F]) -> Callable[P, F]:
 
     @wraps(make)
     def build(*args: P.args, **kwargs: P.kwargs) -> F:
+        """Make the filter as it is, or one of told laws around it where the channel tells numbers."""
         given = parameters.bind(*args, **kwargs).arguments
         channel = given.get("channel")
         if not isinstance(first(channel), AbstractRandomAffine) or not separate_told(first(channel)).numbers:

@@ -64,7 +64,7 @@ class AbstractWrapper(AbstractSizedFilter):
 
     @property
     def remarks(self) -> bool:
-        """As the filter within."""
+        """True if the remark of the filter within may say anything."""
         return self.base.remarks
 
     def remark(self, state: PyTree) -> Remark:
@@ -73,12 +73,12 @@ class AbstractWrapper(AbstractSizedFilter):
 
     @property
     def of_atoms(self) -> bool:
-        """As the filter within."""
+        """True for a filter within that is a mixture over atoms."""
         return self.base.of_atoms
 
     @property
     def silence_tells(self) -> bool:
-        """As the filter within."""
+        """True if a step at which nothing arrives changes the state of the filter within."""
         return self.base.silence_tells
 
     def _claim_first_states(self, whole: Estimate) -> Estimate:

@@ -50,7 +50,7 @@ class NeighbourWeights(NamedTuple):
 
 
 class NodeStep(NamedTuple):
-    """Plant over one step, A and Q, and information of measurements: of those that arrived, and of all."""
+    """Plant over one step, A and Q, and information H' R^-1 H of measurements: of those that arrived, and of all."""
 
     matrix: Float[Array, "n n"]
     noise: Float[Array, "n n"]
@@ -59,7 +59,7 @@ class NodeStep(NamedTuple):
 
 
 class NodeGains(NamedTuple):
-    """Gains of one node's step: M_j = front parts_j, of others than itself; W and F = I - W S; P.
+    """Gains of one node's step: M_j = front parts_j, of others than itself; gain W, innovation F = I - W S; P after it.
 
     Shapes: front, gain, innovation and covariance (n, n), parts (degree, n, n) or their diagonals (degree, n).
     """
@@ -86,8 +86,8 @@ def correct(
 
     With S = L diag(d) L' the measurements that were made say as much as L' x + v, Cov v = diag(d)^-1.
     """
-    n, said = len(predicted), eliminate(information)
-    rows = jnp.diag(square_root(said.weights)) @ said.matrix.T
+    n, factors = len(predicted), eliminate(information)
+    rows = jnp.diag(square_root(factors.weights)) @ factors.matrix.T  # diag(d)^1/2 L', of unit noise
     x = from_covariance(np.zeros(n), predicted)
     after, _ = condition_on_observation(x, rows @ x.root, jnp.zeros(n), Columns(np.eye(n), jnp.ones(n)))
     return after.covariance, np.eye(n) - after.covariance @ information
@@ -96,9 +96,16 @@ def correct(
 def information_of(
     gain: jax.Array, noise: jax.Array, used: jax.Array
 ) -> tuple[Float[jax.Array, "n m"], Float[jax.Array, "n n"]]:
-    """Return H' R^-1 and H' R^-1 H of the components that are used."""
-    there = used.astype(gain.dtype)
-    h = there[:, None] * gain
-    r = there[:, None] * noise * there[None] + jnp.diag(1 - there)
+    """Return H' R^-1 and H' R^-1 H of the components that are used.
+
+    Args:
+        gain: H (m, n).
+        noise: R (m, m).
+        used: True where a component is used (m,).
+    """
+    mask = used.astype(gain.dtype)
+    # Components that are not used have rows of zeros in H, and noise of their own.
+    h = mask[:, None] * gain
+    r = mask[:, None] * noise * mask[None] + jnp.diag(1 - mask)
     weighted = psd_solve(r, h).T
     return weighted, weighted @ h

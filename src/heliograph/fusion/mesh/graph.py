@@ -52,7 +52,9 @@ class Graph(NamedTuple):
         Arithmetic on a row costs by its length, up to its cube, and a graph's longest rows are few.
         """
         counts = self.present.sum(axis=1)
-        widths = {int(w) for w in np.quantile(counts, PARTS, method="higher")} if len(counts) > FEW else {counts.max()}
+        widths = {counts.max()}
+        if len(counts) > FEW:
+            widths = {int(width) for width in np.quantile(counts, PARTS, method="higher")}
         parts, least = [], 0
         for width in sorted(widths):
             rows = np.flatnonzero((counts > least) & (counts <= width))
@@ -62,7 +64,7 @@ class Graph(NamedTuple):
 
 
 def neighbours_of(value: object) -> dict[str, tuple[str, ...]]:
-    """Return the names of those whom each node receives, from such a table or from a graph of networkx.
+    """Return the names of those whom each node receives, from a table of these or from a graph of networkx.
 
     Raises:
         ValueError: neither of them, names that are no texts, a node as its own neighbour, or one twice.
@@ -119,9 +121,10 @@ def neighbours_within(
     if len({len(row) for row in rows}) > 1:
         raise fail("positions", "as many numbers for each node", sorted({len(row) for row in rows}))
     names = list(given)
-    from scipy.spatial import cKDTree  # 40 ms, for those who give positions
+    from scipy.spatial import cKDTree  # imported here, since it takes 40 ms
 
-    # In a power of two as the unit, which changes no digit, and in which no square leaves the range of numbers.
+    # In a power of two as the unit, which changes no digit, and in which no square leaves the range of numbers: all
+    # numbers are less than 2, and so no distance is 4 (1 + axes); a longer reach is cut to that.
     points = np.array(rows)
     largest = np.abs(points).max(initial=0.0)
     unit = 2.0 ** (int(np.frexp(largest)[1]) - 1) if largest else 1.0
@@ -148,14 +151,15 @@ def upstream(graph: Graph) -> list[Int[np.ndarray, " senders"]]:
     Nodes that are reached from the same ones, as those of one strongly connected component, share one array.
     """
     count = len(graph.nodes)
-    senders = [row[there].tolist() for row, there in zip(graph.senders, graph.present, strict=True)]
-    # Bit j of reached[i]: a path leads from j to i. Each takes its senders' bits, until nothing is added.
-    reached, before = [1 << i for i in range(count)], list[int]()
-    while reached != before:
-        before = list(reached)
+    senders = [row[present].tolist() for row, present in zip(graph.senders, graph.present, strict=True)]
+    # Bit j of sources[i]: a path leads from j to i. Each takes its senders' bits, until nothing is added.
+    sources, before = [1 << i for i in range(count)], list[int]()
+    while sources != before:
+        before = list(sources)
         for i in (*range(count), *reversed(range(count))):
             for sender in senders[i]:
-                reached[i] |= reached[sender]
-    bits = {known: np.frombuffer(known.to_bytes(count // 8 + 1, "little"), np.uint8) for known in set(reached)}
-    places = {known: np.flatnonzero(np.unpackbits(row, bitorder="little")) for known, row in bits.items()}
-    return [places[known] for known in reached]
+                sources[i] |= sources[sender]
+    # The places of the bits that are set, once for each set of them.
+    as_bytes = {bits: np.frombuffer(bits.to_bytes(count // 8 + 1, "little"), np.uint8) for bits in set(sources)}
+    places = {bits: np.flatnonzero(np.unpackbits(row, bitorder="little")) for bits, row in as_bytes.items()}
+    return [places[bits] for bits in sources]

@@ -18,20 +18,25 @@ from heliograph.numerics.types import Array, Bool, Float, Int
 
 
 def error_transitions(gains: NodeGains, matrix: Float[Array, "n n"]) -> Float[Array, "node degree n n"]:
-    """M_ij of all neighbours, and of the node itself M_ii = F_i A - sum_j M_ij: e_i+ = sum_j M_ij e_j + noise."""
+    """Return M_ij of all neighbours, e_i+ = sum_j M_ij e_j + noise, after that of the node itself.
+
+    M_ii = F_i A - sum_j M_ij. `gains` has a leading axis of nodes.
+    """
     parts = gains.parts if gains.parts.ndim == 4 else gains.parts[..., None] * np.eye(len(matrix))
     others = (gains.front[:, None] @ parts)[:, 1:]
-    alone = gains.innovation @ matrix - others.sum(axis=1)
-    moves: Float[Array, "node degree n n"] = library(gains).concatenate([alone[:, None], others], axis=1)
-    return moves
+    itself = gains.innovation @ matrix - others.sum(axis=1)
+    transitions: Float[Array, "node degree n n"] = library(gains).concatenate([itself[:, None], others], axis=1)
+    return transitions
 
 
 def measurement_weights(
     gain: Float[Array, "node n n"], arrived: Bool[Array, "node degree"]
 ) -> Float[Array, "node degree n n"]:
     """Return W_i of the measurements that arrived, zero for the others."""
-    taken: Float[Array, "node degree n n"] = library(gain, arrived).where(arrived[..., None, None], gain[:, None], 0.0)
-    return taken
+    weights: Float[Array, "node degree n n"] = library(gain, arrived).where(
+        arrived[..., None, None], gain[:, None], 0.0
+    )
+    return weights
 
 
 def scatter_blocks(
@@ -40,9 +45,10 @@ def scatter_blocks(
     """Return the matrix (N, N) with these blocks at (node, sender) where present, sparse unless it is traced."""
     nodes, _, n, _ = blocks.shape
     if is_traced(blocks):
-        there = jnp.where(present[:, :, None, None], blocks, 0.0)
-        empty = jnp.zeros((nodes, nodes, n, n)).at[np.arange(nodes)[:, None], senders]
-        return empty.add(there).swapaxes(1, 2).reshape(nodes * n, nodes * n)
+        # Padding adds zeros at the node itself.
+        masked = jnp.where(present[:, :, None, None], blocks, 0.0)
+        places = jnp.zeros((nodes, nodes, n, n)).at[np.arange(nodes)[:, None], senders]
+        return places.add(masked).swapaxes(1, 2).reshape(nodes * n, nodes * n)
     ends = np.concatenate([[0], np.cumsum(present.sum(axis=1))])
     return scipy.sparse.bsr_array(
         (np.asarray(blocks)[present], senders[present], ends), shape=(nodes * n,) * 2, blocksize=(n, n)
@@ -52,12 +58,21 @@ def scatter_blocks(
 def joint_after(
     joint: Float[Array, "N N"], m: Any, f: Float[Array, "node n n"], noise: Float[Array, "n n"], ws: Any, w: Any
 ) -> Float[Array, "N N"]:
-    """Return J+ from M, F, Q, and the matrices of W_i S_j and of W_i over the measurements that node i has."""
+    """Return J+ of J, symmetric.
+
+    Args:
+        joint: J.
+        m: M (N, N).
+        f: F_i of each node.
+        noise: Q.
+        ws: matrix (N, N) of the blocks W_i S_j of the measurements that node i has.
+        w: matrix (N, N) of the blocks W_i of these.
+    """
     measured = ws @ w.T
     added = propagate_by_mode(f.reshape(len(joint), -1), noise, measured if is_traced(measured) else measured.toarray())
     after = propagate_by_mode(m, joint, added)
-    joined: Float[Array, "N N"] = (after + after.T) / 2
-    return joined
+    symmetric: Float[Array, "N N"] = (after + after.T) / 2
+    return symmetric
 
 
 def blocks_of(joint: Float[Array, "node n node n"], senders: Int[Array, "node degree"]) -> Float[Array, "..."]:

@@ -59,7 +59,7 @@ class _NeighbourRule(AbstractFusion):
     """Rule that fuses estimates of neighbours only, not at a fusion centre."""
 
     def claim(self, claims: list[Claim]) -> Claim:
-        """Refused: a fusion centre has no neighbours."""
+        """Refuse: a fusion centre has no neighbours."""
         raise self._refuse_without_neighbours()
 
     def combine(self, means: Means, covariances: Covariances) -> Fused:
@@ -108,12 +108,13 @@ class DiffusionWeights(_NeighbourRule):
         if unknown := sorted(set(self.given or {}) - set(graph.nodes)):
             raise fail("diffusion shares", f"those of nodes of the fusion {list(graph.nodes)[:5]}", unknown)
         shares = np.where(graph.present, 1.0 / graph.present.sum(axis=1, keepdims=True), 0.0)
+        # The given shares of each row, if any are given; a neighbour that is not named has none.
         for i, senders in enumerate(graph.senders if self.given is not None else ()):
             name, *others = (graph.nodes[j] for j in senders[graph.present[i]])
-            mine = (self.given or {}).get(name, {})
-            if unknown := sorted(set(mine) - {name, *others}):
+            row = (self.given or {}).get(name, {})
+            if unknown := sorted(set(row) - {name, *others}):
                 raise fail(f"diffusion shares of {name!r}", f"those of its neighbours {sorted(others)}", unknown)
-            shares[i, 1 : 1 + len(others)] = [mine.get(other, 0.0) for other in others]
+            shares[i, 1 : 1 + len(others)] = [row.get(other, 0.0) for other in others]
         shares[:, 0] = 0.0
         placed: DiffusionWeights = eqx.tree_at(
             lambda r: (r.shares, r.given), self, (shares.T, None), is_leaf=lambda leaf: leaf is None
@@ -161,14 +162,16 @@ class FrozenWeights(_NeighbourRule):
         return self.rule.neighbour_weights(believed._replace(joint=jnp.asarray(self.blocks)))
 
     def weights_ahead(self, arrived: Bool[np.ndarray, "step row degree"]) -> Ahead | None:
-        """Weights of many steps by native code, parts and covariances (step, row, ...); None where it takes none.
+        """Return the weights of many steps by native code, parts and covariances (step, row, ...); None without it.
 
         They depend on what arrives at a step alone, so that a node's blocks are read once for all of them.
         """
         rows = np.moveaxis(np.asarray(self.blocks), -1, 0), np.swapaxes(arrived, 0, 1)
         with jax.enable_x64(True):
-            code = choose_code(_weigh_row, (self.rule, *rows), (False, True, True))
-            return None if code.code is None else jax.tree.map(lambda leaf: np.swapaxes(leaf, 0, 1), code.results())
+            choice = choose_code(_weigh_row, (self.rule, *rows), (False, True, True))
+            if choice.code is None:
+                return None
+            return jax.tree.map(lambda leaf: np.swapaxes(leaf, 0, 1), choice.results())
 
 
 def _weigh_row(
@@ -176,20 +179,25 @@ def _weigh_row(
 ) -> tuple[jax.Array, jax.Array]:
     """Return the parts and covariances (step, ...) of one node's weights."""
     degree, n = joint.shape[:2]
-    nothing = NeighbourEstimates(jnp.zeros((n, n)), jnp.zeros(degree), jnp.zeros((degree, n, n)), joint, arrived[0])
+    # Rules of best weights read the joint covariance alone.
+    believed = NeighbourEstimates(jnp.zeros((n, n)), jnp.zeros(degree), jnp.zeros((degree, n, n)), joint, arrived[0])
 
     def body(_: None, present: jax.Array) -> tuple[None, tuple[jax.Array, jax.Array]]:
-        weights = rule.neighbour_weights(nothing._replace(present=present))
+        weights = rule.neighbour_weights(believed._replace(present=present))
         return None, (weights.parts, weights.covariance)
 
     return jax.lax.scan(body, None, arrived)[1]
 
 
 def _check_shares(name: str, row: object) -> dict[str, float]:
-    """Return the shares of one node: not negative, at most one in sum, and one where its own is among them."""
+    """Return the shares that a node gives to others, by name.
+
+    They are not negative, and their sum is at most 1; it is 1 where the node's own share is among them.
+    """
     what = f"diffusion shares of {name!r}"
-    mine = {n: float(scalar(what, share, 0.0)) for n, share in table(what, row, "shares by neighbour").items()}
-    total = sum(mine.values())
-    if total > 1 + SUM or (name in mine and total < 1 - SUM):
+    given = table(what, row, "shares by neighbour")
+    shares = {sender: float(scalar(what, share, 0.0)) for sender, share in given.items()}
+    total = sum(shares.values())
+    if total > 1 + SUM or (name in shares and total < 1 - SUM):
         raise fail(what, "shares that sum to 1", f"{total:g}")
-    return mine
+    return shares
