@@ -358,7 +358,6 @@ def estimates(estimate: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(estimate)
     def call(filter: AbstractFilter, state: PyTree) -> R:
-        """Call the method, and say so if the state is none."""
         return call_with_state(filter, state, run)
 
     return cast(Callable[P, R], call)
@@ -369,15 +368,11 @@ def _check_calls(
     check: Callable[[AbstractFilter, ArrayLike], Float[Array, " length"]],
     call_checked: Callable[..., R],
 ) -> Callable[P, R]:
-    """Return a filter's method, compiled, that first checks its data and step number, and names a wrong state.
-
-    `check` returns the data as an array of the filter's length; `call_checked` calls the compiled method.
-    """
+    """Return a filter's method, compiled, that first checks its data and step number, and names a wrong state."""
     run = cast(Callable[..., R], compile_on_call(function))
 
     @wraps(function)
     def call(filter: AbstractFilter, state: PyTree, data: ArrayLike = (), k: Step = 0) -> R:
-        """Check the arguments and call the method."""
         return call_checked(filter, state, run, check(filter, data), step_number(filter, k))
 
     return cast(Callable[P, R], call)

@@ -339,10 +339,7 @@ def _scan_in_parts(
     filters: AllFilters, later: Smoother | None, u: np.ndarray, arrivals: dict[str, Drawn], z: tuple[np.ndarray, ...],
     judged: bool,
 ) -> PyTree:  # fmt: skip
-    """Filter by XLA, some rows at a time, whose weights between neighbours are computed ahead.
-
-    Arguments as of `_run_filters`.
-    """
+    """Run `_run_filters` by XLA, some rows at a time, whose weights between neighbours are computed ahead."""
     # As few parts of at most ROWS rows as there can be, of one size, so that they share a program.
     count = -(-len(u) // ROWS)
     size = -(-len(u) // count)
@@ -363,15 +360,9 @@ def _run_filters(
     filters: AllFilters, later: Smoother | None, u: np.ndarray, arrivals: dict[str, Drawn], z: tuple[np.ndarray, ...],
     judged: bool,
 ) -> PyTree:  # fmt: skip
-    """Filter all rows in one scan.
+    """Filter all rows in one scan: filters, smoother, inputs and what arrived as in `Rest`.
 
-    Args:
-        filters: all filters of a network.
-        later: smoother of their results; None without.
-        u: inputs (steps, inputs).
-        arrivals: what arrived of reports and between neighbours, by fusion.
-        z: measurements (steps, node, received) by group.
-        judged: whether what a filter judges implausible is left out before it is used.
+    z are the measurements (steps, node, received) by group; if `judged`, what is implausible is left out.
     """
     return _collect_results(later, z, *_scan(filters, filters.init(), (jnp.arange(len(u)), u, z, arrivals), judged))
 

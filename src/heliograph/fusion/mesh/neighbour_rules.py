@@ -171,7 +171,8 @@ class FrozenWeights(_NeighbourRule):
             choice = choose_code(_weigh_row, (self.rule, *rows), (False, True, True))
             if choice.code is None:
                 return None
-            return jax.tree.map(lambda leaf: np.swapaxes(leaf, 0, 1), choice.results())
+            weights: Ahead = jax.tree.map(lambda leaf: np.swapaxes(leaf, 0, 1), choice.results())
+            return weights
 
 
 def _weigh_row(

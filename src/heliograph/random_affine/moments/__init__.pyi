@@ -26,6 +26,7 @@ from .monomials import degrees as degrees
 from .monomials import evaluate_monomials as evaluate_monomials
 from .monomials import exponents as exponents
 from .monomials import factor_variables as factor_variables
+from .monomials import give_sizes as give_sizes
 from .monomials import multiply_polynomials as multiply_polynomials
 from .monomials import place as place
 from .monomials import position as position
