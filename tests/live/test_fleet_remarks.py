@@ -10,7 +10,7 @@ import pytest
 import heliograph as hg
 from heliograph.serving import Fleet, InMemoryStore, NetworkProgram, Options, Service
 from heliograph.serving.observation import watch_of
-from heliograph.serving.observation.page import Tallies
+from tests.serving.watched import metrics_of
 
 SAID = r"a/gate: the gate gave in once, last in row 3, and moved place by \d"
 
@@ -78,5 +78,5 @@ def test_a_service_logs_and_counts_it_by_plant(network):
         assert service.remarks()["a", "gate"] == (2 if k >= 2 else 0)
     watch = watch_of(network, "places")
     watch.wrap(service)
-    assert 'heliograph_gave_in_total{filter="gate",node="a"} 2.0' in Tallies(watch).text().decode()
+    assert 'heliograph_gave_in_total{filter="gate",node="a"} 2.0' in metrics_of(watch)
     assert [re.match(f"warning: plant '(.*)', {SAID}", line)[1] for line in said] == ["first", "second"]

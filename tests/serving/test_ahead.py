@@ -9,10 +9,10 @@ import pytest
 import heliograph as hg
 from heliograph.numerics import horizons_in
 from heliograph.serving import Fleet, InMemoryStore, NetworkProgram, Options, Service, parse_threshold
-from heliograph.serving.observation.page import Tallies
-from heliograph.serving.observation.watch import Watch
+from heliograph.serving.observation import watch_of
 from heliograph.serving.output import Estimates
 from heliograph.serving.settings import ServiceSettings
+from tests.serving.watched import metrics_of
 
 BEGUN = datetime(2026, 11, 25, 12, 0, 0, tzinfo=UTC)
 
@@ -80,7 +80,7 @@ def test_horizons_that_a_service_cannot_keep_are_refused(program, text):
 def test_the_probability_to_pass_a_level_is_published_and_a_metric(program):
     """Of a state above and an output below, as from a timeline; every step between horizons is looked at."""
     served, timeline = service(program, "2s,20s", "x>1.5", "y<-1"), hg.Timeline(network(), 5.0)
-    watch = Watch(["x"])
+    watch = watch_of(network(), "")
     *_, output = watch.wrap(served).take([message(0, 0.4)])
     timeline.push("a", 0, 0, [0.4])
     told = [h["estimates"]["a"]["f"]["thresholds"] for h in json.loads(output.body)["forecast"]]
@@ -94,7 +94,7 @@ def test_the_probability_to_pass_a_level_is_published_and_a_metric(program):
     # The exact probability one step ahead, from the claim of the forecast; within four errors of the drawing.
     exact = 1 - hg.forecast(timeline, 1)["a"]["f"].states.below(1.5)[0, 0]
     assert abs(told[0]["x>1.5"]["then"] - exact) < 4 * told[0]["x>1.5"]["by_error"]
-    text = Tallies(watch).text().decode()
+    text = metrics_of(watch)
     assert f'{{ahead="20",filter="f",node="a",plant="p",threshold="x>1.5"}} {told[1]["x>1.5"]["by"]}' in text
 
 

@@ -42,9 +42,9 @@ def test_a_line_from_the_template_is_that_of_its_row(program):
     reasons = [columns.judgement.reason for columns in program.places if columns.judgement is not None]
     outputs[:, reasons] = 2 * generator.integers(0, 2, (300, len(reasons))) * (np.arange(300)[:, None] >= 200)
     rows = [(f'p{i}, "%b"', float(i) if i % 3 else "2026-11-26T00:00:00+00:00") for i in range(300)]
-    written = writer.lines(b"final", rows, outputs)
+    written = writer.write_lines(b"final", rows, outputs)
     for (plant, moment), row, body in zip(rows, outputs.tolist(), written, strict=True):
         head = b'{"kind":"final","plant":%b,"time":%b,"estimates":' % (to_json(plant), to_json(moment))
         assert body == head + to_json(writer._write_estimates(row), inf_nan_mode="null") + b"}"
         assert json.loads(body)["plant"] == plant
-    assert writer.lines(b"final", [], outputs[:0]) == []
+    assert writer.write_lines(b"final", [], outputs[:0]) == []

@@ -15,11 +15,11 @@ from heliograph.live import LinkCounts
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.network_program import NetworkProgram
 from heliograph.serving.observation import watch_of
-from heliograph.serving.observation.page import Tallies
 from heliograph.serving.output import Estimates, Refused
 from heliograph.serving.service import Service
 from heliograph.serving.storage import InMemoryStore
 from tests.losing import Losing
+from tests.serving.watched import metrics_of
 from tests.serving.worlds import WINDOW, fleet, lines, messages, moving, stepping
 
 READER = TypeAdapter(Estimates | Refused)
@@ -205,7 +205,7 @@ def test_robust_and_adaptive_filters_say_what_they_made_of_each_number():
     assert set(said) == {(name, output) for name in ("robust", "adaptive") for output in ("left", "right")}
     assert said["robust", "left"]["to_blame"] and not said["robust", "right"]["to_blame"]
     assert "down-weighted" in said["robust", "left"]["words"]
-    text = Tallies(watch).text().decode()
+    text = metrics_of(watch)
     assert 'heliograph_output_share{filter="robust",node="radio",output="left"}' in text
 
 

@@ -1,13 +1,41 @@
-"""A service that says what a test wants it to: so that the page can be looked at without a filter."""
+"""A service that says what a test wants it to, and its observer: so that the page can be looked at without a filter."""
 
-from collections.abc import Sequence
+import asyncio
+import urllib.request
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from pydantic_core import to_json
 
+import heliograph as hg
 from heliograph.live import LinkCounts
+from heliograph.serving.observation import parse_page_address, serve_page, watch_of
 from heliograph.serving.output import Output
+
+
+def observer_of(states: Sequence[str] | Mapping[str, str], title: str = "", inputs: Sequence[str] = ()) -> Any:
+    """The observer of services of a network with these states, whose two nodes are fused."""
+    n = len(states)
+    transition = (lambda u: jnp.eye(n)) if inputs else np.eye(n)
+    plant = hg.LinearPlant(transition, np.eye(n), np.zeros(n), np.eye(n), states=states, inputs=inputs)
+    sensor = hg.LinearSensor(np.eye(n), np.eye(n))
+    node = hg.Node(sensor, hg.perfect(n), {"cubature": hg.linear_filter(plant, sensor, hg.perfect(n))})
+    fusion = {"both": hg.Fusion("cubature", hg.fusion.EqualIntersection())}
+    return watch_of(hg.Network(plant, {"node 0": node, "node 1": node}, fusion), title)
+
+
+def metrics_of(watch: Any) -> str:
+    """The metrics of services, as their page gives them."""
+
+    async def ask() -> str:
+        async with serve_page(watch, parse_page_address("0", {})) as port:
+            opened = await asyncio.to_thread(urllib.request.urlopen, f"http://127.0.0.1:{port}/metrics", None, 10)
+            return opened.read().decode()
+
+    return asyncio.run(ask())
 
 
 @dataclass

@@ -19,7 +19,7 @@ from heliograph.serving.brokers.pipe import Pipe
 from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.brokers.transport import LOG, WHOLE, Part, TakenOverError, Transport
 from heliograph.serving.brokers.url import Address
-from heliograph.serving.loop import AbandonedError, Ending, Takes, serve_until, signals
+from heliograph.serving.loop import AbandonedError, BatchService, Ending, serve_until, signals
 from heliograph.serving.patience import WaitingService, retry_while_away
 from heliograph.serving.service import Service
 from heliograph.serving.settings import NOTHING, SHORTEST, ServiceSettings
@@ -179,7 +179,7 @@ def _log_to_stderr() -> None:
         LOG.setLevel(logging.INFO)
 
 
-WrapService = Callable[[Service], Takes]
+WrapService = Callable[[Service], BatchService]
 
 
 @asynccontextmanager

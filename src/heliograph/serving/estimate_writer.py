@@ -1,4 +1,4 @@
-"""Lines of JSON of a service: of a batch of rows at once, by a template that their numbers fill."""
+"""Estimates as lines of JSON, for a batch of rows at once, by a template that their numbers fill."""
 
 import re
 from collections.abc import Sequence
@@ -17,8 +17,8 @@ FIRST = 2**52  # the number of column 0 where a row holds column numbers: no nam
 COLUMN = re.compile(rb"(4503599627[0-9]{6})(\.0)?")
 
 
-def line(parts: object) -> bytes:
-    """Encode a value as one line of JSON, without the newline; numbers that are not finite become null."""
+def encode_line(parts: object) -> bytes:
+    """Return a value as one line of JSON, without the newline; numbers that are not finite become null."""
     return to_json(parts, inf_nan_mode="null")
 
 
@@ -44,32 +44,39 @@ class EstimateWriter:
         # The template, the columns that fill it, and which of these are whole numbers.
         numbered = FIRST + np.arange(float(program.step_rows.outputs.size))
         numbered[self._reasons] = 0.0
-        written = line(self._write_estimates(numbered.tolist()))
+        written = encode_line(self._write_estimates(numbered.tolist()))
         filled = COLUMN.findall(written)
         form = COLUMN.sub(lambda match: b"%b" if match[2] else b"%d", written.replace(b"%", b"%%"))
         self._template = HEAD + form + b"}"
         self._order = [int(digits) - FIRST for digits, _ in filled]
         self._whole = [i for i, (_, point) in enumerate(filled) if not point]
 
-    def lines(
+    def write_lines(
         self, kind: bytes, rows: Sequence[tuple[str, float | str]], outputs: Float[np.ndarray, "row outputs"]
     ) -> list[bytes]:
-        """Return a line with the estimates of all filters for each row, a plant and a moment, from its outputs."""
+        """Return a line with the estimates of all filters for each row.
+
+        Args:
+            kind: "final" or "provisional".
+            rows: plant and time of each row.
+            outputs: outputs of the network after each row.
+        """
         if not rows:
             return []
+        # The template fits rows whose numbers are finite, variances not negative, and nothing refused.
         fits = np.isfinite(outputs[:, self._finite]).all(axis=1) & (outputs[:, self._variances] >= 0).all(axis=1)
         fits &= (outputs[:, self._reasons] <= 0).all(axis=1)
-        # All numbers as texts, those of one row after those of another.
+        # All numbers as texts, row by row; then by place in the template, of which some are whole numbers.
         width, numbers = len(self._order), _write_numbers(outputs[:, self._order].ravel().tolist())
         columns: list[Sequence[bytes | int]] = [numbers[i::width] for i in range(width)]
         for i in self._whole:
             columns[i] = outputs[:, self._order[i]].astype(int).tolist()
-        names = {plant: line(plant) for plant in {plant for plant, _ in rows}}
+        names = {plant: encode_line(plant) for plant in {plant for plant, _ in rows}}
         head = [kind] * len(rows), [names[plant] for plant, _ in rows], _write_numbers([moment for _, moment in rows])
         lines = [*map(self._template.__mod__, zip(*head, *columns, strict=True))]
         for i in np.flatnonzero(~fits).tolist():
             estimates = self._write_estimates(outputs[i].tolist())
-            lines[i] = HEAD % tuple(column[i] for column in head) + line(estimates) + b"}"
+            lines[i] = HEAD % tuple(column[i] for column in head) + encode_line(estimates) + b"}"
         return lines
 
     def _write_estimates(self, outputs: list[float]) -> dict[str, dict[str, object]]:
@@ -80,7 +87,7 @@ class EstimateWriter:
         }
 
     def _write_filter(self, columns: FilterColumns, outputs: list[float]) -> dict[str, object]:
-        """One filter's estimate, what it made of what arrived, and its claim, as the parts of a JSON object."""
+        """Return one filter's estimate, its claim, and what it made of what arrived, as a table for JSON."""
         n, mean, begin, judged = self._n, columns.mean, columns.covariance, columns.judgement
         # Estimate, without a claim where it is no number.
         covariance = None if columns.claim == "none" else [outputs[i : i + n] for i in range(begin, begin + n * n, n)]
@@ -90,7 +97,7 @@ class EstimateWriter:
         results: dict[str, object] = {"mean": outputs[mean : mean + n], "covariance": covariance, "claim": claim}
         if columns.modes is not None:
             results["modes"] = outputs[slice(*columns.modes)]
-        # Squared innovation: of a fusion that of what its nodes received, of a filter as it judged it.
+        # Normalised innovation squared: of a fusion that of what its nodes received, of a filter as it judged it.
         if columns.tested is not None:
             nis, received = (outputs[column] for column in columns.tested)
             return results | {"nis": nis, "received": int(received) if isfinite(nis) else 0}
@@ -98,7 +105,7 @@ class EstimateWriter:
             return results
         if columns.weighed is not None:
             parts = columns.weighed._asdict().items()
-            results["outputs"] = {name: [outputs[i] for i in columns] for name, columns in parts}
+            results["outputs"] = {name: [outputs[i] for i in places] for name, places in parts}
         if outputs[judged.reason] > 0:
             why = Judgement.describe(outputs[judged.reason], outputs[judged.distance])
             return results | {"nis": None, "received": 0, "implausible": why}
@@ -106,5 +113,5 @@ class EstimateWriter:
 
 
 def _write_numbers(numbers: Sequence[float | str]) -> list[bytes]:
-    """Return numbers, and texts without a comma, as JSON has them."""
-    return line(numbers)[1:-1].split(b",")
+    """Return each number, or text without a comma, as JSON writes it."""
+    return encode_line(numbers)[1:-1].split(b",")

@@ -1,4 +1,4 @@
-"""Messages of a node of a fusion without a centre to the services of the nodes that receive it."""
+"""Messages that the service of a node sends to its neighbours' services, in a fusion without a centre."""
 
 from collections.abc import Callable, Iterable
 
@@ -15,7 +15,7 @@ Moment = Callable[[PlantState, float], float | str]
 
 
 class Exchange:
-    """Messages of a node: each step's, of its estimate before the step and its measurement, once, to its receivers.
+    """Makes a node's messages to its neighbours: one a step, with the estimate before the step and the measurement.
 
     A step's message goes with the measurement; from a node without a sensor when anything of the step comes, and where
     a measurement is missing when the next step has begun. A message that is lost is lost: what neighbours claim stands.
@@ -45,28 +45,35 @@ class Exchange:
         ]
 
     def _find_due_rows(self, plant: PlantState) -> list[HeldRow]:
-        """Return rows that are whole now and were not before: measured, or with a row after them."""
+        """Return the rows whose message is due now and was not before the recorded changes.
+
+        It is due once the row has the node's measurement, or a row after it, which shows that this step is over.
+        """
         assert self._node is not None
-        before: dict[int, bool] = {}  # of each row with changes whether it was measured; of new ones none
+        # By row with changes: whether it was measured before them.
+        measured_before: dict[int, bool] = {}
         for row, old in plant.changes:
-            before.setdefault(id(row), old is not None and self._has_measurement(old[1]))
+            measured_before.setdefault(id(row), old is not None and self._has_measurement(old[1]))
         new = {id(row) for row, old in plant.changes if old is None}
         held, due = plant.rows.held, []
         for i, row in enumerate(held[1:], 1):
             after = held[i + 1] if i + 1 < len(held) else None
-            followed = after is not None and id(after) not in new and id(row) not in new
-            sent = followed or before.get(id(row), self._has_measurement(row.events))
+            followed_before = after is not None and id(after) not in new and id(row) not in new
+            sent = followed_before or measured_before.get(id(row), self._has_measurement(row.events))
             if (self._has_measurement(row.events) or after is not None) and not sent:
                 due.append(row)
         return due
 
     def _has_measurement(self, events: Iterable[tuple[int, int, float]]) -> bool:
-        """Test whether a row has the node's measurement, or anything where the node has no sensor."""
+        """Return whether events, by their keys, include the node's measurement, or any where it has no sensor.
+
+        The node itself is number 0 of its network; its neighbours, whose messages come to it, follow.
+        """
         assert self._node is not None
         return any(node == 0 or (node > 0 and not self._node.measured[0]) for node, _, _ in events)
 
     def _send_row(self, plant: PlantState, row: HeldRow) -> list[Output]:
-        """The message of a row to each receiver: the estimate before the step, its covariance, and the measurement."""
+        """Return a row's message to each receiver: estimate and covariance before the step, and the measurement."""
         assert self._node is not None
         pool, network = self.fleet.pool, self.fleet.network
         _, central, *_ = pool.step_rows.state.tree(pool.table[row.slot, pool.state])

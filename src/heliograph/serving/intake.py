@@ -1,4 +1,4 @@
-"""Use of a batch without its implausible messages: their plants are restored, and take the rest again."""
+"""Intake of a batch of messages: plants that an implausible one has changed are restored, and take the rest again."""
 
 from collections import OrderedDict
 from collections.abc import Container, Sequence
@@ -23,18 +23,24 @@ Outcome: TypeAlias = tuple[PlantState | None, Verdict | None, str, Sequence[str]
 NOTHING: Outcome = None, None, "", ()
 
 
-class Before(NamedTuple):
-    """State of a plant before a batch: whether it existed, its time and its counts."""
+class PlantBefore(NamedTuple):
+    """State of a plant before a batch: whether it was in memory, its time and its counts."""
 
     known: bool
     clock: tuple[float, Leap | None]
     links: dict[str, tuple[Any, ...]]
 
 
-class Brought(NamedTuple):
-    """What a message brings: when it was measured and arrived, this machine's clock, and its events.
+class TimedEvents(NamedTuple):
+    """The events of a message with times as numbers from the plant's `origin`.
 
-    Times are numbers from the plant's `origin`; without one there is no clock to compare with.
+    Attributes:
+        at: when it was measured.
+        arrival: when it arrived.
+        clock: the present by this machine's clock; None where times have no origin to compare with.
+        origin: the date from which times are counted; None where they are numbers.
+        event: its measurement.
+        inputs: its inputs, None if it has none.
     """
 
     at: float
@@ -45,13 +51,14 @@ class Brought(NamedTuple):
     inputs: Known | None
 
 
-class Using:
-    """Distribution of messages to their plants; `plants` are those in memory, by name."""
+class BatchIntake:
+    """Gives the messages of a batch to their plants; `plants` are those in memory, by name."""
 
     def __init__(self, fleet: Fleet, plants: OrderedDict[str, PlantState]):
         self.fleet, self.plants, self._judges = fleet, plants, Judges(fleet)
-        self._refused: dict[tuple[int, bool], str] = {}  # why, by the number of a message and whether it is its inputs
-        self._before: dict[str, Before] = {}
+        # Why something is refused, by the number of its message and whether it is the message's inputs.
+        self._refused: dict[tuple[int, bool], str] = {}
+        self._before: dict[str, PlantBefore] = {}
         self._taken: list[Candidate] = []
         self._anew: dict[str, int] = {}  # versions of plants that began anew in this batch
         self.replaced: list[tuple[PlantState, list[Withdrawn]]] = []  # these as they were, with their events
@@ -69,89 +76,94 @@ class Using:
         for i, message in enumerate(messages):
             if (name := plant_of(message)) is None or name not in damaged:
                 by_plant.setdefault(name or "", []).append(i)
-        left = [i for numbers in by_plant.values() for i in numbers]
+        waiting = [i for numbers in by_plant.values() for i in numbers]
         # Each round refuses at least one message, restores its plant, and gives the plant its other messages again.
-        while left:
+        while waiting:
             self._before, self._taken = {}, []
-            for i in left:
-                try:
-                    message = messages[i]
-                    if isinstance(message, str):
-                        outcomes[i] = None, None, message, ()
-                    elif isinstance(message, UnreadMessage):
-                        outcomes[i] = self._count_unread(message.read), None, message.why, ()
-                    else:
-                        outcomes[i] = self._use_message(i, message, wall)
-                except InputError as error:  # of another kind than its plant expects
-                    assert not isinstance(message, str | UnreadMessage)
-                    outcomes[i] = self._count_unread(message), None, str(error), ()
+            for i in waiting:
+                outcomes[i] = self._take_one(i, messages[i], wall)
             self.fleet.step({plant.name: plant for _, plant, _, _ in self._taken}.values())
             implausible = self._judges.find_implausible(self._taken)
-            # Plants that an implausible message has spoilt go back.
-            spoilt = set()
+            # Plants that took an implausible message go back.
+            restored = set()
             for i, why in implausible.items():
                 number, plant, event, _ = self._taken[i]
                 self._refused[number, event.node_index < 0] = why
-                spoilt.add(plant.name)
-            for name in spoilt:
+                restored.add(plant.name)
+            for name in restored:
                 self._restore_plant(name)
-            left = [i for i in left if plant_of(messages[i]) in spoilt]
+            waiting = [i for i in waiting if plant_of(messages[i]) in restored]
         self._taken = []
         return outcomes
 
+    def _take_one(self, number: int, message: Read, wall: datetime) -> Outcome:
+        """Give a message to its plant, as far as it was read; return its outcome."""
+        if isinstance(message, str):
+            return None, None, message, ()
+        if isinstance(message, UnreadMessage):
+            return self._count_unread(message.read), None, message.why, ()
+        try:
+            return self._use_message(number, message, wall)
+        except InputError as error:  # of another kind than its plant expects
+            return self._count_unread(message), None, str(error), ()
+
     def _find_implausible_inputs(self, messages: Sequence[Read]) -> dict[tuple[int, bool], str]:
-        """Return the inputs that lead to no valid prediction from the state before the batch."""
-        given = [(i, m, values) for i, m in enumerate(messages) if not isinstance(m, str | UnreadMessage)
-                 and (values := m.values if m.node == INPUTS else m.inputs)
-                 and len(values) == self.fleet.program.given]  # fmt: skip
-        plants = [self.plants.get(message.plant) for _, message, _ in given]
-        numbers = np.array([values for *_, values in given], dtype=np.float64)
-        why = self._judges.explain_implausible_inputs(plants, numbers)
-        return {(i, True): said for (i, _, _), said in zip(given, why, strict=True) if said}
+        """Return which inputs lead to no valid prediction from the state before the batch, as `_refused` has them."""
+        numbers, plants, inputs = list[int](), list[PlantState | None](), []
+        for i, message in enumerate(messages):
+            if isinstance(message, str | UnreadMessage):
+                continue
+            values = message.values if message.node == INPUTS else message.inputs
+            if values and len(values) == self.fleet.program.given:
+                numbers.append(i)
+                plants.append(self.plants.get(message.plant))
+                inputs.append(values)
+        reasons = self._judges.explain_implausible_inputs(plants, np.array(inputs, dtype=np.float64))
+        return {(i, True): why for i, why in zip(numbers, reasons, strict=True) if why}
 
     def _use_message(self, number: int, message: AnyMessage, wall: datetime) -> Outcome:
-        """Give a message to its plant; the outcome has none if the plant would begin with a refused message."""
+        """Give a message to its plant; the outcome has no plant if one would begin with a refused message."""
         plant = self._find_plant(message, wall)
-        brought = self._read_events(message, plant, wall)
-        at, arrival, event, inputs = brought.at, brought.arrival, brought.event, brought.inputs
+        timed = self._read_events(message, plant, wall)
+        at, arrival, event, inputs = timed.at, timed.arrival, timed.event, timed.inputs
         # Values beyond limits do not count as received; an event of such values only is implausible.
         screened = self.fleet.screen(message.node, event, plant)
-        event, refused, why, spoilt = screened.event, self._refused, screened.why if screened.is_empty else "", None
-        if refused:
-            why = refused.get((number, event.node_index < 0)) or why
-            spoilt = refused.get((number, True)) if inputs is not None else None
+        event, why, why_inputs = screened.event, screened.why if screened.is_empty else "", None
+        if self._refused:  # as most often nothing is
+            why = self._refused.get((number, event.node_index < 0)) or why
+            why_inputs = self._refused.get((number, True)) if inputs is not None else None
         # A new plant begins with a message that is plausible and of a right clock.
         if plant is None and at > arrival + self.fleet.options.ahead:
             return None, "future", "", ()
-        if plant is None and why and (inputs is None or spoilt):
+        if plant is None and why and (inputs is None or why_inputs):
             return None, "implausible", why, ()
         given = message.arrival is not None
         if plant is None:
-            begins = make_first_leap(*((arrival, ARRIVAL) if given else (at, message.node)))
-            plant = self._begin_plant(message.plant, at, brought.origin, begins)
-        plant = self._remember(plant, at)
+            begins = make_first_leap(arrival, ARRIVAL) if given else make_first_leap(at, message.node)
+            plant = self._begin_plant(message.plant, at, timed.origin, begins)
+        plant = self._note_before(plant, at)
         # Inputs and measurement are used or refused independently.
         notes: list[str] = []
-        if inputs is not None and spoilt is None:
-            self._give_to_plant(number, plant, inputs, given, brought.clock, message.node)
-        elif spoilt is not None:
+        if inputs is not None and why_inputs is None:
+            self._give_to_plant(number, plant, inputs, given, timed.clock, message.node)
+        elif why_inputs is not None:
             plant.link(INPUTS).implausible += 1
-            notes.append(f"inputs {message.inputs}: {spoilt}; the rest is used")
+            notes.append(f"inputs {message.inputs}: {why_inputs}; the rest is used")
         verdict: Verdict = "implausible"
         if not why:
-            verdict = self._give_to_plant(number, plant, event, given, brought.clock, message.node)
+            verdict = self._give_to_plant(number, plant, event, given, timed.clock, message.node)
         self.fleet.count(plant, message.node, screened, verdict)
         if screened.why and verdict == "used":
             notes.append(f"{screened.why}; the rest is used")
         return plant, verdict, why, notes
 
-    def _read_events(self, message: AnyMessage, plant: PlantState | None, wall: datetime) -> Brought:
+    def _read_events(self, message: AnyMessage, plant: PlantState | None, wall: datetime) -> TimedEvents:
         """Return the events of a message, its measurement and inputs, with times as numbers of its plant."""
         origin = self._choose_origin(message) if plant is None else plant.origin
         at = message.time
         if origin is not None or not isinstance(at, float):
             at = self._time_as_number(at, origin, message.plant)
-        # Without a time of arrival it came when its plant had come so far.
+        # Without a time of arrival it arrived when measured, or, if late, when the plant's newest message did.
         now = at if plant is None else plant.confirmed
         came = message.arrival
         arrival = max(now, at) if came is None else self._time_as_number(came, origin, message.plant)
@@ -159,10 +171,13 @@ class Using:
         event, inputs = self.fleet.convert_message(message.node, message.sequence, at, message.values, arrival), None
         if message.inputs is not None:
             inputs = self.fleet.convert_message(INPUTS, message.sequence, at, message.inputs, arrival)
-        return Brought(at, arrival, clock, origin, event, inputs)
+        return TimedEvents(at, arrival, clock, origin, event, inputs)
 
     def _count_unread(self, message: AnyMessage) -> PlantState | None:
-        """Count a message that came and cannot be used as none that was lost; return its plant, if that says so."""
+        """Count a message that came but cannot be used, so that it is not counted as lost.
+
+        Returns its plant; None where plant, node or time of the message are none that is known.
+        """
         plant, node = self.plants.get(message.plant), message.node
         if plant is None or (node != INPUTS and node not in self.fleet.network.names):
             return None
@@ -170,18 +185,21 @@ class Using:
             at = self._time_as_number(message.time, plant.origin, plant.name)
         except InputError:  # a time of another kind
             return None
-        link = self._remember(plant, at).link(node)
+        link = self._note_before(plant, at).link(node)
         link.count_unread(message.sequence, at, self.fleet.periods.get(node, 0))
         return plant
 
-    def _remember(self, plant: PlantState, begun: float) -> PlantState:
-        """Return the plant, and store once in a batch what it was before; a new one joins the others."""
+    def _note_before(self, plant: PlantState, begun: float) -> PlantState:
+        """Return the plant, and note once in a batch what it was before, for `_restore_plant`; a new one is added.
+
+        `begun`: time of the first event of a new plant.
+        """
         if plant.name not in self.plants:
             self.plants[plant.name] = plant
-            self._before[plant.name] = Before(False, (begun, None), {})
+            self._before[plant.name] = PlantBefore(False, (begun, None), {})
         elif plant.name not in self._before:
             links = {name: tuple(vars(link).values()) for name, link in plant.links.items()}
-            self._before[plant.name] = Before(True, plant.clock, links)
+            self._before[plant.name] = PlantBefore(True, plant.clock, links)
         return plant
 
     def _time_as_number(self, moment: float | datetime, origin: datetime | None, plant: str) -> float:
@@ -200,11 +218,13 @@ class Using:
             return plant
         at = self._time_as_number(message.time, plant.origin, plant.name)
         said = self._time_as_number(message.arrival, plant.origin, plant.name) if message.arrival is not None else at
+        # The leap with which the plant began: its message takes that back if it goes on from before.
         first, newest = find_leap(plant.leap, plant.now, said, leap) or (None, at)
         begins = first is not None and first.now == -inf and not plant.holds(first, at, leap)
         clock = message.node if message.arrival is None else ARRIVAL
         if first is not None and begins and first.taken_back_by(clock, said, newest):
             return None
+        # The clock on the wall agrees with the message, and not with the plant.
         if plant.origin is not None:
             now = self._time_as_number(wall, plant.origin, plant.name)
             if plant.confirmed > now + leap and abs(at - now) <= leap:
@@ -212,7 +232,10 @@ class Using:
         return plant
 
     def _begin_plant(self, name: str, at: float, origin: datetime | None, leap: Leap) -> PlantState:
-        """Begin a plant, whose first moment may still turn out wrong; one that begins anew is withdrawn first."""
+        """Return a new plant, whose first moment may still turn out wrong.
+
+        Of one that begins anew the old is ended, and its events are counted as from the future.
+        """
         plant, old = self.fleet.begin(name, at, origin), self.plants.pop(name, None)
         plant.now, plant.leap, plant.version = at, leap, self._anew.get(name, 0)
         if old is not None:
@@ -229,7 +252,16 @@ class Using:
     def _give_to_plant(
         self, number: int, plant: PlantState, event: Known, given: bool, wall: float | None, clock: str
     ) -> Verdict:
-        """Let the plant judge an event, and note what it changed."""
+        """Let the plant judge an event; note it as taken if it is used.
+
+        Args:
+            number: number of its message in the batch.
+            plant: the plant.
+            event: the event.
+            given: whether its arrival is known by another clock than the sender's.
+            wall: time by the clock on the wall, None if it is not known.
+            clock: name of the node by whose clock it is dated.
+        """
         verdict = self.fleet.take(plant, event, given, wall, clock)
         if verdict == "used":
             self._taken.append((number, plant, event, plant.changes[-1][0]))

@@ -13,21 +13,19 @@ from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
 
 T = TypeVar("T")
-PATIENCE, LEAST = (
-    7.0,
-    0.5,
-)  # seconds from a stop to the end, and for each part of it: the rest comes again, or is journaled
+PATIENCE = 7.0  # seconds from a stop to the end: what is not done then comes again, or is journaled
+LEAST = 0.5  # seconds that each piece of work after a stop has in any case
 
 
 class Ending:
-    """The end of a service: a stop that may come at any moment, and the time that is left after it.
+    """Runs the work of a service until a stop, and after it for the time that is left.
 
     The service is called in a thread of its own, which is not waited for in the end.
     """
 
     def __init__(self, stop: asyncio.Event):
         self.stop = stop
-        self._thread, self._begun = ThreadPoolExecutor(1), 0.0
+        self._thread, self._stopped_at = ThreadPoolExecutor(1), 0.0
 
     async def finished(self, work: "asyncio.Future[T]") -> bool:
         """Wait for work, after a stop for as long as is left; return whether it is done."""
@@ -36,8 +34,8 @@ class Ending:
         await asyncio.wait(both, return_when=asyncio.FIRST_COMPLETED)
         stopped.cancel()
         if not work.done():
-            self._begun = self._begun or monotonic()
-            await asyncio.wait({work}, timeout=max(self._begun + PATIENCE - monotonic(), LEAST))
+            self._stopped_at = self._stopped_at or monotonic()
+            await asyncio.wait({work}, timeout=max(self._stopped_at + PATIENCE - monotonic(), LEAST))
         return work.done()
 
     async def call(self, function: Callable[..., T], *arguments: object) -> T:
@@ -56,7 +54,7 @@ class AbandonedError(Exception):
     """End of a service that was still computing when its time was over: nothing of that is committed."""
 
 
-class Takes(Protocol):
+class BatchService(Protocol):
     """A service as the loop sees it; it may be called from another thread, one call at a time."""
 
     def unpublished(self) -> list[Output]:
@@ -72,7 +70,7 @@ class Takes(Protocol):
         """Commit everything; return the last outputs. `ended`: there will be no more messages."""
 
 
-async def keep_running(service: Takes, transport: Transport) -> None:
+async def keep_running(service: BatchService, transport: Transport) -> None:
     """Serve until the transport ends, or until SIGTERM or SIGINT; then commit and publish what was received.
 
     Args:
@@ -84,7 +82,9 @@ async def keep_running(service: Takes, transport: Transport) -> None:
         await serve_until(stop, service, transport)
 
 
-async def serve_until(stop: asyncio.Event, service: Takes, transport: Transport, patience: float | None = None) -> None:
+async def serve_until(
+    stop: asyncio.Event, service: BatchService, transport: Transport, patience: float | None = None
+) -> None:
     """Serve until the transport ends or `stop` is set; then commit and publish what was received.
 
     Args:
@@ -105,8 +105,8 @@ async def serve_until(stop: asyncio.Event, service: Takes, transport: Transport,
         await transport.close()
 
 
-async def _serve(service: Takes, transport: Transport, ending: Ending, patience: float | None) -> bool:
-    """Run the loop; return whether the transport ended."""
+async def _serve(service: BatchService, transport: Transport, ending: Ending, patience: float | None) -> bool:
+    """Receive, take and publish until a stop or the transport's end; return whether it was the latter."""
     stop = ending.stop
     while not stop.is_set():
         # The next messages, or after a while that there are none.
@@ -125,13 +125,13 @@ async def _serve(service: Takes, transport: Transport, ending: Ending, patience:
     return False
 
 
-async def _publish(service: Takes, transport: Transport, outputs: Sequence[Output], ending: Ending) -> None:
+async def _publish(service: BatchService, transport: Transport, outputs: Sequence[Output], ending: Ending) -> None:
     """Publish outputs; what a reader does not take in the time after a stop is published after a restart."""
-    telling = asyncio.ensure_future(transport.publish(outputs))
-    if not await ending.finished(telling):
-        telling.cancel()
+    publishing = asyncio.ensure_future(transport.publish(outputs))
+    if not await ending.finished(publishing):
+        publishing.cancel()
         return
-    telling.result()
+    publishing.result()  # raises what it raised
     service.published(outputs)
 
 
@@ -142,7 +142,8 @@ async def _await_unless_stopped(stop: asyncio.Event, waiting: Coroutine[object, 
     stopped.cancel()
     if task.done():
         return task.result()
-    while not task.done():  # again: a client may take it for the end of its own wait, as wait_for of Python 3.11 does
+    # Again and again: a client may take a cancellation for the end of its own wait, as wait_for of Python 3.11 does.
+    while not task.done():
         task.cancel()
         await asyncio.wait({task}, timeout=1.0)
     return None if task.cancelled() else task.result()

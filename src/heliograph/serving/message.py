@@ -79,7 +79,7 @@ class NumberedMessage(msgspec.Struct, forbid_unknown_fields=True, gc=False):
 
 
 class UnreadMessage(NamedTuple):
-    """A message of which node, count and time were read, and something else was not; and why."""
+    """A message that cannot be used although its node, count and time were read, and why it cannot."""
 
     read: Message
     why: str
@@ -115,7 +115,7 @@ def read_messages(payloads: Sequence[Payload]) -> list[Read]:
 
 
 def _read_or_explain(payload: bytes) -> Message | UnreadMessage | str:
-    """Parse a message, or return in words why it cannot be read, with what names it if it has that."""
+    """Return a message; or why it cannot be read, with what names it (plant, node, count, time) if it has these."""
     try:
         return read_message(payload)
     except InputError as error:
@@ -123,7 +123,7 @@ def _read_or_explain(payload: bytes) -> Message | UnreadMessage | str:
     try:
         fields = json.loads(payload[:LONGEST], object_pairs_hook=tuple)
         names = [(name, value) for name, value in fields if name in NAMED] if isinstance(fields, tuple) else []
-        if len(dict(names)) < len(names):  # by which of the two nobody knows
+        if len(dict(names)) < len(names):  # a field twice: nobody knows which of the two names it
             return why
         named = Message.model_validate_json(json.dumps(dict(names)))
     except (ValueError, TypeError, RecursionError):  # no JSON object, or one that names nothing
@@ -158,10 +158,11 @@ def read_message(payload: bytes) -> Message:
 
 
 def _refuse_doubled(payload: bytes, read: AnyMessage) -> None:
-    """Raise where a line has a field twice, of which decoders use the last.
+    """Raise ValueError where a line has a field twice, of which decoders use the last.
 
-    A field and a text have two quotes each: a line of no more than what was read needs has no field twice.
+    Each field's name and each text has two quotes: a line that has just the quotes of what was read has no field twice.
     """
+    # Fields that are always there: node, sequence, time; texts: node, and what else is one.
     fields = 3 + (read.plant != "") + (read.values != []) + (read.inputs is not None) + (read.arrival is not None)
     texts = 1 + (read.plant != "") + isinstance(read.time, datetime) + isinstance(read.arrival, datetime)
     if payload.count(b'"') == 2 * (fields + texts):
@@ -173,7 +174,7 @@ def _refuse_doubled(payload: bytes, read: AnyMessage) -> None:
 
 
 def _describe_payload(payload: bytes) -> str:
-    """Return what came in place of a JSON object."""
+    """Return in words what a payload is that is no JSON object."""
     try:
         return f"{show_value(json.loads(payload))}, which is no object"
     except RecursionError:

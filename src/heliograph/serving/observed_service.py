@@ -5,7 +5,7 @@ from contextlib import AbstractContextManager
 from threading import Lock
 from typing import Protocol
 
-from heliograph.serving.loop import Takes
+from heliograph.serving.loop import BatchService
 from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
 from heliograph.serving.totals import LinkTotals
@@ -19,8 +19,8 @@ class WatchedPlant(Protocol):
         """Return the counts of the plant's links, by node."""
 
 
-class Taken(Protocol):
-    """Statistics of the last batch."""
+class BatchTimes(Protocol):
+    """How long the last batch took, and how old its messages were."""
 
     @property
     def took(self) -> float:
@@ -35,7 +35,7 @@ class Taken(Protocol):
         """Return the age of the oldest message in seconds, where it is dated; else the seconds of the batch."""
 
 
-class Serves(Takes, Protocol):
+class WatchableService(BatchService, Protocol):
     """A service as the page needs it."""
 
     @property
@@ -47,7 +47,7 @@ class Serves(Takes, Protocol):
         """Return the number of messages that could not be read."""
 
     @property
-    def last(self) -> Taken:
+    def last(self) -> BatchTimes:
         """Return the statistics of the last batch."""
 
     def dead_senders(self) -> Mapping[str, int]:
@@ -57,22 +57,22 @@ class Serves(Takes, Protocol):
         """Return how often each filter that may say so had a state changed as users should know, by node and name."""
 
 
-class Watches(Protocol):
+class ServiceObserver(Protocol):
     """The observer of a service."""
 
     lock: Lock
 
-    def taking(self) -> AbstractContextManager[None]:
+    def taking_batch(self) -> AbstractContextManager[None]:
         """Return what holds the lock while a batch is taken."""
 
-    def note(self, outputs: Sequence[Output], last: Taken | None) -> None:
+    def note(self, outputs: Sequence[Output], last: BatchTimes | None) -> None:
         """Record the outputs and statistics of a batch."""
 
 
 class ObservedService:
     """A service whose batches are observed; the loop uses it like the service."""
 
-    def __init__(self, service: Serves, watch: Watches):
+    def __init__(self, service: WatchableService, watch: ServiceObserver):
         self.service, self.watch = service, watch
 
     def unpublished(self) -> list[Output]:
@@ -81,7 +81,7 @@ class ObservedService:
 
     def take(self, payloads: Sequence[Payload]) -> list[Output]:
         """Let the service take a batch, and record its outputs."""
-        with self.watch.taking():
+        with self.watch.taking_batch():
             outputs = self.service.take(payloads)
             self.watch.note(outputs, self.service.last if payloads else None)
         return outputs

@@ -94,7 +94,7 @@ class SenderOutput(BaseModel):
 
 
 class OutputAhead(BaseModel):
-    """What a sensor would measure at one horizon.
+    """Forecast of what a sensor would measure at one horizon.
 
     Args:
         mean: expected value.
@@ -106,7 +106,7 @@ class OutputAhead(BaseModel):
 
 
 class Passing(BaseModel):
-    """Probabilities that a level is passed, from drawn paths.
+    """Probabilities that a number crosses a threshold, from drawn paths.
 
     Args:
         then: that the number is beyond the level at the horizon.

@@ -7,7 +7,7 @@ from time import sleep
 from typing import TypeVar
 
 from heliograph.serving.brokers.transport import FIRST, LOG, LONGEST
-from heliograph.serving.loop import Takes
+from heliograph.serving.loop import BatchService
 from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
 from heliograph.serving.storage.store_protocol import AwayError
@@ -17,7 +17,7 @@ LOOK = 0.1  # seconds between looks at whether to stop
 
 
 def retry_while_away(act: Callable[[], T], stop: asyncio.Event) -> T:
-    """Do something with a store, and do it again for as long as the store is away.
+    """Call `act` until the store that it uses is not away, with waits that double, and return what it returns.
 
     Raises:
         AwayError: the store is away, and `stop` is set.
@@ -47,7 +47,7 @@ class WaitingService:
     After a failed commit it is not known whether it was one: what the store has and nobody was told is published first.
     """
 
-    def __init__(self, service: Takes, stop: asyncio.Event):
+    def __init__(self, service: BatchService, stop: asyncio.Event):
         self.service, self._stop, self._failed = service, stop, False
 
     def unpublished(self) -> list[Output]:

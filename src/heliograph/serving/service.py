@@ -22,12 +22,12 @@ from heliograph.live.stored.plant_codec import pack_plant, unpack_plant
 from heliograph.numerics.check import instance, show_value
 from heliograph.numerics.process.collector import no_collector
 from heliograph.serving.ahead import ForecastPublisher, Spans
-from heliograph.serving.estimate_writer import EstimateWriter, line
+from heliograph.serving.estimate_writer import EstimateWriter, encode_line
 from heliograph.serving.exchange import Exchange
-from heliograph.serving.intake import Outcome, Using, plant_of
+from heliograph.serving.intake import BatchIntake, Outcome, plant_of
 from heliograph.serving.message import AnyMessage, Message, Payload, Read, UnreadMessage, read_messages
 from heliograph.serving.output import Output
-from heliograph.serving.silence import Silence, find_dead_senders
+from heliograph.serving.silence import SilenceWatch, find_dead_senders
 from heliograph.serving.storage.store_protocol import ConflictError, Entry, StoredPlant, StoreProtocol
 from heliograph.serving.thresholds import Thresholds
 
@@ -88,13 +88,13 @@ class Service:
         self.fleet, self.store, self._say = fleet, store, say
         self.plants = OrderedDict[str, PlantState]()  # those in memory, in order of their newest message
         self.malformed, self.known, self.last = 0, 0, BatchStatistics(0, 0, 0.0, 0.0, 0.0)
-        self._writer, self._using = EstimateWriter(fleet.program), Using(fleet, self.plants)
-        self._exchange, self._silence = Exchange(fleet, self._time_in_messages), Silence(fleet, every)
+        self._writer, self._intake = EstimateWriter(fleet.program), BatchIntake(fleet, self.plants)
+        self._exchange, self._silence = Exchange(fleet, self._time_in_messages), SilenceWatch(fleet, every)
         self._angles, self._remarks, self._doubt = FleetAngles(fleet), FleetRemarks(fleet), say
         self._held = FleetHeld(fleet)
         self._ahead = None if forecast is None else ForecastPublisher(fleet, forecast, thresholds)
         self._unsearched = 0  # messages since the last search for garbage
-        self._published: int | None = None  # up to where, since the last commit
+        self._published: int | None = None  # number of the newest output published since the last commit
         self._damage = dict[str, str]()  # what is wrong with plants of the last batch that the store cannot give
 
     def take(self, payloads: Sequence[Payload]) -> list[Output]:
@@ -134,16 +134,19 @@ class Service:
         return self._write_provisional([(plant, plant.silence) for plant, _ in late if plant.silence is not None])
 
     def _take_silence(self, now: datetime) -> list[Output]:
-        """Advance the clock where no message came: commit what is final by it; silence is published, not committed."""
+        """Advance plants by the clock, as no message came: commit what is final by it, and publish what silence means.
+
+        The estimates of silent steps are published without a commit, since they follow from it and the clock.
+        """
         if self._exchange.sends:  # each of its steps is a message to the neighbours
             steps = self._make_step_messages(now)
             return self._take_batch(steps) if steps else []
-        due = self._silence.due(self.plants.values(), now)
+        due = self._silence.find_due(self.plants.values(), now)
         for plant, step in due:
             self.fleet.advance(plant, step)
         finalised = self.fleet.finalise(plant for plant, _ in due)
-        changed = {row_set.plant.name: row_set.plant for row_set in finalised if row_set.left}
-        entries = [entry for row_set in finalised for entry in self._write_withdrawn(row_set.plant, row_set.withdrawn)]
+        changed = {each.plant.name: each.plant for each in finalised if each.left}
+        entries = [entry for each in finalised for entry in self._write_withdrawn(each.plant, each.withdrawn)]
         entries += self._write_finals(finalised)
         self.fleet.pass_silence(due)
         rows = [(plant, plant.silence) for plant, _ in due if plant.silence is not None]
@@ -156,17 +159,17 @@ class Service:
             return []
 
     def _make_step_messages(self, now: datetime) -> list[Message]:
-        """Return a message of inputs that all stay as they were for each plant of which another step has begun."""
-        nothing: list[float | None] = [None] * self.fleet.program.given
+        """Return a message for each plant of which another step has begun: inputs that all stay as they were."""
+        unchanged: list[float | None] = [None] * self.fleet.program.given
         return [
             Message.model_construct(
-                plant=plant.name, node=INPUTS, sequence=int(step), time=now, values=nothing, inputs=None, arrival=None
+                plant=plant.name, node=INPUTS, sequence=int(step), time=now, values=unchanged, inputs=None, arrival=None
             )
-            for plant, step in self._silence.due(self.plants.values(), now)
+            for plant, step in self._silence.find_due(self.plants.values(), now)
         ]
 
     def _take_batch(self, payloads: Sequence[Payload]) -> list[Output]:
-        """Read and use a batch, and again from the store's plants if another process has committed one of them."""
+        """Use a batch of payloads and return the outputs to publish; note its statistics in `last`."""
         begun = perf_counter()
         messages = read_messages(payloads)
         names = {name for message in messages if (name := plant_of(message)) is not None}
@@ -227,7 +230,7 @@ class Service:
 
     def _take_messages(self, messages: Sequence[Read], payloads: Sequence[Payload]) -> tuple[list[Output], float]:
         """Use messages and commit; return the outputs to publish, and the seconds of the commit."""
-        outcomes = self._using.apply_batch(messages, self._damage, datetime.now(UTC))
+        outcomes = self._intake.apply_batch(messages, self._damage, datetime.now(UTC))
         touched = {plant.name: plant for plant, _, _, _ in outcomes if plant is not None}
         used = {plant.name for plant, verdict, _, _ in outcomes if plant is not None and verdict == "used"}
         if self._doubt is not None:
@@ -241,10 +244,10 @@ class Service:
         # Step what is due; estimates of final rows are committed, provisional ones and messages only published.
         sent = self._exchange.messages(touched.values())
         finalised = self.fleet.finalise(touched.values())
-        withdrawn = [*self._using.replaced, *((row_set.plant, row_set.withdrawn) for row_set in finalised)]
+        withdrawn = [*self._intake.replaced, *((each.plant, each.withdrawn) for each in finalised)]
         entries += [entry for plant, events in withdrawn for entry in self._write_withdrawn(plant, events)]
         entries += self._write_finals(finalised)
-        newest = [(row_set.plant, row_set.newest) for row_set in finalised if row_set.plant.name in used]
+        newest = [(each.plant, each.newest) for each in finalised if each.plant.name in used]
         provisional = self._write_provisional(newest)
         self.fleet.free_slots(finalised)
         begun = perf_counter()
@@ -257,21 +260,25 @@ class Service:
     def _refuse_unused(
         self, messages: Sequence[Read], payloads: Sequence[Payload], outcomes: Sequence[Outcome]
     ) -> tuple[list[Entry], int, int]:
-        """Return entries on messages that were not used, or not wholly, and counts of malformed and known ones."""
+        """Return entries on messages that were not used, or not wholly; how many were malformed, and how many known.
+
+        Known are duplicates, and late ones, which a store may have used before it was closed.
+        """
         entries, malformed, known = list[Entry](), 0, 0
-        # All but those that were used as they are, as most were.
-        for i in [i for i, (_, verdict, _, notes) in enumerate(outcomes) if notes or verdict != "used"]:
-            message, payload, (_, verdict, why, notes) = messages[i], payloads[i], outcomes[i]
-            # Of a damaged plant, or not read.
+        for message, payload, (_, verdict, why, notes) in zip(messages, payloads, outcomes, strict=True):
+            if verdict == "used" and not notes:  # as most are
+                continue
+            # Of a plant that is damaged in the store.
             if (damage := self._damage.get(plant_of(message) or "")) and not isinstance(message, str):
                 entries.append(_refuse(message, "damaged", damage))
                 continue
+            # Not read, or of another kind than its plant expects.
             if isinstance(message, str | UnreadMessage) or verdict is None:
                 malformed += 1
                 said = why if isinstance(payload, str | UnreadMessage) else f"{why}: {show_value(payload)}"
                 entries.append(_refuse(message, "malformed", said))
                 continue
-            # Used but for some of it, known already, or refused with the reason.
+            # Refused with the reason; or used except for parts, on which there are notes.
             if verdict != "used":
                 known += verdict in ("duplicate", "late")
                 entries.append(_refuse(message, verdict, why or WHY[verdict]))
@@ -289,7 +296,10 @@ class Service:
             self._say = None
 
     def _commit(self, touched: dict[str, PlantState], entries: Sequence[Entry], malformed: int) -> list[Output]:
-        """Commit the changed plants. If that fails, forget them in memory: the store is authoritative."""
+        """Commit the changed plants and entries; return the outputs to publish.
+
+        If that fails, the plants are forgotten in memory: what the store has is true.
+        """
         stored = {}
         if self.store.keeps:
             stored = {
@@ -328,7 +338,7 @@ class Service:
 
     def _write_finals(self, finalised: Iterable[Finalised]) -> list[Entry]:
         """Return final estimates, each published once: of rows that are final now and received a measurement."""
-        rows = [(row_set.plant, row) for row_set in finalised for row in row_set.final if row.has_data()]
+        rows = [(each.plant, row) for each in finalised for row in each.final if row.has_data()]
         names = (plant.name for plant, _ in rows)
         return [*map(Entry._make, zip(names, repeat("final"), self._write_estimates(b"final", rows)))]
 
@@ -340,19 +350,21 @@ class Service:
             yield _write_refusal(plant.name, parts, "future", LEAPT)
 
     def _write_provisional(self, rows: Sequence[tuple[PlantState, HeldRow]]) -> list[Output]:
-        """Return the provisional estimates after these rows, and what the senders' silence means."""
+        """Return outputs with the estimates after these rows, their forecasts, and what the senders' silence means."""
         outputs = []
         self._silence.note_published(rows)
-        aheads = self._ahead.forecasts([row for _, row in rows]) if self._ahead is not None else [None] * len(rows)
-        for (plant, _), body, horizons in zip(rows, self._write_estimates(b"provisional", rows), aheads, strict=True):
+        forecasts = self._ahead.forecasts([row for _, row in rows]) if self._ahead is not None else [None] * len(rows)
+        bodies = self._write_estimates(b"provisional", rows)
+        for (plant, _), body, horizons in zip(rows, bodies, forecasts, strict=True):
+            # Members are added before the closing brace of the line.
             if horizons is not None:
                 ahead = [{"time": self._time_in_messages(plant, time), "ahead": distance, "estimates": estimates}
                          for time, distance, estimates in horizons]  # fmt: skip
-                body = b'%b,"forecast":%b}' % (body[:-1], line(ahead))
+                body = b'%b,"forecast":%b}' % (body[:-1], encode_line(ahead))
             if self.fleet.watched:
                 senders = {name: status._asdict() | {"dead": status.dead, "reason": status.reason}
                            for name, status in self.fleet.senders(plant).items()}  # fmt: skip
-                body = b'%b,"senders":%b}' % (body[:-1], line(senders))
+                body = b'%b,"senders":%b}' % (body[:-1], encode_line(senders))
             outputs.append(Output(None, plant.name, "provisional", body))
         return outputs
 
@@ -360,7 +372,7 @@ class Service:
         """Write the estimates of these rows, a line each."""
         moments = [(plant.name, row.key[0] if plant.origin is None else self._time_in_messages(plant, row.key[0]))
                    for plant, row in rows]  # fmt: skip
-        return self._writer.lines(kind, moments, self.fleet.outputs([row.slot for _, row in rows]))
+        return self._writer.write_lines(kind, moments, self.fleet.outputs([row.slot for _, row in rows]))
 
     def _time_in_messages(self, plant: PlantState, at: float) -> float | str:
         """Return the time of a row as messages have it."""
@@ -379,5 +391,6 @@ def _refuse(message: Read, why: str, detail: str) -> Entry:
 
 
 def _write_refusal(plant: str | None, parts: dict[str, object], why: str, detail: str) -> Entry:
+    """Return the refusal of a message as an entry for the store; `parts`: node, sequence and time, if known."""
     results = {"kind": "refused", "plant": plant, "node": None, "sequence": None, "time": None}
-    return Entry(plant or "", "refused", line(results | parts | {"reason": why, "detail": detail}))
+    return Entry(plant or "", "refused", encode_line(results | parts | {"reason": why, "detail": detail}))

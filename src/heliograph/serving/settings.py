@@ -101,9 +101,9 @@ class ServiceSettings:
 
 
 def store_of(network: str, given: str | None, parts: int | None, node: str | None = None) -> str | None:
-    """Return the place of the store as requested, else a file in this folder named after the network and its node.
+    """Return the path or URL of the store: `given`, else a file in this folder named after the network and its node.
 
-    None keeps no state. Processes that share parts must all name the store.
+    None keeps no state. Processes that share `parts` have no such default, and must all name the store.
     """
     if given is not None or parts is not None:
         return None if given == NOTHING else given
@@ -122,16 +122,14 @@ def settings_of_node(settings: ServiceSettings, node: str) -> ServiceSettings:
     states = settings.states
     if states is not None:
         states = states._replace(address=_below(states.address, node))
-    # Messages of its own sensor, where they are of topics of others; the seconds of a step are those of all nodes.
+    # The sources of its own messages, by topic; the seconds of a step are those of all nodes.
     table, step = settings.sources, settings.options.step
     if isinstance(table, Mapping):
-        items = {topic: list(rows) if isinstance(rows, Sequence) else [rows] for topic, rows in table.items()}
-        step = next((row.step for rows in items.values() for row in rows if isinstance(row, Source)), step)
+        rows_of = {topic: list(rows) if isinstance(rows, Sequence) else [rows] for topic, rows in table.items()}
+        step = next((row.step for rows in rows_of.values() for row in rows if isinstance(row, Source)), step)
         measures = node in settings.network.nodes and settings.network.nodes[node].received > 0
-        mine = {topic: [row for row in rows if not isinstance(row, Source) or row.node in (node, INPUTS)
-                        or (measures and not isinstance(row.node, str))]
-                for topic, rows in items.items()}  # fmt: skip
-        table = {topic: rows for topic, rows in mine.items() if rows} or None
+        of_node = {topic: [row for row in rows if _concerns(row, node, measures)] for topic, rows in rows_of.items()}
+        table = {topic: rows for topic, rows in of_node.items() if rows} or None
     return replace(
         settings,
         network=node_network(settings.network, node),
@@ -142,6 +140,16 @@ def settings_of_node(settings: ServiceSettings, node: str) -> ServiceSettings:
         others=tuple(name for name in settings.network.names if name != node),
         name=f"{settings.name} {node}",
     )
+
+
+def _concerns(row: object, node: str, measures: bool) -> bool:
+    """Return whether a source is for a node: its own, of the inputs, or of a node that the message names.
+
+    The last is so if the node measures something. What is no Source is refused later.
+    """
+    if not isinstance(row, Source) or row.node in (node, INPUTS):
+        return True
+    return measures and not isinstance(row.node, str)
 
 
 def _below(address: Address, node: str) -> Address:

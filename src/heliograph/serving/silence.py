@@ -12,25 +12,26 @@ from heliograph.live.plant import PlantState
 from heliograph.live.rows import HeldRow
 from heliograph.serving.settings import SHORTEST
 
-MOVED = 0.1  # deviations by which a mean, and share by which a deviation has to move to be told
+MOVED = 0.1  # deviations by which a mean has to move to be published again, and share by which a deviation has to
 GRACE = 10.0  # seconds after a start in which messages that waited come first
 
 
-class Silence:
-    """What silence makes of plants whose steps have dates, and which of it is worth telling.
+class SilenceWatch:
+    """Finds silent plants whose steps have dates, and which of their estimates are worth publishing.
 
-    Of a silent plant an estimate is told where a mean has moved by a tenth of its deviation since it was told last, a
+    An estimate is published where a mean has moved by a tenth of its deviation since the last one published, a
     deviation by a tenth of itself, or a sender is dead now, or is not any more; and every so many seconds if asked for.
 
     Args:
         fleet: the plants of the network.
-        every: seconds after which an estimate is told although it has hardly changed; None for never.
+        every: seconds after which an estimate is published although it has hardly changed; None for never.
     """
 
     def __init__(self, fleet: Fleet, every: float | None):
         self.fleet, self.every, self._begun, self._looked = fleet, every, monotonic(), -inf
-        self._told: dict[str, tuple[np.ndarray, tuple[str, ...], float]] = {}  # outputs, dead senders, step
-        self._resumed = set[str]()
+        self._published: dict[str, tuple[np.ndarray, tuple[str, ...], float]] = {}  # outputs, dead senders, step
+        self._resumed = set[str]()  # plants of before this start, of which messages may wait somewhere
+        # Columns (filter, state) of each filter's mean, and of the diagonal of its covariance, which is row by row.
         n, places = len(fleet.network.states), fleet.program.places
         self._means = np.array([[place.mean + i for i in range(n)] for place in places], dtype=int)
         self._variances = np.array([[place.covariance + i * (n + 1) for i in range(n)] for place in places], dtype=int)
@@ -39,16 +40,17 @@ class Silence:
         """Note plants that a service goes on with, of which messages may wait somewhere."""
         self._resumed.update(names)
 
-    def due(self, plants: Iterable[PlantState], now: datetime) -> list[tuple[PlantState, float]]:
-        """Return the plants of which another step has begun by now, with its number."""
+    def find_due(self, plants: Iterable[PlantState], now: datetime) -> list[tuple[PlantState, float]]:
+        """Return the plants of which another step has begun by now without a message, with its number."""
         step, due = self.fleet.options.step, list[tuple[PlantState, float]]()
         if step is None or not self.fleet.deciding:
             return due
         for plant, origin in self._dated(plants):
             passed = min((now - origin) // timedelta(seconds=step), self.fleet.end_step)
-            leap = plant.leap  # which the clock confirms or contradicts
-            leaps = leap is not None and leap.now > -inf and not leap.believed
-            if passed > plant.confirmed and (leaps or passed > plant.rows.held[-1].key[0]):
+            # The clock also confirms or contradicts a leap in time that no other clock has confirmed so far.
+            leap = plant.leap
+            has_open_leap = leap is not None and leap.now > -inf and not leap.believed
+            if passed > plant.confirmed and (has_open_leap or passed > plant.rows.held[-1].key[0]):
                 due.append((plant, float(passed)))
         return due
 
@@ -89,12 +91,12 @@ class Silence:
         if self.fleet.watched:
             outputs = self.fleet.outputs([row.slot for _, row in rows])
             for (plant, row), output in zip(rows, outputs, strict=True):
-                self._told[plant.name] = output, self._dead_senders(plant), row.key[0]
+                self._published[plant.name] = output, self._dead_senders(plant), row.key[0]
                 self._resumed.discard(plant.name)
 
     def forget(self, name: str) -> None:
         """Forget a plant that leaves the memory."""
-        self._told.pop(name, None)
+        self._published.pop(name, None)
 
     def select_for_publication(self, rows: Sequence[tuple[PlantState, HeldRow]]) -> list[tuple[PlantState, HeldRow]]:
         """Return the rows whose estimates differ from what was published, or which are due again."""
@@ -102,16 +104,16 @@ class Silence:
         return [pair for pair, output in zip(rows, outputs, strict=True) if self._is_news(*pair, output)]
 
     def _is_news(self, plant: PlantState, row: HeldRow, output: np.ndarray) -> bool:
-        """Test whether a row is news: a sender died, `every` is over, or a mean or deviation has moved visibly."""
-        told = self._told.get(plant.name)
-        if told is None or told[1] != self._dead_senders(plant):
+        """Return whether a row is worth publishing: a sender died, `every` is over, a mean or deviation has moved."""
+        published = self._published.get(plant.name)
+        if published is None or published[1] != self._dead_senders(plant):
             return True
         step = self.fleet.options.step or 1.0
-        if self.every is not None and (row.key[0] - told[2]) * step >= self.every:
+        if self.every is not None and (row.key[0] - published[2]) * step >= self.every:
             return True
-        before = np.sqrt(np.maximum(told[0][self._variances], 0.0))
+        before = np.sqrt(np.maximum(published[0][self._variances], 0.0))
         now = np.sqrt(np.maximum(output[self._variances], 0.0))
-        moved = np.abs(output[self._means] - told[0][self._means]) > MOVED * before
+        moved = np.abs(output[self._means] - published[0][self._means]) > MOVED * before
         return bool((moved | (np.abs(now - before) > MOVED * before)).any())
 
     def _dead_senders(self, plant: PlantState, now: float = -inf) -> tuple[str, ...]:
@@ -120,7 +122,7 @@ class Silence:
 
     def _told_dead(self, plant: PlantState) -> tuple[str, ...]:
         """Return the senders of a plant that were told to be dead."""
-        return self._told[plant.name][1] if plant.name in self._told else ()
+        return self._published[plant.name][1] if plant.name in self._told else ()
 
 
 def find_dead_senders(fleet: Fleet, plants: Mapping[str, PlantState]) -> dict[str, list[str]]:

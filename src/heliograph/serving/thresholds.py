@@ -56,10 +56,10 @@ def parse_threshold(text: str) -> Threshold:
 
 
 def check_names(network: Network, thresholds: Thresholds) -> None:
-    """Refuse a level of what is no state of the network and no output of its sensors, and any of a plant of modes.
+    """Raise ValueError unless each threshold is of a state of the network or of an output of its sensors.
 
     Raises:
-        ValueError: such a level.
+        ValueError: such a level, or any of a plant of modes, whose paths cannot be drawn.
     """
     if thresholds and isinstance(first(network.plant), ModalPlant):
         raise fail("--threshold", "a plant of one law of motion, whose paths can be drawn", "a markov_plant")
@@ -73,7 +73,7 @@ def check_names(network: Network, thresholds: Thresholds) -> None:
 def find_crossings(
     source: HasOrigin, place: tuple[str, str], threshold: Threshold, horizons: list[float], whole: bool
 ) -> list[dict[str, float]]:
-    """Return at each horizon the probabilities that a level is passed then, and by then, as they are published.
+    """Return for each horizon the probabilities that a threshold is crossed then, and by then, as they are published.
 
     Args:
         source: where the forecast starts.

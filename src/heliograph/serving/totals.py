@@ -58,6 +58,7 @@ class Totals:
             if now != before:
                 self._seen[plant, node] = now
                 total = self.by_node.setdefault(node, Counter(dict.fromkeys(FIELDS, 0)))
+                # A count that fell is of a plant that began anew; only lost messages may become fewer by themselves.
                 for name, new, old in zip(FIELDS, now, before, strict=True):
                     total[name] += new - old if name == "lost" else max(new - old, 0)
 

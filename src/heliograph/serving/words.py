@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from heliograph.files.availability import LastWords
-from heliograph.serving.loop import Takes
+from heliograph.serving.loop import BatchService
 from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
 from heliograph.serving.storage.store_protocol import StoreProtocol
@@ -18,7 +18,7 @@ class LastWordsService:
         store: where they are kept.
     """
 
-    def __init__(self, service: Takes, words: LastWords, store: StoreProtocol):
+    def __init__(self, service: BatchService, words: LastWords, store: StoreProtocol):
         self._service, self._words, self._store = service, words, store
         self._unkept = dict[str, int]()
         words.restore(store.words())
@@ -43,7 +43,8 @@ class LastWordsService:
 
     def _keep_words(self) -> None:
         """Store the words that came since the last call."""
-        self._unkept |= self._words.changed()  # until the store has them: it may be away
+        # Words stay unkept until the store has them: it may be away, and raise.
+        self._unkept |= self._words.changed()
         if self._unkept:
             self._store.keep_words(self._unkept)
             self._unkept = {}

@@ -9,19 +9,17 @@ from importlib.util import find_spec
 import pytest
 
 pytest.importorskip("prometheus_client")
-from heliograph.serving.observation.page import Tallies
-from heliograph.serving.observation.watch import Watch
 from tests.serving.observation import monitoring
-from tests.serving.watched import Scripted
+from tests.serving.watched import Scripted, metrics_of, observer_of
 
 AGAIN = "python -m tests.serving.observation.monitoring writes it anew"
 
 
 def families():
     """Every metric of a service that has taken some rows."""
-    watch = Watch(["x", "v"])
-    Tallies(watch)
+    watch = observer_of(["x", "v"])
     watch.wrap(Scripted()).take([b"1", b"2"])
+    metrics_of(watch)  # the page adds its own to the registry
     return sorted(watch.registry.collect(), key=lambda family: family.name)
 
 

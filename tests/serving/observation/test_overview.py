@@ -9,17 +9,15 @@ from pydantic_core import to_json
 
 from heliograph.live import LinkCounts
 from heliograph.serving.observation import parse_page_address, serve_page
-from heliograph.serving.observation.page import PageAddress
 from heliograph.serving.observation.running_nis import read_nis
-from heliograph.serving.observation.watch import Watch
 from heliograph.serving.output import Output
 from tests.serving.observation.test_page import TOKEN, got
-from tests.serving.watched import Scripted
+from tests.serving.watched import Scripted, observer_of
 
 
 def fleet(count, wrong=3, dead=5):
     """A watch of so many plants: of one the innovations are 16 times what is claimed, of one a sender is dead."""
-    watch, services = Watch(["x"], "oven"), []
+    watch, services = observer_of(["x"], "oven"), []
     for i in range(count):
         status = {"last": 3, "silent": 9, "provisional": 0, "missed": 3, "chance": 1e-9, "dead": True}
         senders = {"<b>node": status} if i == dead else {}
@@ -31,7 +29,7 @@ def fleet(count, wrong=3, dead=5):
 
 def looked(watch, look, at=None):
     async def work():
-        async with serve_page(watch, at or PageAddress("127.0.0.1", 0, None)) as port:
+        async with serve_page(watch, at or parse_page_address("0", {})) as port:
             await look(f"http://127.0.0.1:{port}")
 
     asyncio.run(work())
@@ -104,23 +102,23 @@ def test_health_is_said_to_everybody_and_all_pages_are_there_while_a_batch_is_lo
         bearer = {"Authorization": f"Bearer {TOKEN}"}
         before = [await got(url + page, **bearer) for page in pages]
         monkeypatch.setattr("heliograph.serving.observation.last_answers.PATIENCE", 0.01)
-        with watch.taking():
+        with watch.taking_batch():
             assert [await got(url + page, **bearer) for page in pages] == before
             assert (await got(f"{url}/healthz"))[0] == 200
             monkeypatch.setattr("heliograph.serving.observation.page.STUCK", 0.0)
             status, text, _ = await got(f"{url}/healthz")
             assert status == 503 and "a batch has been taken for" in text
 
-    looked(watch, look, PageAddress("127.0.0.1", 0, TOKEN))
+    looked(watch, look, parse_page_address("0", {"HELIOGRAPH_PAGE_TOKEN": TOKEN}))
 
 
 def test_the_first_batch_may_be_long_and_all_pages_are_there(monkeypatch):
     """Twelve event senders took 31 s to answer at /, since the first batch compiles."""
     monkeypatch.setattr("heliograph.serving.observation.last_answers.PATIENCE", 0.01)
-    watch = Watch(["x"])
+    watch = observer_of(["x"])
 
     async def look(url):
-        with watch.taking():
+        with watch.taking_batch():
             for page in ("/", "/plants", "/metrics", "/healthz"):
                 assert (await got(url + page))[0] == 200
 
@@ -150,7 +148,7 @@ def test_a_token_holds_wherever_it_is_set_and_hosts_are_a_setting():
 
 def test_what_a_gate_left_out_does_not_count_against_it():
     """Its innovations are chi-squared but for one in ten, ten deviations off, of weight 0: the claim is right."""
-    rng, watch = np.random.default_rng(1), Watch(["x"])
+    rng, watch = np.random.default_rng(1), observer_of(["x"])
     for k in range(400):
         outlier = k % 10 == 0
         value = 10.0 if outlier else rng.normal()

@@ -6,6 +6,7 @@ import re
 import socket
 import urllib.request
 from collections.abc import Awaitable, Callable
+from typing import Any
 from urllib.error import HTTPError
 
 import numpy as np
@@ -18,10 +19,8 @@ pytest.importorskip("uvicorn")
 from heliograph.files.sources import Sources
 from heliograph.live import LinkCounts
 from heliograph.serving.observation import parse_page_address, serve_page, watch_of
-from heliograph.serving.observation.page import PageAddress, Tallies
 from heliograph.serving.observation.running_nis import RunningNis
-from heliograph.serving.observation.watch import Watch
-from tests.serving.watched import Scripted
+from tests.serving.watched import Scripted, metrics_of, observer_of
 from tests.serving.worlds import stepping
 from tests.widths import program
 
@@ -33,18 +32,18 @@ def looked(
     service: Scripted,
     rows: int = 300,
     token: str | None = None,
-    watch: Watch | None = None,
-) -> Watch:
+    watch: Any = None,
+) -> None:
     """Look at a page of a service that has taken so many rows."""
-    watch = Watch(["<i>x</i>", "v"]) if watch is None else watch
+    watch = observer_of(["<i>x</i>", "v"]) if watch is None else watch
     watch.wrap(service).take([str(i).encode() for i in range(rows)])
 
     async def work() -> None:
-        async with serve_page(watch, PageAddress("127.0.0.1", 0, token)) as port:
+        environment = {} if token is None else {"HELIOGRAPH_PAGE_TOKEN": token}
+        async with serve_page(watch, parse_page_address("0", environment)) as port:
             await look(f"http://127.0.0.1:{port}")
 
     asyncio.run(work())
-    return watch
 
 
 async def got(url: str, **headers: str) -> tuple[int, str, dict[str, str]]:
@@ -92,11 +91,10 @@ def test_an_honest_filter_stays_in_its_band_and_a_wrong_one_does_not():
 
 
 def test_a_door_that_others_reach_needs_a_token():
-    assert (
-        parse_page_address("8000", {}) == PageAddress("127.0.0.1", 8000, None)
-        and parse_page_address("[::1]:80", {}).token is None
-    )
-    assert parse_page_address("0.0.0.0:8000", {"HELIOGRAPH_PAGE_TOKEN": TOKEN}) == PageAddress("0.0.0.0", 8000, TOKEN)
+    here, open_ = parse_page_address("8000", {}), parse_page_address("0.0.0.0:8000", {"HELIOGRAPH_PAGE_TOKEN": TOKEN})
+    assert (here.host, here.port, here.token, here.hosts) == ("127.0.0.1", 8000, None, ())
+    assert (open_.host, open_.port, open_.token) == ("0.0.0.0", 8000, TOKEN)
+    assert parse_page_address("[::1]:80", {}).token is None
     for place in ("0.0.0.0:8000", "[::]:8000", "example.org:80"):
         with pytest.raises(ValueError, match="a token of 16 characters"):
             parse_page_address(place, {"HELIOGRAPH_PAGE_TOKEN": "short"})
@@ -192,12 +190,12 @@ def test_what_is_lost_of_messages_without_a_count_is_not_counted():
     watch = watch_of(network, "house", uncounted)
     watch.totals.add("", {name: LinkCounts(used=3, lost=0) for name in "ab"})
     assert {name: link["lost"] for name, link in watch.links().items()} == {"a": None, "b": 0}
-    said = Tallies(watch).text().decode()
+    said = metrics_of(watch)
     assert 'heliograph_lost{node="b"} 0' in said and 'heliograph_lost{node="a"}' not in said
 
 
 def test_many_nodes_have_one_warning_of_a_kind():
-    watch, service = Watch(["x", "v"]), Scripted(nodes=5)
+    watch, service = observer_of(["x", "v"]), Scripted(nodes=5)
     watch.wrap(service).take([b"0"])
     for i, link in enumerate(service.plants["mower"].links.values()):
         link.late, link.future = i, int(i == 3)
@@ -239,16 +237,15 @@ FORECAST = [passing(5.0, 0.034, 0.02), passing(60.0, 0.95, 0.4)]
 
 def test_a_fusion_of_estimates_is_judged_by_what_it_fuses_and_a_dead_sender_is_a_warning():
     assert watch_of(stepping(), "tank").fused == {"both": ("upper", [("a", "linear"), ("b", "linear")])}
-    parts = [("node 0", "cubature"), ("node 1", "cubature")]
     for scale, doubted in ((1.0, False), (3.0, True)):
-        watch = Watch(["x", "v"], "tank", "steps", {"both": ("upper", parts)})
+        watch = observer_of(["x", "v"], "tank")
         assert watch.view(None)["tests"] == []  # nothing to judge by yet
         watch.wrap(Scripted(scale, nodes=2, senders=SENDERS)).take([str(i).encode() for i in range(300)])
         view = watch.view(None)
         fused = view["tests"][-1]
         assert (fused["node"], fused["filter"], fused["claim"], fused["doubt"]) == ("fused", "both", "upper", doubted)
         assert fused["by"] == ["node 0/cubature", "node 1/cubature"] and fused["numbers"] == 2 * 600
-        assert f'heliograph_fusion_doubted{{filter="both"}} {float(doubted)}' in Tallies(watch).text().decode()
+        assert f'heliograph_fusion_doubted{{filter="both"}} {float(doubted)}' in metrics_of(watch)
         assert view["senders"] == SENDERS
         dead = "node 2: its sender is dead: 9 heartbeats did not come, by chance once in 100,000"
         assert [line for line in view["warnings"] if "sender" in line] == [dead]
@@ -256,8 +253,7 @@ def test_a_fusion_of_estimates_is_judged_by_what_it_fuses_and_a_dead_sender_is_a
 
 @pytest.mark.real("browser")
 def test_a_browser_draws_axes_with_units_what_is_not_final_and_the_state_of_senders(fits):
-    plant = hg.LinearPlant(np.eye(2), np.eye(2), np.zeros(2), np.eye(2), states={"position": "m", "v": ""})
-    watch = Watch(list(plant.states), "tank", "s")
+    watch = observer_of({"position": "m", "v": ""}, "tank", ["dt"])
 
     async def look(url: str) -> None:
         await asyncio.to_thread(fits, f"{url}/")

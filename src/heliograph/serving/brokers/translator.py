@@ -153,7 +153,7 @@ class Translator:
                     continue
                 results.append(self._make_message(where, reading, arrival, repeatable))
                 self.sources.senders.note(topic, reading.plant, reading.node, content, self.sources.list_fields(topic))
-                for said in self.sources.senders.news():
+                for said in self.sources.senders.lines_now_and_then():
                     LOG.warning("%s", said)
         except InputError as error:
             results.append(str(error))

@@ -10,7 +10,7 @@ PATIENCE = 1.0  # seconds that a batch may take before the answer before it is t
 
 
 class LastAnswers(Generic[T]):
-    """Answers to a kind of question about a service, the last of each kept: a batch may take minutes to compile.
+    """Answers questions about a service, with the answer before a batch while that is being taken, as it may long be.
 
     Args:
         lock: that which is held while a batch is taken.
@@ -24,7 +24,7 @@ class LastAnswers(Generic[T]):
         self._last: OrderedDict[str, T] = OrderedDict()
 
     def ask(self, question: str = "") -> T:
-        """Return the answer of now, or after `PATIENCE` that before the batch which is being taken."""
+        """Return the answer now; if a batch holds the lock for longer than PATIENCE, the last one given, or `begin`."""
         if self.lock.acquire(timeout=PATIENCE):
             try:
                 self._last[question] = self.answer(question)

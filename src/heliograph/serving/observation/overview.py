@@ -50,7 +50,7 @@ class Wrong(NamedTuple):
 
 
 class Overview:
-    """What is wrong with each plant, looked at anew where a plant has had a message since the last look."""
+    """Keeps what is wrong with each plant, found anew where a plant has had a message since the last look."""
 
     def __init__(self) -> None:
         self.touched = set[str]()  # since the last look
@@ -66,7 +66,13 @@ class Overview:
         dead: Mapping[str, Sequence[str]],
         refused: Mapping[str, str],
     ) -> list[Wrong]:
-        """Return the plants with something wrong, the worst first; `refused` has words by plant."""
+        """Return the plants with something wrong, the worst first.
+
+        Args:
+            tests: tests of each plant's filters.
+            dead: dead senders of each plant that has one.
+            refused: refused messages of each touched plant, in words.
+        """
         for plant in self.touched:
             doubts = tuple(find_doubts(tests.get(plant, {})))
             wrong = Wrong(plant, tuple(dead.get(plant, ())), doubts, refused.get(plant, ""))
@@ -82,8 +88,9 @@ def find_doubts(tests: Mapping[Name, RunningNis]) -> Iterable[Doubt]:
     """Yield the doubted filters of a plant, the most doubted first."""
     doubts = []
     for (node, name), test in tests.items():
+        # The ratio, of deviation sqrt(variance) / mean, is within NEAR deviations of 1: clearly inside of its band.
         if test.numbers < FEWEST or (test.ratio - 1.0) ** 2 * test.mean**2 < NEAR**2 * test.variance:
-            continue  # clearly inside of the band
+            continue
         low, high = test.band()
         if test.doubt() is not None:
             doubts.append(Doubt(node, name, test.ratio, low, high))
@@ -114,7 +121,7 @@ that were refused.{more}</p></header>
 
 
 def make_plants_page(title: str, plants: Collection[str], wrong: Sequence[Wrong], most: int) -> str:
-    """Return the page of all plants, at most so many rows."""
+    """Return the page of all plants, those with something wrong first, of `most` rows at most."""
     named = {item.plant for item in wrong}
     rows = [(item.plant, "<br>".join(escape(line) for line in item.describe), "doubt") for item in wrong]
     rows += [(plant, "nothing", "fine") for plant in sorted(plants) if plant not in named]

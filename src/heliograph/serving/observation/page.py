@@ -33,8 +33,8 @@ from heliograph.serving.observation.overview import make_plants_page
 from heliograph.serving.observation.watch import LISTED, Watch
 
 
-class Tallies(Collector):
-    """Collector of the numbers of a watch, by node and filter, and by plant where there are few, else of the worst."""
+class ServiceMetrics(Collector):
+    """Collector of the metrics of a watch: by node and filter, and by plant where there are few, else of the worst."""
 
     def __init__(self, watch: Watch):
         self.watch = watch
@@ -47,9 +47,9 @@ class Tallies(Collector):
         yield from _collect_links(self.watch)
         yield from _collect_nis(self.watch)
         yield from _collect_outputs(self.watch)
-        yield from _yield_plant_metrics(self.watch)
-        yield _collect_passing(self.watch)
-        yield _count_doubted_fused(self.watch)
+        yield from _collect_plants(self.watch)
+        yield _collect_crossings(self.watch)
+        yield _collect_fusion_doubts(self.watch)
         yield _collect_dead_senders(self.watch)
         yield _collect_remarks(self.watch)
         yield GaugeMetricFamily("heliograph_plants", "Plants known.", sum(1 for _ in self.watch.plants()))
@@ -57,11 +57,11 @@ class Tallies(Collector):
         yield CounterMetricFamily("heliograph_malformed", "Messages that could not be read.", malformed)
 
     def text(self) -> bytes:
-        """Return all metrics as text; while a batch takes long, as where programs compile, those before it."""
+        """Return all metrics in Prometheus's text format; while a batch takes long, those before it."""
         return self._texts.ask()
 
 
-def _yield_plant_metrics(watch: Watch) -> Iterable[Metric]:
+def _collect_plants(watch: Watch) -> Iterable[Metric]:
     """Yield the tests of each plant where there are few, else of the worst, and how many plants are wrong."""
     worst, labels = watch.worst(), ["plant", "node", "filter"]
     wrong = GaugeMetricFamily("heliograph_plants_wrong", "Plants with something wrong.", labels=["what"])
@@ -82,14 +82,14 @@ def _yield_plant_metrics(watch: Watch) -> Iterable[Metric]:
     return wrong, *families, dead
 
 
-def _collect_passing(watch: Watch) -> Metric:
-    """Return the metric of levels that may be passed, of the plants in which that is most probable."""
+def _collect_crossings(watch: Watch) -> Metric:
+    """Return the metric of thresholds that may be crossed, of the plants in which that is most probable."""
     what = "Probability that a level of --threshold is passed by so far ahead."
     labels = ["plant", "node", "filter", "threshold", "ahead"]
-    passing = GaugeMetricFamily("heliograph_plant_passing", what, labels=labels)
-    for key, probability in watch.passing(SHOWN):
-        passing.add_metric(list(key), probability)
-    return passing
+    crossings = GaugeMetricFamily("heliograph_plant_passing", what, labels=labels)
+    for key, probability in watch.crossings(SHOWN):
+        crossings.add_metric(list(key), probability)
+    return crossings
 
 
 def _collect_links(watch: Watch) -> Iterable[Metric]:
@@ -134,11 +134,11 @@ def _collect_remarks(watch: Watch) -> Metric:
     return gave_in
 
 
-def _count_doubted_fused(watch: Watch) -> Metric:
+def _collect_fusion_doubts(watch: Watch) -> Metric:
     """Return the metric of filters under fusions whose claims are doubted."""
     what = "1 if a filter whose estimates a fusion without a test of itself takes is doubted."
     doubted = GaugeMetricFamily("heliograph_fusion_doubted", what, labels=["filter"])
-    for row in watch.fused_rows(watch.nis):
+    for row in watch.judge_fusions(watch.nis):
         doubted.add_metric([str(row["filter"])], float(bool(row["doubt"])))
     return doubted
 
@@ -158,7 +158,7 @@ def _collect_nis(watch: Watch) -> Iterable[Metric]:
 
 
 def _collect_outputs(watch: Watch) -> Iterable[Metric]:
-    """Metrics of each output of filters that weigh: weight, share down-weighted, bias and size of its innovations."""
+    """Return the metrics of each output of filters that weigh: weight, share down-weighted, its innovations' bias."""
     what = {
         "weight": "Mean weight of an output's values, of the last rows of a filter that weighs; 1 counts in full.",
         "share": "Share of an output's values that were down-weighted, below a weight of 1/2.",
@@ -217,7 +217,9 @@ class PageAddress(NamedTuple):
 def parse_page_address(
     address: str, environment: Mapping[str, str] | None = None, hosts: Sequence[str] = ()
 ) -> PageAddress:
-    """`PORT`, of this machine alone, or `ADDRESS:PORT`; a token in HELIOGRAPH_PAGE_TOKEN holds at either.
+    """Return where a page is served: `PORT`, of this machine alone, or `ADDRESS:PORT`, with its token and hosts.
+
+    The token is that in HELIOGRAPH_PAGE_TOKEN; an address that others can reach needs one.
 
     Args:
         address: the address.
@@ -244,14 +246,14 @@ def parse_page_address(
 
 
 def _is_loopback(host: str) -> bool:
-    """Return whether a host is this machine."""
+    """Return whether a host is this machine's own loopback, which others cannot reach."""
     try:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False
 
 
-def list_plants(watch: Watch) -> str:
+def make_overview_page(watch: Watch) -> str:
     """Return the page of all plants, the worst first."""
     return make_plants_page(watch.title, {name for name, _ in watch.plants()}, watch.worst(), LISTED)
 
@@ -261,14 +263,13 @@ def make_application(watch: Watch, token: str | None, stopped: asyncio.Event, ho
 
     Without a token, or where `hosts` are given, it answers to these names and those of this machine alone.
     """
-    tallies = Tallies(watch)
-    overview = LastAnswers(watch.lock, lambda _: list_plants(watch), list_plants(watch))
+    tallies = ServiceMetrics(watch)
+    overview = LastAnswers(watch.lock, lambda _: make_overview_page(watch), make_overview_page(watch))
 
-    # The first view is written into the page; all others come from /events.
+    # The first view is written into the page, in place of its only "null"; all others come from /events.
     def page(request: Request) -> Response:
-        first = json.dumps(watch.view(request.query_params.get("plant"))).replace(
-            "<", "\\u003c"
-        )  # no name ends the element that it stands in
+        # Without a "<" no name ends the element that the view stands in.
+        first = json.dumps(watch.view(request.query_params.get("plant"))).replace("<", "\\u003c")
         return Response(_read_page_file("page.html").replace("null", first, 1), media_type="text/html", headers=POLICY)
 
     def metrics(_: Request) -> Response:
@@ -287,14 +288,14 @@ def make_application(watch: Watch, token: str | None, stopped: asyncio.Event, ho
             return PlainTextResponse(f"a batch has been taken for {busy:.0f} s", 503)
         return PlainTextResponse("ok")
 
-    # The token is checked for every other route.
+    # The token is checked for every other route; a page of elsewhere that names itself 127.0.0.1 does not get in.
     middleware = [Middleware(TokenMiddleware, token)]
-    if token is None or hosts:  # a page of elsewhere that names itself 127.0.0.1 does not get in
+    if token is None or hosts:
         allowed = [*LOOPBACK, *hosts]
         middleware.insert(0, Middleware(TrustedHostMiddleware, allowed_hosts=allowed, www_redirect=False))
     routes = [Route("/", page), Route("/metrics", metrics), Route("/events", events), Route("/plants", plants)]
     routes.append(Route(HEALTH, health))
-    return Starlette(routes=[*routes, *(Route(f"/{name}", file) for name in KINDS)], middleware=middleware)
+    return Starlette(routes=[*routes, *(Route(f"/{name}", send_page_file) for name in KINDS)], middleware=middleware)
 
 
 def _read_page_file(name: str) -> str:
@@ -302,8 +303,8 @@ def _read_page_file(name: str) -> str:
     return (files("heliograph.serving.observation") / "browser" / name).read_text("utf-8")
 
 
-def file(request: Request) -> Response:
-    """Return a file of the page as the answer to a request."""
+def send_page_file(request: Request) -> Response:
+    """Return the file of the page that a request names."""
     name = request.url.path.removeprefix("/")
     return Response(_read_page_file(name), media_type=KINDS[name], headers=POLICY)
 
@@ -345,7 +346,7 @@ class TokenMiddleware:
             await PlainTextResponse("a token is needed: ?token=", 401)(scope, receive, send)
 
     def _matches_token(self, given: str) -> bool:
-        """Test whether what was given is the token, in a time that says nothing of where it differs."""
+        """Return whether what was given is the token, in a time that says nothing of where it differs."""
         return hmac.compare_digest(given.encode(), str(self.token).encode())
 
 
@@ -355,7 +356,7 @@ def _read_bearer_token(requested: HTTPConnection) -> str:
     return token if kind.lower() == "bearer" else ""
 
 
-class _Page(uvicorn.Server):
+class _PageServer(uvicorn.Server):
     """Web server next to a service; only the service handles signals."""
 
     @contextmanager
@@ -383,7 +384,7 @@ async def serve_page(watch: Watch, at: PageAddress) -> AsyncIterator[int]:
         access_log=False,
         timeout_graceful_shutdown=3,
     )
-    server = _Page(config)
+    server = _PageServer(config)
     serving = asyncio.ensure_future(server.serve([listener]))
     try:
         yield int(listener.getsockname()[1])

@@ -32,10 +32,10 @@ class RunningNis:
 
     def add(self, squared: float, received: int) -> None:
         """Add the NIS of one row, with its degrees of freedom."""
-        stored = 1 - 1 / MEMORY
-        self.total = stored * self.total + squared
-        self.mean = stored * self.mean + received
-        self.variance = stored * stored * self.variance + 2 * received
+        weight = 1 - 1 / MEMORY
+        self.total = weight * self.total + squared
+        self.mean = weight * self.mean + received
+        self.variance = weight * weight * self.variance + 2 * received
         self.numbers += received
 
     @property
@@ -66,7 +66,7 @@ class RunningNis:
 
 
 def read_nis(message: Mapping[str, Any]) -> tuple[float | None, int]:
-    """Return the squared innovation of what a filter used, and of how many numbers it is.
+    """Return the normalised innovation squared (NIS) of what a filter used, and of how many numbers it is.
 
     Of a filter that weighs these are the numbers of weight 1/2 or more, each over its variance: outliers that it left
     out do not count against it.

@@ -20,7 +20,7 @@ from heliograph.report.outputs import RecentOutputs, make_output_row
 from heliograph.serving.observation.last_answers import LastAnswers
 from heliograph.serving.observation.overview import Overview, Wrong
 from heliograph.serving.observation.running_nis import MEMORY, RunningNis, read_nis
-from heliograph.serving.observed_service import ObservedService, Serves, Taken, WatchedPlant
+from heliograph.serving.observed_service import BatchTimes, ObservedService, WatchableService, WatchedPlant
 from heliograph.serving.output import Output
 from heliograph.serving.totals import FIELDS, Totals
 from heliograph.simulation.network import Network
@@ -30,12 +30,10 @@ PLANTS = 200  # plants with estimates in memory, those with the newest messages
 TESTED = 20_000  # plants whose claims are tested, those with the newest messages
 POINTS = 800  # estimates remembered of each, final ones and those that are not yet
 LISTED = 1000  # plants that can be chosen from
-WARNINGS = 50
+WARNINGS = 50  # lines
 APART = 3  # nodes that have a warning each; more of the same kind have one together
 REFUSED = "late", "future", "implausible", "conflict"
 LAGS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3600.0, 86400.0)  # s, edges of the histogram
-
-
 COUNTED = {  # of a node's messages
     "late": "came too late to be used; a longer --window would hold what they change",
     "future": "of a time that is not yet, refused; its clock is wrong",
@@ -60,8 +58,8 @@ class Point(NamedTuple):
     estimates: dict[str, dict[str, dict[str, object]]]
 
 
-class FromServices(NamedTuple):
-    """What the page tells of the services themselves: the names of all plants, and of one plant its links."""
+class ServiceAnswers(NamedTuple):
+    """What services answer between batches: names of all plants, one plant's counts by node, and counts of all."""
 
     names: list[str]
     links: dict[str, dict[str, int]]
@@ -92,48 +90,50 @@ class Watch:
     ):
         self.states, self.title, self.time_unit = list(states), title, time_unit
         self.fused, self.uncounted = dict(fused or {}), uncounted
-        # Of all plants together, of each plant, and histograms.
-        self.lock, self._count = threading.Lock(), 0  # held for a batch
+        self.lock, self._count = threading.Lock(), 0  # held while a batch is taken; number of points so far
         self._noting = threading.Lock()  # held while outputs are recorded
-        self._told = LastAnswers(self.lock, self._ask_services, FromServices([], {}, 0, 0), PLANTS)
-        self.services: list[Serves] = []
+        self._service_answers = LastAnswers(self.lock, self._ask_services, ServiceAnswers([], {}, 0, 0), PLANTS)
+        # Of all plants together.
+        self.services: list[WatchableService] = []
         self.nis: dict[tuple[str, str], RunningNis] = {}
         self.outputs = RecentOutputs(MEMORY, names or {})
+        self._batch_started: float | None = None  # of the batch that is being taken
+        # By plant, the oldest forgotten first: weighed outputs, tests, points, crossings of thresholds, senders.
         self._outputs: OrderedDict[str, RecentOutputs] = OrderedDict()
         self._tests: OrderedDict[str, dict[tuple[str, str], RunningNis]] = OrderedDict()
         self._points: OrderedDict[str, deque[Point]] = OrderedDict()
-        self.totals, self._overview, self._dead = Totals(), Overview(), dict[str, list[str]]()
-        self._passing: OrderedDict[str, dict[tuple[str, ...], Mapping[str, float]]] = OrderedDict()
-        self._begun: float | None = None  # of the batch that is being taken
+        self.totals, self._overview, self._dead_senders = Totals(), Overview(), dict[str, list[str]]()
+        self._crossings: OrderedDict[str, dict[tuple[str, ...], Mapping[str, float]]] = OrderedDict()
         self._senders: OrderedDict[str, dict[str, dict[str, Any]]] = OrderedDict()
+        # Metrics that are counted here; the page adds others to the registry.
         self.registry = CollectorRegistry()
         self.took = Histogram("heliograph_batch_seconds", "From messages to what is published.", registry=self.registry)
         what = "From when the oldest message of a batch was measured, where it has a date, to what is published."
         self.lag = Histogram("heliograph_lag_seconds", what, buckets=LAGS, registry=self.registry)
         self.committed = Histogram("heliograph_commit_seconds", "Of it, to commit.", registry=self.registry)
 
-    def wrap(self, service: Serves) -> "ObservedService":
+    def wrap(self, service: WatchableService) -> "ObservedService":
         """Wrap a service so that its batches are observed."""
         self.services.append(service)
         return ObservedService(service, self)
 
     @contextmanager
-    def taking(self) -> Iterator[None]:
-        """Hold the lock while a batch is taken, so that no page sees half of it."""
+    def taking_batch(self) -> Iterator[None]:
+        """Hold the lock while a batch is taken, so that no page sees half of it; note when it began, for `busy`."""
         with self.lock:
-            self._begun = monotonic()
+            self._batch_started = monotonic()
             try:
                 yield
             finally:
-                self._begun = None
+                self._batch_started = None
 
-    def note(self, outputs: Sequence[Output], last: Taken | None) -> None:
-        """Record the outputs and statistics of a batch; None where nothing came."""
+    def note(self, outputs: Sequence[Output], last: BatchTimes | None) -> None:
+        """Record the outputs and statistics of a batch, `last`; None where nothing came."""
         with self._noting:
             self._record(outputs, last)
 
-    def _record(self, outputs: Sequence[Output], last: Taken | None) -> None:
-        """Take in what a batch published: its times, each plant's counts, points to draw, and tests of claims."""
+    def _record(self, outputs: Sequence[Output], last: BatchTimes | None) -> None:
+        """Update times, counts, points and tests by a batch's outputs; call it with `_noting` held."""
         if last is not None:
             self.took.observe(last.took)
             self.committed.observe(last.committed)
@@ -148,12 +148,12 @@ class Watch:
                 message = from_json(output.body)
                 self._keep_point(output.plant, message)
                 if message["kind"] == "provisional":
-                    self._keep_passing(output.plant, message.get("forecast", []))
+                    self._keep_crossings(output.plant, message.get("forecast", []))
                 if output.kind == "final":
                     self._test_claims(output.plant, message["estimates"])
 
     def _test_claims(self, plant: str, estimates: Mapping[str, Mapping[str, Any]]) -> None:
-        """Add the NIS of a plant's newest estimates to the running tests, and outputs to those that are weighed."""
+        """Add the NIS of a plant's newest estimates to the running tests, and weighed outputs to the recent ones."""
         of_plant = _move_to_newest(self._tests, plant, dict, TESTED)
         recent = self.outputs, _move_to_newest(self._outputs, plant, lambda: RecentOutputs(MEMORY, self.outputs.names))
         for node, filters in estimates.items():
@@ -161,8 +161,8 @@ class Watch:
                 squared, received = read_nis(message)
                 if squared is not None:
                     for tests in (self.nis, of_plant):
-                        single = tests.setdefault((node, name), RunningNis(message["claim"]))
-                        single.add(squared, received)
+                        test = tests.setdefault((node, name), RunningNis(message["claim"]))
+                        test.add(squared, received)
                 if message.get("outputs") and message.get("received"):
                     for outputs in recent:
                         outputs.add(node, name, message["outputs"])
@@ -171,39 +171,38 @@ class Watch:
         """Keep a plant's newest estimates as a point of its chart."""
         self._count += 1
         estimates = {
-            node: {name: _means_and_deviations(points) for name, points in filters.items()}
+            node: {name: _means_and_deviations(estimate) for name, estimate in filters.items()}
             for node, filters in message["estimates"].items()
         }
         points = _move_to_newest(self._points, plant, lambda: deque(maxlen=POINTS))
         points.append(Point(self._count, message["time"], message["kind"] == "final", estimates))
         if message.get("senders"):
             _move_to_newest(self._senders, plant, dict).update(message["senders"])
-            self._dead[plant] = [node for node, sender in message["senders"].items() if sender["dead"]]
-            if not self._dead[plant]:
-                del self._dead[plant]
+            self._dead_senders[plant] = [node for node, sender in message["senders"].items() if sender["dead"]]
+            if not self._dead_senders[plant]:
+                del self._dead_senders[plant]
 
-    def _keep_passing(self, plant: str, horizons: Sequence[Mapping[str, Any]]) -> None:
-        """Keep the probabilities that a plant's levels are passed, by node, filter, level and how far ahead."""
-        passing: dict[tuple[str, ...], Mapping[str, float]] = {
-            (node, name, level, f"{horizon['ahead']:g}"): said
-            for horizon in horizons
-            for node, filters in horizon["estimates"].items()
-            for name, body in filters.items()
-            for level, said in body.get("thresholds", {}).items()
-        }
-        self._passing.pop(plant, None)
-        if passing:
-            _move_to_newest(self._passing, plant, dict).update(passing)
+    def _keep_crossings(self, plant: str, horizons: Sequence[Mapping[str, Any]]) -> None:
+        """Keep the probabilities that a plant's thresholds are crossed, as its newest forecast has them."""
+        crossings = dict[tuple[str, ...], Mapping[str, float]]()  # by node, filter, threshold, how far ahead
+        for horizon in horizons:
+            for node, filters in horizon["estimates"].items():
+                for name, body in filters.items():
+                    for level, probabilities in body.get("thresholds", {}).items():
+                        crossings[node, name, level, f"{horizon['ahead']:g}"] = probabilities
+        self._crossings.pop(plant, None)
+        if crossings:
+            _move_to_newest(self._crossings, plant, dict).update(crossings)
 
-    def passing(self, most: int) -> list[tuple[tuple[str, ...], float]]:
-        """Return the probabilities of levels to be passed, by plant, node, filter, level and how far ahead.
+    def crossings(self, most: int) -> list[tuple[tuple[str, ...], float]]:
+        """Return ((plant, node, filter, threshold, how far ahead), probability that it is crossed by then).
 
-        Of so many plants, those in which one is most probable.
+        Of `most` plants at most, those in which a crossing is most probable.
         """
         with self._noting:
-            of_each = {plant: max(said["by"] for said in levels.values()) for plant, levels in self._passing.items()}
-            first = sorted(of_each, key=lambda plant: -of_each[plant])[:most]
-            return [((plant, *key), said["by"]) for plant in first for key, said in self._passing[plant].items()]
+            largest = {plant: max(p["by"] for p in levels.values()) for plant, levels in self._crossings.items()}
+            first = sorted(largest, key=lambda plant: -largest[plant])[:most]
+            return [((plant, *key), p["by"]) for plant in first for key, p in self._crossings[plant].items()]
 
     def plants(self) -> Iterator[tuple[str, WatchedPlant]]:
         """Yield all plants of all services."""
@@ -223,15 +222,18 @@ class Watch:
         return self._hide_uncounted(self.totals.as_table())
 
     def _hide_uncounted(self, links: Mapping[str, dict[str, int]]) -> dict[str, dict[str, int | None]]:
+        """Return counts by node with None for the lost messages of nodes that do not count theirs."""
         return {node: tally | ({"lost": None} if node in self.uncounted else {}) for node, tally in links.items()}
 
     def worst(self) -> list[Wrong]:
         """Return the plants with something wrong, the worst first."""
         refused = dict[str, str]()
         for name, plant in self._iterate_plants(self._overview.touched):
-            refused[name] = "; ".join(f"{node}: {count:,} {verdict}" for node, link in plant.links.items()
-                                      for verdict in REFUSED if (count := getattr(link, verdict)))  # fmt: skip
-        return self._overview.worst(self._tests, self._dead, refused)
+            counts = [
+                (node, verdict, getattr(link, verdict)) for node, link in plant.links.items() for verdict in REFUSED
+            ]
+            refused[name] = "; ".join(f"{node}: {count:,} {verdict}" for node, verdict, count in counts if count)
+        return self._overview.worst(self._tests, self._dead_senders, refused)
 
     def tests(self, plant: str) -> Mapping[tuple[str, str], RunningNis]:
         """Return the tests of a plant's claims."""
@@ -239,7 +241,7 @@ class Watch:
 
     def busy(self) -> float:
         """Return for how many seconds the present batch is being taken; 0 where there is none."""
-        begun = self._begun
+        begun = self._batch_started
         return 0.0 if begun is None else monotonic() - begun
 
     def dead_senders(self) -> Mapping[str, int]:
@@ -263,7 +265,7 @@ class Watch:
         """
         with self._noting:
             name = next(reversed(self._points), "") if plant is None else plant
-        told = self._told.ask(name)
+        answers = self._service_answers.ask(name)
         with self._noting:
             points = [point for point in self._points.get(name, ()) if point.number > since]
             tests, senders = self._tests.get(name, {}), self._senders.get(name, {})
@@ -271,8 +273,8 @@ class Watch:
             # One JSON object; lists are bounded, so that its size does not grow with the plants.
             return {
                 "title": self.title,
-                "count": len(told.names),
-                "plants": told.names[:LISTED],
+                "count": len(answers.names),
+                "plants": answers.names[:LISTED],
                 "plant": name,
                 "states": self.states,
                 "units": [unit_of(state) for state in self.states],
@@ -280,40 +282,44 @@ class Watch:
                 "since": since,
                 "newest": self._count,
                 "points": [point._asdict() for point in points],
-                "links": self._hide_uncounted(told.links),
+                "links": self._hide_uncounted(answers.links),
                 "senders": senders,
-                "tests": [_make_test_row(*key, test) for key, test in tests.items()] + self.fused_rows(tests),
+                "tests": [_make_test_row(*key, test) for key, test in tests.items()] + self.judge_fusions(tests),
                 "outputs": [make_output_row(output) for output in health],
                 "levels": [
                     {**dict(zip(("node", "filter", "level", "ahead"), key, strict=True)), **said}
-                    for key, said in self._passing.get(name, {}).items()
+                    for key, said in self._crossings.get(name, {}).items()
                 ],
-                "warnings": list(self._yield_warnings(told.links, tests, senders))[:WARNINGS],
-                "malformed": told.malformed,
+                "warnings": list(self._yield_warnings(answers.links, tests, senders))[:WARNINGS],
+                "malformed": answers.malformed,
                 "all": self.links(),
-                "wrong": told.wrong,
+                "wrong": answers.wrong,
             }
 
-    def _ask_services(self, plant: str) -> FromServices:
+    def _ask_services(self, plant: str) -> ServiceAnswers:
         """Ask the services, between two batches, for their plants, and for the counts of one, summed over them."""
         every = list(self.plants())
-        return FromServices(
+        return ServiceAnswers(
             sorted(name for name, _ in every),
             _add_counts([status for name, status in every if name == plant]),
             sum(service.malformed for service in self.services),
             len(self.worst()),
         )
 
-    def fused_rows(self, tests: Mapping[tuple[str, str], RunningNis]) -> list[dict[str, object]]:
-        """Return the check of each fusion of estimates that has no test of itself, by the claims of what it fuses."""
+    def judge_fusions(self, tests: Mapping[tuple[str, str], RunningNis]) -> list[dict[str, object]]:
+        """Return a row for each fusion without a NIS test of its own: in doubt if that of any estimate it fuses is.
+
+        `by` names the estimates that are in doubt, else all that were tested.
+        """
         rows: list[dict[str, object]] = []
         for name, (claim, parts) in self.fused.items():
-            known = [(source, tests[source]) for source in parts if source in tests]
-            doubted = ["/".join(source) for source, test in known if test.doubt()]
-            numbers = {"ratio": None, "low": None, "high": None, "numbers": sum(test.numbers for _, test in known)}
-            judged = {"doubt": bool(doubted), "by": doubted or ["/".join(source) for source, _ in known]}
-            if known and (Network.FUSED, name) not in tests:  # else it has a test of itself
-                rows.append({"node": Network.FUSED, "filter": name, "claim": claim, **numbers, **judged})
+            tested = [(source, tests[source]) for source in parts if source in tests]
+            if not tested or (Network.FUSED, name) in tests:
+                continue
+            doubted = ["/".join(source) for source, test in tested if test.doubt()]
+            numbers = {"ratio": None, "low": None, "high": None, "numbers": sum(test.numbers for _, test in tested)}
+            judged = {"doubt": bool(doubted), "by": doubted or ["/".join(source) for source, _ in tested]}
+            rows.append({"node": Network.FUSED, "filter": name, "claim": claim, **numbers, **judged})
         return rows
 
     def _yield_warnings(
@@ -323,7 +329,6 @@ class Watch:
         senders: Mapping[str, Mapping[str, Any]],
     ) -> Iterator[str]:
         """Yield what is wrong with a plant, a line each: doubted filters, dead senders, then messages by count."""
-        # Filters that are doubted, senders that are dead, then the nodes' messages.
         for (node, filter_name), test in tests.items():
             if doubt := test.doubt():
                 yield f"{node}/{filter_name}: {doubt}"
@@ -331,12 +336,10 @@ class Watch:
             if sender["dead"]:
                 yield f"{node}: its sender is dead: {sender['reason']}"
         for name, words in COUNTED.items():
-            of = sorted(node for node in links if links[node][name])
+            counted = sorted(node for node in links if links[node][name])
             # A line for each node, or one for many.
-            yield from (
-                f"{join_names(nodes)}: {sum(links[node][name] for node in nodes):,} {words}"
-                for nodes in ([of] if len(of) > APART else [[node] for node in of])
-            )
+            for nodes in [counted] if len(counted) > APART else [[node] for node in counted]:
+                yield f"{join_names(nodes)}: {sum(links[node][name] for node in nodes):,} {words}"
 
 
 def _move_to_newest(newest: OrderedDict[str, T], plant: str, make: Callable[[], T], most: int = PLANTS) -> T:

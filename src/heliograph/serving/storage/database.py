@@ -1,4 +1,4 @@
-"""The database of a store: SQLite at a path or PostgreSQL at a URL, and how transactions begin and end there."""
+"""The database of a store: SQLite at a path or PostgreSQL at a URL, and how transactions begin there."""
 
 import sqlite3
 from typing import Any
@@ -46,7 +46,7 @@ def read_location(location: str) -> URL:
 
 
 def is_away(error: SQLAlchemyError) -> bool:
-    """Return whether a server does not answer, or ends its connections: it may answer later.
+    """Return whether an error means that a server does not answer, or ends its connections: it may answer later.
 
     One that answers and refuses, as for a wrong password, would refuse again.
     """

@@ -29,7 +29,7 @@ TERM = 5.0  # seconds that a lease lasts: so long after a process died its parts
 
 
 class Leases:
-    """A process's share of `parts` parts: all live processes have equally many, up to one.
+    """Leases a process's share of `parts` parts: all live processes have equally many, up to one.
 
     A lease makes it likely that one process reads a part at a time, which keeps messages in order. That no message is
     used twice does not depend on leases or clocks: the commit of a plant fails if another was made since it was read.
@@ -52,11 +52,10 @@ class Leases:
             fair = self._fair_share(connection, now)
             leased = select(PARTS.c.number, PARTS.c.process).where(PARTS.c.until >= now)
             held = [(row.number, row.process) for row in connection.execute(leased)]
-            mine = [number for number, process in sorted(held) if process == self.process]
+            own = [number for number, process in sorted(held) if process == self.process]
             taken = {number for number, _ in held}
             free = [number for number in range(self.parts) if number not in taken]
-            expected = (mine + free)[:fair]
-            return {number for number in expected if self._lease(connection, number, now)}
+            return {number for number in (own + free)[:fair] if self._lease(connection, number, now)}
 
     @contextmanager
     def _raise_if_away(self) -> Iterator[None]:
@@ -86,8 +85,8 @@ class Leases:
         new = self._insert(PROCESSES).values(name=self.process, until=now + self.term)
         connection.execute(new.on_conflict_do_update(index_elements=["name"], set_={"until": now + self.term}))
         alive = sorted(row.name for row in connection.execute(select(PROCESSES.c.name)))
-        items, over = divmod(self.parts, len(alive))
-        return items + (alive.index(self.process) < over)
+        each, remainder = divmod(self.parts, len(alive))
+        return each + (alive.index(self.process) < remainder)
 
     def _lease(self, connection: Connection, number: int, now: float) -> bool:
         """Lease a part if it is ours or free; return whether it is ours now."""

@@ -102,4 +102,5 @@ def _lock_session(engine: Engine, process: str) -> Iterator[None]:
 
 
 def _refuse_taken(where: str, whose: str) -> InputError:
+    """Return the error that another service has the store."""
     return fail(f"store {where}", "one that no other service has", f"that of {whose or 'another'}; {MEND}")

@@ -93,7 +93,7 @@ class Store:
             raise InputError(f"{error}; to begin anew, name another{more}") from None
 
     def _check_network(self, mine: Identity) -> None:
-        """Refuse the state of another network, naming what differs."""
+        """Raise ValueError, which names what differs, if the store's state is of another network than `mine`."""
         if _strip_description(mine) == _strip_description(self.identity):
             return
         try:
@@ -145,7 +145,7 @@ class Store:
         return {LAYOUT_KEY: "1"} | identity
 
     def _check_layout(self, carried: bool) -> None:
-        """Refuse a store of an older layout, which is carried over only if the user says so and it can be."""
+        """Raise ValueError at a store of another layout, unless its plants are `carried` over and its layout can be."""
         layout, release = self.identity.get(LAYOUT_KEY), self.identity.get("heliograph", "an unknown release")
         if layout == LAYOUT or (carried and layout in CARRIED):
             return
@@ -184,20 +184,19 @@ class Store:
             rows = _select_plants(connection, list(PLANTS.c), names)
         results = {}
         for name, version, body, written in rows:
-            whole = is_whole(written, name, version, body)
-            results[name] = (
-                StoredPlant(version, body)
-                if whole
-                else StoredPlant(0, b"", self._describe_damage(name, "a damaged one"))
-            )
+            if is_whole(written, name, version, body):
+                results[name] = StoredPlant(version, body)
+            else:
+                results[name] = StoredPlant(0, b"", damage=self._describe_damage(name, "a damaged one"))
+        # A new name may be that of a plant whose name is damaged.
         nameless = [name for name, damage in self.damaged.items() if not damage.named]
         for name in names if nameless else ():
             got = f"none of that name, and damaged ones that may have had it: {', '.join(map(repr, nameless))}"
-            results.setdefault(name, StoredPlant(0, b"", self._describe_damage(name, got)))
+            results.setdefault(name, StoredPlant(0, b"", damage=self._describe_damage(name, got)))
         return results
 
     def _describe_damage(self, name: str, got: str) -> str:
-        """Return the damage of a row, and what stands in its place."""
+        """Return in words that the state of a plant is damaged, with what was found (`got`) and how to mend it."""
         anew = f"--anew {quote(name)} begins it anew"
         return f"{fail(f'store {self.name}, plant {name!r}', 'the state that was written', got)}; {anew}"
 
@@ -206,7 +205,8 @@ class Store:
         with self._name_store_in_errors("a database that takes a commit"), self._engine.begin() as connection:
             for name in names:
                 damage = self.damaged.pop(name, None)
-                nameless = damage is not None and not damage.named  # it may be no text that a name could equal
+                # A damaged name may be no text that any name could equal: its row is found by its checksum.
+                nameless = damage is not None and not damage.named
                 this = PLANTS.c.checksum == damage.checksum if damage and nameless else PLANTS.c.name == name
                 if not connection.execute(delete(PLANTS).where(this)).rowcount:
                     raise fail(f"store {self.name}, --anew", "the name of a plant that it has", repr(name))
@@ -294,12 +294,19 @@ class Store:
                 self._put(connection, NUMBERS, rows)
 
     def _count_written(self, name: str, value: int, written: int) -> int:
+        """Return a stored count; raise ValueError if `written` is not the checksum of it."""
         if not is_whole(written, name, value):
             raise fail(f"store {self.name}, count {name!r}", "what was written", f"damage; {MEND} {self.name}")
         return value
 
     def carry(self, carrier: PlantMigration, what: str, stored: Identity) -> None:
-        """Carry all plants, which are of the network with the identity `stored`, over to the carrier's network."""
+        """Migrate all plants, which are of the network with the identity `stored`, to the carrier's network.
+
+        Args:
+            carrier: carries plants over.
+            what: name of the store that they come from, for reports.
+            stored: identity of the network that they are of.
+        """
         carrier.begin(what, stored)
         mine = carrier.mine | {LAYOUT_KEY: LAYOUT}
         with self._engine.begin() as connection:
@@ -346,7 +353,8 @@ class Store:
         new = self._insert(NUMBERS).values(with_checksum(NUMBERS, name, more))
         locked = new.on_conflict_do_update(index_elements=["name"], set_={"value": NUMBERS.c.value + more})
         value, written = connection.execute(locked.returning(NUMBERS.c.value, NUMBERS.c.checksum)).one()
-        if written != checksum(name, value):  # it was there, with the checksum of what it was
+        # A count that was there has the checksum of what it was before.
+        if written != checksum(name, value):
             value = self._count_written(name, value - more, written) + more
             this = NUMBERS.c.name == name
             connection.execute(update(NUMBERS).where(this).values(checksum=checksum(name, value)))
@@ -374,5 +382,5 @@ def _parse_output(line: str) -> Output:
 
 
 def _strip_description(identity: Identity) -> Identity:
-    """Return an identity without the description, of which the other parts are hashes."""
+    """Return an identity without the description, whose numbers its other parts have as hashes."""
     return {name: value for name, value in identity.items() if name != DESCRIPTION}

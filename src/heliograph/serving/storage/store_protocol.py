@@ -152,11 +152,9 @@ class InMemoryStore:
 
 def report_damage(plants: Mapping[str, Damage]) -> str:
     """Describe damaged plants to a user: their names, and whether a name itself was lost."""
-    named = " ".join(f"--anew {quote(name)}" for name in list(plants)[:LISTED])
+    options = " ".join(f"--anew {quote(name)}" for name in list(plants)[:LISTED])
     more = "" if len(plants) <= LISTED else f" and {len(plants) - LISTED} more"
-    new = (
-        ""
-        if all(plant.named for plant in plants.values())
-        else "; one has lost its name, so that no new plant begins before"
-    )
-    return f"damaged plants, whose messages are refused until they begin anew ({named}{more}){new}"
+    lost_name = ""
+    if not all(plant.named for plant in plants.values()):
+        lost_name = "; one has lost its name, so that no new plant begins before"
+    return f"damaged plants, whose messages are refused until they begin anew ({options}{more}){lost_name}"

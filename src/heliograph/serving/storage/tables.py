@@ -38,7 +38,7 @@ def is_named(written: object, name: object) -> bool:
 
 
 def _checksum_row(name: str | int, values: Sequence[str | int | bytes]) -> int:
-    """Return the checksum of a row with this name and these columns."""
+    """Return the CRC-32 of a row's name and columns, each behind its length, so that none runs into the next."""
     checksum = crc32(f"{name}".encode())
     for value in values:
         data = value if isinstance(value, bytes) else f"{value}".encode()
