@@ -192,3 +192,14 @@ def test_the_command_takes_events(tmp_path, capsys):
     assert "--lag: expected messages or events, got rows of time in" in capsys.readouterr().err
     assert cli.main([*command, "--window", "1"]) == 2
     assert "--window, --ahead, --lag and --plant: expected messages or events" in capsys.readouterr().err
+
+
+def test_an_arrival_of_steps_may_be_no_step_whatever_the_file_is_called(tmp_path):
+    """In a file called times.csv it was refused as if it were the column `time`."""
+    plant, sensor = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.1, outputs=["y"])
+    node = hg.Node(sensor, hg.perfect(), {"f": hg.kalman_filter(plant, sensor)})
+    rows = [("a", 0, 0, 0.5, 1.0), ("a", 1, 1, 1.25, 2.0)]
+    for name in ("times.csv", "steps.csv"):
+        path = written(tmp_path / name, ["node", "sequence", "time", "arrival", "y"], rows)
+        events = hg.files.read_messages(path, hg.Network(plant, {"a": node}), strict=True)
+        assert [event.arrival for event in events.sort_events()] == [0.5, 1.25]

@@ -8,7 +8,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.files.sources import Sources, Unread, convert_time, decode_json, match_topic
-from heliograph.files.sources.fields import at
+from heliograph.files.sources.fields import field_at
 
 json_field = hg.files.json_field
 PLANT = hg.Plant(
@@ -55,8 +55,8 @@ def test_what_is_no_finite_number_did_not_arrive(value):
 
 def test_a_name_with_dots_comes_first():
     message = {"a.b": 1, "a": {"b": 2, "c.d": 3}}
-    assert at(message, "a.b", "m") == 1 and at(message, "a.c.d", "m") == 3
-    assert at(SimpleNamespace(pose=SimpleNamespace(x=np.array([4.0]))), "pose.x.0", "m") == 4.0
+    assert field_at(message, "a.b", "m") == 1 and field_at(message, "a.c.d", "m") == 3
+    assert field_at(SimpleNamespace(pose=SimpleNamespace(x=np.array([4.0]))), "pose.x.0", "m") == 4.0
 
 
 SECONDS = 1_700_000_000
@@ -222,12 +222,12 @@ def test_a_condition_leaves_messages_out_and_counts_them(where, used):
 def test_a_message_with_a_count_and_without_a_value_measured_nothing():
     sources = Sources({"t": json_field("v", "garden", "in", time="at", sequence="n")}, NETWORK)
     readings = [sources.read("t", {"at": 1, **rest}, "m")[0] for rest in ({"n": 4}, {"v": 2.0}, {"n": 5, "v": 3.0})]
-    assert [r.sequence for r in readings] == [4, 0, 5] and not sources.never()
+    assert [r.sequence for r in readings] == [4, 0, 5] and not sources.describe_absent_field()
     np.testing.assert_array_equal([r.values[0] for r in readings], [np.nan, 2.0, 3.0])
     # Where no message has it, it is misspelt.
     sources = Sources({"t": json_field("w", "garden", "in", time="at", sequence="n")}, NETWORK)
     sources.read("t", {"at": 1, "n": 1, "v": 2}, "m")
-    assert "expected a field 'w', got no 'w' in at, n, v" in sources.never()
+    assert "expected a field 'w', got no 'w' in at, n, v" in sources.describe_absent_field()
     with pytest.raises(ValueError, match="expected a field 'v'"):
         read(json_field("v", "garden", "in", sequence="n"), {"at": 1})
 

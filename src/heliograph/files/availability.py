@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from typing_extensions import TypeAliasType
 
-from heliograph.files.sources.fields import at, decode_json, match_topic
+from heliograph.files.sources.fields import decode_json, field_at, match_topic
 from heliograph.numerics.check import InputError, fail, show_value
 from heliograph.numerics.module import readable
 
@@ -68,14 +68,14 @@ class Available:
         Raises:
             ValueError: a word that is neither; one line.
         """
-        word = str(at(payload, self.path, where) if isinstance(payload, dict) else payload).strip().casefold()
+        word = str(field_at(payload, self.path, where) if isinstance(payload, dict) else payload).strip().casefold()
         if word not in (*self.online, *self.offline):
             raise fail(where, f"one of {', '.join((*self.online, *self.offline))}", show_value(payload))
         return word in self.offline
 
 
 class LastWords:
-    """Last words of the devices of some conditions.
+    """Keeps the last word, online or offline, of each device that a condition is about.
 
     Args:
         conditions: the conditions.
@@ -95,15 +95,15 @@ class LastWords:
 
     @property
     def unheard(self) -> list[str]:
-        """Return the topics on which no word was said."""
+        """Return the topics, wildcards included, on which no device has said a word."""
         return [topic for topic, several in self._by_pattern.items() if not self._heard.intersection(several)]
 
     def about(self, topic: str) -> list[Available]:
-        """Return the conditions to which a message of a topic is a word."""
+        """Return the conditions for which a message of this topic is a device's word."""
         matching = [several for pattern, several in self._by_pattern.items() if match_topic(topic, pattern)]
         return [condition for several in matching for condition in several]
 
-    def hear(self, topic: str, payload: object, where: str) -> bool:
+    def take_word(self, topic: str, payload: object, where: str) -> bool:
         """Take the word of a message, and return whether it is one.
 
         Args:
@@ -119,15 +119,13 @@ class LastWords:
             return False
         said, before = _decode_payload(payload, where), self._number(topic)
         for condition in conditions:
-            offline = said != "" and condition.says_offline(said, where)
-            self._heard.add(condition)
-            (self._offline.add if offline else self._offline.discard)((condition, topic))
+            self._note(condition, topic, offline=said != "" and condition.says_offline(said, where))
         if self._number(topic) != before:
             self._changed.add(topic)
         return True
 
     def changed(self) -> dict[str, int]:
-        """Return the topics on which a word has changed since the last call, each with a number that says it."""
+        """Return {topic: its words as a number, as `restore` takes it} of the words changed since the last call."""
         changed, self._changed = self._changed, set()
         return {topic: self._number(topic) for topic in changed}
 
@@ -135,14 +133,18 @@ class LastWords:
         """Take last words that were kept, as `changed` gives them: bit i is 1 if a topic's condition i says offline."""
         for topic, bits in words.items():
             for i, condition in enumerate(self.about(topic)):
-                self._heard.add(condition)
-                if (bits >> i) & 1:
-                    self._offline.add((condition, topic))
-                else:
-                    self._offline.discard((condition, topic))
+                self._note(condition, topic, offline=bool((bits >> i) & 1))
+
+    def _note(self, condition: Available, topic: str, offline: bool) -> None:
+        """Note the word of a topic for a condition."""
+        self._heard.add(condition)
+        if offline:
+            self._offline.add((condition, topic))
+        else:
+            self._offline.discard((condition, topic))
 
     def _number(self, topic: str) -> int:
-        """Return the word of a topic as a number, a bit for each condition that it is about: 1 if it is offline."""
+        """Return the words of a topic as a number: bit i is 1 if its i-th condition says offline."""
         return sum(1 << i for i, condition in enumerate(self.about(topic)) if (condition, topic) in self._offline)
 
     def offline(self, condition: Available, topic: str) -> bool:

@@ -92,6 +92,7 @@ def read_design(path: Path) -> DesignFile:
 
 
 def _number(path: Path, table: Mapping[str, Any], key: str) -> float | None:
+    """Return the number under a key, which is not negative; None if it is not there."""
     return float(scalar(f"{path.name}, {key}", table[key], 0.0)) if key in table else None
 
 
@@ -117,7 +118,7 @@ def _read_map(path: Path, table: Mapping[str, object]) -> MapPlaces:
 
 
 def _find_function(path: Path, value: object, key: str) -> tuple[Path, str]:
-    """Return the Python file and the name in it."""
+    """Return the Python file beside the design file that a value names, as FILE or FILE:NAME, and NAME or ""."""
     if not isinstance(value, str):
         raise fail(f"{path.name}, {key}", 'a Python file, as "my_network.py" or "my_network.py:name"', repr(value))
     file_name, colon, name = value.rpartition(":")

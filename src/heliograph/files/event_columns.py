@@ -48,7 +48,7 @@ class Columns:
         return np.array(self.time), np.array(self.arrival), np.array(self.sequence, dtype=np.int64)
 
     def keep(self, which: np.ndarray) -> None:
-        """Keep some of the events, by mask."""
+        """Keep only the events of a mask."""
         columns, matrix = self.arrays(), self.matrix()[which]
         self.time, self.arrival, self.sequence = (array(c.dtype.char.replace("l", "q"), c[which]) for c in columns)
         self.values = array("d", matrix.ravel())
@@ -77,10 +77,23 @@ class Columns:
         counts = np.array([count for _, count in self.unread], dtype=np.int64)
         return count_gaps(np.concatenate([time, moments]), np.concatenate([sequence, counts]), self.period)
 
-    def doubt_count(self, name: str) -> list[str]:
-        """Say of a count that it begins at 0 again sooner than its bits say, or that it stands still.
+    def fill_losses(
+        self, table: Float[np.ndarray, "rows received"], rows: np.ndarray, counts: Int[np.ndarray, " events"]
+    ) -> None:
+        """Write how many messages were lost before each event into the last column of the node's `table`.
 
-        It does so where it fell at least three times, each time from the largest number, which is 2^b - 1.
+        The running counts say it, of the events in `rows`, in order of time, whose messages do not have the number.
+        """
+        gaps = np.diff(counts, prepend=counts[:1]) - 1.0
+        gaps[gaps < 0] = np.nan  # the first, and after a restart
+        has_count = min(self.sequence, default=-1) >= 0
+        missing = np.isnan(table[rows, -1]) & has_count
+        table[rows[missing], -1] = gaps[missing]
+
+    def doubt_count(self, name: str) -> list[str]:
+        """Return a line if a count begins at 0 again sooner than its bits say, and one if it stands still.
+
+        It begins sooner where it fell at least three times, each time from the largest number, which is 2^b - 1.
         """
         if not self.period or not len(self.time):
             return []
@@ -107,7 +120,7 @@ class Columns:
         return [f"{name}: {count} events have {distinct} stamps"] if count > 3 and 2 * distinct <= count else []
 
     def drop_unset(self, name: str) -> tuple[str, str, int]:
-        """Leave out stamps that were not set; return what to say of the clock, why some were left out, and how many.
+        """Remove events whose stamps were not set; return a note on the clock, why some were removed, and how many.
 
         A stamp that is more than a year before its arrival was not set; where most are, they are of another clock, and
         each event arrives when it was measured. Where arrivals are not known, neither was one that is more than a year
@@ -129,7 +142,7 @@ class Columns:
         first = time[np.argmax(unset)]
         moment = f"{first:.10g}" if self.numbers else str(np.datetime64(int(first), "ns"))
         got = f"{moment} in {count} of {len(time)} messages"
-        # They came when those did that were set just before them, or first.
+        # Without a stamp or arrival they came when the last set one before them did, or else the first set one.
         set_before = np.maximum.accumulate(np.where(unset, -1, np.arange(len(time))))
         near_them = time[np.where(set_before < 0, np.argmin(unset), set_before)]
         moments = (arrival if known else near_them)[unset]
@@ -139,7 +152,7 @@ class Columns:
 
 
 class Events(NamedTuple):
-    """Events in order of arrival: node (-1: inputs), time, arrival, count, and place among those of the node.
+    """Events in order of arrival: node (-1: inputs), time, arrival, count, and index among those of the node.
 
     Shapes: all (events,).
     """
@@ -177,28 +190,54 @@ def judge(
     """
     verdicts = np.full(len(events.time), USED)
     verdicts[events.time > events.arrival + ahead] = FUTURE
-    kept = np.flatnonzero(verdicts != FUTURE)
-    some = events.of(kept)
-    # In a row of its own an event stands after inputs of its time, then by node and count.
-    rank = _rank_rows(some.time) if joint else _rank_rows(some.time, some.node, some.sequence)
+    # Of the events that are not in the future: rank of the row of each, in order of time; an event in a row of its own
+    # stands after inputs of its time, then by node and count. Events of one identity are of one node, time and count.
+    candidates = np.flatnonzero(verdicts != FUTURE)
+    some = events.of(candidates)
     identity = _rank_rows(some.time, some.node, some.sequence)
+    rank = _rank_rows(some.time) if joint else identity
+    # Late: its row was final before it came. The newest final row is the base, where in a row of its own the event
+    # itself may stand, which is then a copy.
     newest_final = _find_newest_final(some, rank, window)
-    # Of events of one identity, and of a node's values in a joint row, the first stays.
-    verdicts[kept[rank <= newest_final if joint else rank < newest_final]] = LATE
+    verdicts[candidates[rank <= newest_final if joint else rank < newest_final]] = LATE
     rivals = _rank_rows(some.time, some.node) if joint else identity
-    several: Bool[np.ndarray, " names"] = np.bincount(rivals, minlength=1) > 1
-    first_of, filled = dict[int, int](), dict[int, np.ndarray]()  # of an identity; components of a row
-    for i in np.flatnonzero(several[rivals] & (rank >= newest_final)).tolist():
-        k, mine, row = int(kept[i]), int(identity[i]), int(rivals[i])
-        there = ~np.isnan(values(k))
-        if mine in first_of:
-            same = np.array_equal(values(k), values(first_of[mine]), equal_nan=True)
-            verdicts[k] = DUPLICATE if same else CONFLICT
-        elif joint and verdicts[k] == USED and row in filled and np.any(there & filled[row]):
-            verdicts[k] = CONFLICT
-        elif verdicts[k] == USED:
-            first_of[mine], filled[row] = k, there | filled.get(row, False)
+    contested: Bool[np.ndarray, " names"] = np.bincount(rivals, minlength=1) > 1
+    contenders = np.flatnonzero(contested[rivals] & (rank >= newest_final))
+    _judge_copies(verdicts, candidates[contenders], identity[contenders], rivals[contenders], values, joint)
     return verdicts
+
+
+def _judge_copies(
+    verdicts: Int[np.ndarray, " events"],
+    numbers: np.ndarray,
+    identity: np.ndarray,
+    rivals: np.ndarray,
+    values: Callable[[int], np.ndarray],
+    joint: bool,
+) -> None:
+    """Write the verdicts on copies, and on second values of a node in a joint row: the first event stays.
+
+    Args:
+        verdicts: verdicts on all events, which are changed.
+        numbers: numbers of the events to judge, in order of arrival.
+        identity: for each of these, the number of its node, time and count.
+        rivals: for each, the number of its row and node if rows are joint, else of its identity.
+        values: the values of the event with a number.
+        joint: whether all events of one time are one row.
+    """
+    first_of_identity, components_filled = dict[int, int](), dict[int, np.ndarray]()
+    for k, name, row in zip(numbers.tolist(), identity.tolist(), rivals.tolist(), strict=True):
+        present = ~np.isnan(values(k))
+        if name in first_of_identity:
+            same = np.array_equal(values(k), values(first_of_identity[name]), equal_nan=True)
+            verdicts[k] = DUPLICATE if same else CONFLICT
+        elif verdicts[k] == USED:
+            filled = components_filled.get(row)
+            if joint and filled is not None and np.any(present & filled):
+                verdicts[k] = CONFLICT
+            else:
+                first_of_identity[name] = k
+                components_filled[row] = present if filled is None else present | filled
 
 
 def count_verdicts(
@@ -255,10 +294,11 @@ def _find_newest_final(events: Events, rank: Int[np.ndarray, " events"], window:
     count = len(rank)
     if not np.isfinite(window):
         return np.full(count, -1)
+    # Number of the first event before which each one is final: after its own, and where the watermark is past its time.
     watermark = events.arrival - window
-    final = np.maximum(np.arange(count) + 1, np.searchsorted(watermark, events.time, side="right"))
+    final_from = np.maximum(np.arange(count) + 1, np.searchsorted(watermark, events.time, side="right"))
     newest = np.full(count + 1, -1)
-    np.maximum.at(newest, final, rank)
+    np.maximum.at(newest, final_from, rank)
     return np.maximum.accumulate(newest[:count])
 
 
@@ -271,7 +311,7 @@ def counts_losses(network: Network, name: str) -> bool:
 
 
 def fill_forward(values: Float[np.ndarray, "rows given"]) -> Float[np.ndarray, "rows given"]:
-    """Fill what is missing with the value before it, 0 before the first."""
+    """Return each column with NaN replaced by the last value before it, 0 before the first."""
     rows = np.where(np.isnan(values), -1, np.arange(len(values))[:, None])
     last = np.maximum.accumulate(rows, axis=0) if len(values) else rows
     return np.asarray(np.where(last < 0, 0.0, np.take_along_axis(values, np.maximum(last, 0), axis=0)))

@@ -81,10 +81,11 @@ class EventTable:
         """
         if plant not in self._plants:
             raise fail("plant", f"one of {', '.join(map(repr, self._plants)) or 'none'}", repr(plant))
-        one = EventTable(self.network, None, self.start, self.numbers)
-        one.step, one._plants = self.step, {plant: self._plants[plant]}
-        one.notes, one.broken, one.refused, one.reasons = self.notes, self.broken, self.refused, self.reasons
-        return one
+        single = EventTable(self.network, None, self.start, self.numbers)
+        single.step, single._plants = self.step, {plant: self._plants[plant]}
+        single.notes, single.broken = self.notes, self.broken
+        single.refused, single.reasons = self.refused, self.reasons
+        return single
 
     @property
     def columns(self) -> dict[str, Columns]:
@@ -161,21 +162,23 @@ class EventTable:
         Raises:
             ValueError: no event, and a message that could not be read; a stamp that was not set.
         """
-        every = [each for plant in self._plants.values() for each in plant.items()]
-        for name, columns in every if self.dated or not self.steps else ():
+        by_node = [node for plant in self._plants.values() for node in plant.items()]
+        # Steps are no stamps; neither are numbers of a network that counts steps.
+        for name, columns in by_node if self.dated or not self.steps else ():
             note, reason, count = columns.drop_unset(f"{source}, {name}")
-            self.notes += [note] * bool(note) + columns.doubt_count(f"{source}, {name}")
+            self.notes += [note] if note else []
+            self.notes += columns.doubt_count(f"{source}, {name}")
             if reason:
                 self.refuse(InputError(reason), strict)
                 self.refused += count - 1
         if not len(self) and (first := (*self.reasons, self.broken)[0]):
             raise InputError(first)
-        for name, columns in () if self.steps else every:
+        for name, columns in () if self.steps else by_node:
             self.notes += columns.list_lost_digits(f"{source}, {name}")
 
     @property
     def origin(self) -> int:
-        """Nanoseconds since 1970 from which the times of the events count; 0 where these are steps or numbers.
+        """Return the nanoseconds since 1970 from which times of events count; 0 where these are steps or numbers.
 
         Raises:
             ValueError: no events.
@@ -183,7 +186,7 @@ class EventTable:
         return 0 if self.steps or self.numbers else self._find_first_moment()
 
     def _find_first_moment(self) -> int:
-        """Return the first moment, in the unit of the columns, or that of step 0."""
+        """Return the moment of step 0 if it is given, else that of the first event, in the unit of the columns."""
         if self.start is not None:
             return self.start
         times = [min(columns.time) for columns in self.columns.values() if columns.time]
@@ -243,11 +246,12 @@ class EventTable:
         """
         results, second = {}, 1 if self.numbers else SECOND
         for name, late in self.lateness().items():
-            apart = np.diff(np.unique(self.columns[name].arrays()[0]))
-            between = float(np.median(apart)) / second if len(apart) else 1.0
-            between = 1.0 if self.numbers and self.steps else between
-            size = step if step is not None else between if self.step is None else self.step / SECOND
-            if np.any(late > -size / 2):
+            size = self.step / SECOND if step is None and self.step is not None else step
+            if size is None:
+                apart = np.diff(np.unique(self.columns[name].arrays()[0]))
+                counts_steps = self.numbers and self.steps
+                size = float(np.median(apart)) / second if len(apart) and not counts_steps else 1.0
+            if np.any(late > -size / 2):  # else nothing arrived at or after its step
                 results[name] = learn_delays(late, size)
         return results
 
@@ -322,33 +326,21 @@ class EventTable:
         # Values of each node in its row.
         tables = []
         for n, matrix in zip((*range(len(self.network.names)), -1), self._matrices(), strict=True):
-            mine, table = events.node == n, np.full((len(times), matrix.shape[1]), np.nan)
+            of_node, table = events.node == n, np.full((len(times), matrix.shape[1]), np.nan)
             for i in range(table.shape[1]):
-                values = matrix[events.place[mine], i]
-                there = ~np.isnan(values)
-                table[row[mine][there], i] = values[there]
+                values = matrix[events.place[of_node], i]
+                present = ~np.isnan(values)
+                table[row[of_node][present], i] = values[present]
             tables.append(table)
         for n, name in enumerate(self.network.names):
-            self._fill_losses(name, tables[n], row, events, n)
+            if counts_losses(self.network, name):
+                self.columns[name].fill_losses(tables[n], row[events.node == n], events.sequence[events.node == n])
         inputs = self._make_inputs(fill_forward(tables.pop()), times)
         origin = self.origin
         time = times.astype(np.float64) if self.steps or self.numbers else (times - origin) / SECOND
         measured = np.zeros(len(times), dtype=bool)
         measured[row[events.node >= 0]] = True
         return Recording(dict(zip(self.network.names, tables, strict=True)), inputs, time), measured
-
-    def _fill_losses(
-        self, name: str, table: Float[np.ndarray, "rows received"], row: np.ndarray, events: Events, number: int
-    ) -> None:
-        """Fill in how many transmissions of a node were lost before each, by its count, where its filter expects it."""
-        if not counts_losses(self.network, name):
-            return
-        mine, column = events.node == number, self.network.nodes[name].received - 1
-        counts, rows = events.sequence[mine], row[mine]
-        gaps = np.diff(counts, prepend=counts[:1]) - 1.0
-        gaps[(gaps < 0)] = np.nan  # the first, and after a restart
-        told = np.isnan(table[rows, column]) & (min(self.columns[name].sequence, default=-1) >= 0)
-        table[rows[told], column] = gaps[told]
 
     @property
     def _joint(self) -> bool:
@@ -389,7 +381,11 @@ class EventTable:
         return events, judge(events, values, self._joint, *limits)
 
     def _make_inputs(self, held: Float[np.ndarray, "rows given"], times: np.ndarray) -> np.ndarray:
-        """Return the plant's inputs (rows, inputs): those held after the row before, and the time since that row."""
+        """Return the plant's inputs (rows, inputs), from those set up to each row, `held`.
+
+        In continuous time those of the row before lead to a row, 0 at first, with the time dt since that row; where
+        time counts steps, those of the row itself do.
+        """
         if self.steps:
             return held
         before = np.vstack([np.zeros((1, held.shape[1])), held[:-1]])

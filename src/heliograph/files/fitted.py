@@ -35,7 +35,7 @@ network = hg.files.load_fitted({reference}, HERE / "{fitted}")
 
 @dataclass(frozen=True)
 class NetworkAgain:
-    """Loader of the network of a file or module, which builds it anew at each call, so that `hg.free` is called again.
+    """Builds the network of a file or module anew at each call, so that `hg.free` is called again.
 
     A file is run again; of an installed module a function that returns the network is called again.
     """
@@ -69,8 +69,8 @@ def write_fitted(content: Mapping[str, object], reference: str, measurements: st
     if path is None:
         source = repr(reference)
     else:
-        way = Path(os.path.relpath(path.resolve(), target.resolve())).as_posix()
-        source = f'f"{{HERE}}/{way}{colon}{name}"'
+        relative = Path(os.path.relpath(path.resolve(), target.resolve())).as_posix()
+        source = f'f"{{HERE}}/{relative}{colon}{name}"'
     named = {"network": _quote_in_docstring(reference), "measurements": _quote_in_docstring(measurements)}
     text = SOURCE.format(**named, fitted=FITTED, file=NETWORK, reference=source)
     (folder / NETWORK).write_text(text, encoding="utf-8")
@@ -99,11 +99,13 @@ def load_fitted(reference: str | Path, fitted: str | Path) -> Network:
 
 
 def _tabulate_delays(delays: Delays) -> dict[str, Any]:
+    """Return a law of delays as tables for JSON."""
     shares = [{"steps": steps, **share._asdict()} for steps, share in delays.shares.items()]
     return {"step": delays.step, "counted": delays.counted, "early": delays.early, "shares": shares}
 
 
 def _plain(value: object) -> object:
+    """Return a value for JSON: None in place of a float that is not finite."""
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
@@ -117,4 +119,5 @@ def _split_reference(reference: str) -> tuple[Path | None, str, str]:
 
 
 def _quote_in_docstring(text: str) -> str:
+    """Return the name of a file so that it ends no docstring."""
     return Path(text).name.replace("\\", "/").replace('"', "'")

@@ -55,7 +55,7 @@ CLOCKS = re.compile(
 
 @dataclass
 class Topic:
-    """Messages of one topic: times of logging or arrival, and lateness in seconds where messages have a time.
+    """What messages of one topic have: their number, fields, times of logging or arrival, dates, and lateness.
 
     Attributes:
         kind: type of the messages.
@@ -113,7 +113,7 @@ class Topic:
 
     @property
     def count(self) -> str | None:
-        """Return the path of what is named as a running count is."""
+        """Return the path of the first field that is named as a running count is; None if none is."""
         return next((path for path in self.fields if COUNTS.fullmatch(path.split(".")[-1].lower())), None)
 
     def list_measured(self) -> list[str]:
@@ -127,18 +127,10 @@ class Topic:
         apart = np.diff(times) / SECOND
         span = float(apart.sum())
         rate = f"{len(apart) / span:.3g} Hz" if span > 0 else "-"
-        late = (
-            " ".join(f"{value:.3g}" for value in np.quantile(np.array(self.late), [0.5, 0.95, 1.0]))
-            if self.late
-            else "-"
-        )
-        return [
-            self.kind,
-            f"{max(len(times), self.messages)}",
-            rate,
-            f"{apart.max():.3g} s" if len(apart) else "-",
-            late,
-        ]
+        count = f"{max(len(times), self.messages)}"
+        gap = f"{apart.max():.3g} s" if len(apart) else "-"
+        quantiles = np.quantile(np.array(self.late), [0.5, 0.95, 1.0]) if self.late else []
+        return [self.kind, count, rate, gap, " ".join(f"{value:.3g}" for value in quantiles) or "-"]
 
 
 def inspect_bag(path: Path, progress: Progress | None = None) -> tuple[dict[str, Topic], str]:
@@ -169,8 +161,8 @@ def _inspect_part(path: Path, topics: dict[str, Topic], progress: Progress | Non
             for done, (connection, logged, data) in enumerate(bag_messages(reader, reader.connections), 1):
                 topic = topics[connection.topic]
                 topic.logged.append(logged)
-                if topic.time is not None and len(data) >= 12:
-                    topic.late.append((logged - _stamp(data)) / SECOND)
+                if topic.time is not None and len(data) >= 12:  # 4 bytes of encoding, then the stamp's 8
+                    topic.late.append((logged - _read_stamp(data)) / SECOND)
                 if progress is not None and done % OFTEN == 0:
                     progress(done, total)
         except Exception as error:  # whatever damage makes a reader do
@@ -206,8 +198,11 @@ def _note_message(topics: dict[str, Topic], name: str, content: object, kind: st
             topic.fields.append(path)
         if arrival is None and isinstance(value, int | float) and _counts_from_start(path, value):
             topic.clocks.setdefault(path, array("d")).append(value)
-        # A date in a message may be the time of its measurement.
-        unit = "s" if is_stamp(value) or (isinstance(value, str) and looks_like_date(value)) else _unit(value)
+        # A date in a message may be the time of its measurement: a stamp, a text, or a number of these years.
+        if is_stamp(value) or (isinstance(value, str) and looks_like_date(value)):
+            unit: TimeUnit | None = "s"
+        else:
+            unit = _unit_of_date(value)
         if unit is not None:
             with suppress(InputError):
                 time = convert_time(value, unit, path)
@@ -233,11 +228,11 @@ def _name_clock_unit(path: str) -> Literal["s", "ms", "us", "ns"]:
 
 def _counts_from_start(path: str, value: float) -> bool:
     """Return whether a number is named as a clock is, and no date of these years."""
-    return not isinstance(value, bool) and _unit(value) is None and _named_clock(path) is not None
+    return not isinstance(value, bool) and _unit_of_date(value) is None and _named_clock(path) is not None
 
 
-def _unit(value: object) -> TimeUnit | None:
-    """Return the unit in which a number is a date of these years; None of any other."""
+def _unit_of_date(value: object) -> TimeUnit | None:
+    """Return the unit in which a number, counted from 1970, is a date of these years; None of any other value."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     return next((unit for unit, size in UNITS.items() if YEARS.start <= value * size / SECOND < YEARS.stop), None)
@@ -326,16 +321,25 @@ def suggest_sources(topics: Mapping[str, Topic], names: Mapping[str, Sequence[st
         fields = topic.list_measured()
         if not fields:
             continue
+        options = _suggest_options(topic, dated)
+        source = f"hg.files.json_field({fields[0]!r}, node='NODE', output='OUTPUT'{options})"
+        lines.append(f"    {name!r}: {source},{_say_unit(topic, fields[0])}")
         others = [f"{path}{_say_unit(topic, path, '')}" for path in fields[1:FEW]]
         more = ", ".join(others) + (", ..." if len(fields) > FEW else "")
-        when = "" if topic.time is None else f", time={_describe_time(topic, dated)}"
-        unit = "s" if topic.time is None else topic.units.get(topic.time, "s")
-        when += "" if unit == "s" else f", time_unit={unit!r}"
-        when += "" if topic.count is None else f", sequence={_describe_count(topic, topic.count)}"
-        source = f"hg.files.json_field({fields[0]!r}, node='NODE', output='OUTPUT'{when})"
-        lines.append(f"    {name!r}: {source},{_say_unit(topic, fields[0])}")
         lines += [f"    #   or {more}"] if more else []
     return "\n".join([*lines, "}"])
+
+
+def _suggest_options(topic: Topic, dated: bool) -> str:
+    """Return a source's options for a topic's time and count; `dated`: whether there are dates in any topic."""
+    options = ""
+    if topic.time is not None:
+        options += f", time={_describe_time(topic, dated)}"
+        unit = topic.units.get(topic.time, "s")
+        options += "" if unit == "s" else f", time_unit={unit!r}"
+    if topic.count is not None:
+        options += f", sequence={_describe_count(topic, topic.count)}"
+    return options
 
 
 def _describe_time(topic: Topic, dated: bool) -> str:
@@ -357,15 +361,18 @@ def _say_unit(topic: Topic, path: str, mark: str = "  #") -> str:
 
 
 def _rank_field(path: str) -> int:
-    """Return how little a field looks like a measurement: 0 under a payload, 2 for what devices say of themselves."""
+    """Return how little a field looks like a measurement: 0 under a payload, 2 for a device's own state, else 1."""
     words = path.lower().split(".")
     if any(HOUSEKEEPING.fullmatch(word) for word in words):
         return 2
     return 0 if any(word in PAYLOADS for word in words) else 1
 
 
-def _stamp(data: bytes) -> int:
-    """Read the stamp of a header that a message begins with: the bytes after those that say in which order they are."""
+def _read_stamp(data: bytes) -> int:
+    """Return the stamp of the header that a message begins with, in nanoseconds since 1970.
+
+    Four bytes come before it, of which the second says whether the little end comes first.
+    """
     seconds, rest = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
     return int(seconds) * 10**9 + int(rest)
 

@@ -101,7 +101,10 @@ def _find_network(module: ModuleType, name: str, file: str, path: Path | None) -
 
 
 def _read_name(module: ModuleType, name: str, file: str, path: Path | None, networks: dict[str, Network]) -> Network:
-    """Return the network that a name of a module stands for; a function is called for it."""
+    """Return the network that a name of a module stands for, or that the function of this name returns.
+
+    `networks`: those of the module by name, for errors.
+    """
     if not hasattr(module, name):
         close = get_close_matches(name, [key for key in vars(module) if not key.startswith("_")], 1)
         holds = ", ".join(networks) or "no networks"

@@ -121,26 +121,24 @@ def _truth_columns(network: Network) -> dict[str, str]:
 
 
 def _map_headers(network: Network) -> dict[str, str]:
-    """Return the name that a column has here by the header that it may have.
+    """Return {header that a column may have: name of the column}.
 
-    That is the name, with the unit of its state, input or output ("range (m)") or without, also as `write_table` writes
-    what no cell can hold.
+    A header is the name, with the unit of its state, input or output ("range (m)") or without, also as `write_table`
+    writes what no cell can hold.
     """
     received = {node: receiver.received_names for node, receiver in network.nodes.items()}
-    names = [*network.states, *network.inputs, *(name for of in received.values() for name in of)]
+    names = [*network.states, *network.inputs, *(name for components in received.values() for name in components)]
     headers = {append_unit(name): str(name) for name in names}
     headers |= {f"truth.{append_unit(name)}": f"truth.{name}" for name in network.states}
-    headers |= {f"{node}.{append_unit(name)}": f"{node}.{name}" for node, of in received.items() for name in of}
-    plain = [TIME, *headers.values()]
-    return (
-        {read_back_name(header): name for header, name in headers.items()}
-        | headers
-        | dict(zip(plain, plain, strict=True))
-    )
+    for node, components in received.items():
+        headers |= {f"{node}.{append_unit(name)}": f"{node}.{name}" for name in components}
+    as_written = {read_back_name(header): name for header, name in headers.items()}
+    without_unit = {name: name for name in (TIME, *headers.values())}
+    return as_written | headers | without_unit
 
 
 class RowReader:
-    """Rows of time of a network, from columns, a part of a table at a time.
+    """Reads rows of time of a network from columns, a part of a table at a time.
 
     Args:
         network: the network that the columns belong to.
@@ -208,7 +206,7 @@ class RowReader:
 
 
 class _RowChecks:
-    """Checks of the rows of a table: the first that fails is an error, or each is refused with the reason.
+    """Refuses rows of a table that cannot be read: the first is an error, or each is noted with the reason.
 
     Attributes:
         good: of each row whether nothing was wrong so far.
@@ -221,7 +219,13 @@ class _RowChecks:
         self.refused = list[InputError]()
 
     def refuse(self, bad: np.ndarray, column: str, expected: str, came: Callable[[int], str]) -> None:
-        """Refuse rows.
+        """Refuse the rows of a mask, unless they were refused before.
+
+        Args:
+            bad: the mask, (rows,).
+            column: name of the column that is wrong.
+            expected: what was expected there.
+            came: what stands in a row instead.
 
         Raises:
             ValueError: one of them, where reading is strict.
@@ -236,7 +240,7 @@ class _RowChecks:
 
 
 def _read_cells(columns: Mapping[str, np.ndarray], network: Network, checks: _RowChecks) -> Cells:
-    """Read what stands in the columns of a table, each row by itself."""
+    """Return what stands in the columns of a table; rows that cannot be read are refused by `checks`."""
     inputs, received, source = network.inputs, _list_received_columns(network), checks.source
     # A relay whose measurements are left out altogether loses its filter only.
     for name in () if network.relays is None else network.relays.relays:
@@ -244,31 +248,33 @@ def _read_cells(columns: Mapping[str, np.ndarray], network: Network, checks: _Ro
             del received[name]  # its own filter is left out
     if TIME in inputs:
         raise fail("input names", f"none called {TIME!r}, which is the recording's own column", list(inputs))
-    expected = [(TIME,), *((name,) for name in inputs), *(a for node in received.values() for a in node)]
-    true = _truth_columns(network)
-    _refuse_unknown(columns, [*expected, *((name,) for name in true.values())], source)
+    expected = [(TIME,), *((name,) for name in inputs), *(names for node in received.values() for names in node)]
+    truth_columns = _truth_columns(network)
+    _refuse_unknown(columns, [*expected, *((name,) for name in truth_columns.values())], source)
     time = _read_times(columns, _find_column(columns, (TIME,), source), checks)
-    measurements = {
-        node: np.stack(
-            [_read_measurements(columns, _find_column(columns, a, source), checks) for a in components], axis=1
-        )
-        for node, components in received.items()
-    }
+    measurements = {}
+    for node, components in received.items():
+        found = [_find_column(columns, names, source) for names in components]
+        measurements[node] = np.stack([_read_measurements(columns, column, checks) for column in found], axis=1)
     # An input dt may be left out.
     given = {
         name: _read_complete(columns, _find_column(columns, (name,), source), checks)
         for name in inputs
         if name != TIME_STEP or name in columns
     }
-    known = {state: name for state, name in true.items() if name in columns}
-    truth = {state: _read_measurements(columns, name, checks) for state, name in known.items()}
+    truth = {
+        state: _read_measurements(columns, name, checks) for state, name in truth_columns.items() if name in columns
+    }
     return Cells(checks.numbers, time, measurements, given, truth)
 
 
 def _make_inputs(
     network: Network, given: Mapping[str, np.ndarray], time: np.ndarray, rows: "KeptRows", source: str
 ) -> np.ndarray:
-    """Return the inputs of rows whose times do not go backwards; a missing dt is the difference of the times."""
+    """Return the inputs (rows, inputs); raise ValueError where times go backwards or a time step is impossible.
+
+    A missing dt is the difference of the times.
+    """
     row = backwards(time)
     if row is not None:
         where = f"{source}, row {rows.numbers[row]}, column {TIME!r}"
@@ -340,22 +346,26 @@ def _warn_of_equal_times(time: np.ndarray, source: str) -> None:
 
 
 def _read_complete(columns: Mapping[str, np.ndarray], name: str, checks: _RowChecks) -> np.ndarray:
+    """Return the numbers of a column in which every cell has to have one."""
     values = columns[name] if columns[name].dtype.kind == "i" else _read_numbers(columns, name, checks.source)
     checks.refuse(~np.isfinite(values), name, "a finite number", _describe_cell(values))
     return values
 
 
 def _read_measurements(columns: Mapping[str, np.ndarray], name: str, checks: _RowChecks) -> np.ndarray:
+    """Return the numbers of a column, NaN where a cell is empty."""
     values = _read_numbers(columns, name, checks.source)
     checks.refuse(np.isinf(values), name, "a finite number, or none where it did not arrive", _describe_cell(values))
     return values
 
 
 def _read_numbers(columns: Mapping[str, np.ndarray], name: str, source: str) -> np.ndarray:
+    """Return a column as doubles; raise ValueError if it has dates."""
     if columns[name].dtype.kind == "M":
         raise fail(f"{source}, column {name!r}", "numbers", "dates")
     return np.asarray(columns[name], dtype=np.float64)
 
 
 def _describe_cell(values: np.ndarray) -> Callable[[int], str]:
+    """Return what says in words what stands in a row of a column."""
     return lambda row: "an empty cell" if np.isnan(values[row]) else f"{values[row]}"

@@ -66,7 +66,7 @@ def columns_of(table: object, name: str = "table", only: Container[str] | None =
 
 
 def _convert_column(values: Any, name: str) -> np.ndarray:
-    """Convert one column, which may have a missing value other than NaN."""
+    """Return one column as numbers or dates; what its own kind marks as missing becomes NaN or NaT."""
     missing = values.isna() if hasattr(values, "isna") else None
     if missing is not None and values.dtype.kind in "iufb":  # pandas's own kinds of number have a mask
         return np.asarray(values.to_numpy(dtype=np.float64, na_value=np.nan))
@@ -93,7 +93,7 @@ def convert_to_nanoseconds(column: np.ndarray, name: str) -> np.ndarray:
         ValueError: a date that 64 bits of nanoseconds cannot say, or a part of a nanosecond; one line with its row.
     """
     moments = column.astype("datetime64[ns]")
-    # There and back: what wraps or is cut is another date then.
+    # Converted back, what overflowed or lost a part of a nanosecond is another date.
     wrong = ~np.isnat(column) & (moments.astype(column.dtype) != column)
     if wrong.any():
         row = int(np.argmax(wrong))
@@ -102,22 +102,24 @@ def convert_to_nanoseconds(column: np.ndarray, name: str) -> np.ndarray:
 
 
 def _convert_objects(column: np.ndarray, name: str) -> np.ndarray:
-    """Convert numbers with None among them, or dates; refuse text, even if it reads as a number."""
+    """Return a column of objects as numbers, NaN for None, or as dates; the first value says which.
+
+    Text is no number, though it may read as one.
+    """
     column = np.array([None if is_absent(value) else value for value in column], dtype=object)
-    some = next((value for value in column if value is not None), None)
-    if hasattr(some, "to_timestamp"):  # a period of pandas: its first moment
+    first = next((value for value in column if value is not None), None)
+    if hasattr(first, "to_timestamp"):  # a period of pandas: its first moment
         return dates([None if value is None else value.to_timestamp() for value in column], name)
-    if (isinstance(some, str) and looks_like_date(some)) or hasattr(some, "isoformat"):
+    if (isinstance(first, str) and looks_like_date(first)) or hasattr(first, "isoformat"):
         return dates(column, name)
-    texts = [x for x in column if isinstance(x, str | bytes)]  # text is no number, though it may read as one
+    texts = [x for x in column if isinstance(x, str | bytes)]
     try:
         if texts:
             raise TypeError
         return np.array([np.nan if value is None else float(value) for value in column])
     except (TypeError, ValueError, OverflowError):
-        raise fail(
-            name, "numbers or dates", show_value(str(texts[0]) if texts and isinstance(texts[0], str) else some)
-        ) from None
+        got = str(texts[0]) if texts and isinstance(texts[0], str) else first
+        raise fail(name, "numbers or dates", show_value(got)) from None
 
 
 def read_table(path: str | Path) -> dict[str, Shaped[np.ndarray, " rows"]]:
@@ -193,7 +195,7 @@ def _check_columns(columns: Mapping[str, np.ndarray]) -> None:
 
 
 class CsvColumns:
-    """Rows of CSV to columns, a part of a table at a time: a column is of dates if its first cell is one.
+    """Reads rows of CSV as columns, a part of a table at a time; a column is of dates if its first cell is one.
 
     Args:
         source: the name of the table, for errors.
@@ -243,27 +245,32 @@ class CsvColumns:
             raise fail(row.where, f"the columns {', '.join(self.header)}", ", ".join(row.header))
 
     def _read_numbers(self, row: CsvRow) -> list[float | int]:
-        """Return the number of each cell, nanoseconds of dates; of a column its first cell says what all are."""
-        dated = dict[str, bool]()
+        """Return the number of each cell, nanoseconds of dates, NaN or NAT of empty ones and of columns not read.
+
+        The first cell of a column that is not empty says whether all are dates; of a row that is refused none does.
+        """
+        newly_dated = dict[str, bool]()
         numbers: list[float | int] = []
         for name, cell in zip(row.header, row.cells, strict=True):
             if self._only is not None and name not in self._only:
                 numbers.append(np.nan)
                 continue
-            known = self._dated.get(name)
-            if (looks_like_date(cell) if known is None else known) and not self._is_missing(cell):
+            dated = self._dated.get(name)  # None: not known yet
+            if (looks_like_date(cell) if dated is None else dated) and not self._is_missing(cell):
                 numbers.append(self._read_moment(row, name, cell))
-                dated[name] = True
-            elif known:
+                newly_dated[name] = True
+            elif dated:
                 numbers.append(NAT)
             else:
                 numbers.append(parse_cell(row.where, name, cell, self.path))
-                dated |= {name: False} if cell else {}
-        self._dated |= dated
+                if cell:
+                    newly_dated[name] = False
+        self._dated |= newly_dated
         return numbers
 
     @staticmethod
     def _is_missing(cell: str) -> bool:
+        """Return whether a cell is empty, or says that there is no value."""
         return not cell or NO_VALUE.fullmatch(cell) is not None
 
     def _read_moment(self, row: CsvRow, name: str, cell: str) -> int:
@@ -298,7 +305,7 @@ def _read_csv(path: Path, only: Container[str] | None, strict: bool) -> "Rows":
 
 
 def _read_parquet(path: Path, only: Container[str] | None) -> Rows:
-    """Read a Parquet table: numbers by column (NaN where null), times in nanoseconds."""
+    """Return the rows of a Parquet file: numbers, NaN where null, and dates in nanoseconds."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -352,7 +359,8 @@ def _format_cells(column: np.ndarray) -> list[str]:
     text = msgspec.json.encode(values).decode().replace("]", ",")
     for digit in "6789":  # of an exponent Python writes two digits
         text = text.replace(f"e-{digit},", f"e-0{digit},")
-    differs = (size >= WITH_EXPONENT[0]) & (size < WITH_EXPONENT[1]) | ~(size < LARGE)
+    # JSON and Python write these differently: numbers in a range of exponents, large ones, NaN (`~ <`) and infinity.
+    differs = ((size >= WITH_EXPONENT[0]) & (size < WITH_EXPONENT[1])) | ~(size < LARGE)
     texts = text[1:-1].split(",")
     for row in np.flatnonzero(differs).tolist():
         texts[row] = repr(values[row])
@@ -365,9 +373,10 @@ def read_back_name(name: str) -> str:
 
 
 def _plain(column: np.ndarray) -> np.ndarray:
+    """Return dates as texts, and true and false as 1 and 0; other numbers as they are."""
     if column.dtype.kind == "M":
         return format_dates(column)
-    return column.astype(np.int64) if column.dtype == np.bool_ else column  # true is 1 in a CSV file
+    return column.astype(np.int64) if column.dtype == np.bool_ else column
 
 
 def _write_parquet(columns: Mapping[str, np.ndarray], path: Path) -> None:

@@ -16,7 +16,7 @@ MOST_OUT = 0.5  # share of the rows that may be out of order where each row is a
 
 
 class Cells(NamedTuple):
-    """Rows of time: their numbers from 1, times, measurements by node, inputs and true states by name."""
+    """Rows of time as columns: their numbers from 1, times, measurements by node, inputs and true states by name."""
 
     numbers: np.ndarray
     time: np.ndarray
@@ -25,7 +25,7 @@ class Cells(NamedTuple):
     truth: dict[str, np.ndarray]
 
     def of(self, good: np.ndarray) -> "Cells":
-        """Return some of the rows."""
+        """Return the rows of a mask, or of numbers."""
         parts = ({name: values[good] for name, values in part.items()} for part in self[2:])
         return Cells(self.numbers[good], self.time[good], *parts)
 
@@ -73,7 +73,13 @@ def order_rows(cells: Cells, network: Network, source: str) -> tuple[Cells, list
 
 
 class KeptRows(NamedTuple):
-    """Rows that a recording has: their numbers in the table, which row each is of, and whether it arrived itself."""
+    """Rows that a recording has, of which some may stand for rows that did not arrive.
+
+    Attributes:
+        numbers: their numbers in the table, from 1.
+        of: index of the row that was read from which each is taken: its own, or the one before it.
+        arrived: whether it was read itself.
+    """
 
     numbers: np.ndarray
     of: np.ndarray
@@ -87,18 +93,19 @@ class KeptRows(NamedTuple):
 
     def fill_times(self, time: np.ndarray) -> np.ndarray:
         """Return the times of these rows, those of rows that did not arrive at equal steps between the others."""
-        between = np.flatnonzero(~self.arrived)
+        missing = np.flatnonzero(~self.arrived)
         filled = np.array(time[self.of])
-        before, after = self.of[between], np.minimum(self.of[between] + 1, len(time) - 1)
-        known = self.numbers[self.arrived]
-        share = np.maximum(self.numbers[between] - known[before], 0) / np.maximum(known[after] - known[before], 1)
+        # t = t_before + share (t_after - t_before), between the rows that arrived before and after it.
+        before, after = self.of[missing], np.minimum(self.of[missing] + 1, len(time) - 1)
+        numbers = self.numbers[self.arrived]
+        share = np.maximum(self.numbers[missing] - numbers[before], 0) / np.maximum(numbers[after] - numbers[before], 1)
         moved = share * (time[after] - time[before]).astype(np.float64)
-        filled[between] += moved.astype("timedelta64[ns]" if time.dtype.kind == "M" else time.dtype)
+        filled[missing] += moved.astype("timedelta64[ns]" if time.dtype.kind == "M" else time.dtype)
         return filled
 
 
 def keep_rows(numbers: np.ndarray, network: Network) -> KeptRows:
-    """Return the rows of these numbers; where each row is a step also those between them, as the ones before."""
+    """Return the rows with these numbers; where each row is a step also those between them, as the row before each."""
     if TIME_STEP in network.inputs or not len(numbers):
         return KeptRows(numbers, np.arange(len(numbers)), np.ones(len(numbers), dtype=bool))
     steps = np.arange(1, numbers[-1] + 1)

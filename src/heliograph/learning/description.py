@@ -75,7 +75,10 @@ def free(start: ArrayLike, name: str | None = None, kind: Kind | None = None) ->
 
 
 class _Reader(Protocol):
-    def read(self, start: np.ndarray, name: str | None, kind: Kind | None) -> object: ...
+    """What answers the calls of `free` while a network is built."""
+
+    def read(self, start: np.ndarray, name: str | None, kind: Kind | None) -> object:
+        """Return what stands in the place of the free number."""
 
 
 # What `free` answers depends on who builds the network: nobody, one who asks what is free, or one who tries values.
@@ -83,7 +86,7 @@ _reader: ContextVar[_Reader | None] = ContextVar("reader of free numbers", defau
 
 
 @contextmanager
-def reading(reader: _Reader) -> Iterator[None]:
+def answering_free_by(reader: _Reader) -> Iterator[None]:
     """Have `free` answer as this reader does, inside the block."""
     token = _reader.set(reader)
     try:
@@ -93,7 +96,7 @@ def reading(reader: _Reader) -> Iterator[None]:
 
 
 class _Mark:
-    """Free number while it is being collected."""
+    """A free number while it is being collected: its start, name, and the domain that its places leave it."""
 
     def __init__(self, start: np.ndarray, name: str | None, kind: Kind | None):
         self.start, self.given, self.place = start, name, ""
@@ -101,7 +104,7 @@ class _Mark:
         self.explicit = kind is not None
 
     def report(self, name: str, domain: Domain) -> None:
-        """Narrow the domain to what a check of the number's place requires."""
+        """Note the number's place, and narrow its domain to what the check there requires."""
         self.place = self.place or name
         if self.explicit:
             return
@@ -113,8 +116,8 @@ class _Mark:
         self.domain = domain
 
 
-class Asking:
-    """Collector of what is free."""
+class FreeNumberCollector:
+    """Reader that collects the free numbers, each at its start; checks of their places report their domains."""
 
     def __init__(self) -> None:
         self.marks: list[_Mark] = []
@@ -132,20 +135,19 @@ class Asking:
         return mark_checked(start, self.marks[-1].report)
 
     def parameters(self) -> Parameters:
-        """Collect all marks as parameters; one without a name is called after its place."""
+        """Return all marks as parameters; one without a name is called after its place."""
         taken = {mark.given for mark in self.marks if mark.given is not None}
         results = []
         for mark in self.marks:
-            name = mark.given or _new(mark.place or "free number", taken)
+            name = mark.given or _make_distinct(mark.place or "free number", taken)
             taken.add(name)
             domain = REAL if mark.domain is None else mark.domain
-            parameter = Parameter(name, mark.start, domain)
-            map_to_line(name, domain, mark.start)
-            results.append(parameter)
+            map_to_line(name, domain, mark.start)  # raises at a start outside of the domain
+            results.append(Parameter(name, mark.start, domain))
         return Parameters(tuple(results))
 
 
-class Given:
+class ValueReader:
     """Reader that puts values in their places: by name, and in the order of the marks where no name was given."""
 
     def __init__(self, parameters: Parameters, named: tuple[bool, ...], values: Mapping[str, object]):
@@ -153,7 +155,7 @@ class Given:
         self.unnamed = iter([p.name for p, single in zip(parameters.every, named, strict=True) if not single])
 
     def read(self, start: np.ndarray, name: str | None, kind: Kind | None) -> object:
-        """Return the value."""
+        """Return the value of this name, or of the next number without a name."""
         key = next(self.unnamed, "") if name is None else name
         if key not in self.values:
             raise fail(
@@ -162,7 +164,8 @@ class Given:
         return self.values[key]
 
 
-def _new(name: str, taken: set[str]) -> str:
+def _make_distinct(name: str, taken: set[str]) -> str:
+    """Return a name, with a number behind it if it is taken."""
     if name not in taken:
         return name
     return next(f"{name} {i}" for i in range(2, 10_000) if f"{name} {i}" not in taken)
@@ -189,7 +192,7 @@ class Description:
         Raises:
             ValueError: operations on a free number that derivatives cannot pass, a function that returns no network.
         """
-        with reading(Given(self.parameters, self.named, values)), jax.enable_x64(True):
+        with answering_free_by(ValueReader(self.parameters, self.named, values)), jax.enable_x64(True):
             try:
                 return check_network(self.build())
             except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
@@ -224,15 +227,15 @@ def describe(network: Build) -> Description:
         signature(network).bind()
     except (TypeError, ValueError) as error:
         raise fail("network to be learned", "a function without arguments", str(error)) from None
-    asking = Asking()
-    with reading(asking), jax.enable_x64(True):
+    collector = FreeNumberCollector()
+    with answering_free_by(collector), jax.enable_x64(True):
         check_network(network())
-    if not asking.marks:
+    if not collector.marks:
         raise fail("network to be learned", "at least one number marked by hg.free(start)", "none")
-    parameters = asking.parameters()
-    return Description(network, parameters, tuple(mark.given is not None for mark in asking.marks))
+    parameters = collector.parameters()
+    return Description(network, parameters, tuple(mark.given is not None for mark in collector.marks))
 
 
 def check_network(network: object) -> Network:
-    """Check that a function returned a network, and return it."""
+    """Return what a function returned; raise ValueError if it is no network."""
     return instance("network to be learned", network, Network, "a function that returns a Network")

@@ -13,15 +13,15 @@ def describe_boundaries(best: Solution) -> list[str]:
 
 
 def describe_forms(solutions: tuple[Solution, ...]) -> list[str]:
-    """Sentences on numbers for which the two forms of the likelihood disagree by more than their errors explain."""
+    """Return sentences on numbers on which the two forms of the likelihood disagree beyond their errors."""
     if len(solutions) < 2:
         return []
     sentences = []
     for a, b in zip(*(solution.rows() for solution in solutions), strict=True):
-        size = abs(a.estimate - b.estimate) / max(a.standard_error, b.standard_error)
-        if np.isfinite(size) and size > APART:
+        distance = abs(a.estimate - b.estimate) / max(a.standard_error, b.standard_error)
+        if np.isfinite(distance) and distance > APART:
             sentences.append(
-                f"{a.name}: the two forms of the likelihood disagree by {size:.1f} standard errors "
+                f"{a.name}: the two forms of the likelihood disagree by {distance:.1f} standard errors "
                 f"({a.estimate:.4g} and {b.estimate:.4g}), so that the model is in doubt."
             )
     return sentences

@@ -27,7 +27,7 @@ from heliograph.numerics.types import ArrayLike, Float
 from heliograph.simulation.network import Network
 
 ELSEWHERE = 0.01  # of the log-likelihood: a start that ends so far below the best ended elsewhere
-IN_HASTE = "Errors by the expected information; `rows()` has intervals by the scores, and at the ends of domains."
+CHEAP_ERRORS = "Errors by the expected information; `rows()` has intervals by the scores, and at the ends of domains."
 
 Progress = TypeAliasType("Progress", Callable[[str], None])
 Rows = TypeAliasType("Rows", ArrayLike | Sequence[ArrayLike])  # of one recording, or a list of one for each
@@ -181,13 +181,14 @@ class Fit:
     @property
     def covariance(self) -> Float[np.ndarray, "entries entries"]:
         """Covariance of the estimates in the order of `rows()`, by cosines; NaN if not identified, or at a boundary."""
+        # Cov(v) = J Cov(x) J', of the coordinates x that are no ends of domains, with J = dv/dx.
         best = self.best
-        inner, _ = best.covariance()
-        turned = self.description.parameters.jacobian(best.x)[:, best.active]
-        rotated = turned @ inner @ turned.T
-        lost = np.array([row.boundary or not row.identified for row in best.rows()])
-        rotated[lost] = rotated[:, lost] = np.nan
-        return np.asarray(rotated)
+        of_coordinates, _ = best.covariance()
+        jacobian = self.description.parameters.jacobian(best.x)[:, best.active]
+        covariance = jacobian @ of_coordinates @ jacobian.T
+        unknown = np.array([row.boundary or not row.identified for row in best.rows()])
+        covariance[unknown] = covariance[:, unknown] = np.nan
+        return np.asarray(covariance)
 
     def to_arviz(self, draws: int = 500, seed: int = 0) -> Any:
         """Return draws of the numbers and the log-likelihood of each row, as ArviZ compares models by them.
@@ -220,17 +221,14 @@ class Fit:
         )
 
     def __str__(self) -> str:
-        """Return the estimates without more work: with intervals if `rows` were asked for, else standard errors."""
-        delays = [f"{node}: {found}" for node, found in self.delays.items()]
+        """Return the table of estimates: with intervals if `rows` computed them, else with cheap standard errors."""
+        delay_lines = [f"{node}: {found}" for node, found in self.delays.items()]
         if not self.best.has_rows:
-            return "\n".join([*self.best.describe_in_haste(), *delays, *self._sentences_at_once(), IN_HASTE])
+            sentences = (*_describe_climb(self), *self.identified.sentences)  # those that need no interval
+            return "\n".join([*self.best.describe_with_cheap_errors(), *delay_lines, *sentences, CHEAP_ERRORS])
         width = max(len(row.name) for row in self.table)
         lines = [f"{row.name:{width}}  {row.value:>10}  ({row.interval})  ({row.form})" for row in self.table]
-        return "\n".join([*lines, *delays, *self.sentences])
-
-    def _sentences_at_once(self) -> tuple[str, ...]:
-        """Return the sentences that need no interval."""
-        return (*_describe_climb(self), *self.identified.sentences)
+        return "\n".join([*lines, *delay_lines, *self.sentences])
 
 
 def fit(
@@ -300,7 +298,10 @@ def fit(
 def _search_forms(
     surfaces: list[Surface], points: np.ndarray, seed: int, ridges: int, progress: Progress
 ) -> tuple[list[Solution], Float[np.ndarray, " starts"], bool]:
-    """Search each form, from the best end of the one before: solutions, ends of the first, and whether it was stopped.
+    """Maximise each form, from the best end of the one before.
+
+    Returns:
+        The solutions, log-likelihoods at the ends of the first form's starts, and whether Ctrl-C stopped it.
 
     Raises:
         KeyboardInterrupt: before there was a first point.
@@ -325,7 +326,7 @@ def _search_forms(
 
 
 def _convert_tables(recording: Any) -> tuple[object, dict[str, Delays]]:
-    """Return the rows of tables of events, and the laws of their delays by node; other recordings are rows."""
+    """Return recordings with tables of events turned into rows, and the laws of their delays by node."""
     several = recording if isinstance(recording, list) else [recording]
     tables = [table for table in several if hasattr(table, "lateness")]
     if not tables:
@@ -351,7 +352,8 @@ def _choose_starts(surface: Surface, count: int, seed: int) -> Float[np.ndarray,
         step = int(np.argmax(~np.isfinite(surface.evaluate_rows(start[None]).density[0].sum(axis=0))))
         raise fail("start of the fit", "numbers under which the recording is possible",
                    f"a log-likelihood of {first.total[0]} from step {step} on")  # fmt: skip
-    # spread: of logarithms and logits a fixed one, of real numbers half their size or some standard errors
+    # Others are drawn uniformly around it: logarithms and logits within SPREAD, real numbers within half their size or
+    # AWAY standard errors, whichever is more.
     free, deviation = surface.domains.free, surface.standard_errors(start)
     far = np.maximum(np.abs(start) / 2, AWAY * np.where(np.isfinite(deviation), deviation, 0.0))
     drawn = rng.uniform(-1, 1, (count - 1, len(start))) * np.where(free, far, SPREAD)
@@ -361,23 +363,23 @@ def _choose_starts(surface: Surface, count: int, seed: int) -> Float[np.ndarray,
 
 
 def _check_dependence(surface: Surface, points: np.ndarray) -> None:
-    """Check that the likelihood depends on every free number somewhere."""
-    seen = np.nanmax(np.diagonal(surface.evaluations(points).information, axis1=1, axis2=2), axis=0)
+    """Raise ValueError at a free number of which the data have no information at any of the points."""
+    largest = np.nanmax(np.diagonal(surface.evaluations(points).information, axis1=1, axis2=2), axis=0)
     names = surface.objective.description.parameters.coordinates
-    lost = [name for name, size in zip(names, seen, strict=True) if not size > 0]
-    if lost:
-        raise fail(f"free number {lost[0]!r}", "one on which the measurements depend", "one on which nothing does")
+    without = [name for name, information in zip(names, largest, strict=True) if not information > 0]
+    if without:
+        raise fail(f"free number {without[0]!r}", "one on which the measurements depend", "one on which nothing does")
 
 
 def _report_climbs(surface: Surface, say: Progress) -> Callable[[Maximum], None]:
-    """Make the callback that says after each step how far the searches are."""
+    """Return what says after each step of a search how far it is."""
     form = surface.objective.form
 
-    def watch(now: Maximum) -> None:
+    def report(now: Maximum) -> None:
         best = np.nanmax(now.total)
         say(f"{form}: step {now.steps}, {int(now.converged.sum())} of {len(now.x)} starts done, {best:.6g}")
 
-    return watch
+    return report
 
 
 def _describe_climb(fitted: Fit) -> list[str]:
@@ -389,10 +391,10 @@ def _describe_climb(fitted: Fit) -> list[str]:
         if not solution.converged and not fitted.stopped:
             why = f"The {solution.form} form did not converge: {solution.top.reason}."
             sentences.append(f"{why} The estimates are the best point found.")
-    # the best end of a search itself is not lower than the best
+    # How far below the best each start ended (NaN: nowhere); those within ELSEWHERE ended at the same maximum.
     below = fitted.solutions[0].total - fitted.ends
     lower = np.count_nonzero(~(below < ELSEWHERE))
     if lower and not fitted.stopped:
-        lost = np.nanmin(np.where(below < ELSEWHERE, np.nan, below))
-        sentences.append(f"Best of {len(below)} starts, of which {lower} ended lower, by {lost:.3g} or more.")
+        least = np.nanmin(np.where(below < ELSEWHERE, np.nan, below))
+        sentences.append(f"Best of {len(below)} starts, of which {lower} ended lower, by {least:.3g} or more.")
     return sentences

@@ -89,20 +89,22 @@ class Uniformity:
 def compare_filters(
     before: Network, after: Network, measurements: dict[str, np.ndarray], inputs: np.ndarray, cut: int
 ) -> list[Change]:
-    """Compare every filter that claims a covariance, run over all rows and judged from row `cut` on."""
+    """Return how each filter that claims a covariance predicts the rows from `cut` on, before and after learning.
+
+    The filters run over all rows.
+    """
     results = []
     for name, z in measurements.items():
-        for key, old in before.nodes[name].filters.items():
-            if old.claim == "none" or not old.received:
+        for key, old_filter in before.nodes[name].filters.items():
+            if old_filter.claim == "none" or not old_filter.received:
                 continue
-            single, other = (_predict_rows(filter, z, inputs, cut) for filter in (old, after.nodes[name].filters[key]))
-            received = ~np.all(np.isnan(single.white), axis=1)
-            gain = (
-                compare_mean((other.log_likelihood - single.log_likelihood)[received])
-                if received.sum() >= LAGS
-                else None
-            )
-            results.append(Change(name, key, single, other, gain))
+            old = _predict_rows(old_filter, z, inputs, cut)
+            new = _predict_rows(after.nodes[name].filters[key], z, inputs, cut)
+            received = ~np.all(np.isnan(old.white), axis=1)
+            gain = None
+            if received.sum() >= LAGS:
+                gain = compare_mean((new.log_likelihood - old.log_likelihood)[received])
+            results.append(Change(name, key, old, new, gain))
     return results
 
 
@@ -136,11 +138,11 @@ def _transform_by_laws(network: Network, node: Node, z: np.ndarray, inputs: np.n
 
 
 def _predict_rows(filter: AbstractFilter, z: np.ndarray, u: np.ndarray, cut: int) -> Expected:
-    """Run a filter over all rows; return its predictions of those from `cut` on."""
+    """Return a filter's predictions of the rows from `cut` on; it runs over all rows."""
     likelihood, white = (np.asarray(values)[cut:] for values in score_innovations(filter, z, u))
     lags = min(LAGS, len(white) // 10)
-    enough = lags > 0 and np.count_nonzero(~np.isnan(white)) > LAGS
-    return Expected(likelihood, white, MemoryTest.of(white, lags, claimed=True) if enough else None)
+    has_enough = lags > 0 and np.count_nonzero(~np.isnan(white)) > LAGS
+    return Expected(likelihood, white, MemoryTest.of(white, lags, claimed=True) if has_enough else None)
 
 
 def compare_laws(a: Predictive, b: Predictive) -> Comparison:
@@ -167,7 +169,7 @@ def compare_laws(a: Predictive, b: Predictive) -> Comparison:
 
 
 def compare_mean(differences: Float[np.ndarray, " steps"]) -> Comparison:
-    """Test a mean difference (steps,) against zero."""
+    """Return the test of whether the mean of differences (steps,) is zero."""
     mean, error = mean_and_error(differences)
     z = mean / error if error > 0 else 0.0
     return Comparison(mean, error, float(z), float(2 * scipy.stats.norm.sf(abs(z))))

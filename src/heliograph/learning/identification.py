@@ -109,15 +109,14 @@ def identify_by_recording(surface: Surface, start: Float[np.ndarray, " p"], seed
 
 
 def _choose_points(start: np.ndarray, seed: int) -> list[np.ndarray]:
-    """Return three points at which to look: a start, and two drawn near it."""
+    """Return POINTS points drawn near a start, within AROUND, or less of coordinates that are small."""
     rng = np.random.default_rng([seed, 1])
-    return [
-        start + rng.uniform(-AROUND, AROUND, len(start)) * np.minimum(1.0, 0.2 + np.abs(start)) for _ in range(POINTS)
-    ]
+    reach = np.minimum(1.0, 0.2 + np.abs(start))
+    return [start + rng.uniform(-AROUND, AROUND, len(start)) * reach for _ in range(POINTS)]
 
 
 def _judge_identifiability(parameters: Parameters, points: list[np.ndarray], ranks: list[Rank]) -> Identifiability:
-    """Sum up ranks at several points: groups that the data do not separate, and sentences on them."""
+    """Return the identifiability by the ranks of the information at several points, with its sentences."""
     groups = tuple(find_confounded(parameters, points, ranks))
     ridges = min(rank.flat.shape[1] for rank in ranks)
     weakest = max(rank.weakest for rank in ranks)
@@ -145,38 +144,44 @@ def _describe_group(parameters: Parameters, group: Confounded, solution: "Soluti
     """Return one sentence on a group of confounded numbers: which sums or products of them the data do tell."""
     names = [parameters.coordinates[i] for i in group.places]
     fix = "fix one" if group.fix == 1 else f"fix {group.fix} of them"
-    # products or sums that are identified, each with its interval
-    left = len(names) - group.fix - len(group.exponents) - len(group.weights)
+    # Directions that are identified besides the products and sums that have a name.
+    unnamed = len(names) - group.fix - len(group.exponents) - len(group.weights)
     if group.fix == len(names):
         return f"Nothing in the data tells {_join_names(names)}."
-    outputs = [
-        *(
-            product_text(names, row) + _format_interval(parameters, group, row, solution, log=True)
-            for row in group.exponents
-        ),
-        *(
-            sum_text(names, row) + _format_interval(parameters, group, row, solution, log=False)
-            for row in group.weights
-        ),
-    ]
-    if not outputs:
-        return f"The data tell only {_count_in_words(left, 'combination')} of {_join_names(names)}; {fix}."
-    # one sentence: sum, product or combination, singular or plural
-    kind = "sum" if len(group.weights) else "product" if np.all(group.exponents >= 0) else "combination"
-    others = f" and {_count_in_words(left, 'other combination')}" if left else ""
-    verb = "is" if len(outputs) == 1 and not left else "are"
-    several = kind + ("s" if len(outputs) > 1 else "")
-    return f"Of {_join_names(names)} only the {several} {_join_names(outputs)}{others} {verb} identified; {fix}."
+    # Products x^a y^b and sums a x + b y that are identified, each with its interval.
+    combinations = []
+    for row in group.exponents:
+        combinations.append(product_text(names, row) + _format_interval(parameters, group, row, solution, log=True))
+    for row in group.weights:
+        combinations.append(sum_text(names, row) + _format_interval(parameters, group, row, solution, log=False))
+    if not combinations:
+        return f"The data tell only {_count_in_words(unnamed, 'combination')} of {_join_names(names)}; {fix}."
+    kind = "product" if np.all(group.exponents >= 0) else "combination"
+    if len(group.weights):
+        kind = "sum"
+    kind += "s" if len(combinations) > 1 else ""
+    others = f" and {_count_in_words(unnamed, 'other combination')}" if unnamed else ""
+    verb = "is" if len(combinations) == 1 and not unnamed else "are"
+    return f"Of {_join_names(names)} only the {kind} {_join_names(combinations)}{others} {verb} identified; {fix}."
 
 
 def _count_in_words(count: int, what: str) -> str:
+    """Return a count of something, "one" in words, with its plural."""
     return f"one {what}" if count == 1 else f"{count} {what}s"
 
 
 def _format_interval(
     parameters: Parameters, group: Confounded, row: np.ndarray, solution: "Solution | None", log: bool
 ) -> str:
-    """Return the interval in parentheses, (0.48, 95 % 0.44..0.53), of a product or a sum at a maximum."""
+    """Return the interval in parentheses, (0.48, 95 % 0.44..0.53), of a product or a sum at a maximum; "" if none.
+
+    Args:
+        parameters: the free numbers.
+        group: the group that it is of.
+        row: exponents of a product, or weights of a sum, by place in the group.
+        solution: the maximum; None where there is none yet.
+        log: whether it is a product, whose logarithm sum_i a_i log |v_i| is a sum.
+    """
     if solution is None or not all(solution.active[i] for i in group.places):
         return ""
     jacobian, values = parameters.jacobian(solution.x), parameters.entries_at(solution.x)
@@ -186,31 +191,34 @@ def _format_interval(
             weight = row[group.places.index(entry.coordinate)]
             slopes += weight * (slope / number if log else slope)
             value += weight * (np.log(abs(number)) if log else number)
+    # g' C g is the variance of a function with the gradient g.
     covariance, freedom = solution.covariance()
-    along = slopes[solution.active]
-    reach = quantile(freedom) * float(np.sqrt(max(along @ covariance @ along, 0.0)))
+    gradient = slopes[solution.active]
+    reach = quantile(freedom) * float(np.sqrt(max(gradient @ covariance @ gradient, 0.0)))
     middle, low, high = ((np.exp(v) if log else v) for v in (value, value - reach, value + reach))
     return f" ({middle:.3g}, 95 % {low:.3g}..{high:.3g})"
 
 
 def _join_names(names: list[str]) -> str:
+    """Return names with commas between them, and "and" before the last."""
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
 def _draw_data(objective: Objective, x: np.ndarray, u: np.ndarray, seed: int) -> Float[np.ndarray, "steps m"]:
-    """Draw data with the mean and covariance that the filter expects of them, Gaussian given those before."""
+    """Return measurements drawn as the filter at the point x expects them, Gaussian given those before them."""
     with jax.enable_x64(True):
         return np.asarray(_draw_expected(objective, x, u, jax.random.key(seed)))
 
 
 @quickly_compiled
 def _draw_expected(objective: Objective, x: Array, u: Array, key: jax.Array) -> jax.Array:
-    """Draw a recording from the filter itself: each z from N(E z, S) given those before it."""
+    """Return a recording drawn from the filter itself: each z from N(E z, S) given those before it."""
     filter = objective.filter(jnp.asarray(x))
 
     def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, jax.Array]:
         k, u_k, noise = row
         prior = filter.predict(state, u_k, k)
+        # The innovation of z = 0 is -E z, with covariance S.
         received = filter.correct(prior, jnp.zeros(filter.received), k)[1]
         z = cholesky(jnp.asarray(received.covariance)) @ noise - received.value
         return filter.correct(prior, z, k)[0], z
@@ -228,37 +236,38 @@ KINDS = ("mean gain", "gain variance", "noise")
 
 
 def describe_routes(solution: "Solution") -> list[str]:
-    """Sentences on the identified mean gain, gain variance and noise of each output, the sensor's noise included."""
+    """Return sentences on the identified mean gain, gain variance and noise of each output, the sensor's included."""
     description = solution.surface.objective.description
     _, sensor, channel = join_world(description.start)
     if isinstance(sensor, OverTime) or not _is_route_constant(sensor, channel):
         return []
 
-    def totals(x: Array) -> jax.Array:
+    def measure_at(x: Array) -> jax.Array:
+        """Return mean gain, gain variance and noise of each output at a point, (outputs, 3)."""
         _, sensor, channel = join_world(description.at(description.parameters.values(x)))
         return _measure_route(first(sensor), first(channel))
 
     with jax.enable_x64(True):
         x = jnp.asarray(solution.x)
-        values, slopes = np.asarray(totals(x)), np.asarray(jax.jacfwd(totals)(x))
-    # Intervals by the derivatives, for what is identified.
+        values, slopes = np.asarray(measure_at(x)), np.asarray(jax.jacfwd(measure_at)(x))
+    # Intervals by the derivatives g, of variance g' C g, for what is identified.
     covariance, freedom = solution.covariance()
     lines = []
-    for i, name in enumerate(sensor.outputs if len(sensor.outputs) == len(values) else range(len(values))):
-        report = [
-            f"{kind} {value:.3g} ({value - reach:.3g} .. {value + reach:.3g})"
-            for kind, value, row in zip(KINDS, values[i], slopes[i][:, solution.active], strict=True)
-            if solution.identifies(row)
-            for reach in [quantile(freedom) * float(np.sqrt(max(row @ covariance @ row, 0.0)))]
-        ]
-        if report:
-            label = name if isinstance(name, str) else f"z{name}"
-            lines.append(f"The received {label} has {', '.join(report)}, 95 %, the sensor's noise included.")
+    has_names = len(sensor.outputs) == len(values)
+    for i in range(len(values)):
+        found = []
+        for kind, value, gradient in zip(KINDS, values[i], slopes[i][:, solution.active], strict=True):
+            if solution.identifies(gradient):
+                reach = quantile(freedom) * float(np.sqrt(max(gradient @ covariance @ gradient, 0.0)))
+                found.append(f"{kind} {value:.3g} ({value - reach:.3g} .. {value + reach:.3g})")
+        if found:
+            name = sensor.outputs[i] if has_names else f"z{i}"
+            lines.append(f"The received {name} has {', '.join(found)}, 95 %, the sensor's noise included.")
     return lines
 
 
 def _is_route_constant(sensor: AbstractSensor, channel: Channel) -> bool:
-    """Decide whether a channel is the same at each step, and it and the sensor depend on no input and nothing past."""
+    """Return whether a channel is the same at each step, and it and the sensor depend on no inputs and no past."""
     return not (isinstance(channel, OverTime) or sensor.inputs or channel.remembers or channel.past)
 
 
@@ -272,7 +281,7 @@ def _measure_route(sensor: AbstractSensor, link: AbstractRandomAffine) -> jax.Ar
     spread = jnp.asarray(moments.nominal.center)
     whole = jnp.zeros((p + 1, p + 1)).at[:p, :p].set(r).at[p, p].set(1.0)
     noise = jnp.diagonal(mean @ r @ mean.T + contract(spread, whole))
-    # Of each output the gain of what it hears most.
-    reached = jnp.argmax(jnp.abs(mean), axis=1)
+    # Of each output the gain of the measured value that it has most of.
+    strongest = jnp.argmax(jnp.abs(mean), axis=1)
     rows = jnp.arange(len(mean))
-    return jnp.stack([mean[rows, reached], spread[rows, rows, reached, reached], noise], axis=1)
+    return jnp.stack([mean[rows, strongest], spread[rows, rows, strongest, strongest], noise], axis=1)

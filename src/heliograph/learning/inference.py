@@ -32,7 +32,7 @@ class FitTest(NamedTuple):
 
 
 def chi_square_test(statistic: float, freedom: int) -> FitTest:
-    """Return the test of a statistic.
+    """Return the test by a statistic that is chi-square with so many degrees of freedom where the statement is true.
 
     Args:
         statistic: the statistic.

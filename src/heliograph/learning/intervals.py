@@ -9,7 +9,7 @@ from heliograph.numerics.types import Bool, Float
 
 
 def long_run_deviation(values: Float[np.ndarray, " steps"]) -> float:
-    """Return the standard deviation of the sum over the root of the length, by Bartlett's weights."""
+    """Return sqrt(Var(sum of T values) / T) of a series (steps,), correlated over time, by Bartlett's weights."""
     total = bartlett([values[:, None] - values.mean()]).covariance
     return float(np.sqrt(max(total[0, 0], 0.0) / len(values)))
 
@@ -41,33 +41,36 @@ def count_cosines(steps: int) -> int:
 
 
 def find_told_by_few(information: list[Float[np.ndarray, "steps k"]]) -> Bool[np.ndarray, " k"]:
-    """Return the numbers (k,) whose information lies in a few of the nu stretches of the data.
+    """Return which numbers (k,) have their information in a few of the nu stretches of the data.
 
     (sum_b V_b)^2 / sum_b V_b^2, of V_b in stretch b, is the number of stretches if all tell the same, and 1 if one
     tells all. Scores vary over time only where they are told of: cosines that hardly change there see next to nothing.
     """
-    stretches = np.concatenate([
-        np.add.reduceat(rows, np.arange(count_cosines(len(rows))) * len(rows) // count_cosines(len(rows)), axis=0)
-        for rows in information
-    ])  # fmt: skip
-    stretches = np.maximum(stretches, 0.0)
+    by_stretch = []
+    for rows in information:
+        count = count_cosines(len(rows))
+        begins = np.arange(count) * len(rows) // count
+        by_stretch.append(np.add.reduceat(rows, begins, axis=0))
+    stretches = np.maximum(np.concatenate(by_stretch), 0.0)
     return np.asarray(stretches.sum(axis=0) ** 2 < FEW * len(stretches) * np.sum(stretches**2, axis=0))
 
 
 def covariance_by_model(
     scores: Scores, hessian: Float[np.ndarray, "p p"], few: Bool[np.ndarray, " p"]
 ) -> tuple[Scores, Float[np.ndarray, "p p"]]:
-    """Scores less what is foretold of them by those of a few numbers, and the covariance of that by the model.
+    """Return scores less what the scores of a few numbers K predict of them, and the covariance of that prediction.
 
-    s - H_.K H_KK^-1 s_K and H_.K H_KK^-1 H_K., of the numbers K: where the model is true the two are uncorrelated, and
-    the covariances of their sums add up to H.
+    s - H_.K H_KK^-1 s_K and H_.K H_KK^-1 H_K., with K the numbers of the mask `few`: where the model is true the two
+    parts are uncorrelated, and the covariances of their sums add up to H.
     """
     shares = np.linalg.solve(hessian[np.ix_(few, few)], hessian[few])
     return [s - s[:, few] @ shares for s in scores], hessian[:, few] @ shares
 
 
 def cosines(scores: Scores) -> LongRun:
-    """(T/nu) sum_j G_j G_j', G_j = sqrt(2/T) sum_t s_t cos(pi j (t + 1/2)/T), j = 1..nu, nu = floor(0.4 T^(2/3)).
+    """Return the long-run covariance (T/nu) sum_j G_j G_j' of scores, summed over series, with its degrees of freedom.
+
+    G_j = sqrt(2/T) sum_t s_t cos(pi j (t + 1/2)/T), j = 1..nu, nu = floor(0.4 T^(2/3)).
 
     Source: Müller, HAC corrections for strongly autocorrelated time series (2014); Lazarus, Lewis, Stock and Watson,
     HAR inference (2018).
@@ -84,7 +87,9 @@ def cosines(scores: Scores) -> LongRun:
 
 
 def bartlett(scores: Scores) -> LongRun:
-    """Return sum_|l| <= L (1 - |l|/(L + 1)) sum_t s_t s_(t-l)', L = ceil(4 (T/100)^(2/9)).
+    """Return the long-run covariance of scores with Bartlett's weights, summed over series.
+
+    sum_|l|<=L (1 - |l|/(L + 1)) sum_t s_t s_(t-l)', L = ceil(4 (T/100)^(2/9)).
 
     Source: Newey and West (1987).
     """
@@ -93,16 +98,16 @@ def bartlett(scores: Scores) -> LongRun:
         lags = int(np.ceil(4 * (len(s) / 100) ** (2 / 9)))
         products = [s[lag:].T @ s[: len(s) - lag] * (1 - lag / (lags + 1)) for lag in range(min(lags + 1, len(s)))]
         results.append(products[0] + sum(product + product.T for product in products[1:]))
-    return LongRun(np.sum(results, axis=0), np.inf)
+    return LongRun(np.sum(results, axis=0), freedom=np.inf)
 
 
 def white(scores: Scores) -> LongRun:
-    """Return sum_t s_t s_t'."""
-    return LongRun(np.sum([s.T @ s for s in scores], axis=0), np.inf)
+    """Return the covariance of the sum of scores that are uncorrelated over time, sum_t s_t s_t'."""
+    return LongRun(np.sum([s.T @ s for s in scores], axis=0), freedom=np.inf)
 
 
-def block_sums(scores: Scores, draws: int, seed: int) -> Float[np.ndarray, "draws p"]:
-    """Return the sums of scores over blocks drawn anew, of T^(1/3) times two steps each, about their mean.
+def draw_block_sums(scores: Scores, draws: int, seed: int) -> Float[np.ndarray, "draws p"]:
+    """Return sums of scores over blocks of 2 T^(1/3) steps drawn with replacement, less their mean, (draws, p).
 
     Source: Künsch (1989) for blocks; Hu and Kalbfleisch (2000) for drawing scores in place of data.
     """
@@ -111,10 +116,12 @@ def block_sums(scores: Scores, draws: int, seed: int) -> Float[np.ndarray, "draw
     for s in scores:
         length = min(max(int(np.ceil(2 * len(s) ** (1 / 3))), 1), len(s))
         running = np.concatenate([np.zeros((1, s.shape[1])), np.cumsum(s, axis=0)])
-        of_blocks = running[length:] - running[:-length]  # of each block
+        block_sums = running[length:] - running[:-length]  # of the block that begins at each step
+        # The series has `count` blocks, of which a whole number is drawn; the variance is scaled to all.
         count = len(s) / length
-        drawn = of_blocks[rng.integers(0, len(of_blocks), (draws, max(int(count), 1)))].sum(axis=1)
-        total += (drawn - max(int(count), 1) * of_blocks.mean(axis=0)) * np.sqrt(count / max(int(count), 1))
+        whole = max(int(count), 1)
+        drawn = block_sums[rng.integers(0, len(block_sums), (draws, whole))].sum(axis=1)
+        total += (drawn - whole * block_sums.mean(axis=0)) * np.sqrt(count / whole)
     return total
 
 
@@ -122,7 +129,7 @@ def long_run(method: Method, scores: Scores, hessian: Float[np.ndarray, "p p"]) 
     """Return the covariance of the sum of scores by a method."""
     match method:
         case "bootstrap":
-            return LongRun(np.atleast_2d(np.cov(block_sums(scores, DRAWS, 0).T)), np.inf)
+            return LongRun(np.atleast_2d(np.cov(draw_block_sums(scores, DRAWS, 0).T)), np.inf)
         case "cosines":
             return cosines(scores)
         case "bartlett":
@@ -138,11 +145,11 @@ def quantile(freedom: float, level: float = LEVEL) -> float:
 
 
 def allowed_fall(level: float) -> float:
-    """Nats by which the profile of a likelihood has fallen at the ends of an interval: half a chi-square's quantile."""
+    """Return by how many nats a profile likelihood is lower at the ends of an interval: half a chi-square quantile."""
     return float(scipy.stats.chi2.ppf(level, 1)) / 2
 
 
 def sandwich(hessian: Float[np.ndarray, "p p"], scores: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
-    """Return H^-1 J H^-1."""
+    """Return the covariance H^-1 J H^-1 of estimates, by the Hessian H and the covariance J of the sum of scores."""
     half = np.linalg.solve(hessian, scores)
     return np.asarray(np.linalg.solve(hessian, half.T))

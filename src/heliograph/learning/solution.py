@@ -209,7 +209,7 @@ class Solution:
         """True if the default table was computed."""
         return ("cosines", LEVEL) in self._tables
 
-    def describe_in_haste(self) -> list[str]:
+    def describe_with_cheap_errors(self) -> list[str]:
         """Return a line for each number: its estimate, and an interval by the expected information at the maximum."""
         active, values = self.active, self.parameters.entries_at(self.x)
         information = self.surface.evaluations(self.top.x[None]).information[0][np.ix_(active, active)]

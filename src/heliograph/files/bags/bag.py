@@ -42,7 +42,10 @@ def is_bag(path: Path) -> bool:
 
 
 def parts_of(path: Path) -> list[Path]:
-    """Return the bags in a folder in the order of their names; none where it is one bag of ROS 2, with its metadata."""
+    """Return the bag files in a folder in the order of their names; [] where it is one bag of ROS 2, or no folder.
+
+    A bag of ROS 2 is a folder with the file metadata.yaml.
+    """
     if not path.is_dir() or (path / "metadata.yaml").is_file():
         return []
     return sorted(file for file in path.iterdir() if file.suffix.lower() in BAGS)
@@ -155,7 +158,7 @@ def read_raw_messages(path: Path, reader: "AnyReader", topics: list[str]) -> Ite
         except Exception as error:
             after = f"after message {count} of its topics, logged at {moment(last)}" if count else "before any message"
             raise DamageError(str(fail(f"{path}, {after}", "a bag without damage", _format_reason(error)))) from None
-        # Of the type that its topic had before.
+        # A topic keeps the type that it has first.
         connection, last = message.connection, message.logged
         kind = connection.msgtype
         if types.setdefault(connection.topic, kind) != kind:
@@ -195,7 +198,17 @@ def _append_messages(
     table: EventTable,
     strict: bool,
 ) -> None:
-    """Append the events of messages one after another; what cannot be read is refused alone."""
+    """Append the events of messages one after another; what cannot be read is refused alone.
+
+    Args:
+        path: the bag, for errors.
+        reader: its reader.
+        sources: the sources.
+        batch: the messages.
+        done: how many messages of the sources' topics were read before.
+        table: where the events go.
+        strict: whether the first message that cannot be read is an error.
+    """
     for number, (connection, logged, data) in enumerate(batch, done + 1):
         topic, kind = connection.topic, connection.msgtype
         try:
@@ -232,17 +245,15 @@ def list_fields(reader: "AnyReader", kind: str, prefix: str = "", depth: int = 6
 
 
 def moment(nanoseconds: int) -> str:
-    """Put nanoseconds since 1970 into a date of ISO 8601."""
+    """Return nanoseconds since 1970 as a date of ISO 8601."""
     return f"{np.datetime64(nanoseconds, 'ns')}Z"
 
 
 def _check_types(path: Path, reader: "AnyReader", sources: Sources) -> None:
-    """Check before reading that each mapped field is in its topic's type, as far as the bag says."""
-    # Paths that the sources need of each topic, against the fields of its type.
+    """Raise ValueError, before anything is read, at a mapped field that the type of its topic does not have."""
     for connection in reader.connections:
         fields = dict(list_fields(reader, connection.msgtype))
         needed = [path_ for source, *_ in sources.of(connection.topic) for path_ in source.fields if path_]
-        # What is needed is a field, a message with fields, or in a list.
         if needed and not fields:
             what = f"{path}, {connection.topic}"
             raise fail(what, "a message type that the bag defines", f"{connection.msgtype!r}, which it does not")
@@ -256,7 +267,7 @@ def _check_types(path: Path, reader: "AnyReader", sources: Sources) -> None:
 
 
 def _has_field(fields: dict[str, str], path: str) -> bool:
-    """Return whether a path is a field, a stamp or another message, or in a list."""
+    """Return whether a path is a field, a message with fields (such as a stamp), or something in a list."""
     lists = [name for name, kind in fields.items() if kind == "list"]
     return any(name == path or name.startswith(f"{path}.") for name in fields) or any(
         path.startswith(f"{name}.") for name in lists
@@ -264,20 +275,23 @@ def _has_field(fields: dict[str, str], path: str) -> bool:
 
 
 def _format_reason(error: Exception) -> str:
+    """Return why something cannot be read, on one line without a full stop."""
     return " ".join(show_error(error).split()).rstrip(".")
 
 
 def _join_names(names: "list[str] | Counter[str]", most: int = LISTED) -> str:
+    """Return the first `most` names, and how many more there are."""
     names = list(names)
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def _join_counts(counts: dict[str, int]) -> str:
+    """Return topics, each with its count in brackets."""
     return _join_names([f"{topic} ({count})" for topic, count in counts.items()])
 
 
 def is_cut(path: Path) -> bool:
-    """Return whether a file begins as MCAP and does not end so."""
+    """Return whether a file begins as MCAP and does not end as MCAP does: it was cut off."""
     if not path.is_file() or path.stat().st_size < 2 * len(MAGIC):
         return False
     with path.open("rb") as file:
@@ -287,7 +301,7 @@ def is_cut(path: Path) -> bool:
 
 
 def measure_whole_records(path: Path) -> int:
-    """Return the number of bytes up to the end of the last record of data that is whole."""
+    """Return the number of bytes of an MCAP file up to the end of its last whole record of data."""
     size, end = path.stat().st_size, len(MAGIC)
     with path.open("rb") as file:
         while end + 9 <= size:
@@ -301,7 +315,7 @@ def measure_whole_records(path: Path) -> int:
 
 @contextmanager
 def copy_whole_part(path: Path) -> Iterator[tuple[Path, int]]:
-    """Yield a temporary copy of what is whole, ended as a file of MCAP ends, and its number of bytes of data."""
+    """Yield a temporary copy of the whole records of an MCAP file, with an end, and the bytes of data in it."""
     end = measure_whole_records(path)
     with TemporaryDirectory() as folder:
         copy = Path(folder) / path.name

@@ -14,7 +14,10 @@ if TYPE_CHECKING:  # an extra
     from rosbags.interfaces import Connection
     from rosbags.rosbag2.storage_mcap import ChunkInfo, McapReader
 
-MESSAGE, LENGTH, CRC = 0x05, 9, 24  # a record's kind; bytes before its content; where a chunk has its checksum
+MESSAGE = 0x05  # kind of a record
+LENGTH = 9  # bytes of a record before its content: kind and length
+CRC = 24  # bytes of a chunk's content before its checksum: first and last time, size
+FIXED = 40  # bytes of a chunk's content before its messages, but for the name of the compression
 HEADER = struct.Struct("<QHIQQ")  # of a message: its length, channel, count, times of logging and publishing
 SIZE, CHECKSUM = struct.Struct("<Q"), struct.Struct("<I")
 
@@ -28,7 +31,7 @@ def read_messages_in_order(reader: "AnyReader", connections: "Sequence[Connectio
     """
     from rosbags.rosbag2.storage_mcap import McapReader
 
-    # What is not all MCAP files with chunks, rosbags reads itself.
+    # Anything but MCAP files with chunks is read by rosbags itself.
     bag: Any = getattr(reader.readers[0], "storage", None) if len(reader.readers) == 1 else None
     files = [bag] if isinstance(bag, McapReader) else getattr(bag, "storages", [])
     indexed = files and all(isinstance(file, McapReader) and file.chunks for file in files)
@@ -46,16 +49,17 @@ def read_messages_in_order(reader: "AnyReader", connections: "Sequence[Connectio
 def _merge_chunks(
     storage: "McapReader", chunks: "Sequence[ChunkInfo]", channels: "Mapping[int, Connection]"
 ) -> Iterator[RawMessage]:
-    """Yield the messages of chunks, which may overlap in time: what a later one may precede waits for it.
+    """Yield the messages of chunks in the order of their times, although chunks may overlap in time.
 
-    Of messages of one time the first in the file comes first.
+    A message waits while a later chunk may hold an earlier one. Of messages of one time the first in the file comes
+    first.
     """
     starts = [chunk.message_start_time for chunk in chunks]
-    least = [*accumulate(reversed(starts), min)][::-1]  # of a chunk and all after it
+    earliest = [*accumulate(reversed(starts), min)][::-1]  # the earliest time of each chunk and all after it
     waiting: list[RawMessage] = []
-    for chunk, after in zip(chunks, [*least[1:], None], strict=True):
+    for chunk, next_start in zip(chunks, [*earliest[1:], None], strict=True):
         waiting = sorted([*waiting, *_read_chunk(storage, chunk, channels)], key=attrgetter("logged"))
-        end = len(waiting) if after is None else bisect_left(waiting, after, key=attrgetter("logged"))
+        end = len(waiting) if next_start is None else bisect_left(waiting, next_start, key=attrgetter("logged"))
         yield from waiting[:end]
         waiting = waiting[end:]
 
@@ -70,12 +74,12 @@ def _read_chunk(
     """
     from rosbags.rosbag2.storage_mcap import decompress
 
-    # Its content, whose checksum is compared.
+    # Its content, whose checksum `decompress` compares.
     stream, at = storage.bio, chunk.chunk_start_offset + LENGTH
     assert stream is not None
     stream.seek(at + CRC)
     (checksum,) = CHECKSUM.unpack(stream.read(CHECKSUM.size))
-    stream.seek(at + 40 + len(chunk.compression))
+    stream.seek(at + FIXED + len(chunk.compression))
     content = decompress(stream.read(chunk.compressed_size), chunk.compression, chunk.uncompressed_size, checksum)
     # Record after record.
     begin, end = 0, len(content)

@@ -26,7 +26,7 @@ OTHERS = {"protobuf", "flatbuffer", "cbor", "msgpack"}  # encodings of MCAP's re
 
 
 class Channel(NamedTuple):
-    """Topic of a channel, and how its messages are encoded."""
+    """A channel of an MCAP file: its topic, and how its messages are encoded."""
 
     topic: str
     encoding: str
@@ -43,7 +43,7 @@ def holds_json(path: Path) -> bool:
     try:
         with path.open("rb") as file:
             channels = _find_channels(file)
-    except Exception:  # damage, which the reader of the file says
+    except Exception:  # damage, which whoever reads the file reports
         return False
     encodings = {channel.encoding for channel in channels}
     if encodings and encodings <= OTHERS:
@@ -52,7 +52,9 @@ def holds_json(path: Path) -> bool:
 
 
 def read_json_messages(path: Path, sources: Sources | None = None) -> Iterator[FileMessage | InputError]:
-    """Yield the messages of an MCAP file in its order, each with the moment when it was logged; of others no content.
+    """Yield the messages of an MCAP file in its order, each with the moment when it was logged.
+
+    Messages that are not in JSON have no content.
 
     Where the file is damaged or cut off the last is a `CutOffError`.
 
@@ -112,7 +114,7 @@ def _find_channels(file: BinaryIO) -> list[Channel]:
 
 
 def _read_records(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
-    """Yield kind and content of each record up to the end of the data or of the summary, those in chunks too.
+    """Yield kind and content of each record up to the end of the data or the summary; records of chunks by themselves.
 
     Raises:
         DamageError: a record that is longer than what is left.
@@ -145,7 +147,7 @@ def _read_channel(content: bytes) -> tuple[int, Channel]:
 
 
 def _read_text(content: bytes, at: int) -> tuple[str, int]:
-    """Return a text that begins with its length, and where it ends."""
+    """Return the text at a place, where its length stands before it, and the place where it ends."""
     (size,) = LENGTH.unpack_from(content, at)
     begin = at + LENGTH.size
     return content[begin : begin + size].decode(), begin + size

@@ -33,7 +33,7 @@ class RawMessage(NamedTuple):
 
 
 class LayoutError(Exception):
-    """A message that is not of fixed places, or one that cannot be read: it is decoded alone, which says why."""
+    """A message whose fields cannot be read by fixed places: it is decoded alone, which says why if it fails."""
 
 
 class Layout:
@@ -55,7 +55,7 @@ class Layout:
         self._definitions, self._data, self._paths = definitions, data, paths
         self.lengths, self.fields = dict[int, int](), dict[str, tuple[int, str]]()
         self._read_length(0)
-        end = self._message(4, kind, "")
+        end = self._place_message(4, kind, "")
         if self.lengths[0] != HEAD or not 0 <= len(data) - end < 4 or paths != self.fields.keys():
             raise LayoutError  # a message is filled up to four bytes at most
 
@@ -70,8 +70,11 @@ class Layout:
         """Return each wanted field of messages of this layout, (messages,)."""
         return {path: _column(table, begin, kind) for path, (begin, kind) in self.fields.items()}
 
-    def _message(self, begin: int, kind: str, prefix: str) -> int:
-        """Pass over a message from byte `begin` on; return where it ends, as all of these do."""
+    def _place_message(self, begin: int, kind: str, prefix: str) -> int:
+        """Note where the wanted numbers of a message stand that begins at byte `begin`; return where it ends.
+
+        `prefix`: path of the message in the whole one, with a dot; "" for that itself.
+        """
         for name, (node, of) in self._definitions[kind][1]:
             begin = self._place_field(begin, str(node.name), of, prefix + name)
         return begin
@@ -80,28 +83,27 @@ class Layout:
         """Note where the wanted numbers of one field stand in a message's bytes; return where the next field begins."""
         # Parts, texts and single numbers.
         if node == "NAME":
-            return self._message(begin, of, f"{path}.")
+            return self._place_message(begin, of, f"{path}.")
         if node == "BASE" and of[0] == "string":
             begin = _align(begin, 4)
             return begin + 4 + self._read_length(begin)
         if node == "BASE":
-            return self._place_numbers(begin, of[0], 1, path, [path])
+            return self._place_numbers(begin, of[0], 1, [path])
         # Lists, of numbers or of anything else.
         (inner_node, inner), count = of
         if node == "SEQUENCE":
             begin = _align(begin, 4)
             count, begin = self._read_length(begin), begin + 4
         if inner_node.name == "BASE" and inner[0] in NUMBERS:
-            near = any(name.startswith(f"{path}.") for name in self._paths)
-            return self._place_numbers(
-                begin, inner[0], count, path, [f"{path}.{i}" for i in range(count if near else 0)]
-            )
+            is_wanted = any(name.startswith(f"{path}.") for name in self._paths)
+            names = [f"{path}.{i}" for i in range(count)] if is_wanted else []
+            return self._place_numbers(begin, inner[0], count, names)
         for i in range(count):
             begin = self._place_field(begin, inner_node.name, inner, f"{path}.{i}")
         return begin
 
-    def _place_numbers(self, begin: int, kind: str, count: int, path: str, names: list[str]) -> int:
-        """Note where the wanted ones of `count` numbers in a row stand; return the byte behind the last."""
+    def _place_numbers(self, begin: int, kind: str, count: int, names: list[str]) -> int:
+        """Note where the wanted ones of `count` numbers in a row stand, by `names`; return the byte behind the last."""
         size = NUMBERS.get(kind)
         if size is None:
             raise LayoutError
@@ -112,7 +114,7 @@ class Layout:
         return begin + count * size
 
     def _read_length(self, begin: int) -> int:
-        """Return the length that stands at this byte, of the messages that the layout describes."""
+        """Return the length that stands at this byte, and note it: messages of the layout all have it there."""
         length = int.from_bytes(self._data[begin : begin + 4], "little")
         self.lengths[begin] = length
         if len(self.lengths) > MOST_LENGTHS or (begin and begin + 4 + length > len(self._data)):
@@ -121,7 +123,7 @@ class Layout:
 
 
 class Decoder:
-    """Decoder of messages of mapped topics, many at once: values, stamps and counts as arrays.
+    """Decodes messages of mapped topics, many at once: values, stamps and counts as arrays.
 
     Args:
         reader: the bag.
@@ -138,7 +140,7 @@ class Decoder:
         What `Sources.read` says of a message at a time is what it gives: the same numbers, in the same order.
         """
         try:
-            readings = self._yield_readings(batch)
+            readings = self._read_by_node(batch)
         except LayoutError:
             return False
         for node, parts in readings.items():
@@ -152,8 +154,12 @@ class Decoder:
             table.add_many(node, logged, time, sequence, values, parts[-1].period)
         return True
 
-    def _yield_readings(self, batch: Sequence[RawMessage]) -> "dict[str, list[Readings]]":
-        """Return the readings of each node, from the messages of one topic and size after another."""
+    def _read_by_node(self, batch: Sequence[RawMessage]) -> "dict[str, list[Readings]]":
+        """Return the readings of each node, a block for the messages of one topic, size and layout.
+
+        Raises:
+            LayoutError: messages that need a look at each.
+        """
         if not self._little:
             raise LayoutError
         groups, results = defaultdict[tuple[str, int], list[int]](list), defaultdict[str, list[Readings]](list)
@@ -165,17 +171,21 @@ class Decoder:
             table = np.frombuffer(b"".join(batch[i].data for i in numbers), dtype=np.uint8).reshape(len(numbers), -1)
             for rows, columns in self._iterate_layouts(batch[numbers[0]].connection, table):
                 for source, _, places in self._sources.of(topic):
-                    ((node, at),) = places.items()
-                    read = _convert_columns(
-                        np.array(numbers)[rows], columns, source, at, len(self._sources.names[node])
-                    )
-                    results[node].append(read)
+                    # The node and the places of its values, of which there is one: `_list_paths` refuses others.
+                    ((node, outputs),) = places.items()
+                    size = len(self._sources.names[node])
+                    results[node].append(_convert_columns(np.array(numbers)[rows], columns, source, outputs, size))
         return results
 
     def _iterate_layouts(
         self, connection: "Connection", table: np.ndarray
     ) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
-        """Yield the rows of messages of one topic and size that have one layout, and the wanted fields of these."""
+        """Yield the rows that have one layout, and their wanted fields by path, until all messages are covered.
+
+        Args:
+            connection: topic and type of the messages.
+            table: the messages, all of one size, (messages, bytes).
+        """
         known = self._layouts[connection.topic, table.shape[1]]
         left, index = np.arange(len(table)), 0
         while len(left):
@@ -210,21 +220,28 @@ def _list_paths(source: Source) -> list[str]:
 
 
 def _parts(path: str | Computed) -> tuple[str, ...]:
+    """Return the paths of the numbers of which a value is computed; that of the value itself if it is not."""
     return (path,) if isinstance(path, str) else path.parts
 
 
 def _convert_columns(
-    rows: np.ndarray, columns: dict[str, np.ndarray], source: Source, places: np.ndarray, outputs: int
+    rows: np.ndarray, columns: dict[str, np.ndarray], source: Source, places: np.ndarray, size: int
 ) -> Readings:
-    """Convert the fields of many messages of one source to readings: times, counts and values by output.
+    """Return the readings of one source from the fields of many messages.
 
+    Args:
+        rows: numbers of the messages, (messages,).
+        columns: their fields by path, (messages,) each.
+        source: the source.
+        places: place of each of its values among those that its node receives.
+        size: how many values the node receives.
 
-    Raises LayoutError where a stamp, a count or what a value is computed of is none, which reading message by message
-    then names.
+    Raises:
+        LayoutError: a stamp, a count or part of a value that is none, which reading message by message then names.
     """
-    none = np.full(len(rows), -1, dtype=np.int64)
+    uncounted = np.full(len(rows), -1, dtype=np.int64)
     time = np.full(len(rows), NONE)
-    values = np.full((len(rows), outputs), np.nan)
+    values = np.full((len(rows), size), np.nan)
     for column, path, scale, offset in zip(places, source.paths, source.scale, source.offset, strict=True):
         numbers = [columns[part].astype(np.float64) for part in _parts(path)]
         parts = [np.where(np.isfinite(n), n, np.nan) for n in numbers]
@@ -240,7 +257,7 @@ def _convert_columns(
         if seconds.dtype.itemsize > 4 or np.any(time == 0):
             raise LayoutError
         time += source.time.shift
-    sequence = none if source.sequence is None else columns[source.sequence.path]
+    sequence = uncounted if source.sequence is None else columns[source.sequence.path]
     if sequence.dtype.kind not in "iu" or (source.sequence is not None and np.any(sequence.astype(np.int64) < 0)):
         raise LayoutError
     period = 0 if source.sequence is None else source.sequence.period
@@ -248,6 +265,7 @@ def _convert_columns(
 
 
 def _column(table: np.ndarray, begin: int, kind: str) -> np.ndarray:
+    """Return the number of a kind at byte `begin` of each message of a table of bytes, (messages,)."""
     column = np.ascontiguousarray(table[:, begin : begin + NUMBERS[kind]])
     return column.view(np.dtype(kind).newbyteorder("<"))[:, 0]
 

@@ -12,7 +12,7 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.disk.whole_file import check_output, whole_file
-from heliograph.model.estimate import Claim, Estimate, is_sound
+from heliograph.model.estimate import Claim, is_sound
 from heliograph.numerics.check import fail, instance, text
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Float
@@ -22,7 +22,7 @@ AXES = ("x", "y", "z", "roll", "pitch", "yaw")  # rows of the covariance of a po
 UNKNOWN = -1.0  # first entry of a covariance that is not known, as messages of ROS have it
 ODOMETRY, NUMBER = "nav_msgs/msg/Odometry", "std_msgs/msg/Float64"
 
-State = TypeAliasType("State", str | None)  # of a state of the plant, if it is there
+State = TypeAliasType("State", str | None)  # name of a state of the plant; None if the plant has no such state
 
 
 @readable
@@ -63,7 +63,7 @@ class Pose:
                 text(f"pose, {name}", value)
 
     def places(self, states: tuple[str, ...]) -> tuple[list[int | None], list[int | None]]:
-        """Return for each axis the place of its state, None if it has none: of the pose, and of the twist.
+        """Return for each axis of the pose, and of the twist, the index of its state; None where it has none.
 
         Raises:
             ValueError: an unknown state.
@@ -127,6 +127,7 @@ def write_bag(record: Record, path: str | Path, origin: np.datetime64 | None = N
 
 
 def _load_types() -> Any:
+    """Return the types of ROS 2 Humble's messages."""
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS2_HUMBLE)
@@ -160,17 +161,12 @@ def _yield_messages(record: Record, times: list[int], pose: Pose, types: Any) ->
     # Estimates as arrays, once for all rows.
     number, places = types[NUMBER], pose.places(record.states)
     moves = any(state is not None for axes in places for state in axes)
-    parts = [
-        (
-            f"/{_make_topic_word(node)}/{_make_topic_word(name)}",
-            np.asarray(e.mean),
-            np.asarray(e.covariance),
-            _claims(e),
-            is_sound(e),
-        )
-        for node, filters in record.estimates.items()
-        for name, e in filters.items()
-    ]
+    parts = []
+    for node, filters in record.estimates.items():
+        for name, estimate in filters.items():
+            prefix = f"/{_make_topic_word(node)}/{_make_topic_word(name)}"
+            mean, covariance = np.asarray(estimate.mean), np.asarray(estimate.covariance)
+            parts.append((prefix, mean, covariance, np.asarray(estimate.claims), is_sound(estimate)))
     # Row by row, in order of time.
     for k, stamp in enumerate(times):
         for prefix, mean, covariance, claims, sound in parts:
@@ -180,17 +176,10 @@ def _yield_messages(record: Record, times: list[int], pose: Pose, types: Any) ->
                 bound = None if claims[k] == "none" else covariance[k]
                 yield stamp, f"{prefix}/odometry", _make_odometry(stamp, mean[k], bound, places, pose, types)
             for i, state in enumerate(record.states):
-                yield stamp, f"{prefix}/{_make_topic_word(state)}", number(float(mean[k, i]))
+                topic = f"{prefix}/{_make_topic_word(state)}"
+                yield stamp, topic, number(float(mean[k, i]))
                 if claims[k] != "none":
-                    yield (
-                        stamp,
-                        f"{prefix}/{_make_topic_word(state)}/sd",
-                        number(float(np.sqrt(max(covariance[k, i, i], 0.0)))),
-                    )
-
-
-def _claims(estimate: Estimate) -> np.ndarray:
-    return np.asarray(estimate.claims)
+                    yield stamp, f"{topic}/sd", number(float(np.sqrt(max(covariance[k, i, i], 0.0))))
 
 
 def _make_odometry(
@@ -201,7 +190,16 @@ def _make_odometry(
     pose: Pose,
     types: Any,
 ) -> object:
-    """Return an odometry message; `covariance` is None where none is claimed."""
+    """Return an odometry message.
+
+    Args:
+        stamp: its time in nanoseconds since 1970.
+        mean: mean of the states.
+        covariance: their covariance; None where none is claimed.
+        places: indices of the states of pose and twist, as `Pose.places` returns them.
+        pose: names of the frames.
+        types: classes of messages by the names of their types.
+    """
     geometry = "geometry_msgs/msg/"
     vector, header = types[f"{geometry}Vector3"], types["std_msgs/msg/Header"]
     (position, bound), (velocity, twist_bound) = (_select_pose(mean, covariance, states) for states in places)
@@ -219,15 +217,15 @@ def _make_odometry(
 def _select_pose(
     mean: Float[np.ndarray, " n"], covariance: Float[np.ndarray, "n n"] | None, places: list[int | None]
 ) -> tuple[list[float], Float[np.ndarray, " 36"]]:
-    """Return the six numbers of pose or twist, and their covariance, row by row."""
+    """Return the six numbers of pose or twist, and their covariance (36,), row by row; `places`: states by axis."""
     numbers = [0.0 if state is None else float(mean[state]) for state in places]
     bound = np.zeros((6, 6))
-    named = [(axis, state) for axis, state in enumerate(places) if state is not None]
+    pairs = [(axis, state) for axis, state in enumerate(places) if state is not None]
     if covariance is None:
         bound[0, 0] = UNKNOWN
-    elif named:
-        there, states = np.array(named).T
-        bound[np.ix_(there, there)] = covariance[np.ix_(states, states)]
+    elif pairs:
+        axes, states = np.array(pairs).T
+        bound[np.ix_(axes, axes)] = covariance[np.ix_(states, states)]
     return numbers, bound.ravel()
 
 

@@ -27,16 +27,18 @@ def forecast_columns(record: Record, forecasts: ByFilter, predicted: ByFilter | 
     What each sensor would measure stands in the columns forecast.OUTPUT and forecast.OUTPUT.sd, named after node and
     filter as the states are; NaN in rows of data. What was `predicted` of those is NaN in rows of forecasts.
     """
-    one = next(forecast for filters in forecasts.values() for forecast in filters.values())
+    # All forecasts have the same times.
+    times = next(forecast for filters in forecasts.values() for forecast in filters.values()).time
     estimates = {
         node: {name: Estimate(f.states.mean, f.states.covariance, f.states.claim) for name, f in filters.items()}
         for node, filters in forecasts.items()
     }
     above = estimate_columns(record, predicted)
-    below = estimate_columns(replace(record, time=one.time, truth=None, estimates=estimates, smoothed=None))
-    columns = {name: _append_rows(values, below.get(name), len(one.time)) for name, values in above.items()}
-    ahead = np.arange(len(record.time) + len(one.time)) >= len(record.time)
-    columns = {"time": columns.pop("time"), FORECAST: ahead, **columns}
+    below = estimate_columns(replace(record, time=times, truth=None, estimates=estimates, smoothed=None))
+    columns = {name: _append_rows(values, below.get(name), len(times)) for name, values in above.items()}
+    is_forecast = np.arange(len(record.time) + len(times)) >= len(record.time)
+    columns = {"time": columns.pop("time"), FORECAST: is_forecast, **columns}
+    # Node and filter are part of a name where there are several of them.
     several = len(forecasts) > 1, any(len(filters) > 1 for filters in forecasts.values())
     for node, filters in forecasts.items():
         for name, forecast in filters.items():
@@ -70,7 +72,7 @@ def write_forecast(record: Record, forecasts: ByFilter, path: str | Path, predic
 
 
 def _append_rows(above: np.ndarray, below: np.ndarray | None, rows: int) -> np.ndarray:
-    """Put rows below a column; of one that has none they are NaN, or false."""
+    """Return a column with `rows` more values: those `below`, or where it has none NaN, or false."""
     if below is None:
         below = np.full(rows, np.nan if above.dtype.kind == "f" else False)
     return np.concatenate([above, below.astype(above.dtype)])

@@ -23,18 +23,19 @@ Predicted = Mapping[str, "Mapping[str, heliograph.forecasting.Forecast]"]  # by 
 def estimate_columns(record: Record, predicted: Predicted | None = None) -> dict[str, np.ndarray]:
     """Return the estimates of a recording as columns, with what was predicted of each row where it is given."""
     columns = [(TIME, record.time)]
+    # Node and filter are part of a name where there are several of them.
     several = len(record.estimates) > 1, any(len(filters) > 1 for filters in record.estimates.values())
     for node, filters in record.estimates.items():
         for name, estimate in filters.items():
             prefix = "".join(f"{label}." for label, used in zip((node, name), several, strict=True) if used)
             columns += [(prefix + key, values) for key, values in _make_columns(record.states, record.units, estimate)]
-            later = {} if record.smoothed is None else record.smoothed.estimates.get(node, {})
-            if name in later:
-                known = _make_columns(record.states, record.units, later[name])
-                columns += [(f"{prefix}smoothed.{key}", _pad_start(values, len(record.time))) for key, values in known]
+            smoothed = {} if record.smoothed is None else record.smoothed.estimates.get(node, {})
+            if name in smoothed:  # which may cover the last rows alone
+                parts = _make_columns(record.states, record.units, smoothed[name])
+                columns += [(f"{prefix}smoothed.{key}", _pad_start(values, len(record.time))) for key, values in parts]
             if predicted is not None and name in predicted.get(node, {}):
-                known = _make_predicted_columns(predicted[node][name], record)
-                columns += [(f"{prefix}predicted.{key}", values) for key, values in known]
+                parts = _make_predicted_columns(predicted[node][name], record)
+                columns += [(f"{prefix}predicted.{key}", values) for key, values in parts]
     twice = [name for name, count in Counter(name for name, _ in columns).items() if count > 1]
     if twice:
         raise fail("columns of the estimates", "distinct names", f"{twice[0]!r} more than once")
@@ -115,6 +116,6 @@ def _make_predicted_columns(
 
 
 def _pad_start(values: np.ndarray, rows: int) -> np.ndarray:
-    """Extend a column at its start by NaN, or false, to a number of rows."""
-    none = np.full(rows - len(values), np.nan if values.dtype.kind == "f" else False)
-    return np.concatenate([none.astype(values.dtype), values])
+    """Return a column extended at its start by NaN, or false, to a number of rows."""
+    padding = np.full(rows - len(values), np.nan if values.dtype.kind == "f" else False)
+    return np.concatenate([padding.astype(values.dtype), values])

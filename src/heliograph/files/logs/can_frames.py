@@ -59,7 +59,7 @@ def read_database(path: Path) -> Database:
 
 
 class FrameReader:
-    """Frames to messages; counts what is left out.
+    """Reads frames as messages, and counts what is left out.
 
     Args:
         path: the log.
@@ -71,10 +71,12 @@ class FrameReader:
 
     def __init__(self, path: Path, sources: LogSources, database: Database, wanted: Wanted, notes: list[str]):
         self._path, self._sources, self._database, self._wanted, self._notes = path, sources, database, wanted, notes
+        # By name of the message: frames decoded, frames longer than described, sizes of those too short, channels.
         self._decoded, self._longer = Counter[str](), Counter[str]()
-        self._short: dict[str, Counter[int]] = defaultdict(Counter)  # sizes of frames that are too short
-        self._identifiers, self._left = Counter[str](), Counter[str]()
+        self._short: dict[str, Counter[int]] = defaultdict(Counter)
         self._channels: dict[str, set[object]] = defaultdict(set)
+        # Frames by identifier, and frames left out by kind.
+        self._identifiers, self._left_out = Counter[str](), Counter[str]()
 
     def read(self) -> Iterator[FileMessage | InputError]:
         """Yield the messages in the order of the file.
@@ -88,14 +90,14 @@ class FrameReader:
                 continue
             frame, moment = item
             if frame.is_error_frame or frame.is_remote_frame:
-                self._left["error" if frame.is_error_frame else "remote"] += 1
+                self._left_out["error" if frame.is_error_frame else "remote"] += 1
             elif self._sources.channel in (None, frame.channel):
                 yield from self._decode(frame, moment, f"{self._path}, frame {number}")
             else:
-                self._left[f"of channel {frame.channel}"] += 1
+                self._left_out[f"of channel {frame.channel}"] += 1
         self._check_fit()
-        if self._left:
-            counts = ", ".join(f"{kind} ({count})" for kind, count in self._left.items())
+        if self._left_out:
+            counts = ", ".join(f"{kind} ({count})" for kind, count in self._left_out.items())
             self._notes.append(f"{self._path}: frames left out: {counts}")
         if self._longer:
             counts = ", ".join(f"{name} ({count})" for name, count in self._longer.items())
@@ -122,10 +124,10 @@ class FrameReader:
             except Exception as error:  # a multiplexer that the database does not know
                 yield fail(where, f"what {self._sources.dbc} describes", show_error(error))
                 return
-            # Of a multiplexed message the signals that it has not did not arrive.
+            # Signals that a multiplexed message does not have this time did not arrive: None.
             content = dict.fromkeys(signal.name for signal in described.signals) | signals
-            self._longer[name] += size > length
-            self._longer += Counter()
+            if size > length:
+                self._longer[name] += 1
         self._decoded[name] += 1
         yield FileMessage(where, name, {STAMP: moment, **content}, moment)
 
@@ -137,7 +139,7 @@ class FrameReader:
             raise fail(f"{self._path}, {name}", "one bus, which channel= of LogSources names", sorted(map(str, seen)))
 
     def _check_fit(self) -> None:
-        """Raise ValueError where the database does not fit the frames."""
+        """Raise ValueError if the frames of a wanted message are all too short, or no frame is of a wanted one."""
         remedy = "another database, or another bus (channel=)?"
         for name, sizes in self._short.items():
             if not self._decoded[name]:
@@ -148,7 +150,7 @@ class FrameReader:
         if wanted and not self._decoded:
             among = f"only {_join(list(self._identifiers))}; {remedy}" if self._identifiers else "no frame at all"
             if self._sources.channel is not None and not self._identifiers:
-                among = ", ".join(f"frames {kind}" for kind in self._left) or among
+                among = ", ".join(f"frames {kind}" for kind in self._left_out) or among
             raise fail(str(self._path), f"a frame of {_join(wanted)}", among)
 
 
@@ -167,7 +169,7 @@ def _read_frames(path: Path, sources: LogSources) -> "Iterator[tuple[Message, fl
         while True:
             try:
                 frame = next(frames, None)
-            except Exception as error:  # the same
+            except Exception as error:  # whatever a damaged file makes a reader do
                 yield CutOffError(str(fail(f"{path}, after frame {number}", "a log without damage", show_error(error))))
                 return
             if frame is None:
@@ -177,7 +179,7 @@ def _read_frames(path: Path, sources: LogSources) -> "Iterator[tuple[Message, fl
 
 
 def _open_frames(path: Path, stack: ExitStack) -> "tuple[MessageReader, float, float]":
-    """Return a reader, the time in it of the log's begin, and what makes its times seconds since 1970."""
+    """Return a reader, the time in it of the log's begin, and what added to its times makes them seconds since 1970."""
     from can import ASCReader, BLFReader
 
     kind = path.suffix.lower()
@@ -204,4 +206,5 @@ def _open_frames(path: Path, stack: ExitStack) -> "tuple[MessageReader, float, f
 
 
 def _join(names: list[str]) -> str:
+    """Return the first LISTED names, and how many more there are."""
     return ", ".join(names[:LISTED]) + (f" and {len(names) - LISTED} more" if len(names) > LISTED else "")

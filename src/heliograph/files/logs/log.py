@@ -38,7 +38,7 @@ class Log(NamedTuple):
 
 
 class Series(NamedTuple):
-    """Messages of one name: seconds from the log's begin, and the values of each signal. Shape of all: (messages,)."""
+    """Messages of one name: seconds from the log's begin, and the values of each signal; all of shape (messages,)."""
 
     time: Float[np.ndarray, " messages"]
     values: Mapping[str, np.ndarray]
@@ -51,15 +51,17 @@ def is_log(path: Path) -> bool:
 
 def merge_series(path: Path, begin: float, series: Mapping[str, Series]) -> Iterator[FileMessage]:
     """Yield the messages of several series in order of time; `begin` is in seconds since 1970."""
+    # All messages one series after another: time, number of the series, and row in it.
     names = list(series)
     times = np.concatenate([np.zeros(0), *(each.time for each in series.values())])
     sizes = [len(each.time) for each in series.values()]
-    which = np.repeat(np.arange(len(names)), sizes)
+    series_numbers = np.repeat(np.arange(len(names)), sizes)
     rows = np.concatenate([np.zeros(0, dtype=int), *(np.arange(size) for size in sizes)])
-    columns = [[values.tolist() for values in each.values.values()] for each in series.values()]
+    # By series the names of its signals, and their values.
     fields = [list(each.values) for each in series.values()]
-    for number, at in enumerate(np.argsort(times, kind="stable").tolist(), 1):
-        i, row = which[at], rows[at]
-        moment = round(begin + float(times[at]), DIGITS)
+    columns = [[values.tolist() for values in each.values.values()] for each in series.values()]
+    for number, k in enumerate(np.argsort(times, kind="stable").tolist(), 1):
+        i, row = series_numbers[k], rows[k]
+        moment = round(begin + float(times[k]), DIGITS)
         content = {name: column[row] for name, column in zip(fields[i], columns[i], strict=True)}
         yield FileMessage(f"{path}, message {number}", names[i], {STAMP: moment, **content}, moment)

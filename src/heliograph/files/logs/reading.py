@@ -76,7 +76,7 @@ def _check_signals(place: str, path: Path, log: Log, sources: Sources) -> list[s
 
 
 def _name_near(name: str, known: dict[str, object] | dict[str, str] | dict[str, dict[str, str]]) -> str:
-    """Say which names there are: the closest, or else the first."""
+    """Return in words which names there are instead: the closest one, or else the first LISTED."""
     close = get_close_matches(name, known, 1)
     if close:
         return f"none of that name (closest: {close[0]!r})"

@@ -43,8 +43,11 @@ def open_ulog(path: Path, sources: LogSources, wanted: Wanted) -> Log:
     begin = _find_date(file)
     if sources.start is not None:
         begin = sources.start - file.start_timestamp * MICROSECOND
-    notes = [f"{path}: the device lost {len(file.dropouts)} times what it should have logged"] * bool(file.dropouts)
-    notes += [f"{path}: damaged; what could be read is used"] * bool(file.file_corruption)
+    notes = list[str]()
+    if file.dropouts:
+        notes.append(f"{path}: the device lost {len(file.dropouts)} times what it should have logged")
+    if file.file_corruption:
+        notes.append(f"{path}: damaged; what could be read is used")
     return Log(units, dict.fromkeys(topics, "ULog"), merge_series(path, begin, series), notes)
 
 

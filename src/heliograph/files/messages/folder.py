@@ -60,7 +60,7 @@ def read_folder(folder: Path, sources: Sources) -> Iterator[FileMessage | InputE
 
 
 def list_left_files(folder: Path, sources: Sources) -> list[str]:
-    """Say which files are no topics of sources, and which topics of theirs are no files."""
+    """Return a line on the files that are no topics of sources, and one on the topics that are no files."""
     used = list_used_files(folder, sources)
     rest = [path.name for path in list_files(folder) if path not in used]
     found = {name_topic(path, sources) for path in used}
@@ -70,5 +70,6 @@ def list_left_files(folder: Path, sources: Sources) -> list[str]:
 
 
 def _join_names(names: list[str]) -> str:
+    """Return the first LISTED names, and how many more there are."""
     more = f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
     return f"{', '.join(names[:LISTED])}{more}"

@@ -85,7 +85,7 @@ def read_message_file(path: Path) -> Iterator[FileMessage | InputError]:
         yield from until_cut_off(_read_lines(path) if kind in LINES else _read_csv_messages(path))
 
 
-def log_line(text: str) -> tuple[str, str, str | None] | None:
+def parse_log_line(text: str) -> tuple[str, str, str | None] | None:
     """Return topic, payload and arrival of a line that an MQTT client printed; None for any other."""
     match = LOGGED.fullmatch(text.strip())
     return None if match is None else (match["topic"], match["payload"], match["arrival"])
@@ -102,8 +102,9 @@ def read_log_entry(content: object) -> tuple[str, str, Any, bool] | None:
 
 def find_arrival(logged: Mapping[str, Any]) -> Any:
     """Return when a message with a payload was logged, as the log says it; None if it does not."""
-    said = next((logged[name] for name in ARRIVALS if logged.get(name) is not None), None)
-    return said if said is not None else next((logged[name] for name in CLOCKS if _is_moment(logged.get(name))), None)
+    arrivals = [logged[name] for name in ARRIVALS if logged.get(name) is not None]
+    arrivals += [logged[name] for name in CLOCKS if _is_moment(logged.get(name))]
+    return arrivals[0] if arrivals else None
 
 
 def _is_moment(value: object) -> bool:
@@ -119,11 +120,14 @@ def _is_moment(value: object) -> bool:
 
 
 def convert_row(where: str, row: Mapping[str, Any]) -> FileMessage:
-    """Return the message of a row of a table: with a payload, or with the fields of its columns."""
+    """Return the message of a row of a table.
+
+    Without a topic it is the row itself; with one it is what the column `payload` has, or the row if there is none.
+    """
     arrival = find_arrival(row) if PAYLOAD in row else row.get("arrival")
     if TOPIC not in row:
         return FileMessage(where, None, row, arrival)
-    payload = row.get(PAYLOAD) if PAYLOAD in row else row
+    payload = row.get(PAYLOAD, row)
     return FileMessage(where, str(row[TOPIC]), payload, arrival)
 
 
@@ -164,7 +168,7 @@ def convert_line(where: str, line: str) -> list[FileMessage | InputError]:
     try:
         return [_convert_item(where, *item) for item in decode_items(line, where)]
     except InputError as error:
-        parts = log_line(line)
+        parts = parse_log_line(line)
         return [error if parts is None else FileMessage(where, *parts)]
 
 
@@ -183,18 +187,27 @@ def _convert_item(where: str, content: object, doubled: str | None) -> FileMessa
 
 
 def _read_csv_messages(path: Path) -> Iterator[FileMessage | InputError]:
+    """Yield the messages of the rows of a CSV file, or why one cannot be read."""
     for row in csv_rows(path, marked=True):
         yield row if isinstance(row, InputError) else convert_row(row.where, typed_cells(row))
 
 
 def typed_cells(row: CsvRow) -> dict[str, Any]:
-    """Return the cells of a row by name: numbers as numbers, whole ones with every digit, empty cells as None."""
-    cells = zip(row.header, row.cells, strict=True)
-    return {name: cell if name == PAYLOAD else parse_number(cell) if cell else None for name, cell in cells}
+    """Return the cells of a row by name: numbers with every digit of whole ones, None of empty cells, else texts.
+
+    A payload stays a text.
+    """
+    results: dict[str, Any] = {}
+    for name, cell in zip(row.header, row.cells, strict=True):
+        if name == PAYLOAD:
+            results[name] = cell
+        else:
+            results[name] = parse_number(cell) if cell else None
+    return results
 
 
 def _read_parquet_rows(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield the rows from 1; moments are dates of ISO 8601, in UTC where they have no zone."""
+    """Yield place and cells of each row, counted from 1; moments are dates of ISO 8601, in UTC if they have no zone."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -204,20 +217,21 @@ def _read_parquet_rows(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     for i, column in enumerate(table.columns):
         if pa.types.is_timestamp(column.type):
             whole = column.cast(pa.timestamp("ns", "UTC")).cast(pa.int64()).to_pylist()
-            texts = [None if t is None else _iso(t) for t in whole]
+            texts = [None if t is None else _format_moment(t) for t in whole]
             table = table.set_column(i, names[i], pa.chunked_array([pa.array(texts, pa.string())]))
     for number, row in enumerate(table.to_pylist(), 1):
         yield f"{path}, row {number}", row
 
 
-def _iso(nanoseconds: int) -> str:
+def _format_moment(nanoseconds: int) -> str:
+    """Return nanoseconds since 1970 as a date of ISO 8601."""
     import numpy as np
 
     return f"{np.datetime64(nanoseconds, 'ns')}Z"
 
 
 def decode_payload(message: FileMessage) -> object:
-    """Decode the payload of a message of a log.
+    """Return the content of a message, decoded from JSON where it is the payload of a log.
 
     Raises:
         ValueError: no JSON, or a field that is there twice; one line.

@@ -45,7 +45,7 @@ def is_own(content: object) -> bool:
 
 
 class OwnMessages:
-    """Messages in our own form as they are read, to a table of their events.
+    """Collects messages in our own form in a table of their events, and counts those that cannot be read.
 
     Args:
         network: the network that the names belong to.
@@ -149,10 +149,10 @@ class OwnReader:
         if node not in self.components:
             raise fail(f"{where}, column {NODE!r}", f"one of {', '.join(self.components)}", show_value(node))
         sequence = _parse_whole(row[SEQUENCE], f"{where}, column {SEQUENCE!r}")
-        time, dated = self._read_moment(row[TIME], f"{where}, column {TIME!r}")
+        time, dated = self._read_moment(row[TIME], where, TIME)
         arrival = time
         if ARRIVAL in row and (row[ARRIVAL] is not None or self._table):
-            arrival, _ = self._read_moment(row[ARRIVAL], f"{where}, column {ARRIVAL!r}")
+            arrival, _ = self._read_moment(row[ARRIVAL], where, ARRIVAL)
         plant = "" if row.get(PLANT) is None else convert_name(row[PLANT], f"{where}, column {PLANT!r}")
         self.numbers = not dated
         try:
@@ -166,7 +166,10 @@ class OwnReader:
         return [*found, (Reading(plant, node, sequence, time, values), arrival)]
 
     def _check_columns(self, where: str, row: Mapping[str, Any]) -> None:
-        """Refuse unknown columns, which are most likely misspelt; of rows that are alike one is looked at."""
+        """Raise ValueError at an unknown column, which is most likely misspelt, or at one that lacks.
+
+        Of rows with the same columns the first is looked at.
+        """
         if row.keys() == self._columns:
             return
         place = f"{self.source}, header" if self._table else where
@@ -181,15 +184,15 @@ class OwnReader:
                 raise make(str(fail(place, f"a column {name!r}", f"only {', '.join(row)}")))
         self._columns = row.keys()
 
-    def _read_moment(self, cell: Any, name: str) -> tuple[Any, bool]:
+    def _read_moment(self, cell: Any, where: str, column: str) -> tuple[Any, bool]:
         """Return a time, in nanoseconds of a date or a number, and whether it is a date; all are of one kind."""
+        name = f"{where}, column {column!r}"
         dated = isinstance(cell, str) and looks_like_date(cell)
-        expected = "a number"
         if self.numbers is not None and dated != (not self.numbers):
             expected = "a number, as the times before" if dated else "a date, as the times before"
             raise fail(name, expected, show_value(cell))
         if not dated:
-            return self._read_time(cell, name), False
+            return self._read_number_of_time(cell, name, is_step=self.steps and column == TIME), False
         if self.steps:
             raise fail(name, "a step, a whole number from 0", f"{show_value(cell)} ({OF_STEPS})")
         moment, zoned = moment_of(cell, name)
@@ -198,14 +201,17 @@ class OwnReader:
             raise fail(name, "a zone with every date or with none", show_value(cell))
         return moment, True
 
-    def _read_time(self, cell: Any, name: str) -> float:
-        """Return a time that is a number, counted from the first one where these are too large for a double."""
+    def _read_number_of_time(self, cell: Any, name: str, is_step: bool) -> float:
+        """Return a time that is a number; raise ValueError where it `is_step` and not a whole number from 0.
+
+        Where the first whole number is too large for a double, as of nanoseconds, all are counted from that one.
+        """
         number = _parse_number(cell, name)
         if isinstance(cell, int):
             if self.zero is None:
                 self.zero = cell if abs(cell) >= EXACT else 0
             number = float(cell - self.zero)
-        if self.steps and TIME in name and not (number >= 0 and number.is_integer()):
+        if is_step and not (number >= 0 and number.is_integer()):
             raise fail(name, "a step, a whole number from 0", f"{cell} ({OF_STEPS})")
         return number
 
@@ -215,7 +221,11 @@ class HeaderError(InputError):
 
 
 def _read_values(row: Mapping[str, Any], names: Sequence[str], where: str, numbered: bool = False) -> np.ndarray:
-    """Return the values of one event; where it is `numbered` the last, of what was lost, may be left to its count."""
+    """Return the values of one event, NaN where one did not arrive.
+
+    They stand in the field `values`, a list or a text, or each in a field of its name. Where the event is `numbered`
+    the last, how many messages were lost, may be missing in `values`, since the running count says it too.
+    """
     if row.get(VALUES) not in (None, ""):
         cell = row[VALUES]
         parts: list[Any] = cell.replace(";", " ").split() if isinstance(cell, str) else _list_items(cell)
@@ -224,11 +234,13 @@ def _read_values(row: Mapping[str, Any], names: Sequence[str], where: str, numbe
         if len(parts) != len(names):
             raise fail(f"{where}, column {VALUES!r}", f"{len(names)} numbers, {' '.join(names)}", show_value(cell))
         from_text = isinstance(cell, str)
-        return np.array([_parse_number(word, f"{where}, column {VALUES!r}", True, from_text) for word in parts])
-    return np.array([_parse_number(row.get(name), f"{where}, column {name!r}", True) for name in names])
+        place = f"{where}, column {VALUES!r}"
+        return np.array([_parse_number(word, place, may_be_empty=True, text=from_text) for word in parts])
+    return np.array([_parse_number(row.get(name), f"{where}, column {name!r}", may_be_empty=True) for name in names])
 
 
 def _list_items(cell: Any) -> list[Any]:
+    """Return what is in a list or array; anything else as a list of one."""
     return list(cell) if isinstance(cell, list | tuple | np.ndarray) else [cell]
 
 
@@ -241,11 +253,18 @@ def _parse_whole(cell: Any, name: str) -> int:
     return check_63_bits(name, cell)
 
 
-def _parse_number(cell: Any, name: str, empty: bool = False, text: bool = False) -> float:
-    """Return a number; NaN for what may be `empty` and is; a `text` that reads as one is one."""
-    if empty and (cell is None or cell == "" or (isinstance(cell, str) and NO_VALUE.fullmatch(cell))):
+def _parse_number(cell: Any, name: str, may_be_empty: bool = False, text: bool = False) -> float:
+    """Return the number in a cell, NaN of an empty one.
+
+    Args:
+        cell: the cell.
+        name: its place, for errors.
+        may_be_empty: whether it may be empty, or a word of that meaning; else that is an error.
+        text: whether a text that reads as a number is one; else it is an error.
+    """
+    if may_be_empty and (cell is None or cell == "" or (isinstance(cell, str) and NO_VALUE.fullmatch(cell))):
         return np.nan
-    expected = "a number or an empty cell" if empty else "a number"
+    expected = "a number or an empty cell" if may_be_empty else "a number"
     if isinstance(cell, str) and not text:
         raise fail(name, expected, f"text, {show_value(cell)}")
     try:
@@ -254,6 +273,6 @@ def _parse_number(cell: Any, name: str, empty: bool = False, text: bool = False)
         number = float(cell)
     except (TypeError, ValueError, OverflowError):
         number = np.inf
-    if np.isinf(number) or (np.isnan(number) and not empty):
+    if np.isinf(number) or (np.isnan(number) and not may_be_empty):
         raise fail(name, expected, "an empty cell" if cell is None else show_value(cell))
     return number

@@ -86,31 +86,37 @@ def read_events(
     instance("network", network, Network, "a Network")
     check_progress(progress, "(read, total)")
     strict, ignore_unknown = flag("strict", strict), flag("ignore_unknown", ignore_unknown)
-    known = None if sources is None else Sources(sources, network)
+    checked = None if sources is None else Sources(sources, network)
     if isinstance(source, Path) and is_bag(source):
-        if known is None:
+        if checked is None:
             raise fail("sources", f"a source for the topics of {source}", "none")
-        events = EventTable(network, known.step)
-        for part in parts_of(source) or [source]:
-            if holds_json(part):
-                found = _append_all(part, read_json_messages(part, known), known, events, strict)
-                missing = [topic for topic in known.topics if not set("+#") & set(topic) and topic not in found]
-                events.notes += [f"{part}: not in the bag: {', '.join(missing)}"] if missing else []
-            else:
-                read_bag(part, known, events, progress, strict)
+        events = _read_bags(source, checked, progress, strict)
     elif isinstance(source, Path) and is_log(source):
-        if known is None:
+        if checked is None:
             raise fail("sources", f"hg.files.LogSources for the messages of {source}", "none")
-        events = _read_log(source, sources, known, strict)
-    elif isinstance(source, Path) and is_folder(source) and known is None:
+        events = _read_log(source, sources, checked, strict)
+    elif isinstance(source, Path) and is_folder(source) and checked is None:
         raise fail("sources", f"a source for the files of {source}", "none")
     elif _holds_own_rows(source):
         events = _read_own_table(source, network, strict, ignore_unknown)
     else:
-        events = _map_messages(source, network, known, strict)
-    if known is not None:
-        _warn_of_left_out(source, known, events)
+        events = _read_by_topic(source, network, checked, strict)
+    if checked is not None:
+        _note_left_out(source, checked, events)
     events.finish(str(source), strict)
+    return events
+
+
+def _read_bags(path: Path, sources: Sources, progress: Progress | None, strict: bool) -> EventTable:
+    """Return the events of a bag, or of the bags in a folder, with messages of ROS or in JSON."""
+    events = EventTable(sources.network, sources.step)
+    for part in parts_of(path) or [path]:
+        if holds_json(part):
+            found = _append_all(part, read_json_messages(part, sources), sources, events, strict)
+            missing = [topic for topic in sources.topics if not set("+#") & set(topic) and topic not in found]
+            events.notes += [f"{part}: not in the bag: {', '.join(missing)}"] if missing else []
+        else:
+            read_bag(part, sources, events, progress, strict)
     return events
 
 
@@ -139,17 +145,18 @@ def _list_messages(source: Path | StoreTable, sources: Sources | None = None) ->
 
 
 def _read_own_table(path: Path | StoreTable, network: Network, strict: bool, ignore_unknown: bool) -> EventTable:
-    """Read a table of events in our own form."""
-    own = OwnMessages(network, path, True, ignore_unknown)
+    """Return the events of a table in our own form."""
+    own = OwnMessages(network, path, table=True, ignore_unknown=ignore_unknown)
     for message in _list_messages(path):
         own.add(message, strict)
     return own.events()
 
 
-def _map_messages(path: Path | StoreTable, network: Network, sources: Sources | None, strict: bool) -> EventTable:
-    """Read messages by their topics, and those in our own form among them."""
+def _read_by_topic(path: Path | StoreTable, network: Network, sources: Sources | None, strict: bool) -> EventTable:
+    """Return the events of messages, which are either all of topics of the sources, or all in our own form."""
     events = None if sources is None else EventTable(network, sources.step)
-    own = OwnMessages(network, path, isinstance(path, StoreTable) or is_table(path), False)
+    is_rows = isinstance(path, StoreTable) or is_table(path)
+    own = OwnMessages(network, path, table=is_rows, ignore_unknown=False)
     broken = ""
     for message in _list_messages(path, sources):
         if isinstance(message, CutOffError) and not strict:
@@ -165,14 +172,15 @@ def _map_messages(path: Path | StoreTable, network: Network, sources: Sources | 
         if events is not None and len(events):
             raise fail(str(path), "messages in our own form, or of topics", "both")
         events = own.events()
+    else:  # those that could not be read count against the topics' messages
+        events.refused += own.refused
+        events.reasons += own.reasons
     events.broken = broken
-    events.refused += own.refused if own.used == 0 else 0
-    events.reasons += own.reasons if own.used == 0 else []
     return events
 
 
 def _read_log(path: Path, table: object, sources: Sources, strict: bool) -> EventTable:
-    """Read the messages of a vehicle's log."""
+    """Return the events of a vehicle's log; `table` are its sources as the network's file has them."""
     events = EventTable(sources.network, sources.step)
     _append_all(path, read_log(path, table, sources, events.notes), sources, events, strict)
     return events
@@ -181,7 +189,7 @@ def _read_log(path: Path, table: object, sources: Sources, strict: bool) -> Even
 def _append_all(
     path: Path, messages: Iterator[FileMessage | InputError], sources: Sources, events: EventTable, strict: bool
 ) -> set[str | None]:
-    """Append what messages of named topics say, and return these topics."""
+    """Append the events of messages that name their topics, and return these topics."""
     topics = set[str | None]()
     for message in messages:
         if isinstance(message, CutOffError) and not strict:
@@ -197,12 +205,12 @@ def _append_all(
 def _append_message(
     path: Path | StoreTable, message: FileMessage, sources: Sources, events: EventTable, strict: bool
 ) -> None:
-    """Append what a message says; what cannot be read is refused alone."""
+    """Append the events of a message; what cannot be read is refused alone."""
     topic = message.topic
     if topic is None:
         topic = path.topic if isinstance(path, StoreTable) else name_topic(path, sources)
     try:
-        if sources.hear(topic, message.content, message.where):
+        if sources.take_word(topic, message.content, message.where):
             return
         # The payload of a topic that nobody asks for may be anything.
         content = decode_payload(message) if sources.of(topic) else None
@@ -222,26 +230,26 @@ def _append_message(
                 continue
             if came is None and reading.time is not None and events.dated:
                 sources.clocks.note(topic, content, reading.time, (single.source for single in sources.of(topic)))
-            events.add(sources.original(reading, came), arrival)
+            events.add(sources.date_copy(reading, came), arrival)
             sources.senders.note(topic, reading.plant, reading.node, content, sources.list_fields(topic))
     except InputError as error:
         events.refuse(error, strict)
 
 
-def _warn_of_left_out(path: Path | StoreTable, sources: Sources, events: EventTable) -> None:
-    """Say which messages were left out.
+def _note_left_out(path: Path | StoreTable, sources: Sources, events: EventTable) -> None:
+    """Add notes on the messages that were left out to the events.
 
     Raises:
         ValueError: a field that no message of its topic had, clocks that cannot be joined.
     """
-    if said := sources.never():
+    if said := sources.describe_absent_field():
         raise InputError(said)
-    own = sources.clocks.check(str(path))
+    from_zero = sources.clocks.check(str(path))
     if isinstance(path, Path) and is_folder(path):
         events.notes += list_left_files(path, sources)
-        if len(own) > 1:
+        if len(from_zero) > 1:
             remedy = "start= or offset= of hg.files.Stamp says if they are not"
-            events.notes.append(f"{path}: times from 0 are taken as of one clock: {', '.join(own)} ({remedy})")
+            events.notes.append(f"{path}: times from 0 are taken as of one clock: {', '.join(from_zero)} ({remedy})")
     if sources.unknown.total():
         counts = ", ".join(f"{topic} ({count})" for topic, count in sources.unknown.items() if count)
         events.notes.append(f"{path}: not among the sources: {counts}")

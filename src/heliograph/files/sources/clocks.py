@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from heliograph.files.sources.fields import at
+from heliograph.files.sources.fields import field_at
 from heliograph.files.sources.json_field import Source
 from heliograph.numerics.check import InputError, fail
 from heliograph.numerics.times.dates import looks_like_date
@@ -15,26 +15,26 @@ from heliograph.numerics.times.row_order import YEAR
 
 @dataclass
 class Clock:
-    """Times of a topic.
+    """The clock of a topic, as far as its times show it.
 
     Attributes:
         path: dotted path of its time.
         numbers: whether times are numbers, and not dates.
         first: the first of them, in nanoseconds since 1970.
         count: how many there were.
-        since_1970: how many were a year or more away from 1970.
+        far_from_1970: how many were a year or more away from 1970.
     """
 
     path: str
     numbers: bool
     first: int
     count: int = 0
-    since_1970: int = 0
+    far_from_1970: int = 0
 
     @property
     def from_zero(self) -> bool:
-        """Return whether it counts from its own start: most times are numbers that were of the year around 1970."""
-        return self.numbers and 2 * self.since_1970 <= self.count
+        """Return whether it counts from its own start: its times are numbers, of which most are within a year of 0."""
+        return self.numbers and 2 * self.far_from_1970 <= self.count
 
 
 class Clocks:
@@ -51,29 +51,29 @@ class Clocks:
             clock = Clock(path, not (isinstance(value, str) and looks_like_date(value)), time)
             self._by_topic[topic] = clock
         clock.count += 1
-        clock.since_1970 += abs(time) >= YEAR
+        clock.far_from_1970 += abs(time) >= YEAR
 
     def check(self, place: str) -> list[str]:
-        """Return the topics whose clocks count from their own starts; refuse them beside those of dates.
+        """Return the topics whose clocks count from their own starts; raise ValueError if others have dates.
 
         Raises:
             ValueError: some count from their own start and others are dates; one line with the remedy.
         """
-        own = [topic for topic, clock in self._by_topic.items() if clock.from_zero]
-        dated = next((topic for topic in self._by_topic if topic not in own), None)
-        if own and dated is not None:
-            path, first = self._by_topic[own[0]].path, np.datetime64(self._by_topic[dated].first, "ns")
-            date = f"{np.datetime_as_string(first, unit='s')}Z"
-            remedy = f"such as time=hg.files.Stamp({path!r}, start={date!r}), with the date of its 0"
-            got = f"numbers from {self._by_topic[own[0]].first / 1e9:g} s"
-            raise fail(f"{place}, {own[0]}, field {path!r}", f"dates as in {dated}, from {date} on ({remedy})", got)
-        return own
+        from_zero = [topic for topic, clock in self._by_topic.items() if clock.from_zero]
+        dated = next((topic for topic in self._by_topic if topic not in from_zero), None)
+        if from_zero and dated is not None:
+            topic, clock = from_zero[0], self._by_topic[from_zero[0]]
+            date = f"{np.datetime_as_string(np.datetime64(self._by_topic[dated].first, 'ns'), unit='s')}Z"
+            remedy = f"such as time=hg.files.Stamp({clock.path!r}, start={date!r}), with the date of its 0"
+            expected = f"dates as in {dated}, from {date} on ({remedy})"
+            raise fail(f"{place}, {topic}, field {clock.path!r}", expected, f"numbers from {clock.first / 1e9:g} s")
+        return from_zero
 
 
 def _find_time(topic: str, content: object, sources: Iterable[Source]) -> tuple[str, object]:
-    """Return path and value of the first time of a message that is there, of those that sources name."""
+    """Return path and value of the first time field of some sources that the message has; ("", None) if none."""
     for source in sources:
         if source.time is not None:
             with suppress(InputError):
-                return source.time.path, at(content, source.time.path, topic)
+                return source.time.path, field_at(content, source.time.path, topic)
     return "", None

@@ -69,10 +69,12 @@ class Covariance:
 
     def of(self, *numbers: Any) -> Any:
         """Return the entry, of numbers or of arrays; NaN where it is unknown."""
-        diagonal, (entry, mirror, one, other) = numbers[: self.size], numbers[self.size : self.size + 4]
+        # In the order of `parts`: the diagonal, entries ij and ji, and the variances ii and jj.
+        diagonal, (entry, mirror, row_variance, column_variance) = numbers[: self.size], numbers[self.size :][:4]
         known = np.asarray(diagonal[0]) != -1
         known &= np.any([np.asarray(variance) != 0 for variance in diagonal], axis=0)
-        known &= np.abs(np.asarray(entry) - mirror) <= SYMMETRIC * np.sqrt(np.abs(np.asarray(one) * other))
+        deviations = np.sqrt(np.abs(np.asarray(row_variance) * column_variance))
+        known &= np.abs(np.asarray(entry) - mirror) <= SYMMETRIC * deviations
         for kind in numbers[self.size + 4 :]:
             known &= np.asarray(kind) != 0
         return np.where(known, entry, np.nan)
@@ -226,18 +228,19 @@ class PlaneCovariance:
 
     @property
     def _entries(self) -> list[Covariance]:
+        """Return all nine entries in the axes of the position, row by row."""
         return [self.entry(row=row, column=column) for row in range(3) for column in range(3)]
 
     def of(self, *numbers: Any) -> Any:
         """Return the entry, of numbers or of arrays; NaN where the covariance or the position is unknown."""
         begin = len(self.position.parts)
         latitude, longitude, _ = self.position.coordinates(*numbers[:begin])
-        own = []
+        entries = []
         for entry in self._entries:
             count = len(entry.parts)
-            own.append(entry.of(*numbers[begin : begin + count]))
+            entries.append(entry.of(*numbers[begin : begin + count]))
             begin += count
-        matrix = np.stack(np.broadcast_arrays(*own), axis=-1).reshape(*np.shape(own[0]), 3, 3)
+        matrix = np.stack(np.broadcast_arrays(*entries), axis=-1).reshape(*np.shape(entries[0]), 3, 3)
         return self.position.plane.turn_covariance(latitude, longitude, matrix)[..., self.places[0], self.places[1]]
 
 

@@ -18,12 +18,8 @@ from heliograph.numerics.check import InputError, fail, show_value
 from heliograph.numerics.times.dates import UNITS, dates, instant
 
 TimeUnit = Literal["s", "ms", "us", "ns", "step"]
-STAMPS = (
-    ("sec", "nanosec"),
-    ("secs", "nsecs"),
-    ("seconds", "nanos"),
-    ("sec", "nsec"),
-)  # ROS 2 and 1, protobuf, Foxglove
+# Fields of a stamp, of seconds and nanoseconds: of ROS 2 and 1, protobuf, Foxglove.
+STAMPS = (("sec", "nanosec"), ("secs", "nsecs"), ("seconds", "nanos"), ("sec", "nsec"))
 PLAIN = (Mapping, list, tuple, str, int, float, np.ndarray, type(None))
 NUMBER = "a number, true or false, or null for what did not arrive"
 # Bare words that C, C++ and JavaScript print for what is no number, outside of texts.
@@ -50,7 +46,7 @@ def decode_json(text: str | bytes, name: str) -> Any:
 
 
 def decode_items(text: str | bytes, name: str) -> list[tuple[Any, str | None]]:
-    """Decode JSON as `decode_json` does; return what is in its lists, and in lists of these, each alone.
+    """Decode JSON as `decode_json` does; return each item of a list, or of lists in it, else the one content.
 
     Returns:
         Each item, and a field that is there twice within it, None if none is.
@@ -68,7 +64,7 @@ def fail_of_doubled(name: str, field: str) -> InputError:
 
 
 def _decode(text: str | bytes, name: str) -> tuple[Any, list[tuple[dict[str, Any], str]]]:
-    """Decode JSON; return its content, and the objects in it that have a field twice with the field."""
+    """Return the content of JSON, and each object in it that has a field twice, with the field's name."""
     doubled: list[tuple[dict[str, Any], str]] = []
 
     def collect(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -78,6 +74,7 @@ def _decode(text: str | bytes, name: str) -> tuple[Any, list[tuple[dict[str, Any
             doubled.append((fields, next(name for name in names if names.count(name) > 1)))
         return fields
 
+    # As it is; then once more with null for bare words such as nan.
     try:
         return json.loads(text, object_pairs_hook=collect), doubled
     except ValueError:
@@ -93,18 +90,18 @@ def _decode(text: str | bytes, name: str) -> tuple[Any, list[tuple[dict[str, Any
 
 
 def _find_doubled(content: Any, doubled: list[tuple[dict[str, Any], str]]) -> str | None:
-    """Return the doubled field of an object in `content`, of those that have one."""
+    """Return the doubled field of `content` or of an object in it, by the objects that have one; None if none has."""
     if not doubled or not isinstance(content, dict | list):
         return None
-    own = next((field for fields, field in doubled if fields is content), None)
-    if own is not None:
-        return own
+    field_of_content = next((field for fields, field in doubled if fields is content), None)
+    if field_of_content is not None:
+        return field_of_content
     parts = content.values() if isinstance(content, dict) else content
     return next((field for part in parts if (field := _find_doubled(part, doubled)) is not None), None)
 
 
 def _flatten(content: object) -> Iterator[object]:
-    """Yield what is in a list, and in lists of lists."""
+    """Yield each item of a list, or of lists in it; what is no list as the one item."""
     for item in content if isinstance(content, list) else [content]:
         yield from _flatten(item) if isinstance(item, list) else [item]
 
@@ -119,13 +116,13 @@ def match_topic(topic: str, pattern: str) -> bool:
     return len(words) == len(parts) and all(level in ("+", word) for word, level in zip(words, parts, strict=True))
 
 
-def at(message: object, path: str, where: str) -> Any:
+def field_at(message: object, path: str, where: str) -> Any:
     """Return the field at a dotted path of a message: of dictionaries, lists, arrays and objects with attributes.
 
     Raises:
         ValueError: no such field; one line with the path and the fields that are there.
     """
-    # Objects first, since a bag has millions of them.
+    # Objects with attributes first: messages of bags, of which there are millions.
     if path and not isinstance(message, PLAIN):
         with suppress(AttributeError):
             return _getter(path)(message)
@@ -149,13 +146,14 @@ def at(message: object, path: str, where: str) -> Any:
 
 @lru_cache
 def _getter(path: str) -> "attrgetter[Any]":
+    """Return what reads a dotted path of attributes."""
     return attrgetter(path)
 
 
 def convert_number(value: Any, name: str, quoted: bool = False) -> float:
-    """Convert a value to a number; NaN for null, for words of that meaning, and for what is not finite.
+    """Return a value as a double; NaN for null, for words of that meaning, and for what is not finite.
 
-    A number may be `quoted` on request.
+    A text of a number is one only where it may be `quoted`.
     """
     if value is None or value == "" or (isinstance(value, str) and NO_VALUE.fullmatch(value.strip())):
         return np.nan
@@ -212,7 +210,7 @@ def convert_time(value: Any, unit: TimeUnit, name: str, quoted: bool = False) ->
     if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not np.isfinite(value):
         raise fail(name, "a time: a date with its zone, a stamp, or a number", show_value(value))
     if unit == "step":
-        return count(value, name)
+        return convert_count(value, name)
     # The decimal that was meant: a double of seconds times 10^9 is off by up to 128 ns.
     whole_units = float(value).is_integer()
     stamp = int(value) * UNITS[unit] if whole_units else round(Decimal(repr(float(value))) * UNITS[unit])
@@ -241,8 +239,8 @@ def parse_start(name: str, start: object) -> int:
     return convert_time(start, "s", name)
 
 
-def count(value: Any, name: str, quoted: bool = False) -> int:
-    """Convert a running count, which columns of numbers have as a float."""
+def convert_count(value: Any, name: str, quoted: bool = False) -> int:
+    """Return a running count, which columns of numbers have as a float; a text of it only where it may be `quoted`."""
     if quoted and isinstance(value, str):
         value = parse_number(value)
     if isinstance(value, float) and value.is_integer():
@@ -251,7 +249,7 @@ def count(value: Any, name: str, quoted: bool = False) -> int:
 
 
 def convert_name(value: Any, name: str) -> str:
-    """Convert the name of a plant or a node: a text, or a whole number."""
+    """Return the name of a plant or a node as a text; it may be a whole number."""
     if isinstance(value, int | np.integer) and not isinstance(value, bool):
         return str(int(value))
     if isinstance(value, float) and value.is_integer():
@@ -262,7 +260,7 @@ def convert_name(value: Any, name: str) -> str:
 
 
 def _name_fields(value: object) -> str:
-    """Name the fields of a value, for an error."""
+    """Return the names of a value's fields for an error; the value itself where it has no fields."""
     if isinstance(value, Mapping):
         names = [str(key) for key in value]
     elif hasattr(value, "__dataclass_fields__"):

@@ -10,7 +10,7 @@ from typing_extensions import TypeAliasType
 
 from heliograph.files.availability import Available
 from heliograph.files.sources.derived import Computed, Covariance, PlaneCovariance, ZeroIfAbsent
-from heliograph.files.sources.fields import TimeUnit, at, convert_name, convert_time, parse_start
+from heliograph.files.sources.fields import TimeUnit, convert_name, convert_time, field_at, parse_start
 from heliograph.numerics.check import TINY, fail, flag, scalar, show_value
 from heliograph.numerics.module import readable
 from heliograph.numerics.times.dates import looks_like_date
@@ -54,7 +54,7 @@ class Field:
 
     def of(self, topic: str, message: object, where: str) -> str:
         """Return the name for a message of a topic."""
-        name = convert_name(at(message, self.path, where), f"{where}, field {self.path!r}")
+        name = convert_name(field_at(message, self.path, where), f"{where}, field {self.path!r}")
         return (self.names or {}).get(name, name)
 
 
@@ -92,7 +92,7 @@ class Stamp:
 
     def of(self, message: object, unit: TimeUnit, where: str, quoted: bool = False) -> int:
         """Return the time in a message, in nanoseconds since 1970, or its step."""
-        value, name = at(message, self.path, where), f"{where}, field {self.path!r}"
+        value, name = field_at(message, self.path, where), f"{where}, field {self.path!r}"
         if self.start is not None and isinstance(value, str) and looks_like_date(value):
             raise fail(name, f"a number, which counts from start={self.start!r}", show_value(value))
         return convert_time(value, unit, name, quoted) + self.shift
@@ -195,7 +195,7 @@ class Source:
             ValueError: a flag that does not, that is a text where a number is expected, or is not there.
         """
         for field, allowed in self.valid.items():
-            value = at(message, field, where)
+            value = field_at(message, field, where)
             if value not in allowed:
                 expected = "true or 1" if allowed == (True, 1) else f"one of {show_value(allowed)}"
                 raise fail(
@@ -274,7 +274,7 @@ def json_field(
     count = Count(sequence) if isinstance(sequence, str) else sequence
     if not isinstance(count, Count | None):
         raise fail("json_field, sequence", "a text or hg.files.Count", show_value(sequence))
-    whose, of = _check_name("node", node), Field(plant) if isinstance(plant, str) else plant
+    plant_name = Field(plant) if isinstance(plant, str) else plant
     seconds = None if step is None else float(scalar("json_field, step", step, TINY))
     if time_unit == "step" and (seconds is not None or (stamp is not None and stamp.shift)):
         raise fail("json_field, step", "none where the time is in steps already, and no offset", step)
@@ -282,11 +282,23 @@ def json_field(
         _broadcast_to_paths(name, value, paths, neutral)
         for name, value, neutral in (("scale", scale, 1.0), ("offset", offset, 0.0))
     )
+    conditions, available = _split_conditions(where)
     return Source(
-        paths, whose, outputs, factors, shifts, stamp, time_unit, count,
-        None if of is None else _check_name("plant", of),
-        seconds, *_split_conditions(where), _read_valid(valid), flag("json_field, quoted", quoted),
-    )  # fmt: skip
+        paths=paths,
+        node=_check_name("node", node),
+        outputs=outputs,
+        scale=factors,
+        offset=shifts,
+        time=stamp,
+        time_unit=time_unit,
+        sequence=count,
+        plant=None if plant_name is None else _check_name("plant", plant_name),
+        step=seconds,
+        where=conditions,
+        available=available,
+        valid=_read_valid(valid),
+        quoted=flag("json_field, quoted", quoted),
+    )
 
 
 def read_paths(value: object) -> tuple[str | Computed, ...]:
@@ -299,14 +311,14 @@ def read_paths(value: object) -> tuple[str | Computed, ...]:
 
 
 def _check_name(name: str, value: object) -> Any:
-    """Check what names a node or a plant."""
+    """Return what names a node or a plant; raise ValueError unless it is a text, a Level or a Field."""
     if not isinstance(value, str | Level | Field):
         raise fail(f"json_field, {name}", "a text, hg.files.Level or hg.files.Field", show_value(value))
     return value
 
 
 def _split_conditions(where: object) -> tuple[Allowed, tuple[Available, ...]]:
-    """Return the conditions on fields, and those on what devices say of themselves."""
+    """Return the allowed values by path of a field, and the conditions on what devices say of themselves."""
     several = list(where) if isinstance(where, list | tuple) else [] if where is None else [where]
     available = tuple(single for single in several if isinstance(single, Available))
     pairs = list[tuple[str, object]]()
@@ -345,7 +357,10 @@ def read_texts(name: str, value: object) -> tuple[str, ...]:
 
 
 def _broadcast_to_paths(name: str, value: ArrayLike, paths: tuple[Path, ...], neutral: float) -> tuple[float, ...]:
-    """Return one number for each path; one number is of the values, and what is told of these stays as it is."""
+    """Return one number for each path, from as many or from one.
+
+    One is for values alone: what is told of these, such as covariances, gets the `neutral` number.
+    """
     count = len(paths)
     try:
         values = np.atleast_1d(np.asarray(value, dtype=object))

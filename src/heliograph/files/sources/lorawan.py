@@ -20,7 +20,7 @@ RADIO = ("rssi", "snr")  # what a gateway says of how it received an uplink
 
 
 class _Uplinks(NamedTuple):
-    """Uplinks of a LoRaWAN server: their topic, and the paths of values, time, count of frames, device, reception."""
+    """How a LoRaWAN server lays out uplinks: topic, and paths of values, time, frame count, device and reception."""
 
     topic: str
     values: str
@@ -29,17 +29,17 @@ class _Uplinks(NamedTuple):
     device: str
     reception: str
 
-    def sources(
+    def make_sources(
         self, path: "Paths", node: "Name", output: "Texts", scale: float, offset: float, radio: "Texts"
     ) -> "dict[str, Source]":
-        """Return the source of its topic, a plant for each device."""
-        told = () if radio is None else read_texts("radio", radio)
-        unknown = [name for name in told if name not in RADIO]
+        """Return the source of the server's topic, as `the_things_stack` takes its arguments."""
+        radio_names = () if radio is None else read_texts("radio", radio)
+        unknown = [name for name in radio_names if name not in RADIO]
         if unknown:
             raise fail("radio of an uplink", f"some of {', '.join(RADIO)}", show_value(unknown[0]))
-        values = _below(self.values, path)
-        reception = [ZeroIfAbsent(f"{self.reception}.{name}") for name in told]
-        outputs = None if output is None else [*read_texts("output", output), *told]
+        values = _prefix_paths(self.values, path)
+        reception = [ZeroIfAbsent(f"{self.reception}.{name}") for name in radio_names]
+        outputs = None if output is None else [*read_texts("output", output), *radio_names]
         source = json_field(
             [*values, *reception],
             node,
@@ -54,14 +54,21 @@ class _Uplinks(NamedTuple):
 
 
 THE_THINGS_STACK = _Uplinks(
-    "v3/+/devices/+/up",
-    "uplink_message.decoded_payload",
-    "received_at",
-    "uplink_message.f_cnt",
-    "end_device_ids.device_id",
-    "uplink_message.rx_metadata.0",
+    topic="v3/+/devices/+/up",
+    values="uplink_message.decoded_payload",
+    time="received_at",
+    frames="uplink_message.f_cnt",
+    device="end_device_ids.device_id",
+    reception="uplink_message.rx_metadata.0",
 )
-CHIRPSTACK = _Uplinks("application/+/device/+/event/up", "object", "time", "fCnt", "deviceInfo.devEui", "rxInfo.0")
+CHIRPSTACK = _Uplinks(
+    topic="application/+/device/+/event/up",
+    values="object",
+    time="time",
+    frames="fCnt",
+    device="deviceInfo.devEui",
+    reception="rxInfo.0",
+)
 
 
 def the_things_stack(
@@ -90,7 +97,7 @@ def the_things_stack(
     Raises:
         ValueError: what `json_field` refuses.
     """
-    return THE_THINGS_STACK.sources(path, node, output, scale, offset, radio)
+    return THE_THINGS_STACK.make_sources(path, node, output, scale, offset, radio)
 
 
 def chirpstack(
@@ -118,9 +125,10 @@ def chirpstack(
     Raises:
         ValueError: what `json_field` refuses.
     """
-    return CHIRPSTACK.sources(path, node, output, scale, offset, radio)
+    return CHIRPSTACK.make_sources(path, node, output, scale, offset, radio)
 
 
-def _below(prefix: str, path: Paths) -> list[str | Computed]:
-    """Return paths within a part of the message."""
-    return [Yaw(f"{prefix}.{one.path}") if isinstance(one, Yaw) else f"{prefix}.{one}" for one in read_paths(path)]
+def _prefix_paths(prefix: str, path: Paths) -> list[str | Computed]:
+    """Return paths within the part of a message that has the path `prefix`, as paths within the message."""
+    paths = read_paths(path)
+    return [Yaw(f"{prefix}.{part.path}") if isinstance(part, Yaw) else f"{prefix}.{part}" for part in paths]

@@ -14,7 +14,7 @@ WORDS = re.compile(
 
 
 class SeveralSenders:
-    """Counts the values of fields that name a sender, by their own names, in what is read as one node of one plant."""
+    """Counts the values of fields that are named as a sender's name is, in messages read as one node of one plant."""
 
     def __init__(self) -> None:
         self._counts: dict[tuple[str, str, str, str], Counter[object]] = defaultdict(Counter)
@@ -22,7 +22,10 @@ class SeveralSenders:
         self._noted, self._said = 0, set[tuple[str, str]]()
 
     def note(self, topic: str, plant: str, node: str, message: object, asked: Collection[str]) -> None:
-        """Note a message that was read as one of a node of a plant; fields that are `asked` for say what they mean."""
+        """Count the fields of a message that was read as one of a node of a plant.
+
+        Fields that are `asked` for by a source tell senders apart already, or are values.
+        """
         self._noted += 1
         for name, value in message.items() if isinstance(message, Mapping) else ():
             if isinstance(value, str | int) and name not in asked and self._is_name(name):
@@ -30,12 +33,12 @@ class SeveralSenders:
                 if len(counts) <= MANY:
                     counts[value] += 1
 
-    def news(self) -> list[str]:
-        """Return what `lines` does after 1, 2, 4, 8, ... messages, and nothing in between."""
+    def lines_now_and_then(self) -> list[str]:
+        """Return `lines` after 1, 2, 4, 8, ... messages, and [] in between, to save time."""
         return self.lines() if self._noted & (self._noted - 1) == 0 else []
 
     def lines(self) -> list[str]:
-        """Say which fields have several values that come again, a line for each field of a topic; each is said once."""
+        """Return a line for each field of a topic that has several values which come again; each is returned once."""
         found: dict[tuple[str, str], list[object]] = {}
         for (topic, _, _, name), counts in self._counts.items():
             if (topic, name) not in self._said and 2 <= len(counts) <= MANY and counts.total() >= 2 * len(counts):

@@ -12,9 +12,9 @@ from heliograph.files.sources.clocks import Clocks
 from heliograph.files.sources.derived import Computed, ZeroIfAbsent
 from heliograph.files.sources.fields import (
     MissingFieldError,
-    at,
+    convert_count,
     convert_number,
-    count,
+    field_at,
     match_topic,
 )
 from heliograph.files.sources.json_field import Field, Source
@@ -33,7 +33,7 @@ COPY = 10 * SECOND  # a message that comes again so soon, with its count and val
 
 @readable
 class Reading(NamedTuple):
-    """Content of one message for one node.
+    """What one message says of one node.
 
     Attributes:
         plant: name of the plant, "" for a single one.
@@ -65,7 +65,10 @@ class Unread(NamedTuple):
 
 
 class Mapped(NamedTuple):
-    """Source, the topic that it stands for, and the places of its values in the measurement of each possible node."""
+    """A source, the pattern of its topics, and by node the places of its values in the node's measurement.
+
+    The nodes are those that its messages may be of.
+    """
 
     source: Source
     pattern: str
@@ -92,13 +95,10 @@ class Sources:
         self.stored = 0  # messages that only their arrival would date, which is that of a new subscriber
         self.excluded = Counter[str]()  # messages that a condition leaves out, by topic
         self.offline = Counter[str]()  # messages of devices that had said that they are offline, by topic
-        self.absent = dict[
-            tuple[str, str], str
-        ]()  # by source's topic and path, what was said of the first without the field
-        self.found = set[tuple[str, str]]()  # the same of fields that may be absent and were there
-        self._last = dict[
-            tuple[str, str], tuple[Reading, int, bool]
-        ]()  # by plant and node: its moment, and whether counts moved
+        # By source's topic and path: the error of the first message without the field; fields that were there.
+        self.absent, self.found = dict[tuple[str, str], str](), set[tuple[str, str]]()
+        # By plant and node the newest reading, its moment, and whether the count has moved.
+        self._last = dict[tuple[str, str], tuple[Reading, int, bool]]()
         self.steps = TIME_STEP not in network.inputs
         self.names = {name: tuple(network.nodes[name].received_names) for name in network.names}
         self.names[INPUTS] = tuple(name for name in network.inputs if name != TIME_STEP)
@@ -161,7 +161,7 @@ class Sources:
         return {name for source in mapped for path in source.fields for name in (path, path.split(".")[0])}
 
     def list_fields(self, topic: str) -> set[str]:
-        """Return the fields of a topic's messages of which a source says what they mean, by the first of their path."""
+        """Return the fields of a topic's messages that a source uses, by the first word of their paths."""
         if topic not in self._asked:
             asked = self._asked.setdefault(topic, set())
             for source, *_ in self.of(topic):
@@ -177,8 +177,8 @@ class Sources:
             self._known[topic] = [source for items in matching for source in items]
         return self._known[topic]
 
-    def hear(self, topic: str, payload: object, where: str) -> bool:
-        """Take what a device says of itself, online or offline; return whether the message says that.
+    def take_word(self, topic: str, payload: object, where: str) -> bool:
+        """Note what a device says of itself, online or offline; return whether the message is such a word.
 
         Args:
             topic: the topic of the message.
@@ -188,12 +188,12 @@ class Sources:
         Raises:
             ValueError: a word that is neither online nor offline; one line.
         """
-        return self.words.hear(topic, payload, where)
+        return self.words.take_word(topic, payload, where)
 
     def read(self, topic: str, message: object, where: str) -> list[Reading | Unread]:
-        """Read the message of a topic, one reading for each source; none, and counted, if the topic is unknown.
+        """Return a reading of a message for each source of its topic; [] of an unknown topic, which is counted.
 
-        A source for which a field is not there, or is no number, time or count, says so; the others are read.
+        In the place of a reading stands why a source could not read it; one that a condition leaves out has none.
 
         Args:
             topic: the topic of the message.
@@ -211,8 +211,8 @@ class Sources:
                 results += [] if reading is None else [reading]
         return results
 
-    def original(self, reading: Reading, arrival: int | None) -> Reading:
-        """Give a copy of the message before of its node the time of that; any other reading is returned as it is.
+    def date_copy(self, reading: Reading, arrival: int | None) -> Reading:
+        """Return a reading as it is; of a copy of the node's message before, with the time of that.
 
         A copy has the same count and values, and comes within ten seconds: gateways and senders repeat messages, and
         the time may be that of the reception. Where a node's count has never moved it names nothing.
@@ -225,19 +225,19 @@ class Sources:
         if reading.sequence is None or reading.time is None or moment is None or (self.steps and self.step is None):
             return reading
         key = reading.plant, reading.node
-        before, at, moved = self._last.get(key, (reading, -COPY - 1, False))
-        same = reading.sequence == before.sequence and moved and 0 <= moment - at <= COPY
-        if same and np.array_equal(reading.values, before.values, equal_nan=True):
+        before, moment_before, moved = self._last.get(key, (reading, -COPY - 1, False))
+        may_be_copy = reading.sequence == before.sequence and moved and 0 <= moment - moment_before <= COPY
+        if may_be_copy and np.array_equal(reading.values, before.values, equal_nan=True):
             return reading._replace(time=before.time)
         self._last[key] = reading, moment, moved or reading.sequence != before.sequence
         return reading
 
-    def never(self) -> str:
-        """Return what was said of a field that no message of its topic had; "" if there is none."""
+    def describe_absent_field(self) -> str:
+        """Return the error of the first field that no message of its topic had; "" if there is none."""
         return next((said for key, said in self.absent.items() if key not in self.found), "")
 
     def _read(self, mapped: Mapped, topic: str, message: object, where: str) -> Reading | None:
-        """Read a message by one of its sources; None of one that a condition leaves out, or that is of another process.
+        """Return a message's reading by one source; None if a condition leaves it out or another process reads it.
 
         Raises:
             ValueError: a field that is not there, or is no number, time or count; one line that names it.
@@ -245,7 +245,7 @@ class Sources:
         source, pattern, places = mapped
         # A condition leaves a message out.
         for field, allowed in source.where.items():
-            if at(message, field, where) not in allowed:
+            if field_at(message, field, where) not in allowed:
                 self.excluded[topic] += 1
                 return None
         if any(self.words.offline(condition, topic) for condition in source.available):
@@ -273,7 +273,7 @@ class Sources:
         return Reading(plant, node, sequence, _read_time(source, message, where), values, period)
 
     def _read_count(self, mapped: Mapped, topic: str, message: object, where: str) -> Reading | None:
-        """Read plant, node, count and time of a message that is unreadable otherwise; None where these are too."""
+        """Return plant, node, count and time of a message whose values cannot be read; None if these cannot either."""
         try:
             plant, node = _read_names(mapped, topic, message, where)
             sequence, missing = self._find_count(mapped.source, mapped.pattern, message, where)
@@ -285,27 +285,27 @@ class Sources:
             time = _read_time(mapped.source, message, where)
         except InputError:
             time = None
-        nothing = np.full(len(self.names[node]), np.nan)
+        no_values = np.full(len(self.names[node]), np.nan)
         period = 0 if mapped.source.sequence is None else mapped.source.sequence.period
-        return Reading(plant, node, sequence, time, nothing, period)
+        return Reading(plant, node, sequence, time, no_values, period)
 
     def _find_count(self, source: Source, pattern: str, message: object, where: str) -> tuple[int | None, bool]:
-        """Return the count of a message, None where there are none, and whether it is absent, and so 0."""
+        """Return a message's count, None if the source has none, and whether it is absent, which means 0."""
         if source.sequence is None:
             return None, False
         path = source.sequence.path
         key = pattern, path
         try:
-            value = at(message, path, where)
+            value = field_at(message, path, where)
         except MissingFieldError as error:
             self.absent.setdefault(key, str(error))
             return 0, True
         self.found.add(key)
         name = f"{where}, field {path!r}"
-        return source.sequence.check(count(value, name, source.quoted), name), False
+        return source.sequence.check(convert_count(value, name, source.quoted), name), False
 
     def _check_sources(self, topic: object, items: object) -> list[Mapped]:
-        """Check the sources of a topic, and look up where their values are in the measurement of each node."""
+        """Return the sources of a topic, checked, with the places of their values in each node's measurement."""
         if not isinstance(topic, str) or not topic:
             raise fail("sources", "topics that are text", show_value(topic))
         sources = [items] if isinstance(items, Source) else items
@@ -314,7 +314,7 @@ class Sources:
         return [Mapped(source, topic, self._place_outputs(topic, source)) for source in sources]
 
     def _place_outputs(self, topic: str, source: Source) -> dict[str, np.ndarray]:
-        """Check a source against the network; return by node which output each of its values is."""
+        """Return by node which output each value of a source is; raise ValueError if it does not fit the network."""
         name, node = f"sources, {topic!r}", source.node
         wild = [i for i, word in enumerate(topic.split("/")) if word in ("+", "#")]
         if wild and source.plant is None and isinstance(node, str):
@@ -326,12 +326,11 @@ class Sources:
             found = {node: self._index_outputs(name, source, node)}
         else:  # of the nodes that have these outputs
             wanted = set(source.outputs)
-            able = [
-                n
-                for n, known in self.names.items()
-                if (wanted <= set(known) if wanted else len(known) == len(source.paths))
-            ]
-            found = {able_one: self._index_outputs(name, source, able_one) for able_one in able if able_one != INPUTS}
+            found = {}
+            for candidate, known in self.names.items():
+                fits = wanted <= set(known) if wanted else len(known) == len(source.paths)
+                if fits and candidate != INPUTS:
+                    found[candidate] = self._index_outputs(name, source, candidate)
             if not found:
                 raise fail(f"{name}, output", "outputs of a node", show_value(source.outputs or len(source.paths)))
         for condition in source.available if "#" not in topic else ():
@@ -374,6 +373,7 @@ def _read_time(source: Source, message: object, where: str) -> int | None:
 
 
 def _count_more(count: int) -> str:
+    """Return how many of a list are not named in a line; "" if all are."""
     return "" if count <= LISTED else f" and {count - LISTED} more"
 
 
@@ -381,16 +381,17 @@ def _read_value(message: object, path: str | Computed, where: str, quoted: bool)
     """Return the number at a path, or what is computed of several; NaN for what did not arrive."""
     if isinstance(path, ZeroIfAbsent):
         within, _, name = path.path.rpartition(".")
-        whole = at(message, within, where)
+        whole = field_at(message, within, where)
         return 0.0 if isinstance(whole, Mapping) and name not in whole else _read_value(whole, name, where, quoted)
     if not isinstance(path, str):
         return float(path.of(*(_read_value(message, part, where, quoted) for part in path.parts)))
-    value = at(message, path, where)
+    value = field_at(message, path, where)
     if type(value) is float:  # names its place only where there may be something to say
         return value if np.isfinite(value) else np.nan
     return convert_number(value, f"{where}, field {path!r}", quoted)
 
 
 def _suggest_name(name: str, names: Sequence[str] | Mapping[str, object]) -> str:
+    """Return an unknown name with the closest known one in brackets, if any is close."""
     close = get_close_matches(name, list(names), 1)
     return f"{name!r}{f' (closest: {close[0]!r})' if close else ''}"

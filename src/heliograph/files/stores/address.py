@@ -75,9 +75,10 @@ def parse_store(url: str) -> StoreAddress:
     from heliograph.numerics.check import fail, text  # not before a command needs it
 
     text("store", url)
-    before, asks, query = [*ASKS.split(url, maxsplit=1), "", ""][:3]
+    # "scheme://.../database?options", then "query", "flux" or "sql" and the statement, where there is one.
+    place, language, statement = [*ASKS.split(url, maxsplit=1), "", ""][:3]
     try:
-        parts = urlsplit(before)
+        parts = urlsplit(place)
         host, _ = parts.hostname, parts.port
     except ValueError:
         raise fail("store", SHAPE, "an address that cannot be read") from None
@@ -85,21 +86,33 @@ def parse_store(url: str) -> StoreAddress:
     influx = parts.scheme in INFLUX
     if parts.scheme not in (*INFLUX, *POSTGRES) or not database or (influx and not host):
         raise fail("store", SHAPE, f"{parts.scheme}://{host or ''}{parts.path}")
+    store = f"store {parts.scheme}://{host or ''}/{database}"
     options = [unquote(option) for option in parts.query.split("&") if option]
     tables = [option.removeprefix("table=") for option in options if option.startswith("table=")]
     others = [option for option in options if not option.startswith("table=")]
     organisation = ""
     if influx and len(others) == 1 and others[0].startswith("org="):
         organisation = others.pop().removeprefix("org=")
-    if (influx and others) or len(tables) > 1 or (asks and (tables or not query.strip())):
-        came = others[0].split("=")[0] if influx and others else "both, or one without a value" if asks else "several"
-        raise fail(f"store {parts.scheme}://{host or ''}/{database}", "one of table=NAME and query=SELECT...", came)
-    if not influx and asks not in ("", "query"):
-        raise fail(
-            f"store {parts.scheme}://{host or ''}/{database}", "query=SELECT..., as InfluxDB alone has others", asks
-        )
+    # What is asked for: one table, or one statement, and of InfluxDB nothing else.
+    problem = ""
+    if influx and others:
+        problem = others[0].split("=")[0]
+    elif language and (tables or not statement.strip()):
+        problem = "both, or one without a value"
+    elif len(tables) > 1:
+        problem = "several"
+    if problem:
+        raise fail(store, "one of table=NAME and query=SELECT...", problem)
+    if not influx and language not in ("", "query"):
+        raise fail(store, "query=SELECT..., as InfluxDB alone has others", language)
+    # The server's own options stay in the URL.
     kept = "" if influx else "&".join(option for option in parts.query.split("&") if not option.startswith("table="))
-    plain = urlunsplit((parts.scheme, parts.netloc, parts.path, kept, ""))
-    language = cast(Language, asks or "query")
-    table = tables[0] if tables else ""
-    return StoreAddress(parts.scheme, plain, database, table, unquote(query), language, organisation)
+    return StoreAddress(
+        kind=parts.scheme,
+        url=urlunsplit((parts.scheme, parts.netloc, parts.path, kept, "")),
+        database=database,
+        table=tables[0] if tables else "",
+        query=unquote(statement),
+        language=cast(Language, language or "query"),
+        organisation=organisation,
+    )

@@ -25,7 +25,7 @@ BATCH = 4 * 2**20  # bytes of one request: a server may refuse more than ten mil
 
 
 def ask_influx(address: StoreAddress) -> tuple[str, dict[str, Any]]:
-    """Ask for a table; return the measurement's name and its columns: lists, and `time` as datetime64[ns].
+    """Return the measurement's name and the columns of a table: lists, and `time` as datetime64[ns].
 
     Several series, as of GROUP BY, are one table in the order of time, with their tags as columns.
 
@@ -35,7 +35,7 @@ def ask_influx(address: StoreAddress) -> tuple[str, dict[str, Any]]:
     query = address.query or f'SELECT * FROM "{_escape(address.table, chr(34))}"'
     match address.language:
         case "flux":
-            return read_flux(address, _send(address, "POST", *_ask_flux(address)))
+            return read_flux(address, _send(address, "POST", *_make_flux_request(address)))
         case "sql":
             target = urlencode({"db": address.database, "q": query, "format": "json"})
             return read_rows(address, _send(address, "GET", f"/api/v3/query_sql?{target}"))
@@ -43,8 +43,8 @@ def ask_influx(address: StoreAddress) -> tuple[str, dict[str, Any]]:
     return read_influxql(address, answer)
 
 
-def _ask_flux(address: StoreAddress) -> tuple[str, bytes]:
-    """Return where Flux is asked, and the request: tables of CSV that say of which type each column is."""
+def _make_flux_request(address: StoreAddress) -> tuple[str, bytes]:
+    """Return target and body of a request in Flux, which asks for CSV with the type of each column."""
     organisation = f"?{urlencode({'org': address.organisation})}" if address.organisation else ""
     dialect = {"header": True, "delimiter": ",", "annotations": ["datatype"]}
     body = {"query": address.query, "type": "flux", "dialect": dialect}
@@ -104,6 +104,7 @@ def _print_value(value: bool | float) -> str:
 
 
 def _escape(name: str, signs: str) -> str:
+    """Return a name with a backslash before each of some signs."""
     return re.sub(f"([{re.escape(signs)}])", r"\\\1", name)
 
 
@@ -131,7 +132,7 @@ def _send(address: StoreAddress, method: str, target: str, body: bytes | None = 
 
 
 def _make_headers(address: StoreAddress) -> dict[str, str]:
-    """Return the headers that name who asks: a user with his password, or a token alone; and of Flux what is sent."""
+    """Return the headers of a request: a user with a password, or a token alone; of Flux also the types of content."""
     user, password = address.login
     if address.language == "flux":
         token = f"{user}:{password}" if user else password  # version 1 takes both as one
@@ -144,10 +145,12 @@ def _make_headers(address: StoreAddress) -> dict[str, str]:
 
 
 def _explain_refusal(content: bytes) -> str:
-    """Return what a server says in its answer: of JSON its error or message."""
-    said = content.decode(errors="replace")
+    """Return why a server refuses, by its answer: of JSON its error or message, else all of it."""
+    answer = content.decode(errors="replace")
     try:
-        found = json.loads(said)
+        found = json.loads(answer)
     except ValueError:
-        return shorten(said)
-    return shorten(str(found.get("error") or found.get("message") or said) if isinstance(found, dict) else said)
+        found = None
+    if isinstance(found, dict):
+        return shorten(str(found.get("error") or found.get("message") or answer))
+    return shorten(answer)

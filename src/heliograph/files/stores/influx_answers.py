@@ -16,7 +16,7 @@ Row = Mapping[str, Any]
 
 
 def read_influxql(address: StoreAddress, answer: bytes) -> Answer:
-    """Read the answer to InfluxQL. Several series, as of GROUP BY, are one table, with their tags as columns.
+    """Return the table of an answer to InfluxQL; several series, as of GROUP BY, are one, with their tags as columns.
 
     Raises:
         ValueError: no answer of InfluxDB, a refusal, a part of the rows, none; one line.
@@ -42,7 +42,7 @@ def read_influxql(address: StoreAddress, answer: bytes) -> Answer:
 
 
 def read_rows(address: StoreAddress, answer: bytes) -> Answer:
-    """Read the answer of version 3 to SQL: a list of rows, each an object of JSON.
+    """Return the table of an answer of version 3 to SQL, a list of rows, each an object of JSON.
 
     Raises:
         ValueError: no such answer, no rows; one line.
@@ -58,7 +58,7 @@ def read_rows(address: StoreAddress, answer: bytes) -> Answer:
 
 
 def read_flux(address: StoreAddress, answer: bytes) -> Answer:
-    """Read the answer to Flux: tables of CSV, each with its header, below it a value of one field at one time a row.
+    """Return the table of an answer to Flux: tables of CSV, each row of which has one field's value at one time.
 
     Values of one measurement, one time and the same tags are one row, as after `pivot`, which a query may do itself.
     `_time` is the time, `_measurement` the name; `result`, `table`, `_start` and `_stop` tell how the answer was
@@ -73,17 +73,18 @@ def read_flux(address: StoreAddress, answer: bytes) -> Answer:
         for number, row in enumerate(_yield_flux_rows(answer.decode())):
             if "error" in row:
                 raise fail(str(address), "a query that it answers", shorten(str(row["error"])))
-            its_own = str(row.pop("_measurement", ""))
-            measurement = measurement or its_own
-            for left in ("result", "table", "_start", "_stop"):
-                row.pop(left, None)
+            measurement_of_row = str(row.pop("_measurement", ""))
+            measurement = measurement or measurement_of_row
+            for name in ("result", "table", "_start", "_stop"):
+                row.pop(name, None)
             if "_time" in row:
                 row["time"] = row.pop("_time")
             if "_field" not in row or "_value" not in row:  # pivoted, or fields of a query's own
                 joined[(number,)] = row
                 continue
             name, value = str(row.pop("_field")), row.pop("_value")
-            joined.setdefault((its_own, *sorted(row.items())), row.copy())[name] = value
+            # What is left are the time and the tags, which all fields of one row share.
+            joined.setdefault((measurement_of_row, *sorted(row.items())), row.copy())[name] = value
     except InputError:
         raise
     except (ValueError, KeyError, csv.Error):
@@ -94,25 +95,31 @@ def read_flux(address: StoreAddress, answer: bytes) -> Answer:
 
 
 def _yield_flux_rows(text: str) -> Iterable[dict[str, Any]]:
-    """Yield the rows of all tables, with values of their types; empty ones are None."""
-    kinds: list[str] = []
+    """Yield the rows of all tables by name of the column, with values of the columns' types; empty ones are None.
+
+    A table has a line of types, one of names, its rows, and then an empty line.
+    """
+    types: list[str] = []
     names: list[str] = []
     for cells in csv.reader(text.splitlines()):
-        if not any(cells):  # between tables
+        if not any(cells):
             names = []
-        elif cells[0].startswith("#"):
-            kinds, names = (cells, []) if cells[0] == "#datatype" else (kinds, names)
+        elif cells[0] == "#datatype":
+            types, names = cells, []
+        elif cells[0].startswith("#"):  # another annotation
+            continue
         elif not names:
             names = cells
         else:
-            known = kinds if len(kinds) == len(names) else [""] * len(names)
+            types_of_row = types if len(types) == len(names) else [""] * len(names)
             yield {
-                name: None if cell == "" else READ.get(kind, str)(cell)
-                for name, kind, cell in zip(names, known, cells, strict=True)
-                if name
+                name: None if cell == "" else READ.get(type_, str)(cell)
+                for name, type_, cell in zip(names, types_of_row, cells, strict=True)
+                if name  # the first column has annotations alone
             }
 
 
+# What reads a cell, by the type of its column; others are texts.
 READ: dict[str, Callable[[str], Any]] = {
     "double": float,
     "long": int,
@@ -129,7 +136,15 @@ def _read_moment(time: object) -> int:
 def _make_columns(
     address: StoreAddress, names: Iterable[str], rows: list[Any], read_time: Callable[[Any], int], sorts: bool
 ) -> dict[str, Any]:
-    """Return rows as the columns of one table, in the order of time where they are of several series."""
+    """Return rows as the columns of one table.
+
+    Args:
+        address: where they came from, for errors.
+        names: names of the columns, which may repeat.
+        rows: the rows, by name.
+        read_time: makes nanoseconds since 1970 of a time.
+        sorts: whether rows are of several series, and are put in the order of time.
+    """
     if not rows:
         raise fail(str(address), "a query with rows", "none")
     known = list(dict.fromkeys(names))

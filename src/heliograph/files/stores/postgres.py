@@ -16,7 +16,7 @@ TYPES = {"b": "boolean", "f": "double precision", "M": "timestamptz", "i": "doub
 
 
 def ask_postgres(address: StoreAddress) -> tuple[str, dict[str, Any]]:
-    """Ask for a table in a transaction that only reads; return the database's name and the columns, as lists.
+    """Return the database's name and the columns of a table, as lists, asked for in a transaction that only reads.
 
     Raises:
         ValueError: the server is away or refuses; no rows; a name twice. One line.
@@ -33,7 +33,7 @@ def ask_postgres(address: StoreAddress) -> tuple[str, dict[str, Any]]:
             names = [column.name for column in cursor.description]
             rows = cursor.fetchall()
     except (psycopg.Error, OverflowError) as error:  # a date that Python has not
-        raise _explain(address, error) from None
+        raise _explain_error(address, error) from None
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise fail(str(address), "columns of different names", f"{twice!r} more than once")
@@ -68,7 +68,7 @@ def write_postgres(address: StoreAddress, columns: Mapping[str, np.ndarray], pla
                 for row in zip(*cells, strict=True):
                     copy.write_row((plant, *row))
     except psycopg.Error as error:
-        raise _explain(address, error) from None
+        raise _explain_error(address, error) from None
 
 
 def check_postgres(address: StoreAddress) -> None:
@@ -76,7 +76,7 @@ def check_postgres(address: StoreAddress) -> None:
     try:
         psycopg.connect(address.url, connect_timeout=10).close()
     except psycopg.Error as error:
-        raise _explain(address, error) from None
+        raise _explain_error(address, error) from None
 
 
 def _convert_cells(column: np.ndarray) -> list[Any]:
@@ -87,8 +87,8 @@ def _convert_cells(column: np.ndarray) -> list[Any]:
     return [value if value == value else None for value in column.tolist()]
 
 
-def _explain(address: StoreAddress, error: Exception) -> InputError:
-    """Return the error of one line: what the server said first."""
+def _explain_error(address: StoreAddress, error: Exception) -> InputError:
+    """Return an error of one line: the first that the server said."""
     said = next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
     away = isinstance(error, psycopg.OperationalError)
     return fail(str(address), "a server that answers" if away else "what the server accepts", said)

@@ -62,7 +62,7 @@ def _convert_cell(cell: object) -> object:
 
 
 def ask_store(address: StoreAddress) -> StoreTable:
-    """Ask a store for the rows of its query or table.
+    """Return the rows of a store's query or table.
 
     Raises:
         ValueError: the server is away or refuses, no rows, neither a query nor a table; one line.
@@ -79,7 +79,7 @@ def ask_store(address: StoreAddress) -> StoreTable:
 
 
 def check_store(address: StoreAddress) -> None:
-    """Raise the error that writing to a store would raise at once: no package, no server, a query in the URL.
+    """Raise now what writing to a store would raise at once: no package, no server, a query in the URL.
 
     Raises:
         ValueError: one line.

@@ -6,7 +6,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 from heliograph.disk.quoting import unquote_cell
-from heliograph.files.text.dialects import NO_VALUE, check_header, hint_of_cell, recoding, suggest_rewrite
+from heliograph.files.text.dialects import (
+    NO_VALUE,
+    check_header,
+    guess_meaning_of_cell,
+    suggest_recoding,
+    suggest_rewrite,
+)
 from heliograph.files.text.text_file import is_text, open_text
 from heliograph.numerics.check import InputError, fail, show_value
 
@@ -47,7 +53,7 @@ class CsvText:
         self.source, self.path, self._marked = source, path, marked
         self.header: list[str] = []
         self.number = 0
-        self._open: list[str] = []  # lines since one with a quote that is not closed
+        self._open_lines: list[str] = []  # lines since one with a quote that is not closed
 
     def add(self, line: str) -> list[CsvRow | InputError]:
         """Return the rows that a line completes, or why one cannot be read.
@@ -55,37 +61,43 @@ class CsvText:
         Raises:
             ValueError: a header that names no columns, or one of them twice; one line.
         """
-        if not self._open and '"' not in line:
-            return self._row(line.rstrip("\r\n").split(","))
-        self._open.append(line)
-        return self._close(ended=False)
+        if not self._open_lines and '"' not in line:
+            return self._make_row(line.rstrip("\r\n").split(","))
+        self._open_lines.append(line)
+        return self._read_open_lines(ended=False)
 
     def end(self) -> list[CsvRow | InputError]:
         """Return what is left at the end of the text."""
-        return self._close(ended=True)
+        return self._read_open_lines(ended=True)
 
-    def _close(self, ended: bool) -> list[CsvRow | InputError]:
-        """Read the lines since a quote was opened, if it is closed; one that never is costs its own line alone."""
+    def _read_open_lines(self, ended: bool) -> list[CsvRow | InputError]:
+        """Return the rows of the lines since a quote was opened, once it is closed.
+
+        Where it is not closed within OPEN lines, or at the end, its line is an error and the others are read anew.
+        """
         rows: list[CsvRow | InputError] = []
-        while self._open:
+        while self._open_lines:
             try:
-                cells = next(csv.reader(["".join(self._open)], strict=True))
+                cells = next(csv.reader(["".join(self._open_lines)], strict=True))
             except csv.Error as error:
-                if "unexpected end" in str(error) and not ended and len(self._open) < OPEN:
+                if "unexpected end" in str(error) and not ended and len(self._open_lines) < OPEN:
                     return rows
-                lines, self._open = self._open, []
-                rows += self._row(lines[:1], str(error))
+                lines, self._open_lines = self._open_lines, []
+                rows += self._make_row(lines[:1], str(error))
                 for line in lines[1:]:
                     rows += self.add(line)
                 if not ended:
                     return rows
             else:
-                self._open = []
-                rows += self._row(cells)
+                self._open_lines = []
+                rows += self._make_row(cells)
         return rows
 
-    def _row(self, cells: list[str], broken: str = "") -> list[CsvRow | InputError]:
-        """Return the row of these cells; nothing of a header and of an empty line."""
+    def _make_row(self, cells: list[str], broken: str = "") -> list[CsvRow | InputError]:
+        """Return the row of these cells, or why they are none; [] of a header, an annotation or an empty line.
+
+        `broken`: what is wrong with the line, if it is known already.
+        """
         if not broken and not any(cell.strip() for cell in cells):
             return []
         if cells[0].strip() in ANNOTATIONS:
@@ -100,14 +112,14 @@ class CsvText:
             return []
         self.number += 1
         where = f"{self.source}, row {self.number}"
-        why = fail(where, "a row of CSV", broken) if broken else self._fault(where, cells)
+        why = fail(where, "a row of CSV", broken) if broken else self._find_fault(where, cells)
         return [CsvRow(where, self.number, self.header, [c.strip() for c in cells]) if why is None else why]
 
-    def _fault(self, where: str, cells: list[str]) -> InputError | None:
+    def _find_fault(self, where: str, cells: list[str]) -> InputError | None:
         """Return why cells are no row of this table; None if they are."""
         line = ",".join(cells)
         if not is_text(line):
-            return fail(where, "a text in UTF-8 or UTF-16", f"{show_value(line)}{recoding(self.path, line)}")
+            return fail(where, "a text in UTF-8 or UTF-16", f"{show_value(line)}{suggest_recoding(self.path, line)}")
         if line.lstrip().startswith("#") and not (self._marked and len(cells) == len(self.header)):
             remedy = "" if self.path is None else f": {suggest_rewrite(self.path, comment='#')}"
             return fail(where, "numbers", f"a comment, {show_value(cells[0])}{remedy}")
@@ -157,6 +169,6 @@ def parse_cell(where: str, name: str, cell: str, path: Path | None) -> float:
     except ValueError:
         if NO_VALUE.fullmatch(cell):
             return float("nan")
-        hint = hint_of_cell(cell, name, path)
+        hint = guess_meaning_of_cell(cell, name, path)
         expected = "a number or an empty cell"
         raise fail(f"{where}, column {name!r}", expected, f"{show_value(cell)}{hint}") from None

@@ -36,19 +36,21 @@ def check_header(source: str, header: Sequence[str], path: Path | None, marked: 
     """
     line = ",".join(header)
     if not is_text(line):
-        raise fail(f"{source}, header", "a text in UTF-8 or UTF-16", f"{show_value(line)}{recoding(path, line)}")
+        raise fail(
+            f"{source}, header", "a text in UTF-8 or UTF-16", f"{show_value(line)}{suggest_recoding(path, line)}"
+        )
     if line.startswith(COMMENTS) and not (marked and len(header) > 1):
-        remedy = "" if path is None else f": {_rewriting_without_comments(path)}"
+        remedy = "" if path is None else f": {_suggest_without_comments(path)}"
         raise fail(f"{source}, header", "names of columns", f"a comment, {show_value(line)}{remedy}")
-    mark = separator_of(header)
+    mark = find_separator(header)
     if mark is not None:
-        remedy = "" if path is None else f": {_suggest_rewriting(path, mark)}"
+        remedy = "" if path is None else f": {_suggest_separator(path, mark)}"
         came = f"{SEPARATORS[mark]} in {show_value(line)}{remedy}"
         raise fail(f"{source}, header", "names separated by commas", came)
     check_distinct(source, [name for name in header if name])
 
 
-def separator_of(header: Sequence[str]) -> str | None:
+def find_separator(header: Sequence[str]) -> str | None:
     """Return what separates several names that were read as one; None if nothing does."""
     return next((mark for mark in SEPARATORS if len(header) == 1 and mark in header[0]), None)
 
@@ -62,22 +64,23 @@ def names_in(line: str) -> set[str]:
 
 
 def suggest_rewrite(path: Path, **how: object) -> str:
-    """Write the pandas call that converts a table written in another dialect, read with the arguments `how`."""
+    """Return the pandas call that rewrites a table of another dialect, which is read with the arguments `how`."""
     given = "".join(f", {name}={value!r}" for name, value in how.items())
     return f"pandas.read_csv({str(path)!r}{given}).to_csv({str(path)!r}, index=False) rewrites it"
 
 
-def recoding(path: Path | None, line: str) -> str:
-    """Return what rewrites a table of another encoding, of which a line is known; "" where it cannot be read again."""
+def suggest_recoding(path: Path | None, line: str) -> str:
+    """Return the call that rewrites a table of another encoding, by one of its lines; "" if it cannot be read again."""
     if path is None:
         return ""
     encoding = "utf-16-le" if "\0" in line else "latin-1"
     commented = line.startswith(COMMENTS)
-    return f": {_rewriting_without_comments(path, encoding) if commented else suggest_rewrite(path, encoding=encoding)}"
+    return f": {_suggest_without_comments(path, encoding) if commented else suggest_rewrite(path, encoding=encoding)}"
 
 
-def hint_of_cell(cell: str, name: str, path: Path | None) -> str:
-    """Return what is probably meant by a cell that is no number, with what rewrites the table; "" if nobody knows."""
+def guess_meaning_of_cell(cell: str, name: str, path: Path | None) -> str:
+    """Return what a cell that is no number probably means, with the call that rewrites the table; "" if unknown."""
+    # 21.11.2026 and 11/21/2026: the day comes first where it cannot be a month, or between full stops.
     if day := DAY_FIRST.fullmatch(cell):
         first = int(day[1]) > 12 or (day[2] == "." and int(day[3]) <= 12)
         remedy = "" if path is None else f": {suggest_rewrite(path, parse_dates=[name], dayfirst=first)}"
@@ -91,27 +94,30 @@ def hint_of_cell(cell: str, name: str, path: Path | None) -> str:
     return ""
 
 
-def _suggest_rewriting(path: Path, mark: str) -> str:
-    """Say how to rewrite a table with another separator, from the first lines of the file."""
+def _suggest_separator(path: Path, mark: str) -> str:
+    """Return the call that rewrites a table with another separator, from the first lines of the file."""
     with open_text(path) as file:
         start = file.read(SEEN)
     if start.lstrip().startswith(COMMENTS):
-        return _rewriting_without_comments(path)
+        return _suggest_without_comments(path)
     commas = re.search(r"\d,\d", start)
     return suggest_rewrite(path, sep=mark, decimal=",") if commas else suggest_rewrite(path, sep=mark)
 
 
-def _rewriting_without_comments(path: Path, encoding: str = "") -> str:
+def _suggest_without_comments(path: Path, encoding: str = "") -> str:
     """Return the pandas call that converts a table whose first lines are comments, the last maybe its header."""
     with open_text(path) as file:
         lines = [line.strip() for line in file.read(100_000).splitlines() if line.strip()]
+    # The first line that is no comment tells the separator.
     comments = next((i for i, line in enumerate(lines) if not line.startswith(COMMENTS)), len(lines))
     following = lines[comments] if comments < len(lines) else "0"
     mark = next((mark for mark in (",", *SEPARATORS) if mark in following), r"\s+")
-    first = re.split(mark if mark == r"\s+" else re.escape(mark), following)[0]
-    sep = ({} if mark == "," else {"sep": mark}) | ({"encoding": encoding} if encoding else {})
-    if not re.match(r"[-+.\d]", first):  # names of their own
-        return suggest_rewrite(path, comment=lines[0][0], **sep)
+    pattern = mark if mark == r"\s+" else re.escape(mark)
+    how = ({} if mark == "," else {"sep": mark}) | ({"encoding": encoding} if encoding else {})
+    # If it begins with no number, it has the names; else the last comment does.
+    first_cell = re.split(pattern, following)[0]
+    if not re.match(r"[-+.\d]", first_cell):
+        return suggest_rewrite(path, comment=lines[0][0], **how)
     title = lines[comments - 1].lstrip("".join(COMMENTS) + " ")
-    split = [part.strip() for part in re.split(mark if mark == r"\s+" else re.escape(mark), title) if part.strip()]
-    return suggest_rewrite(path, skiprows=comments, names=split, **sep)
+    names = [part.strip() for part in re.split(pattern, title) if part.strip()]
+    return suggest_rewrite(path, skiprows=comments, names=names, **how)

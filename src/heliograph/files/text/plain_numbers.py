@@ -15,7 +15,7 @@ BLOCK = 1 << 24  # bytes of lines that are read together
 
 
 def read_plain_numbers(path: Path) -> tuple[list[str], Float[np.ndarray, "rows columns"]] | None:
-    """Return the names and numbers of a table, NaN for empty cells; None of one of which anything is not plain.
+    """Return the names and numbers of a table, NaN for empty cells; None of a table in which anything is not plain.
 
     JSON writes numbers as such tables do, and is read in a fiftieth of the time that a row takes with its cells one by
     one. What it does not take, .5 or 007 or a row that is shorter, is for the reader of rows, which says why.
@@ -45,10 +45,13 @@ def _read_block(lines: bytes, columns: int) -> Float[np.ndarray, "rows columns"]
     body = lines.replace(b"\r\n", b"\n").removesuffix(b"\n")
     if b"\r" in body or OTHERWISE.search(body):
         return None
-    # An empty cell stands between two commas, or at an end of its line.
+    # An empty cell stands between two commas, or at an end of its line; twice, since matches do not overlap.
     body = body.replace(b",,", b",null,").replace(b",,", b",null,")
     body = body.replace(b",\n", b",null\n").replace(b"\n,", b"\nnull,")
-    body = (b"null" if body.startswith(b",") else b"") + body + (b"null" if body.endswith(b",") else b"")
+    if body.startswith(b","):
+        body = b"null" + body
+    if body.endswith(b","):
+        body += b"null"
     try:
         rows = msgspec.json.decode(b"[[" + body.replace(b"\n", b"],[") + b"]]", type=list[list[float | None]])
     except msgspec.DecodeError:

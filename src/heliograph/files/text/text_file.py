@@ -24,7 +24,7 @@ class CutOffError(InputError):
 
 
 def kind_of(path: Path) -> str:
-    """Return the extension of a file in small letters, without .gz where it is packed; of a table in a .txt ".csv"."""
+    """Return the extension of a file in small letters: before .gz where it is packed, ".csv" of a table in a .txt."""
     kind = (path.with_suffix("") if path.suffix.lower() == PACKED else path).suffix.lower()
     return ".csv" if kind == ".txt" and path.is_file() and _begins_as_table(path) else kind
 
@@ -99,4 +99,5 @@ def until_cut_off(parts: Iterable[T]) -> Iterator[T | CutOffError]:
 
 
 def _shorten(error: Exception) -> str:
+    """Return in words what is wrong with a packed file."""
     return "one that was cut off" if isinstance(error, EOFError) else str(error)

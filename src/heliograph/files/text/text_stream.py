@@ -18,7 +18,7 @@ LONGEST_START = max(map(len, NO_TEXT))
 
 
 class TextStream:
-    """Bytes to text in UTF-8. What they are is said by the first of them.
+    """Turns bytes as they come into text in UTF-8; the first of them tell whether they are packed or UTF-16.
 
     Args:
         source: where they come from, for errors.
@@ -31,13 +31,14 @@ class TextStream:
         self.source, self.broken = source, ""
         self._start: bytes | None = b""  # bytes of which it is not known yet what they are
         self._packed: bytes | None = None  # packed bytes that are not unpacked yet; None of what is not packed
-        self._unpack, self._begun = zlib.decompressobj(16 + zlib.MAX_WBITS), False
+        self._unpack = zlib.decompressobj(16 + zlib.MAX_WBITS)  # 16: of gzip
+        self._in_member = False  # whether a packed file has begun and not ended
         self._inside: TextStream | None = None  # of what was packed
         self._decode: codecs.IncrementalDecoder | None = None
 
     @property
     def more(self) -> bool:
-        """Return whether there is text that no more bytes are needed for."""
+        """Return whether bytes wait to be unpacked, so that `feed` has text without more bytes."""
         return bool(self._packed) and not self.broken
 
     def feed(self, data: bytes, ended: bool = False) -> bytes:
@@ -64,7 +65,7 @@ class TextStream:
         return len(start) < len(WIDE[0]) or any(mark.startswith(start) for mark in marks if len(start) < len(mark))
 
     def _begin(self, start: bytes) -> bytes:
-        """Choose how the bytes are read; return those that are read so."""
+        """Choose how the bytes are read, by the first of them; return them without the mark of UTF-8."""
         for mark, kind in NO_TEXT.items():
             if start.startswith(mark):
                 came = f"{kind}: heliograph replay sends it as messages"
@@ -80,15 +81,15 @@ class TextStream:
         packed, results = (self._packed or b"") + data, b""
         try:
             while packed and len(results) < AT_ONCE and not self.broken:
-                self._begun = True
+                self._in_member = True
                 results += self._unpack.decompress(packed, AT_ONCE)
                 packed = self._unpack.unconsumed_tail
                 if self._unpack.eof:  # files one after another are one
-                    packed, self._begun = self._unpack.unused_data.lstrip(b"\0"), False
+                    packed, self._in_member = self._unpack.unused_data.lstrip(b"\0"), False
                     self._unpack = zlib.decompressobj(16 + zlib.MAX_WBITS)
         except zlib.error as error:
             self.broken = str(fail(self.source, "a packed file without damage", error))
         self._packed = packed
-        if ended and self._begun and not packed and not self.broken:
+        if ended and self._in_member and not packed and not self.broken:
             self.broken = str(fail(self.source, "a packed file without damage", "one that was cut off"))
         return results

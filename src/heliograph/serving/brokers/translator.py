@@ -113,7 +113,7 @@ class Translator:
             more = "" if len(unknown) <= LISTED else f" and {len(unknown) - LISTED} more"
             lines.append(f"topics that are not among the sources: {named}{more}")
         lines += [*self.sources.notes, *self.sources.senders.lines()]
-        if said := self.sources.never():
+        if said := self.sources.describe_absent_field():
             lines.append(f"a field that no message had: {said}")
         if self._stored:
             lines.append(f"{self._stored} stored messages were left out: without time= they have no date")
@@ -137,7 +137,7 @@ class Translator:
         results: list[Message | UnreadMessage | str] = []
         try:
             # Who is online or offline is noted by the sources; such a message has no readings.
-            if self.sources.hear(topic, payload, where):
+            if self.sources.take_word(topic, payload, where):
                 return []
             # Messages of unknown topics are counted, whatever they carry.
             if not self.sources.of(topic):
@@ -185,7 +185,7 @@ class Translator:
                 f"{topic}, plant", f"a name of at most {NAME} characters, without NUL", show_value(reading.plant)
             )
         arrival = datetime.now(UTC) if known is None else known
-        reading = self.sources.original(reading, None if known is None else (arrival - EPOCH) // MICROSECOND * 1000)
+        reading = self.sources.date_copy(reading, None if known is None else (arrival - EPOCH) // MICROSECOND * 1000)
         time: datetime | float = arrival
         came: datetime | None = None
         if reading.time is not None and self.sources.steps and self.sources.step is None:
