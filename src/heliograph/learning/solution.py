@@ -12,7 +12,7 @@ from heliograph.learning.intervals import (
     Method,
     Scores,
     allowed_fall,
-    block_sums,
+    draw_block_sums,
     covariance_by_model,
     find_told_by_few,
     long_run,
@@ -292,7 +292,7 @@ class Solution:
 
     def _draw_ends(self, slopes: np.ndarray, level: float) -> np.ndarray:
         """Return the ends of an interval by blocks of scores drawn anew, less the estimate."""
-        drawn = np.linalg.solve(self.hessian, block_sums([s @ self.basis for s in self.scores], DRAWS, 0).T)
+        drawn = np.linalg.solve(self.hessian, draw_block_sums([s @ self.basis for s in self.scores], DRAWS, 0).T)
         ends: np.ndarray = np.quantile(slopes @ self.basis @ drawn, [(1 - level) / 2, (1 + level) / 2])
         return ends
 
