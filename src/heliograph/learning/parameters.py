@@ -17,7 +17,10 @@ from heliograph.numerics.types import Array, Float
 @readable
 @dataclass(frozen=True)
 class Parameter:
-    """Free number: its name, start, domain, and the coordinates and entries that it has."""
+    """A free number, which may be an array: its name, start and domain.
+
+    Its coordinates are unbounded numbers, on which it is searched; its entries are the numbers of the table.
+    """
 
     name: str
     start: Float[np.ndarray, "..."]
@@ -25,16 +28,18 @@ class Parameter:
 
     @property
     def size(self) -> int:
-        """Count of numbers on the line."""
+        """Return how many coordinates it has."""
         return size(self.domain, self.start.shape)
 
     @property
     def entries(self) -> tuple[str, ...]:
-        """Names of its entries, of a covariance those on and below the diagonal."""
+        """Return the names of its entries, of a covariance those on and below the diagonal."""
         if self.start.ndim == 0:
             return (self.name,)
-        places = [at for at in np.ndindex(self.start.shape) if self.domain.kind != "covariance" or at[0] >= at[1]]
-        return tuple(f"{self.name}[{','.join(map(str, at))}]" for at in places)
+        indices = np.ndindex(self.start.shape)
+        is_covariance = self.domain.kind == "covariance"
+        shown = [index for index in indices if not is_covariance or index[0] >= index[1]]
+        return tuple(f"{self.name}[{','.join(map(str, index))}]" for index in shown)
 
     def read(self, value: Array) -> Array:
         """Return the vector of the entries of a value."""
@@ -53,11 +58,12 @@ class Parameter:
             return np.asarray(jax.jacfwd(self._read_at)(jnp.asarray(x)))
 
     def _read_at(self, x: Array) -> Array:
+        """Return the entries at coordinates, in operations that JAX traces."""
         return self.read(map_from_line(self.domain, self.start.shape, x))
 
     @property
     def entry_domains(self) -> tuple[Domain, ...]:
-        """Domain of each entry."""
+        """Return the domain of each entry."""
         if self.domain.kind == "simplex":
             return (PROBABILITY,) * self.start.size
         if self.domain.kind == "covariance":
@@ -66,7 +72,7 @@ class Parameter:
 
 
 class Entry(NamedTuple):
-    """Number of the table: its name, its domain, and its place on the line if it is a coordinate itself."""
+    """Number of the table: its name, its domain, and the index of its coordinate; None if it has none of its own."""
 
     name: str
     domain: Domain
@@ -86,30 +92,30 @@ class Parameters:
 
     @property
     def size(self) -> int:
-        """Count of numbers on the line."""
+        """Return how many coordinates all have together."""
         return sum(parameter.size for parameter in self.every)
 
     @property
     def start(self) -> Float[np.ndarray, " p"]:
-        """Starts of all free numbers, mapped to the whole line."""
+        """Return the coordinates of all starts."""
         return np.concatenate(
             [map_to_line(parameter.name, parameter.domain, parameter.start) for parameter in self.every]
         )
 
     @property
     def entries(self) -> tuple[Entry, ...]:
-        """Rows of the table of parameters: one for each free number."""
+        """Return the numbers of the table, in order."""
         results, begin = [], 0
         for parameter in self.every:
-            on_line = parameter.domain.kind == "interval"
+            has_own = parameter.domain.kind == "interval"  # each entry a coordinate
             for i, (name, domain) in enumerate(zip(parameter.entries, parameter.entry_domains, strict=True)):
-                results.append(Entry(name, domain, begin + i if on_line else None))
+                results.append(Entry(name, domain, begin + i if has_own else None))
             begin += parameter.size
         return tuple(results)
 
     @property
     def coordinates(self) -> tuple[str, ...]:
-        """Names of the numbers on the line."""
+        """Return the names of all coordinates."""
         return tuple(
             parameter.entries[i] if parameter.domain.kind == "interval" else f"{parameter.name}({i})"
             for parameter in self.every
@@ -138,6 +144,7 @@ class Parameters:
         return np.asarray(block_diag(*(parameter.derivatives(single) for parameter, single in self._parts(x))))
 
     def _parts(self, x: np.ndarray) -> list[tuple[Parameter, np.ndarray]]:
+        """Return each free number with its coordinates at a point."""
         ends = np.cumsum([parameter.size for parameter in self.every])
         return list(zip(self.every, np.split(x, ends[:-1]), strict=True))
 
@@ -149,5 +156,5 @@ class Parameters:
 
 
 def plain_number(value: Array) -> float | np.ndarray:
-    """Convert a number to a float, several to an array."""
+    """Return a single number as a float, several as an array."""
     return float(value) if np.ndim(value) == 0 else np.asarray(value)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize
@@ -108,7 +108,7 @@ def fit_sender(
 
     In delta the likelihood has steps, where a value that came would have been silent: so it is searched without
     derivatives (Nelder and Mead), from the start and from others around it. The interval of a number is where twice
-    the likelihood, largest over all others, is within 3.84 of its maximum. Who interrupts keeps the best so far.
+    the log-likelihood, largest over all others, is within 3.84 of its maximum. Ctrl-C returns the best so far.
 
     Raises:
         KeyboardInterrupt: before there was a first point.
@@ -121,10 +121,10 @@ def fit_sender(
         raise fail(
             "free numbers of a sender that decides", "numbers with limits of their own", "a simplex or covariance"
         )
-    # The likelihood of all recordings at a point of the line.
     data = gather_data(description.start, recording, inputs, parameters.size)
 
     def likelihood(x: Float[np.ndarray, " p"]) -> float:
+        """Return the log-likelihood of all recordings at a point of the line; -1e300 where they are impossible."""
         filter = filter_at(description.at_point(x))
         rows = zip(data.measurements, data.inputs, data.lengths, strict=True)
         total = sum(float(log_likelihood(filter, z[:n], u[:n])) for z, u, n in rows)
@@ -148,33 +148,34 @@ def fit_sender(
 def _search_starts(
     likelihood: Likelihood, points: Sequence[Float[np.ndarray, " p"]]
 ) -> tuple[Float[np.ndarray, " p"], float, bool, bool]:
-    """The best point from several starts, its likelihood, whether its search converged, and whether it was stopped.
+    """Return the best point of several starts, its likelihood, whether it converged and whether it was stopped.
 
     Raises:
         KeyboardInterrupt: before there was a first point.
     """
-    seen: tuple[Float[np.ndarray, " p"], float] | None = None
+    best: tuple[Float[np.ndarray, " p"], float] | None = None
 
-    def noted(x: Float[np.ndarray, " p"]) -> float:
-        nonlocal seen
+    def evaluate(x: Float[np.ndarray, " p"]) -> float:
+        """Return the likelihood at a point, and keep the best one so far."""
+        nonlocal best
         total = likelihood(x)
-        if seen is None or total > seen[1]:
-            seen = x.copy(), total
+        if best is None or total > best[1]:
+            best = x.copy(), total
         return total
 
     ends = list[tuple[Float[np.ndarray, " p"], float, bool]]()
     try:
         for point in points:
-            ends.append(_climb_simplex(noted, np.asarray(point)))
+            ends.append(_climb_simplex(evaluate, np.asarray(point)))
     except KeyboardInterrupt:
-        if seen is None:
+        if best is None:
             raise
-        return *seen, False, True
+        return *best, False, True
     return *max(ends, key=lambda end: end[1]), False
 
 
 def filter_at(network: Network) -> AbstractFilter:
-    """Return the filter whose likelihood counts."""
+    """Return the event filter of the network's only node, whose likelihood is maximised."""
     (node,) = network.nodes.values()
     if not isinstance(node, Node) or node.trigger is None:
         raise fail("node to be learned", "one whose sender decides", type(node).__name__)
@@ -188,7 +189,15 @@ def _climb_simplex(
     size: float = 0.2,
     digits: float = DIGITS,
 ) -> tuple[Float[np.ndarray, " p"], float, bool]:
-    """Return the maximum that is reached from a start by a simplex of this size, or the first point above `enough`."""
+    """Return (point, likelihood, whether it converged) of a search by Nelder and Mead from `start`.
+
+    Args:
+        likelihood: what is maximised.
+        start: the first corner of the simplex, (p,).
+        enough: the search ends at the first point above it.
+        size: edges of the simplex.
+        digits: size at which the simplex is small enough.
+    """
     first = likelihood(start)
     if not len(start) or first > enough:
         return start, first, True
@@ -200,37 +209,57 @@ def _climb_simplex(
         if -intermediate_result.fun > enough:
             raise StopIteration
 
-    def lack(x: Float[np.ndarray, " p"]) -> float:
-        return -first if np.array_equal(x, start) else -likelihood(x)
+    def negative_likelihood(x: Float[np.ndarray, " p"]) -> float:
+        return -first if np.array_equal(x, start) else -likelihood(x)  # at the start it is known already
 
-    optimum = climb(lack, start, method="Nelder-Mead", options=options, callback=stop)
+    optimum = climb(negative_likelihood, start, method="Nelder-Mead", options=options, callback=stop)
     return np.asarray(optimum.x), -float(optimum.fun), bool(optimum.success)
 
 
 def _row_without_ends(description: Description, x: Float[np.ndarray, " p"], index: int) -> Row:
-    """Return the estimate, with no interval."""
-    estimate = float(description.parameters.entries_at(x)[index])
-    return Row(description.parameters.entries[index].name, estimate, np.nan, np.nan, np.nan, "conditional", False, True)
+    """Return the row of the estimate of a number, without an interval."""
+    return Row(
+        name=description.parameters.entries[index].name,
+        estimate=float(description.parameters.entries_at(x)[index]),
+        low=np.nan,
+        high=np.nan,
+        standard_error=np.nan,
+        form="conditional",
+        boundary=False,
+        identified=True,
+    )
 
 
 def _make_row(
     row: Row, description: Description, likelihood: Likelihood, x: Float[np.ndarray, " p"], total: float, index: int
 ) -> Row:
-    """Return the row of an estimate, with how far the profile stays near its maximum to either side."""
+    """Return the row of an estimate, with how far its profile stays near its maximum to either side.
+
+    Args:
+        row: the row without an interval.
+        description: the network with its free numbers.
+        likelihood: log-likelihood at a point of the line.
+        x: the maximum (p,).
+        total: log-likelihood there.
+        index: number of the entry of the table.
+    """
     entry = description.parameters.entries[index]
     coordinate = index if entry.coordinate is None else entry.coordinate
+    least = total - allowed_fall(LEVEL)
 
-    # The profile at a value, searched from where it was highest at the last one, as far as the two are apart.
-    def near(value: float) -> bool:
-        (known, rest), least = last, total - allowed_fall(LEVEL)
-        size = float(np.clip(abs(value - known), 10 * NEAR, 0.2))
-        rest, top, _ = _climb_simplex(
-            lambda other: likelihood(np.insert(other, coordinate, value)), rest, least, size, NEAR
+    def is_inside(value: float, start: "_ProfilePoint") -> tuple[bool, "_ProfilePoint"]:
+        """Return whether the profile at a value is within the fall, searched from a point of it nearby; and its point.
+
+        The simplex is as large as the two values are apart.
+        """
+        size = float(np.clip(abs(value - start.value), 10 * NEAR, 0.2))
+        others, top, _ = _climb_simplex(
+            lambda others: likelihood(np.insert(others, coordinate, value)), start.others, least, size, NEAR
         )
-        last[:] = [value, rest]
-        return top > least
+        return top > least, _ProfilePoint(value, others)
 
-    def number(value: float) -> float:
+    def entry_at(value: float) -> float:
+        """Return the entry of the table where its coordinate has a value."""
         point = x.copy()
         point[coordinate] = value
         return float(description.parameters.entries_at(point)[index])
@@ -238,15 +267,25 @@ def _make_row(
     # Doubled steps until the profile is below, then bisection.
     ends = []
     for sign in (-1.0, 1.0):
-        inside, outside, last = 0.0, 0.05, [x[coordinate], np.delete(x, coordinate)]
-        while outside < FURTHEST and near(x[coordinate] + sign * outside):
+        inside, outside, last = 0.0, 0.05, _ProfilePoint(x[coordinate], np.delete(x, coordinate))
+        while outside < FURTHEST:
+            within, last = is_inside(x[coordinate] + sign * outside, last)
+            if not within:
+                break
             inside, outside = outside, 2 * outside
         for _ in range(HALVINGS):
             middle = (inside + outside) / 2
-            still = near(x[coordinate] + sign * middle)
-            inside, outside = (middle, outside) if still else (inside, middle)
+            within, last = is_inside(x[coordinate] + sign * middle, last)
+            inside, outside = (middle, outside) if within else (inside, middle)
             if outside - inside < NEAR:
                 break
-        ends.append(number(x[coordinate] + sign * outside))
+        ends.append(entry_at(x[coordinate] + sign * outside))
     low, high = sorted(ends)
     return row._replace(low=low, high=high, standard_error=(high - low) / (2 * 1.96))
+
+
+class _ProfilePoint(NamedTuple):
+    """Point of a profile: the value of its coordinate, and the others where the likelihood was best."""
+
+    value: float
+    others: Float[np.ndarray, " others"]

@@ -12,8 +12,8 @@ from heliograph.learning.intervals import (
     Method,
     Scores,
     allowed_fall,
-    draw_block_sums,
     covariance_by_model,
+    draw_block_sums,
     find_told_by_few,
     long_run,
     quantile,
@@ -75,7 +75,7 @@ class Row(NamedTuple):
 
 
 def round_to_width(value: float, width: float) -> str:
-    """Write a number to two digits of a width, at most eight of its own; to four of its own where there is no width.
+    """Return a number to two digits of a width, at most eight of its own; to four of its own where there is no width.
 
     An end that is far smaller than the width keeps two digits of its own.
     """
@@ -120,7 +120,7 @@ class Solution:
 
     @property
     def active(self) -> Bool[np.ndarray, " p"]:
-        """Which coordinates are not at a boundary (p,)."""
+        """Return which coordinates are not at a boundary (p,)."""
         return self.top.active
 
     @property
@@ -172,11 +172,12 @@ class Solution:
         return np.asarray(self.rank.unit[:, None] * self.rank.rest)
 
     def _reduce(self, matrix: np.ndarray) -> np.ndarray:
+        """Return a matrix of the active coordinates along the identified directions, B' A B."""
         return np.asarray(self.basis.T @ matrix @ self.basis)
 
     @cached_property
     def few(self) -> Bool[np.ndarray, " active"]:
-        """Which active coordinates are real numbers of which a few stretches of the data tell: a step, a start."""
+        """Return which active coordinates are real numbers told by a few stretches of the data, as a step is."""
         places = np.flatnonzero(self.active & self.surface.domains.free)
         few = np.zeros(len(self.active), dtype=bool)
         if len(places) and not self.rank.flat.size:
@@ -188,13 +189,14 @@ class Solution:
 
         Of numbers of which a few stretches of the data tell the scores' covariance is the model's.
         """
-        scores, known = self.scores, np.zeros((len(self.few), len(self.few)))
+        scores, by_model = self.scores, np.zeros((len(self.few), len(self.few)))
         if self.few.any():
-            back = np.linalg.inv(self.basis)
-            scores, known = covariance_by_model(scores, back.T @ self.hessian @ back, self.few)
+            # The Hessian of all active coordinates from that along the directions, which are as many.
+            inverse = np.linalg.inv(self.basis)
+            scores, by_model = covariance_by_model(scores, inverse.T @ self.hessian @ inverse, self.few)
         estimate = long_run(method, [s @ self.basis for s in scores], self.hessian)
         if method != "hessian":
-            estimate = estimate._replace(covariance=estimate.covariance + self._reduce(known))
+            estimate = estimate._replace(covariance=estimate.covariance + self._reduce(by_model))
         return np.asarray(self.basis @ sandwich(self.hessian, estimate.covariance) @ self.basis.T), estimate.freedom
 
     def rows(self, method: Method = "cosines", level: float = LEVEL) -> tuple[Row, ...]:
@@ -285,13 +287,13 @@ class Solution:
         return Row(entry.name, value, least, most, error * slope, self.form, False, True)
 
     def identifies(self, slopes: Float[np.ndarray, " active"]) -> bool:
-        """Decide whether the data identify a function of the coordinates with this derivative."""
+        """Return whether the data identify a function with this derivative by coordinate: it has none along ridges."""
         along = self.rank.unit * slopes
         size = np.linalg.norm(along)
         return bool(size > 0 and np.linalg.norm(along @ self.rank.flat) <= ALONG * size)
 
     def _draw_ends(self, slopes: np.ndarray, level: float) -> np.ndarray:
-        """Return the ends of an interval by blocks of scores drawn anew, less the estimate."""
+        """Return the ends of an interval, relative to the estimate, by sums of blocks of scores drawn anew."""
         drawn = np.linalg.solve(self.hessian, draw_block_sums([s @ self.basis for s in self.scores], DRAWS, 0).T)
         ends: np.ndarray = np.quantile(slopes @ self.basis @ drawn, [(1 - level) / 2, (1 + level) / 2])
         return ends
@@ -308,7 +310,7 @@ class Solution:
         return Row(entry.name, value, min(value, limit), max(value, limit), np.nan, self.form, True, True)
 
     def _cut_profile(self, coordinate: int, first: np.ndarray, drop: float) -> Float[np.ndarray, " sides"]:
-        """Where the profile of a coordinate has fallen by `drop`, from distances at which to look first."""
+        """Return where the profile of a coordinate has fallen by `drop`; `first`: signed distances to look at first."""
         furthest = REAL_END * np.abs(first).max() if self.surface.domains.free[coordinate] else END
         return self.surface.crossings(self.top.x, self.total, coordinate, first, furthest, drop, self.active)
 

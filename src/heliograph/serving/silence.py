@@ -122,7 +122,7 @@ class SilenceWatch:
 
     def _told_dead(self, plant: PlantState) -> tuple[str, ...]:
         """Return the senders of a plant that were told to be dead."""
-        return self._published[plant.name][1] if plant.name in self._told else ()
+        return self._published[plant.name][1] if plant.name in self._published else ()
 
 
 def find_dead_senders(fleet: Fleet, plants: Mapping[str, PlantState]) -> dict[str, list[str]]:

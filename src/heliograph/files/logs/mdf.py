@@ -57,8 +57,9 @@ def _list_units(file: "MDF", group: int) -> dict[str, str]:
 
 
 def _read_group(file: "MDF", group: int, names: dict[str, str]) -> Series:
-    """Return the times and signals of a group; a sample that the file marks as invalid is None, signals of several
-    numbers a sample are left out.
+    """Return the times and signals of a group.
+
+    A sample that the file marks as invalid is None; signals of several numbers a sample are left out.
     """
     time, values = np.zeros(0), dict[str, np.ndarray]()
     for name in names:

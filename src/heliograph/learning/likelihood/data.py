@@ -35,12 +35,12 @@ def gather_data(network: Network, recording: object, inputs: Any, free: int, tru
     Raises:
         ValueError: recordings of other shapes, too short, or without any change.
     """
-    several = (
-        recording if isinstance(recording, list | tuple) and not hasattr(recording, "measurements") else [recording]
-    )
+    # A Recording is a tuple too.
+    is_list = isinstance(recording, list | tuple) and not hasattr(recording, "measurements")
+    several = recording if is_list else [recording]
     if not len(several):
         raise fail("recordings", "at least one", "none")
-    # every run of every recording, then all filled up to the longest
+    # Every run of every recording, then all filled up to the longest.
     parts = [
         run
         for i, single in enumerate(several)
@@ -51,10 +51,10 @@ def gather_data(network: Network, recording: object, inputs: Any, free: int, tru
     longest = max(len(z) for z, _ in parts)
     true = [] if truth is False else _split_truth(network, several, truth, [len(z) for z, _ in parts])
     data = Data(
-        np.stack([_pad_rows(z, longest, np.nan) for z, _ in parts]),
-        np.stack([_pad_rows(u, longest, None) for _, u in parts]),
-        tuple(len(z) for z, _ in parts),
-        np.stack([_pad_rows(x, longest, np.nan) for x in true]) if true else None,
+        measurements=np.stack([_pad_rows(z, longest, np.nan) for z, _ in parts]),
+        inputs=np.stack([_pad_rows(u, longest, None) for _, u in parts]),
+        lengths=tuple(len(z) for z, _ in parts),
+        truth=np.stack([_pad_rows(x, longest, np.nan) for x in true]) if true else None,
     )
     _check_enough(data, free)
     return data
@@ -70,7 +70,9 @@ def _pick_inputs(inputs: object, index: int, several: Sequence[object]) -> objec
 
 
 def _split_truth(network: Network, several: Sequence[object], truth: Any, steps: list[int]) -> list[np.ndarray]:
-    """True states (steps, n) of each run of each recording, NaN where they are not known.
+    """Return the true states (steps, n) of each run of each recording, NaN where they are not known.
+
+    `truth`: True for those that the recordings hold, else the states, or a list of them; `steps`: length of each run.
 
     Raises:
         ValueError: recordings without them, other shapes.
@@ -92,24 +94,27 @@ def _split_truth(network: Network, several: Sequence[object], truth: Any, steps:
 
 
 def _split_runs(network: Network, recording: Any, inputs: Any) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return the measurements (steps, received) and inputs (steps, inputs) of each run of a recording."""
+    """Return the measurements (steps, received) and inputs (steps, inputs) of each run of a recording.
+
+    The same inputs led to every run; those of the recording count unless others are given.
+    """
     held = getattr(recording, "measurements", recording)
-    known = getattr(recording, "inputs", None) if inputs is None else inputs
-    # measurements by node
+    given_inputs = getattr(recording, "inputs", None) if inputs is None else inputs
+    # Measurements by node.
     if not isinstance(held, Mapping):
         if len(network.names) > 1:
             raise fail("recording", f"measurements by node, of {list(network.names)}", show_value(recording))
         held = {network.names[0]: held}
     if set(held) != set(network.names):
         raise fail("recording", f"measurements of the nodes {list(network.names)}", list(held))
-    # times of its rows: those that it holds, or the dates by which tables know them
+    # Times of its rows: those that it holds, or the dates in the index of its tables.
     clock = getattr(recording, "time", None)
     if isinstance(clock, np.ndarray):
         warn_of_unequal_steps(network.inputs, clock)
     else:
-        tables = {f"measurements of {name!r}": z for name, z in held.items()} | {"inputs": known}
+        tables = {f"measurements of {name!r}": z for name, z in held.items()} | {"inputs": given_inputs}
         judge_dates(network.inputs, tables)
-    # each run: the nodes' columns side by side, and the inputs
+    # Each run: the nodes' columns side by side, and the inputs.
     for name, z in held.items():
         check_columns(f"measurements of {name!r}", z, network.nodes[name].received_names)
     runs = _list_runs([np.asarray(fill_masked(held[name])) for name in network.names])
@@ -117,20 +122,22 @@ def _split_runs(network: Network, recording: Any, inputs: Any) -> list[tuple[np.
     for run in runs:
         columns: list[np.ndarray] = []
         for name, z in zip(network.names, run, strict=True):
-            like = len(columns[0]) if columns else None
-            measured = check_rows(f"measurements of {name!r}", z, like, network.nodes[name].received, missing=True)
+            length = len(columns[0]) if columns else None  # that of the first node
+            measured = check_rows(f"measurements of {name!r}", z, length, network.nodes[name].received, missing=True)
             columns.append(np.asarray(measured))
         steps, count = len(columns[0]), len(network.inputs)
-        if known is None and count:
+        if given_inputs is None and count:
             raise fail("inputs", f"an array ({steps}, {count}) of {list(network.inputs)}", "none")
-        u = np.zeros((steps, 0)) if known is None else check_rows("inputs", known, steps, count, False, network.inputs)
+        u = np.zeros((steps, 0))
+        if given_inputs is not None:
+            u = check_rows("inputs", given_inputs, steps, count, False, network.inputs)
         check_inputs(network.inputs, np.asarray(u), (network.plant, network.nodes, network.fused))
         results.append((np.concatenate(columns, axis=1), np.array(u)))
     return results
 
 
 def _list_runs(values: list[np.ndarray]) -> list[list[np.ndarray]]:
-    """Return the runs of a simulation one by one; a recording is one."""
+    """Return the arrays of all nodes by run: (runs, steps, received) are cut into runs, a recording is one run."""
     if all(value.ndim == 3 for value in values):
         return [list(run) for run in zip(*values, strict=True)]
     return [values]
@@ -144,7 +151,7 @@ def _pad_rows(values: np.ndarray, length: int, filler: float | None) -> np.ndarr
 
 
 def _check_enough(data: Data, free: int) -> None:
-    """Refuse recordings with too few numbers for so many free ones, or of which nothing varies."""
+    """Raise ValueError if recordings have fewer than FEWEST numbers for each free one, or nothing in them varies."""
     z = data.measurements if data.truth is None else data.truth
     count = int(np.count_nonzero(~np.isnan(z)))
     if count < FEWEST * free:
@@ -153,6 +160,7 @@ def _check_enough(data: Data, free: int) -> None:
     z = data.measurements
     flat = z.reshape(-1, z.shape[-1])
     received = [column[~np.isnan(column)] for column in flat.T]
-    still = [i for i, column in enumerate(received) if len(column) and np.ptp(column) == 0]
-    if len(still) == sum(len(column) > 0 for column in received):
-        raise fail("recording", "measurements that vary", f"{array('m', received[still[0]], (None,))[0]:g} throughout")
+    constant = [i for i, column in enumerate(received) if len(column) and np.ptp(column) == 0]
+    if len(constant) == sum(len(column) > 0 for column in received):
+        value = array("m", received[constant[0]], (None,))[0]
+        raise fail("recording", "measurements that vary", f"{value:g} throughout")

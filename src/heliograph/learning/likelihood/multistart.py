@@ -26,7 +26,7 @@ Watch = Callable[[Maximum], None]
 
 
 class Top(NamedTuple):
-    """Where a search ended.
+    """The highest point that a search has found.
 
     Args:
         x: the point on the line (p,); a number at the end of its domain is so near that nothing sees the difference.
@@ -72,19 +72,21 @@ class Search:
     ends: Float[np.ndarray, " starts"] = field(default_factory=lambda: np.zeros(0))
 
     def run(self, starts: Float[np.ndarray, "starts p"], seed: int) -> Top:
-        """Climb from all starts, then from as many others around the best, and one near each end; prove the highest.
+        """Return the highest point that climbs reach, proved to be a maximum.
+
+        Climbs begin at all starts, then at as many points around the best, then near each end of the domains.
 
         Args:
             starts: where to begin (starts, p); from a single one there is a single climb.
             seed: seed of the second round.
         """
-        none = np.zeros(starts.shape[1])
-        climbed = self._climb(starts, none)
+        no_ends = np.zeros(starts.shape[1])
+        climbed = self._climb(starts, no_ends)
         top = self._prove_maximum(climbed)
         self.best, ends = top._replace(converged=False, reason=""), climbed.total
         if len(starts) > 1:
             around = self._draw_around(top, len(starts) - 1, seed)
-            climbed = self._climb(np.concatenate([around, top.x[None]]), none)  # what climbs to the top joins it there
+            climbed = self._climb(np.concatenate([around, top.x[None]]), no_ends)  # what climbs to the top joins it
             ends = np.concatenate([ends, climbed.total[:-1]])
             if climbed.total.max() > top.total + SAME:
                 top = self._prove_maximum(climbed)
@@ -92,34 +94,37 @@ class Search:
         return top
 
     def _prove_maximum(self, climbed: Maximum) -> Top:
-        """Put numbers at the ends of their domains and climb again until the best end is a maximum.
+        """Return the best of some climbs, with numbers put at the ends of their domains, once it is a maximum.
+
+        Else it climbs again, ROUNDS times at most, or says why it is none.
 
         A maximum: g' H^-1 g is nothing with the Hessian H of -l, which is not indefinite, among the numbers inside
         their domains; at an end the likelihood does not rise inwards.
         """
-        none = np.zeros(climbed.x.shape[1])
-        top = _take_best(climbed, none)
+        no_ends = np.zeros(climbed.x.shape[1])
+        top = _take_best(climbed, no_ends)
         for _ in range(ROUNDS):
             top = self._move_to_limits(top)
             again, reason = self._choose_restarts(top) if top.converged else (None, top.reason)
             if again is None:
-                reason = self._say_that_it_grows(top) or reason
+                reason = self._explain_unbounded(top) or reason
                 return top._replace(converged=not reason, reason=reason)
-            top = _take_best(self._climb(again, none), none)
+            top = _take_best(self._climb(again, no_ends), no_ends)
         return top._replace(converged=False, reason="the search went to and fro between two points")
 
     def _draw_around(self, top: Top, count: int, seed: int) -> Float[np.ndarray, "points p"]:
         """Return points around a maximum: logarithms and logits within SPREAD, real numbers some standard errors away.
 
-        Besides one for each number that has an end of its domain, which is near it there.
+        One more for each number that has an end of its domain begins near that end.
         """
         deviation = self.surface.standard_errors(top.x)
         spread = np.where(self.surface.domains.free, AWAY * np.where(np.isfinite(deviation), deviation, 0.0), SPREAD)
         lowered = np.flatnonzero(self.surface.domains.single)
         drawn = np.random.default_rng([seed, 2]).uniform(-1.0, 1.0, (count + len(lowered), len(top.x)))
+        # A number at an end is drawn around the point furthest inside at which the likelihood has not fallen by SEEN.
         centre = top.x.copy()
         for index in np.flatnonzero(top.ends):
-            rise = self._inwards(top, int(index))[1]
+            _, rise = self._look_inwards(top, int(index))
             centre[index] -= top.ends[index] * INWARDS[np.flatnonzero(rise > -SEEN)[-1]]
         points = centre + drawn * spread
         points[count + np.arange(len(lowered)), lowered] -= LOWERED
@@ -128,14 +133,14 @@ class Search:
     def _climb(self, starts: np.ndarray, ends: np.ndarray) -> Maximum:
         """Maximise from each start, coordinates at an end held there, and keep the best point seen so far."""
 
-        def seen(now: Maximum) -> None:
-            here = _take_best(now, ends)
-            if self.best is None or not here.total < self.best.total:
-                self.best = here._replace(converged=False, reason="")
+        def keep_best(now: Maximum) -> None:
+            top = _take_best(now, ends)
+            if self.best is None or not top.total < self.best.total:
+                self.best = top._replace(converged=False, reason="")
             self.watch(now)
 
         moving = np.repeat((ends == 0)[None], len(starts), axis=0)
-        return maximise(self.surface.evaluate, starts, moving, seen, self.surface.domains, joining=True)
+        return maximise(self.surface.evaluate, starts, moving, keep_best, self.surface.domains, joining=True)
 
     def _move_to_limits(self, top: Top) -> Top:
         """Put numbers that the data hardly see at the end of their domains, where the likelihood is the same."""
@@ -144,20 +149,22 @@ class Search:
         for index in np.flatnonzero(top.active & domains.single & (information < HARDLY_SEEN)):
             moved, side = x.copy(), 1.0 if domains.high[index] and x[index] > 0 else -1.0
             moved[index] += side * FURTHER
-            at = self.surface.evaluations(moved[None])
-            if np.isfinite(at.gradient).all() and np.isfinite(at.information).all() and at.total[0] > total - SAME:
-                x, total, ends[index] = moved, float(at.total[0]), side
+            there = self.surface.evaluations(moved[None])
+            is_finite = np.isfinite(there.gradient).all() and np.isfinite(there.information).all()
+            if is_finite and there.total[0] > total - SAME:
+                x, total, ends[index] = moved, float(there.total[0]), side
         if np.array_equal(ends, top.ends):
             return top
         return _take_best(self._climb(x[None], ends), ends)
 
     def _choose_restarts(self, top: Top) -> tuple[np.ndarray | None, str]:
-        """Points from which to climb again where the end of a climb is no maximum, or why it is none and nothing helps.
+        """Return points from which to climb again where the end of a climb is no maximum; else None and why it is none.
 
-        Along each number at the end of its domain the likelihood is looked at on the way back inside.
+        The reason is "" of a maximum. Along each number at the end of its domain the likelihood is looked at on the way
+        back inside; at a saddle the climbs begin to both sides of it.
         """
         for index in np.flatnonzero(top.ends):
-            points, rise = self._inwards(top, int(index))
+            points, rise = self._look_inwards(top, int(index))
             if rise.max() > SAME:
                 return points[[int(rise.argmax())]], ""
         curvature = self.surface.curvature(top.x, top.active)
@@ -167,10 +174,11 @@ class Search:
             return None, f"a step by the Hessian promises {curvature.gain:.2g} of log-likelihood"
         return None, ""
 
-    def _say_that_it_grows(self, top: Top) -> str:
-        """Say that the likelihood has no maximum: of data that the network reproduces exactly; "" of all others.
+    def _explain_unbounded(self, top: Top) -> str:
+        """Return a sentence where the likelihood has no maximum, as the network reproduces the data exactly; else "".
 
-        A climb may end there all the same, where rounding is what is left.
+        A climb may end there all the same, where rounding is what is left. The log-likelihood for each number is about
+        -log of the size of its innovation.
         """
         z = self.surface.data.measurements if self.surface.data.truth is None else self.surface.data.truth
         size = np.log(np.nanmax(np.abs(z)))
@@ -178,8 +186,8 @@ class Search:
             return "the likelihood grows for ever as variances fall to 0, for the network reproduces the data exactly"
         return ""
 
-    def _inwards(self, top: Top, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """Points on the way from the end of a domain inwards (INWARDS, p), and how much higher the likelihood is."""
+    def _look_inwards(self, top: Top, index: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return points from the end of a number's domain inwards (INWARDS, p), and how much higher l is at each."""
         points = np.repeat(top.x[None], len(INWARDS), axis=0)
         points[:, index] -= top.ends[index] * INWARDS
         return points, np.nan_to_num(self.surface.evaluations(points).total - top.total, nan=-np.inf)
@@ -189,11 +197,12 @@ def _take_best(climbed: Maximum, ends: np.ndarray) -> Top:
     """Return the best of the climbs, with why it stopped if it did not converge."""
     lane = int(climbed.order[0])
     converged, remaining = bool(climbed.converged[lane]), float(climbed.remaining[lane])
-    reason = "" if converged else _why(remaining)
+    reason = "" if converged else _explain_end(remaining)
     return Top(climbed.x[lane].copy(), ends, float(climbed.total[lane]), converged, reason, climbed.steps)
 
 
-def _why(remaining: float) -> str:
+def _explain_end(remaining: float) -> str:
+    """Return why a climb ended that did not converge, by what a further step promises."""
     if not np.isfinite(remaining):
         return "the likelihood has no finite derivatives there"
     return f"after {MOST_STEPS} steps a further one promises {remaining:.2g} of log-likelihood"

@@ -46,15 +46,15 @@ def law_nodes(law: AbstractLaw, count: int) -> Discrete:
 
 
 def discretise_laws(channel: Map, count: int) -> Map:
-    """Return the channel with each gain's law as finitely many values."""
+    """Return the channel with each gain's law replaced by `count` values; constant gains stay."""
 
     def is_law(leaf: object) -> bool:
         return isinstance(leaf, AbstractLaw)
 
-    def chosen(leaf: object) -> object:
+    def discretise(leaf: object) -> object:
         return law_nodes(leaf, count) if isinstance(leaf, AbstractLaw) and leaf.constant is None else leaf
 
-    discrete: Map = jax.tree.map(chosen, channel, is_leaf=is_law)
+    discrete: Map = jax.tree.map(discretise, channel, is_leaf=is_law)
     return discrete
 
 
@@ -151,7 +151,7 @@ def predictive(
 
 
 class StackDensity(NamedTuple):
-    """Part of a stack as arrays over the combinations of its gains and noises.
+    """Part of a stack as arrays over the combinations of its gains and noises: z = gain y + offset + noise in each.
 
     Shapes: log_weight (a,), gain (a, m, p), offset (a, m), noise (a, m, m).
     """
@@ -169,17 +169,23 @@ class StackDensities(tuple[StackDensity, ...]):
     def of(channel: AbstractRandomAffine, nodes: int) -> "StackDensities":
         """Return the combinations of each part of a stack, of everything else as a whole."""
         parts = channel.in_parallel
-        return StackDensities(_part(discretise_laws(affine, nodes).list_atoms()) for affine in parts)
+        return StackDensities(_stack_combinations(discretise_laws(affine, nodes).list_atoms()) for affine in parts)
 
 
-def _part(components: list[Component]) -> StackDensity:
+def _stack_combinations(components: list[Component]) -> StackDensity:
+    """Return combinations of a probability above zero as arrays."""
     possible = [component for component in components if component.weight > 0]
     weight, gain, offset, noise = (np.array(column) for column in zip(*possible, strict=True))
     return StackDensity(np.log(weight), gain, offset, noise)
 
 
 def score_signals(expected: tuple[np.ndarray, np.ndarray, np.ndarray], parts: StackDensities) -> Predictive:
-    """Densities and pits of z (steps, m), from the moments (steps, p) and (steps, p, p) of the signals before each."""
+    """Return densities and probability integral transforms of measurements.
+
+    Args:
+        expected: mean (steps, p) and covariance (steps, p, p) of the signal before each step, and z (steps, m).
+        parts: the combinations of gains of each part of the channel.
+    """
     y, spread, z = expected
     blocks = [
         _score_block(y[i : i + ROWS], spread[i : i + ROWS], z[i : i + ROWS], parts)
@@ -195,14 +201,17 @@ def _score_block(
     total, pits, start = np.zeros(len(z)), [], 0
     for i, law in enumerate(parts):
         stop = start + law.gain.shape[1]
-        weight, error = _weigh_combinations(y, spread, z[:, start:stop], law)
+        log_weight, error = _weigh_combinations(y, spread, z[:, start:stop], law)
+        # P(less than what came) = sum_a P(a | components before) Phi(error of the component in combination a).
         for j in range(stop - start):
-            now = np.exp(weight[..., j] - logsumexp(weight[..., j], axis=1, keepdims=True))
-            pits.append(np.where(np.isnan(z[:, start + j]), np.nan, np.sum(now * ndtr(error[..., j]), axis=1)))
-        last = logsumexp(weight[..., -1], axis=1)
-        total += last
+            weight = np.exp(log_weight[..., j] - logsumexp(log_weight[..., j], axis=1, keepdims=True))
+            pits.append(np.where(np.isnan(z[:, start + j]), np.nan, np.sum(weight * ndtr(error[..., j]), axis=1)))
+        # log p of the part, and the signal given it, for the next part.
+        density = logsumexp(log_weight[..., -1], axis=1)
+        total += density
         if i + 1 < len(parts):
-            y, spread = _correct_signal(y, spread, z[:, start:stop], law, np.exp(weight[..., -1] - last[:, None]))
+            posterior = np.exp(log_weight[..., -1] - density[:, None])
+            y, spread = _correct_signal(y, spread, z[:, start:stop], law, posterior)
         start = stop
     return total, np.stack(pits, axis=1)
 
@@ -210,31 +219,38 @@ def _score_block(
 def _weigh_combinations(
     y: np.ndarray, spread: np.ndarray, z: np.ndarray, law: StackDensity
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Log-weights of the combinations before each component and after the last (t, a, m + 1), and L^-1 (z - E z)."""
-    there = ~np.isnan(z)[:, None]
-    both = there[..., None] & there[..., None, :]
+    """Return log-weights of the combinations, and L^-1 (z - E z) of each, which is standard normal given those before.
+
+    Of shapes (t, a, m + 1), before each component and after the last, and (t, a, m), for step t and combination a. With
+    the covariance L L' = G P_y G' + N of z, components that did not arrive stand apart with variance 1.
+    """
+    present = ~np.isnan(z)[:, None]
+    both = present[..., None] & present[..., None, :]
     total = np.einsum("amp,tpq,anq->tamn", law.gain, spread, law.gain) + law.noise
     total = np.where(both, total, np.where(np.eye(z.shape[1], dtype=bool), 1.0, 0.0))
     root = np.linalg.cholesky(total)
-    value = np.where(there, z[:, None] - np.einsum("amp,tp->tam", law.gain, y) - law.offset, 0.0)
+    value = np.where(present, z[:, None] - np.einsum("amp,tp->tam", law.gain, y) - law.offset, 0.0)
     error = np.linalg.solve(root, value[..., None])[..., 0]
     scale = np.diagonal(root, axis1=-2, axis2=-1)
-    density = np.where(there, -(error**2 + np.log(2 * np.pi)) / 2 - np.log(scale), 0.0)
-    weight = law.log_weight[:, None] + np.concatenate(
-        [np.zeros((*density.shape[:2], 1)), np.cumsum(density, axis=2)], axis=2
-    )
-    return weight, error
+    density = np.where(present, -(error**2 + np.log(2 * np.pi)) / 2 - np.log(scale), 0.0)
+    gained = np.concatenate([np.zeros((*density.shape[:2], 1)), np.cumsum(density, axis=2)], axis=2)
+    return law.log_weight[:, None] + gained, error
 
 
 def _correct_signal(
     y: np.ndarray, spread: np.ndarray, z: np.ndarray, law: StackDensity, weight: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Moments of the signal given these components too: those of the mixture over its combinations, weight (t, a)."""
-    there = ~np.isnan(z)[:, None, :, None]
-    value = np.where(there[..., 0], z[:, None] - np.einsum("amp,tp->tam", law.gain, y) - law.offset, 0.0)
-    gain, noise = (np.where(there, rows, 0.0) for rows in (law.gain, roots_of(law.noise)))
+    """Return mean (t, p) and covariance (t, p, p) of the signal given these components too.
+
+    They are those of the mixture over the combinations, of probabilities `weight` (t, a): each is a Kalman update, and
+    the covariance is sum_a w_a (P_a + (m_a - m) (m_a - m)').
+    """
+    present = ~np.isnan(z)[:, None, :, None]
+    value = np.where(present[..., 0], z[:, None] - np.einsum("amp,tp->tam", law.gain, y) - law.offset, 0.0)
+    gain, noise = (np.where(present, rows, 0.0) for rows in (law.gain, roots_of(law.noise)))
     after = observe_root(roots_of(spread)[:, None], gain, noise)
     moved = np.einsum("tapm,tam->tap", after.gain, value)
     shift = np.einsum("ta,tap->tp", weight, moved)
-    apart = np.append(after.root, (moved - shift[:, None])[..., None], axis=-1)
-    return y + shift, np.einsum("ta,tapq->tpq", weight, covariance_of_root(apart))
+    # A column more in the root adds the square of the distance from the mean.
+    with_distance = np.append(after.root, (moved - shift[:, None])[..., None], axis=-1)
+    return y + shift, np.einsum("ta,tapq->tpq", weight, covariance_of_root(with_distance))

@@ -31,7 +31,7 @@ class Curvature(NamedTuple):
 
 @dataclass(frozen=True)
 class Surface:
-    """Objective over all recordings; the last points are cached, for they are often used again."""
+    """The likelihood of all recordings as a function of the free numbers; the last evaluation is cached for reuse."""
 
     objective: Objective
     data: Data
@@ -39,7 +39,7 @@ class Surface:
 
     @cached_property
     def domains(self) -> Domains:
-        """Which coordinates are logarithms and logits, and at which side their domains end."""
+        """Return which coordinates are logarithms and logits, and at which side their domains end."""
         every = self.objective.description.parameters.every
         low, high = (np.concatenate(column) for column in zip(*map(_find_ends_at_infinity, every), strict=True))
         single = np.concatenate([np.full(number.size, number.domain.kind == "interval") for number in every])
@@ -64,7 +64,7 @@ class Surface:
         return evaluation.total, evaluation.gradient, evaluation.information
 
     def hessian(self, x: Float[np.ndarray, " p"], active: Bool[np.ndarray, " p"]) -> Float[np.ndarray, "p p"]:
-        """Hessian of -l by central differences of the scores of active coordinates; the information for the others."""
+        """Return the Hessian of -l, by central differences of scores; the information for coordinates not active."""
         information: np.ndarray = self.evaluations(x[None]).information[0]
         diagonal = np.diag(information)
         width = np.where(diagonal > 0, DIFFERENCE / np.sqrt(np.where(diagonal > 0, diagonal, 1.0)), 0.0)
@@ -75,33 +75,38 @@ class Surface:
             return information
         gradient = self.evaluations(np.concatenate([x + shifts, x - shifts])).gradient
         hessian: np.ndarray = information.copy()
-        slopes = -(gradient[: len(moving)] - gradient[len(moving) :]) / (2 * width[moving][:, None])
-        block = slopes[:, moving]
+        forward, backward = gradient[: len(moving)], gradient[len(moving) :]
+        block = (-(forward - backward) / (2 * width[moving][:, None]))[:, moving]
         hessian[np.ix_(moving, moving)] = (block + block.T) / 2
         return hessian
 
     def information_by_row(self, x: Float[np.ndarray, " p"], places: np.ndarray) -> list[Float[np.ndarray, "steps k"]]:
-        """Return what each row of each recording tells of some coordinates: -ds_k/dx_k by central differences."""
+        """Return for each recording the information of each row on some coordinates, -ds_k/dx_k, (steps, k).
+
+        By central differences; `places`: the coordinates.
+        """
         deviation = self.standard_errors(x)[places]
         width = DIFFERENCE * np.where(np.isfinite(deviation), deviation, 0.0)
         shifts = np.zeros((len(places), len(x)))
         shifts[np.arange(len(places)), places] = width
         score = self.evaluate_rows(np.concatenate([x + shifts, x - shifts])).score
-        further, back = (np.stack([s[..., k] for s, k in zip(half, places, strict=True)], axis=-1)
-                         for half in (score[: len(places)], score[len(places) :]))  # fmt: skip
-        told = (back - further) / np.where(width > 0, 2 * width, 1.0)
-        return [rows[:steps] for rows, steps in zip(told, self.data.lengths, strict=True)]
+        # Of the point moved along coordinate k the scores in k, (recordings, steps, k).
+        forward, backward = (
+            np.stack([scores[..., k] for scores, k in zip(half, places, strict=True)], axis=-1)
+            for half in (score[: len(places)], score[len(places) :])
+        )
+        information = (backward - forward) / np.where(width > 0, 2 * width, 1.0)
+        return [rows[:steps] for rows, steps in zip(information, self.data.lengths, strict=True)]
 
     def standard_errors(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
-        """Standard error of each number at a point, were the others known; infinite if the data say nothing of it."""
-        information: np.ndarray = self.evaluations(x[None]).information[0]
-        seen = np.diag(information)
-        return np.where(seen > 0, 1 / np.sqrt(np.where(seen > 0, seen, 1.0)), np.inf)
+        """Return the standard error of each number at a point, were the others known; infinite if nothing tells it."""
+        information: np.ndarray = np.diag(self.evaluations(x[None]).information[0])
+        return np.where(information > 0, 1 / np.sqrt(np.where(information > 0, information, 1.0)), np.inf)
 
     def possible(
         self, points: Float[np.ndarray, "points p"], near: Float[np.ndarray, " p"]
     ) -> Float[np.ndarray, "points p"]:
-        """Return the points, moved halfway to a possible one, again and again, where the likelihood is not finite."""
+        """Return the points; those where the likelihood is not finite halfway to `near`, where it is, and so on."""
         points = points.copy()
         for _ in range(HALVINGS):
             wrong = ~np.isfinite(self.evaluations(points).total)
@@ -115,14 +120,15 @@ class Surface:
         evaluation, places = self.evaluations(x[None]), np.flatnonzero(active)
         information = evaluation.information[0][np.ix_(places, places)]
         gradient = evaluation.gradient[0][places]
+        # Directions in which the information, in units of standard errors, is above zero, in columns.
         unit = np.where(np.diag(information) > 0, 1 / np.sqrt(np.maximum(np.diag(information), TINY)), 0.0)
-        seen, directions = np.linalg.eigh(information * unit[:, None] * unit)
-        basis = unit[:, None] * directions[:, seen > FLAT]
+        eigenvalues, directions = np.linalg.eigh(information * unit[:, None] * unit)
+        basis = unit[:, None] * directions[:, eigenvalues > FLAT]
         if not basis.size:
-            return Curvature(np.inf, np.zeros(len(x)), 0.0)
+            return Curvature(least=np.inf, direction=np.zeros(len(x)), gain=0.0)
         observed = basis.T @ self.hessian(x, active)[np.ix_(places, places)] @ basis
         if not np.isfinite(observed).all():
-            return Curvature(np.inf, np.zeros(len(x)), np.inf)
+            return Curvature(least=np.inf, direction=np.zeros(len(x)), gain=np.inf)
         values, vectors = np.linalg.eigh(observed)
         direction = np.zeros(len(x))
         direction[places] = basis @ vectors[:, 0]
@@ -140,17 +146,17 @@ class Surface:
         drop: float,
         active: Bool[np.ndarray, " p"],
     ) -> Float[np.ndarray, " lanes"]:
-        """Find where the likelihood, its other active coordinates at their best, has fallen by `drop` below `top`.
+        """Return where the log-likelihood, with its other active coordinates at their best, is `drop` below `top`.
 
         Newton's method for h = sqrt(2 (top - l)), which is linear where l is quadratic, between what is known to be
         inside and outside; dl/dx of the profile is the score of the coordinate alone.
 
         Args:
             x: the maximum (p,).
-            top: the likelihood there.
+            top: the log-likelihood there.
             coordinate: the one that is cut.
             first: signed distances at which to begin, to either side.
-            furthest: distance at which a likelihood that has not fallen never does: then the end is infinite.
+            furthest: distance at which a likelihood that has not fallen is taken never to: the end is infinite.
             drop: fall at the ends.
             active: coordinates that are inside their domains (p,).
         """
@@ -158,30 +164,32 @@ class Surface:
         moving, points = np.repeat(others[None], len(first), axis=0), np.repeat(x[None], len(first), axis=0)
         side, target, at = np.sign(first), np.sqrt(2 * drop), np.abs(first)
         inside, outside = np.zeros(len(first)), np.full(len(first), np.inf)
+        # Distances `inside` where the likelihood has not fallen so far, and `outside` where it has fallen further.
         for _ in range(CUTS):
             points[:, coordinate] = x[coordinate] + side * at
             climbed = maximise(self.evaluate, points, moving, None, self.domains, ENOUGH)
+            # dh/dt = -side dl/dx / h for the distance t, so that Newton's t+ is t + (target - h) h / (-side dl/dx).
             with np.errstate(all="ignore"):
                 fallen = np.sqrt(2 * np.maximum(top - np.nan_to_num(climbed.total, nan=-np.inf), 0.0))
-                outwards = at + (target - fallen) * fallen / (-side * climbed.gradient[:, coordinate])
-            there = np.abs(fallen - target) < EXACT * target
+                newton = at + (target - fallen) * fallen / (-side * climbed.gradient[:, coordinate])
+            is_there = np.abs(fallen - target) < EXACT * target
             beyond = fallen > target
             inside, outside = np.where(beyond, inside, at), np.where(beyond, at, outside)
             points = np.where(beyond[:, None], points, climbed.x)
-            never = ~beyond & (at >= furthest)
-            done = there | never | (outside - inside < EXACT * EXACT * outside)
+            never_falls = ~beyond & (at >= furthest)
+            done = is_there | never_falls | (outside - inside < EXACT * EXACT * outside)
             if done.all():
-                return np.asarray(x[coordinate] + side * np.where(never & ~there, np.inf, at))
-            # within the bracket; where nothing is outside yet, at most three times as far
+                return np.asarray(x[coordinate] + side * np.where(never_falls & ~is_there, np.inf, at))
+            # Within the bracket; where nothing is outside yet, at most three times as far.
             most = np.minimum(np.where(np.isfinite(outside), outside, 3 * at), furthest)
-            sound = np.isfinite(outwards) & (outwards > inside) & (outwards < most)
+            within = np.isfinite(newton) & (newton > inside) & (newton < most)
             middle = np.where(np.isfinite(outside), (inside + most) / 2, most)
-            at = np.where(done, at, np.where(sound, outwards, middle))
-        return np.asarray(x[coordinate] + side * at)
+            at = np.where(done, at, np.where(within, newton, middle))
+        return np.asarray(x[coordinate] + side * at)  # the last points, after CUTS rounds
 
 
 def _find_ends_at_infinity(parameter: Parameter) -> tuple[Bool[np.ndarray, " size"], Bool[np.ndarray, " size"]]:
-    """Return the coordinates of a number that are at an end of its domain at minus infinity, and at infinity."""
+    """Return which coordinates of a number have an end of its domain at minus infinity, and which at infinity."""
     domain, none = parameter.domain, np.zeros(parameter.size, dtype=bool)
     if domain.kind == "simplex":
         return ~none, ~none

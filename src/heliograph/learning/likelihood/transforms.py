@@ -11,7 +11,7 @@ from heliograph.numerics.types import Array, Float, PyTree
 
 
 def map_to_line(name: str, domain: Domain, value: Float[np.ndarray, "..."]) -> Float[np.ndarray, " size"]:
-    """Transform the start of a free number to unbounded ones.
+    """Return the start of a free number as unbounded coordinates.
 
     Intervals: v, log(v - low) or logit. Simplexes: log p_i / p_last. Covariances: the entries of Cholesky's factor row
     by row, those on the diagonal by their logarithms.
@@ -26,17 +26,19 @@ def map_to_line(name: str, domain: Domain, value: Float[np.ndarray, "..."]) -> F
         return logs.reshape(-1)
     if domain.kind == "covariance":
         factor = _factorise_start(name, value)
-        return np.asarray(
-            np.where(np.eye(len(value)), np.log(np.abs(factor) + (factor == 0)), factor)[np.tril_indices(len(value))]
-        )
+        np.fill_diagonal(factor, np.log(np.diagonal(factor)))
+        return np.asarray(factor[np.tril_indices(len(value))])
     if np.any(value <= domain.low) or np.any(value >= domain.high):
         raise fail(f"start of {name}", f"a start {_describe_domain(domain)}", value.tolist())
     return np.asarray(link(domain, value)).reshape(-1)
 
 
 def map_from_line(domain: Domain, shape: tuple[int, ...], x: Array) -> Array:
-    """Number at a point of the line, in operations that JAX traces; of an interval's plain number a plain one."""
-    # Simplexes and covariances.
+    """Return the number that has the coordinates x, as `map_to_line` makes them; JAX can trace it.
+
+    Of an interval plain coordinates give a plain number.
+    """
+    # p_i = exp(x_i) / sum exp(x_j), of which the last has x = 0.
     if domain.kind == "simplex":
         rows = jnp.reshape(x, (*shape[:-1], shape[-1] - 1))
         weights = jnp.concatenate([rows, jnp.zeros((*shape[:-1], 1))], axis=-1)
@@ -59,7 +61,7 @@ def map_from_line(domain: Domain, shape: tuple[int, ...], x: Array) -> Array:
 
 
 def link(domain: Domain, value: PyTree) -> PyTree:
-    """Transform a number to the scale on which its interval is symmetric."""
+    """Return a number of an interval on the line: its logit, logarithm, or itself; intervals are symmetric there."""
     if np.isfinite(domain.low) and np.isfinite(domain.high):
         return np.log((value - domain.low) / (domain.high - value))
     if np.isfinite(domain.low):
@@ -68,7 +70,7 @@ def link(domain: Domain, value: PyTree) -> PyTree:
 
 
 def unlink(domain: Domain, value: PyTree) -> PyTree:
-    """Transform back from that scale; infinite values, and those beyond all numbers, give the limits."""
+    """Return the number that `link` puts at a value of the line; infinite values give the ends of the interval."""
     with np.errstate(over="ignore"):
         if np.isfinite(domain.low) and np.isfinite(domain.high):
             return domain.low + (domain.high - domain.low) / (1 + np.exp(-value))
@@ -96,7 +98,7 @@ def slope(domain: Domain, value: PyTree) -> PyTree:
 
 
 def size(domain: Domain, shape: tuple[int, ...]) -> int:
-    """Return the count of numbers on the line."""
+    """Return how many coordinates a number of a shape has."""
     count = int(np.prod(shape))
     if domain.kind == "simplex":
         return count - count // shape[-1]
@@ -112,6 +114,7 @@ def _factorise_start(name: str, value: np.ndarray) -> np.ndarray:
 
 
 def _describe_domain(domain: Domain) -> str:
+    """Return in words where an interval's numbers lie."""
     if np.isfinite(domain.low) and np.isfinite(domain.high):
         return f"between {domain.low:g} and {domain.high:g}"
     return f"above {domain.low:g}" if np.isfinite(domain.low) else f"below {domain.high:g}"

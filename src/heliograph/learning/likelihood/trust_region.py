@@ -146,34 +146,33 @@ def maximise(
 
 
 def _init_lanes(evaluate: Evaluate, start: np.ndarray, moving: np.ndarray, domains: Domains, close: float) -> _State:
-    """Evaluate all starts; lanes whose likelihood or slope is no number there are done."""
+    """Return the state before the first step; lanes whose likelihood or slope is no number at the start are done."""
     total, gradient, information = evaluate(start)
-    impossible = ~_is_finite(total, gradient, information, moving)
     lanes = len(start)
     state = _State(
-        start.copy(),
-        total,
-        gradient,
-        information,
-        information,
-        np.full(lanes, FIRST_RADIUS),
-        np.full(lanes, np.inf),
-        impossible,
-        np.zeros(lanes, dtype=bool),
-        np.arange(lanes),
+        x=start.copy(),
+        total=total,
+        gradient=gradient,
+        information=information,
+        model=information,
+        radius=np.full(lanes, FIRST_RADIUS),
+        remaining=np.full(lanes, np.inf),
+        done=~_is_finite(total, gradient, information, moving),
+        converged=np.zeros(lanes, dtype=bool),
+        joined=np.arange(lanes),
     )
     return _mark_arrived(state, moving, domains, close)
 
 
 def _is_finite(total: np.ndarray, gradient: np.ndarray, information: np.ndarray, moving: np.ndarray) -> np.ndarray:
-    """Test by lane whether likelihood, gradient and information are numbers."""
+    """Return for each lane whether likelihood, and gradient and information of what moves, are finite, (lanes,)."""
     pairs = moving[:, :, None] & moving[:, None, :]
     derivatives = np.all(np.isfinite(gradient) | ~moving, axis=1)
     return np.asarray(np.isfinite(total) & derivatives & np.all(np.isfinite(information) | ~pairs, axis=(1, 2)))
 
 
 def _mark_arrived(state: _State, moving: np.ndarray, domains: Domains, close: float) -> _State:
-    """Mark lanes that have arrived, and those that are stuck because rounding hides what is left to gain."""
+    """Return the state with lanes done that have arrived, or are stuck since rounding hides what is left to gain."""
     counting = moving & ~find_at_limits(state.x, state.gradient, domains)
     remaining = np.where(state.done, state.remaining, expected_gain(state.gradient, state.information, counting) / 2)
     stuck = state.radius < SMALLEST_RADIUS
@@ -196,35 +195,32 @@ def _step_lanes(evaluate: Evaluate, state: _State, moving: np.ndarray, domains: 
     """Take one trust-region step in every lane: propose, evaluate, accept or not, then adapt radius and model."""
     going = ~state.done
     counting = moving & ~find_at_limits(state.x, state.gradient, domains)
-    step, length, foretold = trust_region_step(state.gradient, state.information, state.model, state.radius, counting,
-                                               domains.free)  # fmt: skip
+    step, length, foretold = trust_region_step(
+        state.gradient, state.information, state.model, state.radius, counting, domains.free
+    )
     tried = np.where(going[:, None], state.x + step, state.x)
     total, gradient, information = _evaluate_lanes(evaluate, tried, going, state)
-    # taken where the likelihood rises; where rounding hides that, if the gradient falls or the step crosses a plateau
+    # Taken where the likelihood rises by a share of the foretold gain; where rounding hides that, if the gradient falls
+    # or the step crosses a plateau.
     gain = total - state.total
     sound = going & _is_finite(total, gradient, information, moving)
     far = length > 0.9 * state.radius
     hidden = foretold < NOISE * np.abs(state.total)
     fell = expected_gain(gradient, information, counting) < expected_gain(state.gradient, state.information, counting)
     taken = sound & np.where(hidden, (fell | far) & (gain >= -NOISE * np.abs(total)), gain > 1e-4 * foretold)
-    # radius by how well the gain was foretold
+    # The radius by how well the gain was foretold.
     well = taken & ((gain > 0.75 * foretold) | hidden)
     badly = going & ~(sound & ((gain > 0.25 * foretold) | (hidden & taken)))
     wider = np.where(well & far, WIDER * state.radius, state.radius)
     radius = np.where(badly, NARROWER * np.minimum(length, state.radius), wider)
     model = _update_hessian(state, domains, step, gradient, information, gain, sound, taken)
-    pick = taken[:, None]
-    after = _State(
-        np.where(pick, tried, state.x),
-        np.where(taken, total, state.total),
-        np.where(pick, gradient, state.gradient),
-        np.where(pick[:, None], information, state.information),
-        model,
-        radius,
-        state.remaining,
-        state.done,
-        state.converged,
-        state.joined,
+    after = state._replace(
+        x=np.where(taken[:, None], tried, state.x),
+        total=np.where(taken, total, state.total),
+        gradient=np.where(taken[:, None], gradient, state.gradient),
+        information=np.where(taken[:, None, None], information, state.information),
+        model=model,
+        radius=radius,
     )
     return _mark_arrived(after, moving, domains, close)
 
@@ -257,10 +253,10 @@ def _join_lanes(state: _State, moving: np.ndarray, domains: Domains) -> _State:
 
 
 def _evaluate_lanes(evaluate: Evaluate, x: np.ndarray, going: np.ndarray, state: _State) -> Evaluated:
-    """Evaluate the lanes that go on; the others stay as they are."""
+    """Return likelihood, gradient and information at x in the lanes that go on, and as they were in the others."""
     values = state.total.copy(), state.gradient.copy(), state.information.copy()
-    for known, new in zip(values, evaluate(x[going]), strict=True):
-        known[going] = new
+    for value, new in zip(values, evaluate(x[going]), strict=True):
+        value[going] = new
     return values
 
 
@@ -289,7 +285,7 @@ def _update_hessian(
         sound: whether what was found there is finite.
         taken: whether the step is.
     """
-    # B+ = B + r r' / r' p with r = y - B p, so that B+ p = y, y the gradient before less that after the step
+    # B+ = B + r r' / r' p with r = y - B p, so that B+ p = y, y the gradient before less that after the step.
     base = np.nan_to_num(state.model)
     residual = np.where(sound[:, None], np.nan_to_num(state.gradient - gradient), 0.0) - _multiply_lanes(base, step)
     diagonal = np.diagonal(state.information, axis1=1, axis2=2)
@@ -297,20 +293,18 @@ def _update_hessian(
     along = np.sum(residual * step, axis=1)
     unit, _ = _find_flat_directions(state.information, step != 0)
     size = np.sqrt(np.sum((residual * unit) ** 2, axis=1) * np.sum((step / np.where(unit > 0, unit, 1.0)) ** 2, axis=1))
-    # r' p must be more than rounding of |r| |p|, both in standard errors
-    clear = sound & (np.abs(along) > 1e-8 * size)
-    secant = base + np.where(
-        clear[:, None, None],
-        residual[:, :, None] * residual[:, None, :] / np.where(clear, along, 1.0)[:, None, None],
-        0.0,
-    )
-    # of the two the one that would have foretold this gain
+    # r' p must be more than rounding of |r| |p|, both in standard errors.
+    is_defined = sound & (np.abs(along) > 1e-8 * size)
+    update = residual[:, :, None] * residual[:, None, :] / np.where(is_defined, along, 1.0)[:, None, None]
+    secant = base + np.where(is_defined[:, None, None], update, 0.0)
+    # Of the two the one that would have foretold this gain.
     slope = np.sum(state.gradient * step, axis=1)
     by_model = slope - np.sum(step * _multiply_lanes(base, step), axis=1) / 2
     by_information = slope - np.sum(step * _multiply_lanes(np.nan_to_num(state.information), step), axis=1) / 2
-    now = np.where(taken[:, None, None], information, state.information)
-    believe = sound & (np.abs(gain - by_model) <= np.abs(gain - by_information))
-    return np.where((believe | ~sound)[:, None, None], np.where(sound[:, None, None], secant, base), now)
+    current_information = np.where(taken[:, None, None], information, state.information)
+    model_is_better = sound & (np.abs(gain - by_model) <= np.abs(gain - by_information))
+    corrected = np.where(sound[:, None, None], secant, base)
+    return np.where((model_is_better | ~sound)[:, None, None], corrected, current_information)
 
 
 def trust_region_step(
@@ -327,6 +321,15 @@ def trust_region_step(
     method for 1 / |D p| = 1 / radius, from below. All in units u of standard errors, in which B is of order 1 and
     D = max(1, radius u / LONGEST) where a logarithm moves, else 1: matrices scaled by a diagonal are solved as exactly
     as without. To B is added v v' for each direction v that is not identified, whose gradient is but rounding.
+
+    Args:
+        gradient: g (lanes, p).
+        information: its diagonal gives the standard errors.
+        model: B, minus the Hessian or near it; it may be indefinite. Where it is not finite, or huge, the information
+            takes its place.
+        radius: of the trust region (lanes,).
+        moving: which coordinates may move (lanes, p).
+        free: which are no logarithms, and so not limited by LONGEST (p,).
     """
     unit, flat = _find_flat_directions(information, moving)
     stays = unit == 0
@@ -336,7 +339,7 @@ def trust_region_step(
     sane = np.all(np.abs(b) < LARGEST, axis=(1, 2))  # NaN is not
     b = np.where(sane[:, None, None], b, _scale_both_sides(information, unit))
     b = (b + b.swapaxes(1, 2)) / 2 + flat @ flat.swapaxes(1, 2) + np.eye(len(free)) * stays[:, :, None]
-    # s: none at first, or what makes the matrix positive
+    # s: none at first, or what makes the matrix positive.
     least = np.linalg.eigvalsh(b / d[:, :, None] / d[:, None, :])[:, 0]
     shift = np.where(least > -ROUNDING, 0.0, -least * (1 + 1e-6))
     for _ in range(SECULAR_STEPS):
@@ -375,13 +378,16 @@ def expected_gain(
 
 
 def _find_flat_directions(information: np.ndarray, moving: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Standard errors of single coordinates, 0 of those that stay, and directions (lanes, p, p) without information."""
+    """Return the standard error of each coordinate alone (lanes, p), and the directions without information.
+
+    The errors are 0 of coordinates that stay; directions stand in columns (lanes, p, p), the others are zeros.
+    """
     diagonal = np.diagonal(information, axis1=1, axis2=2)
-    there = moving & (diagonal > LEAST) & np.isfinite(diagonal)
-    unit = np.where(there, 1 / np.sqrt(np.where(there, diagonal, 1.0)), 0.0)
+    informed = moving & (diagonal > LEAST) & np.isfinite(diagonal)
+    unit = np.where(informed, 1 / np.sqrt(np.where(informed, diagonal, 1.0)), 0.0)
     scaled = _scale_both_sides(information, unit)
     values, vectors = np.linalg.eigh((scaled + scaled.swapaxes(1, 2)) / 2)
-    return unit, np.where(((values <= FLAT)[:, None, :]), vectors, 0.0) * there[:, :, None]
+    return unit, np.where(((values <= FLAT)[:, None, :]), vectors, 0.0) * informed[:, :, None]
 
 
 def _scale_both_sides(matrix: np.ndarray, unit: np.ndarray) -> np.ndarray:

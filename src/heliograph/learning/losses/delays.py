@@ -69,7 +69,7 @@ def learn_delays(late: "Float[ArrayLike, ' measurements']", step: "Float[ArrayLi
         raise fail("delays", "at least one measurement that was logged after its time", f"{len(steps)} before it")
     shares = {}
     for delay in np.unique(known):
-        mine = (known == delay).astype(float)
-        count = count_independent(mine)
-        shares[int(delay)] = wilson(float(mine.mean()) * count, count)
+        is_delay = (known == delay).astype(float)
+        count = count_independent(is_delay)
+        shares[int(delay)] = wilson(float(is_delay.mean()) * count, count)
     return Delays(size, len(known), len(steps) - len(known), shares)

@@ -25,13 +25,13 @@ MOST = 2.0**53  # whole numbers up to here are doubles
 class BetweenArrivals(np.ndarray):
     """Fates of a stretch that begins and ends where a packet arrived: these ends are no trials, being chosen for it.
 
-    Only the array itself is: of its slices, copies and sums nothing is said.
+    Only the array itself is marked so; its slices, copies and sums are not.
     """
 
     chosen = False
 
     def __array_finalize__(self, source: Any) -> None:
-        """Make no claim for what is derived from an array."""
+        """Leave an array that is derived from another unmarked."""
         self.chosen = False
 
     @staticmethod
@@ -43,17 +43,17 @@ class BetweenArrivals(np.ndarray):
 
 
 def is_trial(fate: np.ndarray) -> Bool[np.ndarray, " packets"]:
-    """Return the packets whose fate is known and was not what made them an end."""
+    """Return which packets are trials: those whose fate is known, and that are no ends chosen for having arrived."""
     return np.asarray((fate == 0) | (fate == 1))
 
 
 def fill_ends(fate: np.ndarray) -> Float[np.ndarray, " packets"]:
-    """Return the fates as far as they are known to those after them: ends have arrived."""
+    """Return the fates with 0, arrived, for chosen ends: so packets after them know them."""
     return np.where(fate == CHOSEN, 0.0, fate)
 
 
-def ends_alone(fate: np.ndarray) -> Float[np.ndarray, " packets"]:
-    """Return a stretch of which nothing is known but that its chosen ends arrived."""
+def keep_ends_only(fate: np.ndarray) -> Float[np.ndarray, " packets"]:
+    """Return the stretch with NaN, unknown, for all packets but the chosen ends, which arrived."""
     return np.where(fate == CHOSEN, 0.0, np.nan)
 
 
@@ -83,12 +83,12 @@ def fates_of_sequence(
         raise fail("sequence numbers", "whole numbers, at least one", "none" if not len(numbers) else "fractions")
     if np.max(np.abs(numbers)) > MOST:
         raise fail("sequence numbers", "numbers up to 2^53", f"{numbers[np.argmax(np.abs(numbers))]:g}")
-    # order by time of sending where it is known
+    # In the order of sending where it is known.
     received = numbers.astype(np.int64)
     if sent is not None:
         when = array("times of sending", sent, received.shape)
         received = np.unique(np.stack([when, numbers]), axis=1)[1].astype(np.int64)  # by time, then by number
-    # a new stretch at each restart, copies dropped
+    # A new stretch at each restart, copies dropped. `again`: numbers at the begin of a rising run that came before.
     stretches: list[list[int]] = [[]]
     for run in _split_rising(received):
         again = [number for number in run if stretches[-1] and number <= stretches[-1][-1]]
@@ -103,16 +103,16 @@ def fates_of_sequence(
 
 
 def _split_rising(received: np.ndarray) -> list[list[int]]:
-    """Split numbers where they fall back; of equal ones in a row one stays."""
+    """Return the numbers in runs that rise, cut where they fall back; of equal ones in a row one stays."""
     numbers = received[np.concatenate([[True], np.diff(received) != 0])]
     return [run.tolist() for run in np.split(numbers, np.flatnonzero(np.diff(numbers) < 0) + 1)]
 
 
 def _are_copies(again: list[int], run: list[int], stretch: list[int]) -> bool:
-    """Test whether numbers that came again, at the begin of a rising run, are copies, not those of a sender anew.
+    """Return whether numbers that came again, at the begin of a rising run, are copies, and not of a restarted sender.
 
-    A few may be, if all came lately. Many are where all that came from a number on comes again, and goes on from
-    there, as from a broker to which nobody said that it had come; but not from the first number on.
+    A few are, if all of them came within the last COPY. More are where all that came from a number on comes again, and
+    the run goes on from there, as from a broker that was not told of their arrival; but not from the first number on.
     """
     lately = stretch[-COPY:]
     if not set(again) <= set(lately):
@@ -172,7 +172,7 @@ def fates_by_hop(arrived: "Mapping[str, Float[ArrayLike, ' packets']]") -> dict[
         received = array(f"arrivals behind {name!r}", value, (None if before is None else len(before),))
         if np.any((received != 0) & (received != 1)):
             raise fail(f"arrivals behind {name!r}", "0 and 1, or truth values", "other numbers")
-        # a packet has a fate at a hop if it passed the hop before
+        # A packet has a fate at a hop if it passed the hop before.
         before = np.ones(len(received)) if before is None else before
         if np.any(received > before):
             packet = int(np.argmax(received > before))
@@ -200,41 +200,44 @@ def fates_of_measurements(measurements: "Mapping[str, Float[ArrayLike, 'steps *r
     for node, value in table("measurements", measurements, "arrays").items():
         name = f"measurements of {node!r}"
         values = array(name, value, (None,) if rank(name, value) == 1 else (None, None), missing=True)
-        gone = np.isnan(
-            array(f"measurements of {node!r}", values[:, None] if values.ndim == 1 else values, (None, None), True)
-        )
-        if np.all(gone == gone[:, :1]):
-            fates[node] = [gone[:, 0].astype(float)]
+        lost = np.isnan(array(name, values[:, None] if values.ndim == 1 else values, (None, None), missing=True))
+        if np.all(lost == lost[:, :1]):
+            fates[node] = [lost[:, 0].astype(float)]
         else:
-            fates |= {f"{node}.{i}": [lost.astype(float)] for i, lost in enumerate(gone.T) if not np.all(lost)}
+            fates |= {f"{node}.{i}": [column.astype(float)] for i, column in enumerate(lost.T) if not np.all(column)}
     return fates
 
 
 def check_fates(value: object) -> Fates:
-    """Check and list stretches of fates, given one or several; CHOSEN stands for ends that are no trials.
+    """Return stretches of fates, checked, from one or several; ends that are no trials are marked by CHOSEN.
 
     Raises:
         ValueError: anything but 0, 1 and NaN, or nothing that is known.
     """
     if isinstance(value, CheckedFates):
         return value
-    listed = isinstance(value, Sequence) or rank("fates", value) > 0
-    items: list[Any] = list(cast(Sequence[Any], value)) if listed else [value]
-    several = len(items) > 0 and all(rank("fates", x) == 1 for x in items)
-    parts = [array("fates", x, (None,), missing=True) for x in (items if several else [cast(ArrayLike, value)])]
+    # One stretch, of numbers, or several of them.
+    is_sequence = isinstance(value, Sequence) or rank("fates", value) > 0
+    members: list[Any] = list(cast(Sequence[Any], value)) if is_sequence else [value]
+    several = len(members) > 0 and all(rank("fates", member) == 1 for member in members)
+    stretches: list[Any] = members if several else [value]
+    parts = [array("fates", cast(ArrayLike, stretch), (None,), missing=True) for stretch in stretches]
     for stretch in parts:
         if np.any((stretch != 0) & (stretch != 1) & ~np.isnan(stretch)):
             raise fail(
                 "fates", "0 for a packet that arrived, 1 for a lost one, NaN for an unknown one", "other numbers"
             )
-    chosen = [getattr(x, "chosen", False) for x in (items if several else [value])]
-    fates = CheckedFates(_mark_ends(f) if c else f for f, c in zip(parts, chosen, strict=True) if len(f))
+    chosen = [getattr(stretch, "chosen", False) for stretch in stretches]
+    fates = CheckedFates(
+        _mark_ends(fate) if is_chosen else fate for fate, is_chosen in zip(parts, chosen, strict=True) if len(fate)
+    )
     if not any(np.any(is_trial(fate)) for fate in fates):
         raise fail("fates", "at least one packet of which the fate is known and that is no end of its stretch", "none")
     return fates
 
 
 def _mark_ends(fate: np.ndarray) -> Float[np.ndarray, " packets"]:
+    """Return the fates with CHOSEN for the first and the last."""
     ends = np.zeros(len(fate), dtype=bool)
     ends[[0, -1]] = True
     return np.where(ends, CHOSEN, fate)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from heliograph.learning.losses.fates import CHOSEN, Fates, check_fates, ends_alone, fill_ends
+from heliograph.learning.losses.fates import CHOSEN, Fates, check_fates, fill_ends, keep_ends_only
 from heliograph.learning.losses.loss_law import AbstractLossLaw, Packets
 from heliograph.learning.losses.shares import Share, estimate_shares, logits, maximise_shares
 from heliograph.model.channel import erasure
@@ -44,19 +44,20 @@ class HiddenModeLosses(AbstractLossLaw):
             ValueError: what is no fates.
         """
         parts = check_fates(fates)
-        chosen = [ends_alone(fate) for fate in parts if fate[-1] == CHOSEN]
+        # log P(fates) - log P(chosen ends arrive).
+        chosen = [keep_ends_only(fate) for fate in parts if fate[-1] == CHOSEN]
         whole, ends = Runs.of([fill_ends(fate) for fate in parts]), Runs.of(chosen) if chosen else None
 
         def likelihood(x: np.ndarray) -> tuple[float, np.ndarray]:
             value, slope = whole.likelihood(x)
             if ends is None:
                 return value, slope
-            given, by_ends = ends.likelihood(x)
-            return value - given, slope - by_ends
+            value_of_ends, slope_of_ends = ends.likelihood(x)
+            return value - value_of_ends, slope - slope_of_ends
 
         top, value = maximise_shares(likelihood, [*STARTS])
         good, bad, fails, recovers = estimate_shares(likelihood, top, value, intervals)
-        if good.estimate > bad.estimate:
+        if good.estimate > bad.estimate:  # the good mode is the one that loses less
             good, bad, fails, recovers = bad, good, recovers, fails
         return HiddenModeLosses(good, bad, fails, recovers)
 
@@ -70,12 +71,13 @@ class HiddenModeLosses(AbstractLossLaw):
         away = fails + recovers
         is_bad = fails / away if away else 0.5  # two modes that never change: nobody knows which it is
         probabilities = np.zeros(len(fate))
-        for k, seen in enumerate(fate.tolist()):
+        for k, observed in enumerate(fate.tolist()):
             p = (1 - is_bad) * good + is_bad * bad
             probabilities[k] = p
-            if seen == 1 and p > 0:
+            # Bayes' rule on a known fate, then the step of the chain.
+            if observed == 1 and p > 0:
                 is_bad = is_bad * bad / p
-            elif seen == 0 and p < 1:
+            elif observed == 0 and p < 1:
                 is_bad = is_bad * (1 - bad) / (1 - p)
             is_bad = (1 - is_bad) * fails + is_bad * (1 - recovers)
         return probabilities
@@ -95,19 +97,23 @@ class Runs:
     """
 
     def __init__(self, kind: np.ndarray, length: np.ndarray):
+        """Take kind and length of each run; by kind keep its runs, their distinct lengths, and which each one has."""
         self.kind = kind
-        items = {int(fate): kind == fate for fate in np.unique(kind)}
-        self.places = {name: (here, *np.unique(length[here], return_inverse=True)) for name, here in items.items()}
+        masks = {int(fate): kind == fate for fate in np.unique(kind)}
+        self.places = {fate: (mask, *np.unique(length[mask], return_inverse=True)) for fate, mask in masks.items()}
 
     @staticmethod
     def of(fates: Fates) -> "Runs":
-        """Put stretches one after another, each behind a START."""
+        """Return the runs of stretches one after another, each behind a START."""
         code = np.concatenate([[START, *np.where(np.isnan(f), UNKNOWN, f).tolist()] for f in fates]).astype(int)
         first = np.flatnonzero(np.concatenate([[True], (np.diff(code) != 0) | (code[1:] == START)]))
         return Runs(code[first], np.diff(np.append(first, len(code))))
 
     def likelihood(self, x: np.ndarray) -> tuple[float, np.ndarray]:
-        """Log-likelihood at logits of (loss when good, when bad, fail, recover), and its gradient by complex steps."""
+        """Return the log-likelihood at logits (loss when good, when bad, fail, recover), and its gradient (4,).
+
+        By complex steps: the imaginary part of l(x + i h) is h dl/dx.
+        """
         shifted = np.broadcast_to(x, (5, 4)).astype(complex)
         shifted[np.arange(4), np.arange(4)] += 1j * STEP
         total = self._compute_log_likelihoods(1 / (1 + np.exp(-shifted)))
@@ -117,61 +123,67 @@ class Runs:
         """Return the log-likelihoods for several sets of shares (sets, 4)."""
         good, bad, fails, recovers = shares.T
         ones = np.ones_like(good)
-        # T' and A of each fate, and the stationary law p
-        moved = _matrices([[1 - fails, recovers], [fails, 1 - recovers]])  # T', columns from the present mode
+        # T' and A of each fate, and the stationary law p.
+        moved = _stack_matrices([[1 - fails, recovers], [fails, 1 - recovers]])  # T', columns from the present mode
         emitted = {0: [1 - good, 1 - bad], 1: [good, bad], UNKNOWN: [ones, ones]}
         away = fails + recovers
-        start = _matrices([[recovers / away] * 2, [fails / away] * 2])  # p 1'
+        start = _stack_matrices([[recovers / away] * 2, [fails / away] * 2])  # p 1'
         parts = np.zeros((len(shares), len(self.kind), 2, 2), dtype=complex)
         scales = np.zeros((len(shares), len(self.kind)), dtype=complex)
-        # (T' A)^length of each run, and their product
-        for kind, (here, lengths, position) in self.places.items():
+        # (T' A)^length of each run, computed once for each length, and their product.
+        for kind, (runs, lengths, position) in self.places.items():
             if kind == START:
-                parts[:, here] = start[:, None]
+                parts[:, runs] = start[:, None]
                 continue
             step = moved * np.stack(emitted[kind], axis=-1)[:, None, :]  # T' A
             power, scale = _raise_matrices(step, lengths)
-            parts[:, here], scales[:, here] = power[:, position], scale[:, position]
-        whole, scale = _multiply_runs(parts)
-        ahead = whole.sum(axis=-2)[..., 0]  # all columns of what starts with p 1' agree
-        return np.asarray(np.log(ahead) + scale + scales.sum(axis=1))
+            parts[:, runs], scales[:, runs] = power[:, position], scale[:, position]
+        product, scale = _multiply_runs(parts)
+        probability = product.sum(axis=-2)[..., 0]  # 1' (...): all columns of what starts with p 1' agree
+        return np.asarray(np.log(probability) + scale + scales.sum(axis=1))
 
 
-def _matrices(rows: list[list[np.ndarray]]) -> np.ndarray:
-    """Stack rows of entries (sets,) as matrices (sets, 2, 2)."""
+def _stack_matrices(rows: list[list[np.ndarray]]) -> np.ndarray:
+    """Return rows of entries (sets,) as matrices (sets, 2, 2)."""
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def _scale(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Scale matrices by their largest real part; return them and the logarithm of the scale."""
+def _rescale(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return matrices over their largest real part, so that products do not underflow, and its logarithm."""
     size = np.max(matrix.real, axis=(-2, -1))
     size = np.where(size > 0, size, 1.0)
     return matrix / size[..., None, None], np.log(size)
 
 
 def _raise_matrices(matrix: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Scaled matrix^length for each length, and the logarithms of the scales: by the binary digits of the lengths."""
+    """Return matrix^length for each length, (sets, lengths, 2, 2), rescaled, and the logarithms of the scales.
+
+    By the binary digits of the lengths: `square` is the matrix to the power 1, 2, 4, ...
+    """
     shape = (len(matrix), len(lengths))
     power = np.broadcast_to(np.eye(2, dtype=complex), (*shape, 2, 2))
-    scale, (square, square_scale) = np.zeros(shape), _scale(matrix)
-    left = lengths.copy()
-    while np.any(left):
-        odd = (left & 1).astype(bool)
+    scale, (square, square_scale) = np.zeros(shape), _rescale(matrix)
+    digits = lengths.copy()
+    while np.any(digits):
+        odd = (digits & 1).astype(bool)
         power = np.where(odd[:, None, None], square[:, None] @ power, power)
-        power, more = _scale(power)
+        power, more = _rescale(power)
         scale = scale + more + np.where(odd, square_scale[:, None], 0.0)
-        left = left >> 1
-        square, more = _scale(square @ square)
+        digits = digits >> 1
+        square, more = _rescale(square @ square)
         square_scale = 2 * square_scale + more
     return power, scale
 
 
 def _multiply_runs(parts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Product of (sets, runs, 2, 2), the last run first, scaled, and the logarithm of the scale: pair by pair."""
+    """Return the product of (sets, runs, 2, 2) over runs, the last one leftmost, rescaled, and the scale's logarithm.
+
+    Pair by pair: each turn halves the number of matrices.
+    """
     scale = np.zeros(len(parts))
     while parts.shape[1] > 1:
         if parts.shape[1] % 2:
             parts = np.concatenate([parts, np.broadcast_to(np.eye(2), (len(parts), 1, 2, 2))], axis=1)
-        parts, more = _scale(parts[:, 1::2] @ parts[:, ::2])
+        parts, more = _rescale(parts[:, 1::2] @ parts[:, ::2])
         scale = scale + more.sum(axis=1)
     return parts[:, 0], scale

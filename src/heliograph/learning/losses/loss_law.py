@@ -46,7 +46,7 @@ class AbstractLossLaw(Module):
         raise fail(f"channel with {type(self).__name__}", "a law with finitely many states", "a rate that drifts")
 
     def log_likelihoods(self, fates: object) -> Packets:
-        """Log-likelihood log P(fate | those before), packet by packet, of all stretches; NaN where the fate is unknown.
+        """Return log P(fate | those before) of each packet of all stretches; NaN where the fate is unknown.
 
         A last packet that is an end because it arrived has log P(arrived | those before) - log P(arrived | the first).
 
@@ -66,7 +66,7 @@ class AbstractLossLaw(Module):
         return logs
 
     def _arrives_again(self, steps: int) -> float:
-        """Return the probability that a packet arrives so many after one that did, whatever became of those between."""
+        """Return P(arrived after so many steps | arrived now), whatever became of the packets between."""
         fate = np.full(steps + 1, np.nan)
         fate[0] = 0.0
         return 1.0 - float(self.predicted(fate)[-1])
@@ -85,7 +85,7 @@ class IndependentLosses(AbstractLossLaw):
 
     @staticmethod
     def fit(fates: object) -> "IndependentLosses":
-        """Count losses and packets.
+        """Return the law of the share of losses, by counting.
 
         Raises:
             ValueError: what is no fates.
@@ -121,7 +121,7 @@ class MarkovLosses(AbstractLossLaw):
 
     @staticmethod
     def fit(fates: object, order: int = 1, intervals: bool = True) -> "MarkovLosses":
-        """Count, over packets of which the last `order` fates are known.
+        """Return the law by counts over packets of which the last `order` fates are known.
 
         Between ends that arrived for being ends the chain is one given its end. For order 1 the counts are then such
         that their shares are the maximum of that likelihood, with as many packets as know as much, and intervals are
@@ -136,10 +136,10 @@ class MarkovLosses(AbstractLossLaw):
         parts = check_fates(fates)
         for stretch in parts:
             past, length = _number_last_fates(fill_ends(stretch), order)
-            # where a chain is counted given its end, the step to the end counts as well
-            full = (length == order) & (~np.isnan(stretch) if order == 1 else is_trial(stretch))
-            np.add.at(counts, (past[full], fill_ends(stretch)[full].astype(int)), 1.0)
-        spans = _spans(parts)
+            # Where a chain is counted given its end, the step to the end counts as well.
+            counted = (length == order) & (~np.isnan(stretch) if order == 1 else is_trial(stretch))
+            np.add.at(counts, (past[counted], fill_ends(stretch)[counted].astype(int)), 1.0)
+        spans = _measure_spans(parts)
         return _condition_on_ends(counts, spans, intervals) if order == 1 and len(spans) else MarkovLosses(counts)
 
     @property
@@ -148,7 +148,7 @@ class MarkovLosses(AbstractLossLaw):
         return len(self.counts).bit_length() - 1
 
     def shares(self) -> dict[str, Share]:
-        """Shares P(lost | arrived) and P(arrived | lost) with Wilson's intervals; of a higher order P(lost | past).
+        """Return P(lost | arrived) and P(arrived | lost) with Wilson's intervals; of a higher order P(lost | past).
 
         Between ends that arrived for being ends the intervals are the likelihood's.
         """
@@ -167,8 +167,8 @@ class MarkovLosses(AbstractLossLaw):
         for known in range(self.order + 1):
             counts = self.counts.reshape(-1, 2**known, 2).sum(axis=0)  # over fates further back
             p = (counts[:, 1] + 0.5) / (counts.sum(axis=1) + 1)
-            here = length == known
-            probabilities[here] = p[past[here] & (2**known - 1)]
+            selected = length == known
+            probabilities[selected] = p[past[selected] & (2**known - 1)]
         return probabilities
 
     def _arrives_again(self, steps: int) -> float:
@@ -184,28 +184,31 @@ class MarkovLosses(AbstractLossLaw):
         if self.order == 1:
             shares = self.shares()
             return gilbert_elliott(arrives, lost, shares["fail"].estimate, shares["recover"].estimate)
-        seen = self.counts.sum(axis=1)
-        p = np.where(seen > 0, self.counts[:, 1], 0.5) / np.where(seen > 0, seen, 1.0)
-        now = np.arange(len(p))
+        total = self.counts.sum(axis=1)
+        p = np.where(total > 0, self.counts[:, 1], 0.5) / np.where(total > 0, total, 1.0)
+        # The next past has the new fate as its lowest bit, and drops the oldest.
+        pasts = np.arange(len(p))
         transition = np.zeros((len(p), len(p)))
-        transition[now, (now << 1) & (len(p) - 1)] += 1 - p
-        transition[now, ((now << 1) | 1) & (len(p) - 1)] += p
-        return markov_fading([lost if mode & 1 else arrives for mode in now], MarkovChain(transition))
+        transition[pasts, (pasts << 1) & (len(p) - 1)] += 1 - p
+        transition[pasts, ((pasts << 1) | 1) & (len(p) - 1)] += p
+        return markov_fading([lost if past & 1 else arrives for past in pasts], MarkovChain(transition))
 
 
-def _spans(parts: Fates) -> np.ndarray:
-    """Return the steps from the first to the last packet of stretches between arrivals."""
+def _measure_spans(parts: Fates) -> np.ndarray:
+    """Return the steps from the first to the last packet of each stretch whose ends are chosen, (stretches,)."""
     return np.array([len(fate) - 1 for fate in parts if fate[-1] == CHOSEN and len(fate) > 1])
 
 
 def _condition_on_ends(counts: np.ndarray, spans: np.ndarray, intervals: bool) -> MarkovLosses:
-    """The law of counts whose shares are the most likely fail a and recover b of chains that are known to end arrived.
+    """Return the Markov law of order 1, by the most likely fail a and recover b of chains known to end arrived.
 
     l = sum n log p - sum_spans log P_m, P_m = (b + a (1 - a - b)^m) / (a + b) the probability to arrive again after m
-    steps. A count in all is p (1 - p) / variance of p: as many packets as would know as much alone.
+    steps. Its counts have these shares; a count in all is p (1 - p) / variance of p: as many packets as would know as
+    much alone.
     """
 
     def likelihood(x: np.ndarray) -> tuple[float, np.ndarray]:
+        # P_m = again / total; power = (1 - a - b)^m, slope its derivative in a and in b.
         a, b = shares = 1 / (1 + np.exp(-x))
         kept = 1 - a - b
         power, slope = kept**spans, -spans * kept ** (spans - 1.0)
@@ -219,7 +222,7 @@ def _condition_on_ends(counts: np.ndarray, spans: np.ndarray, intervals: bool) -
 
     top, value = maximise_shares(likelihood, [logits(0.1, 0.5), logits(0.3, 0.3), logits(0.02, 0.9)])
     shares = 1 / (1 + np.exp(-top))
-    # variances of the logits, 1 / (n p (1 - p)) of n packets alone, from differences of the score
+    # Variances of the logits, 1 / (n p (1 - p)) of n packets alone, from differences of the score.
     steps = 1e-4 * np.eye(2)
     hessian = np.stack([likelihood(top - step)[1] - likelihood(top + step)[1] for step in steps]) / 2e-4
     variances = np.diag(np.linalg.pinv((hessian + hessian.T) / 2))

@@ -70,16 +70,16 @@ class LossMemory(NamedTuple):
         counts = MarkovLosses.fit(fates, intervals=False).counts
         both = counts.sum(axis=0)
         ratio = max(2 * (_likelihood(counts) - _likelihood(both[None])), 0.0)
-        # Wald and Wolfowitz: runs less their mean, given the number of losses, and their variance
-        off, variance = 0.0, 0.0
+        # Wald and Wolfowitz: the number of runs less its mean 1 + 2 n1 n0 / n, given n1 losses of n, and its variance.
+        excess, variance = 0.0, 0.0
         for stretch in check_fates(fates):
-            # of a stretch between arrivals the packets between them, which are exchangeable if losses are independent
+            # Of a stretch between arrivals the packets between them, which are exchangeable if losses are independent.
             for lost in _split_at_unknown(np.where(is_trial(stretch), stretch, np.nan)):
-                n, ones = len(lost), float(lost.sum())
-                pairs = 2 * ones * (n - ones)
-                off += 1 + np.sum(np.diff(lost) != 0) - (1 + pairs / n)
+                n, losses = len(lost), float(lost.sum())
+                pairs = 2 * losses * (n - losses)
+                excess += 1 + np.sum(np.diff(lost) != 0) - (1 + pairs / n)
                 variance += pairs * (pairs - n) / (n**2 * (n - 1)) if n > 1 else 0.0
-        z = float(off / np.sqrt(variance)) if variance > 0 else 0.0
+        z = float(excess / np.sqrt(variance)) if variance > 0 else 0.0
         return cls(float(ratio), float(scipy.stats.chi2.sf(ratio, 1)), z, float(2 * scipy.stats.norm.sf(abs(z))))
 
 
@@ -144,28 +144,30 @@ def learn_losses(fates: object, held_out: float = 1 / 3) -> Losses:
 
 
 def _find_significant_laws(laws: dict[str, AbstractLossLaw], parts: Fates) -> set[str]:
-    """Find the laws that a likelihood ratio test prefers to independent losses, at LEVEL for all of them together."""
+    """Return the laws that a likelihood ratio test prefers to independent losses, at LEVEL for all of them together."""
     level = LEVEL / (len(laws) - 1)
-    score = {name: float(np.nansum(law.log_likelihoods(parts))) for name, law in laws.items()}
-    more = {name: len(law.shares()) - 1 for name, law in laws.items()}
-    return {
-        name
-        for name in laws
-        if name != INDEPENDENT and scipy.stats.chi2.sf(2 * (score[name] - score[INDEPENDENT]), more[name]) < level
-    }
+    total = {name: float(np.nansum(law.log_likelihoods(parts))) for name, law in laws.items()}
+    significant = set[str]()
+    for name, law in laws.items():
+        ratio, freedom = 2 * (total[name] - total[INDEPENDENT]), len(law.shares()) - 1
+        if name != INDEPENDENT and scipy.stats.chi2.sf(ratio, freedom) < level:
+            significant.add(name)
+    return significant
 
 
 def _choose_law(significant: set[str], held_out: dict[str, HeldOutScores]) -> str:
-    """Choose the law of the largest held-out likelihood of these and independent losses; "hidden" without scores."""
+    """Return the law of the largest held-out likelihood among these and independent losses.
+
+    Without scores it is "hidden" where that is significant.
+    """
     if not held_out:
         return HIDDEN if HIDDEN in significant else INDEPENDENT
-    return max(
-        held_out, key=lambda name: held_out[name].log_likelihood if name in {INDEPENDENT, *significant} else -np.inf
-    )
+    candidates = [name for name in held_out if name in {INDEPENDENT, *significant}]
+    return max(candidates, key=lambda name: held_out[name].log_likelihood)
 
 
 def _fit_laws(parts: Fates, intervals: bool) -> dict[str, AbstractLossLaw]:
-    """Fit the five laws, by name."""
+    """Return the five laws fitted to stretches, by name."""
     return {
         INDEPENDENT: IndependentLosses.fit(parts),
         "markov": MarkovLosses.fit(parts, intervals=intervals),
@@ -176,17 +178,20 @@ def _fit_laws(parts: Fates, intervals: bool) -> dict[str, AbstractLossLaw]:
 
 
 def _score_held_out(parts: Fates, known: np.ndarray, cut: int) -> dict[str, HeldOutScores]:
-    """Fit to the first `cut` known packets, judge on the others, each given all before it."""
+    """Return the scores of the laws, fitted to the first `cut` known packets, on the others, each given all before it.
+
+    `known`: which packets are trials, of all stretches one after another.
+    """
     everything = np.concatenate(parts)
     late = known & (np.cumsum(known) > cut)
     early = np.where(late, np.nan, everything)
     ends = np.cumsum([len(stretch) for stretch in parts])[:-1]
     laws = _fit_laws(CheckedFates(np.split(early, ends)), False)
-    said = {name: law.log_likelihoods(parts)[late] for name, law in laws.items()}
+    log_likelihoods = {name: law.log_likelihoods(parts)[late] for name, law in laws.items()}
     scores = {}
-    for name, logs in said.items():
-        gain, error = mean_and_error(logs - said[INDEPENDENT])
-        scores[name] = HeldOutScores(float(logs.mean()), gain, error)
+    for name, logs in log_likelihoods.items():
+        gain, error = mean_and_error(logs - log_likelihoods[INDEPENDENT])
+        scores[name] = HeldOutScores(log_likelihood=float(logs.mean()), gain=gain, gain_error=error)
     return scores
 
 
@@ -231,15 +236,13 @@ class RunningRateLosses(AbstractLossLaw):
         trials, parts = [is_trial(stretch) for stretch in parts], [fill_ends(stretch) for stretch in parts]
 
         def likelihood(x: np.ndarray) -> tuple[float, np.ndarray]:
+            # Over the logits of the shares p, of which the derivative is p (1 - p).
             share = expit(x)
-            ahead = [_predict_losses(stretch, *share) for stretch in parts]
-            value, slope = (
-                sum(column)
-                for column in zip(
-                    *(_sum_log_probabilities(*a) for a in zip(parts, ahead, trials, strict=True)), strict=True
-                )
-            )
-            return float(value), np.asarray(slope * share * (1 - share))
+            total, gradient = 0.0, np.zeros(len(x))
+            for stretch, trial_mask in zip(parts, trials, strict=True):
+                value, slope = _sum_log_probabilities(stretch, _predict_losses(stretch, *share), trial_mask)
+                total, gradient = total + value, gradient + slope
+            return total, gradient * share * (1 - share)
 
         top, value = maximise_shares(likelihood, [*STARTS])
         return RunningRateLosses(*estimate_shares(likelihood, top, value, intervals))
@@ -251,14 +254,16 @@ class RunningRateLosses(AbstractLossLaw):
     def predicted(self, fate: Packets) -> Packets:
         """Return the probability of each loss by the running rate; an unknown fate leaves it where it is."""
         known = ~np.isnan(fate)
-        at_known = _predict_losses(np.append(fate[known], 0.0), *(share.estimate for share in self.shares().values()))[
-            0
-        ]
+        base, weight, step = (share.estimate for share in self.shares().values())
+        at_known, _ = _predict_losses(np.append(fate[known], 0.0), base, weight, step)  # also after the last known one
         return np.asarray(at_known[np.cumsum(known) - known])
 
 
 def _predict_losses(lost: Packets, base: float, weight: float, step: float) -> tuple[Packets, Packets]:
-    """Return P(lost) of each packet, and its derivatives (3, packets)."""
+    """Return P(lost) of each packet, and its derivatives in base, weight and step (3, packets).
+
+    With d = r - base: d+ = (1 - step) d + step (lost - base), and so its derivatives by recursions of the same kind.
+    """
     before = np.concatenate([[0.0], lost - base])[:-1] if len(lost) else lost
     keep = [1.0, step - 1.0]
     rate = scipy.signal.lfilter([step], keep, before)  # r - base, which starts at 0
@@ -268,10 +273,10 @@ def _predict_losses(lost: Packets, base: float, weight: float, step: float) -> t
 
 
 def _sum_log_probabilities(
-    lost: Packets, ahead: tuple[Packets, Packets], trials: np.ndarray
+    lost: Packets, predictions: tuple[Packets, Packets], trials: np.ndarray
 ) -> tuple[float, np.ndarray]:
-    """Return the log-likelihood of the trials under these predictions, and its gradient."""
-    p, slope = ahead
+    """Return the log-likelihood of the trials under predictions (P(lost), its derivatives), and its gradient (3,)."""
+    p, slope = predictions
     p = np.clip(p, 1e-300, 1 - 1e-16)
     logs, score = np.where(lost == 1, np.log(p), np.log1p(-p)), (lost - p) / (p * (1 - p))
     return float(np.sum(logs[trials])), slope @ np.where(trials, score, 0.0)

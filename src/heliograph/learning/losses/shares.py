@@ -10,16 +10,15 @@ from scipy.special import expit, logit
 from heliograph.numerics.shares import Share as Share
 
 FALL = 1.920729  # of the log-likelihood to the ends of a 95 % interval: half the 95 % point of chi-square(1)
-FALL_AT_END = (
-    2.995732  # where the maximum lies at 0 or 1, as of events that never came: n of them fail with 5 %, log 20
-)
+# The same where the maximum is at 0 or 1, as of an event that never came in n trials: (1 - p)^n = 5 %, n p ~ log 20.
+FALL_AT_END = 2.995732
 END = 14.0  # logits beyond are 0 and 1: shares of 8e-7
 
 Slope = Callable[[np.ndarray], tuple[float, np.ndarray]]  # value and gradient of a log-likelihood of logits
 
 
 def maximise_shares(function: Slope, starts: list[np.ndarray], precision: float = 1e-13) -> tuple[np.ndarray, float]:
-    """Maximise from several starts (logits); return the best point and the value there. Logits stay within END.
+    """Return the best point (logits, within END) of searches from several starts, and the value there.
 
     precision: the relative change of the value at which a search ends.
     """
@@ -46,30 +45,31 @@ def estimate_shares(function: Slope, top: np.ndarray, value: float, intervals: b
 
 def _find_profile_interval(function: Slope, top: np.ndarray, value: float, i: int) -> Share:
     """Return the share at logit i of the maximum, with the interval where its profile falls by FALL."""
-    ends = {side: top[i] * side > END - 4 for side in (-1, 1)}
-    fall = FALL_AT_END if any(ends.values()) else FALL
-    low, high = (
-        (0.0 if side < 0 else 1.0) if ends[side] else _find_crossing(function, top, value - fall, i, side)
-        for side in (-1, 1)
-    )
-    estimate = next((0.0 if side < 0 else 1.0 for side in (-1, 1) if ends[side]), float(expit(top[i])))
+    is_zero, is_one = top[i] < 4 - END, top[i] > END - 4
+    level = value - (FALL_AT_END if is_zero or is_one else FALL)
+    low = 0.0 if is_zero else _find_crossing(function, top, level, i, -1)
+    high = 1.0 if is_one else _find_crossing(function, top, level, i, 1)
+    estimate = float(expit(top[i]))
+    if is_zero or is_one:
+        estimate = 0.0 if is_zero else 1.0
     return Share(estimate, low, high)
 
 
 def _find_crossing(function: Slope, top: np.ndarray, level: float, i: int, side: int) -> float:
-    """Return the crossing of the level by the profile of logit i on one side; 0 or 1 where it does not cross."""
+    """Return the share at which the profile of logit i crosses a level on one side; 0 or 1 where it does not."""
     others, near = np.delete(np.arange(len(top)), i), top.copy()
 
-    # How far the profile is above the level, where logit i is x and all others are the best.
     @cache  # an end of a bracket keeps its value: from another start a search may end elsewhere
     def above(x: float) -> float:
-        def held(free: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return how far the profile is above the level where logit i is x and all others are the best."""
+
+        def with_x(free: np.ndarray) -> tuple[float, np.ndarray]:
             whole = np.zeros(len(top))
             whole[i], whole[others] = x, free
             value, slope = function(whole)
             return value, slope[others]
 
-        free, best = maximise_shares(held, [near[others]], 1e-9)
+        free, best = maximise_shares(with_x, [near[others]], 1e-9)
         if best > level:
             near[others] = free
         return best - level
