@@ -5,7 +5,14 @@ import pytest
 from scipy import optimize
 
 import heliograph as hg
-from heliograph.learning.intervals import bartlett, block_sums, cosines, covariance_by_model, find_told_by_few, white
+from heliograph.learning.intervals import (
+    bartlett,
+    cosines,
+    covariance_by_model,
+    draw_block_sums,
+    find_told_by_few,
+    white,
+)
 from heliograph.learning.likelihood.trust_region import maximise
 from heliograph.learning.unidentified import find_confounded, product_text, rank_of, sum_text
 
@@ -57,7 +64,7 @@ def test_long_run_covariances_of_an_autoregression():
     assert cosines(scores).covariance[0, 0] / whole == pytest.approx(4.0, abs=spread)
     assert white(scores).covariance[0, 0] / whole == pytest.approx(4 / 3, rel=0.05)
     assert 3.2 < bartlett(scores).covariance[0, 0] / whole < 4.2  # its weights take off lag / (L + 1), L = 13
-    drawn = block_sums(scores, 2000, 0)
+    drawn = draw_block_sums(scores, 2000, 0)
     assert np.var(drawn) / whole == pytest.approx(4.0, rel=0.2)
     assert cosines(scores[:1]).freedom == int(0.4 * steps ** (2 / 3))
     assert cosines(scores).freedom == pytest.approx(3 * int(0.4 * steps ** (2 / 3)))

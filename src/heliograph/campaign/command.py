@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from textwrap import fill
+from typing import Literal
 
 import rich.box
 import rich.console
@@ -45,13 +46,13 @@ def sweep(
     if only is not None and workers is None:
         workers = 0  # so that a debugger can follow
     # Compute with a progress bar, then write the report from the new scores.
-    with showing(workers or os.cpu_count() or 1) as progress:
+    with show_campaign_progress(workers or os.cpu_count() or 1) as progress:
         outcome = run_campaign(campaign, out, workers, scheduler, only, progress)
     scores = read_summary(out / SUMMARY)
     report = write_report(campaign, scores, out)
     print_scores(campaign, scores)
     console = rich.console.Console()
-    console.print(_done(outcome), soft_wrap=True, highlight=False, markup=False)
+    console.print(_count_chunks(outcome), soft_wrap=True, highlight=False, markup=False)
     console.print(f"Report: {report}", soft_wrap=True, highlight=False, markup=False)
     # Problems go to stderr: damaged files, and failures with the way to repeat them.
     for file in outcome.damaged:
@@ -79,7 +80,8 @@ def _select_chunks(campaign: Campaign, setting: int | None, chunk: int | None) -
     return [(setting, number) for number in (chunks if chunk is None else [chunk])]
 
 
-def _done(run: CampaignRun) -> str:
+def _count_chunks(run: CampaignRun) -> str:
+    """Say how many chunks were computed, and how many were already there."""
     if not run.computed and not run.failures:
         return f"{run.folder}: nothing to compute, all {run.already} chunks are already there"
     return f"{run.folder}: {run.computed} chunks computed, {run.already} were already there"
@@ -89,12 +91,13 @@ ROWS = 30  # of the printed table; the file has all
 
 
 @contextmanager
-def showing(workers: int) -> Iterator[Progress]:
+def show_campaign_progress(workers: int) -> Iterator[Progress]:
     """Show a progress bar on stderr; a line each minute where stderr is no terminal."""
     countdown = Countdown(workers)
     with show_countdown(countdown) as show:
 
         def progress(what: str, done: int, total: int) -> None:
+            """Show how many chunks are done; at first also how many were there before."""
             if what == "simulating":
                 if countdown.first is None and done:
                     print(f"{done} of {total} chunks are already there", file=sys.stderr)
@@ -105,14 +108,12 @@ def showing(workers: int) -> Iterator[Progress]:
 
 
 def print_scores(campaign: Campaign, scores: Sequence[Score]) -> None:
-    """Print the first rows of the table."""
+    """Print the first rows of the table: words to the left, numbers, which begin after three names, to the right."""
     table = rich.table.Table(box=rich.box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    first_number = len(campaign.parameters) + 3
     for i, header in enumerate(score_headers(campaign)):
-        table.add_column(
-            Text(fill(visible(header), 7)),
-            overflow="fold",
-            justify="right" if i >= len(campaign.parameters) + 3 else "left",
-        )
+        side: Literal["left", "right"] = "right" if i >= first_number else "left"
+        table.add_column(Text(fill(visible(header), 7)), overflow="fold", justify=side)
     for score in scores[:ROWS]:
         table.add_row(*(Text(visible(cell)) for cell in score_row(campaign, score)))
     console = rich.console.Console()

@@ -65,6 +65,7 @@ def _share_jobs(crew: list["_Worker"], waiting: deque[Job]) -> Iterator[tuple[Jo
     count = len(waiting)
 
     def serve(worker: _Worker) -> None:
+        """Take jobs and do them, until none waits or the worker is stopped."""
         while not worker.stopped:
             try:
                 job = waiting.popleft()
@@ -79,7 +80,7 @@ def _share_jobs(crew: list["_Worker"], waiting: deque[Job]) -> Iterator[tuple[Jo
 
 
 class _Worker:
-    """A worker process and the pipes to it."""
+    """A worker process and the pipes to it: a job is a line of JSON, its reply another."""
 
     def __init__(self, campaign: str, store: Path, timeout: float):
         self.greeting, self.timeout = json.dumps([campaign, str(store)]), timeout
@@ -87,7 +88,7 @@ class _Worker:
         self.stopped = False
 
     def ask(self, job: Job) -> Reply:
-        """Do a job in the process; if it dies or is too late, the next job gets a new process."""
+        """Return the reply to a job that the process does; if it dies or is too late, the next job gets a new one."""
         process = self._ensure_running()
         late = Event()
 
@@ -95,11 +96,11 @@ class _Worker:
             late.set()
             process.kill()
 
-        # A timer kills the process at the timeout; reading its answer then ends.
+        # A timer kills the process at the timeout; then reading its answer ends, with an empty line or part of one.
         guard = Timer(min(self.timeout, TIMEOUT_MAX), give_up)
         guard.daemon = True
         guard.start()
-        _say(process, json.dumps([job.setting, job.chunk]))
+        _send_line(process, json.dumps([job.setting, job.chunk]))
         assert process.stdout is not None
         line = process.stdout.readline()
         guard.cancel()
@@ -109,7 +110,7 @@ class _Worker:
         code = process.wait()
         self._kill()
         if late.is_set():
-            return _too_late(self.timeout)
+            return _make_late_reply(self.timeout)
         return Reply(error=f"WorkerDied: the worker process ended with {_describe_exit(code)}")
 
     def _ensure_running(self) -> subprocess.Popen[str]:
@@ -125,7 +126,7 @@ class _Worker:
                 encoding="utf-8",
                 process_group=0,  # Ctrl-C in a terminal is for the parent, which decides
             )
-            _say(self.process, self.greeting)
+            _send_line(self.process, self.greeting)
         return self.process
 
     def stop(self) -> None:
@@ -145,7 +146,7 @@ class _Worker:
                     pipe.close()
 
 
-def _say(process: subprocess.Popen[str], line: str) -> None:
+def _send_line(process: subprocess.Popen[str], line: str) -> None:
     """Send a line to a worker; one that is dead is noticed by its answer, which does not come."""
     assert process.stdin is not None
     with suppress(OSError):  # it is dead: the answer, which does not come, will say so
@@ -153,11 +154,13 @@ def _say(process: subprocess.Popen[str], line: str) -> None:
         process.stdin.flush()
 
 
-def _too_late(timeout: float) -> Reply:
+def _make_late_reply(timeout: float) -> Reply:
+    """Return the reply in place of one that took longer than the timeout."""
     return Reply(error=f"TimedOut: no answer within {timeout:g} s, the campaign's timeout", late=True)
 
 
 def _describe_exit(code: int) -> str:
+    """Return how a process ended, in words; a code below zero is minus the signal that ended it."""
     return f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
 
 
@@ -196,7 +199,6 @@ def _submit_jobs(
 ) -> Iterator[tuple[Job, Reply]]:
     """Run jobs on a Dask cluster, a few more at once than it has threads; yield each with its reply.
 
-
     Where none returns within `timeout` seconds all that are left are given up, each with the reason.
     """
     from distributed import as_completed
@@ -216,13 +218,17 @@ def _submit_jobs(
         future = _wait_for_next(client, flying, timeout)
         if future is None:
             client.cancel(list(jobs))
-            yield from ((job, _too_late(timeout)) for job in jobs.values())
+            yield from ((job, _make_late_reply(timeout)) for job in jobs.values())
             return
         yield jobs.pop(future), _read_reply(future)
 
 
 def _wait_for_next(client: Untyped, flying: Untyped, timeout: float) -> Untyped:
-    """Wait for the next job that is done; None after `timeout` seconds without one."""
+    """Return the next future that is done, of those in flight; None after `timeout` seconds without one.
+
+    Raises:
+        ValueError: the connection to the cluster is lost.
+    """
     waited = 0.0
     while not flying.has_ready():
         if client.status != "running":
@@ -235,7 +241,7 @@ def _wait_for_next(client: Untyped, flying: Untyped, timeout: float) -> Untyped:
 
 
 def _ask_cluster(ask: Callable[[], Untyped]) -> Untyped:
-    """Return the answer of a cluster; if it fails, say in one line that the cluster was lost."""
+    """Return what `ask`, which talks to the cluster, returns; if that fails, say in a line that the cluster is lost."""
     try:
         return ask()
     except (OSError, RuntimeError, TimeoutError):
@@ -243,6 +249,7 @@ def _ask_cluster(ask: Callable[[], Untyped]) -> Untyped:
 
 
 def _line(error: Exception) -> str:
+    """Return an error as one line, with its class."""
     return " ".join(f"{type(error).__name__}: {error}".split())
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import groupby
 from pathlib import Path
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import zarr
@@ -60,53 +60,88 @@ def list_details(store: Path, campaign: Campaign, settings: Sequence[int], steps
         chunks = [chunk for chunk in campaign.chunks(setting) if (setting, chunk.number) in done]
         parts = [_sum_errors(group, setting, slice(c.start, c.stop), claims[setting], steps) for c in chunks]
         if parts:
-            sums = [np.sum(totals, axis=0) for totals in zip(*parts, strict=True)]
+            sums = ErrorSums(*(np.sum(totals, axis=0) for totals in zip(*parts, strict=True)))
             results += _compute_details(setting, labels, claims[setting], [0, *steps], sums)
     return results
 
 
-def _sum_errors(
-    group: zarr.Group, setting: int, runs: slice, claims: np.ndarray, steps: Sequence[int]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Count finite runs (node, filter); sum squared errors, claimed variances and their ratios, and the squares."""
+class ErrorSums(NamedTuple):
+    """Sums over the finite runs of a setting.
+
+    Values are, along the first axis: squared error, claimed variance, and the quotient of the two. Along the second
+    axis is their mean over all steps first, then they at each given step.
+    Shapes: runs (node, filter), values and squares (value, step, node, filter, state).
+    """
+
+    runs: np.ndarray
+    values: np.ndarray
+    squares: np.ndarray
+
+
+def _sum_errors(group: zarr.Group, setting: int, runs: slice, claims: np.ndarray, steps: Sequence[int]) -> ErrorSums:
+    """Return the sums over those of some runs that are finite.
+
+    Args:
+        group: the store, with errors and variances (setting, run, step, node, filter, state).
+        setting: number of the setting.
+        runs: which runs.
+        claims: what each filter claims (node, filter); the variance of one that claims "none" need not be finite.
+        steps: at which to sum, from 1.
+    """
     error, variance = (np.asarray(group[name][setting, runs]) for name in ("error", "variance"))  # type: ignore[index]
     squared = error**2
     claimed = np.isfinite(variance).all(axis=(1, -1)) | (claims == "none")
-    counted = np.isfinite(squared).all(axis=(1, -1)) & claimed  # (run, node, filter)
+    counted = np.isfinite(squared).all(axis=(1, -1)) & claimed  # (run, node, filter), over steps and states
     with np.errstate(divide="ignore", invalid="ignore"):
         values = np.stack([squared, variance, squared / variance])
-    at = np.concatenate([values.mean(axis=2, keepdims=True), values[:, :, [step - 1 for step in steps]]], axis=2)
-    at = np.where(counted[None, :, None, :, :, None], at, 0.0)
-    return counted.sum(axis=0), at.sum(axis=1), (at**2).sum(axis=1)
+    # (value, run, step, node, filter, state): the mean over steps, then the given ones.
+    kept = np.concatenate([values.mean(axis=2, keepdims=True), values[:, :, [step - 1 for step in steps]]], axis=2)
+    kept = np.where(counted[None, :, None, :, :, None], kept, 0.0)
+    return ErrorSums(counted.sum(axis=0), kept.sum(axis=1), (kept**2).sum(axis=1))
 
 
 def _compute_details(
-    setting: int, labels: Labels, claims: np.ndarray, steps: Sequence[int], sums: Sequence[np.ndarray]
+    setting: int, labels: Labels, claims: np.ndarray, steps: Sequence[int], sums: ErrorSums
 ) -> list[Detail]:
     """Return RMSE, claimed deviation and NEES with standard errors, by node, filter, state and step of one setting.
 
-    `sums` are the number of runs (node, filter), and the sums over these of values and of their squares, both
-    (value, step, node, filter, state) with the values squared error, claimed variance and the quotient of the two.
+    Args:
+        setting: number of the setting.
+        labels: names of nodes, filters and states.
+        claims: what each filter claims (node, filter), "" where a node has no such filter.
+        steps: of the sums, 0 for all together.
+        sums: over the finite runs.
     """
-    count, first, second = sums
     with np.errstate(divide="ignore", invalid="ignore"):
-        n = count[None, None, :, :, None]
+        n = sums.runs[None, None, :, :, None]
         # Mean and its standard error over n runs: sqrt((E[x^2] - E[x]^2) / (n - 1)).
-        mean = first / n
-        error = np.sqrt(np.maximum(second / n - mean**2, 0.0) / (n - 1))
-        rmse, claimed = np.sqrt(mean[:2])
-        halved = np.where(rmse > 0, error[0] / (2 * rmse), 0.0)  # of a root, to first order
+        mean = sums.values / n
+        mean_error = np.sqrt(np.maximum(sums.squares / n - mean**2, 0.0) / (n - 1))
+        squared_error, claimed_variance, nees = mean  # each (step, node, filter, state)
+        squared_error_error, _, nees_error = mean_error
+        rmse, claimed = np.sqrt(squared_error), np.sqrt(claimed_variance)
+        rmse_error = np.where(rmse > 0, squared_error_error / (2 * rmse), 0.0)  # of a root, to first order
     return [
         Detail(
-            setting, node, name, str(claims[i, j]), state, step, float(rmse[k, i, j, s]), float(halved[k, i, j, s]),
-            float(claimed[k, i, j, s]), float(mean[2, k, i, j, s]), float(error[2, k, i, j, s]), int(count[i, j])
+            setting,
+            node,
+            name,
+            str(claims[i, j]),
+            state,
+            step,
+            rmse=float(rmse[k, i, j, s]),
+            rmse_error=float(rmse_error[k, i, j, s]),
+            claimed=float(claimed[k, i, j, s]),
+            nees_per_dimension=float(nees[k, i, j, s]),
+            nees_error=float(nees_error[k, i, j, s]),
+            finite_runs=int(sums.runs[i, j]),
         )
         for k, step in enumerate(steps)
         for i, node in enumerate(labels.nodes)
         for j, name in enumerate(labels.filters)
         if claims[i, j]
         for s, state in enumerate(labels.states)
-    ]  # fmt: skip
+    ]
 
 
 EXPLORE = "explore.html"
@@ -200,43 +235,59 @@ def _keep_first_settings(scores: Sequence[Score]) -> list[Score]:
 
 
 def _make_tables(campaign: Campaign, scores: Sequence[Score], look: Look | None) -> list[Explored]:
-    """Return scores over all steps, of single states too if there are several; then of single states over time."""
+    """Return the tables of the page: scores over all steps, of all states and of each of several; then over time.
+
+    Details of single states take time to read: of as many settings as have some ROWS rows, by those of the first.
+    """
     scored = [
         Detail(s.setting, s.node, s.filter, s.claim, ALL, 0, s.rmse, s.rmse_error, math.nan, s.nees_per_dimension,
                s.nees_error, s.finite_runs)
         for s in scores
     ]  # fmt: skip
     if look is None:
-        return [_table_scores(campaign, scored)]
+        return [_make_scores_table(campaign, scored)]
     settings = list(dict.fromkeys(score.setting for score in scores))
     steps = sorted({round(step) for step in np.linspace(1, campaign.horizon, min(STEPS, campaign.horizon))})
     detailed = look(settings[:1], steps)
     detailed += look(settings[1 : ROWS // max(len(detailed), 1)], steps)
     if len({detail.state for detail in detailed}) > 1:
         scored += [detail for detail in detailed if not detail.step]
-    return [_table_scores(campaign, scored), _table_steps(campaign, [detail for detail in detailed if detail.step])]
+    at_steps = [detail for detail in detailed if detail.step]
+    return [_make_scores_table(campaign, scored), _make_steps_table(campaign, at_steps)]
 
 
-def _table_scores(campaign: Campaign, rows: Sequence[Detail]) -> Explored:
-    """Make the table of the page that shows each filter's scores over all steps, and how to draw it at first."""
+def _make_scores_table(campaign: Campaign, rows: Sequence[Detail]) -> Explored:
+    """Return the table of each filter's scores over all steps, and how it is drawn at first."""
     columns, parameters = _make_columns(campaign, rows, SCORED), list(campaign.parameters)
     x = _choose_axis(columns, parameters)
     panel = next((name for name in ("node", *parameters) if name != x and len(set(columns[name])) > 1), "")
     whole = {"setting", "node", "filter", x, panel, *(parameters if x == "setting" else ())} - {""}
-    dimensions = ["setting", *parameters, *NAMES]
     return Explored(
-        "all steps together", columns, dimensions, (RMSE, NEES), x, panel, "filter", sorted(whole), "setting"
+        "all steps together",
+        columns,
+        dimensions=["setting", *parameters, *NAMES],
+        quantities=(RMSE, NEES),
+        x=x,
+        panel=panel,
+        colour="filter",
+        whole=sorted(whole),
+        unordered="setting",
     )
 
 
-def _table_steps(campaign: Campaign, rows: Sequence[Detail]) -> Explored:
-    """Make the table of the page that shows scores step by step, and how to draw it at first."""
-    steps = {"time": [row.step for row in rows]}
-    columns = steps | _make_columns(campaign, rows, OVER_TIME)
-    dimensions = ["time", "setting", *campaign.parameters, *NAMES]
-    whole = ["filter", "setting", "state", "time"]
+def _make_steps_table(campaign: Campaign, rows: Sequence[Detail]) -> Explored:
+    """Return the table of scores step by step, and how it is drawn at first."""
+    steps: dict[str, list[Value]] = {"time": [row.step for row in rows]}
     return Explored(
-        "step by step", columns, dimensions, (RMSE, CLAIMED, NEES), "time", "state", "filter", whole, "setting"
+        "step by step",
+        columns=steps | _make_columns(campaign, rows, OVER_TIME),
+        dimensions=["time", "setting", *campaign.parameters, *NAMES],
+        quantities=(RMSE, CLAIMED, NEES),
+        x="time",
+        panel="state",
+        colour="filter",
+        whole=["filter", "setting", "state", "time"],
+        unordered="setting",
     )
 
 
@@ -251,13 +302,14 @@ def _make_columns(campaign: Campaign, rows: Sequence[Detail], fields: Sequence[s
 
 
 def _choose_axis(columns: dict[str, list[Value]], parameters: Sequence[str]) -> str:
-    """Return the first numeric parameter with several values, else any parameter with several, else the setting."""
+    """Return the first numeric parameter with several values, else any with several, else the column "setting"."""
     several = [name for name in parameters if len(set(columns[name])) > 1]
     numbers = [name for name in several if {type(value) for value in columns[name]} <= {int, float}]
     return next(iter([*numbers, *several]), "setting")
 
 
 def _round_value(value: object) -> Value:
+    """Return a value for the page: numbers to DIGITS digits, None if not finite; what is no number as text."""
     if isinstance(value, float):
         return float(f"{value:.{DIGITS}g}") if math.isfinite(value) else None
     return value if isinstance(value, int | bool) else str(value)

@@ -53,12 +53,15 @@ def describe_failure(campaign: Campaign, out: Path, job: Job, reply: Reply) -> F
         key=(campaign.seed, *campaign.words(job.setting)),
         error=reply.error,
         traceback=reply.traceback,
-        command=_command(campaign, out, job),
+        command=_write_command(campaign, out, job),
     )
 
 
 def write_failures(out: Path, failures: list[Failure], tried: list[Job]) -> None:
-    """Write failures.json next to the store: these, and earlier ones not tried now; without any, remove the file."""
+    """Write failures.json next to the store: these, and earlier ones not tried now; without any, remove the file.
+
+    A setting that failed as a whole was tried again where a chunk of it was.
+    """
     path = out / FAILURES
     partial = path.with_name(f".{path.name}.partial")
     jobs = {*tried, *(Job(job.setting) for job in tried)}
@@ -73,7 +76,7 @@ def write_failures(out: Path, failures: list[Failure], tried: list[Job]) -> None
     replace(partial, path)
 
 
-def _command(campaign: Campaign, out: Path, job: Job) -> str:
+def _write_command(campaign: Campaign, out: Path, job: Job) -> str:
     """Return the command that repeats a failure, alone and in one process."""
     words = ["heliograph", "sweep", campaign.path, "--out", str(out.absolute()), "--setting", str(job.setting)]
     return shlex.join(words if job.chunk is None else [*words, "--chunk", str(job.chunk)])

@@ -96,7 +96,7 @@ def _find_only_node(network: Network) -> tuple[str, Node]:
 
 
 def _replace_law(channel: object, pair: tuple[AbstractLaw, AbstractLaw], law: AbstractLaw) -> AbstractRandomAffine:
-    """Return the channel with `law` in the place of the gain in question."""
+    """Return the channel with `law` in place of its gain in question: the one whose law is of the pair, or its only."""
     single = instance("channel", channel, AbstractRandomAffine, "one channel, that does not vary over time")
     leaves = jax.tree.leaves(single, is_leaf=_is_law_leaf)
     laws = [leaf for leaf in leaves if _is_law_leaf(leaf) and leaf.constant is None]
@@ -105,10 +105,10 @@ def _replace_law(channel: object, pair: tuple[AbstractLaw, AbstractLaw], law: Ab
     if not of_pair and not 0 < len(chosen) == len(laws):
         raise fail("network", "gains of one law, or some whose law is one of the two", f"{len(laws)} random gains")
 
-    def placed(leaf: object) -> object:
+    def replace_if_chosen(leaf: object) -> object:
         return law if any(leaf is gain for gain in chosen) else leaf
 
-    changed: AbstractRandomAffine = jax.tree.map(placed, single, is_leaf=_is_law_leaf)
+    changed: AbstractRandomAffine = jax.tree.map(replace_if_chosen, single, is_leaf=_is_law_leaf)
     return changed
 
 
@@ -128,15 +128,27 @@ def _draw_likelihood_ratios(
     seed: int,
     nodes: int,
 ) -> np.ndarray:
-    """Return log-likelihood ratio log p_true - log p_other of each run and step, of data drawn under the true law."""
+    """Return log p_true - log p_other (runs, steps) of data that a network of this node alone draws by the true law.
+
+    Args:
+        network: its plant and inputs.
+        name: name of the node.
+        node: gives the sensor.
+        true: the channel by which data are drawn.
+        other: the channel with the other law.
+        inputs: of the plant (count, inputs); None for 0.
+        count: number of steps.
+        seed: seed of the simulation.
+        nodes: number of values that stand for each law.
+    """
     plain = Node(node.sensor, true, {"open_loop": open_loop_filter(network.plant)})
     world = Network(network.plant, {name: plain})
     z = monte_carlo(world, count, RUNS, seed, inputs=inputs).measurements[name]
     u = np.zeros((count, len(network.inputs))) if inputs is None else np.asarray(inputs, dtype=float)
-    said = []
+    log_densities = []
     for channel in (true, other):
         received = channel.condition_on_arrival()
         filter, parts = signal_filter(network.plant, node.sensor, received), StackDensities.of(received, nodes)
         y, spread, near = (np.asarray(a).reshape(-1, *a.shape[2:]) for a in filter.expect_signals(z, u))
-        said.append(score_signals((y, spread, near), parts).log_likelihood.reshape(z.shape[:2]))
-    return np.asarray(said[0] - said[1])
+        log_densities.append(score_signals((y, spread, near), parts).log_likelihood.reshape(z.shape[:2]))
+    return np.asarray(log_densities[0] - log_densities[1])

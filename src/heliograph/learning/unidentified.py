@@ -33,7 +33,8 @@ class Confounded(NamedTuple):
 class Rank(NamedTuple):
     """Rank of the information at a point: directions of which nothing is known, and those of which something is.
 
-    Directions are orthonormal in units of each coordinate; weakest: least eigenvalue above zero.
+    flat, rest: orthonormal directions of either kind, in columns, in units of each coordinate. unit: that unit,
+    1 / sqrt(I_ii). weakest: the least eigenvalue along `rest`.
     Shapes: flat (p, k), rest (p, p - k), unit (p,).
     """
 
@@ -44,20 +45,24 @@ class Rank(NamedTuple):
 
 
 def rank_of(information: Float[np.ndarray, "p p"]) -> Rank:
-    """Return rank of I_ij / sqrt(I_ii I_jj); a coordinate of which nothing at all is known is a direction by itself."""
+    """Return the rank of I_ij / sqrt(I_ii I_jj); a coordinate of which nothing is known is a direction by itself."""
     diagonal = np.diag(information)
-    there = diagonal > 0
-    unit = np.where(there, 1 / np.sqrt(np.where(there, diagonal, 1.0)), 1.0)
+    known = diagonal > 0
+    unit = np.where(known, 1 / np.sqrt(np.where(known, diagonal, 1.0)), 1.0)
     values, vectors = np.linalg.eigh(information * unit[:, None] * unit)
-    none = values < NOTHING
-    weakest = float(values[~none].min(initial=np.inf))
-    return Rank(vectors[:, none], vectors[:, ~none], unit, weakest)
+    is_flat = values < NOTHING
+    weakest = float(values[~is_flat].min(initial=np.inf))
+    return Rank(flat=vectors[:, is_flat], rest=vectors[:, ~is_flat], unit=unit, weakest=weakest)
 
 
 def find_confounded(
     parameters: Parameters, points: list[Float[np.ndarray, " p"]], ranks: list[Rank]
 ) -> list[Confounded]:
-    """Return the groups of coordinates that the data do not separate at any of the points, with what they identify."""
+    """Return the groups of coordinates that the data do not separate at any of the points, with what they identify.
+
+    Only points with the fewest flat directions count. The flat directions of coordinates become those of the numbers
+    v themselves, and of log |v|: sums of v, or products, are identified where they do not change along these.
+    """
     count = min(rank.flat.shape[1] for rank in ranks)
     if not count:
         return []
@@ -85,13 +90,13 @@ def _differentiate_coordinates(parameters: Parameters, x: Float[np.ndarray, " p"
 
 
 def _orthonormalise(vectors: np.ndarray) -> np.ndarray:
-    """Return the orthonormal columns."""
+    """Return an orthonormal basis, in columns, of what the columns of `vectors` span."""
     left, size, _ = np.linalg.svd(vectors, full_matrices=False)
     return np.asarray(left[:, size > 1e-12 * max(size.max(initial=0.0), 1e-300)])
 
 
 def _group_connected(bases: list[np.ndarray]) -> list[tuple[int, ...]]:
-    """Return the coordinates connected by flat directions at any point."""
+    """Return the groups of coordinates that a flat direction at any point connects; `bases`: of each point, columns."""
     joined = np.max([np.abs(b @ b.T) for b in bases], axis=0) > SAME
     count, labels = connected_components(joined, directed=False)
     groups = [tuple(np.flatnonzero(labels == i).tolist()) for i in range(count)]
@@ -99,20 +104,27 @@ def _group_connected(bases: list[np.ndarray]) -> list[tuple[int, ...]]:
 
 
 def _make_confounded(group: tuple[int, ...], logs: list[np.ndarray], plain: list[np.ndarray]) -> Confounded:
-    """Return a group, with what the data do identify: products of whole powers if those fit all points, else sums."""
+    """Return a group, with what the data do identify: products of whole powers if those fit all points, else sums.
+
+    Args:
+        group: the coordinates.
+        logs: flat directions of the logarithms of numbers at each point, in columns.
+        plain: flat directions of the numbers at each point, in columns.
+    """
     places = list(group)
-    size = int(max(np.linalg.matrix_rank(b[places], tol=SAME) for b in logs))
-    none = np.zeros((0, len(group)))
-    powers = _rows_known_everywhere([b[places] for b in logs])
+    unknown = int(max(np.linalg.matrix_rank(b[places], tol=SAME) for b in logs))
+    no_rows = np.zeros((0, len(group)))
+    powers = _find_known_rows([b[places] for b in logs])
     if len(powers):
+        # In each row the least exponent becomes 1.
         powers = powers / np.min(np.abs(np.where(powers == 0, np.inf, powers)), axis=1, keepdims=True)
         if np.all(np.abs(powers - np.round(powers)) < WHOLE) and np.max(np.abs(powers)) <= LARGEST + WHOLE:
-            return Confounded(group, np.round(powers), none, size)
-    return Confounded(group, none, _rows_known_everywhere([b[places] for b in plain]), size)
+            return Confounded(group, exponents=np.round(powers), weights=no_rows, fix=unknown)
+    return Confounded(group, no_rows, weights=_find_known_rows([b[places] for b in plain]), fix=unknown)
 
 
-def _rows_known_everywhere(bases: list[np.ndarray]) -> np.ndarray:
-    """Return the rows orthogonal to the flat directions of all points, reduced."""
+def _find_known_rows(bases: list[np.ndarray]) -> np.ndarray:
+    """Return the combinations, in rows, that no flat direction of any point changes, in row echelon form."""
     _, size, right = np.linalg.svd(np.concatenate(bases, axis=1).T)
     rank = int(np.count_nonzero(size > SAME))
     return _reduce_to_echelon(right[rank:])
@@ -154,8 +166,12 @@ def sum_text(names: list[str], weights: Float[np.ndarray, " places"]) -> str:
     text = ""
     for name, weight in zip(names, weights, strict=True):
         if weight:
-            sign = (" - " if weight < 0 else " + ") if text else ("-" if weight < 0 else "")
-            text += sign + (name if abs(abs(weight) - 1) < SAME else f"{abs(weight):.4g} {name}")
+            sign = "-" if weight < 0 else "+"
+            if text:
+                text += f" {sign} "
+            elif weight < 0:
+                text = sign
+            text += name if abs(abs(weight) - 1) < SAME else f"{abs(weight):.4g} {name}"
     return text
 
 

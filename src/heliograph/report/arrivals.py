@@ -59,14 +59,17 @@ class Arrivals:
     def rate(self) -> Rate | None:
         """The mean rate of a sender whose clock is not that of the rows; None where a pattern of rows explains as much.
 
-        None too where its period is declared, and where rows are messages.
+        None too where its period is declared, and where rows are messages. Of rate and pattern the one that says that
+        fewer messages were due explains more.
         """
         if self.declared_period is not None or self.of_messages:
             return None
         rate, pattern = find_rate(self.arrived), find_pattern(self.arrived)
-        # At this rate some len / period messages are due: it tells more where a pattern has more due rows than that.
-        finer = pattern is None or rate is None or rate.period * pattern.rows.sum() > len(self.arrived) + rate.period
-        return rate if finer else None
+        if rate is None or pattern is None:
+            return rate
+        # In N rows N / period messages are due by the rate: the pattern's D due rows are more than one more than that
+        # where D > N / period + 1, or period * D > N + period.
+        return rate if rate.period * pattern.rows.sum() > len(self.arrived) + rate.period else None
 
     @cached_property
     def period(self) -> float | None:
@@ -87,8 +90,8 @@ class Arrivals:
         period = float(np.median(intervals))
         if not self.of_messages and period < SLOWER * spacing:
             return None
-        apart = np.abs(intervals / period - np.maximum(np.round(intervals / period), 1))
-        return period if np.mean(apart <= NEAR) >= REGULAR else None
+        off_whole = np.abs(intervals / period - np.maximum(np.round(intervals / period), 1))
+        return period if np.mean(off_whole <= NEAR) >= REGULAR else None
 
     @cached_property
     def slots(self) -> Bool[np.ndarray, " slots"] | None:
@@ -99,17 +102,17 @@ class Arrivals:
         if self.period is None:
             return None if self.of_messages and not self.arrived.all() else self.arrived
         clock = _read_clock(self.time)
-        came = clock[self.arrived]
-        if not len(came):
+        arrivals = clock[self.arrived]
+        if not len(arrivals):
             return np.zeros(max(int((clock[-1] - clock[0]) / self.period), 1), dtype=bool)
-        # Whole periods from each to the next; then those that are late by more than is usual.
+        # Whole periods from each arrival to the next; then those after the last, late by more than is usual.
         if self.rate is not None:
-            apart = np.diff(self.rate.slots)
+            steps = np.diff(self.rate.slots)
         else:
-            apart = np.maximum(np.round(np.diff(came) / self.period), 1).astype(np.int64)
-        since = max(int((clock[-1] - came[-1]) / self.period - NEAR), 0)
-        slots = np.zeros(1 + int(apart.sum()) + since, dtype=bool)
-        slots[np.concatenate([[0], np.cumsum(apart)])] = True
+            steps = np.maximum(np.round(np.diff(arrivals) / self.period), 1).astype(np.int64)
+        missing_at_end = max(int((clock[-1] - arrivals[-1]) / self.period - NEAR), 0)
+        slots = np.zeros(1 + int(steps.sum()) + missing_at_end, dtype=bool)
+        slots[np.concatenate([[0], np.cumsum(steps)])] = True
         return slots
 
     @cached_property
@@ -144,12 +147,15 @@ class Arrivals:
         lost = np.flatnonzero(~self.slots & due)
         if self.period is None:
             return self.time[lost]
-        clock, came = _read_clock(self.time), np.flatnonzero(self.slots)
+        clock, filled = _read_clock(self.time), np.flatnonzero(self.slots)
         times = clock[self.arrived]
-        if len(came) != len(times):  # several that came in one slot
-            times = np.interp(came, [came[0], max(came[-1], came[0] + 1)], [times[0], times[-1]])
-        at = np.interp(lost, came, times) + np.maximum(lost - came[-1], 0) * self.period
-        return np.asarray(self.time[0] + at * np.timedelta64(10**9, "ns") if self.time.dtype.kind == "M" else at)
+        if len(filled) != len(times):  # several came in one slot: slots evenly from the first arrival to the last
+            times = np.interp(filled, [filled[0], max(filled[-1], filled[0] + 1)], [times[0], times[-1]])
+        # Between arrivals by interpolation; after the last slot that is filled, a period each.
+        lost_clock = np.interp(lost, filled, times) + np.maximum(lost - filled[-1], 0) * self.period
+        if self.time.dtype.kind == "M":
+            return np.asarray(self.time[0] + lost_clock * np.timedelta64(10**9, "ns"))
+        return np.asarray(lost_clock)
 
     @property
     def due(self) -> int | None:
@@ -159,8 +165,8 @@ class Arrivals:
     @property
     def numbers(self) -> Int[np.ndarray, " arrivals"]:
         """Running number of each message that arrived, from 0, among those that were due; of rows if nobody knows."""
-        there = np.flatnonzero(self.arrived if self.due_slots is None else self.due_slots)
-        return there - there[:1]
+        places = np.flatnonzero(self.arrived if self.due_slots is None else self.due_slots)
+        return places - places[:1]
 
     @property
     def share(self) -> float:
@@ -170,13 +176,14 @@ class Arrivals:
     def contradicts(self, level: float) -> bool:
         """Test at a level whether the share that arrived is another than the stated one, and by more than a hundredth.
 
-        Arrivals that come in bursts say as much as fewer independent ones, N (1 - a) / (1 + a).
+        Arrivals that come in bursts say as much as fewer independent ones, N (1 - a) / (1 + a) with the correlation a
+        of each with the next.
         """
         p = self.stated_share
         if p is None or self.due_slots is None or not 0 < p < 1:
             return False
-        came = self.due_slots.astype(float)
-        independent = len(came) if self.period is not None else count_independent(came)
+        arrived = self.due_slots.astype(float)
+        independent = len(arrived) if self.period is not None else count_independent(arrived)
         deviation = np.sqrt(p * (1 - p) / independent)
         return bool(abs(self.share - p) > max(-ndtri(level / 2) * deviation, LEAST_SHARE))
 
@@ -185,6 +192,7 @@ class Arrivals:
         """Greatest number of messages in a row that were due and did not arrive; None where nobody knows."""
         if self.due_slots is None:
             return None
+        # As if a message had come before the first and after the last.
         ends = np.flatnonzero(np.concatenate([[True], self.due_slots, [True]]))
         return int(np.max(np.diff(ends)) - 1)
 
@@ -207,7 +215,7 @@ def _read_clock(time: np.ndarray) -> Float[np.ndarray, " time"]:
 
 
 def list_arrivals(network: Network, times: np.ndarray, received: Mapping[str, np.ndarray]) -> list[Arrivals]:
-    """Return when each component arrived, by distinct times: of messages at one time each may be a row.
+    """Return when each component of each node arrived, at distinct times: rows of one time count as one.
 
     Args:
         network: the network.
@@ -216,10 +224,11 @@ def list_arrivals(network: Network, times: np.ndarray, received: Mapping[str, np
     """
     time, row = np.unique(times, return_inverse=True)
 
-    def by_time(there: Any) -> np.ndarray:
-        came = np.zeros(len(time), dtype=bool)
-        came[row[there]] = True
-        return came
+    def by_time(in_row: Any) -> np.ndarray:
+        """Return whether something is true in any row of each distinct time."""
+        at_time = np.zeros(len(time), dtype=bool)
+        at_time[row[in_row]] = True
+        return at_time
 
     messages = rows_are_messages({node: by_time(np.any(~np.isnan(z), axis=1)) for node, z in received.items()})
     links = []
@@ -230,11 +239,22 @@ def list_arrivals(network: Network, times: np.ndarray, received: Mapping[str, np
         if isinstance(receiver, Node) and isinstance(receiver.trigger, Periodic):
             declared, may_be_lost = int(receiver.trigger.period), first(receiver.channel).erases
         for i, name in enumerate(receiver.received_names):
-            there = ~np.isnan(z[:, i])
-            stated = None if shares is None or i >= len(shares) else float(shares[i])
-            refuses, watched = limits is not None, limits is not None and limits.stuck is not None
-            values = time, by_time(there), z[there, i]
-            links.append(Arrivals(node, name, *values, may_be_lost, declared, stated, messages, refuses, watched))
+            arrived = ~np.isnan(z[:, i])
+            links.append(
+                Arrivals(
+                    node,
+                    name,
+                    time,
+                    by_time(arrived),
+                    values=z[arrived, i],
+                    may_be_lost=may_be_lost,
+                    declared_period=declared,
+                    stated_share=None if shares is None or i >= len(shares) else float(shares[i]),
+                    of_messages=messages,
+                    refuses=limits is not None,
+                    watched=limits is not None and limits.stuck is not None,
+                )
+            )
     return links
 
 

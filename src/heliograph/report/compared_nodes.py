@@ -21,12 +21,12 @@ LEAST = 0.2  # of an innovation's deviation: an error of less is not worth a war
 
 
 def compare_nodes(network: Network, record: Record, inputs: np.ndarray, level: float) -> ConstantError | None:
-    """Find the one output whose constant error explains what nodes say otherwise than the others; None of none.
+    """Return the output whose constant error explains why nodes disagree, and that error; None where there is none.
 
     A node that filters by itself takes its sensor's constant error for the state, and its innovations show nothing. So
-    a filter of all nodes' measurements is made, and its innovations judged as those of a centre are. The error has
-    to be sure by what noises are stated to be, and by the spread of what rows say for it, which holds whether these are
-    stated right, whatever they remember.
+    a filter of all nodes' measurements is made, and its innovations judged as those of a centre are. The error has to
+    be significant twice: by the stated noises, and by the spread over the rows, which holds also where noises are
+    stated wrong or remember.
 
     Args:
         network: the network.
@@ -36,11 +36,8 @@ def compare_nodes(network: Network, record: Record, inputs: np.ndarray, level: f
     """
     nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node) and _can_be_joined(node)}
     names = [f"{name}: {output}" for name, node in nodes.items() for output in node.received_names]
-    if (
-        len(nodes) < 2
-        or len(names) > MOST
-        or any(isinstance(fusion, AbstractFilter) for fusion in network.fused.values())
-    ):
+    has_centre = any(isinstance(fusion, AbstractFilter) for fusion in network.fused.values())
+    if len(nodes) < 2 or len(names) > MOST or has_centre:
         return None
     links = [x.channel.condition_on_arrival() for x in nodes.values() if not isinstance(x.channel, OverTime)]
     sensor, channel = join_links({name: node.sensor for name, node in nodes.items()}, links)
@@ -53,12 +50,17 @@ def compare_nodes(network: Network, record: Record, inputs: np.ndarray, level: f
     off = find_constant_error(names, joint, z, inputs)
     if off is None or off.size < LEAST:
         return None
-    surely = min(off.significance, abs(off.error) / off.standard_error)
-    return off if surely > -ndtri(level / (2 * len(names))) else None
+    deviations = min(off.significance, abs(off.error) / off.standard_error)
+    # The level is shared by all outputs and both signs (Bonferroni).
+    return off if deviations > -ndtri(level / (2 * len(names))) else None
 
 
 def _can_be_joined(node: Node) -> bool:
-    """Return whether a node filters by itself what it receives whenever it is sent, and claims how far that is off."""
+    """Return whether a filter of several nodes can take this one in.
+
+    Its sensor and link do not change over time, messages come whenever they are due, as they were measured, and a
+    filter of its own claims a covariance and weighs nothing.
+    """
     fixed = not isinstance(node.sensor, OverTime) and not isinstance(node.channel, OverTime)
     sent = node.trigger is None or isinstance(node.trigger, Periodic)
     claims = [f for f in node.filters.values() if f.received and f.claim != "none"]

@@ -7,7 +7,7 @@ import numpy as np
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.numerics.shares import average_correlated
-from heliograph.numerics.types import Float
+from heliograph.numerics.types import Bool, Float
 from heliograph.report.outputs import round_to
 
 SMALL = 1e-3  # of an innovation's deviation: the step by which responses are found
@@ -23,12 +23,12 @@ class ConstantError(NamedTuple):
         outputs: names of the outputs, of which one has the error; several where they cannot be told apart.
         error: the error of the first of them, in the output's unit.
         standard_error: its standard error if all else is as the model says.
-        explained: share of what squared innovations are too large by that goes with it.
-        squares: squares over their variances of the innovations without what it does to them (time, m).
-        white: these innovations in units of the filter's claim (time, m).
+        explained: share of the excess of squared innovations over the claim that the error explains.
+        squares: innovations less the error's effect on them, squared, over their variances (time, m).
+        white: innovations less the error's effect on them, in units of the filter's claim (time, m).
         size: the error's absolute value, in deviations of the output's innovations.
         significance: mean of what the rows say for the error, over its standard error by their own spread and memory.
-        nothing_else: whether these are as the filter claims.
+        nothing_else: whether the innovations without the error's effect are as the filter claims.
     """
 
     outputs: tuple[str, ...]
@@ -78,34 +78,29 @@ def find_constant_error(
     tried = []
     for j in np.flatnonzero((deviations > 0) & np.isfinite(deviations)):
         response = np.where(there, _find_response(filter, measurements, inputs, e, int(j), deviations), 0.0)
-        of_white = np.einsum("tij,tj->ti", whiten, response)
-        weight, agreement = float(np.sum(of_white**2)), float(np.sum(of_white * white))
-        if weight > 0 and np.isfinite(agreement):
-            error, agreements = agreement / weight, np.sum(of_white * white, axis=1)
-            mean, spread = average_correlated(np.where(there.any(axis=1), agreements, np.nan))
-            size, significance = abs(error) / deviations[j], abs(mean) / spread if spread > 0 else 0.0
-            tried.append(
-                _Tried(agreement * error, names[int(j)], error, weight**-0.5, response, of_white, size, significance)
-            )
+        white_response = np.einsum("tij,tj->ti", whiten, response)
+        candidate = _estimate_error(names[int(j)], white, response, white_response, there.any(axis=1), deviations[j])
+        if candidate is not None:
+            tried.append(candidate)
     if not tried:
         return None
     best = max(tried, key=lambda one: one.gain)
     others = tuple(one.output for one in tried if one is not best and best.gain - one.gain < CLEAR)
     left = np.where(there, e - best.error * best.response, np.nan)
-    too_large = float(np.sum(white**2)) - np.count_nonzero(there)
+    excess = float(np.sum(white**2)) - np.count_nonzero(there)
     return ConstantError(
         (best.output, *others),
         best.error,
         best.standard_error,
-        best.gain / too_large if too_large > 0 else 0.0,
-        left**2 / np.where(variance > 0, variance, np.nan),
-        np.where(there, white - best.error * best.white, np.nan),
-        float(best.size),
-        float(best.significance),
+        explained=best.gain / excess if excess > 0 else 0.0,
+        squares=left**2 / np.where(variance > 0, variance, np.nan),
+        white=np.where(there, white - best.error * best.white_response, np.nan),
+        size=float(best.size),
+        significance=float(best.significance),
     )
 
 
-class _Tried(NamedTuple):
+class _Candidate(NamedTuple):
     """The likeliest error of one output, and what it does; gain: twice the logarithm of the likelihood ratio."""
 
     gain: float
@@ -113,9 +108,44 @@ class _Tried(NamedTuple):
     error: float
     standard_error: float
     response: np.ndarray
-    white: np.ndarray
+    white_response: np.ndarray
     size: float
     significance: float
+
+
+def _estimate_error(
+    output: str,
+    white: Float[np.ndarray, "time m"],
+    response: Float[np.ndarray, "time m"],
+    white_response: Float[np.ndarray, "time m"],
+    received: Bool[np.ndarray, " time"],
+    deviation: float,
+) -> _Candidate | None:
+    """Return the likeliest constant error of one output; None where the innovations do not depend on it.
+
+    Args:
+        output: its name.
+        white: innovations in units of the filter's claim.
+        response: change of the innovations by an error of one.
+        white_response: this change in units of the filter's claim.
+        received: whether anything arrived in each row.
+        deviation: of the output's innovations.
+    """
+    weight, agreement = float(np.sum(white_response**2)), float(np.sum(white_response * white))
+    if not (weight > 0 and np.isfinite(agreement)):
+        return None
+    error, agreements = agreement / weight, np.sum(white_response * white, axis=1)
+    mean, spread = average_correlated(np.where(received, agreements, np.nan))
+    return _Candidate(
+        gain=agreement * error,
+        output=output,
+        error=error,
+        standard_error=weight**-0.5,
+        response=response,
+        white_response=white_response,
+        size=abs(error) / deviation,
+        significance=abs(mean) / spread if spread > 0 else 0.0,
+    )
 
 
 def _find_response(
@@ -135,7 +165,10 @@ def _find_response(
 
 
 def _inverse_roots(s: Float[np.ndarray, "time m m"], there: Float[np.ndarray, "time m"]) -> np.ndarray:
-    """Return S^(-1/2) over the components that arrived, by row; zero for the others."""
+    """Return S^(-1/2) of each row (time, m, m) over the components that are `there`; zero for the others.
+
+    Zero also where S is not finite; a direction in which S has no positive eigenvalue counts nothing.
+    """
     both = np.asarray(there[:, :, None] & there[:, None, :])
     eye = np.eye(s.shape[1])
     filled = np.where(both, s, eye)

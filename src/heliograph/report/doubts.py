@@ -7,7 +7,7 @@ from heliograph.simulation.results.whiteness import MemoryTest
 
 
 def _name_outputs(outputs: Sequence[str], sizes: Sequence[float]) -> tuple[str, str]:
-    """Name the outputs, or none where all are meant, and their sizes."""
+    """Return " of" and the names of the outputs, "" where all are meant (`outputs` is [""]); and their sizes."""
     return f" of {', '.join(outputs)}" if outputs != [""] else "", ", ".join(f"{size:.2f}" for size in sizes)
 
 
@@ -32,7 +32,7 @@ def say_memory(name: str, test: MemoryTest) -> str:
 
 
 def say_off(name: str, off: ConstantError) -> str:
-    """The sentence on the one output whose constant error leaves nothing else doubtful, or explains most of it."""
+    """Return the sentence on the output whose constant error leaves nothing else doubtful, or explains most of it."""
     if not off.nothing_else:
         share = f"{min(off.explained, 0.99):.0%} of what its squared innovations are too large by"
         return f"{name}: a constant error of {off}, would explain {share}, not all"
@@ -43,7 +43,7 @@ def say_off(name: str, off: ConstantError) -> str:
 
 
 def say_apart(off: ConstantError) -> str:
-    """The sentence on the output that differs from what the other nodes say by a constant."""
+    """Return the sentence on the output that differs from what the other nodes say by a constant."""
     return (
         f"nodes disagree: a constant error of {off}, explains it. By itself a node takes it for the state; "
         "hg.model.with_bias makes it a state of its own"
@@ -51,7 +51,7 @@ def say_apart(off: ConstantError) -> str:
 
 
 def say_underconfident(name: str, outputs: Sequence[str], sizes: Sequence[float]) -> str:
-    """The sentence on a NIS below its interval, which a filter that follows a slow error of its sensor has, too."""
+    """Return the sentence on a NIS below its interval; a filter that follows its sensor's slow error has one too."""
     of, times = _name_outputs(outputs, sizes)
     return (
         f"{name} expects more{of} than comes: the mean square of its innovations is {times} times what it claims. "

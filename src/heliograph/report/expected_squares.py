@@ -14,16 +14,16 @@ def expect_squares(
 
     Behind random gains the two differ, as the state of this run differs from its mean over all runs.
     """
-    given = filter.given_record()
-    if given is filter:
+    conditioned = filter.given_record()
+    if conditioned is filter:
         return np.ones(data.shape)
-    here, over_runs = (np.diagonal(one.run(data, inputs).innovation_covariances, axis1=1, axis2=2)
-                       for one in (given, filter))  # fmt: skip
-    return np.where(over_runs > 0, here / np.where(over_runs > 0, over_runs, 1.0), 1.0)
+    in_run, over_runs = (np.diagonal(one.run(data, inputs).innovation_covariances, axis1=1, axis2=2)
+                         for one in (conditioned, filter))  # fmt: skip
+    return np.where(over_runs > 0, in_run / np.where(over_runs > 0, over_runs, 1.0), 1.0)
 
 
 def compare_squares(squares: Float[np.ndarray, " steps"], expected: Float[np.ndarray, " steps"]) -> tuple[float, float]:
-    """Return the sum of squares over what was expected of them, 1 where a claim holds, and its standard error.
+    """Return the ratio of the squares' mean to that expected of them, 1 where a claim holds, and its standard error.
 
     Args:
         squares: of innovations in units of their claim, NaN where none is.

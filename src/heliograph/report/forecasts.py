@@ -29,7 +29,16 @@ def draw_forecasts(
     names: Sequence[str],
     sigmas: float,
 ) -> None:
-    """Draw forecasts of these filters with bands behind their estimates, one panel a state, and a line between."""
+    """Draw the filters' forecasts with their bands after their estimates, and a line where the record ends.
+
+    Args:
+        panels: one for each state.
+        record: the record from whose last row they predict.
+        node: name of the node.
+        forecasts: by filter.
+        names: filters in the order of their colours.
+        sigmas: half width of a band in deviations.
+    """
     for number, name in enumerate(names):
         if name not in forecasts:
             continue
@@ -37,9 +46,9 @@ def draw_forecasts(
         time = np.concatenate([record.time[-1:], forecast.time])
         for i, panel in enumerate(panels):
             # From the last estimate on.
-            now = np.asarray(last.mean)[-1, i], np.sqrt(np.asarray(last.covariance)[-1, i, i])
-            mean, deviation = forecast.states.mean[:, i], forecast.states.deviation[:, i]
-            mean, band = np.append(now[0], mean), sigmas * np.append(now[1], deviation)
+            last_mean, last_deviation = np.asarray(last.mean)[-1, i], np.sqrt(np.asarray(last.covariance)[-1, i, i])
+            mean = np.append(last_mean, forecast.states.mean[:, i])
+            band = sigmas * np.append(last_deviation, forecast.states.deviation[:, i])
             panel.plot(time, mean, color=colour, linestyle=(0, (4, 1.5)))
             panel.fill_between(time, mean - band, mean + band, color=colour, alpha=0.2, linewidth=0)
     for panel in panels if forecasts else ():
@@ -48,18 +57,21 @@ def draw_forecasts(
 
 def forecast_tables(record: Record, forecasts: Forecasts) -> list[Table | Text]:
     """Return a table for each filter: mean and interval of each state and output at horizons spread over all."""
-    some = next(forecast for filters in forecasts.values() for forecast in filters.values())
-    held = "Inputs are held at those of the last row."
-    inputs = {"held": held, "given": "Inputs ahead are those that were given.", "none": ""}[some.inputs]
-    said = f"From what had arrived by the last row, as if nothing arrived any more. {inputs}".strip()
-    parts: list[Table | Text] = [Text([said])]
+    any_forecast = next(forecast for filters in forecasts.values() for forecast in filters.values())
+    sentence_on_inputs = {
+        "held": "Inputs are held at those of the last row.",
+        "given": "Inputs ahead are those that were given.",
+        "none": "",
+    }[any_forecast.inputs]
+    intro = f"From what had arrived by the last row, as if nothing arrived any more. {sentence_on_inputs}".strip()
+    parts: list[Table | Text] = [Text([intro])]
     for node, filters in forecasts.items():
         parts += [_forecast_table(record, f"{node}/{name}", forecast) for name, forecast in filters.items()]
     return parts
 
 
 def _forecast_table(record: Record, name: str, forecast: "heliograph.forecasting.Forecast") -> Table:
-    """Return the mean and interval of each state and output at some of the horizons, a row each."""
+    """Return a table with a row for each of at most MOST horizons: its time, then each state and output."""
     count = len(forecast.time)
     rows = np.unique(np.linspace(0, count - 1, min(count, MOST)).round().astype(int))
     predictions = [("", forecast.states)] + ([] if forecast.outputs is None else [("measured ", forecast.outputs)])
@@ -69,14 +81,8 @@ def _forecast_table(record: Record, name: str, forecast: "heliograph.forecasting
         low, high = prediction.interval(BOTH_SIDES) if claims else (prediction.mean, prediction.mean)
         for i, number in enumerate(prediction.names):
             headers.append(visible(f"{kind}{number}"))
-            columns.append(
-                [
-                    _format_mean_and_interval(
-                        prediction.mean[row, i], low[row, i], high[row, i], prediction.deviation[row, i]
-                    )
-                    for row in rows
-                ]
-            )
+            mean, deviation = prediction.mean[:, i], prediction.deviation[:, i]
+            columns.append([_format_mean_and_interval(mean[r], low[r, i], high[r, i], deviation[r]) for r in rows])
     caption = f"**{visible(name)}**: mean, and the interval that holds 95 % of what it predicts."
     return Table(headers, [list(cells) for cells in zip(*columns, strict=True)], caption)
 

@@ -18,7 +18,7 @@ from heliograph.report.doubts import say_apart, say_memory, say_off, say_overcon
 from heliograph.report.expected_squares import compare_squares, expect_squares
 from heliograph.report.forecasts import Forecasts, Residuals
 from heliograph.report.held import HeldValue
-from heliograph.report.outputs import OutputHealth, judge_outputs_of_filter, list_listeners, weighs
+from heliograph.report.outputs import Listener, OutputHealth, judge_outputs_of_filter, list_listeners, weighs
 from heliograph.report.time_unit import doubt_time_unit
 from heliograph.simulation.declared.judgement import DeclaredJudgement, judge_declared_links
 from heliograph.simulation.description.possible import doubt_estimates
@@ -109,20 +109,21 @@ class Health:
     def held(self) -> dict[tuple[str, str], str]:
         """Return a line for each output that repeats one value for longer than its noise allows, by node and output.
 
-        Of a node that no filter listens to by itself, the output is known from a central one, by its name there.
+        An output that a node's filter and a central one both use is there once, by the node's.
         """
         trusted = {(filter.node, filter.filter) for filter in self.filters if filter.trusted}
-        stuck = {
-            f"{health.node}: {health.judged.output}" if health.node != Network.FUSED else health.judged.output: health
-            for health in sorted(self.outputs, key=lambda output: output.node != Network.FUSED)
-            if health.judged.held is not None and (health.node, health.filter) in trusted
-        }
+        # Central filters first, whose outputs are named "node: output": a node's own filter takes their place.
+        stuck: dict[str, tuple[str, str, HeldValue]] = {}
+        for health in sorted(self.outputs, key=lambda output: output.node != Network.FUSED):
+            output = health.judged.output
+            name = output if health.node == Network.FUSED else f"{health.node}: {output}"
+            if health.judged.held is not None and (health.node, health.filter) in trusted:
+                stuck[name] = health.node, output, health.judged.held
         watched = {f"{link.node}: {link.component}" for link in self.links if link.watched}
         return {
-            (health.node, health.judged.output): f"{name} is stuck, or has no noise: {held}, where its "
-            f"noise makes no run as long; {_say_what_to_do(held, name in watched)}"
-            for name, health in stuck.items()
-            if (held := health.judged.held) is not None
+            (node, output): f"{name} is stuck, or has no noise: {held}, where its noise makes no run as long; "
+            f"{_say_what_to_do(held, name in watched)}"
+            for name, (node, output, held) in stuck.items()
         }
 
     def doubted(self) -> list[FilterHealth]:
@@ -130,13 +131,14 @@ class Health:
 
         None of those that use an output which is stuck: their innovations tell of that alone.
         """
-        nodes = {node for node, _ in self.held()}
-        return [
-            filter
-            for filter in self.filters
-            if filter.trusted and not (filter.node in nodes or (nodes and filter.node == Network.FUSED))
-            if any(self._describe_doubts(filter))
-        ]
+        stuck = {node for node, _ in self.held()}
+
+        def is_doubted(health: FilterHealth) -> bool:
+            """Return whether one of these filters is trusted, uses nothing that is stuck, and has doubts."""
+            uses_stuck = health.node in stuck or (bool(stuck) and health.node == Network.FUSED)
+            return health.trusted and not uses_stuck and any(self._describe_doubts(health))
+
+        return [health for health in self.filters if is_doubted(health)]
 
     def remarks(self) -> list[str]:
         """Return one line for each doubt about a filter that is there to be compared with."""
@@ -166,41 +168,43 @@ class Health:
     def _describe_sizes(self, health: FilterHealth, test: MemoryTest) -> Iterator[str]:
         """Say of which outputs the mean square of innovations is not what is claimed."""
         name, level = f"{health.node}/{health.filter}", self._level()
-        outputs = [e for e in self.outputs if (e.node, e.filter) == (health.node, health.filter)]
+        outputs = [one for one in self.outputs if (one.node, one.filter) == (health.node, health.filter)]
         weighs = any(output.weighs for output in outputs)
         # Each output by itself, since a mean over outputs hides the one that is wrong; all together where none is.
-        sizes = {e.judged.output: (e.judged.size, e.judged.size_error, e.judged.summary.received)
-                 for e in outputs if e.judged.summary.received > LAGS}  # fmt: skip
+        # Size of each: mean square over its claim, the standard error of that, number of innovations.
+        judged = [output.judged for output in outputs]
+        sizes = {j.output: (j.size, j.size_error, j.summary.received) for j in judged if j.summary.received > LAGS}
         wrong = {output: compare_with_claim(*size, level / len(sizes)) for output, size in sizes.items()}
         if not any(wrong.values()):
             sizes = {"": (test.power, test.power_error, health.numbers)}
             wrong = {"": compare_with_claim(*sizes[""], level)}
         for sign, say in ((1, say_overconfident), (-1, say_underconfident)):
-            of = [output for output, departure in wrong.items() if departure == sign and not (weighs and sign < 0)]
+            if weighs and sign < 0:  # a filter that leaves outliers out has smaller innovations
+                continue
+            named = [output for output, departure in wrong.items() if departure == sign]
             # One that is far off pulls the estimates, and so makes others a little larger.
-            most = max((sizes[output][0] - 1 for output in of), default=0.0)
-            of = [output for output in of if sign < 0 or sizes[output][0] - 1 >= PULLED * most]
-            if of:
-                yield say(name, of if len(sizes) > 1 else [""], [sizes[output][0] for output in of])
+            most = max((sizes[output][0] - 1 for output in named), default=0.0)
+            named = [output for output in named if sign < 0 or sizes[output][0] - 1 >= PULLED * most]
+            if named:
+                yield say(name, named if len(sizes) > 1 else [""], [sizes[output][0] for output in named])
 
     def explains_all(self, health: FilterHealth, off: ConstantError) -> bool:
-        """Ask whether innovations without a constant error are as large as claimed, and have no memory."""
+        """Return whether innovations without the effect of a constant error are as large as claimed, without memory."""
         level = self._level() / off.squares.shape[1]
-        sizes = [(*average_correlated(column), int(np.count_nonzero(~np.isnan(column)))) for column in off.squares.T
-                 if np.any(~np.isnan(column))]  # fmt: skip
+        for column in off.squares.T:
+            numbers = int(np.count_nonzero(~np.isnan(column)))
+            if numbers and compare_with_claim(*average_correlated(column), numbers, level):
+                return False
         test = _test_innovations(off.white)
-        return not any(compare_with_claim(*size, level) for size in sizes) and not (
-            test is not None and self._has_memory(health, test)
-        )
+        return test is None or not self._has_memory(health, test)
 
     def _has_memory(self, health: FilterHealth, test: MemoryTest) -> bool:
-        """Ask whether innovations tell of those after, by the last one or by several, and by more than chance does.
+        """Return whether innovations predict those after, by the last one or by several, and more than by chance.
 
         Of N numbers that know nothing of one another each lag seems to predict 1 / N of the variance.
         """
-        if abs(np.log(health.expected)) > np.log(
-            TYPICAL
-        ):  # its gains suit the mean over all runs: here too large or small
+        # A filter's gains suit the mean over all runs: in a run that is far from it they are too large or too small.
+        if abs(np.log(health.expected)) > np.log(TYPICAL):
             return False
         by_chance = len(test.correlation) / health.numbers if health.numbers else 0.0
         probability = 2 * min(test.p_value, test.p_value_of_all)  # two tests share the level
@@ -219,8 +223,10 @@ def _say_what_to_do(held: HeldValue, refused: bool) -> str:
     """Say that the rest of a run was refused, or how it would be."""
     if refused:
         return "what repeated for longer was refused"
-    start = "what else is said of filters that use it may be due to that. "
-    return f"{start}stuck={held.stuck} of its node refuses what repeats for longer"
+    return (
+        "what else is said of filters that use it may be due to that. "
+        f"stuck={held.stuck} of its node refuses what repeats for longer"
+    )
 
 
 def compare_with_claim(size: float, error: float, numbers: int, level: float) -> int:
@@ -233,8 +239,8 @@ def compare_with_claim(size: float, error: float, numbers: int, level: float) ->
     if not (size > 0 and error > 0):
         return 0
     relative = max(error / size, np.sqrt(2 / numbers) if numbers else 0.0)
-    sure = max(-ndtri(level / 2) * relative, np.log(LEAST_SIZE))
-    return int(np.sign(np.log(size))) if abs(np.log(size)) > sure else 0
+    least = max(-ndtri(level / 2) * relative, np.log(LEAST_SIZE))
+    return int(np.sign(np.log(size))) if abs(np.log(size)) > least else 0
 
 
 def examine(
@@ -263,47 +269,64 @@ def examine(
     # Filters: innovations whitened by their claimed covariance, S^(-1/2) e, and their correlations over time.
     filters, outputs = [], []
     for listener in list_listeners(network, record):
-        node, name, filter, z = listener[:4]
-        advance(f"testing {node}/{name}")
-        white, test, expected = None, None, np.ones(1)
-        if filter.claim != "none" and filter.received:
-            white = np.asarray(score_innovations(filter, z, u)[1])
+        advance(f"testing {listener.node}/{listener.name}")
+        filters.append(_examine_filter(network, listener, record, u))
+        if filters[-1].white is not None:
             outputs += judge_outputs_of_filter(network, listener, record, u)
-            test = _test_innovations(subtract_mean(white) if weighs(filter) else white)
-            expected = expect_squares(filter, z, u)
-            test = test and _compare_size(test, white, expected)
-        lost = np.any(record.estimates[node][name].claims == "none")
-        claim = "none" if lost else filter.claim
-        declared = () if test is None else judge_declared_links(filter, z, u)
-        unit = _name_time_unit(record) if TIME_STEP in network.inputs else "steps"
-        mean = float(np.nanmean(expected))
-        filters.append(FilterHealth(node, name, claim, white, test, listener.trusted, declared, unit, mean))
-    others = tuple(belief.words for belief in network.beliefs())
+    beliefs = tuple(belief.words for belief in network.beliefs())
     timeouts = {node: network.nodes[node].timeout for node in network.names}
     silences = find_long_silences(timeouts, record.measurements, u, network.inputs)
     links, possible = list_arrivals(network, record.time, record.measurements), doubt_estimates(network, record)
-    health = Health(record, links, filters, outputs, network.shared, others, possible=possible, silences=silences)
+    health = Health(record, links, filters, outputs, network.shared, beliefs, possible=possible, silences=silences)
     off = {(judged.node, judged.filter): _find_off(network, health, judged, u) for judged in health.doubted()}
     apart = None if health.held() else compare_nodes(network, record, u, FALSE)
     health = replace(health, off={place: error for place, error in off.items() if error is not None}, apart=apart)
     return replace(health, time_unit=_doubt_time_unit(network, health, u))
 
 
+def _examine_filter(network: Network, listener: Listener, record: Record, inputs: np.ndarray) -> FilterHealth:
+    """Return one filter's innovations in units of its claim, and what tests say of them."""
+    node, name, filter, z = listener.node, listener.name, listener.filter, listener.measurements
+    white, test, expected = None, None, np.ones(1)
+    if filter.claim != "none" and filter.received:
+        white = np.asarray(score_innovations(filter, z, inputs)[1])
+        test = _test_innovations(subtract_mean(white) if weighs(filter) else white)
+        expected = expect_squares(filter, z, inputs)
+        test = test and _compare_size(test, white, expected)
+    lost = np.any(record.estimates[node][name].claims == "none")
+    return FilterHealth(
+        node,
+        name,
+        "none" if lost else filter.claim,
+        white,
+        test,
+        trusted=listener.trusted,
+        declared=() if test is None else judge_declared_links(filter, z, inputs),
+        unit=_name_time_unit(record) if TIME_STEP in network.inputs else "steps",
+        expected=float(np.nanmean(expected)),
+    )
+
+
 def _doubt_time_unit(network: Network, health: Health, inputs: np.ndarray) -> str:
-    """Say that the times are in another unit, by the first filter of which something is doubtful."""
-    doubted = [(judged.node, judged.filter) for judged in health.doubted() if judged.test is not None]
-    listeners = (one for one in list_listeners(network, health.record) if (one.node, one.name) in doubted[:1])
-    found = [doubt_time_unit(f"{one.node}/{one.name}", one.filter, one.measurements, inputs, network.inputs)
-             for one in listeners]  # fmt: skip
-    return found[0] if found else ""
+    """Say that the times are in another unit, by the first filter of which something is doubtful; else ""."""
+    tested = [judged for judged in health.doubted() if judged.test is not None]
+    if not tested:
+        return ""
+    one = _find_listener(network, health.record, tested[0])
+    return doubt_time_unit(f"{one.node}/{one.name}", one.filter, one.measurements, inputs, network.inputs)
+
+
+def _find_listener(network: Network, record: Record, judged: FilterHealth) -> Listener:
+    """Return the filter that was judged, with what it listens to."""
+    listeners = list_listeners(network, record)
+    return next(one for one in listeners if (one.node, one.name) == (judged.node, judged.filter))
 
 
 def _find_off(network: Network, health: Health, judged: FilterHealth, inputs: np.ndarray) -> ConstantError | None:
-    """Find the constant error of one output that explains what is doubtful in a filter of several."""
+    """Return the constant error of one output that explains what is doubtful in a filter of several; else None."""
     if judged.test is None:
         return None
-    every = list_listeners(network, health.record)
-    listener = next(one for one in every if (one.node, one.name) == (judged.node, judged.filter))
+    listener = _find_listener(network, health.record, judged)
     off = find_constant_error(listener.outputs, listener.filter, listener.measurements, inputs)
     if off is None:
         return None
@@ -339,12 +362,12 @@ def _check_run(network: Network, record: Record) -> None:
 
 
 def subtract_mean(white: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, "steps m"]:
-    """Innovations less their mean: those that count of a law with outliers to one side have one, and no memory by it.
+    """Return the innovations less the mean of each output.
 
-    Their median tells of a bias.
+    Where outliers lie to one side, those that a filter keeps have a mean: it would look like memory, and is no bias.
     """
-    there = np.maximum(np.sum(~np.isnan(white), axis=0), 1)
-    return np.asarray(white - np.nansum(white, axis=0) / there)
+    count = np.maximum(np.sum(~np.isnan(white), axis=0), 1)
+    return np.asarray(white - np.nansum(white, axis=0) / count)
 
 
 def _test_innovations(white: Float[np.ndarray, "steps m"]) -> MemoryTest | None:
@@ -359,7 +382,7 @@ def _test_innovations(white: Float[np.ndarray, "steps m"]) -> MemoryTest | None:
 def _compare_size(
     test: MemoryTest, white: Float[np.ndarray, "steps m"], expected: Float[np.ndarray, "steps m"]
 ) -> MemoryTest:
-    """The test with the size of innovations beside what this recording makes of the claim, where that is not 1."""
+    """Return the test with the size of innovations relative to what is `expected` in this recording, where not 1."""
     if np.all(expected == 1):
         return test
     there = ~np.isnan(white)

@@ -32,7 +32,7 @@ NO_LAW = NoiseLaw(np.ones(1), np.zeros(1), 0.0)  # of which the claimed variance
 
 
 def list_noise_laws(network: Network, node: str) -> list[NoiseLaw]:
-    """List the noise laws of what a node receives, of its sensor where that arrives as it was sent.
+    """Return the noise law of each number that a node receives; NO_LAW where it does not arrive as it was measured.
 
     Args:
         network: the network.
@@ -101,30 +101,36 @@ def find_held_value(
     rows = np.flatnonzero(~np.isnan(values) & (variance > 0))
     if len(rows) < 3:
         return None
-    came = values[rows]
+    received = values[rows]
     # Runs of equal values: where each begins, and how long it is.
-    starts = np.flatnonzero(np.concatenate([[True], came[1:] != came[:-1]]))
-    lengths = np.diff(np.concatenate([starts, [len(came)]]))
+    starts = np.flatnonzero(np.concatenate([[True], received[1:] != received[:-1]]))
+    lengths = np.diff(np.concatenate([starts, [len(received)]]))
     longest = int(np.argmax(lengths))
     # The probability that chance repeats a value.
-    levels = np.unique(came)
+    levels = np.unique(received)
     resolution = float(np.min(np.diff(levels))) if len(levels) > 1 else 0.0
     spread = max(float(np.median(variance[rows])) - law.total, 0.0) + law.variance - resolution**2 / 12
     with np.errstate(divide="ignore", invalid="ignore"):
         by_law = float(law.share @ np.where(spread > 0, erf(resolution / np.sqrt(8 * np.abs(spread))), 1.0))
-    repeats = max(by_law, *_share_outside(came, starts[longest], lengths[longest])) if len(levels) > 1 else 0.5
+    repeats = max(by_law, *_shares_outside_run(received, starts[longest], lengths[longest])) if len(levels) > 1 else 0.5
     if repeats >= 1:
         return None
-    expected = np.log(len(came)) + (int(lengths[longest]) - 1) * np.log(max(repeats, 1e-300))
-    if lengths[longest] < 3 or expected > np.log(SELDOM):
+    log_expected = np.log(len(received)) + (int(lengths[longest]) - 1) * np.log(max(repeats, 1e-300))
+    if lengths[longest] < 3 or log_expected > np.log(SELDOM):
         return None
-    first, refused = int(starts[longest]), int(longest_by_chance(np.array(repeats)))
-    return HeldValue(float(came[first]), int(rows[first]), int(lengths[longest]), len(came), refused)
+    start = int(starts[longest])
+    return HeldValue(
+        value=float(received[start]),
+        first_row=int(rows[start]),
+        readings=int(lengths[longest]),
+        received=len(received),
+        stuck=int(longest_by_chance(np.array(repeats))),
+    )
 
 
-def _share_outside(came: Float[np.ndarray, " n"], start: int, length: int) -> tuple[float, float]:
+def _shares_outside_run(readings: Float[np.ndarray, " n"], start: int, length: int) -> tuple[float, float]:
     """Return the share of a run's value outside of it, and the share of readings there that equal the one before."""
-    outside = np.ones(len(came), dtype=bool)
+    outside = np.ones(len(readings), dtype=bool)
     outside[start : start + length] = False
-    equal = (came[1:] == came[:-1])[outside[1:] & outside[:-1]]
-    return float(np.mean(came[outside] == came[start])), float(np.mean(equal)) if len(equal) else 0.0
+    equal = (readings[1:] == readings[:-1])[outside[1:] & outside[:-1]]
+    return float(np.mean(readings[outside] == readings[start])), float(np.mean(equal)) if len(equal) else 0.0

@@ -24,7 +24,7 @@ LOOK = STYLE | {"axes.prop_cycle": cycler(color=COLOURS), "date.converter": "con
 
 
 def tested_by_figure(health: Health) -> dict[str, list[FilterHealth]]:
-    """Return the filters in each figure of innovations: one of all, or one of each node where there are many."""
+    """Return the filters in each figure of innovations by its name: one of all, or one of each node of many."""
     tested = _sort_fused_first(filter for filter in health.filters if filter.white is not None)
     if len(tested) <= FEW:
         return {"innovations": tested} if tested else {}
@@ -42,10 +42,12 @@ def draw_innovations(health: Health, tested: Sequence[FilterHealth]) -> Figure:
     for axes, judged in zip(grid, tested, strict=True):
         white = np.asarray(judged.white)
         # A colour for each output; of more outputs than colours, such as a centre's, one for all.
-        alike = white.shape[1] > len(COLOURS)
-        for i, component in enumerate(white.T):
-            name, colour = ("outputs", BLUE) if alike else (names[judged.node][i], COLOURS[i])
-            label = None if alike and i else quote_for_figure(f"{white.shape[1]} {name}" if alike else name)
+        count = white.shape[1]
+        if count > len(COLOURS):
+            colours, labels = [BLUE] * count, [f"{count} outputs", *[None] * (count - 1)]
+        else:
+            colours, labels = list(COLOURS[:count]), list(map(quote_for_figure, names[judged.node]))
+        for component, colour, label in zip(white.T, colours, labels, strict=False):
             axes.plot(health.record.time, component, ".", markersize=3, color=colour, label=label)
         for level in (-BAND, BAND):
             axes.axhline(level, color=MUTED, linewidth=0.8, linestyle=(0, (4, 1.6)))
@@ -68,7 +70,7 @@ def make_innovations_section(health: Health, drawings: Mapping[str, bytes]) -> S
     """Return the tests of each filter's innovations, their pictures, and what they say of each output."""
     table = _make_tests_table(health)
     text = "An innovation is what arrived less what the filter expected. The tests need no true state."
-    # The innovations themselves, if any filter has some.
+    # Pictures of the innovations, by node; of one figure with all filters, by the node of the first.
     tested = tested_by_figure(health)
     pictures = {
         filters[0].node: Picture(drawings[name], "Innovations over time in claimed deviations",
@@ -79,9 +81,9 @@ def make_innovations_section(health: Health, drawings: Mapping[str, bytes]) -> S
     drawn = {filter.node for name, filters in tested.items() if name in drawings for filter in filters}
     left = [f"{filter.node}/{filter.filter}" for filter in health.filters
             if filter.white is not None and filter.node not in drawn]  # fmt: skip
-    # Fusions of estimates, which are in no row.
-    listed = {(filter.node, filter.filter) for filter in health.filters}
-    fusions = [name for name in health.record.estimates.get(Network.FUSED, {}) if (Network.FUSED, name) not in listed]
+    # Fusions of estimates are in no row of the table.
+    in_table = {(filter.node, filter.filter) for filter in health.filters}
+    fusions = [name for name in health.record.estimates.get(Network.FUSED, {}) if (Network.FUSED, name) not in in_table]
     if fusions:
         text += (
             f" A fusion of estimates receives nothing itself ({', '.join(map(visible, fusions))}): the filters that it "
@@ -94,18 +96,16 @@ def make_innovations_section(health: Health, drawings: Mapping[str, bytes]) -> S
 
 def _make_tests_table(health: Health) -> Table:
     """Return size, correlation and p-value of each filter's innovations, a row each, the fused ones first."""
-    # One row for each filter.
     rows = []
     for judged in _sort_fused_first(health.filters):
-        numbers = ["–", "–", "–"]
+        cells = ["–", "–", "–"]
         if (test := judged.test) is not None:
-            numbers = [
+            cells = [
                 f"{test.power:.2f} ± {1.96 * test.power_error:.2f}",
                 f"{test.correlation[0]:.2f} ± {1.96 * test.standard_error[0]:.2f}",
                 "< 0.001" if test.p_value < 0.001 else f"{test.p_value:.3f}",
             ]
-        rows.append([visible(f"{judged.node}/{judged.filter}"), judged.claim, *numbers])
-    # What the columns are, in words.
+        rows.append([visible(f"{judged.node}/{judged.filter}"), judged.claim, *cells])
     caption = (
         "**Size**: mean square of the innovations in units of what the filter claims (normalised innovation squared "
         "per dimension): 1 where the claim holds, above 1 too sure. **Correlation** of innovations one message apart: "
@@ -116,22 +116,23 @@ def _make_tests_table(health: Health) -> Table:
 
 
 def _sort_fused_first(filters: Iterable[FilterHealth]) -> list[FilterHealth]:
+    """Return the filters, central ones first, else in their order."""
     return sorted(filters, key=lambda judged: judged.node != Network.FUSED)
 
 
 def _make_outputs_table(health: Health) -> list[Table]:
-    """Return what the innovations of each output say of it; of filters that weigh, how many values they doubted."""
+    """Return the table of each output's bias and size, and of how many values weighing filters doubted; [] if empty."""
     rows = []
     for output in health.outputs:
-        # Numbers of the summary; the bias to two digits of its standard error.
+        # Numbers of the summary; bias and size to two digits of their standard errors.
         judged, s = output.judged, output.judged.summary
         doubted = f"{s.down_weighted} ({100 * s.share.low:.2g} to {100 * s.share.high:.2g} %)" if output.weighs else "–"
         half = (s.bias_high - s.bias_low) / 2
         error = half / 1.96
         bias = f"{round_to(s.bias, error)} ± {round_to(half, error)}"
         size = f"{round_to(judged.size, judged.size_error)} ± {round_to(1.96 * judged.size_error, judged.size_error)}"
-        said = ["to blame"] * judged.to_blame + ["stuck"] * (judged.held is not None)
-        rows.append([output.name, f"{s.received} of {s.expected}", doubted, bias, size, ", ".join(said)])
+        remarks = ["to blame"] * judged.to_blame + ["stuck"] * (judged.held is not None)
+        rows.append([output.name, f"{s.received} of {s.expected}", doubted, bias, size, ", ".join(remarks)])
     caption = (
         "**Down-weighted**: values that counted less than half, and the interval of their share. **Bias**: median "
         "of the innovations in the output's unit, less that of the law of its noise. **Size**: mean square of the "
@@ -143,16 +144,19 @@ def _make_outputs_table(health: Health) -> list[Table]:
 
 
 def _make_declared_table(health: Health) -> list[Table]:
-    """Return what the innovations say of variances that messages declare, by class; nothing where none do."""
+    """Return the table of what innovations say of variances that messages declare, by class; [] where none do."""
     rows = []
-    for judged in health.filters:
-        for names, one in [(j.outputs, one) for j in judged.declared for one in j.classes]:
-            said = f"{one.low:.3g}" if one.low == one.high else f"{one.low:.3g} to {one.high:.3g}"
-            size = f"{one.nis:.3g} ({one.nis_low:.2f} to {one.nis_high:.2f})"
-            scale = "–" if one.scale_low == one.scale_high else (
-                f"{one.scale:.3g} ({one.scale_low:.3g} to {one.scale_high:.3g})")  # fmt: skip
-            name = f"{judged.node}/{judged.filter}" + f": {', '.join(names)}" * (len(judged.declared) > 1)
-            rows.append([visible(name), said, f"{one.numbers:,}", size, scale])
+    for filter in health.filters:
+        for judgement in filter.declared:
+            name = f"{filter.node}/{filter.filter}"
+            if len(filter.declared) > 1:
+                name += f": {', '.join(judgement.outputs)}"
+            for one in judgement.classes:
+                declared = f"{one.low:.3g}" if one.low == one.high else f"{one.low:.3g} to {one.high:.3g}"
+                size = f"{one.nis:.3g} ({one.nis_low:.2f} to {one.nis_high:.2f})"
+                has_scale = one.scale_low != one.scale_high
+                scale = f"{one.scale:.3g} ({one.scale_low:.3g} to {one.scale_high:.3g})" if has_scale else "–"
+                rows.append([visible(name), declared, f"{one.numbers:,}", size, scale])
     caption = (
         "**Declared**: variances that came with the messages, in classes. **Size**: mean square of the innovations "
         "over the claimed one, and where it lies for true variances in 99 of 100 recordings. **Scale**: the factor of "
@@ -164,15 +168,13 @@ def _make_declared_table(health: Health) -> list[Table]:
 
 def choose_picture(pictures: Mapping[str, Picture]) -> list[Picture | Choice]:
     """Return pictures by node one below the other, or as a choice where there are many."""
-    return (
-        [*pictures.values()]
-        if len(pictures) <= FEW
-        else [Choice("Node", list(map(visible, pictures)), list(pictures.values()))]
-    )
+    if len(pictures) <= FEW:
+        return [*pictures.values()]
+    return [Choice("Node", list(map(visible, pictures)), list(pictures.values()))]
 
 
 def say_not_drawn(names: Sequence[str], where: str) -> list[Text]:
-    """Return what a figure leaves out for lack of room, by name, and where its numbers are."""
+    """Return a text that names what no figure shows for lack of room, and says `where` its numbers are; [] of none."""
     if not names:
         return []
     return [Text([f"Not drawn, for lack of room: {', '.join(map(visible, names))}. {where}"])]
@@ -180,7 +182,7 @@ def say_not_drawn(names: Sequence[str], where: str) -> list[Text]:
 
 def label_time_axis(record: Record, axes: Axes) -> None:
     """Name the axis of time, with its unit."""
-    units, dated = record.units, record.time.dtype.kind == "M"
-    axes.set_xlabel(
-        "time (UTC)" if dated else quote_for_figure(f"time ({units['time']})" if "time" in units else "time")
-    )
+    if record.time.dtype.kind == "M":
+        axes.set_xlabel("time (UTC)")
+    else:
+        axes.set_xlabel(quote_for_figure(f"time ({record.units['time']})" if "time" in record.units else "time"))

@@ -16,8 +16,8 @@ def find_law_medians(
 ) -> Float[np.ndarray, " received"]:
     """Return the median of an innovation under the node's own law, by received number; 0 where the law is symmetric.
 
-    The innovation is M (v - E v) through the mean gain M of the link, and a Gaussian rest, so that its variance is the
-    claimed one; drawn with a fixed key.
+    The innovation is taken for M (v - E v), the noise v through the mean gain M of the link, plus a Gaussian number,
+    independent, that makes its variance the claimed one; drawn with a fixed key.
 
     Args:
         network: the network.

@@ -14,12 +14,13 @@ PREFIX = "modes_"  # of the names of figures, before that of a node's estimates
 
 def draw_modes_of_nodes(record: Record, kind: str, nodes: Sequence[str]) -> dict[str, Figure]:
     """Return a figure of each node with a filter that weighs modes, by name: "modes_", `kind` and the node's number."""
-    weigh = [any(e.modes is not None for e in record.estimates[node].values()) for node in nodes]
-    return {f"{PREFIX}{kind}_{i}": _draw(record, node) for i, node in enumerate(nodes) if weigh[i]}
+    has_modes = [any(e.modes is not None for e in record.estimates[node].values()) for node in nodes]
+    return {f"{PREFIX}{kind}_{i}": _draw_modes(record, node) for i, node in enumerate(nodes) if has_modes[i]}
 
 
 @matplotlib.rc_context(LOOK)
-def _draw(record: Record, node: str) -> Figure:
+def _draw_modes(record: Record, node: str) -> Figure:
+    """Draw the probabilities of the modes over time, by the filters of one node."""
     figure, grid = stacked_panels(1, 2.2, 0.8)
     record.plot_modes(node, axes=grid[0])
     place_legend_above(figure, grid[0], columns=3)

@@ -47,15 +47,20 @@ def compare_with_truth(record: Record) -> list[Errors]:
     results = []
     for node, estimates in sorted(record.estimates.items(), key=lambda pair: pair[0] != Network.FUSED):
         for name, estimate in estimates.items():
-            values = record.nees(node, name)
-            judged = ~np.isnan(values)
-            size = float(values[judged].sum() / known[judged].sum()) if judged.any() else np.nan
-            claim = weakest(np.unique(estimate.claims).tolist())
+            nees = record.nees(node, name)
+            claimed = ~np.isnan(nees)
             rmse = record.rmse(node, name)
-            per_state = values / np.where(known > 0, known, np.nan)
-            error = average_correlated(per_state)[1] if judged.any() else np.nan
+            per_state = nees / np.where(known > 0, known, np.nan)
             results.append(
-                Errors(node, name, claim, rmse, _estimate_rmse_errors(record, node, name, rmse), size, error)
+                Errors(
+                    node,
+                    name,
+                    claim=weakest(np.unique(estimate.claims).tolist()),
+                    rmse=rmse,
+                    rmse_error=_estimate_rmse_errors(record, node, name, rmse),
+                    nees=float(nees[claimed].sum() / known[claimed].sum()) if claimed.any() else np.nan,
+                    nees_error=average_correlated(per_state)[1] if claimed.any() else np.nan,
+                )
             )
     return results
 
@@ -64,8 +69,11 @@ def _estimate_rmse_errors(record: Record, node: str, name: str, rmse: Mapping[st
     """Return the standard error of each RMSE, that of the mean square over twice the RMSE; NaN where there is none."""
     truth = np.asarray(record.truth)
     squares = np.where(np.isnan(truth), np.nan, record.errors(node, name)) ** 2
-    means = [average_correlated(column)[1] for column in squares.T]
-    return {state: e / (2 * rmse[state]) if rmse[state] > 0 else np.nan for state, e in zip(rmse, means, strict=True)}
+    errors = {}
+    for (state, size), column in zip(rmse.items(), squares.T, strict=True):
+        mean_square_error = average_correlated(column)[1]
+        errors[state] = mean_square_error / (2 * size) if size > 0 else np.nan
+    return errors
 
 
 class OutputJudgement(NamedTuple):
@@ -140,16 +148,16 @@ def _find_relied_on(network: Network) -> dict[str, set[str]]:
     Others, such as one that takes the mean of a random gain for it, are there to be compared with.
     """
     fused = {fusion.filter for fusion in (network.fused | network.meshes).values() if isinstance(fusion, Fusion)}
-    results = {}
+    relied_on = {}
     for node, receiver in network.nodes.items():
-        claims = {name: STRENGTH[filter.claim] for name, filter in receiver.filters.items()}
-        strongest = [name for name, s in claims.items() if s == max(claims.values())]
-        results[node] = fused & set(claims) or set(strongest[:1])
-    return results
+        strengths = {name: STRENGTH[filter.claim] for name, filter in receiver.filters.items()}
+        strongest = [name for name, strength in strengths.items() if strength == max(strengths.values())]
+        relied_on[node] = fused & set(strengths) or set(strongest[:1])
+    return relied_on
 
 
 def weighs(filter: AbstractFilter) -> bool:
-    """Ask whether a filter weighs the components of what arrives."""
+    """Return whether a filter weighs the components of what arrives."""
     with jax.enable_x64(True):
         state = jax.tree.map(np.asarray, filter.init())
         innovation = jax.eval_shape(lambda before, z: filter.correct(before, z)[1], state, np.zeros(filter.received))
@@ -170,23 +178,28 @@ def judge_outputs_of_filter(
         variance = np.diagonal(outcome.innovation_covariances, axis1=-2, axis2=-1)
         innovations = Weighed(outcome.innovations, variance, np.ones_like(outcome.innovations))
     medians = find_law_medians(network, listener.node, _median_over_time(np.asarray(innovations.variance)))
-    # What is told, such as a gain or a flag, is known: its innovations are 0, of variance 0.
+    expected = expect_squares(listener.filter, listener.measurements, inputs)
+    laws = list_noise_laws(network, listener.node)
+    # What is told, such as a gain or a flag, is known: its innovations are 0, of variance 0, and it is not judged.
     variance = np.asarray(innovations.variance)
-    judges = ~(np.any(variance == 0, axis=0) & ~np.any(variance > 0, axis=0))
-    names = [name for name, is_judged in zip(listener.outputs, judges, strict=True) if is_judged]
-    uncertain = Weighed(*(np.asarray(column)[:, judges] for column in innovations))
-    received = listener.measurements[:, judges]
-    expected = expect_squares(listener.filter, listener.measurements, inputs)[:, judges]
-    known = [law for law, is_judged in zip(list_noise_laws(network, listener.node), judges, strict=True) if is_judged]
-    judged = judge_outputs(names, received, uncertain, medians[judges], weighed and listener.blames, expected, known)
+    is_known = np.any(variance == 0, axis=0) & ~np.any(variance > 0, axis=0)
+    places = np.flatnonzero(~is_known)
+    judged = judge_outputs(
+        [listener.outputs[i] for i in places],
+        listener.measurements[:, places],
+        Weighed(*(np.asarray(column)[:, places] for column in innovations)),
+        medians[places],
+        blames=weighed and listener.blames,
+        expected=expected[:, places],
+        laws=[laws[i] for i in places],
+    )
     return [OutputHealth(listener.node, listener.name, weighed, output) for output in judged]
 
 
 def _median_over_time(variance: np.ndarray) -> np.ndarray:
-    """Return the median over time by output; 0 where none arrived."""
-    came = ~np.isnan(variance)
-    return np.array([np.median(column[there]) if there.any() else 0.0
-                     for column, there in zip(variance.T, came.T, strict=True)])  # fmt: skip
+    """Return the median over time by output (m,) of variances (time, m), NaN where nothing arrived; 0 of none."""
+    columns = [column[~np.isnan(column)] for column in variance.T]
+    return np.array([np.median(column) if len(column) else 0.0 for column in columns])
 
 
 def judge_outputs(
@@ -202,7 +215,7 @@ def judge_outputs(
 
     `medians` (m,): of innovations under a law that is not symmetric. `blames`: whether weights tell of outliers.
     `expected` (time, m): of the squares, as `expect_squares` returns them.
-    `laws`: of each output's noise; None where they are not known.
+    `laws`: of each output's noise; None where they are not known. The bias is that beyond `medians`.
     """
     summaries = [
         summary._replace(bias=summary.bias - m, bias_low=summary.bias_low - m, bias_high=summary.bias_high - m)
@@ -212,16 +225,9 @@ def judge_outputs(
     used, variance = innovations.square_used(), np.asarray(innovations.variance)
     judged = []
     for i, (name, summary) in enumerate(zip(names, summaries, strict=True)):
-        size = compare_squares(used[:, i], expected[:, i])
-        judged.append(
-            OutputJudgement(
-                name,
-                i in outliers,
-                summary,
-                *size,
-                find_held_value(received[:, i], variance[:, i], NO_LAW if laws is None else laws[i]),
-            )
-        )
+        size, size_error = compare_squares(used[:, i], expected[:, i])
+        held = find_held_value(received[:, i], variance[:, i], NO_LAW if laws is None else laws[i])
+        judged.append(OutputJudgement(name, i in outliers, summary, size, size_error, held))
     return judged
 
 
@@ -248,19 +254,24 @@ class RecentOutputs:
             count = innovations.value.shape[1]
             names = list(self.names.get((node, name)) or [str(i + 1) for i in range(count)])
             unknown = np.full(innovations.value.shape, np.nan)  # what was received is not kept
-            judged = judge_outputs(names, unknown, innovations, np.zeros(count), True, np.ones_like(unknown))
-            results += [OutputHealth(node, name, True, output) for output in judged]
+            judged = judge_outputs(
+                names, unknown, innovations, medians=np.zeros(count), blames=True, expected=np.ones_like(unknown)
+            )
+            results += [OutputHealth(node, name, weighs=True, judged=output) for output in judged]
         return results
 
 
 def weighed_outputs(network: Network, record: Record) -> list[OutputHealth]:
     """Summarise the innovations of all filters that weigh what arrives in a recording, by output."""
-    chosen = (x for x in list_listeners(network, record) if x.name in record.weighed.get(x.node, {}))
-    return [output for x in chosen for output in judge_outputs_of_filter(network, x, record, np.zeros(0))]
+    outputs: list[OutputHealth] = []
+    for listener in list_listeners(network, record):
+        if listener.name in record.weighed.get(listener.node, {}):
+            outputs += judge_outputs_of_filter(network, listener, record, np.zeros(0))
+    return outputs
 
 
 def summarise_output(health: OutputHealth) -> dict[str, Json]:
-    """Return the numbers of one output for a summary; None where there are none."""
+    """Return the numbers of one output for a summary, by name; None in place of NaN."""
     judged, summary = health.judged, health.judged.summary
     values: dict[str, float] = {"bias": summary.bias, "bias_low": summary.bias_low, "bias_high": summary.bias_high,
                                 "squared": summary.squared, "size": judged.size,

@@ -28,7 +28,8 @@ def find_pattern(arrived: Bool[np.ndarray, " time"]) -> Pattern | None:
     """
     rows, due, length = np.ones(len(arrived), dtype=bool), 1, 1
     while (places := _find_least_probable_rows(arrived[rows])) is not None:
-        # A pattern among `due` of each `length` rows: both as far as the whole returns.
+        # Of the due rows, `due` in each `length`, only `places` are due: the two patterns together return after `turns`
+        # of the first, as soon as their turns * due rows are a multiple of len(places).
         turns = len(places) // np.gcd(due, len(places))
         due, length = int(places.sum()) * due * turns // len(places), length * turns
         rows[rows] = np.resize(places, int(rows.sum()))
@@ -36,18 +37,20 @@ def find_pattern(arrived: Bool[np.ndarray, " time"]) -> Pattern | None:
 
 
 def _find_least_probable_rows(arrived: Bool[np.ndarray, " rows"]) -> Bool[np.ndarray, " length"] | None:
-    """Return which of the first rows are due, of the pattern that chance makes least; None of what chance may make."""
-    came = np.flatnonzero(arrived)
-    intervals = np.diff(came)
+    """Return the pattern that chance makes least: which of its rows are due; None where chance may make each."""
+    arrivals = np.flatnonzero(arrived)
+    intervals = np.diff(arrivals)
     law = LossLaw.of_intervals(intervals)
     least, found = np.log(CHANCE), None
     for length in range(2, min(LONGEST, len(arrived) // 2) + 1 if len(intervals) else 0):
-        places = np.bincount(came % length, minlength=length) > 0
+        places = np.bincount(arrivals % length, minlength=length) > 0
         if places.all():
             continue
         # Any set of as many places, and any length, would have been taken: 1 / (length (length - 1)) add up to 1.
         tried = log(comb(length, int(places.sum()))) + log(length * (length - 1))
-        if length > SHORT and len(came) * log(length / places.sum()) < tried - least:  # independent losses make it
+        # Independent losses leave all n arrivals in d of `length` rows with probability (d / length)^n: if that is no
+        # less than the least, bursts need not be looked at.
+        if length > SHORT and len(arrivals) * log(length / places.sum()) < tried - least:
             continue
         chance = _bound_log_chance(places, law, len(intervals)) + tried
         if chance < least:
@@ -67,9 +70,12 @@ class LossLaw(NamedTuple):
 
     @staticmethod
     def of_intervals(intervals: Int[np.ndarray, " arrivals"]) -> "LossLaw":
-        """Return the most likely law."""
-        gaps = intervals[intervals > 1] - 1
-        return LossLaw(1 - len(gaps) / max(len(intervals), 1), len(gaps) / gaps.sum() if len(gaps) else 1.0)
+        """Return the law of the greatest likelihood: shares of arrivals after an arrival, and of losses that end."""
+        losses = intervals[intervals > 1] - 1
+        return LossLaw(
+            follows=1 - len(losses) / max(len(intervals), 1),
+            ends=len(losses) / losses.sum() if len(losses) else 1.0,
+        )
 
     def log_chance_within(self, due: Bool[np.ndarray, " rows"], count: int) -> float:
         """Bound the log probability that `count` arrivals after a first one are all in rows that are due.
@@ -83,10 +89,10 @@ class LossLaw(NamedTuple):
         return min(self._log_moment(due, -exponent * log(share), count) for exponent in (0.0, 0.5, 1.0))
 
     def _log_moment(self, due: Bool[np.ndarray, " rows"], log_z: float, count: int) -> float:
-        """Return log(stay(first) / z^count)."""
+        """Return log(stay(first) / z^count), by the recursion of `log_chance_within`; numbers are scaled to about 1."""
         z, logarithm, stay, after, later = exp(log_z), 0.0, 1.0, 1.0, 1.0
         for is_due in due[-2::-1].tolist():
-            # Of the row after this one and of the row after that, where these are due.
+            # `stay` and `after` are those of the row after this one and of the next, 0 where these are not due.
             later = self.ends * after + (1 - self.ends) * later
             after = stay
             now = z * (self.follows * after + (1 - self.follows) * later)
@@ -101,7 +107,7 @@ class LossLaw(NamedTuple):
 
 
 def _bound_log_chance(places: Bool[np.ndarray, " length"], law: LossLaw, count: int) -> float:
-    """Bound the probability, by its logarithm, that losses in bursts let nothing arrive outside of these places.
+    """Return an upper bound of the log probability that losses in bursts let nothing arrive outside of these places.
 
     The row of an arrival, modulo the pattern's length, moves as a Markov chain. The probability that N moves all end in
     `places` is at most the largest row sum of M^N, where M has the probabilities of moves between these places alone.
@@ -112,8 +118,8 @@ def _bound_log_chance(places: Bool[np.ndarray, " length"], law: LossLaw, count: 
         count: N, how many intervals were seen.
     """
     length = len(places)
-    # P(interval = 1) = follows, P(interval = k) = (1 - follows) ends (1 - ends)^(k - 2) for k = 2, 3, ...; a move by an
-    # interval modulo the length is the geometric series over k, k + length, k + 2 length, ...
+    # P(interval = 1) = follows, P(interval = k) = (1 - follows) ends (1 - ends)^(k - 2) for k = 2, 3, ...; modulo the
+    # length the intervals k, k + length, k + 2 length, ... are one move: a geometric series of (1 - ends)^length.
     interval = np.arange(2, length + 2)
     move: Float[np.ndarray, " length"] = np.zeros(length)
     series = 1 / (1 - (1 - law.ends) ** length)

@@ -29,7 +29,7 @@ def coordinates_of(states: Sequence[str]) -> tuple[int, int] | None:
 
 @matplotlib.rc_context(STYLE)
 def draw_position_map(record: Record, node: str, names: Sequence[str]) -> Figure:
-    """Draw the paths that filters of a node estimate, with ellipses of two claimed deviations, and the true one."""
+    """Draw the paths that filters of a node estimate, with ellipses of two claimed deviations, and the true path."""
     places = coordinates_of(record.states)
     assert places is not None  # only then is a map drawn
     i, j = places
@@ -58,6 +58,7 @@ def _add_ellipse(axes: matplotlib.axes.Axes, center: np.ndarray, covariance: np.
     values, vectors = np.linalg.eigh(covariance)
     if values[0] < 0:
         return
+    # Axes are 2 SIGMAS sqrt(eigenvalue) long; the longer one, of the second eigenvector, is the width.
     width, height = 2 * SIGMAS * np.sqrt(values[::-1])
     angle = float(np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1])))
     axes.add_patch(Ellipse((center[0], center[1]), width, height, angle=angle, color=colour, alpha=0.2, linewidth=0))

@@ -36,6 +36,7 @@ def progress(stages: int) -> Iterator[Advance]:
         stage, begun = "", 0
 
         def advance(what: str, done: int = 0, total: int = 0) -> None:
+            """Show a stage and how much of it is done."""
             nonlocal stage, begun
             if what != stage:
                 stage, begun = what, begun + 1
@@ -46,12 +47,18 @@ def progress(stages: int) -> Iterator[Advance]:
 
 
 class Countdown:
-    """Estimate of the remaining time, from the pace after each worker's first piece, which includes compilation."""
+    """Estimate of the remaining time, from the pace after each worker's first piece, which includes compilation.
+
+    Args:
+        workers: how many do pieces at once.
+        clock: tells the time in seconds.
+    """
 
     def __init__(self, workers: int = 1, clock: Callable[[], float] = time.monotonic):
         self.workers, self.clock = workers, clock
-        self.pieces = 0
-        self.first: int | None = None  # what was there before
+        self.pieces = 0  # done since the first note
+        self.first: int | None = None  # how much was done before
+        # How much was done, and when: once each worker has done a piece, and at the last note.
         self.warm: tuple[int, float] | None = None
         self.last = (0, 0.0)
 
@@ -69,8 +76,9 @@ class Countdown:
         """Return the remaining seconds; None until every worker could do a second piece."""
         if self.warm is None or self.pieces < 2 * self.workers:
             return None
-        pace = (self.last[1] - self.warm[1]) / (self.last[0] - self.warm[0])
-        return max(pace * (total - self.last[0]) - (self.clock() - self.last[1]), 0.0)
+        (warm_done, warm_time), (done, time) = self.warm, self.last
+        seconds_each = (time - warm_time) / (done - warm_done)
+        return max(seconds_each * (total - done) - (self.clock() - time), 0.0)
 
 
 def format_remaining(seconds: float | None) -> str:
@@ -90,23 +98,22 @@ def show_countdown(countdown: Countdown) -> Iterator[Callable[[str, int, int], N
     The context provides a function of (what is being done, how much is done, how much there is). The caller also has to
     call `countdown.note`, since only it knows what a piece is.
     """
-    # Columns of the bar: count, elapsed time, remaining time.
     columns = (
         rich.progress.MofNCompleteColumn(),
         rich.progress.TimeElapsedColumn(),
         rich.progress.TextColumn("{task.fields[left]}"),
     )
-    said = time.monotonic()
+    last_line = time.monotonic()
     with _bar(*columns) as bar:
         task = bar.add_task("starting", total=1, left="")
 
         def show(what: str, done: int, total: int) -> None:
-            nonlocal said
-            # Remaining time, once the countdown has a first piece.
+            """Show the bar, or print a line if the last was a minute ago; the time left once something is done."""
+            nonlocal last_line
             left = "" if countdown.first is None else format_remaining(countdown.left(total))
             bar.update(task, description=what, completed=done, total=total, left=left)
-            if not bar.console.is_terminal and time.monotonic() - said >= LINE_EVERY:
-                said = time.monotonic()
+            if not bar.console.is_terminal and time.monotonic() - last_line >= LINE_EVERY:
+                last_line = time.monotonic()
                 print(f"{what}: {done} of {total}{left and ', '}{left}", file=sys.stderr)
 
         yield show
@@ -120,6 +127,7 @@ def show_progress(what: str = "simulating") -> Iterator[Callable[[int, int], Non
     with show_countdown(countdown) as show:
 
         def progressed(done: int, total: int) -> None:
+            """Show how much is done of how much, and the time left."""
             countdown.note(done)
             show(what, done, total)
 

@@ -41,8 +41,8 @@ def find_rate(arrived: Bool[np.ndarray, " time"]) -> Rate | None:
     """Return the rate of a sender whose clock is not that of the rows, if losses would hardly leave it; else None.
 
     A sender that is due each T rows, T no whole number, comes in the rows r where frac(r / T - phase) < 1 / T, and all
-    others are empty for ever. If it is hardly slower than the rows the empty ones are rare, and have a rate themselves:
-    one of each 1 / (1 - 1 / T) rows, none of them lost.
+    others are empty for ever (frac is the part after the point). If it is hardly slower than the rows the empty ones
+    are rare, and have a rate themselves: one of each 1 / (1 - 1 / T) rows, and no such slot without its empty row.
     """
     rate = _find_line(arrived)
     if rate is not None:
@@ -55,31 +55,37 @@ def find_rate(arrived: Bool[np.ndarray, " time"]) -> Rate | None:
 
 
 def _find_line(arrived: Bool[np.ndarray, " time"]) -> Rate | None:
-    """Return the slowest rate of which each row with an arrival is, if losses in bursts would hardly leave it."""
+    """Return the slowest rate whose due rows hold all arrivals, if losses in bursts would hardly leave it; else None.
+
+    A sender may begin late and fall silent: the rows from its first arrival to its last decide, up to ENOUGH.
+    """
     rows = np.flatnonzero(arrived)
     if len(rows) < FEWEST or len(rows) == 1 + np.ptp(rows):
         return None
     law, found = LossLaw.of_intervals(np.diff(rows)), None
-    decides = rows[0] + np.arange(min(1 + int(np.ptp(rows)), ENOUGH))  # a sender may begin late, and fall silent
+    decides = rows[0] + np.arange(min(1 + int(np.ptp(rows)), ENOUGH))
     for frequency in _find_peaks(arrived):
+        # Due rows have phases within 1 / T = frequency: the other 1 - frequency of the circle is empty, about.
         if _find_gap(frequency, rows)[1] < 1 - frequency - OFF:
             continue
-        line = _narrow(frequency, rows)
+        line = _find_narrowest_line(frequency, rows)
         slots = np.floor(line.phases(rows)).astype(np.int64)
         if line.width >= 1 or np.any(np.diff(slots) < 1):
             continue
-        # Any rate, phase, width and count would have been taken: each is told apart by the rows to about 1 / rows.
+        # The chance counts for each line that would have been taken: rate, phase, width, first and last row, of each of
+        # which the rows tell as many values apart as there are rows.
         due = np.mod(line.phases(decides) + ROUNDING, 1) <= line.width + 2 * ROUNDING
         chance = law.log_chance_within(due, int(np.sum(rows <= decides[-1])) - 1) + 5 * np.log(len(arrived))
+        # Multiples of a frequency that passes do so too: the least is the sender's.
         if chance < np.log(CHANCE) and (found is None or line.frequency < 1 / found.period):
-            found = Rate(1 / line.frequency, slots - slots[0])  # the slowest, whose multiples pass too
+            found = Rate(1 / line.frequency, slots - slots[0])
     return found
 
 
 def _find_peaks(arrived: Bool[np.ndarray, " time"]) -> list[float]:
-    """Return frequencies, in periods a row: those of a usual interval, and those of the largest peaks of the spectrum.
+    """Return frequencies to look at, in periods a row: of the usual intervals, and of the spectrum's largest peaks.
 
-    A spectrum does not tell a frequency from its mirror, 1 - f, nor a comb from its harmonics.
+    A spectrum does not tell a frequency f from 1 - f: both are returned.
     """
     intervals = np.diff(np.flatnonzero(arrived))
     size = 4 * 2 ** int(np.ceil(np.log2(len(arrived))))
@@ -92,19 +98,23 @@ def _find_peaks(arrived: Bool[np.ndarray, " time"]) -> list[float]:
 
 
 def _find_gap(frequency: float, rows: Int[np.ndarray, " arrivals"]) -> tuple[float, float]:
-    """Return the middle of the largest part without an arrival, on the circle of a period, and its length."""
+    """Return the middle and the length of the largest part of a period, as a circle of length 1, without an arrival."""
     order = np.sort(np.mod(frequency * rows, 1))
     gaps = np.diff(order, append=order[0] + 1)
     largest = int(np.argmax(gaps))
     return float(order[largest] + gaps[largest] / 2), float(gaps[largest])
 
 
-def _narrow(frequency: float, rows: Int[np.ndarray, " arrivals"]) -> _Line:
-    """Return the narrowest line through rows near a frequency: with whole periods as they are, its width is convex."""
+def _find_narrowest_line(frequency: float, rows: Int[np.ndarray, " arrivals"]) -> _Line:
+    """Return the narrowest line through rows near a frequency, of which each row keeps its whole number of periods.
+
+    Then the width is a convex function of the frequency: thirds that cannot hold its minimum are cut off.
+    """
     middle, _ = _find_gap(frequency, rows)
     whole = np.floor(frequency * rows - middle)
 
     def width(f: float) -> float:
+        """Return how far phases are apart at a frequency."""
         return float(np.ptp(f * rows - whole))
 
     low, high = frequency - 1 / np.ptp(rows), frequency + 1 / np.ptp(rows)

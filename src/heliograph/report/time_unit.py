@@ -50,7 +50,7 @@ def doubt_time_unit(
 
 
 def _is_as_claimed(innovations: ArrayLike, covariances: ArrayLike) -> bool:
-    """Ask whether the mean square of innovations over their variances is about 1."""
+    """Return whether the mean square of innovations (time, m) over their variances is about 1."""
     variance = np.diagonal(np.asarray(covariances), axis1=1, axis2=2)
     with np.errstate(divide="ignore", invalid="ignore"):
         squares = np.asarray(innovations) ** 2 / variance

@@ -35,9 +35,9 @@ def gather_data(network: Network, recording: object, inputs: Any, free: int, tru
     Raises:
         ValueError: recordings of other shapes, too short, or without any change.
     """
-    # A Recording is a tuple too.
-    is_list = isinstance(recording, list | tuple) and not hasattr(recording, "measurements")
-    several = recording if is_list else [recording]
+    several: Sequence[object] = [recording]
+    if isinstance(recording, list | tuple) and not hasattr(recording, "measurements"):  # a Recording is a tuple too
+        several = recording
     if not len(several):
         raise fail("recordings", "at least one", "none")
     # Every run of every recording, then all filled up to the longest.
@@ -130,9 +130,9 @@ def _split_runs(network: Network, recording: Any, inputs: Any) -> list[tuple[np.
             raise fail("inputs", f"an array ({steps}, {count}) of {list(network.inputs)}", "none")
         u = np.zeros((steps, 0))
         if given_inputs is not None:
-            u = check_rows("inputs", given_inputs, steps, count, False, network.inputs)
-        check_inputs(network.inputs, np.asarray(u), (network.plant, network.nodes, network.fused))
-        results.append((np.concatenate(columns, axis=1), np.array(u)))
+            u = np.array(check_rows("inputs", given_inputs, steps, count, False, network.inputs))
+        check_inputs(network.inputs, u, (network.plant, network.nodes, network.fused))
+        results.append((np.concatenate(columns, axis=1), u))
     return results
 
 

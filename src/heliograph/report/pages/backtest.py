@@ -55,16 +55,11 @@ class FilterVerdict:
 
     def summarise(self) -> str:
         """Say in a word whether its forecasts hold."""
-        sure = {miss.excess < 0 for miss in self.misses}
-        return (
-            "hold"
-            if not sure
-            else "are too sure"
-            if sure == {True}
-            else "are too cautious"
-            if sure == {False}
-            else "are off"
-        )
+        if not self.misses:
+            return "hold"
+        if all(miss.excess < 0 for miss in self.misses):
+            return "are too sure"
+        return "are off" if any(miss.excess < 0 for miss in self.misses) else "are too cautious"
 
     def describe(self) -> str:
         """Say it with numbers, and with the interval that is furthest off."""
@@ -91,17 +86,13 @@ def make_backtest_results(found: "heliograph.forecasting.Backtest", network: str
 
 
 def judge_filters(found: "heliograph.forecasting.Backtest") -> list[FilterVerdict]:
-    """Compare the intervals of each filter with what came; the filters that are furthest off come first."""
+    """Compare the intervals of each filter with what came; filters with the largest share of misses come first."""
     verdicts = []
     for name in dict.fromkeys(f"{s.node}/{s.filter}" for s in found.scores):
         scores = [s for s in found.scores if f"{s.node}/{s.filter}" == name and s.compared]
-        misses = [
-            miss
-            for s in scores
-            for miss in (Miss(s, level) for level in range(len(SHARES)))
-            if abs(miss.excess) > FAR * s.coverage[miss.level].error
-        ]
-        verdicts.append(FilterVerdict(name, len(SHARES) * len(scores), misses))
+        intervals = [Miss(s, level) for s in scores for level in range(len(SHARES))]
+        misses = [one for one in intervals if abs(one.excess) > FAR * one.score.coverage[one.level].error]
+        verdicts.append(FilterVerdict(name, len(intervals), misses))
     return sorted(verdicts, key=lambda v: -len(v.misses) / max(v.compared, 1))
 
 
@@ -118,12 +109,12 @@ def _draw_coverage(found: "heliograph.forecasting.Backtest") -> Figure:
     nodes = {node for node, _, _ in numbers}
     figure, panels = stacked_panels(len(numbers), 1.3, 0.9)
     for axes, (node, part, name) in zip(panels, numbers, strict=True):
-        for place, one in enumerate(filters):
-            scores = [s for s in found.scores if (s.node, s.part, s.name, s.filter) == (node, part, name, one)]
+        for place, filter in enumerate(filters):
+            scores = [s for s in found.scores if (s.node, s.part, s.name, s.filter) == (node, part, name, filter)]
             shares = [s.coverage[DRAWN] for s in scores]
-            apart = 0.04 * (place - (len(filters) - 1) / 2)  # on a scale of logarithms, so that none hides another
-            axes.errorbar([s.horizon * np.exp(apart) for s in scores], [x.value for x in shares],
-                          [2 * x.error for x in shares], label=quote_for_figure(one) if axes is panels[0] else None,
+            shift = 0.04 * (place - (len(filters) - 1) / 2)  # on a scale of logarithms, so that none hides another
+            axes.errorbar([s.horizon * np.exp(shift) for s in scores], [x.value for x in shares],
+                          [2 * x.error for x in shares], label=quote_for_figure(filter) if axes is panels[0] else None,
                           color=COLOURS[place % len(COLOURS)], marker="o", markersize=4, linewidth=1)  # fmt: skip
         axes.axhline(CLAIMED[DRAWN], color=MUTED, linewidth=1, linestyle="--")
         axes.set_title(quote_for_figure(f"{part} {name}" if len(nodes) == 1 else f"{node}: {part} {name}"))
@@ -149,14 +140,14 @@ def make_backtest_page(
         f"Share of what came within the interval of {SHARES[DRAWN]}, with two standard errors, which know that "
         "forecasts overlap; the dashed line is what was claimed."
     )
-    more = len({(s.node, s.part, s.name) for s in found.scores}) - PANELS
-    caption += f" {more} more numbers are in the table." if more > 0 else ""
-    said = [visible(v.describe()) for v in verdicts[:LISTED]]
+    not_drawn = len({(s.node, s.part, s.name) for s in found.scores}) - PANELS
+    caption += f" {not_drawn} more numbers are in the table." if not_drawn > 0 else ""
+    sentences = [visible(v.describe()) for v in verdicts[:LISTED]]
     if len(verdicts) > LISTED:
-        said.append(f"{len(verdicts) - LISTED} more filters, none of them further off: in the table.")
+        sentences.append(f"{len(verdicts) - LISTED} more filters, none of them further off: in the table.")
     by_horizon: list[Picture | Table] = [Picture(drawings["coverage"], caption, caption), _make_score_table(found)]
     return Page(f"Heliograph backtest: {visible(network)}", _make_title(verdicts), lead,
-                [Section("At a glance", [Points(said)]), Section("By horizon", by_horizon)])  # fmt: skip
+                [Section("At a glance", [Points(sentences)]), Section("By horizon", by_horizon)])  # fmt: skip
 
 
 def _make_title(verdicts: Sequence[FilterVerdict]) -> str:
@@ -182,9 +173,10 @@ def _make_score_table(found: "heliograph.forecasting.Backtest") -> Table:
 
 
 def _summarise(found: "heliograph.forecasting.Backtest") -> dict[str, Json]:
-    """Return all numbers; what is no number is null."""
+    """Return all numbers of the backtest for its summary."""
 
     def plain(value: object) -> Json:
+        """Return texts and whole numbers as they are, finite numbers as floats, None for all else."""
         if isinstance(value, str | int):
             return value
         return float(value) if isinstance(value, float) and np.isfinite(value) else None

@@ -25,7 +25,18 @@ SOURCE, DESIGNED = "network.py", "designed.py"
 
 @dataclass(frozen=True)
 class DesignResults:
-    """Content of the report of a design. `before`: mean power of each transmitter before the design."""
+    """Content of the report of a design.
+
+    Args:
+        reference: the user's name of the network.
+        source: its Python source.
+        design: the designed powers, with their certificate.
+        before: mean power of each transmitter before the design.
+        front: least error over total power.
+        changes: what one more transmitter, relay or place would save.
+        map: error over places for one more; None unless asked for.
+        written: the designed network as Python source.
+    """
 
     reference: str
     source: str
@@ -34,7 +45,7 @@ class DesignResults:
     front: Front
     changes: Sequence[ChangeWorth]
     map: SiteMap | None
-    written: str  # the designed network as Python source
+    written: str
 
 
 def design_results(results: DesignResults) -> Results:
@@ -92,7 +103,7 @@ def draw_front(front: Front, marks: Mapping[str, tuple[float, float]]) -> Figure
     """Plot error over total power: the least found, the lower bound, and named points (power, error)."""
     figure = Figure(figsize=(WIDTH, 3.4), layout="constrained")
     axes = figure.subplots()
-    # a bound at some power holds for all less: hence steps
+    # A bound at some power holds for all smaller powers: hence steps.
     axes.fill_between(front.totals, front.bounds, 0, step="pre", color=PALE, alpha=0.6, linewidth=0, label="impossible")
     axes.plot(front.totals, front.errors, "o-", color=BLUE, linewidth=1.6, markersize=4, label="found")
     for (name, (power, error)), colour in zip(marks.items(), (VERMILION, AMBER, GREEN), strict=False):
@@ -110,9 +121,9 @@ def draw_front(front: Front, marks: Mapping[str, tuple[float, float]]) -> Figure
 
 @matplotlib.rc_context(STYLE)
 def draw_powers(before: Mapping[str, float], after: Mapping[str, float]) -> Figure:
-    """Plot the mean power of each transmitter, original and designed, as bars."""
-    names = sorted(after, key=lambda name: -after[name])[:MOST]
-    names = [name for name in after if name in names]
+    """Plot the mean power of each transmitter: bars of the design, marks of what it was; the MOST largest."""
+    largest_names = sorted(after, key=lambda name: -after[name])[:MOST]
+    names = [name for name in after if name in largest_names]
     figure = Figure(figsize=(WIDTH, 0.9 + 0.28 * len(names)), layout="constrained")
     axes = figure.subplots()
     places = np.arange(len(names))[::-1]
@@ -144,9 +155,9 @@ def draw_map(sites: SiteMap) -> Figure:
 def make_page(results: DesignResults, drawings: Mapping[str, bytes]) -> Page:
     """Return the report; `drawings` holds each figure as SVG."""
     design = results.design
-    sections = [_make_result_section(results), _front_section(drawings), _make_powers_section(results, drawings)]
+    sections = [_make_result_section(results), _make_front_section(drawings), _make_powers_section(results, drawings)]
     if results.map is not None:
-        sections.append(_map_section(drawings))
+        sections.append(_make_map_section(drawings))
     return Page(
         kicker="Heliograph design",
         title=_write_headline(results),
@@ -162,10 +173,11 @@ def make_page(results: DesignResults, drawings: Mapping[str, bytes]) -> Page:
 def _write_headline(results: DesignResults) -> str:
     """Return the title: what the design saves, of error and of power."""
     design, before = results.design, sum(results.before.values())
-    changed = [f"{100 * abs(1 - now / then):.3g} % {'less' if now < then else 'more'} {what}"
-               for what, now, then in (("error", design.error, design.present), ("power", design.total, before))
-               if then > 0 and abs(now - then) > 1e-3 * then]  # fmt: skip
-    return f"By design: {' with '.join(changed)}" if changed else "No design is better than the network as it is"
+    changes = []
+    for what, now, then in (("error", design.error, design.present), ("power", design.total, before)):
+        if then > 0 and abs(now - then) > 1e-3 * then:  # a smaller change is not worth a headline
+            changes.append(f"{100 * abs(1 - now / then):.3g} % {'less' if now < then else 'more'} {what}")
+    return f"By design: {' with '.join(changes)}" if changes else "No design is better than the network as it is"
 
 
 def _make_result_section(results: DesignResults) -> Section:
@@ -180,14 +192,14 @@ def _make_result_section(results: DesignResults) -> Section:
     return Section("The design", [KeyFigures(keys), Text([words])])
 
 
-def _front_section(drawings: Mapping[str, bytes]) -> Section:
-    """Return the least error over total power, with the lower bound."""
+def _make_front_section(drawings: Mapping[str, bytes]) -> Section:
+    """Return the section with the picture of the least error over total power, and its lower bound."""
     caption = "The least error found at each total power. Nothing lies in the grey region, whatever is tried."
     return Section("Error against power", [Picture(drawings["front"], "Error falling with total power.", caption)])
 
 
 def _make_powers_section(results: DesignResults, drawings: Mapping[str, bytes]) -> Section:
-    """Return the powers by transmitter, before and after, and what one more watt would save at each."""
+    """Return the section on the powers by transmitter, before and after, and what one more watt saves at each."""
     after, slope = mean_powers(results.design), results.design.sensitivity
     rows = [
         [visible(name), f"{results.before.get(name, float('nan')):.4g}", f"{power:.4g}",
@@ -203,16 +215,16 @@ def _make_powers_section(results: DesignResults, drawings: Mapping[str, bytes]) 
     return Section("Who sends how much", [picture, Table(headers, rows, caption)])
 
 
-def _map_section(drawings: Mapping[str, bytes]) -> Section:
-    """Return the map of errors over places for one more."""
+def _make_map_section(drawings: Mapping[str, bytes]) -> Section:
+    """Return the section with the map of errors over places for one more."""
     caption = "The least error at the design's total power, with the network standing as the map's function says."
     return Section("Where", [Picture(drawings["map"], "The error over places, with the best one.", caption)])
 
 
 def _make_changes_section(results: DesignResults) -> Section:
-    """Return what one more transmitter, relay or place would save."""
+    """Return the section on what one more transmitter, relay or place would save."""
     unit = results.design.certificate.unit
-    # A saving has two digits of a thousandth of the error: what is beyond them is the search's, and no saving.
+    # The search finds the error to about a thousandth: a saving is shown to two digits of that.
     rows = [
         [visible(change.name), f"{change.value:.4g}", round_to(change.saved, 1e-3 * change.value)]
         for change in results.changes

@@ -17,7 +17,14 @@ Value = float | str | bool | None
 
 @dataclass(frozen=True)
 class Quantity:
-    """A column that can be plotted, with the column of its standard error; `level` is drawn as a reference line."""
+    """A column that can be plotted.
+
+    Args:
+        name: name of the column.
+        label: what the axis is called.
+        error: name of the column of its standard error; "" for none.
+        level: where a reference line is drawn; None for none.
+    """
 
     name: str
     label: str
@@ -61,4 +68,5 @@ def explore_html(page: Page, tables: Sequence[Explored]) -> str:
 
 
 def _read_library(name: str) -> str:
+    """Return a script of the installed Bokeh, to be written into the page."""
     return files("bokeh").joinpath("server", "static", "js", name).read_text(encoding="utf-8")

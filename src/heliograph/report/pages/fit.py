@@ -33,7 +33,18 @@ LOGARITHMIC = 10.0  # times the least of what is shown of a positive number: the
 
 @dataclass(frozen=True)
 class Learned:
-    """Content of the report: the fit, from `learned` rows, and its effect on the `held_out` rows after them."""
+    """Content of the report: the fit, from `learned` rows, and its effect on the `held_out` rows after them.
+
+    Args:
+        network: the user's name of the network.
+        measurements: the user's name of the recording.
+        fit: what was learned.
+        learned: number of rows that it was learned from.
+        held_out: number of rows after them.
+        changes: each filter on the rows held out, before and after.
+        uniform: whether the laws fit these rows, by node.
+        losses: laws of lost measurements, by node.
+    """
 
     network: str
     measurements: str
@@ -46,7 +57,7 @@ class Learned:
 
     @property
     def starts(self) -> dict[str, float]:
-        """Return the start value of each number."""
+        """Return the start value of each free number, by name."""
         parameters = self.fit.description.parameters
         return dict(zip([e.name for e in parameters.entries], parameters.entries_at(parameters.start), strict=True))
 
@@ -65,8 +76,7 @@ def draw_fit_figures(learned: Learned) -> dict[str, Figure]:
 
 @matplotlib.rc_context(STYLE)
 def _draw_estimates(learned: Learned) -> Figure:
-    """Plot each number on its own scale: start, estimates of both forms of the likelihood, intervals."""
-    # One panel for each number, since their units differ.
+    """Draw a panel for each number, since units differ: start, estimates by both forms of the likelihood, intervals."""
     rows = learned.fit.rows()[:MOST]
     forms = [solution.form for solution in learned.fit.solutions]
     by_form = {form: learned.fit.rows(form=form) for form in forms}
@@ -74,13 +84,14 @@ def _draw_estimates(learned: Learned) -> Figure:
     for i, (axes, row) in enumerate(zip(grid, rows, strict=True)):
         # The form that counts is on top; a cross marks a number that the data do not determine.
         for j, form in enumerate(reversed(forms)):
-            e = by_form[form][i]
-            color = BLUE if j == 0 else MUTED
-            if np.isfinite([e.low, e.high]).all():
-                axes.plot([e.low, e.high], [-j, -j], color=color, linewidth=3 if j == 0 else 1.5, alpha=0.7)
-            axes.plot(e.estimate, -j, "o" if e.identified else "x", color=color, markersize=6)
+            estimated = by_form[form][i]
+            color, width = (BLUE, 3.0) if j == 0 else (MUTED, 1.5)
+            ends = [estimated.low, estimated.high]
+            if np.isfinite(ends).all():
+                axes.plot(ends, [-j, -j], color=color, linewidth=width, alpha=0.7)
+            axes.plot(estimated.estimate, -j, "o" if estimated.identified else "x", color=color, markersize=6)
         axes.plot(learned.starts[row.name], 0.6, "v", color=AMBER, markersize=5, clip_on=False)
-        # a positive number that is known to a factor of ten or worse is shown by its logarithm
+        # A positive number that is known to a factor of ten or worse is shown by its logarithm.
         ends = [row.low, row.high, row.estimate, learned.starts[row.name]]
         if min(ends) > 0 and max(ends) > LOGARITHMIC * min(ends):
             axes.set_xscale("log")
@@ -94,17 +105,15 @@ def _draw_estimates(learned: Learned) -> Figure:
 
 @matplotlib.rc_context(STYLE)
 def _draw_correlations(tested: list[Change]) -> Figure:
-    """Return the correlations of innovations some rows apart, before and after learning, with 95 % intervals."""
+    """Draw the correlations of innovations some rows apart, before and after learning, with 95 % intervals."""
     figure, grid = stacked_panels(len(tested), 1.6, 0.7)
-    # Correlation of innovations by lag, before and after, with 95 % intervals.
     for axes, change in zip(grid, tested, strict=True):
-        for shift, color, e, label in ((-0.17, AMBER, change.before, "before"), (0.17, BLUE, change.after, "after")):
-            assert e.test is not None
-            lags = np.arange(1, len(e.test.correlation) + 1)
-            axes.bar(lags + shift, e.test.correlation, 0.3, color=color, label=label)
-            axes.errorbar(
-                lags + shift, e.test.correlation, 1.96 * e.test.standard_error, fmt="none", ecolor=MUTED, lw=1
-            )
+        sides = ((-0.17, AMBER, change.before.test, "before"), (0.17, BLUE, change.after.test, "after"))
+        for shift, color, test, label in sides:
+            assert test is not None
+            lags = np.arange(1, len(test.correlation) + 1)
+            axes.bar(lags + shift, test.correlation, 0.3, color=color, label=label)
+            axes.errorbar(lags + shift, test.correlation, 1.96 * test.standard_error, fmt="none", ecolor=MUTED, lw=1)
         axes.axhline(0.0, color=MUTED, linewidth=0.8)
         axes.set_title(quote_for_figure(f"{change.node}/{change.filter}"))
         axes.set_ylabel("correlation")
@@ -116,15 +125,15 @@ def _draw_correlations(tested: list[Change]) -> Figure:
 
 @matplotlib.rc_context(STYLE)
 def _draw_pits(received: list[Uniformity]) -> Figure:
-    """Return the histogram of each node's probability integral transforms, with the band of 95 % of a uniform law."""
+    """Draw the histogram of each node's probability integral transforms, with the band of 95 % of a uniform law."""
     figure, grid = stacked_panels(len(received), 1.5, 0.7)
+    edges = np.linspace(0, 1, BINS + 1).tolist()
     for axes, transforms in zip(grid, received, strict=True):
         values = transforms.pit[~np.isnan(transforms.pit)]
         count = len(values)
+        # A bar holds a binomial number of `count`; as a density its share is divided by its width 1 / BINS.
         low, high = (scipy.stats.binom.ppf(p, count, 1 / BINS) / count * BINS for p in (0.025, 0.975))
-        axes.hist(
-            values, np.linspace(0, 1, BINS + 1).tolist(), weights=np.full(count, BINS / count), color=BLUE, alpha=0.8
-        )
+        axes.hist(values, edges, weights=np.full(count, BINS / count), color=BLUE, alpha=0.8)
         axes.axhspan(low, high, color=PALE, alpha=0.6, linewidth=0, zorder=0)
         axes.axhline(1.0, color=MUTED, linewidth=0.8)
         axes.set_title(quote_for_figure(transforms.node))
@@ -159,26 +168,28 @@ def _write_headline(learned: Learned) -> str:
 
 
 def _summarise_gain(learned: Learned) -> str:
-    """Summarise whether the filters predict the held-out rows better than before."""
-    whence = f"From `{visible(learned.measurements)}`, for the network `{visible(learned.network)}`."
-    outputs = [(change, change.gain) for change in learned.changes if change.gain is not None]
-    if not outputs:
-        return whence
-    change, gain = outputs[0]
-    error = 1.96 * gain.standard_error
-    what = "better" if gain.difference > error else "worse" if gain.difference < -error else "neither better nor worse"
+    """Return whether the first filter predicts the held-out rows better than before, and from what was learned."""
+    source = f"From `{visible(learned.measurements)}`, for the network `{visible(learned.network)}`."
+    gains = [(change, change.gain) for change in learned.changes if change.gain is not None]
+    if not gains:
+        return source
+    change, gain = gains[0]
+    half = 1.96 * gain.standard_error
+    verdict = "neither better nor worse"
+    if abs(gain.difference) > half:
+        verdict = "better" if gain.difference > 0 else "worse"
     return (
         f"On the {learned.held_out:,} rows after these, which it was not given, the filter "
-        f"{visible(f'{change.node}/{change.filter}')} predicts {what} with the learned numbers than with those before: "
-        f"its log-likelihood changes by {gain.difference:+.3f} ± {error:.3f} a row. {whence}"
+        f"{visible(f'{change.node}/{change.filter}')} predicts {verdict} with the learned numbers than with those "
+        f"before: its log-likelihood changes by {gain.difference:+.3f} ± {half:.3f} a row. {source}"
     )
 
 
 def _list_key_figures(learned: Learned) -> list[KeyFigures]:
     """Return the numbers to remember: how many were learned, from how many rows, and the gain of the first filter."""
-    outputs = [row for row in learned.fit.rows() if row.identified]
+    identified = [row for row in learned.fit.rows() if row.identified]
     keys = [
-        KeyFigure("numbers learned", f"{len(outputs)}", f"of {len(learned.fit.rows())} free ones", BLUE),
+        KeyFigure("numbers learned", f"{len(identified)}", f"of {len(learned.fit.rows())} free ones", BLUE),
         KeyFigure("rows", f"{learned.learned:,}", f"learned from; {learned.held_out:,} held out", GREEN),
     ]
     gains = [change.gain for change in learned.changes if change.gain is not None]
@@ -190,9 +201,8 @@ def _list_key_figures(learned: Learned) -> list[KeyFigures]:
 
 
 def _make_estimates_table(learned: Learned, drawings: Mapping[str, bytes]) -> list[Picture | Table]:
-    """Start, estimate and interval of each number, with the figure of these."""
+    """Return the figure of the estimates, and the table with start, estimate and interval of each number."""
     starts = learned.starts
-    # Start, estimate and interval of each number.
     rows = [
         [visible(row.name), f"{starts[row.name]:.4g}", row.value, row.interval, row.form] for row in learned.fit.table
     ]
@@ -217,9 +227,9 @@ def _make_estimates_table(learned: Learned, drawings: Mapping[str, bytes]) -> li
 
 def _list_sentences(learned: Learned) -> list[Points | Text]:
     """Return the fit's sentences, as points."""
-    said = learned.fit.sentences
-    if said:
-        return [Points([visible(line) for line in said])]
+    sentences = learned.fit.sentences
+    if sentences:
+        return [Points([visible(sentence) for sentence in sentences])]
     return [Text(["All free numbers are identified, all starts ended at one maximum, and none is at a boundary."])]
 
 
@@ -227,24 +237,7 @@ def _make_comparison_sections(learned: Learned, drawings: Mapping[str, bytes]) -
     """Return the sections on the held-out rows: each filter before and after, and whether the laws fit."""
     if not learned.changes:
         return []
-    # One row for each filter: gain of the log-likelihood, size and correlation of its innovations.
-    rows = []
-    for change in learned.changes:
-        test = [judged.test for judged in (change.before, change.after)]
-        sizes = ["–" if t is None else f"{t.power:.2f} ± {1.96 * t.power_error:.2f}" for t in test]
-        memory = ["–" if t is None else f"{t.correlation[0]:.2f} (p {t.p_value:.2g})" for t in test]
-        gain = (
-            "–" if change.gain is None else f"{change.gain.difference:+.3f} ± {1.96 * change.gain.standard_error:.3f}"
-        )
-        rows.append([visible(f"{change.node}/{change.filter}"), gain, *sizes, *memory])
-    headers = ["filter", "gain per row", "size before", "size after", "correlation before", "correlation after"]
-    caption = (
-        f"On the {learned.held_out:,} rows that were not learned from. **Gain**: of log-likelihood, nats per row, with "
-        "its 95 % interval. **Size**: mean square of the innovations in units of what the filter claims; 1 where that "
-        "is right. **Correlation**: of innovations one row apart; 0 where the filter uses all that it receives."
-    )
-    # Table and figure of the innovations; histogram of the PITs if there is one.
-    blocks: list[Table | Picture] = [Table(headers, rows, caption)]
+    blocks: list[Table | Picture] = [_make_changes_table(learned)]
     if "innovations" in drawings:
         text = "Correlations of innovations some rows apart, with 95 % intervals: white ones have none."
         blocks.append(Picture(drawings["innovations"], text, text))
@@ -255,40 +248,54 @@ def _make_comparison_sections(learned: Learned, drawings: Mapping[str, bytes]) -
             "all are equally likely: 95 % of the bars end in the grey band. High in the middle: the network expects "
             "too much spread; high at the ends: too little."
         )
-        kinds = {transforms.by_law for transforms in learned.uniform}
-        how = (
-            "The laws of the gains are used in full."
-            if kinds == {True}
-            else "Some laws of gains are replaced by Gaussians."
-        )
+        by_laws = all(transforms.by_law for transforms in learned.uniform)
+        how = "The laws of the gains are used in full." if by_laws else "Some laws of gains are replaced by Gaussians."
         sections.append(Section("Do the laws fit", [Picture(drawings["pits"], text, text), Text([how])]))
     return sections
 
 
-def _make_losses_section(learned: Learned) -> list[Section]:
-    """Describe the statistics of lost measurements, where some were lost."""
-    # One row for each law of each node: parameters, and gain on held-out packets.
+def _make_changes_table(learned: Learned) -> Table:
+    """Return each filter's gain of log-likelihood, and size and correlation of its innovations, before and after."""
     rows = []
-    # One row for each law of each node: parameters, and gain on held-out packets.
-    for node, loss in learned.losses.items():
-        for name, law in loss.laws.items():
-            said = loss.held_out.get(name)
-            gain = "–" if said is None else f"{said.gain:+.4f} ± {1.96 * said.gain_error:.4f}"
+    for change in learned.changes:
+        tests = [judged.test for judged in (change.before, change.after)]
+        sizes = ["–" if t is None else f"{t.power:.2f} ± {1.96 * t.power_error:.2f}" for t in tests]
+        correlations = ["–" if t is None else f"{t.correlation[0]:.2f} (p {t.p_value:.2g})" for t in tests]
+        gain = "–"
+        if change.gain is not None:
+            gain = f"{change.gain.difference:+.3f} ± {1.96 * change.gain.standard_error:.3f}"
+        rows.append([visible(f"{change.node}/{change.filter}"), gain, *sizes, *correlations])
+    headers = ["filter", "gain per row", "size before", "size after", "correlation before", "correlation after"]
+    caption = (
+        f"On the {learned.held_out:,} rows that were not learned from. **Gain**: of log-likelihood, nats per row, with "
+        "its 95 % interval. **Size**: mean square of the innovations in units of what the filter claims; 1 where that "
+        "is right. **Correlation**: of innovations one row apart; 0 where the filter uses all that it receives."
+    )
+    return Table(headers, rows, caption)
+
+
+def _make_losses_section(learned: Learned) -> list[Section]:
+    """Return the section on the laws of lost measurements; none where none were lost."""
+    # One row for each law of each node: its first four parameters, and gain on held-out packets.
+    rows = []
+    for node, losses in learned.losses.items():
+        for name, law in losses.laws.items():
+            score = losses.held_out.get(name)
+            gain = "–" if score is None else f"{score.gain:+.4f} ± {1.96 * score.gain_error:.4f}"
             shares = [f"{key} {s.estimate:.3g} ({s.low:.3g} to {s.high:.3g})" for key, s in law.shares().items()]
-            best = "best" if name == loss.best else ""
-            rows.append([visible(node), name, "; ".join(shares[:4]) + (" …" if len(shares) > 4 else ""), gain, best])
+            numbers = "; ".join(shares[:4]) + (" …" if len(shares) > 4 else "")
+            rows.append([visible(node), name, numbers, gain, "best" if name == losses.best else ""])
     caption = (
         "Laws of the losses that the receiver knows of, with 95 % intervals, and what each predicts of the last "
         "third of the rows: log-likelihood per packet, less that of independent losses. `hg.learning.learn_losses` "
-        "makes a "
-        "channel of them."
+        "makes a channel of them."
     )
     table = Table(["lost", "law", "numbers", "gain", ""], rows, caption, wordy=True)
     return [Section("How measurements are lost", [table])] if rows else []
 
 
 def _make_delays_section(learned: Learned) -> list[Section]:
-    """Describe how late the measurements of events were."""
+    """Return the section on how late the measurements of events were; none without events."""
     rows = [
         [visible(node), f"{steps * delays.step:g}", f"{share.estimate:.3f}", f"{share.low:.3f} to {share.high:.3f}"]
         for node, delays in learned.fit.delays.items()
@@ -303,5 +310,5 @@ def _make_delays_section(learned: Learned) -> list[Section]:
 
 
 def pages(learned: Learned) -> "partial[Page]":
-    """Return the page, once the figures are drawn."""
+    """Return a function that makes the page of the drawn figures."""
     return partial(make_fit_page, learned)

@@ -233,6 +233,7 @@ def make_environment() -> Environment:
 
 def rich(text: str) -> Markup:
     """Escape a text, then mark up `**strong**` and backquoted code."""
-    safe = re.sub(r"(?<=\d) (?=%|± |m\b|s\b)", "\u00a0", str(escape(text)))  # a number stays with what belongs to it
+    # A number stays on one line with the unit, per cent or ± that belongs to it.
+    safe = re.sub(r"(?<=\d) (?=%|± |m\b|s\b)", "\u00a0", str(escape(text)))
     safe = re.sub(r"\*\*(.+?)\*\*", r"<strong>\1</strong>", safe)
     return Markup(re.sub(r"`(.+?)`", r"<code>\1</code>", safe))

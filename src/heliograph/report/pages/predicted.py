@@ -49,7 +49,7 @@ def predicted_sections(health: Health, drawings: Mapping[str, bytes]) -> list[Se
 
 
 def _list_residuals(health: Health) -> "list[tuple[str, heliograph.forecasting.Residuals]]":
-    """Return what each filter did not predict, with its node and name."""
+    """Return the residuals of each filter, what it did not predict, after "node/filter"."""
     return [(f"{node}/{name}", one) for node, filters in health.residuals.items() for name, one in filters.items()]
 
 
@@ -63,12 +63,12 @@ def _make_residual_sections(health: Health, drawings: Mapping[str, bytes]) -> li
         for i, (name, _) in enumerate(every) if f"residuals_{i}" in drawings
     }  # fmt: skip
     doubts = [f"{visible(name)}: {visible(line)}." for name, one in every for line in one.doubts()]
-    said = doubts or ["Nothing speaks against them: no correlation, no other law, no variance that changes."]
+    sentences = doubts or ["Nothing speaks against them: no correlation, no other law, no variance that changes."]
     text = (
         "What was not predicted: of a right model independent from row to row, normal, of variance 1. Tested, with the "
         "number of tests in mind, by Ljung and Box, by Jarque and Bera, and by the variances of first and last third."
     )
-    return [Section("Residuals", [Text([text]), Text(said), *choose_picture(pictures)])] if every else []
+    return [Section("Residuals", [Text([text]), Text(sentences), *choose_picture(pictures)])] if every else []
 
 
 def _list_nodes(health: Health) -> list[str]:

@@ -9,10 +9,9 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from heliograph.disk.quoting import quote_for_figure, visible
+from heliograph.disk.quoting import visible
 from heliograph.numerics.check import instance
-from heliograph.report.arrivals import Arrivals
-from heliograph.report.figures import BLUE, GREEN, VERMILION, WIDTH, place_legend_above, stacked_panels
+from heliograph.report.figures import BLUE, GREEN, VERMILION, place_legend_above, stacked_panels
 from heliograph.report.forecasts import draw_forecasts, forecast_tables
 from heliograph.report.health import Health
 from heliograph.report.innovations import (
@@ -29,6 +28,7 @@ from heliograph.report.innovations import (
 )
 from heliograph.report.mode_probabilities import PREFIX, draw_modes_of_nodes
 from heliograph.report.outputs import compare_with_truth, round_to
+from heliograph.report.pages.links import draw_deliveries, make_links_blocks
 from heliograph.report.pages.page import Choice, KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
 from heliograph.report.pages.predicted import predicted_figures, predicted_sections
 from heliograph.report.pages.run_summary import run_summary
@@ -52,10 +52,11 @@ def make_results_of_plants(examined: Mapping[str, Health], network: str) -> Resu
     folders = {plant: f"plant.{quote(plant, safe='')}" for plant in examined}
 
     def write(folder: Path) -> None:
+        """Write the results of each plant into a folder of its own."""
         for plant, health in examined.items():
-            place = folder / folders[plant]
-            place.mkdir()
-            write_into(make_run_results(health, f"{network}, {plant}"), place)
+            subfolder = folder / folders[plant]
+            subfolder.mkdir()
+            write_into(make_run_results(health, f"{network}, {plant}"), subfolder)
 
     summary: dict[str, Json] = {plant: run_summary(health) for plant, health in examined.items()}
     return Results({}, lambda _: _make_overview(examined, network, folders), summary, write)
@@ -68,14 +69,12 @@ def _make_overview(examined: Mapping[str, Health], network: str, folders: Mappin
     rows = []
     for plant in worst:
         more = f"; and {len(doubts[plant]) - DOUBTS} more" if len(doubts[plant]) > DOUBTS else ""
-        said = "; ".join(map(visible, doubts[plant][:DOUBTS])) + more
-        rows.append([visible(plant) or "(no name)", f"{len(examined[plant].record.time):,}", said or "nothing"])
-    wrong = sum(map(bool, doubts.values()))
-    title = (
-        f"{_count_in_words(len(examined), 'plant')}, {wrong} with doubts"
-        if wrong
-        else f"{len(examined)} plants, no doubts"
-    )
+        sentences = "; ".join(map(visible, doubts[plant][:DOUBTS])) + more
+        rows.append([visible(plant) or "(no name)", f"{len(examined[plant].record.time):,}", sentences or "nothing"])
+    doubted = sum(map(bool, doubts.values()))
+    title = f"{len(examined)} plants, no doubts"
+    if doubted:
+        title = f"{_count_in_words(len(examined), 'plant')}, {doubted} with doubts"
     links = [f"{quote(folders[plant])}/report.html" for plant in worst]
     lead = f"The filters of `{visible(network)}` ran over each plant by itself. The most doubted come first."
     table = Table(["plant", "rows", "doubts"], rows, wordy=True, links=links)
@@ -103,7 +102,7 @@ def run_figures(health: Health) -> dict[str, Figure]:
     drawn |= {name: draw_innovations(health, tested) for name, tested in tested_by_figure(health).items()}
     drawn |= predicted_figures(health)
     if health.links:
-        drawn["links"] = _draw_deliveries(health)
+        drawn["links"] = draw_deliveries(health)
     return drawn
 
 
@@ -124,9 +123,9 @@ def _nodes_to_draw(record: Record) -> list[str]:
 
 
 def _sort_nodes(record: Record) -> list[str]:
-    return sorted(
-        (node for node, filters in record.estimates.items() if filters), key=lambda node: node != Network.FUSED
-    )
+    """Return the nodes that have estimates, the fused estimate first."""
+    nodes = [node for node, filters in record.estimates.items() if filters]
+    return sorted(nodes, key=lambda node: node != Network.FUSED)
 
 
 @matplotlib.rc_context(LOOK)
@@ -142,77 +141,63 @@ def _draw_estimates(health: Health, record: Record, node: str) -> Figure:
     return figure
 
 
-@matplotlib.rc_context(LOOK)
-def _draw_deliveries(health: Health) -> Figure:
-    """Draw when each component arrived and when it was lost, a line each."""
-    links = health.links[:MOST]
-    figure = Figure(figsize=(WIDTH, 0.8 + 0.28 * len(links)), layout="constrained")
-    axes = figure.subplots()
-    for row, link in enumerate(links):
-        lost = link.lost_times
-        came = link.time[link.arrived]
-        axes.plot(came, np.full(len(came), row - 0.2), "|", color=BLUE, markersize=6, alpha=0.6)
-        axes.plot(lost, np.full(len(lost), row + 0.2), "|", color=VERMILION, markersize=6, alpha=0.6)
-    names = [quote_for_figure(f"{link.node}: {link.component}{_format_share(link, ' ({:.0%})', '')}") for link in links]
-    axes.set_yticks(range(len(links)), names)
-    axes.set_ylim(len(links) - 0.5, -0.5)
-    axes.grid(visible=False)
-    label_time_axis(health.record, axes)
-    return figure
-
-
 def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Page:
     """Return the report of a run as a page, whose `html()` is one file that needs no other.
 
     Args:
         health: what `examine` returned.
         network: the network's name, for the title.
-        drawings: each figure as SVG, by the names of `run_figures`; those stay that fit into a page.
+        drawings: each figure as SVG, by the names of `run_figures`; left out where the page would be too large.
 
     Raises:
-        ValueError: what is no diagnosis, or no name.
+        ValueError: `health` is no diagnosis, or `network` no text.
     """
     instance("health", health, Health, "what examine returns")
     instance("name of the network", network, str, "a text")
     record, doubts, drawings = health.record, health.warnings(), limit_size(drawings, PAGE)
-    shares = [link.share for link in health.links if link.due is not None]
-    arrived = f"{np.mean(shares):.1%}" if shares else "–"
-    # Three numbers to remember.
-    keys = [
-        KeyFigure("rows", f"{len(record.time):,}", _describe_span(record), BLUE),
-        KeyFigure(
-            "arrived", arrived, f"of what {_count_in_words(len(record.measurements), 'node')} should receive", GREEN
-        ),
-        KeyFigure("doubts", f"{len(doubts)}", "see below" if doubts else "nothing to remark", VERMILION),
+    glance = [
+        _make_key_figures(health, len(doubts)),
+        *_list_doubts(doubts),
+        *_list_baseline_remarks(health),
+        *_list_premises(health),
+        *_list_overloads(record),
     ]
-    # The result is the title; doubts follow it.
     return Page(
         kicker=f"Heliograph run: {visible(network)}",
         title=_find_headline(health),
         lead=f"The filters of `{visible(network)}` ran over {len(record.time):,} rows, {_describe_span(record)}. "
         + _describe_agreement(health, doubts),
         sections=[
-            Section(
-                "At a glance",
-                [
-                    KeyFigures(keys),
-                    *_list_doubts(doubts),
-                    *_list_baseline_remarks(health),
-                    *_list_premises(health),
-                    *_list_overloads(health.record),
-                ],
-            ),
+            Section("At a glance", glance),
             Section("Estimates", [*make_errors_table(record), *_list_pictures(health, drawings)]),
             *([Section("Forecasts", forecast_tables(record, health.forecasts))] if health.forecasts else []),
             *predicted_sections(health, drawings),
             make_innovations_section(health, drawings),
-            Section("Links", _make_links_section(health, drawings)),
+            Section("Links", make_links_blocks(health, drawings)),
         ],
     )
 
 
+def _make_key_figures(health: Health, doubts: int) -> KeyFigures:
+    """Return the numbers to remember: rows, the share that arrived of what was due, and how many doubts there are."""
+    record = health.record
+    shares = [link.share for link in health.links if link.due is not None]
+    arrived = f"{np.mean(shares):.1%}" if shares else "–"
+    due = f"of what {_count_in_words(len(record.measurements), 'node')} should receive"
+    return KeyFigures(
+        [
+            KeyFigure("rows", f"{len(record.time):,}", _describe_span(record), BLUE),
+            KeyFigure("arrived", arrived, due, GREEN),
+            KeyFigure("doubts", f"{doubts}", "see below" if doubts else "nothing to remark", VERMILION),
+        ]
+    )
+
+
 def limit_size(drawings: Mapping[str, bytes], limit: int) -> dict[str, bytes]:
-    """Return the drawings in their order that together have at most `limit` bytes; pages hold them by 4/3 of that."""
+    """Return the drawings that together have at most `limit` bytes, those of FIRST before others.
+
+    In a page, as text, they take 4/3 of their bytes.
+    """
     kept, size = dict[str, bytes](), 0
     for name in sorted(drawings, key=lambda name: name in FIRST, reverse=True):
         if size + len(drawings[name]) <= limit:
@@ -224,9 +209,10 @@ def limit_size(drawings: Mapping[str, bytes], limit: int) -> dict[str, bytes]:
 def _find_headline(health: Health) -> str:
     """Return the last estimate of the filter that the network relies on: its first two states, or its position."""
     record = health.record
-    node = _nodes_to_draw(record)[0] if _nodes_to_draw(record) else None
-    if node is None:
+    nodes = _nodes_to_draw(record)
+    if not nodes:
         return f"{len(record.time):,} rows were read"
+    node = nodes[0]
     trusted = {filter.filter for filter in health.filters if filter.trusted and filter.node == node}
     name = next((name for name in record.estimates[node] if name in trusted), next(iter(record.estimates[node])))
     estimate = record.estimates[node][name]
@@ -267,28 +253,23 @@ def _list_pictures(health: Health, drawings: Mapping[str, bytes]) -> list[Pictur
 
 
 def make_errors_table(record: Record) -> list[Table]:
-    """Return the errors of each filter where the recording has the true state."""
+    """Return the table of each filter's errors; none where the recording has no true state."""
     rows = [
         [visible(f"{errors.node}/{errors.filter}"), errors.claim,
          *(round_to(value, errors.rmse_error[state]) for state, value in errors.rmse.items()),
          "–" if np.isnan(errors.nees) else round_to(errors.nees, errors.nees_error)]
         for errors in compare_with_truth(record)
     ]  # fmt: skip
-    # What the columns are, in words.
     caption = (
         "Root mean square error of each state against the truth in the recording, to two digits of its standard "
         "error. **NEES**: squared error over the claimed one, per state: 1 where the claim holds, above 1 too sure."
     )
-    headers = [
-        "filter",
-        "claim",
-        *(visible(f"RMSE of {_make_header(state, record.units)}") for state in record.states),
-        "NEES",
-    ]
-    return [Table(headers, rows, caption)] if rows else []
+    rmse_headers = [visible(f"RMSE of {_name_with_unit(state, record.units)}") for state in record.states]
+    return [Table(["filter", "claim", *rmse_headers, "NEES"], rows, caption)] if rows else []
 
 
-def _make_header(state: str, units: Mapping[str, str]) -> str:
+def _name_with_unit(state: str, units: Mapping[str, str]) -> str:
+    """Return the name of a state, with its unit in brackets where it has one."""
     return f"{state} ({units[state]})" if state in units else state
 
 
@@ -302,6 +283,7 @@ def _describe_agreement(health: Health, doubts: list[str]) -> str:
 
 
 def _count_in_words(count: int, what: str) -> str:
+    """Return a number of things, such as "1 node" or "2 nodes"."""
     return f"{count} {what}{'' if count == 1 else 's'}"
 
 
@@ -336,63 +318,9 @@ def _list_premises(health: Health) -> list[Text | Points]:
 
 def _list_overloads(record: Record) -> list[Text | Points]:
     """Return how often the words that filters take are overloaded, before any data."""
-    overloads = record.overloads.items()
-    lines = [visible(overload.describe(node, name)) for node, of in overloads for name, overload in of.items()]
+    lines = [
+        visible(overload.describe(node, name))
+        for node, by_filter in record.overloads.items()
+        for name, overload in by_filter.items()
+    ]
     return [Text(["Of words, whose range has ends, before any data:"]), Points(lines)] if lines else []
-
-
-def _make_links_section(health: Health, drawings: Mapping[str, bytes]) -> list[Table | Picture | Text]:
-    """Return each link: when it is due, what arrived, its longest gap, and mean and deviation of its values."""
-    rows = []
-    for link in health.links:
-        mean, deviation = _format_mean_and_deviation(link.values)
-        known = "may be lost" if link.may_be_lost else "never lost"
-        name = visible(f"{link.node}: {link.component}")
-        gap = "–" if link.due is None else str(link.longest_gap)
-        quiet = health.silences.get(link.node)
-        past = ["–" if quiet is None else f"{len(quiet.rows)}, up to {quiet.lengths.max():g}"] * bool(health.silences)
-        rows.append([name, link.due_in, _format_share(link, "{:.1%}", "–"), gap, *past, known, mean, deviation])
-    past = ["past its timeout"] * bool(health.silences)
-    headers = ["received", "due", "arrived", "longest gap", *past, "the network says", "mean", "std. deviation"]
-    unit = health.record.units.get("time", "s" if health.record.time.dtype.kind == "M" else "the unit of time")
-    slower = (
-        f"**Due**: a sender that is slower than the rows is due at its own regular intervals (in {unit}), declared or "
-        "found. One that is due in some of so many rows or intervals is so by a pattern that losses would not leave. "
-        "Where each row is a message of some node, nobody knows when another without such an interval is due. A "
-        "**gap** counts what was due and did not come."
-    )
-    came, lost = any(link.arrived.any() for link in health.links), any(len(link.lost_times) for link in health.links)
-    parts = ["arrived (blue, above)"] * came + ["did not (orange, below)" if came else "did not arrive (orange)"] * lost
-    caption = f"When each component {' and when it '.join(parts)}." + ("" if lost else " None is missing.")
-    picture = [Picture(drawings["links"], caption, caption)] if "links" in drawings else []
-    left = [f"{link.node}: {link.component}" for link in health.links[MOST:]]
-    missing = say_not_drawn(left, "Their numbers are in the table.")
-    return [
-        Table(headers, rows, slower if any(link.due_in != "each row" for link in health.links) else ""),
-        *picture,
-        *missing,
-        *describe_shared(health.shared),
-    ]
-
-
-def _format_share(link: Arrivals, form: str, unknown: str) -> str:
-    """Return the share that arrived in this form, or what stands for it where nobody knows how many were due."""
-    return unknown if link.due is None else form.format(link.share)
-
-
-def _format_mean_and_deviation(values: np.ndarray) -> tuple[str, str]:
-    """Return mean and deviation of a component, each to two digits of its standard error."""
-    if len(values) < 2:
-        return (f"{values[0]:.4g}" if len(values) else "–"), "–"
-    deviation = float(values.std())
-    error = deviation / len(values) ** 0.5
-    return round_to(float(values.mean()), error), round_to(deviation, error / 2**0.5)
-
-
-def describe_shared(shared: Mapping[str, tuple[str, ...]]) -> list[Text]:
-    """Return what nodes share as a sentence each; nothing where their links are independent."""
-    said = [
-        f"{', '.join(map(visible, nodes))} share {visible(name)}: their links are in one state at each step."
-        for name, nodes in shared.items()
-    ]
-    return [Text(said)] if said else []

@@ -25,9 +25,8 @@ def run_summary(health: Health) -> dict[str, Json]:
         filters.setdefault(tested.node, {})[tested.filter] = _filter_numbers(tested)
     outputs: dict[str, dict[str, dict[str, Json]]] = {}
     for output in health.outputs:
-        outputs.setdefault(output.node, {}).setdefault(output.filter, {})[output.judged.output] = summarise_output(
-            output
-        )
+        by_output = outputs.setdefault(output.node, {}).setdefault(output.filter, {})
+        by_output[output.judged.output] = summarise_output(output)
     links: dict[str, dict[str, Json]] = {}
     for link in health.links:
         links.setdefault(link.node, {})[link.component] = _link_numbers(link)
@@ -40,15 +39,15 @@ def run_summary(health: Health) -> dict[str, Json]:
         "errors": _error_numbers(health.record),
         "links": links,
         "overloads": {
-            node: {name: _overload_numbers(*overload) for name, overload in of.items()}
-            for node, of in health.record.overloads.items()
+            node: {name: _overload_numbers(*overload) for name, overload in by_filter.items()}
+            for node, by_filter in health.record.overloads.items()
         },
         "shared": {name: list(nodes) for name, nodes in health.shared.items()},
     }
 
 
 def _filter_numbers(tested: FilterHealth) -> dict[str, Json]:
-    """What a filter claims, and what its innovations say of the claim and of the variances that messages declare."""
+    """Return what a filter claims, and what its innovations say of the claim and of variances that messages declare."""
     numbers: dict[str, Json] = {"claim": tested.claim}
     if tested.test is not None:
         numbers |= {
@@ -73,12 +72,12 @@ def _error_numbers(record: Record) -> dict[str, dict[str, Json]]:
 
 
 def _overload_numbers(probability: np.ndarray, bound: np.ndarray) -> dict[str, Json]:
-    """How often each component's words are overloaded, and the bound on the claim, None where there is none."""
+    """Return how often each component's words are overloaded, and the bound on the claim, None of none."""
     return {"probability": probability.tolist(), "bound": float(bound) if np.isfinite(bound) else None}
 
 
 def _link_numbers(link: Arrivals) -> dict[str, Json]:
-    """How often a component arrived, its longest gap, and when it is due."""
+    """Return how often a component arrived, its longest gap, and when it is due."""
     numbers: dict[str, Json] = {"arrived": None if link.due is None else link.share, "longest_gap": link.longest_gap}
     if link.period is not None:
         numbers["period"] = link.period

@@ -1,0 +1,109 @@
+"""Part of a run's report on its links: when each component arrived and when it was lost, and how often."""
+
+from collections.abc import Mapping
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+
+from heliograph.disk.quoting import quote_for_figure, visible
+from heliograph.report.arrivals import Arrivals
+from heliograph.report.figures import BLUE, VERMILION, WIDTH
+from heliograph.report.health import Health
+from heliograph.report.innovations import LOOK, MOST, label_time_axis, say_not_drawn
+from heliograph.report.outputs import round_to
+from heliograph.report.pages.page import Picture, Table, Text
+
+
+@matplotlib.rc_context(LOOK)
+def draw_deliveries(health: Health) -> Figure:
+    """Draw when each component arrived and when it was lost, a line each."""
+    links = health.links[:MOST]
+    figure = Figure(figsize=(WIDTH, 0.8 + 0.28 * len(links)), layout="constrained")
+    axes = figure.subplots()
+    for row, link in enumerate(links):
+        lost = link.lost_times
+        arrived = link.time[link.arrived]
+        axes.plot(arrived, np.full(len(arrived), row - 0.2), "|", color=BLUE, markersize=6, alpha=0.6)
+        axes.plot(lost, np.full(len(lost), row + 0.2), "|", color=VERMILION, markersize=6, alpha=0.6)
+    names = [quote_for_figure(f"{link.node}: {link.component}{_format_share(link, ' ({:.0%})', '')}") for link in links]
+    axes.set_yticks(range(len(links)), names)
+    axes.set_ylim(len(links) - 0.5, -0.5)
+    axes.grid(visible=False)
+    label_time_axis(health.record, axes)
+    return figure
+
+
+def make_links_blocks(health: Health, drawings: Mapping[str, bytes]) -> list[Table | Picture | Text]:
+    """Return the table of links, their figure, and what nodes share.
+
+    Of each link: when it is due, what arrived, its longest gap, and mean and deviation of its values.
+    """
+    rows = []
+    for link in health.links:
+        mean, deviation = _format_mean_and_deviation(link.values)
+        known = "may be lost" if link.may_be_lost else "never lost"
+        name = visible(f"{link.node}: {link.component}")
+        gap = "–" if link.due is None else str(link.longest_gap)
+        quiet = health.silences.get(link.node)
+        past = ["–" if quiet is None else f"{len(quiet.rows)}, up to {quiet.lengths.max():g}"] * bool(health.silences)
+        rows.append([name, link.due_in, _format_share(link, "{:.1%}", "–"), gap, *past, known, mean, deviation])
+    # The column on timeouts, if a sender has one and was silent for longer.
+    past = ["past its timeout"] * bool(health.silences)
+    headers = ["received", "due", "arrived", "longest gap", *past, "the network says", "mean", "std. deviation"]
+    unit = health.record.units.get("time", "s" if health.record.time.dtype.kind == "M" else "the unit of time")
+    slower = (
+        f"**Due**: a sender that is slower than the rows is due at its own regular intervals (in {unit}), declared or "
+        "found. One that is due in some of so many rows or intervals is so by a pattern that losses would not leave. "
+        "Where each row is a message of some node, nobody knows when another without such an interval is due. A "
+        "**gap** counts what was due and did not come."
+    )
+    caption = _caption_deliveries(health)
+    picture = [Picture(drawings["links"], caption, caption)] if "links" in drawings else []
+    left = [f"{link.node}: {link.component}" for link in health.links[MOST:]]
+    missing = say_not_drawn(left, "Their numbers are in the table.")
+    return [
+        Table(headers, rows, slower if any(link.due_in != "each row" for link in health.links) else ""),
+        *picture,
+        *missing,
+        *describe_shared(health.shared),
+    ]
+
+
+def _caption_deliveries(health: Health) -> str:
+    """Return what the marks of the figure of deliveries mean: only of those that it has."""
+    arrived = any(link.arrived.any() for link in health.links)
+    lost = any(len(link.lost_times) for link in health.links)
+    if arrived and lost:
+        return "When each component arrived (blue, above) and when it did not (orange, below)."
+    if lost:
+        return "When each component did not arrive (orange)."
+    if arrived:
+        return "When each component arrived (blue, above). None is missing."
+    return "Nothing arrived, and nobody knows when it was due."
+
+
+def _format_share(link: Arrivals, form: str, unknown: str) -> str:
+    """Return the share that arrived in this form, or what stands for it where nobody knows how many were due."""
+    return unknown if link.due is None else form.format(link.share)
+
+
+def _format_mean_and_deviation(values: np.ndarray) -> tuple[str, str]:
+    """Return mean and standard deviation of values, each to two digits of its standard error; "–" if unknown.
+
+    For N independent values of a normal law these are s / sqrt(N) of the mean and s / sqrt(2 N) of the deviation s.
+    """
+    if len(values) < 2:
+        return (f"{values[0]:.4g}" if len(values) else "–"), "–"
+    deviation = float(values.std())
+    error = deviation / len(values) ** 0.5
+    return round_to(float(values.mean()), error), round_to(deviation, error / 2**0.5)
+
+
+def describe_shared(shared: Mapping[str, tuple[str, ...]]) -> list[Text]:
+    """Return what nodes share as a sentence each; nothing where their links are independent."""
+    sentences = [
+        f"{', '.join(map(visible, nodes))} share {visible(name)}: their links are in one state at each step."
+        for name, nodes in shared.items()
+    ]
+    return [Text(sentences)] if sentences else []
