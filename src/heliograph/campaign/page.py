@@ -38,13 +38,13 @@ def write_report(campaign: Campaign, scores: Sequence[Score], out: Path) -> Path
 def write_campaign_page(campaign: Campaign, scores: Sequence[Score], failures: Sequence[Failure]) -> Page:
     """Return the report of a campaign with its scores and failures."""
     name = Path(campaign.path).name
-    there = sum({score.setting: score.runs for score in scores}.values())
+    computed = sum({score.setting: score.runs for score in scores}.values())
     # Failures first, so that nobody reads the results without them.
     return Page(
         kicker="Heliograph campaign",
         title=summarise_best(scores),
         lead=f"{name}: {len(campaign.settings)} settings, {campaign.runs} runs each of {campaign.horizon} steps; "
-        f"{there} of {len(campaign.settings) * campaign.runs} runs are there. {_describe_failures(failures)} A case "
+        f"{computed} of {len(campaign.settings) * campaign.runs} runs are there. {_describe_failures(failures)} A case "
         "is a node in a setting.",
         sections=[
             *([_list_failures(failures)] if failures else []),
@@ -58,7 +58,10 @@ def write_campaign_page(campaign: Campaign, scores: Sequence[Score], failures: S
 
 
 def summarise_best(scores: Sequence[Score]) -> str:
-    """Summarise which filter has the least error, and how often; of a single filter, the range of errors."""
+    """Return which filter has the least error in most cases, in words; of a single filter the range of errors.
+
+    A case is a node in a setting.
+    """
     cases: dict[tuple[int, str], list[Score]] = {}
     for score in scores:
         if math.isfinite(score.rmse):
@@ -75,6 +78,7 @@ def summarise_best(scores: Sequence[Score]) -> str:
 
 
 def _describe_failures(failures: Sequence[Failure]) -> str:
+    """Say how many jobs failed."""
     return f"{len(failures)} pieces of work failed and are missing here." if failures else "Nothing failed."
 
 
@@ -89,7 +93,7 @@ def _list_failures(failures: Sequence[Failure]) -> Section:
 
 
 def draw_pictures(campaign: Campaign, scores: Sequence[Score]) -> list[Block]:
-    """Return the figures of a campaign's scores."""
+    """Return the figures of a campaign's scores as pictures, the first with a caption for all."""
     caption = f"Bars: two standard errors to both sides. At most {PANELS} panels are drawn; {SUMMARY} has all."
     return [
         Picture(svg(figure), f"{name} of every filter.", caption if i == 0 else "")
@@ -124,7 +128,7 @@ def _explain_reading(campaign: Campaign) -> Section:
 
 @dataclass(frozen=True)
 class Quantity:
-    """A column of scores, with the column of its standard error."""
+    """A column of scores, `value`, and that of its standard error, `error`, by their names in `Score`."""
 
     label: str
     value: str
@@ -137,7 +141,7 @@ NEES = Quantity("NEES per dimension", "nees_per_dimension", "nees_error")
 
 def draw_campaign_figures(campaign: Campaign, scores: Sequence[Score]) -> dict[str, Figure]:
     """Return figures by name: RMSE and NEES for each numeric parameter, or else by setting."""
-    parameters = [name for name in campaign.parameters if _is_axis(campaign, name)][:PARAMETERS]
+    parameters = [name for name in campaign.parameters if _can_be_axis(campaign, name)][:PARAMETERS]
     figures = {}
     for quantity in (RMSE, NEES):
         for name in parameters:
@@ -147,8 +151,8 @@ def draw_campaign_figures(campaign: Campaign, scores: Sequence[Score]) -> dict[s
     return figures
 
 
-def _is_axis(campaign: Campaign, name: str) -> bool:
-    """Return whether a parameter is a finite number and some settings differ in nothing but it."""
+def _can_be_axis(campaign: Campaign, name: str) -> bool:
+    """Return whether a parameter is always a finite number, and at least two settings differ in nothing but it."""
     values = parameter_values(campaign, name)
     if values.dtype.kind not in "if" or not np.all(np.isfinite(values)):
         return False
@@ -157,6 +161,7 @@ def _is_axis(campaign: Campaign, name: str) -> bool:
 
 
 def _drop_parameter(setting: Setting, name: str) -> Setting:
+    """Return a setting without one of its parameters."""
     return {key: value for key, value in setting.items() if key != name}
 
 
@@ -177,17 +182,17 @@ def plot_by_parameter(campaign: Campaign, scores: Sequence[Score], parameter: st
     figure, grid = _make_panels(len(shown), 2.5)
     colours = _assign_colours(scores)
     # A curve for each filter, in order of the parameter, with +- 2 standard errors.
-    for axes, (title, of_panel) in zip(grid, shown.items(), strict=False):
-        for name in dict.fromkeys(score.filter for score in of_panel):
-            curve = [score for score in of_panel if score.filter == name]
+    for axes, (title, panel_scores) in zip(grid, shown.items(), strict=False):
+        for name in dict.fromkeys(score.filter for score in panel_scores):
+            curve = [score for score in panel_scores if score.filter == name]
             curve.sort(key=lambda score: float(values[score.setting]))
             x = [values[score.setting] for score in curve]
             y, error = _list_values(curve, quantity)
             label = quote_for_figure(name)
             axes.errorbar(x, y, 2 * error, color=colours[name], marker="o", markersize=4, linewidth=1.4, label=label)
         axes.set_title(fill(quote_for_figure(title), TITLE))
-    drawn = [score for of_panel in shown.values() for score in of_panel]
-    _scale(grid[0], [values[score.setting] for score in drawn], "x")
+    drawn = [score for panel_scores in shown.values() for score in panel_scores]
+    _choose_scale(grid[0], [values[score.setting] for score in drawn], "x")
     figure.supxlabel(quote_for_figure(parameter), fontsize=10, color=INK)
     _finish_figure(figure, grid, drawn, quantity, colours)
     return figure
@@ -203,12 +208,11 @@ def plot_by_setting(campaign: Campaign, scores: Sequence[Score], quantity: Quant
     # Rows are settings; the filters of a row are shifted so that error bars do not overlap.
     for axes, node in zip(grid, nodes, strict=False):
         for shift, name in zip(np.linspace(-0.2, 0.2, len(colours)), colours, strict=True):
-            curve = [s for s in scores if s.filter == name and s.node == node and s.setting in settings]
-            y, error = _list_values(curve, quantity)
-            rows = [settings.index(score.setting) + shift for score in curve]
-            axes.errorbar(
-                y, rows, xerr=2 * error, color=colours[name], fmt="o", markersize=4, label=quote_for_figure(name)
-            )
+            points = [s for s in scores if s.filter == name and s.node == node and s.setting in settings]
+            x, error = _list_values(points, quantity)
+            rows = [settings.index(score.setting) + shift for score in points]
+            label = quote_for_figure(name)
+            axes.errorbar(x, rows, xerr=2 * error, color=colours[name], fmt="o", markersize=4, label=label)
         axes.set_yticks(range(len(settings)), [_name_setting(campaign, setting) for setting in settings])
         axes.set_ylim(len(settings) - 0.5, -0.5)
         axes.set_title(quote_for_figure(node))
@@ -216,19 +220,20 @@ def plot_by_setting(campaign: Campaign, scores: Sequence[Score], quantity: Quant
             axes.axvline(1.0, color=INK, linewidth=1.0, linestyle=(0, (4, 1.6)))
     # One scale for all panels, and one legend.
     drawn = [score for score in scores if score.node in nodes and score.setting in settings]
-    _scale(grid[0], [getattr(score, quantity.value) for score in drawn], "x")
+    _choose_scale(grid[0], [getattr(score, quantity.value) for score in drawn], "x")
     grid[-1].set_xlabel(quantity.label)
     _draw_legend(figure, grid, colours)
     return figure
 
 
 def _name_setting(campaign: Campaign, setting: int) -> str:
+    """Return the parameters of a setting as a text for a figure, of 36 characters at most."""
     text = ", ".join(f"{name} = {value}" for name, value in campaign.settings[setting].items())
     return quote_for_figure(text if len(text) <= 36 else text[:35] + "…")
 
 
 def _make_panels(count: int, height: float, columns: int = 2) -> tuple[Figure, list[Axes]]:
-    """Return a figure with `count` axes that share their scales, in rows of two; axes beyond the count are hidden."""
+    """Return a figure with `count` axes that share their scales, in rows; axes beyond the count are hidden."""
     columns = min(columns, max(count, 1))
     rows = -(-max(count, 1) // columns)
     figure = Figure(figsize=(WIDTH, 0.5 + height * rows), layout="constrained")
@@ -239,11 +244,13 @@ def _make_panels(count: int, height: float, columns: int = 2) -> tuple[Figure, l
 
 
 def _assign_colours(scores: Sequence[Score]) -> dict[str, str]:
+    """Return a colour for each filter, the same in all panels."""
     names = dict.fromkeys(score.filter for score in scores)
     return {name: COLOURS[i % len(COLOURS)] for i, name in enumerate(names)}
 
 
 def _list_values(scores: Sequence[Score], quantity: Quantity) -> tuple[np.ndarray, np.ndarray]:
+    """Return a quantity of each score and its standard error, 0 where that is not known."""
     values = np.array([getattr(score, quantity.value) for score in scores])
     return values, np.nan_to_num(np.array([getattr(score, quantity.error) for score in scores]))
 
@@ -255,12 +262,12 @@ def _finish_figure(
     if quantity is NEES:
         for axes in grid:
             axes.axhline(1.0, color=INK, linewidth=1.0, linestyle=(0, (4, 1.6)))
-    _scale(grid[0], [getattr(score, quantity.value) for score in drawn], "y")
+    _choose_scale(grid[0], [getattr(score, quantity.value) for score in drawn], "y")
     figure.supylabel(quantity.label, fontsize=10, color=INK)
     _draw_legend(figure, grid, colours)
 
 
-def _scale(axes: Axes, values: Sequence[float], axis: str) -> None:
+def _choose_scale(axes: Axes, values: Sequence[float], axis: str) -> None:
     """Make a shared axis logarithmic if its values span a large ratio."""
     finite = np.array([value for value in values if np.isfinite(value)])
     if len(set(finite)) > 2 and finite.min() > 0 and finite.max() > LOGARITHMIC * finite.min():

@@ -19,7 +19,7 @@ from heliograph.simulation.network import Network
 
 DIMENSIONS = ("setting", "run", "time", "node", "filter", "state", "received")
 BITWISE = ("heliograph", "jax", "jaxlib", "equinox", "numpy", "zarr")  # packages that decide about the store's bytes
-SETTINGS = (  # of JAX that do
+SETTINGS = (  # settings of JAX that decide about them too
     "jax_default_matmul_precision",
     "jax_default_prng_impl",
     "jax_disable_most_optimizations",
@@ -108,7 +108,7 @@ class Campaign:
     def function(self) -> Callable[..., Network]:
         """Return the function that builds the network of a setting; loaded once in a process."""
         file, _, name = self.network.rpartition(":")
-        return _function(str(Path(self.path).parent / file), self.source, name)
+        return _load_function_once(str(Path(self.path).parent / file), self.source, name)
 
     def as_json(self) -> str:
         """Serialise the campaign for other processes."""
@@ -134,9 +134,11 @@ def versions() -> dict[str, str]:
 
 @cache
 def _list_versions() -> dict[str, str]:
-    return {name: version(name) for name in BITWISE}  # each read from a file: every job of a campaign asks
+    """Return the versions of packages; kept, since every job of a campaign asks and each is read from a file."""
+    return {name: version(name) for name in BITWISE}
 
 
 @lru_cache(maxsize=8)
-def _function(path: str, source: str, name: str) -> Callable[..., Network]:
+def _load_function_once(path: str, source: str, name: str) -> Callable[..., Network]:
+    """Return the function of a name in a file's source, which runs only once in a process."""
     return load_function(Path(path), source, name)

@@ -67,7 +67,7 @@ def read_campaign(text: str, source: str, path: Path) -> Campaign:
             close = get_close_matches(key, KEYS, 1)
             hint = f" (closest: {close[0]!r})" if close else ""
             raise fail(f"{name}, key {key!r}", f"one of {', '.join(KEYS)}", f"an unknown key{hint}")
-    runs, horizon = _count(table, "runs", name), _count(table, "horizon", name)
+    runs, horizon = _read_count(table, "runs", name), _read_count(table, "horizon", name)
     # Each reader checks its key and raises one line.
     return Campaign(
         text=text,
@@ -77,11 +77,12 @@ def read_campaign(text: str, source: str, path: Path) -> Campaign:
         horizon=horizon,
         runs=runs,
         seed=check_seed(f"{name}, seed", table.get("seed", 0)),
+        # No larger than all runs, as a multiple of BLOCK.
         chunk=min(_read_chunk(table.get("chunk", CHUNK), name), BLOCK * -(-runs // BLOCK)),
-        keep=_one_of(table.get("keep", KEEP[0]), KEEP, f"{name}, keep"),
+        keep=_read_choice(table.get("keep", KEEP[0]), KEEP, f"{name}, keep"),
         inputs=_read_inputs(table.get("inputs", {}), horizon, name),
         settings=_read_settings(table, name),
-        timeout=_timeout(table.get("timeout", TIMEOUT), name),
+        timeout=_read_timeout(table.get("timeout", TIMEOUT), name),
         versions=versions(),
     )
 
@@ -104,10 +105,12 @@ def _read_network(table: Mapping[str, object], name: str) -> str:
 
 
 def _show_value(value: object) -> str:
+    """Return a value as an error shows it; "none" where the key is missing."""
     return "none" if value is None else repr(value)
 
 
-def _count(table: Mapping[str, object], key: str, name: str) -> int:
+def _read_count(table: Mapping[str, object], key: str, name: str) -> int:
+    """Return the value of a key, a whole number from 1."""
     return check_count(f"{name}, {key}", table.get(key, "none"))
 
 
@@ -119,13 +122,15 @@ def _read_chunk(value: object, name: str) -> int:
     return count
 
 
-def _timeout(value: object, name: str) -> float:
+def _read_timeout(value: object, name: str) -> float:
+    """Return the seconds of a timeout, a positive number."""
     if not isinstance(value, int | float) or not _is_number(value) or value <= 0:
         raise fail(f"{name}, timeout", "a positive number of seconds", _show_value(value))
     return float(value)
 
 
-def _one_of(value: object, choices: Sequence[str], name: str) -> str:
+def _read_choice(value: object, choices: Sequence[str], name: str) -> str:
+    """Return a value that is one of the choices."""
     if value not in choices:
         raise fail(name, " or ".join(map(repr, choices)), repr(value))
     return str(value)
@@ -138,20 +143,23 @@ def _read_inputs(table: object, horizon: int, name: str) -> dict[str, float | li
     for key, value in table.items():
         values = value if isinstance(value, list) else [value]
         if not all(_is_number(v) for v in values) or (isinstance(value, list) and len(value) != horizon):
-            raise fail(f"{name}, inputs.{key}", f"a number or one for each of {horizon} steps", _short(value))
+            found = f"{len(value)} values" if isinstance(value, list) else repr(value)
+            raise fail(f"{name}, inputs.{key}", f"a number or one for each of {horizon} steps", found)
     return dict(table)
 
 
 def _is_number(value: object) -> bool:
+    """Return whether a value is a finite number."""
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def _short(value: object) -> str:
-    return f"{len(value)} values" if isinstance(value, list) else repr(value)
-
-
 def _read_settings(table: Mapping[str, object], name: str) -> list[Setting]:
-    """Return the settings of a campaign's file, from [grid] or [[settings]]; names free in the store, no two equal."""
+    """Return the settings of a campaign's file, from [grid] or [[settings]].
+
+    Raises:
+        ValueError: both or neither of the two, a parameter whose name the store has already, a value that JSON cannot
+            hold, two settings that are the same.
+    """
     if ("grid" in table) == ("settings" in table):
         raise fail(f"campaign {name}", "either [grid] or [[settings]]", "both" if "grid" in table else "neither")
     settings = _expand_grid(table["grid"], name) if "grid" in table else _list_settings(table["settings"], name)
@@ -167,9 +175,8 @@ def _read_settings(table: Mapping[str, object], name: str) -> list[Setting]:
     for i, setting in enumerate(settings):
         first = seen.setdefault(canonical(setting), i)
         if first != i:
-            raise fail(
-                f"{name}, setting {i}", "distinct settings", f"the same as setting {first}, {canonical(setting)}"
-            )
+            same = f"the same as setting {first}, {canonical(setting)}"
+            raise fail(f"{name}, setting {i}", "distinct settings", same)
     return settings
 
 
@@ -184,6 +191,7 @@ def _expand_grid(grid: object, name: str) -> list[Setting]:
 
 
 def _list_settings(settings: object, name: str) -> list[Setting]:
+    """Return the tables of [[settings]], at least one."""
     if not isinstance(settings, list) or not settings or not all(isinstance(s, dict) for s in settings):
         raise fail(f"{name}, settings", "tables [[settings]]", repr(settings))
     return settings

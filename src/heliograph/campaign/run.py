@@ -103,7 +103,10 @@ def _compute_missing(
     only: Sequence[tuple[int, int]] | None,
     progress: Progress,
 ) -> CampaignRun:
-    """Compute the chunks that the store lacks, and write failures and summary; return what was done."""
+    """Compute the chunks that the store lacks, and write failures and summary; return what was done.
+
+    Arguments are those of `run_campaign`.
+    """
     store = (out / STORE).absolute()
     clear_left(store)
     check_replaceable(out, f"{STORE}/zarr.json")
@@ -116,7 +119,6 @@ def _compute_missing(
         damaged = remove_damaged(store, campaign)
         remove_partial(store)
         done = done_chunks(store, campaign)
-    # Compute what is missing; the summary is removed first, since it would no longer be right.
     missing = [job for job in expected if (job.setting, job.chunk) not in done]
     already = len(expected) - len(missing)
     if not missing and not damaged and (out / SUMMARY).is_file():
@@ -125,7 +127,7 @@ def _compute_missing(
     if missing or damaged:
         count = _count_workers(workers, len(missing) or 1)
         with start_engine(campaign.as_json(), store, count, scheduler, campaign.timeout) as engine:
-            (out / SUMMARY).unlink(missing_ok=True)  # it would not hold for what follows
+            (out / SUMMARY).unlink(missing_ok=True)  # it is not right for what is computed now
             failed = _compute_settings(engine, campaign, store, missing, already, progress)
     remove_partial(store)
     # Reports are written again after every call.
@@ -177,16 +179,19 @@ def _count_workers(workers: int | None, jobs: int) -> int:
 def _make_store(
     engine: Engine, campaign: Campaign, store: Path, settings: set[int], progress: Progress
 ) -> dict[Job, Reply]:
-    """Make the store if needed, and write missing claims; return the settings that cannot be built."""
+    """Make the store if needed, and write missing claims; return the jobs of settings that cannot be built."""
     new = not store.is_dir()
-    # Claims are needed of a new store, of the settings to compute, and of those whose claims were damaged.
-    begun = {setting for setting, _ in done_chunks(store, campaign)} if not new else set()  # its claims may be damaged
-    known = set() if new else {setting for (setting,) in find_described(store)}
-    lacking = range(len(campaign.settings)) if new else sorted((settings | begun) - known)
+    if new:
+        lacking = list(range(len(campaign.settings)))
+    else:
+        # Claims of the settings to compute, and of those that were begun: they may have been removed as damaged.
+        begun = {setting for setting, _ in done_chunks(store, campaign)}
+        lacking = sorted((settings | begun) - {setting for (setting,) in find_described(store)})
     jobs = [Job(setting) for setting in lacking]
     results: dict[int, Description] = {}
 
     def accept(job: Job, value: Description | None, done: int) -> None:
+        """Keep the description of a setting."""
         assert value is not None  # these jobs only describe
         results[job.setting] = value
         progress("building", done, len(jobs))
@@ -210,16 +215,17 @@ def _try_jobs(
 ) -> dict[Job, Reply]:
     """Do jobs, repeat failed ones, call accept(job, value, number done) for the others; return the last failures."""
     done, left = 0, {job: Reply() for job in jobs}
-    hung: list[Job] = []  # what took too long once is not waited for again
+    given_up: list[Job] = []  # what took too long once is not waited for again
     for _ in range(TRIES):
-        for job, reply in engine([job for job in left if job not in hung]):
-            if reply.error:
-                left[job] = reply
-                hung += [job] if reply.late else []
-            else:
+        for job, reply in engine([job for job in left if job not in given_up]):
+            if not reply.error:
                 del left[job]
                 done += 1
                 accept(job, reply.value, done)
-        if len(left) == len(hung):
+                continue
+            left[job] = reply
+            if reply.late:
+                given_up.append(job)
+        if len(left) == len(given_up):
             break
     return left

@@ -78,20 +78,21 @@ def unite_labels(parts: Mapping[int, Labels]) -> Labels:
             raise fail(f"setting {setting}", f"the states of setting {first}, {labels.states}", other.states)
     return Labels(
         states=labels.states,
-        nodes=_unite_names([of_setting.nodes for of_setting in parts.values()]),
-        filters=_unite_names([of_setting.filters for of_setting in parts.values()]),
-        received=max(of_setting.received for of_setting in parts.values()),
+        nodes=_unite_names([part.nodes for part in parts.values()]),
+        filters=_unite_names([part.filters for part in parts.values()]),
+        received=max(part.received for part in parts.values()),
     )
 
 
 def check_within(labels: Labels, known: Labels, setting: int) -> None:
-    """Raise ValueError if a setting has a name that the store was not made for."""
+    """Raise ValueError if a setting has a name, or a longer measurement, that the store was not made for."""
     lacking = [name for name in (*labels.nodes, *labels.filters) if name not in (*known.nodes, *known.filters)]
     if labels.states != known.states or labels.received > known.received or lacking:
         raise fail(f"setting {setting}", f"states, nodes and filters of the store, {known}", labels)
 
 
 def _unite_names(names: Sequence[Sequence[str]]) -> tuple[str, ...]:
+    """Return all names, each once, in order of first appearance."""
     return tuple(dict.fromkeys(name for axis in names for name in axis))
 
 
@@ -132,20 +133,20 @@ def create(path: Path, campaign: Campaign, labels: Labels) -> None:
         # Empty variables; a file for each chunk of runs of each setting.
         for name, (axes, meaning) in variables(campaign).items():
             shape = tuple(sizes[axis] for axis in axes)
-            _create_array(group, name, axes, shape, (1, campaign.chunk, *shape[2:]), np.nan, {"long_name": meaning})
+            chunks = (1, campaign.chunk, *shape[2:])
+            _create_array(group, name, axes, shape, chunks, fill=np.nan, attributes={"long_name": meaning})
         # The claims of a setting are one file.
         axes = ("setting", "node", "filter")
         shape = tuple(sizes[axis] for axis in axes)
-        _create_array(
-            group, CLAIM, axes, shape, (1, *shape[1:]), "", {"long_name": "what the filter claims of its variance"}
-        )
+        meaning = "what the filter claims of its variance"
+        _create_array(group, CLAIM, axes, shape, (1, *shape[1:]), fill="", attributes={"long_name": meaning})
         with warnings.catch_warnings():  # zarr says that consolidated metadata are not in the format's text yet
             warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)
             zarr.consolidate_metadata(folder)
 
 
 def _make_coordinates(campaign: Campaign, labels: Labels) -> dict[str, np.ndarray]:
-    """Return the store's coordinates by dimension: settings, runs, times, names, and the parameters of the settings."""
+    """Return the store's coordinates by name: one for each axis, and each parameter along the settings."""
     steps = {
         "setting": np.arange(len(campaign.settings)),
         "run": np.arange(campaign.runs),
@@ -165,18 +166,20 @@ def parameter_values(campaign: Campaign, name: str) -> np.ndarray:
     if all(value is None or (isinstance(value, int | float) and not isinstance(value, bool)) for value in values):
         whole = all(isinstance(value, int) for value in values)
         return np.array(values, dtype=np.int64 if whole else np.float64)
-    return np.array([_text(value) for value in values])
+    return np.array([_write_as_text(value) for value in values])
 
 
-def _text(value: object) -> str:
+def _write_as_text(value: object) -> str:
+    """Return a text as it is, None as "", all else as JSON."""
     if value is None or isinstance(value, str):
         return value or ""
     return json.dumps(value, sort_keys=True, ensure_ascii=False)
 
 
 def _write_coordinate(group: zarr.Group, name: str, values: np.ndarray, axis: str) -> None:
+    """Create a coordinate along an axis, of one chunk, and write its values."""
     fill = "" if values.dtype.kind == "U" else values.dtype.type(0)
-    _create_array(group, name, (axis,), values.shape, values.shape, fill, {}, values.dtype)
+    _create_array(group, name, (axis,), values.shape, values.shape, fill=fill, attributes={}, kind=values.dtype)
     _open(group, name)[...] = values
 
 
@@ -229,6 +232,7 @@ def write_claims(path: Path, setting: int, claims: Claims) -> None:
 
 
 def _sync(folder: Path, start: str) -> None:
+    """Make files of a folder whose names begin so outlast a loss of power, and that they are there."""
     for file in folder.glob(f"{start}*"):
         sync(file)
     sync(folder)
@@ -247,22 +251,26 @@ def find_described(path: Path) -> set[tuple[int, ...]]:
 def remove_damaged(path: Path, campaign: Campaign) -> list[Path]:
     """Remove the files of chunks that do not agree with their checksums; return these files."""
     files = [file for name in variables(campaign) for file in _find_chunks(path / name, 2).values()]
-    damaged = [file for file in (*files, *_find_chunks(path / CLAIM, 1).values()) if not _whole(file)]
+    damaged = [file for file in (*files, *_find_chunks(path / CLAIM, 1).values()) if not _is_whole(file)]
     for file in damaged:
         file.unlink()
     return damaged
 
 
-def _whole(file: Path) -> bool:
+def _is_whole(file: Path) -> bool:
     """Return whether the last four bytes are the checksum of all others."""
     data = file.read_bytes()
     return len(data) > 4 and google_crc32c.value(data[:-4]) == int.from_bytes(data[-4:], "little")
 
 
 def _find_chunks(folder: Path, indices: int) -> dict[tuple[int, ...], Path]:
-    """Return files of chunks by the first indices of the chunk."""
-    files = ((name, name.split(".")[1:]) for name in os.listdir(folder) if name.startswith("c."))
-    return {tuple(map(int, parts[:indices])): folder / name for name, parts in files if all(map(str.isdigit, parts))}
+    """Return the files of chunks, named "c.0.3.0", by so many of the first indices of the chunk, here (0, 3)."""
+    found = {}
+    for name in os.listdir(folder):
+        start, *parts = name.split(".")
+        if start == "c" and parts and all(map(str.isdigit, parts)):  # no partial file
+            found[tuple(map(int, parts[:indices]))] = folder / name
+    return found
 
 
 def remove_partial(path: Path) -> None:
@@ -280,7 +288,7 @@ def read_labels(path: Path) -> Labels:
 
 
 def restore_campaign(path: Path) -> Campaign:
-    """Return the campaign that the store was created with; its file is assumed to be next to the store."""
+    """Return the campaign that the store was created with, as if its file were next to the store."""
     attributes: Any = _read_attributes(path)
     stored = read_campaign(attributes["campaign"], attributes["network_source"], path.parent / "campaign.toml")
     return replace(stored, versions=attributes["versions"])
@@ -289,19 +297,18 @@ def restore_campaign(path: Path) -> Campaign:
 def check_same(path: Path, campaign: Campaign) -> None:
     """Raise ValueError, naming the difference, unless the store was created with this campaign."""
     attributes: Any = _read_attributes(path)
-    begun = dict(attributes["versions"])
-    differs = [
-        f"{name} {campaign.versions.get(name) or 'none'} (was {begun.get(name) or 'none'})"
-        for name in campaign.versions
-        if campaign.versions[name] != begun.get(name)
+    stored_versions = dict(attributes["versions"])
+    differences = [
+        f"{name} {version or 'none'} (was {stored_versions.get(name) or 'none'})"
+        for name, version in campaign.versions.items()
+        if version != stored_versions.get(name)
     ]
-    if not differs:
+    if not differences:
         stored = read_campaign(attributes["campaign"], attributes["network_source"], Path(campaign.path))
-        differs = list(_list_differences(stored, campaign))
-    if differs:
-        raise fail(
-            f"results folder {path.parent}", "the campaign it was begun with, or another folder", "; ".join(differs)
-        )
+        differences = list(_list_differences(stored, campaign))
+    if differences:
+        expected = "the campaign it was begun with, or another folder"
+        raise fail(f"results folder {path.parent}", expected, "; ".join(differences))
 
 
 def _read_attributes(path: Path) -> Mapping[str, object]:
@@ -317,7 +324,7 @@ def _read_attributes(path: Path) -> Mapping[str, object]:
 
 
 def _list_differences(stored: Campaign, campaign: Campaign) -> Iterable[str]:
-    """Yield in words what the campaign of a store has otherwise than this one."""
+    """Yield in words each difference of a campaign from that of a store; of the settings, the first."""
     for name in ("network", "horizon", "runs", "seed", "chunk", "keep", "inputs"):
         new, old = getattr(campaign, name), getattr(stored, name)
         if new != old:

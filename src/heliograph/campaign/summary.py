@@ -106,37 +106,52 @@ def summarize(store: Path, campaign: Campaign) -> list[Score]:
         for i, node in enumerate(labels.nodes):
             for j, name in enumerate(labels.filters):
                 if claims[setting, i, j]:
-                    label = setting, node, name, str(claims[setting, i, j])
-                    scores.append(_make_score(label, squared[:, i, j], nees[:, i, j]))
+                    names = setting, node, name, str(claims[setting, i, j])
+                    scores.append(_make_score(names, squared[:, i, j], nees[:, i, j]))
     return scores
 
 
 def _average_over_time(group: zarr.Group, setting: int, runs: slice, claims: np.ndarray) -> np.ndarray:
-    """Return squared error summed over the state and NEES per dimension, averaged over time, (2, run, node, filter)."""
-    error, variance, nees = (_read(group, name, setting, runs) for name in ("error", "variance", "nees_per_dimension"))
+    """Return squared error summed over the state and NEES per dimension, averaged over time, (2, run, node, filter).
+
+    The error is NaN in runs whose claimed variance is not finite, of filters that claim one.
+    """
+    names = ("error", "variance", "nees_per_dimension")
+    error, variance, nees = (_read_runs(group, name, setting, runs) for name in names)
     squared = np.sum(error**2, axis=-1).mean(axis=1)
     squared[~np.isfinite(variance).all(axis=(1, -1)) & (claims != "none")] = np.nan
     return np.stack([squared, nees.mean(axis=1)])
 
 
-def _read(group: zarr.Group, name: str, setting: int, runs: slice) -> np.ndarray:
+def _read_runs(group: zarr.Group, name: str, setting: int, runs: slice) -> np.ndarray:
+    """Return some runs of a setting, of one variable of the store."""
     array = group[name]
     assert isinstance(array, zarr.Array)
     return np.asarray(array[setting, runs])
 
 
-def _make_score(label: tuple[int, str, str, str], squared: np.ndarray, nees: np.ndarray) -> Score:
-    """Return RMSE and NEES of a filter with their standard errors, from squared errors and NEES of each run."""
+def _make_score(names: tuple[int, str, str, str], squared: np.ndarray, nees: np.ndarray) -> Score:
+    """Return RMSE and NEES of a filter with their standard errors, from squared errors and NEES of each run.
+
+    `names` are setting, node, filter and claim.
+    """
     finite = np.isfinite(squared)
-    mse, mse_error = _mean(squared[finite])
+    mse, mse_error = _compute_mean(squared[finite])
+    mean_nees, nees_error = _compute_mean(nees[finite])
     rmse = float(np.sqrt(mse))
     return Score(
-        *label, rmse, mse_error / (2 * rmse) if rmse else 0.0, *_mean(nees[finite]), len(squared), int(finite.sum())
+        *names,
+        rmse=rmse,
+        rmse_error=mse_error / (2 * rmse) if rmse else 0.0,  # of a root, to first order
+        nees_per_dimension=mean_nees,
+        nees_error=nees_error,
+        runs=len(squared),
+        finite_runs=int(finite.sum()),
     )
 
 
-def _mean(values: np.ndarray) -> tuple[float, float]:
-    """Return the mean and its standard error."""
+def _compute_mean(values: np.ndarray) -> tuple[float, float]:
+    """Return the mean of independent values and its standard error; NaN of too few."""
     if not len(values):
         return np.nan, np.nan
     return float(values.mean()), float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else np.nan
@@ -155,13 +170,16 @@ def score_row(campaign: Campaign, score: Score) -> list[str]:
         score.node,
         score.filter,
         score.claim,
-        *(_number(score.rmse, 4), _number(score.rmse_error, 1)),
-        *(_number(score.nees_per_dimension, 3), _number(score.nees_error, 1)),
+        _format_number(score.rmse, 4),
+        _format_number(score.rmse_error, 1),
+        _format_number(score.nees_per_dimension, 3),
+        _format_number(score.nees_error, 1),
         f"{score.finite_runs}/{campaign.runs}",
     ]
 
 
-def _number(value: float, digits: int) -> str:
+def _format_number(value: float, digits: int) -> str:
+    """Return a number to so many digits; a dash for NaN."""
     return "–" if math.isnan(value) else f"{value:.{digits}g}"
 
 
@@ -179,4 +197,5 @@ def write_summary(store: Path, campaign: Campaign, path: Path) -> None:
 
 
 def _format_cell(value: object) -> object:
+    """Return numbers as they are, all else as a text that no spreadsheet takes for a formula."""
     return value if isinstance(value, int | float) else quote_for_cell(str(value))

@@ -84,7 +84,7 @@ def compute(campaign: Campaign, network: Network, chunk: Chunk, store: Path) -> 
         campaign.horizon,
         campaign.chunk,
         campaign.key(chunk.setting),
-        Errors(campaign.keep == "trajectories"),
+        Errors(world=campaign.keep == "trajectories"),
         inputs(campaign, network),
         campaign.chunk,
         first_run=chunk.start,
@@ -104,6 +104,7 @@ def inputs(campaign: Campaign, network: Network) -> np.ndarray | None:
 
 
 def _check_versions(campaign: Campaign) -> None:
+    """Raise ValueError unless this process has the packages and settings that the campaign was begun with."""
     here = versions()
     if here != campaign.versions:
         raise fail("versions on this worker", str(campaign.versions), here)
@@ -124,7 +125,7 @@ _seen: list[Network] = []
 
 
 def _bound_memory(network: Network) -> None:
-    """Drop compiled programs after networks of more than `COMPILED` structures."""
+    """Drop all compiled programs once networks of `COMPILED` other structures have been seen before this one."""
     if any(alike(network, other) for other in _seen):
         return
     if len(_seen) == COMPILED:
@@ -137,22 +138,22 @@ def _arrange_results(recorded: PyTree, labels: Labels) -> dict[str, np.ndarray]:
     """Arrange the reducer's results on the axes of the store, (run, time, ...); NaN where a node lacks a filter."""
     estimates = recorded["estimates"]
     # Shapes are those of any filter; all have the same states.
-    example = next(iter(next(iter(e for e in estimates.values() if e)).values()))
+    example = next(values for filters in estimates.values() for values in filters.values())
     runs, horizon = example["nees_per_dimension"].shape
-    tail = (len(labels.nodes), len(labels.filters))
+    nodes, filters_count = len(labels.nodes), len(labels.filters)
     arrays = {
-        name: np.full((runs, horizon, *tail, *example[name].shape[2:]), np.nan)
+        name: np.full((runs, horizon, nodes, filters_count, *example[name].shape[2:]), np.nan)
         for name in ("error", "variance", "nees_per_dimension")
     }
     # Each filter goes to its place along the axes (node, filter).
     for node, filters in estimates.items():
         for name, values in filters.items():
-            position = labels.nodes.index(node), labels.filters.index(name)
+            i, j = labels.nodes.index(node), labels.filters.index(name)
             for variable, array in arrays.items():
-                array[:, :, position[0], position[1]] = values[variable]
+                array[:, :, i, j] = values[variable]
     if "truth" in recorded:
         arrays["truth"] = recorded["truth"]
-        arrays["measurement"] = np.full((runs, horizon, tail[0], labels.received), np.nan)
+        arrays["measurement"] = np.full((runs, horizon, nodes, labels.received), np.nan)
         for node, z in recorded["measurements"].items():
             arrays["measurement"][:, :, labels.nodes.index(node), : z.shape[-1]] = z
     return arrays
@@ -198,7 +199,7 @@ class Errors(AbstractReducer[dict[str, PyTree]]):
 
 
 def _measure_errors(truth: jax.Array, estimate: Estimate) -> dict[str, jax.Array]:
-    """Return error, claimed variances and NEES per state, of one estimate or of each step's."""
+    """Return error (..., n), claimed variances (..., n) and NEES per state (...), of one estimate or of each step's."""
     error, covariance = estimate.error(truth), jnp.asarray(estimate.covariance)
     variance = jnp.broadcast_to(jnp.diagonal(covariance, axis1=-2, axis2=-1), error.shape)
     nees = jnp.vectorize(squared_distance, signature="(n,n),(n)->()")(covariance, error)

@@ -22,12 +22,12 @@ app = App(
 
 def number(text: str) -> Parameter:
     """Declare an option that is an integer."""
-    return Parameter(help=text, converter=_whole)
+    return Parameter(help=text, converter=_convert_to_int)
 
 
 def path_option(text: str = "") -> Parameter:
     """Declare an option that is a file or folder."""
-    return Parameter(help=text, converter=_path)
+    return Parameter(help=text, converter=_convert_to_path)
 
 
 MEASURED = (
@@ -38,21 +38,25 @@ MEASURED = (
 
 def measured_option(text: str = MEASURED) -> Parameter:
     """Declare an option that is measured data: a file, or the URL of a store."""
-    return Parameter(help=text, converter=_path_or_store, accepts_keys=False, n_tokens=1)
+    return Parameter(help=text, converter=_convert_to_path_or_store, accepts_keys=False, n_tokens=1)
 
 
 def estimates_option() -> Parameter:
     """Declare an option that is where estimates go: a file, or the URL of a store."""
     return Parameter(
         help="CSV, Parquet or MCAP to write, or influx:// or postgresql://...?table=: estimates with their claims.",
-        converter=_path_or_store,
+        converter=_convert_to_path_or_store,
         accepts_keys=False,
         n_tokens=1,
     )
 
 
 def folder(command: str, out: Path | None, name: str) -> Path:
-    """Return the folder in which the results' folder `name` is made, checked to be writable: `--out` or its parent."""
+    """Return the folder in which a results folder of this name is made: `--out`, or its parent if `--out` is that one.
+
+    Raises:
+        ValueError: no `--out`, or a folder that cannot be written.
+    """
     from heliograph.disk.whole_file import check_output_folder
     from heliograph.numerics.check import fail
 
@@ -62,23 +66,25 @@ def folder(command: str, out: Path | None, name: str) -> Path:
     return out.parent if out.name == name else out
 
 
-def _whole(_: type, tokens: Sequence[Token]) -> int:
+def _convert_to_int(_: type, tokens: Sequence[Token]) -> int:
     """Convert digits to an integer; fractions are refused."""
     if not re.fullmatch(r"[+-]?[0-9]+", tokens[0].value, re.ASCII):
         raise ValueError(f"expected a whole number, got {tokens[0].value!r}")
     return int(tokens[0].value)
 
 
-def _path(_: type, tokens: Sequence[Token]) -> Path:
+def _convert_to_path(_: type, tokens: Sequence[Token]) -> Path:
+    """Convert a text to a path; an empty one is refused."""
     if not tokens[0].value or "\0" in tokens[0].value:
         raise ValueError(f"expected a path, got {tokens[0].value!r}")
     return Path(tokens[0].value)
 
 
-def _path_or_store(kind: type, tokens: Sequence[Token]) -> "Path | StoreAddress":
+def _convert_to_path_or_store(kind: type, tokens: Sequence[Token]) -> "Path | StoreAddress":
+    """Convert the URL of a store to its address, any other text to a path."""
     from heliograph.files.stores.address import is_store, parse_store
 
-    return parse_store(tokens[0].value) if is_store(tokens[0].value) else _path(kind, tokens)
+    return parse_store(tokens[0].value) if is_store(tokens[0].value) else _convert_to_path(kind, tokens)
 
 
 def completion(

@@ -59,6 +59,7 @@ def backtest(
     check_count("--refit", refit, 0)
 
     def compute(advance: "Advance") -> "heliograph.forecasting.Backtest":
+        """Read the data of one plant, and forecast from its rows."""
         from heliograph.files.network_file import load_module
 
         advance("reading")
@@ -68,10 +69,11 @@ def backtest(
             raise fail("backtest", "data of one plant (--plant NAME)", f"{len(others) + 1} plants")
         advance(f"forecasting from {len(data.recording.time)} rows")
         z, u, time, truth = data.recording
-        again = _make_refit(network, data.recording, advance) if refit else None
-        return heliograph.backtest(loaded, z, ahead, u, time, truth, skip, again, refit or 1)
+        fit_to_first = _make_refit(network, data.recording, advance) if refit else None
+        return heliograph.backtest(loaded, z, ahead, u, time, truth, skip, fit_to_first, refit or 1)
 
     def results(found: "heliograph.forecasting.Backtest") -> "Results":
+        """Return the content of the results folder."""
         from heliograph.report.pages.backtest import make_backtest_results
 
         return make_backtest_results(found, network, refit)
@@ -85,7 +87,7 @@ def backtest(
 
 
 def _make_refit(reference: str, recording: "Recording", advance: "Advance") -> "Callable[[int], Network]":
-    """Return what fits the free numbers of a network to the first rows of a recording."""
+    """Return a function from a number of rows to the network, its free numbers fitted to the first rows so many."""
     from heliograph.files.fitted import NetworkAgain
 
     build, (z, u, _, _) = NetworkAgain(reference), recording

@@ -23,7 +23,7 @@ def check(
     outage: Annotated[
         list[str] | None, Parameter(help="NODE:STEPS, out at the end of the run; may be repeated.")
     ] = None,
-    given: Annotated[
+    inputs: Annotated[
         list[str] | None, Parameter(name="--input", help="NAME=VALUE of an input, the same in all steps.")
     ] = None,
     steps: Annotated[int, Parameter(help="Length of a run, for what is left out.")] = 200,
@@ -51,8 +51,9 @@ def check(
 
     # What is asked of sensors is computed first, so that bad input prints nothing.
     loaded = load_network(network)
-    asked = without or outage
-    worth = _ask_worth(loaded, without or [], outage or [], given or [], steps, runs) if asked else None
+    worth = None
+    if without or outage:
+        worth = _compute_worth(loaded, without or [], outage or [], inputs or [], steps, runs)
     # The diagram, then a line for each doubt.
     print("\n".join(map(visible, loaded.diagram().splitlines())))
     lines = doubts_before_data(loaded)
@@ -63,15 +64,15 @@ def check(
     print(f"{serious} doubtful" if serious else "nothing doubtful")
     if worth is not None:
         print()
-        for said in _describe_worth(worth, steps, runs):
-            print(visible(said))
+        for row in _describe_worth(worth, steps, runs):
+            print(visible(row))
     return DOUBTFUL if serious else 0
 
 
-def _ask_worth(
-    network: "Network", without: Sequence[str], outage: Sequence[str], given: Sequence[str], steps: int, runs: int
+def _compute_worth(
+    network: "Network", without: Sequence[str], outage: Sequence[str], inputs: Sequence[str], steps: int, runs: int
 ) -> "SensorWorth":
-    """Compute what sensors are worth, from the options as they are typed."""
+    """Return what sensors are worth, from the options as they are typed."""
     import heliograph as hg
     from heliograph.numerics.check import fail
 
@@ -82,19 +83,19 @@ def _ask_worth(
             raise fail("--outage", "NODE:STEPS, such as gnss:60", repr(word))
         outages[name] = int(count)
     names = list(network.nodes) if EACH in without and EACH not in network.nodes else list(without)
-    inputs = _read_inputs(network.inputs, given, steps)
-    worth: SensorWorth = hg.planning.worth_of_sensors(network, steps, names, outages, runs=runs, inputs=inputs)
+    values = _read_inputs(network.inputs, inputs, steps)
+    worth: SensorWorth = hg.planning.worth_of_sensors(network, steps, names, outages, runs=runs, inputs=values)
     return worth
 
 
-def _read_inputs(names: Sequence[str], given: Sequence[str], steps: int) -> "np.ndarray | None":
-    """Return the inputs of all steps (steps, inputs), from NAME=VALUE of each."""
+def _read_inputs(names: Sequence[str], words: Sequence[str], steps: int) -> "np.ndarray | None":
+    """Return the inputs of all steps (steps, inputs) from a word NAME=VALUE for each; None of a plant without any."""
     import numpy as np
 
     from heliograph.numerics.check import fail
 
     values = {}
-    for word in given:
+    for word in words:
         name, _, number = word.partition("=")
         try:
             values[name] = float(number)
@@ -106,12 +107,12 @@ def _read_inputs(names: Sequence[str], given: Sequence[str], steps: int) -> "np.
 
 
 def _describe_worth(worth: "SensorWorth", steps: int, runs: int) -> Iterator[str]:
-    """Yield the table, a line for each case."""
+    """Yield the lines of the table: a title, the states, then a line for each case, that of all nodes first."""
     how = "by the covariance" if worth.exact else f"root mean square of {runs} runs"
     yield f"error of one filter of all nodes after {steps} steps, {how} (and times that of all nodes)"
     cases = [worth.complete, *worth.cases]
-    wide = max(len(case.name) for case in cases)
-    yield "  ".join([" " * wide, *(f"{name:>20}" for name in worth.states)])
+    width = max(len(case.name) for case in cases)
+    yield "  ".join([" " * width, *(f"{name:>20}" for name in worth.states)])
     for case in cases:
         cells = [f"{e:.4g} ({times:.3g})" for e, times in zip(case.error, case.increase, strict=True)]
-        yield "  ".join([f"{case.name:<{wide}}", *(f"{cell:>20}" for cell in cells)])
+        yield "  ".join([f"{case.name:<{width}}", *(f"{cell:>20}" for cell in cells)])

@@ -70,7 +70,6 @@ def _run_command(arguments: Sequence[str] | None) -> int:
     """Parse the arguments and run their command; return the exit status. What a user can mend is one line on stderr."""
     with suppress(ValueError):  # a home that cannot be written to: then everything is compiled again
         keep_compilations()
-    # Parse and run; what a user can mend becomes one line on stderr.
     try:
         command, bound, _ = app.parse_args(arguments, exit_on_error=False, print_error=False, verbose=False)
         with _print_plain_warnings():
@@ -86,8 +85,10 @@ def _run_command(arguments: Sequence[str] | None) -> int:
             raise
         return _refuse(str(error))
     except OSError as error:
-        what = error.filename or ("standard output" if error.errno in FULL or _output_is_lost() else None)
-        return _refuse(f"{what}: {error.strerror or error}" if what else str(error))
+        place = error.filename
+        if not place and (error.errno in FULL or _output_is_lost()):
+            place = "standard output"
+        return _refuse(f"{place}: {error.strerror or error}" if place else str(error))
     except MissingPackagesError as error:
         return _refuse(str(error))
     except ModuleNotFoundError as error:
@@ -108,6 +109,7 @@ def _print_plain_warnings() -> Iterator[None]:
             message: Warning | str, category: type[Warning], filename: str, lineno: int,
             file: TextIO | None = None, line: str | None = None,
         ) -> None:  # fmt: skip
+            """Print a warning to users as a line; leave others to Python."""
             if issubclass(category, UserWarning):
                 from heliograph.disk.quoting import visible
 

@@ -35,12 +35,13 @@ def design(
     target = folder("design", out, NAME) / NAME
     file = read_design(task)
 
-    def results(designed: "DesignResults") -> "Results":
+    def results_of(designed: "DesignResults") -> "Results":
+        """Return the content of the results folder."""
         from heliograph.report.pages.design import design_results
 
         return design_results(designed)
 
-    designed = write_results(target, count_stages(file), lambda advance: compute_design(file, advance), results)
+    designed = write_results(target, count_stages(file), lambda advance: compute_design(file, advance), results_of)
     best = designed.design
     print(visible(f"{target / 'report.html'}: error {best.error:.6g} at power {best.total:.6g}"))
     print(visible(best.certificate.words))

@@ -62,7 +62,7 @@ KINDS = {
 
 
 def describe_costs(written: "Exported", measured: "Cost") -> list[str]:
-    """Describe the cost of a step in two lines."""
+    """Return two lines on the cost of a step: its operations by kind; bytes of state and code, and its time."""
     from heliograph.export.c_files import COMPILER
 
     counts = {kind: sum(written.operations.get(op, 0) for op in ops) for kind, ops in KINDS.items()}
@@ -70,9 +70,7 @@ def describe_costs(written: "Exported", measured: "Cost") -> list[str]:
     parts = ", ".join(f"{count:,} {kind}" for kind, count in counts.items() if count)
     state = f"state {written.state_bytes:,} bytes"
     code = "code unmeasured" if measured.code_bytes is None else f"code {measured.code_bytes:,} bytes"
-    time = (
-        f"time unmeasured: no C compiler {COMPILER!r} here"
-        if measured.nanoseconds is None
-        else f"a step {measured.nanoseconds:,.0f} ns ({COMPILER} -O2 on this machine)"
-    )
+    time = f"time unmeasured: no C compiler {COMPILER!r} here"
+    if measured.nanoseconds is not None:
+        time = f"a step {measured.nanoseconds:,.0f} ns ({COMPILER} -O2 on this machine)"
     return [f"{sum(written.operations.values()):,} operations: {parts}", f"{state}, {code}, {time}"]

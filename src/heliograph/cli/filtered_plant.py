@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
     from heliograph.files.estimates.forecasts import ByFilter
     from heliograph.files.recording import Recording
+    from heliograph.model.estimate import Estimate
     from heliograph.simulation.network import Network
     from heliograph.simulation.results.record import Record
     from heliograph.smoothing import FixedInterval, FixedLag
@@ -25,10 +26,16 @@ if TYPE_CHECKING:
 
 
 class FilteredPlant(NamedTuple):
-    """What was measured of a plant, and what its filters made of it, with lines on what they doubted and forecast.
+    """What was measured of a plant, and what its filters made of it.
 
-    `written` are those rows of `record` whose estimates are asked for. `forecasts` are of rows behind the last,
-    `predicted` of each row from those before it; {} where not asked for.
+    Args:
+        data: what was measured.
+        record: all rows, filtered.
+        written: those rows of the record in which something was measured: their estimates are written.
+        forecasts: of rows after the last, by node and filter; {} where not asked for.
+        predicted: of each row from those before it, likewise.
+        doubted: lines on what filters doubt and what could not be read.
+        said: lines for the summary.
     """
 
     data: Measured
@@ -54,10 +61,19 @@ def filter_plant(
     if data.events is not None and data.events.dated and record.origin is not None:
         record = replace(record, units={"time": "s"} | record.units).with_origin(record.origin)
     said = [*_describe_doubted(network, record), *data.summary]
-    forecasts = _make_forecasts(record, ahead, said)
-    predicted = heliograph.forecasting.predict_record(record, data.recording.inputs) if predicts else {}
-    doubted = [*data.warnings, *record.failures(), *doubts]
-    return FilteredPlant(data, record, _select_rows(record, data.rows), forecasts, predicted, doubted, said)
+    forecasts: ByFilter = {}
+    if ahead is not None:
+        forecasts = _make_forecasts(record, ahead)
+        said.append(_describe_forecasts(forecasts))
+    return FilteredPlant(
+        data,
+        record,
+        written=_select_rows(record, data.rows),
+        forecasts=forecasts,
+        predicted=heliograph.forecasting.predict_record(record, data.recording.inputs) if predicts else {},
+        doubted=[*data.warnings, *record.failures(), *doubts],
+        said=said,
+    )
 
 
 def write_plant(
@@ -71,7 +87,7 @@ def write_plant(
     """Write a plant's estimates, and beside them those of a lag later where there is one; return lines on these."""
     write = _choose_writer(plant.data, module)
     predicted = _select_predicted(plant.predicted, plant.data.rows)
-    _write_rows(write, plant.written, (plant.forecasts, predicted), place, plant.data)
+    _write_rows(write, plant.written, plant.forecasts, predicted, place, plant.data)
     return _write_lagged(network, plant.data, lag, options, place, write)
 
 
@@ -85,7 +101,7 @@ def place_of_plant(out: Path | StoreAddress, plant: str, several: bool) -> Path 
 def _filter_rows(
     network: "Network", recording: "Recording", smooth: "FixedInterval | FixedLag | None"
 ) -> tuple["Record", list[str]]:
-    """Filter rows; return the record, and what the filters doubted in lines."""
+    """Return the record of the filtered rows, and the warnings that were given meanwhile as lines."""
     with warnings.catch_warnings(record=True) as doubts:
         warnings.simplefilter("always", UserWarning)
         record = heliograph.run(network, *recording, smooth=smooth)
@@ -100,67 +116,73 @@ def _describe_doubted(network: "Network", record: "Record") -> list[str]:
 
 
 def _select_rows(record: "Record", rows: "np.ndarray | None") -> "Record":
-    """Return some of the rows of a record, and of what is smoothed, whose rows are the last ones."""
+    """Return some of the rows of a record, and of what is smoothed, whose rows are its last ones; `rows`: a mask."""
     from dataclasses import replace
 
     import numpy as np
 
     if rows is None or rows.all():
         return record
-    estimates = {
-        node: {
-            name: replace(
-                e,
-                mean=np.asarray(e.mean)[rows],
-                covariance=np.asarray(e.covariance)[rows],
-                modes=None if e.modes is None else np.asarray(e.modes)[rows],
-            )
-            for name, e in filters.items()
-        }
-        for node, filters in record.estimates.items()
-    }
-    measurements = {node: z[rows] for node, z in record.measurements.items()}
-    later = None if record.smoothed is None else _select_rows(record.smoothed, rows[-len(record.smoothed.time) :])
-    truth = None if record.truth is None else np.asarray(record.truth)[rows]
+
+    def select(estimate: "Estimate") -> "Estimate":
+        """Return these rows of an estimate."""
+        return replace(
+            estimate,
+            mean=np.asarray(estimate.mean)[rows],
+            covariance=np.asarray(estimate.covariance)[rows],
+            modes=None if estimate.modes is None else np.asarray(estimate.modes)[rows],
+        )
+
+    smoothed = record.smoothed
     return replace(
         record,
         time=record.time[rows],
-        truth=truth,
-        measurements=measurements,
-        estimates=estimates,
-        smoothed=later,
+        truth=None if record.truth is None else np.asarray(record.truth)[rows],
+        measurements={node: z[rows] for node, z in record.measurements.items()},
+        estimates={
+            node: {name: select(estimate) for name, estimate in filters.items()}
+            for node, filters in record.estimates.items()
+        },
+        smoothed=None if smoothed is None else _select_rows(smoothed, rows[-len(smoothed.time) :]),
         reports={},
         uplinks={},
         weighed={},
     )
 
 
-def _make_forecasts(record: "Record", ahead: "Horizons | None", lines: list[str]) -> "ByFilter":
-    """Forecast each estimate from the last row, and add a line on how far and with which inputs; {} unless asked."""
-    if ahead is None:
-        return {}
+def _make_forecasts(record: "Record", ahead: "Horizons") -> "ByFilter":
+    """Return a forecast of each estimate from the last row."""
     forecasts = heliograph.forecast(record, ahead, inputs="held")
     assert isinstance(forecasts, dict)  # of a network
-    some = next(forecast for filters in forecasts.values() for forecast in filters.values())
-    held = "" if some.inputs == "none" else ", inputs held at those of the last row"
-    lines.append(f"forecast: {len(some.steps)} rows behind the data, to {some.time[-1]}{held}")
     return forecasts
 
 
+def _describe_forecasts(forecasts: "ByFilter") -> str:
+    """Return a line on how far forecasts go, and with which inputs."""
+    any_forecast = next(forecast for filters in forecasts.values() for forecast in filters.values())
+    held = "" if any_forecast.inputs == "none" else ", inputs held at those of the last row"
+    return f"forecast: {len(any_forecast.steps)} rows behind the data, to {any_forecast.time[-1]}{held}"
+
+
 def _select_predicted(predicted: "ByFilter", rows: "np.ndarray | None") -> "ByFilter":
-    """Return what was predicted of some of the rows."""
+    """Return what was predicted of some of the rows; `rows`: a mask, None for all."""
     if rows is None or rows.all():
         return predicted
-    return {
-        node: {name: forecast.select(rows) for name, forecast in filters.items()} for node, filters in predicted.items()
-    }
+    selected = {}
+    for node, filters in predicted.items():
+        selected[node] = {name: forecast.select(rows) for name, forecast in filters.items()}
+    return selected
 
 
 def _write_rows(
-    write: "Write", record: "Record", ahead: "tuple[ByFilter, ByFilter]", place: Path | StoreAddress, data: "Measured"
+    write: "Write",
+    record: "Record",
+    forecasts: "ByFilter",
+    predicted: "ByFilter",
+    place: Path | StoreAddress,
+    data: "Measured",
 ) -> None:
     """Write estimates, with rows of forecasts below them and columns of what was predicted where there are any."""
-    forecasts, predicted = ahead
     if not forecasts and not predicted:
         write(record, place)
         return
@@ -184,7 +206,7 @@ def _write_lagged(
     place: Path | StoreAddress,
     write: "Write",
 ) -> list[str]:
-    """Write the estimates of a lag later beside the others, and say so; nothing without a lag."""
+    """Write the estimates of a lag later beside the others, and return a line on it; none without a lag."""
     if lag is None or data.events is None:
         return []
     from heliograph.live.recorded import play
@@ -196,17 +218,17 @@ def _write_lagged(
     played = play(network, data.events.sort_events(), window, lag, start, ahead, capacity).lagged
     if played is None:
         return []
-    path = (
-        place.with_suffix(f".lagged{place.suffix}")
-        if isinstance(place, Path)
-        else place.named(f"{place.written_table}_lagged")
-    )
-    write(played, path)
-    return [f"{path}: {len(played.time)} rows, each given what came {lag:g} later"]
+    beside: Path | StoreAddress
+    if isinstance(place, Path):
+        beside = place.with_suffix(f".lagged{place.suffix}")
+    else:
+        beside = place.named(f"{place.written_table}_lagged")
+    write(played, beside)
+    return [f"{beside}: {len(played.time)} rows, each given what came {lag:g} later"]
 
 
 def _choose_writer(data: "Measured", module: "Mapping[str, object]") -> "Write":
-    """Return what writes estimates: to a store, a table, or to MCAP with the pose that the network's file names."""
+    """Return a function that writes estimates to a store, a table, or MCAP with the pose that `module` names."""
     from heliograph.files.bags.output import write_bag
     from heliograph.files.estimates.table import estimate_columns, write_estimates
     from heliograph.files.stores.tables import write_columns
@@ -214,6 +236,7 @@ def _choose_writer(data: "Measured", module: "Mapping[str, object]") -> "Write":
     origin = _find_origin(data)
 
     def write(record: "Record", path: Path | StoreAddress) -> None:
+        """Write the estimates of a record, in the form that the path asks for."""
         if isinstance(path, StoreAddress):
             write_columns(path, estimate_columns(record), data.plant, origin)
         elif path.suffix.lower() == ".mcap":

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from heliograph.files.recording import Recording
     from heliograph.learning import Fit, Share
+    from heliograph.learning.held_out import Change, Uniformity
     from heliograph.learning.losses.fates import Fates
     from heliograph.report.pages.fit import Learned
     from heliograph.report.progress import Advance
@@ -61,6 +62,7 @@ def fit(
     with GentleStop() as stop:
 
         def work(advance: "Advance") -> "Learned":
+            """Learn with the options of the command."""
             return learn(network, measurements, starts, seed, share, advance, truth, reading or ReadingOptions(), stop)
 
         learned = write_results(out, 6, work, lambda learning: list_results(learning, out, network))
@@ -98,8 +100,8 @@ def learn(
     build = NetworkAgain(network)
     start = build()
     if has_deciding_sender(start):
-        again = "hg.fit(hg.files.fitted.NetworkAgain(FILE), recording)"
-        raise fail("network to be learned", f"no trigger of a node (in Python {again} learns it)", "one with a trigger")
+        call = "hg.fit(hg.files.fitted.NetworkAgain(FILE), recording)"
+        raise fail("network to be learned", f"no trigger of a node (in Python {call} learns it)", "one with a trigger")
     data = _read_data(measurements, network, start, advance, truth, reading)
     recording = data.recording
     # Earlier rows to learn from, later ones to judge.
@@ -110,18 +112,37 @@ def learn(
     # Predictions before and after the fit, then statistics of the losses.
     z, u = recording.measurements, recording.inputs
     advance("judging on held-out rows")
-    judged = stop.unless_stopped(lambda: compare_filters(start, fitted.network, z, u, cut) if cut < rows else []) or []
-    uniform = stop.unless_stopped(lambda: transform_held_out(fitted.network, judged, z, u, cut) if judged else []) or []
+    changes: list[Change] = []
+    uniform: list[Uniformity] = []
+    if cut < rows:
+        changes = stop.unless_stopped(lambda: compare_filters(start, fitted.network, z, u, cut)) or []
+    if changes:
+        uniform = stop.unless_stopped(lambda: transform_held_out(fitted.network, changes, z, u, cut)) or []
     advance("looking at losses")
-    lossy = {name: fate for name, fate in _find_fates(start, recording).items() if any(0 < f.mean() < 1 for f in fate)}
-    losses = stop.unless_stopped(lambda: {name: learn_losses(fate) for name, fate in lossy.items()}) or {}
-    return Learned(network, str(measurements), fitted, cut, rows - cut, judged, uniform, losses)
+    # Nodes of which some messages arrived and some did not.
+    lossy = {
+        name: fates
+        for name, fates in _find_fates(start, recording).items()
+        if any(0 < sequence.mean() < 1 for sequence in fates)
+    }
+    losses = stop.unless_stopped(lambda: {name: learn_losses(fates) for name, fates in lossy.items()}) or {}
+    return Learned(
+        network,
+        str(measurements),
+        fitted,
+        learned=cut,
+        held_out=rows - cut,
+        changes=changes,
+        uniform=uniform,
+        losses=losses,
+    )
 
 
 def _find_fates(network: "Network", recording: "Recording") -> "dict[str, Fates]":
-    """Return the fates of each node's messages; of one that is not due in each row, of those that were due.
+    """Return which messages of each node arrived, of all that were due, by node or "node.component".
 
-    None of a node that nobody knows to be due: where rows are messages, of one without a rate of its own.
+    Left out are nodes of which nobody knows when a message is due: where rows are messages of any node, those without a
+    rate of their own.
     """
     from heliograph.learning.losses.fates import fates_of_measurements, fates_of_sequence
     from heliograph.report.arrivals import list_arrivals
@@ -172,22 +193,27 @@ def _fit_with_progress(
     advance: "Advance",
     stop: GentleStop,
 ) -> "Fit":
-    """Fit to the first rows, with progress by iterations of the search, after each of which it may be stopped."""
+    """Return the fit to the first rows, with progress by iterations of the search; after each it may be stopped."""
     from heliograph.files.recording import Recording
     from heliograph.learning.fitting import Fit
     from heliograph.learning.fitting import fit as learn_from
 
-    early = Recording({k: z[:rows] for k, z in recording.measurements.items()}, recording.inputs[:rows],
-                      recording.time[:rows], None if recording.truth is None else recording.truth[:rows])  # fmt: skip
+    first_rows = Recording(
+        {node: z[:rows] for node, z in recording.measurements.items()},
+        recording.inputs[:rows],
+        recording.time[:rows],
+        None if recording.truth is None else recording.truth[:rows],
+    )
 
-    def say(line: str) -> None:
+    def show_progress(line: str) -> None:
+        """Show a line of the search, such as "linear: step 3", on the bar; end the search after a signal."""
         stop.check()
         stop.begin()
         form, _, rest = line.partition(":")
         step = re.match(r" step ([0-9]+)", rest)
         advance(f"learning from {rows} rows ({form})", int(step[1]) if step else STEPS, STEPS)
 
-    fitted = learn_from(build, early, starts=starts, seed=seed, progress=say, truth=truth)
+    fitted = learn_from(build, first_rows, starts=starts, seed=seed, progress=show_progress, truth=truth)
     assert isinstance(fitted, Fit)  # since no sender decides
     return fitted
 
@@ -201,6 +227,7 @@ def list_results(learned: "Learned", out: Path, network: str) -> "Results":
     content = as_json(learned.fit, network=learned.network, measurements=learned.measurements, rows=learned.learned)
 
     def write(folder: Path) -> None:
+        """Write the learned numbers and the network with them."""
         write_fitted(content, network, learned.measurements, folder, out)
 
     summary = {**content, "held_out_rows": learned.held_out, **_convert_comparison(learned)}
@@ -231,15 +258,16 @@ def _convert_comparison(learned: "Learned") -> "dict[str, Json]":
             "best": loss.best,
             "memory_p": loss.memory.likelihood_p,
             "laws": {
-                law: {key: _share(s) for key, s in separate.shares().items()} for law, separate in loss.laws.items()
+                name_of_law: {key: _convert_share(share) for key, share in law.shares().items()}
+                for name_of_law, law in loss.laws.items()
             },
-            "gains": {law: said.gain for law, said in loss.held_out.items()},
+            "gains": {name_of_law: score.gain for name_of_law, score in loss.held_out.items()},
         }
         for name, loss in learned.losses.items()
     }
     return {"filters": filters, "losses": losses}
 
 
-def _share(share: "Share") -> "dict[str, Json]":
-    """Convert a share; null if nothing was counted."""
+def _convert_share(share: "Share") -> "dict[str, Json]":
+    """Return a share and its interval by name; None if nothing was counted."""
     return {key: value if isfinite(value) else None for key, value in share._asdict().items()}

@@ -40,7 +40,6 @@ def inspect(
 
         loaded = load_network(network)
         names = {name: node.received_names for name, node in loaded.nodes.items()} | {"inputs": loaded.inputs}
-    # What there is, and what to paste.
     topics, broken = _collect_topics(recording, seconds, dbc)
     _print_table(topics)
     if topics:
@@ -50,7 +49,7 @@ def inspect(
 
 
 def _collect_topics(recording: str, seconds: float, dbc: Path | None) -> "tuple[dict[str, Topic], str]":
-    """Look at the bag, or listen for a while; return the topics, and what is broken in the bag."""
+    """Return the topics of files, or of a broker after listening to it for a while, and what is broken in the files."""
     from heliograph.files.inspection import inspect_bag, inspect_file, inspect_folder, inspect_log
     from heliograph.files.logs.log import is_log
     from heliograph.files.messages.folder import is_folder

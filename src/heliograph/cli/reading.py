@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from heliograph.report.progress import Advance
     from heliograph.simulation.network import Network
 
-SAID = 3  # reasons in a line
+REASONS = 3  # reasons in a line
 WINDOW = 10.0  # how late a message may be, as of `heliograph serve`
 
 
@@ -83,10 +83,18 @@ def read_measured(
     options: ReadingOptions,
     advance: "Advance",
 ) -> list[Measured]:
-    """Read the measured data of each plant: the same rows, whatever is done with them.
+    """Return the measured data of each plant, from a table, messages or a store.
+
+    Args:
+        location: a file or folder, or the address of a store.
+        reference: the user's name of the network, for errors.
+        network: the network.
+        module: its file's names, such as `sources`, by which messages are read.
+        options: as typed.
+        advance: called with the progress.
 
     Raises:
-        ValueError: what cannot be read; options of messages, and rows of time; a plant that is not there.
+        ValueError: what cannot be read; an option of messages where there are rows of time; a plant that is not there.
     """
     from heliograph.numerics.check import fail
 
@@ -98,14 +106,14 @@ def read_measured(
         return [read_rows(path, network, options)]
     wanted = events.plants if options.plant is None else [options.plant]
     measured = [_convert_events(events.of(plant), plant, options) for plant in wanted]
-    # What was read is said once.
+    # What is said of the whole reading is said with one plant: warnings with the first, notes with the last.
     measured[0].warnings.extend(describe_unread(path, events))
     measured[-1].summary.extend(events.notes)
     return measured
 
 
 def open_measured(location: "Path | StoreAddress") -> "Path | StoreTable":
-    """Return the file, or what a store answers."""
+    """Return the path itself, or the table that a store answers."""
     if isinstance(location, Path):
         return location
     from heliograph.files.stores.tables import ask_store
@@ -157,32 +165,34 @@ def read_events(
 
 
 def read_rows(path: "Path | StoreTable", network: "Network", options: ReadingOptions) -> Measured:
-    """Read rows of time, and say which of them could not be read."""
+    """Return the rows of time of a table, with warnings on those that could not be read."""
     from heliograph.files.recording import read_recording_rows
 
     with warnings.catch_warnings(record=True) as doubts:
         warnings.simplefilter("always", UserWarning)
         recording, refused, notes = read_recording_rows(path, network, options.strict, options.ignore_unknown)
-    lines = [describe_refused(path, "rows", len(refused), refused[:SAID])] if refused else []
+    lines = [describe_refused(path, "rows", len(refused), refused[:REASONS])] if refused else []
     return Measured("", recording, warnings=[*lines, *notes, *(str(doubt.message) for doubt in doubts)])
 
 
 def _convert_events(events: "EventTable", plant: str, options: ReadingOptions) -> Measured:
-    """Return the rows of a plant, and the verdicts on its events by node."""
+    """Return the rows of a plant from its events, with a line by node on how many events were used, late or lost."""
     import numpy as np
 
     window, ahead = options.limits
     (counts, lost), absent = events.judge(window, ahead), events.count_absent(window, ahead)
     lines = []
     for node, verdicts in counts.items():
+        # Of the used ones, those without a value are said apart.
         numbers = verdicts | {"used": verdicts["used"] - absent[node], "without a value": absent[node]}
-        said = [f"{count} {verdict}" for verdict, count in numbers.items() if count]
-        said += [f"{lost[node]} lost"] if lost.get(node) else []
-        lines.append(f"{plant + ', ' if plant else ''}{node}: {', '.join(said)}")
+        parts = [f"{count} {verdict}" for verdict, count in numbers.items() if count]
+        if lost.get(node):
+            parts.append(f"{lost[node]} lost")
+        lines.append(f"{plant + ', ' if plant else ''}{node}: {', '.join(parts)}")
     recording, rows = events.rows(window, ahead)
     if events.dated:
         lines.append(f"times in seconds since {np.datetime_as_string(events.date, timezone='UTC')}")
-    return Measured(plant, recording, rows, events, lines)
+    return Measured(plant, recording, rows, events, summary=lines)
 
 
 def describe_unread(path: object, events: "EventTable") -> list[str]:

@@ -70,8 +70,8 @@ def replay(
     try:
         for arrival, line in merge(*sent, key=lambda pair: pair[0]):
             first = arrival if first is None else first
-            while speed is not None and (ahead := begun + (arrival - first) / speed - monotonic()) > 0:
-                sleep(min(ahead, LONGEST))
+            while speed is not None and (early := begun + (arrival - first) / speed - monotonic()) > 0:
+                sleep(min(early, LONGEST))
             print(line, flush=speed is not None)
         sys.stdout.flush()
     except BrokenPipeError:  # nobody reads any more
@@ -81,9 +81,9 @@ def replay(
 def _read_events(
     location: Path | StoreAddress, reference: str, options: ReadingOptions
 ) -> "Iterator[tuple[str, list[Event], np.datetime64 | None]]":
-    """Yield the events of each plant with its name, and the date of time 0, None where times are no dates.
+    """Yield name, events and date of time 0 of each plant; the date is None where times are no dates.
 
-    A recording is a table of events, or one of rows (`read_events` finds none then), which are those of one plant.
+    A recording has events, or rows of time, which are one plant's: then `read_events` returns None.
     """
     from heliograph.disk.quoting import visible
     from heliograph.files.network_file import load_module
@@ -91,7 +91,11 @@ def _read_events(
 
     network, module = load_module(reference)
     path = open_measured(location)
-    table = read_events(path, reference, network, module, options, lambda *_: None)  # a pipe shows no progress
+
+    def no_progress(what: str, done: int = 0, total: int = 0) -> None:
+        """Show nothing: the standard output is a pipe."""
+
+    table = read_events(path, reference, network, module, options, no_progress)
     if table is None:
         rows = read_rows(path, network, options)
         for line in [*rows.warnings, *_describe_finer(path, rows.recording.time)]:
@@ -102,13 +106,16 @@ def _read_events(
 
     from heliograph.cli.reading import describe_unread
 
-    times = [table.of(name).columns[node].time for name in table.plants for node in table.of(name).columns]
-    finer = _describe_finer(path, np.concatenate(times).astype("datetime64[ns]")) if table.dated else []
+    finer: list[str] = []
+    if table.dated:
+        times = [columns.time for name in table.plants for columns in table.of(name).columns.values()]
+        finer = _describe_finer(path, np.concatenate(times).astype("datetime64[ns]"))
     for line in [*describe_unread(path, table), *table.notes, *finer]:
         print(f"heliograph: {visible(line)}", file=sys.stderr)
     for name in table.plants:
         events = table.of(name)
-        yield name, list(events.sort_events()), None if events.steps or events.numbers else events.date
+        has_dates = not events.steps and not events.numbers
+        yield name, list(events.sort_events()), events.date if has_dates else None
 
 
 def _describe_finer(path: "Path | StoreTable", time: "np.ndarray") -> list[str]:

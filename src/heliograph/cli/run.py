@@ -145,9 +145,9 @@ def _check_options(
 
 
 def _describe_results(record: "Record", out: Path | StoreAddress | None, report: Path | None) -> list[str]:
-    """Describe what was written where in a line, and the errors of each filter."""
+    """Return a line on what was written where, and one on the errors of each filter."""
     filters = [
-        f"{node}/{name} ({_claim(estimate)})"
+        f"{node}/{name} ({_describe_claim(estimate)})"
         for node, estimates in record.estimates.items()
         for name, estimate in estimates.items()
     ]
@@ -156,27 +156,27 @@ def _describe_results(record: "Record", out: Path | StoreAddress | None, report:
 
 
 def _describe_errors(record: "Record") -> list[str]:
-    """Compare each filter with the truth, a line each: RMSE by state, and NEES, which is 1 where the claim holds."""
+    """Return a line on the errors of each filter if the truth is known: RMSE by state, and NEES (1: claim holds)."""
     from heliograph.report.outputs import compare_with_truth, round_to
 
     lines = []
     for errors in compare_with_truth(record):
-        rmse = ", ".join(
-            f"of {state} {round_to(value, errors.rmse_error[state])}" for state, value in errors.rmse.items()
-        )
-        size = "" if isnan(errors.nees) else f"; NEES per state {errors.nees:.3g}"
-        lines.append(f"{errors.node}/{errors.filter}: RMSE {rmse}{size}")
+        parts = [f"of {state} {round_to(value, errors.rmse_error[state])}" for state, value in errors.rmse.items()]
+        nees = "" if isnan(errors.nees) else f"; NEES per state {errors.nees:.3g}"
+        lines.append(f"{errors.node}/{errors.filter}: RMSE {', '.join(parts)}{nees}")
     return lines
 
 
-def _claim(estimate: "Estimate") -> str:
-    """Claim of the estimates, and of how many rows nothing is."""
-    lost = int((estimate.claims == "none").sum())
-    return estimate.claim if estimate.claim == "none" or not lost else f"{estimate.claim}, none of {lost} rows"
+def _describe_claim(estimate: "Estimate") -> str:
+    """Return what estimates claim, and in how many rows they claim nothing, such as "exact, none of 3 rows"."""
+    without = int((estimate.claims == "none").sum())
+    if estimate.claim == "none" or not without:
+        return estimate.claim
+    return f"{estimate.claim}, none of {without} rows"
 
 
 def _check_places(measurements: Path | StoreAddress, out: Path | StoreAddress | None, report: Path | None) -> None:
-    """Check before the work starts that files can be read and written, and that what that takes is installed."""
+    """Check before the work starts that packages for these files are installed, and that they can be written."""
     from heliograph.disk.whole_file import FORMATS, check_output
     from heliograph.files.logs.log import PACKAGES
     from heliograph.numerics.check import fail
@@ -205,7 +205,7 @@ def _check_places(measurements: Path | StoreAddress, out: Path | StoreAddress | 
 def _check_kept(
     measurements: Path | StoreAddress, out: Path | StoreAddress | None, network: "Network", sources: object
 ) -> None:
-    """Refuse estimates in place of a file of measurements in a folder."""
+    """Raise ValueError if estimates would replace one of the files that are read from a folder of measurements."""
     from heliograph.files.messages.folder import is_folder, list_used_files
     from heliograph.files.sources.sources import Sources
     from heliograph.numerics.check import fail
@@ -224,19 +224,22 @@ def _write_report(name: str, network: "Network", plants: "Sequence[FilteredPlant
     from heliograph.report.results import Results, write_results
 
     def examine_plant(plant: "FilteredPlant", advance: "Advance") -> Health:
+        """Return the diagnosis of a plant, with its forecasts and residuals."""
         record, inputs = plant.record, plant.data.recording.inputs
         residuals = heliograph.forecasting.record_residuals(record, inputs) if plant.predicted else {}
         health = examine(network, record, inputs, advance)
         return replace(health, forecasts=plant.forecasts, predicted=plant.predicted, residuals=residuals)
 
-    def examined(advance: "Advance") -> dict[str, Health]:
+    def examine_plants(advance: "Advance") -> dict[str, Health]:
+        """Return the diagnosis of each plant, by name."""
         return {plant.data.plant: examine_plant(plant, advance) for plant in plants}
 
     def results_of(health: dict[str, Health]) -> Results:
+        """Return the content of the results folder: of one plant its page, of several an overview and folders."""
         from heliograph.report.pages.run import make_results_of_plants, make_run_results
 
         (first, *more) = health.values()
         return make_results_of_plants(health, name) if more else make_run_results(first, name)
 
     count = len(plants) * sum(map(len, network.claims().values()))
-    write_results(report, count, examined, results_of)
+    write_results(report, count, examine_plants, results_of)

@@ -106,7 +106,7 @@ class ServeOptions:
         return settings if self.node is None else settings_of_node(settings, self.node)
 
     def _read_states(self) -> "StateTopics | None":
-        """Return where single states go.
+        """Return the topics under which single states are published, by --states and --discovery; None without.
 
         Raises:
             ValueError: an address that is none of MQTT; discovery without one, or a topic that is none.

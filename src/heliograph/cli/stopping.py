@@ -26,29 +26,30 @@ def stoppable(stopped: list[int]) -> Iterator[None]:
     by a timer.
     """
 
-    # Both raise KeyboardInterrupt, which nobody takes for an error, and are recorded.
     def interrupt(number: int, _: FrameType | None) -> NoReturn:
+        """Record a signal, and raise what nobody takes for an error."""
         stopped.append(number)
         raise KeyboardInterrupt
 
-    # Interrupts that Python can only report are raised again a little later.
-    def swallowed(what: "sys.UnraisableHookArgs") -> None:
+    def interrupt_later(what: "sys.UnraisableHookArgs") -> None:
+        """Raise an interrupt that Python can only report again, a little later; report all else as before."""
         if issubclass(what.exc_type, KeyboardInterrupt):
-            again.append(Timer(SOON, interrupt_main))  # not here: it would be swallowed once more
-            again[-1].daemon = True
-            again[-1].start()
+            timer = Timer(SOON, interrupt_main)  # raised here, it would be swallowed once more
+            timer.daemon = True
+            timers.append(timer)
+            timer.start()
         else:
-            known(what)
+            report_before(what)
 
-    again: list[Timer] = []
-    known, sys.unraisablehook = sys.unraisablehook, swallowed
+    timers: list[Timer] = []
+    report_before, sys.unraisablehook = sys.unraisablehook, interrupt_later
     try:
         with handlers(interrupt):
             yield
     finally:
-        for timer in again:
+        for timer in timers:
             timer.cancel()
-        sys.unraisablehook = known
+        sys.unraisablehook = report_before
 
 
 class GentleStop:
@@ -59,14 +60,14 @@ class GentleStop:
     """
 
     def __init__(self) -> None:
-        self._number = 0
-        self._before: dict[int, object] = {}
+        self._number = 0  # of the first signal; 0 for none
+        self._handlers: dict[int, object] = {}  # of each signal before `begin`, to be put back
 
     def __enter__(self) -> "GentleStop":
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self._give_back()
+        self._restore_handlers()
 
     @property
     def requested(self) -> bool:
@@ -80,9 +81,9 @@ class GentleStop:
 
     def begin(self) -> None:
         """Only note the next signal."""
-        if not self._before and not self._number:
-            self._before = {number: signal.getsignal(number) for number in STOPPING}
-            for number, handler in self._before.items():
+        if not self._handlers and not self._number:
+            self._handlers = {number: signal.getsignal(number) for number in STOPPING}
+            for number, handler in self._handlers.items():
                 if handler is not signal.SIG_IGN:
                     signal.signal(number, self._note)
 
@@ -101,18 +102,21 @@ class GentleStop:
         except KeyboardInterrupt:
             if not self._number:
                 raise
-        self._give_back()
+        self._restore_handlers()
         return None
 
     def _interrupt(self, number: int, _: FrameType | None) -> NoReturn:
+        """Note a signal, and end what is running."""
         self._number = self._number or number
         raise KeyboardInterrupt
 
     def _note(self, number: int, _: FrameType | None) -> None:
+        """Note a signal; the next one has its effect of before."""
         self._number = self._number or number
-        self._give_back()
+        self._restore_handlers()
 
-    def _give_back(self) -> None:
-        for number, handler in self._before.items():
+    def _restore_handlers(self) -> None:
+        """Give signals the handlers back that they had before `begin`."""
+        for number, handler in self._handlers.items():
             signal.signal(number, handler)  # type: ignore[arg-type]
-        self._before = {}
+        self._handlers = {}

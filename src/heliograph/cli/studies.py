@@ -87,43 +87,56 @@ def reproduce(
     if method == "all" and changes:
         raise fail("--set", "one publication, whose settings these are", "all")
     names = list(list_studies("publication")) if method == "all" else [method]
-    run(names, out, collect_changes(changes, runs=runs, seed=seed), "publication", "" if method == "all" else method)
+    own_folder = "" if method == "all" else method
+    run(names, out, collect_changes(changes, runs=runs, seed=seed), "publication", own_folder)
 
 
 def run(
-    names: Sequence[str], out: Path | None, values: Mapping[str, str], kind: str, within: str | None = None
+    names: Sequence[str], out: Path | None, values: Mapping[str, str], kind: str, own_folder: str | None = None
 ) -> None:
-    """Run studies of a kind one after another, each into its folder in `out`, which may end in `within` itself.
+    """Run studies of a kind one after another, each into its own folder in `out`.
+
+    Args:
+        names: of the studies.
+        out: the folder; if it is named `own_folder` it is the study's own.
+        values: other settings, by name.
+        kind: "publication" or "example".
+        own_folder: name of the study's own folder; that of the first study by default.
 
     Raises:
         ValueError: an unknown study or setting, a value of the wrong kind, a folder that cannot be written.
     """
-    from heliograph.numerics.check import fail
     from heliograph.numerics.process.extras import check_installed
     from heliograph.report.results import NEEDS
 
     known = list_studies(kind)
+    _check_names(names, known, kind)
+    check_installed([package for name in names for package in (*NEEDS, *read_needs(known[name].module))])
+    target = folder("reproduce" if kind == "publication" else kind, out, names[0] if own_folder is None else own_folder)
+    studies = {name: load(known[name]) for name in names}
+    # All settings are checked before any work.
+    settings = {name: change_settings(name, study, values, kind) for name, study in studies.items()}
+    import jax
+
+    for name, study in studies.items():
+        study.run(settings[name], target)
+        # No study uses another's compiled programs; those of all together would be gigabytes.
+        jax.clear_caches()  # type: ignore[no-untyped-call]
+
+
+def _check_names(names: Sequence[str], known: Mapping[str, EntryPoint], kind: str) -> None:
+    """Raise ValueError for the first name that is no study of this kind; it may be a page of the documentation now."""
+    from heliograph.numerics.check import fail
+
     for name in names:
         if name not in known:
             expected = ", ".join(known) + (" or all" if kind == "publication" else "")
             page = f", a page now: docs/{PAGES[name]}" if kind == "example" and name in PAGES else ""
             raise fail("method" if kind == "publication" else kind, f"one of {expected}", f"{name!r}{page}")
-    check_installed([name for study in names for name in (*NEEDS, *read_needs(known[study].module))])
-    target = folder("reproduce" if kind == "publication" else kind, out, names[0] if within is None else within)
-    studies = {name: load(known[name]) for name in names}
-    settings = {
-        name: change_settings(name, study, values, kind) for name, study in studies.items()
-    }  # all before any work
-    import jax
-
-    for name, study in studies.items():
-        study.run(settings[name], target)
-        # One study's programs are no other's: kept, those of all are gigabytes.
-        jax.clear_caches()  # type: ignore[no-untyped-call]
 
 
 def change_settings(name: str, study: Study, values: Mapping[str, str], kind: str) -> Any:
-    """Return a study's settings with other values; an option that it has no setting for is called by its name.
+    """Return a study's settings with other values; an error names the option by which a wrong value was given.
 
     Raises:
         ValueError: no such setting, or a value that is none.
@@ -156,8 +169,10 @@ def collect_changes(changes: Sequence[str] | None, **options: object) -> dict[st
     for name, value in options.items():
         if value is not None:
             values[name] = Option(value)
-            if name in ("seed", "runs"):
-                (check_seed if name == "seed" else check_count)(f"--{name}", value)
+            if name == "seed":
+                check_seed("--seed", value)
+            elif name == "runs":
+                check_count("--runs", value)
     # Changes by --set, each name once.
     for text in changes or ():
         name, equals, value = text.partition("=")

@@ -48,5 +48,5 @@ def join_names(names: Sequence[str]) -> str:
 
 
 def label_with_unit(name: str, units: Mapping[str, str]) -> str:
-    """Label of a state or of time, with its unit if it has one."""
+    """Return the label of a state or of time for a figure, with its unit if it has one."""
     return quote_for_figure(f"{name} ({units[name]})" if name in units else name)

@@ -52,13 +52,10 @@ def only_here(folder: Path) -> Iterator[bool]:
                 os.close(handle)
                 yield False
                 return
-            # The path must still name the locked file: another process may have removed it.
-            with suppress(FileNotFoundError):
-                if os.path.sameopenfile(handle, other := os.open(path, os.O_RDONLY)):
-                    os.close(other)
-                    break
-                os.close(other)
-            os.close(handle)  # a holder before us has removed the file that we opened
+            # The path must still name the locked file: a holder before us may have removed the one that we opened.
+            if _names_open_file(path, handle):
+                break
+            os.close(handle)
         try:
             yield True
         finally:
@@ -68,6 +65,16 @@ def only_here(folder: Path) -> Iterator[bool]:
         for missing in made:
             with suppress(OSError):  # something is in it
                 missing.rmdir()
+
+
+def _names_open_file(path: Path, handle: int) -> bool:
+    """Return whether a path is that of an open file."""
+    with suppress(FileNotFoundError):
+        other = os.open(path, os.O_RDONLY)
+        same = os.path.sameopenfile(handle, other)
+        os.close(other)
+        return same
+    return False
 
 
 def _try_lock(handle: int) -> bool:
@@ -105,7 +112,7 @@ def replace(partial: Path, path: Path) -> None:
 
 @contextmanager
 def naming(path: Path | str) -> Iterator[None]:
-    """Add the path to errors of the system that lack one, such as that of a full disk."""
+    """Within this context, add the path to errors of the system that lack one, such as that of a full disk."""
     try:
         yield
     except OSError as error:
@@ -126,7 +133,7 @@ def whole_files(paths: Sequence[Path]) -> Iterator[list[Path]]:
     """Yield temporary files next to several small ones, which they replace together, or not at all after an error."""
     partials = [path.with_name(f".{path.name}.{os.getpid()}.partial") for path in paths]
     for path in paths:
-        _clear(path)
+        _clear_partial(path)
     replaced: list[tuple[Path, bytes | None]] = []
     try:
         with naming(paths[0]):
@@ -149,8 +156,8 @@ def whole_files(paths: Sequence[Path]) -> Iterator[list[Path]]:
         raise
 
 
-def _clear(path: Path) -> None:
-    """Remove temporary files of processes that no longer run."""
+def _clear_partial(path: Path) -> None:
+    """Remove the temporary files next to `path` of processes that no longer run."""
     for left in path.parent.glob(f".{glob_escape(path.name)}.*.partial"):
         if not _is_running(left.name.split(".")[-2]):
             left.unlink(missing_ok=True)
@@ -225,23 +232,23 @@ def whole_folder(target: Path) -> Iterator[Path]:
     """
     clear_left(target)
     made = [folder for folder in target.parents if not folder.exists()]
-    partial, mine = target.parent, ExitStack()
+    partial, lock = target.parent, ExitStack()  # the parent until there is a temporary folder
     try:
         # Write to a temporary folder in the same file system.
         with hold_signals():
             target.parent.mkdir(parents=True, exist_ok=True)
             partial = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
             (partial / "new").mkdir()
-            mine.enter_context(try_lock(partial))
-        with mine, naming(target):
+            lock.enter_context(try_lock(partial))
+        with lock, naming(target):
             yield partial / "new"
             sync_tree(partial / "new")
         with hold_signals():
-            _swap(partial, target)
+            _replace_folder(partial, target)
     except BaseException:
         # Undo: restore earlier results, remove everything that was made.
         with hold_signals():
-            mine.close()
+            lock.close()
             if (partial / "old").exists() and not target.exists():
                 (partial / "old").rename(target)
             if partial != target.parent:
@@ -252,8 +259,8 @@ def whole_folder(target: Path) -> Iterator[Path]:
         raise
 
 
-def _swap(partial: Path, target: Path) -> None:
-    """Put the new folder in the place of the old one by two renames, and remove that."""
+def _replace_folder(partial: Path, target: Path) -> None:
+    """Put the new folder of `partial` in place of `target` by two renames, and remove the old one."""
     if target.exists():
         target.rename(partial / "old")
     (partial / "new").rename(target)
@@ -262,8 +269,13 @@ def _swap(partial: Path, target: Path) -> None:
 
 
 def clear_left(target: Path) -> None:
-    """Remove the temporary folders next to `target` that killed processes left, none that a running process uses."""
-    for left in target.parent.glob(f".{glob_escape(target.name)}-*") if target.parent.is_dir() else ():
+    """Remove the temporary folders next to `target` that killed processes left, none that a running process uses.
+
+    A folder with something else in it is nobody's of ours. Earlier results that were moved aside are put back.
+    """
+    if not target.parent.is_dir():
+        return
+    for left in target.parent.glob(f".{glob_escape(target.name)}-*"):
         if not re.fullmatch(r"-[a-z0-9_]{8}", left.name.removeprefix(f".{target.name}")) or not left.is_dir():
             continue
         with try_lock(left) as ours:

@@ -26,8 +26,8 @@ from heliograph.simulation.network import Network
 PRECISIONS: dict[str, Real] = {"double": "double", "float": "float"}
 COMPILER = "cc"
 FLAGS = ("-std=c99", "-pedantic", "-Wall", "-Werror", "-O2")
-STEPS = 200_000
-REPEATS = 5
+STEPS = 200_000  # that are timed in each round
+REPEATS = 5  # rounds, of which the fastest counts
 
 
 class Exported(NamedTuple):
@@ -117,7 +117,11 @@ def write_filter(
 
 
 def check_place(path: str | Path) -> Path:
-    """Check the path of the source, whose name is the prefix of the names in it."""
+    """Return the path of the source, checked: its name is the prefix of the names in it.
+
+    Raises:
+        ValueError: a file that does not end in .c, cannot be written, or whose name C does not take for a function.
+    """
     if not isinstance(path, str | Path):
         raise fail("path of the source", "a file that ends in .c", show_value(path))
     source = Path(path)
@@ -132,12 +136,13 @@ def check_place(path: str | Path) -> Path:
 def make_text(
     filter: AbstractFilter, received: Sequence[str], prefix: str, real: Real, apart: bool = False, size: bool = False
 ) -> CText:
-    """Return the text of both files of a filter; for its `size` the shorter of those in loops and written out."""
+    """Return the text of both files of a filter; for `size` the shorter of two forms, in loops and written out."""
     kind = f"a {type(filter).__name__} in {'double' if real == 'double' else 'single'} precision"
     if real == "float" and not (isinstance(filter, ScheduledFilter) or carries_factors(filter)):
         expected = "a filter that carries its covariance as factors L D L', or a schedule of gains"
         raise fail("single precision", expected, type(filter).__name__)
-    exported, form = filter if real == "double" else filter.for_single_precision(), Form(prefix, real, received, kind)
+    exported = filter if real == "double" else filter.for_single_precision()
+    form = Form(prefix, real, received, kind)
     texts = list[CText]()
     try:
         for short in (True, False) if size else (False,):
@@ -162,7 +167,7 @@ class Cost(NamedTuple):
 
 
 def measure_cost(header: Path, source: Path, received: int, inputs: int, real: Real) -> Cost:
-    """Compile and time a step, in a temporary folder."""
+    """Return the bytes of code and the time of a step, compiled in a temporary folder."""
     compiler = shutil.which(COMPILER)
     if compiler is None:
         return Cost(None, None)
@@ -171,26 +176,32 @@ def measure_cost(header: Path, source: Path, received: int, inputs: int, real: R
         for path in (header, source):
             shutil.copy(path, folder)
         (folder / "main.c").write_text(_write_timer(name, received, inputs, real), encoding="utf-8")
-        _run(compiler, *FLAGS, "-c", source.name, "-o", "step.o", folder=folder)
+        _run_command(compiler, *FLAGS, "-c", source.name, "-o", "step.o", folder=folder)
         timer = ["-D_POSIX_C_SOURCE=199309L", *FLAGS, "main.c", "step.o", "-lm", "-o", "timer"]
-        _run(compiler, *timer, folder=folder)
-        return Cost(_measure_code(folder), float(_run(str(folder / "timer"), folder=folder)))
+        _run_command(compiler, *timer, folder=folder)
+        return Cost(_measure_code(folder), nanoseconds=float(_run_command(str(folder / "timer"), folder=folder)))
 
 
 def _measure_code(folder: Path) -> int | None:
     """Return the bytes of text and constants of the object file, without debugging data."""
     if shutil.which("size") is None:
         return None
-    sections = re.findall(r"^(\S+)\s+(\d+)\s+\d+$", _run("size", "-A", "step.o", folder=folder), re.MULTILINE)
+    # Lines of name, size and address.
+    listed = _run_command("size", "-A", "step.o", folder=folder)
+    sections = re.findall(r"^(\S+)\s+(\d+)\s+\d+$", listed, re.MULTILINE)
     return sum(int(size) for name, size in sections if name.startswith((".text", ".rodata", "__text", "__const")))
 
 
-def _run(*command: str, folder: Path) -> str:
+def _run_command(*command: str, folder: Path) -> str:
+    """Run a command in a folder, and return what it prints."""
     return subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout
 
 
 def _write_timer(name: str, received: int, inputs: int, real: Real) -> str:
-    """Return a program that prints the time of a step. After a refusal (the end of a horizon) it starts again."""
+    """Return a C program that prints the nanoseconds of a step, by the fastest of REPEATS rounds of STEPS steps.
+
+    Where a step is refused, as past the end of a schedule, it starts again.
+    """
     return f"""#include <stdio.h>
 #include <time.h>
 #include "{name}.h"

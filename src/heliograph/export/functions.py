@@ -5,7 +5,7 @@ from heliograph.export.program import Real, StepProgram
 
 
 def list_heads(program: StepProgram, prefix: str, real: Real) -> list[str]:
-    """Return the heads of the functions that move the state."""
+    """Return the heads of the functions that move the state: of the step, or also of its parts, the step last."""
     state = f"{prefix}_state *state"
     step = f"int {prefix}_step({state}, const {real} z[], const {real} u[])"
     if len(program.parts) == 1:
@@ -17,7 +17,7 @@ def list_heads(program: StepProgram, prefix: str, real: Real) -> list[str]:
 
 
 def declare_innovation(program: StepProgram, prefix: str, real: Real) -> str:
-    """Declare what a correction tells beside the estimate; nothing of a whole step."""
+    """Return the declaration of what a correction tells beside the estimate; "" of a whole step."""
     if len(program.parts) == 1:
         return ""
     count = max(program.filter.received, 1)
@@ -29,7 +29,7 @@ def declare_innovation(program: StepProgram, prefix: str, real: Real) -> str:
 
 
 def explain_parts(program: StepProgram, prefix: str) -> list[str]:
-    """Explain the functions that are apart, for a reader of the header."""
+    """Return lines for the header on the functions that are apart."""
     lines = [
         "",
         f"{prefix}_step is {prefix}_predict and {prefix}_correct, which may be called apart: predict at each step of",
@@ -50,11 +50,19 @@ def explain_parts(program: StepProgram, prefix: str) -> list[str]:
 
 
 def write_functions(program: StepProgram, prefix: str, real: Real) -> list[str]:
-    """Write the functions that move the state; each writes it only where nothing is refused."""
+    """Return the text of the functions that move the state, in the order of `list_heads`.
+
+    Each writes the state only where nothing is refused.
+    """
     heads = list_heads(program, prefix, real)
     if len(program.parts) == 1:
-        body = [*_check_inputs(program, both=True), *_compute(program, 0, prefix), "    return 0;"]
-        return [_join(heads[0], body)]
+        body = [
+            *_check_measurement(program),
+            *_check_inputs(program),
+            *_compute(program, 0, prefix),
+            "    return 0;",
+        ]
+        return [_join_function(heads[0], body)]
     predict = [*_check_inputs(program), *_compute(program, 0, prefix), "    return 0;"]
     correct = [*_check_measurement(program), *_compute(program, 1, prefix), "    return 0;"]
     step = [
@@ -66,26 +74,26 @@ def write_functions(program: StepProgram, prefix: str, real: Real) -> list[str]:
         "    *state = after;",
         "    return 0;",
     ]
-    begun = [] if program.at is None else [_write_start(program, prefix)]
-    return [_join(head, body) for head, body in zip(heads, [*begun, predict, correct, step], strict=True)]
+    start = [] if program.at is None else [_write_start(program, prefix)]
+    return [_join_function(head, body) for head, body in zip(heads, [*start, predict, correct, step], strict=True)]
 
 
-def _join(head: str, body: list[str]) -> str:
+def _join_function(head: str, body: list[str]) -> str:
+    """Return the text of a function from its head and the lines of its body."""
     return "\n".join([head, "{", *body, "}"])
 
 
 def _check_measurement(program: StepProgram) -> list[str]:
+    """Return the statements that refuse infinite components of a measurement."""
     return [f"    if (isinf(z[{i}]) != 0) {{ return 1; }}" for i in range(program.filter.received)]
 
 
-def _check_inputs(program: StepProgram, both: bool = False) -> list[str]:
-    """Return the statements that refuse inputs, and a step past the end; of a whole step measurements first."""
-    filter = program.filter
-    lines = _check_measurement(program) if both else []
-    lines += [f"    if (!isfinite(u[{i}])) {{ return 2; }}" for i in range(len(filter.inputs))]
-    return (
-        [*lines, f"    if (state->step >= {filter.horizon}) {{ return 3; }}"] if filter.horizon is not None else lines
-    )
+def _check_inputs(program: StepProgram) -> list[str]:
+    """Return the statements that refuse inputs that are not finite, and a step past the end."""
+    lines = [f"    if (!isfinite(u[{i}])) {{ return 2; }}" for i in range(len(program.filter.inputs))]
+    if program.filter.horizon is not None:
+        lines.append(f"    if (state->step >= {program.filter.horizon}) {{ return 3; }}")
+    return lines
 
 
 def _compute(program: StepProgram, number: int, prefix: str) -> list[str]:
@@ -93,17 +101,17 @@ def _compute(program: StepProgram, number: int, prefix: str) -> list[str]:
     part, code = program.parts[number], program.computes[number]
     read = [f"state->{m.name}" + ("" if m.start.ndim else "[0]") for m in program.read]
     written = [*(f"after.{m.name}" for m in program.members), *(_place_beside(name) for name in part.beside)]
-    arguments = [*read, *part.data, _say_step(program, part), *written]
+    arguments = [*read, *part.data, _write_step_number(program, part), *written]
     flags = [name for name in part.beside if name in ("implausible", "spoilt")]
-    told = part.name == "correct"
+    corrects = part.name == "correct"
     # A correction is of the step that was predicted; the others count it.
-    step = "state->step" if told else "state->step + 1"
+    step = "state->step" if corrects else "state->step + 1"
     return [
         f"    {prefix}_state after;",
-        *([f"    {prefix}_innovation news;"] if told else []),
+        *([f"    {prefix}_innovation news;"] if corrects else []),
         *(f"    unsigned char {name}[1];" for name in flags),
         f"    {code.name}(\n        " + ",\n        ".join(arguments) + ");",
-        *(["    if (innovation != NULL) { *innovation = news; }"] if told else []),
+        *(["    if (innovation != NULL) { *innovation = news; }"] if corrects else []),
         *(["    if (spoilt[0] != 0U) { return 6; }"] if "spoilt" in flags else []),
         f"    for (int i = 0; i < {len(program.filter.states)}; ++i) {{",
         f"        if (!isfinite(after.{program.mean}[i])) {{ return 4; }}",
@@ -115,14 +123,17 @@ def _compute(program: StepProgram, number: int, prefix: str) -> list[str]:
 
 
 def _place_beside(name: str) -> str:
-    """Return where what stands beside the state is written to: flags are local, the others a caller's to have."""
+    """Return the C expression for where a result beside the state is written: flags are local, others in `news`."""
     if name in ("implausible", "spoilt"):
         return name
     return f"&news.{name}" if name in ("nis", "arrived") else f"news.{name}"
 
 
-def _say_step(program: StepProgram, part: Part) -> str:
-    """Return the number of the step that a part belongs to."""
+def _write_step_number(program: StepProgram, part: Part) -> str:
+    """Return the C expression for the number of the step that a part belongs to.
+
+    A prediction counts the step: a correction's is one less than the state's count.
+    """
     if not program.counts:
         return "0"
     return "state->step > 0 ? state->step - 1 : 0" if part.name == "correct" else "state->step"

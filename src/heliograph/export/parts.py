@@ -18,10 +18,16 @@ PRECISION = {"double": np.float64, "float": np.float32}
 
 
 class Part(NamedTuple):
-    """A function from (arrays of the state, data, step number) to arrays of state and estimate, and what is `beside`.
+    """A function of arrays that becomes one of C: the step, its prediction or its correction.
 
-    `name` is that of the function in C, `data` what the data are: "z", "u" or both. `beside` has "implausible": the
-    estimate would lose its digits, and what was computed must not be used.
+    Args:
+        name: "step", "predict" or "correct".
+        data: names of the data, "z", "u" or both.
+        function: from (arrays of the state, data, number of the step) to arrays of the state, mean, covariance, and
+            what is `beside`.
+        examples: arguments that it takes.
+        beside: names of the other results. "implausible": the estimate would lose its digits, and what was computed
+            must not be used; "spoilt": an input has too few digits.
     """
 
     name: str
@@ -42,10 +48,10 @@ def parts_of_step(filter: AbstractFilter, real: str, apart: bool) -> list[Part]:
     if not apart:
         return [Part("step", ("z", "u"), _make_step(filter, tree, real), (leaves, z, u, k), ("implausible", "spoilt"))]
     weighs = filter.correct(filter.predict(filter.init(), u, 0), z, 0)[1].weight is not None
-    told = ("implausible", "value", "nis", "arrived", *(("weight",) if weighs else ()))
+    beside = ("implausible", "value", "nis", "arrived", *(("weight",) if weighs else ()))
     return [
         Part("predict", ("u",), _make_prediction(filter, tree, real), (leaves, u, k), ("implausible", "spoilt")),
-        Part("correct", ("z",), _make_correction(filter, tree, real), (leaves, z, k), told),
+        Part("correct", ("z",), _make_correction(filter, tree, real), (leaves, z, k), beside),
     ]
 
 
@@ -54,6 +60,7 @@ def _make_step(filter: AbstractFilter, tree: PyTree, real: str) -> Callable[...,
 
     @jax.jit
     def step(arrays: list[jax.Array], z: jax.Array, u: jax.Array, k: jax.Array) -> list[jax.Array]:
+        """Return state, estimate and two flags after a step."""
         after, estimate, judgement, innovation = filter.judge_step(jax.tree.unflatten(tree, arrays), z, u, k)
         implausible = find_implausible(innovation, z, ROUNDING[real]) | (judgement.input > 0)
         spoilt = do_inputs_spoil(filter, filter.inputs, u, k, PRECISION[real])
@@ -63,10 +70,11 @@ def _make_step(filter: AbstractFilter, tree: PyTree, real: str) -> Callable[...,
 
 
 def _make_prediction(filter: AbstractFilter, tree: PyTree, real: str) -> Callable[..., list[jax.Array]]:
-    """Return the function of the prediction alone."""
+    """Return the function of the prediction alone; `tree` is the structure of a state."""
 
     @jax.jit
     def predict(arrays: list[jax.Array], u: jax.Array, k: jax.Array) -> list[jax.Array]:
+        """Return state, estimate and two flags after a prediction."""
         before = jax.tree.unflatten(tree, arrays)
         prior = filter.predict(before, u, k)
         estimates = filter.estimate(before), filter.estimate(prior)
@@ -82,6 +90,7 @@ def _make_correction(filter: AbstractFilter, tree: PyTree, real: str) -> Callabl
 
     @jax.jit
     def correct(arrays: list[jax.Array], z: jax.Array, k: jax.Array) -> list[jax.Array]:
+        """Return state, estimate, a flag, and what a correction tells."""
         prior = jax.tree.unflatten(tree, arrays)
         after, innovation = filter.correct(prior, z, k)
         expected, estimate = filter.estimate(prior), filter.after_step(after, k)
@@ -89,17 +98,18 @@ def _make_correction(filter: AbstractFilter, tree: PyTree, real: str) -> Callabl
             filter.claim, (prior, after), (expected, estimate), innovation, z, filter.of_atoms
         )
         implausible = find_implausible(innovation, z, ROUNDING[real])
-        told = [innovation.value, judgement.distance, judgement.arrived]
+        beside = [implausible, innovation.value, judgement.distance, judgement.arrived]
         weight = [] if innovation.weight is None else [innovation.weight]
-        return [*jax.tree.leaves(after), estimate.mean, estimate.covariance, implausible, *told, *weight]
+        return [*jax.tree.leaves(after), estimate.mean, estimate.covariance, *beside, *weight]
 
     return correct
 
 
 def find_implausible(innovation: Innovation, z: jax.Array, rounding: float) -> jax.Array:
-    """Return whether some component is larger than expected and beyond the bound of its own deviations, which is cheap.
+    """Return whether some component is larger than expected, and too many of its own deviations away from that.
 
-    Of a filter whose innovation is of part of z, such as a neighbour's measurement, every far one counts.
+    The deviation of one component is cheap, where those of all together are not. Where the innovation is of a part of
+    z, such as a neighbour's measurement, every component that is so far away counts.
     """
     far, differs = Judgement.find_far(innovation), jnp.abs(jnp.asarray(innovation.value))
     if differs.shape == z.shape:

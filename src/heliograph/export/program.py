@@ -35,11 +35,18 @@ class Member(NamedTuple):
 class StepProgram(NamedTuple):
     """A step as functions of C.
 
-    `parts` are the whole step, or prediction and correction, and `computes` their functions: from `read`, the data and
-    the step's number to `members` and what is beside these. `initial` makes the first state; `at` that of a mean and a
-    covariance, None of a state that is more than these. `mean` and `covariance` name the members that hold the
-    estimate, which may be the filter's own; the others come last. `counts`: whether the step's number is part of the
-    state.
+    Args:
+        filter: the filter.
+        members: arrays of the state in C: those of the filter's state, then mean and covariance of the estimate, unless
+            these are arrays of the state themselves.
+        read: the members that a step reads: those of the filter's state.
+        parts: the whole step, or prediction and correction.
+        computes: their functions in C, from `read`, the data and the step's number to `members` and what is beside.
+        initial: the function in C that makes the first state.
+        at: the one that makes the state of a mean and a covariance; None of a state that is more than these.
+        mean: name of the member that holds the estimate's mean.
+        covariance: name of the member that holds its covariance.
+        counts: whether the step's number is part of the state.
     """
 
     filter: AbstractFilter
@@ -79,8 +86,8 @@ def write_step_program(
     try:
         symmetric = _find_symmetric(parts)
         wholes = [_write_part(part, symmetric, prefix, real, size) for part in parts]
-        # The estimate is a member of its own only if it is no array of the state.
-        places = [max(_place(n, whole, named) for whole in wholes) for n in (len(leaves), len(leaves) + 1)]
+        # Mean and covariance of the estimate are members of their own only if they are no arrays of the state.
+        places = [max(_find_same_result(n, whole, named) for whole in wholes) for n in (len(leaves), len(leaves) + 1)]
         kept = [*range(len(leaves)), *(n for n in places if n >= len(leaves))]
         members = [named[n] for n in kept]
         computes = [_write_part(part, symmetric, prefix, real, size, kept, (read, members)) for part in parts]
@@ -95,8 +102,8 @@ def write_step_program(
     return StepProgram(filter, members, read, parts, computes, initial, at, mean, covariance, counts)
 
 
-def _place(number: int, code: Any, named: Sequence[Member]) -> int:
-    """Return the first result that has the numbers of this one, before the first step too."""
+def _find_same_result(number: int, code: Any, named: Sequence[Member]) -> int:
+    """Return the first result that is always equal to this one, before the first step too; itself where none is."""
     same = [n for n in range(number) if code.results[n].same == code.results[number].same]
     start = named[number].start
     return next((n for n in same if np.array_equal(named[n].start, start, equal_nan=True)), number)
@@ -111,50 +118,66 @@ def _write_part(
     kept: Sequence[int] | None = None,
     names: tuple[Sequence[Member], Sequence[Member]] = ((), ()),
 ) -> Any:
-    """Write a part of a step as C; all but the measurement, of which components may be missing, is finite.
+    """Return a part of a step as a function of C; all its arguments but the measurement are finite.
 
-    `kept`: which arrays of state and estimate are results, all by default; `names`: of what is read and of these.
+    Args:
+        part: the part.
+        symmetric: which arrays of the state are symmetric.
+        prefix: of its name.
+        real: type of its numbers.
+        size: whether it is to be small, in loops.
+        kept: which arrays of state and estimate are results; all by default.
+        names: the members that are read, and those that are results.
     """
     count = len(part.examples[0])
 
-    def chosen(*arguments: Any) -> list[jax.Array]:
+    def choose_results(*arguments: Any) -> list[jax.Array]:
+        """Return the results that are kept, then those beside state and estimate."""
         results = part.function(*arguments)
         return results if kept is None else [*(results[n] for n in kept), *results[count + 2 :]]
 
     read, members = ([m.name for m in some] for some in names)
-    data = [count + n for n, name in enumerate(part.data) if name != "z"]
+    # Numbers of the arguments: the arrays of the state, then the data, then the number of the step.
+    finite_data = [count + n for n, name in enumerate(part.data) if name != "z"]
     return to_c(
-        chosen,
+        choose_results,
         *part.examples,
         name=f"{prefix}_compute" if part.name == "step" else f"{prefix}_compute_{part.name}",
         single=real == "float",
         names=([*read, *part.data, "step"], [*(f"next_{name}" for name in members), *part.beside])
         if kept is not None
         else ((), ()),
-        finite={*range(count), *data, count + len(part.data)},
+        finite={*range(count), *finite_data, count + len(part.data)},
         symmetric=symmetric,
         short=size,
     )
 
 
 def _write_start(filter: AbstractFilter, kept: list[int], names: list[str], prefix: str, real: Real) -> Any:
-    """Write the function from mean and covariance to the members, and whether these are none.
+    """Return the function of C from mean and covariance to the members, and a flag `none`: these are no such law.
 
     A covariance whose factors do not give it back is none: elimination keeps each pivot at zero or above.
-    """
 
+    Args:
+        filter: the filter.
+        kept: which arrays of state and estimate are members.
+        names: of the members.
+        prefix: of the function's name.
+        real: type of its numbers.
+    """
     make = centred_from_covariance if isinstance(filter.init(), CentredGaussian) else from_covariance
 
     @jax.jit
     def begin(mean: jax.Array, covariance: jax.Array) -> list[jax.Array]:
+        """Return the members of the state of a mean and covariance, and whether these are none."""
         state = make(mean, covariance)
         estimate = filter.estimate(state)
         results = [*jax.tree.leaves(state), estimate.mean, estimate.covariance]
         deviations = jnp.sqrt(jnp.abs(jnp.diagonal(covariance)))
-        apart = jnp.abs(jnp.asarray(estimate.covariance) - covariance)
-        same = jnp.all(apart <= SAME * jnp.outer(deviations, deviations))
-        right = same & jnp.all(jnp.isfinite(mean)) & jnp.all(jnp.isfinite(covariance))
-        return [*(results[n] for n in kept), ~right]
+        difference = jnp.abs(jnp.asarray(estimate.covariance) - covariance)
+        given_back = jnp.all(difference <= SAME * jnp.outer(deviations, deviations))
+        valid = given_back & jnp.all(jnp.isfinite(mean)) & jnp.all(jnp.isfinite(covariance))
+        return [*(results[n] for n in kept), ~valid]
 
     n = len(filter.states)
     return to_c(
@@ -192,9 +215,10 @@ def name_arrays(state: PyTree) -> list[str]:
     """Return names in C for the arrays of a state, from their field names; the Gaussian that it holds has no name."""
     names: list[str] = []
     for path, _ in jax.tree_util.tree_flatten_with_path(state)[0]:
+        # Each key of the path is that of an attribute, of a dictionary, or a place in a sequence.
         parts = [str(getattr(k, "name", getattr(k, "key", getattr(k, "idx", "")))) for k in path]
-        own = "_".join(part for part in parts if part != "gaussian")
-        text = "".join(c if c.isalnum() and c.isascii() else "_" for c in own)
+        joined = "_".join(part for part in parts if part != "gaussian")
+        text = "".join(c if c.isalnum() and c.isascii() else "_" for c in joined)
         text = f"state_{text}".rstrip("_") if not text or not text[0].isalpha() else text
         while text in RESERVED | ADDED or text in names:
             text += "_"
@@ -203,4 +227,5 @@ def name_arrays(state: PyTree) -> list[str]:
 
 
 def _is_symmetric(value: np.ndarray) -> bool:
+    """Return whether an array is a symmetric matrix of more than one row."""
     return value.ndim == 2 and len(value) > 1 and np.array_equal(value, value.T)

@@ -23,7 +23,14 @@ SIZES = {"double": 8, "float": 4, "unsigned char": 1, "int32_t": 4, "uint32_t": 
 
 
 class Form(NamedTuple):
-    """Options of the text: the prefix of all names, the type of numbers, names of z's components, and a description."""
+    """Options of the text.
+
+    Args:
+        prefix: of all names.
+        real: type of numbers.
+        received: names of z's components.
+        kind: description of the filter and the precision.
+    """
 
     prefix: str
     real: Real
@@ -41,55 +48,66 @@ class CText(NamedTuple):
 
 
 def write_c_text(program: StepProgram, form: Form) -> CText:
-    """Write a step as C."""
+    """Return header and source of a step."""
     prefix, real = form.prefix, form.real
-    kinds = {x.name.removeprefix("next_"): x.type for x in program.computes[0].results}
-    started = [] if program.at is None else [program.at]
+    # The C type of each member: that of the result "next_<member>".
+    types = {x.name.removeprefix("next_"): x.type for x in program.computes[0].results}
+    starts = [program.initial] if program.at is None else [program.initial, program.at]
     text = _SOURCE.format(
         prefix=prefix,
         comment=f"{prefix}.c: one step of {form.kind}; {prefix}.h says how to use it.",
-        functions="\n\n".join(_static(code) for code in (program.initial, *started, *program.computes)),
-        start=_start(program),
+        functions="\n\n".join(_write_static(code) for code in (*starts, *program.computes)),
+        start=_write_start(program),
         step="\n\n".join(write_functions(program, prefix, real)),
         mean=program.mean,
         covariance=program.covariance,
         real=real,
     )
     # The header declares the state and explains the functions.
-    fields = [(kinds[m.name], m.name, max(m.start.size, 1)) for m in program.members]
+    fields = [(types[m.name], m.name, max(m.start.size, 1)) for m in program.members]
     header = _HEADER.format(
         prefix=prefix,
         guard=f"{prefix.upper()}_H",
         comment=_write_comment(program, form),
-        members="\n".join([f"    {kind} {name}[{count}];" for kind, name, count in fields] + _counter(program)),
+        members="\n".join([f"    {kind} {name}[{count}];" for kind, name, count in fields] + _declare_counter(program)),
         innovation=declare_innovation(program, prefix, real),
         functions="".join(f"{head};\n" for head in list_heads(program, prefix, real)),
         real=real,
     )
-    sizes = [(SIZES[kind], count) for kind, _, count in fields] + ([(8, 1)] if program.counts else [])
+    sizes = [(SIZES[kind], count) for kind, _, count in fields]
+    if program.counts:
+        sizes.append((SIZES["int64_t"], 1))  # the step counter
     return CText(header, text, program.operations, _measure_state(sizes))
 
 
-def _static(code: Any) -> str:
+def _write_static(code: Any) -> str:
     """Return the text of a function that only this file knows."""
     text: str = code.definition
     return text.replace(f"void {code.name}(", f"static void {code.name}(", 1)
 
 
-def _counter(program: StepProgram) -> list[str]:
+def _declare_counter(program: StepProgram) -> list[str]:
+    """Return the line that declares the step counter in the state; none where steps are not counted."""
     return ["    int64_t step;"] if program.counts else []
 
 
 def _measure_state(fields: Sequence[tuple[int, int]]) -> int:
-    """Return the bytes of the state, each number aligned to its own size."""
+    """Return the bytes of a C struct of arrays of (bytes of a number, count): each is aligned to its number's size.
+
+    The struct itself is filled up to a multiple of its largest number.
+    """
+
+    def round_up(total: int, size: int) -> int:
+        """Return the next multiple of `size`."""
+        return -(-total // size) * size
+
     total = 0
     for size, count in fields:
-        total = -(-total // size) * size + size * count
-    largest = max(size for size, _ in fields)
-    return -(-total // largest) * largest
+        total = round_up(total, size) + size * count
+    return round_up(total, max(size for size, _ in fields))
 
 
-def _start(program: StepProgram) -> str:
+def _write_start(program: StepProgram) -> str:
     """Return the statements that set the state before the first step."""
     members = ", ".join(f"state->{m.name}" for m in program.members)
     return f"    {program.initial.name}({members});" + ("\n    state->step = 0;" if program.counts else "")
@@ -101,7 +119,7 @@ def claim_of(filter: AbstractFilter, real: Real) -> Claim:
 
 
 def _write_comment(program: StepProgram, form: Form) -> str:
-    """Return the explanation for a reader of the header."""
+    """Return the comment at the head of the header: how to call the functions, and what the arrays hold."""
     filter, prefix, claim = program.filter, form.prefix, claim_of(program.filter, form.real)
     # States that are angles or attitudes say so.
     circular = first(filter.plant).circular if hasattr(filter, "plant") else ()
@@ -121,9 +139,9 @@ def _write_comment(program: StepProgram, form: Form) -> str:
         "bits, or a function of the inputs returned no finite numbers, or no covariance.",
         *(explain_parts(program, prefix) if len(program.parts) > 1 else []),
         "",
-        *_number_entries("z", form.received, [""] * len(form.received)),
-        *_number_entries("u", filter.inputs, [""] * len(filter.inputs)),
-        *_number_entries("mean", filter.states, units),
+        *_explain_entries("z", form.received, [""] * len(form.received)),
+        *_explain_entries("u", filter.inputs, [""] * len(filter.inputs)),
+        *_explain_entries("mean", filter.states, units),
         f"covariance[{len(filter.states)} * i + j] is that of the errors of mean[i] and mean[j].",
         "All numbers are in the units in which the plant and the sensor were described.",
         f"Claim: {claim}, {MEANING[claim]}.",
@@ -133,7 +151,8 @@ def _write_comment(program: StepProgram, form: Form) -> str:
     return "\n".join(f" * {visible(line).replace('*/', '* /').replace('/*', '/ *')}".rstrip() for line in lines)
 
 
-def _number_entries(array: str, names: Sequence[str], notes: Sequence[str]) -> list[str]:
+def _explain_entries(array: str, names: Sequence[str], notes: Sequence[str]) -> list[str]:
+    """Return a line for each entry of an array, such as "z[0]: position", with its note; "not used" of none."""
     if not names:
         return [f"{array}: not used"]
     return [f"{array}[{i}]: {name}{note}" for i, (name, note) in enumerate(zip(names, notes, strict=True))]

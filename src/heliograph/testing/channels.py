@@ -46,7 +46,7 @@ def check_random_affine(channel: AbstractRandomAffine, seed: int = 0, samples: i
             return 0.0
         modes = joint_modes(channel, order=-(-highest // 2))
         now, later = (h[:, :-1] @ np.append(y, 1.0) for h, y in zip((first, second), points, strict=True))
-        worst = _compare_lagged(modes, first[:, :-1], second[:, :-1])
+        worst = _compare_draw_pairs(modes, first[:, :-1], second[:, :-1])
         return max(worst, _compare_modes(modes, points, now, later, highest))
     # Without memory: E[mono_k(z) | y], order by order.
     worst = 0.0
@@ -54,15 +54,23 @@ def check_random_affine(channel: AbstractRandomAffine, seed: int = 0, samples: i
         z = first[:, :-1] @ np.append(y, 1.0)
         for order in range(1, highest + 1):
             expected = channel.moments(order).expect(evaluate_monomials(y, order))
-            worst = max(worst, _compare(f"order {order}", expected, _raise_rows(z, order)))
+            worst = max(worst, _compare(f"order {order}", expected, _evaluate_rows(z, order)))
     return worst
 
 
-def _compare_lagged(modes: JointModes, now: np.ndarray, later: np.ndarray) -> float:
-    """Compare the joint mean of two successive draws M = (G, n) with E = sum_ij p_i T_ij E[M | i] x E[M | j].
+def _compare_draw_pairs(modes: JointModes, now: np.ndarray, later: np.ndarray) -> float:
+    """Compare the mean of the products of two successive draws' entries with the moments.
+
+    A draw is M = (G, n) of z = G y + n. By the modes, E[M_1 x M_2] = sum_ij p_i T_ij E[M | i] x E[M | j] with the
+    initial probabilities p and the transitions T, where x pairs every entry with every other.
+
+    Args:
+        modes: the channel's modes.
+        now: first draws (sample, outputs, inputs + 1).
+        later: second draws (sample, outputs, inputs + 1).
 
     Returns:
-        The largest deviation of the samples' mean from it, in standard errors.
+        The largest difference between samples and moments, in standard errors.
     """
     means = np.array([m.moments(1).mean[:-1] for m in modes.maps])
     expected = np.einsum("i,ij,iab,jcd->abcd", modes.initial, modes.transition, means, means)
@@ -73,25 +81,36 @@ def _compare_lagged(modes: JointModes, now: np.ndarray, later: np.ndarray) -> fl
 def _compare_modes(
     modes: JointModes, points: list[np.ndarray], now: np.ndarray, later: np.ndarray, highest: int
 ) -> float:
-    """Compare moments of two successive draws, each and jointly."""
-    begin, rows, worst = np.asarray(modes.initial), np.asarray(modes.transition), 0.0
-    given = {
+    """Compare moments of two successive draws, each and jointly; return the largest difference in standard errors.
+
+    Args:
+        modes: the channel's modes.
+        points: the input y of the first draw, and of the second.
+        now: what arrives of the first (sample, outputs).
+        later: what arrives of the second (sample, outputs).
+        highest: order of the moments of one draw; of two together, half of it each.
+    """
+    initial, transition, worst = np.asarray(modes.initial), np.asarray(modes.transition), 0.0
+    # By order, E[mono(z) | mode] of the first and of the second draw, (mode, monomials).
+    by_mode = {
         order: [modes.moments(order) @ evaluate_monomials(y, order) for y in points] for order in range(1, highest + 1)
-    }  # E[mono(z) | mode], (mode, monomials)
-    for order, (at_first, at_second) in given.items():
-        worst = max(worst, _compare(f"order {order}, first draw", begin @ at_first, _raise_rows(now, order)))
-        worst = max(worst, _compare(f"order {order}, second draw", begin @ rows @ at_second, _raise_rows(later, order)))
+    }
+    for order, (at_first, at_second) in by_mode.items():
+        first, second = initial @ at_first, initial @ transition @ at_second
+        worst = max(worst, _compare(f"order {order}, first draw", first, _evaluate_rows(now, order)))
+        worst = max(worst, _compare(f"order {order}, second draw", second, _evaluate_rows(later, order)))
     for i, j in product(range(1, highest // 2 + 1), repeat=2):
-        expected = np.einsum("a,ab,am,bl->ml", begin, rows, given[i][0], given[j][1]).reshape(-1)
-        seen = np.einsum("sm,sl->sml", _raise_rows(now, i), _raise_rows(later, j)).reshape(len(now), -1)
+        expected = np.einsum("a,ab,am,bl->ml", initial, transition, by_mode[i][0], by_mode[j][1]).reshape(-1)
+        seen = np.einsum("sm,sl->sml", _evaluate_rows(now, i), _evaluate_rows(later, j)).reshape(len(now), -1)
         worst = max(worst, _compare(f"orders {i} and {j} of two draws in a row", expected, seen))
     return worst
 
 
 def _draw_twice(channel: AbstractRandomAffine, seed: int, samples: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return first and second draws of H, after testing the contract of `init`, `draw` and `sample`."""
+    """Return first and second draws of H = [[G, n], [0, 1]], after testing the contract of `init`, `draw`, `sample`."""
 
     def two_steps(words: jax.Array) -> PyTree:
+        """Return the first state, that after a draw, the draw, the same of a second draw, and what `sample` draws."""
         key = jax.random.wrap_key_data(words)
         start = channel.init(jax.random.fold_in(key, 2))
         state, h = channel.draw(start, key)
@@ -116,8 +135,8 @@ def _draw_twice(channel: AbstractRandomAffine, seed: int, samples: int) -> tuple
     return drawn, np.asarray(later)
 
 
-def _raise_rows(z: np.ndarray, order: int) -> np.ndarray:
-    """Return the monomials of each row of z."""
+def _evaluate_rows(z: np.ndarray, order: int) -> np.ndarray:
+    """Return the monomials up to an order of each row of z, (sample, monomials)."""
     values = np.column_stack([z, np.ones(len(z))])
     columns = np.arange(values.shape[1])
     powers = exponents(len(columns), order)
@@ -127,7 +146,7 @@ def _raise_rows(z: np.ndarray, order: int) -> np.ndarray:
 def _compare(what: str, expected: np.ndarray | jax.Array, seen: np.ndarray) -> float:
     """Compare means over samples (sample, number) with expected ones; return the largest |difference| / standard error.
 
-    The standard error is that of each mean.
+    The standard error is that of each mean. A number that does not vary has to agree to rounding.
     """
     error = seen.std(axis=0) / np.sqrt(len(seen))
     difference = np.abs(seen.mean(axis=0) - expected)

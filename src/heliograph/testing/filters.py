@@ -46,17 +46,17 @@ def check_filter(filter: AbstractFilter, inputs: ArrayLike = (), steps: int = 5,
     for k, z in enumerate(data):
         # Each step twice: determinism, structure, estimate, prediction + correction, vmap.
         arguments = filter, state, z, u[k], np.asarray(k)
-        (stepped, parts, side_by_side), again = (compute_once(_each_way, _each_way_by_xla, arguments) for _ in range(2))
-        (following, estimate), (corrected, known, innovation) = stepped, parts
-        assert np.array_equal(estimate.mean, again[0][1].mean), (
-            "step: expected the same estimate from the same arguments"
-        )
+        once, again = (compute_once(_step_each_way, _step_each_way_by_xla, arguments) for _ in range(2))
+        (following, estimate), (corrected, estimate_of_parts, innovation), means_in_vmap = once
+        (_, estimate_again), *_ = again
+        same = np.array_equal(estimate.mean, estimate_again.mean)
+        assert same, "step: expected the same estimate from the same arguments"
         for belief in (following, corrected):
             assert str(jax.tree.structure(belief)) == structure, "step: expected a state of init's structure"
         _check_estimate(estimate, len(filter.states), k)
-        _check_same(f"step {k}: the prediction, corrected", known, estimate)
+        _check_same(f"step {k}: the prediction, corrected", estimate_of_parts, estimate)
         _check_innovation(innovation, z, filter, k)
-        gap = np.abs(side_by_side - estimate.mean).max()
+        gap = np.abs(means_in_vmap - estimate.mean).max()
         scale = 1 + np.abs(estimate.mean).max()
         assert gap <= ROUNDING * scale, f"step {k}: expected the same estimate inside vmap, off by {gap:g}"
         state, total = following, total + float(innovation.log_likelihood)
@@ -67,33 +67,36 @@ def check_filter(filter: AbstractFilter, inputs: ArrayLike = (), steps: int = 5,
 
 
 def _step(filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree) -> tuple[PyTree, Estimate]:
+    """Return state and estimate after a step."""
     return filter.step(state, z, u, k)
 
 
-def _parts(
+def _predict_and_correct(
     filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree
 ) -> tuple[PyTree, Estimate, Innovation]:
+    """Return state, estimate and innovation after a prediction and a correction."""
     corrected, innovation = filter.correct(filter.predict(state, u, k), z, k)
     return corrected, filter.estimate(corrected), innovation
 
 
-def _side_by_side(filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree) -> PyTree:
-    """Return the means of two such steps in one vmap."""
+def _step_in_vmap(filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree) -> PyTree:
+    """Return the means after two equal steps in one vmap, (2, n)."""
     twice = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), (state, z))
     return jax.vmap(lambda s, z: filter.step(s, z, u, k)[1].mean)(*twice)
 
 
-def _each_way(*arguments: PyTree) -> tuple[PyTree, ...]:
+def _step_each_way(*arguments: PyTree) -> tuple[PyTree, ...]:
     """Return the step in each of three ways; native code computes once what they have in common."""
-    return _step(*arguments), _parts(*arguments), _side_by_side(*arguments)
+    return _step(*arguments), _predict_and_correct(*arguments), _step_in_vmap(*arguments)
 
 
 # By XLA three programs: one of all three is more than thrice as much work for its optimiser.
-_step_by_xla, _parts_by_xla, _side_by_side_by_xla = map(compile_in_float64, (_step, _parts, _side_by_side))
+_ways_by_xla = tuple(map(compile_in_float64, (_step, _predict_and_correct, _step_in_vmap)))
 
 
-def _each_way_by_xla(*arguments: PyTree) -> tuple[PyTree, ...]:
-    return _step_by_xla(*arguments), _parts_by_xla(*arguments), _side_by_side_by_xla(*arguments)
+def _step_each_way_by_xla(*arguments: PyTree) -> tuple[PyTree, ...]:
+    """Return the step in each of three ways, each compiled by itself."""
+    return tuple(way(*arguments) for way in _ways_by_xla)
 
 
 def _check_sizes(filter: AbstractFilter, inputs: ArrayLike) -> None:
@@ -135,9 +138,8 @@ def _check_estimate(estimate: Estimate, n: int, k: int) -> None:
     correlations = bound / np.outer(unit, unit)
     assert np.abs(correlations - correlations.T).max() <= ROUNDING, f"step {k}: expected a symmetric covariance"
     smallest = np.linalg.eigvalsh((correlations + correlations.T) / 2)[0]
-    assert smallest >= -ROUNDING, (
-        f"step {k}: expected a positive semidefinite covariance, smallest eigenvalue of correlations {smallest:g}"
-    )
+    expected = f"step {k}: expected a positive semidefinite covariance"
+    assert smallest >= -ROUNDING, f"{expected}, smallest eigenvalue of correlations {smallest:g}"
 
 
 def _check_innovation(innovation: Innovation, z: np.ndarray, filter: AbstractFilter, k: int) -> None:
@@ -157,7 +159,7 @@ def _check_innovation(innovation: Innovation, z: np.ndarray, filter: AbstractFil
 
 
 def _check_same(what: str, estimate: Estimate, expected: Estimate) -> None:
-    """Raise unless estimates are equal to rounding."""
+    """Raise AssertionError unless estimates are equal to rounding."""
     for name in ("mean", "covariance"):
         a, b = np.asarray(getattr(estimate, name)), np.asarray(getattr(expected, name))
         same = np.allclose(a, b, rtol=ROUNDING, atol=ROUNDING * np.nanmax(np.abs(b), initial=0.0), equal_nan=True)

@@ -39,12 +39,12 @@ def check_fusion(rule: AbstractFusion, count: int = 3, n: int = 2, seed: int = 0
         joint = (root @ root.T).reshape(count, n, count, n)
         bounds = np.stack([joint[i, :, i] for i in range(count)])
         alike = _fuse_bounds(rule, np.ones((count, n)), np.broadcast_to(bounds[0], bounds.shape))
-        _close("identical estimates", alike.mean, np.ones(n))
-        _close("identical bounds", alike.covariance, bounds[0])
+        _check_close("identical estimates", alike.mean, np.ones(n))
+        _check_close("identical bounds", alike.covariance, bounds[0])
         # The mean is linear in the means, so unit means give the gain of each input.
         units = np.moveaxis(np.eye(count * n).reshape(count * n, count, n), 1, 0)
         together = _fuse_bounds(rule, units, np.broadcast_to(bounds[:, None], (count, count * n, n, n)))
-        _close("fusing inside vmap", together.mean[0], _fuse_bounds(rule, units[:, 0], bounds).mean)
+        _check_close("fusing inside vmap", together.mean[0], _fuse_bounds(rule, units[:, 0], bounds).mean)
         gains = np.asarray(together.mean).T
         if rule.claim(["upper"] * count) == "upper":
             claimed = np.asarray(together.covariance[0])
@@ -60,10 +60,17 @@ STARTS, ASCENTS = 8, 50
 def _find_worst_excess(
     gains: np.ndarray, bounds: np.ndarray, claimed: np.ndarray, generator: np.random.Generator
 ) -> float:
-    """Largest v' (E - B) v found over unit directions v and the joint covariances of errors with these bounds P_i.
+    """Return the largest v' (E - B) v found over unit directions v and all joint covariances of the errors.
 
-    With the fused error sum_i W_i e_i the worst is sup v' E v = (sum_i |P_i^(1/2) W_i' v|)^2, where all errors move
-    together. Its root is convex in v, so that v <- B^+ grad ascends the ratio to v' B v at each step.
+    The fused error is sum_i W_i e_i, the covariance of e_i is at most P_i, and E is that of the fused error. The worst
+    is sup v' E v = (sum_i |P_i^(1/2) W_i' v|)^2, where all errors move together. Its root is convex in v, so that
+    v <- B^+ grad, with the gradient of the root, ascends the ratio to v' B v at each step.
+
+    Args:
+        gains: W_1, W_2, ... side by side (n, count n).
+        bounds: P_i (count, n, n).
+        claimed: B (n, n).
+        generator: draws the directions from which the ascents begin.
     """
     parts = [w @ p @ w.T for w, p in zip(np.split(gains, len(bounds), axis=1), bounds, strict=True)]
     inverse, worst = np.linalg.pinv(claimed), -np.inf
@@ -72,16 +79,18 @@ def _find_worst_excess(
             v = v / np.linalg.norm(v)
             sizes = [np.sqrt(v @ part @ v) for part in parts]
             worst = max(worst, float(sum(sizes) ** 2 - v @ claimed @ v))
-            ahead = inverse @ sum(part @ v / size for part, size in zip(parts, sizes, strict=True) if size > 0)
-            v = ahead if np.linalg.norm(ahead) > 0 else v
+            ascended = inverse @ sum(part @ v / size for part, size in zip(parts, sizes, strict=True) if size > 0)
+            v = ascended if np.linalg.norm(ascended) > 0 else v
     return worst
 
 
 def _fuse_bounds(rule: AbstractFusion, means: np.ndarray, bounds: np.ndarray) -> Estimate:
+    """Return the fusion of estimates with these means and upper bounds, along their first axes."""
     return fuse(rule, [Estimate(m, b, "upper") for m, b in zip(means, bounds, strict=True)])
 
 
-def _close(what: str, got: Array, expected: Array) -> None:
+def _check_close(what: str, got: Array, expected: Array) -> None:
+    """Raise AssertionError unless arrays are equal to the digits that a search for weights has."""
     gap = np.abs(np.asarray(got) - expected).max()
     assert gap <= SEARCHED * np.abs(expected).max(), f"{what}: expected the same back, off by {gap:g}"
 
@@ -107,7 +116,10 @@ def check_quantizer(quantizer: AbstractQuantizer, n: int = 2, steps: int = 20, s
 
 
 def _check_steps(quantizer: AbstractQuantizer, n: int, steps: int, generator: np.random.Generator) -> None:
-    """Check a quantizer on random values: its errors hold, Q(Q(x)) = Q(x), and the same under jit and vmap."""
+    """Check a quantizer on random values, each of which follows the last from the state that it left.
+
+    Its errors hold, Q(Q(x)) = Q(x) from the same state, and it does the same under jit and vmap.
+    """
     state = quantizer.init(n)
     structure, compiled = str(jax.tree.structure(state)), jax.jit(jax.vmap(quantizer.step))
     for k in range(steps):

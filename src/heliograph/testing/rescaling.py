@@ -51,20 +51,23 @@ Ended = TypeVar("Ended", bound=WithEnds)
 
 
 class InUnits(Module):
-    """A function of vectors in other units: out f(x / into_1, ...). Functions in all units share one program."""
+    """A function of vectors in other units: out f(x_1 / into_1, ...). Functions in all units share one program."""
 
     function: Callable[..., ArrayLike]
     out: np.ndarray
     into: tuple[np.ndarray, ...]
 
-    def __call__(self, *given: jax.Array) -> jax.Array:
-        return jnp.asarray(self.out) * jnp.asarray(
-            self.function(*(x / s for x, s in zip(given, self.into, strict=True)))
-        )
+    def __call__(self, *vectors: jax.Array) -> jax.Array:
+        """Return the function's value in the other units, of vectors in these."""
+        before = (x / factors for x, factors in zip(vectors, self.into, strict=True))
+        return jnp.asarray(self.out) * jnp.asarray(self.function(*before))
 
 
 class Units(NamedTuple):
-    """Factors of the states (n,), of a sensor's outputs (p,), of the measurement (m,) and of the inputs."""
+    """Factors of the states, of a sensor's outputs, of the measurement and of the inputs.
+
+    In formulas they are the diagonal matrices S (n,), R (p,), Q (m,) and U (u,).
+    """
 
     states: Float[np.ndarray, " n"]
     outputs: Float[np.ndarray, " p"]
@@ -73,7 +76,7 @@ class Units(NamedTuple):
 
 
 def rescale_filter(filter: AbstractFilter, units: Units) -> AbstractFilter:
-    """Return the filter with estimate S xhat from Q z and U u, where `filter` has xhat from z and u.
+    """Return the filter whose estimate is S xhat from Q z and U u, where `filter` has xhat from z and u.
 
     Raises:
         ValueError: a filter of an unknown kind.
@@ -100,7 +103,7 @@ def rescale_filter(filter: AbstractFilter, units: Units) -> AbstractFilter:
         case PredictionFilter():
             return PredictionFilter(_require_gaussian(rescale_filter(filter.base, units)))
         case SequentialFilter():
-            return replace(filter, filters=tuple(_require_gaussian(f) for f in _rescale_in_turn(filter, units)))
+            return replace(filter, filters=tuple(_require_gaussian(f) for f in _rescale_parts(filter, units)))
         case _:
             raise fail("filter to rescale", "one of the package's that computes covariances", type(filter).__name__)
 
@@ -129,20 +132,19 @@ def _rescale_gaussian(filter: GaussianFilter | OpenLoop, units: Units) -> Gaussi
 
 
 def _require_gaussian(filter: AbstractFilter) -> GaussianFilter:
+    """Return the filter, which has to be Gaussian."""
     assert isinstance(filter, GaussianFilter)
     return filter
 
 
-def _rescale_in_turn(filter: SequentialFilter, units: Units) -> list[AbstractFilter]:
-    """Split into parts, each with its own outputs and measurements, which follow one another in `units`."""
-    parts, received, said = [], 0, 0
-    for single in filter.filters:
-        m, p = single.received, len(first(single.sensor).outputs)
-        node_units = units._replace(
-            outputs=units.outputs[said : said + p], received=units.received[received : received + m]
-        )
-        parts.append(rescale_filter(single, node_units))
-        received, said = received + m, said + p
+def _rescale_parts(filter: SequentialFilter, units: Units) -> list[AbstractFilter]:
+    """Return the filters of the parts in other units; factors of their outputs and measurements follow one another."""
+    parts, output, received = [], 0, 0  # where those of the next part begin
+    for part in filter.filters:
+        next_output, next_received = output + len(first(part.sensor).outputs), received + part.received
+        own = units._replace(outputs=units.outputs[output:next_output], received=units.received[received:next_received])
+        parts.append(rescale_filter(part, own))
+        output, received = next_output, next_received
     return parts
 
 
@@ -160,25 +162,39 @@ def rescale_plant(plant: AnyPlant, units: Units) -> AnyPlant:
 
 
 def _rescale_plant(plant: AbstractPlant, units: Units) -> AbstractPlant:
-    """Return the plant whose states and inputs are counted in other units: S f(S^-1 x, U^-1 u), S Q S."""
+    """Return the plant whose states and inputs are counted in other units: S f(S^-1 x, U^-1 u), S W S.
+
+    f is the transition, W the covariance of the noise. The initial law is that of a deviation from its center.
+    """
     s, u = units.states, units.inputs
-    law = (
-        _rescale_noise(plant.deviation, s) if plant.deviation is not None else np.outer(s, s) * plant.initial_covariance
-    )
-    center = s * (plant.initial_mean - (plant.deviation.mean if plant.deviation is not None else 0.0))
-    given = plant.noise
-    noise = _rescale_noise(given, s) if isinstance(given, AbstractNoise) else InUnits(given, np.outer(s, s), (u,))
+    law: AbstractNoise | np.ndarray = np.outer(s, s) * plant.initial_covariance
+    center = s * plant.initial_mean
+    if plant.deviation is not None:
+        law, center = _rescale_noise(plant.deviation, s), s * (plant.initial_mean - plant.deviation.mean)
+    noise: AbstractNoise | InUnits
+    if isinstance(plant.noise, AbstractNoise):
+        noise = _rescale_noise(plant.noise, s)
+    else:
+        noise = InUnits(plant.noise, np.outer(s, s), (u,))
     size = dict(zip(plant.states, s, strict=True))
     limits = {name: (size[name] * low, size[name] * high) for name, (low, high) in plant.limits}
     names = plant.states, plant.inputs, plant.circular
     if isinstance(plant, LinearPlant):
-        matrix, entry = (
-            InUnits(given.function, s[:, None] / by, (u,)) if isinstance(given, OfInputs) else s[:, None] * given / by
-            for given, by in ((plant.matrix, s), (plant.input_matrix, u))
-        )
-        return LinearPlant(matrix, noise, center, law, entry, *names, limits=limits)
+        matrix = _rescale_matrix(plant.matrix, s, s, u)
+        input_matrix = _rescale_matrix(plant.input_matrix, s, u, u)
+        return LinearPlant(matrix, noise, center, law, input_matrix, *names, limits=limits)
     move = InUnits(plant.transition, s, (s, u))
     return Plant(move, noise, center, law, *names, attitude=plant.attitude, limits=limits)
+
+
+def _rescale_matrix(
+    matrix: OfInputs | ArrayLike, out: np.ndarray, into: np.ndarray, inputs: np.ndarray
+) -> InUnits | np.ndarray:
+    """Return the matrix out A / into, a function of the inputs if A is one: element ij is out_i A_ij / into_j."""
+    factor = out[:, None] / into
+    if isinstance(matrix, OfInputs):
+        return InUnits(matrix.function, factor, (inputs,))
+    return np.asarray(out[:, None] * matrix / into)
 
 
 def rescale_sensor(sensor: AnySensor, units: Units) -> AnySensor:
@@ -208,6 +224,7 @@ def rescale_channel(channel: SecondOrder, units: Units) -> SecondOrder:
     q, (_, factor) = units.received, _scale_channel(units)
 
     def scaled(quadratic: QuadraticMap) -> QuadraticMap:
+        """Return second moments of (G, n) in the other units."""
         return QuadraticMap(factor * quadratic.center, factor * quadratic.radius)
 
     gain, offset = q[:, None] * channel.mean_gain / units.outputs, q * channel.offset
@@ -217,7 +234,7 @@ def rescale_channel(channel: SecondOrder, units: Units) -> SecondOrder:
 
 
 def _scale_channel(units: Units) -> tuple[Float[np.ndarray, "m p1"], Float[np.ndarray, "m m p1 p1"]]:
-    """Return factors of (G, n) and of a tensor of second moments."""
+    """Return the factors of M = (G, n), element ia, and of a tensor of second moments E[M_ia M_jb], element ijab."""
     q, r = units.received, np.append(units.outputs, 1.0)
     return q[:, None] / r, (q[:, None] * q)[:, :, None, None] / (r[:, None] * r)
 
@@ -254,6 +271,7 @@ def _rescale_centre(centre: MeanBeforeData | None, units: Units) -> MeanBeforeDa
     s = units.states
 
     def scaled(matrix: Array | OverTime, factors: np.ndarray) -> Array | OverTime:
+        """Return the product of each element with its factor, at each step."""
         return OverTime(factors * matrix.values) if isinstance(matrix, OverTime) else factors * matrix
 
     received = scaled(centre.received, units.received[:, None] / s)
@@ -264,20 +282,17 @@ def _rescale_centre(centre: MeanBeforeData | None, units: Units) -> MeanBeforeDa
 
 def _rescale_system(filter: LinearSystemFilter, degree: int, units: Units) -> LinearSystemFilter:
     """Return the filter of a linear system with state and measurements in other units: monomials by powers of these."""
-    y, z, s = (
-        _scale_monomials(units.states, degree),
-        _scale_monomials(units.received, degree),
-        filter.steps.values,
-    )
+    y, z = _scale_monomials(units.states, degree), _scale_monomials(units.received, degree)
+    s = filter.steps.values
     if s.transition.shape[-1] != len(y):  # monomials and 1, mode after mode, behind links that remember
         y = np.tile(np.append(y, 1.0), s.transition.shape[-1] // (len(y) + 1))
     steps = Steps(
-        y[:, None] * s.transition / y,
-        y * s.drift,
-        np.outer(y, y) * s.process,
-        z[:, None] * s.output / y,
-        z * s.offset,
-        np.outer(z, z) * s.noise,
+        transition=y[:, None] * s.transition / y,
+        drift=y * s.drift,
+        process=np.outer(y, y) * s.process,
+        output=z[:, None] * s.output / y,
+        offset=z * s.offset,
+        noise=np.outer(z, z) * s.noise,
     )
     projection = units.states[:, None] * filter.projection / y
     system = LinearSystem(steps, y * filter.mean, np.outer(y, y) * filter.covariance, projection)
@@ -285,6 +300,6 @@ def _rescale_system(filter: LinearSystemFilter, degree: int, units: Units) -> Li
 
 
 def _scale_monomials(factors: Float[np.ndarray, " n"], degree: int) -> Float[np.ndarray, " N"]:
-    """Return factors of the monomials up to `degree`."""
+    """Return the factors of the monomials up to `degree` of numbers with these factors, the constant 1 left out."""
     table = np.array(exponents(len(factors) + 1, degree))[:-1, :-1]
     return np.asarray(np.prod(factors**table, axis=1))

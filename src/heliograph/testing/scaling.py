@@ -1,7 +1,5 @@
 """Test that the estimates of a network do not depend on the user's units."""
 
-from collections.abc import Callable
-
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter
@@ -18,7 +16,6 @@ from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.combine import Series
 from heliograph.random_affine.hop import known
-from heliograph.random_affine.moments.quadratic_map import QuadraticMap
 from heliograph.random_affine.moments.second_moments import SecondOrder, second_order
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
@@ -63,46 +60,52 @@ def check_scaling(
     z = {name: np.array(rows[0]) for name, rows in world.measurements.items()}
     for name, rows in z.items():
         rows[random.random(rows.shape) < MISSING] = np.nan
-        if (limits := network.nodes[name].limits) is not None:  # which are those of its own units
+        if (limits := network.nodes[name].limits) is not None:  # in these units: what a node refuses never arrives
             rows[limits.outside(rows)] = np.nan
     u = np.zeros((steps, 0)) if inputs is None else np.asarray(inputs, dtype=float)
     plain, worst = run(network, z, u).estimates, 0.0
     for _ in range(trials):
-        for common in (False, True):
-            worst = max(worst, _compare_runs(network, z, u, plain, _draw_units(network, random, common), common))
+        for one_factor in (False, True):
+            units = _draw_units(network, random, one_factor)
+            worst = max(worst, _compare_runs(network, z, u, plain, units, one_factor))
     return worst
 
 
 def _list_nodes(network: Network) -> dict[str, Node]:
     """Return the nodes, all of which must measure the plant themselves."""
-    results = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
-    if len(results) < len(network.nodes):
+    nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
+    if len(nodes) < len(network.nodes):
         raise fail("network to rescale", "nodes that receive the plant themselves", "a network of relays")
-    return results
+    return nodes
 
 
 def _drop_filters(network: Network) -> Network:
     """Return the network without its filters, except where a filter feeds back to its sensor."""
-    published = {name: node.informed_by is not None for name, node in _list_nodes(network).items()}
     nodes = {
-        n: node if published[n] else Node(node.sensor, node.channel, {}) for n, node in _list_nodes(network).items()
+        name: Node(node.sensor, node.channel, {}) if node.informed_by is None else node
+        for name, node in _list_nodes(network).items()
     }
     return Network(network.plant, nodes)
 
 
-def _draw_units(network: Network, random: np.random.Generator, common: bool) -> dict[str, Units]:
-    """Draw units of each node, and of all nodes together under the name of fusion."""
+def _draw_units(network: Network, random: np.random.Generator, one_factor: bool) -> dict[str, Units]:
+    """Return random units of each node, and of all nodes together under `Network.FUSED`.
 
-    def factors(count: int) -> np.ndarray:
+    States and inputs have the same in all nodes; `one_factor`: all states have the same factor.
+    """
+
+    def draw(count: int) -> np.ndarray:
+        """Draw factors."""
         return np.asarray(10.0 ** random.uniform(-DECADES, DECADES, size=count))
 
     n = len(network.states)
-    states = np.repeat(factors(1), n) if common else factors(n)
-    inputs, units = factors(len(network.inputs)), {}
+    states = np.repeat(draw(1), n) if one_factor else draw(n)
+    inputs, units = draw(len(network.inputs)), {}
     for name in network.names:
         node = network.nodes[name]
-        units[name] = Units(states, factors(len(node.outputs)), factors(node.received), inputs)
-    outputs, received = (np.concatenate([units[name][i] for name in network.names]) for i in (1, 2))
+        units[name] = Units(states, draw(len(node.outputs)), draw(node.received), inputs)
+    outputs = np.concatenate([units[name].outputs for name in network.names])
+    received = np.concatenate([units[name].received for name in network.names])
     return units | {Network.FUSED: Units(states, outputs, received, inputs)}
 
 
@@ -112,56 +115,68 @@ def _compare_runs(
     u: np.ndarray,
     plain: dict[str, dict[str, Estimate]],
     units: dict[str, Units],
-    common: bool,
+    one_factor: bool,
 ) -> float:
     """Run the network in other units; return the largest difference of an estimate, as a share of what is allowed.
 
-    `common`: whether all nodes have one set of units. Estimates that are searched for, as by intersection, change in
-    more digits with the units of one node alone, and are compared only then.
+    Args:
+        network: the network.
+        z: measurements by node (steps, received).
+        u: inputs (steps, inputs).
+        plain: estimates in its own units, by node and filter.
+        units: the other units, as `_draw_units` returns them.
+        one_factor: whether all states have one factor. Estimates for which a trace is minimised, a sum of squares of
+            different units, are compared only then.
     """
     nodes = {name: _rescale_node(name, node, units[name]) for name, node in _list_nodes(network).items()}
     fused = {name: _rescale_fusion(name, fusion, units[Network.FUSED]) for name, fusion in network.fused.items()}
     scaled = Network(rescale_plant(network.plant, units[Network.FUSED]), nodes, fused)
-    shared = units[Network.FUSED].inputs
-    estimates = run(scaled, {name: rows * units[name].received for name, rows in z.items()}, u * shared).estimates
+    scaled_z = {name: rows * units[name].received for name, rows in z.items()}
+    estimates = run(scaled, scaled_z, u * units[Network.FUSED].inputs).estimates
     worst = 0.0
     for node, filters in plain.items():
         for name, estimate in filters.items():
             searches = _has_search_in_estimate(network, node, name)
-            if common or not searches:
+            if one_factor or not searches:
                 allowed = SEARCHED if searches else DIGITS
                 difference = _find_difference(estimate, estimates[node][name], units[node].states) / allowed
-                worst = max(worst, _report_largest(f"{node}/{name}", difference))
+                worst = max(worst, _check_differences(f"{node}/{name}", difference))
     return worst
 
 
-def _report_largest(name: str, differences: np.ndarray) -> float:
+def _check_differences(name: str, differences: np.ndarray) -> float:
+    """Return the largest of the differences by step, as shares of what is allowed; raise AssertionError above 1."""
     largest = float(np.max(differences, initial=0.0))
     assert largest <= 1, f"{name}: expected the same estimate in other units, off at step {int(np.argmax(differences))}"
     return largest
 
 
 def _find_difference(a: Estimate, b: Estimate, s: np.ndarray) -> np.ndarray:
-    """Return the largest difference at each step, relative to a component's scale: its mean and greatest deviation."""
-    mean, other = np.asarray(a.mean), np.asarray(b.mean) / s
-    covariance, their = np.asarray(a.covariance), np.asarray(b.covariance) / np.outer(s, s)
+    """Return the largest difference at each step of `a`, and `b` in units s, relative to each component's scale.
+
+    The scale of a component is its largest mean plus its largest deviation, over all steps.
+    """
+    mean, mean_b = np.asarray(a.mean), np.asarray(b.mean) / s
+    covariance, covariance_b = np.asarray(a.covariance), np.asarray(b.covariance) / np.outer(s, s)
     claimed = a.claim != "none"
     assert np.all(np.isfinite(mean)), "expected finite means"
     assert not claimed or np.all(np.isfinite(covariance)), "expected finite covariances"
     deviation = np.sqrt(np.abs(np.diagonal(covariance, axis1=1, axis2=2)).max(axis=0)) if claimed else 0.0
     size = deviation + np.abs(mean).max(axis=0)
     size = np.where(size > 0, size, 1.0)
-    difference = np.nan_to_num(np.abs(mean - other) / size, nan=np.inf).max(axis=1)
+    difference = np.nan_to_num(np.abs(mean - mean_b) / size, nan=np.inf).max(axis=1)
     if claimed:
-        apart = np.abs(covariance - their) / np.outer(size, size)
-        difference = np.maximum(difference, np.nan_to_num(apart, nan=np.inf).max(axis=(1, 2)))
+        of_covariance = np.abs(covariance - covariance_b) / np.outer(size, size)
+        difference = np.maximum(difference, np.nan_to_num(of_covariance, nan=np.inf).max(axis=(1, 2)))
     return np.asarray(difference)
 
 
 def _rescale_node(name: str, node: Node, units: Units) -> Node:
     """Return the node in other units, after checking that its channel's moments change as they must."""
     channel = first(node.channel)
-    for affine in [] if channel.remembers else [outcome.map for outcome in channel.list_outcomes()]:
+    # Of a channel without memory: the map of each set of losses.
+    maps = [] if channel.remembers else [outcome.map for outcome in channel.list_outcomes()]
+    for affine in maps:
         turned = Series([known(np.diag(1 / units.outputs)), affine, known(np.diag(units.received))])
         off = _measure_difference(rescale_channel(second_order(affine), units), second_order(turned))
         assert off <= DIGITS, f"{name}: expected the channel's moments in other units, off by {off:.3g}"
@@ -177,23 +192,28 @@ def _change_units(channel: Channel, units: Units) -> Channel:
 
 
 def _measure_difference(a: SecondOrder, b: SecondOrder) -> float:
-    """Return the largest difference of two descriptions, relative to each entry's scale."""
-    items: list[Callable[[SecondOrder], np.ndarray]] = [
-        lambda d: _ends(d.spread), lambda d: _ends(d.shift), lambda d: _ends(d.power), lambda d: _ends(d.nominal)
-    ]  # fmt: skip
-    power = np.einsum("iiaa->ia", np.abs(items[0](a)) + np.abs(items[2](a)))
-    reach = np.sqrt(power + np.abs(np.concatenate([a.mean_gain, a.offset[:, None]], axis=1)) ** 2)
-    size = np.einsum("ia,jb->ijab", reach, reach)
+    """Return the largest difference of two descriptions' second moments E[M_ia M_jb], relative to each entry's scale.
+
+    The scale of an entry of M = (G, n) is the root of its mean square, that of a product the product of its two.
+    """
+    ends = [_find_ends(a), _find_ends(b)]
+    spread, _, power, _ = ends[0]
+    squares = np.einsum("iiaa->ia", np.abs(spread) + np.abs(power))
+    scale = np.sqrt(squares + np.abs(np.concatenate([a.mean_gain, a.offset[:, None]], axis=1)) ** 2)
+    size = np.einsum("ia,jb->ijab", scale, scale)
     size = size + size.swapaxes(2, 3)
-    return max(float(np.max(np.abs(read(a) - read(b)) / np.where(size > 0, size, 1.0), initial=0.0)) for read in items)
+    size = np.where(size > 0, size, 1.0)
+    return max(float(np.max(np.abs(one - other) / size, initial=0.0)) for one, other in zip(*ends, strict=True))
 
 
-def _ends(quadratic: QuadraticMap) -> np.ndarray:
-    return np.asarray(quadratic.center + quadratic.radius)
+def _find_ends(described: SecondOrder) -> list[np.ndarray]:
+    """Return the largest that spread, shift, power and nominal second moments may be, (m, m, p + 1, p + 1) each."""
+    quadratics = described.spread, described.shift, described.power, described.nominal
+    return [np.asarray(quadratic.center + quadratic.radius) for quadratic in quadratics]
 
 
 def _rescale_fusion(name: str, fusion: Fusion | AbstractFilter, units: Units) -> Fusion | AbstractFilter:
-    """Return a fusion or a central filter in other units; a rule of fusion has none."""
+    """Return a central filter in other units, or a fusion as it is: its rule has no units."""
     if isinstance(fusion, AbstractFilter):
         return rescale_filter(fusion, units)
     if fusion.quantizer is not None:
@@ -214,7 +234,7 @@ def _has_search_in_estimate(network: Network, node: str, name: str) -> bool:
 
 
 def _has_search(filter: AbstractFilter) -> bool:
-    """Tell whether a filter minimises numerically, so that its answers depend on units by its tolerance."""
+    """Return whether a filter minimises a trace by a search, so that its answers depend on units by the tolerance."""
     match filter:
         case GaussianFilter() | LinearFilter():
             return bool(first(filter.channel).uncertain)

@@ -2,12 +2,12 @@
 
 from .derived import Computed as Computed
 from .fields import TimeUnit as TimeUnit
-from .fields import at as at
 from .fields import convert_name as convert_name
 from .fields import convert_time as convert_time
 from .fields import decode_items as decode_items
 from .fields import decode_json as decode_json
 from .fields import fail_of_doubled as fail_of_doubled
+from .fields import field_at as field_at
 from .fields import is_stamp as is_stamp
 from .fields import match_topic as match_topic
 from .fields import parse_arrival as parse_arrival
