@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from heliograph.learning import Fit, Share
     from heliograph.learning.held_out import Change, Uniformity
     from heliograph.learning.losses.fates import Fates
+    from heliograph.learning.losses.losses import Losses
     from heliograph.report.pages.fit import Learned
     from heliograph.report.progress import Advance
     from heliograph.report.results import Json, Results
@@ -91,7 +92,6 @@ def learn(
 
     from heliograph.files.fitted import NetworkAgain
     from heliograph.learning.held_out import compare_filters, transform_held_out
-    from heliograph.learning.losses.losses import learn_losses
     from heliograph.learning.sender_fit import has_deciding_sender
     from heliograph.numerics.check import fail
     from heliograph.report.pages.fit import Learned
@@ -119,23 +119,17 @@ def learn(
     if changes:
         uniform = stop.unless_stopped(lambda: transform_held_out(fitted.network, changes, z, u, cut)) or []
     advance("looking at losses")
-    # Nodes of which some messages arrived and some did not.
-    lossy = {
-        name: fates
-        for name, fates in _find_fates(start, recording).items()
-        if any(0 < sequence.mean() < 1 for sequence in fates)
-    }
-    losses = stop.unless_stopped(lambda: {name: learn_losses(fates) for name, fates in lossy.items()}) or {}
-    return Learned(
-        network,
-        str(measurements),
-        fitted,
-        learned=cut,
-        held_out=rows - cut,
-        changes=changes,
-        uniform=uniform,
-        losses=losses,
-    )
+    losses = stop.unless_stopped(lambda: _learn_lossy(start, recording)) or {}
+    return Learned(network, str(measurements), fitted, cut, rows - cut, changes, uniform, losses)
+
+
+def _learn_lossy(network: "Network", recording: "Recording") -> "dict[str, Losses]":
+    """Return the statistics of losses of the nodes of which some messages arrived and some did not."""
+    from heliograph.learning.losses.losses import learn_losses
+
+    fates = _find_fates(network, recording)
+    lossy = {name for name, sequences in fates.items() if any(0 < sequence.mean() < 1 for sequence in sequences)}
+    return {name: learn_losses(fates[name]) for name in fates if name in lossy}
 
 
 def _find_fates(network: "Network", recording: "Recording") -> "dict[str, Fates]":

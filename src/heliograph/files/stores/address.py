@@ -63,6 +63,9 @@ def is_store(location: object) -> bool:
     return isinstance(location, str) and location.split("://")[0] in (*INFLUX, *POSTGRES) and "://" in location
 
 
+ASKED = "one of table=NAME and query=SELECT..."
+
+
 def parse_store(url: str) -> StoreAddress:
     """Read the URL of a store: SCHEME://user:password@host:port/database?table=NAME, or ...?query=SELECT ....
 
@@ -94,15 +97,10 @@ def parse_store(url: str) -> StoreAddress:
     if influx and len(others) == 1 and others[0].startswith("org="):
         organisation = others.pop().removeprefix("org=")
     # What is asked for: one table, or one statement, and of InfluxDB nothing else.
-    problem = ""
     if influx and others:
-        problem = others[0].split("=")[0]
-    elif language and (tables or not statement.strip()):
-        problem = "both, or one without a value"
-    elif len(tables) > 1:
-        problem = "several"
-    if problem:
-        raise fail(store, "one of table=NAME and query=SELECT...", problem)
+        raise fail(store, ASKED, others[0].split("=")[0])
+    if (language and (tables or not statement.strip())) or len(tables) > 1:
+        raise fail(store, ASKED, "both, or one without a value" if language else "several")
     if not influx and language not in ("", "query"):
         raise fail(store, "query=SELECT..., as InfluxDB alone has others", language)
     # The server's own options stay in the URL.
