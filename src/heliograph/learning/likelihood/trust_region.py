@@ -148,18 +148,17 @@ def maximise(
 def _init_lanes(evaluate: Evaluate, start: np.ndarray, moving: np.ndarray, domains: Domains, close: float) -> _State:
     """Return the state before the first step; lanes whose likelihood or slope is no number at the start are done."""
     total, gradient, information = evaluate(start)
-    lanes = len(start)
     state = _State(
         x=start.copy(),
         total=total,
         gradient=gradient,
         information=information,
         model=information,
-        radius=np.full(lanes, FIRST_RADIUS),
-        remaining=np.full(lanes, np.inf),
+        radius=np.full(len(start), FIRST_RADIUS),
+        remaining=np.full(len(start), np.inf),
         done=~_is_finite(total, gradient, information, moving),
-        converged=np.zeros(lanes, dtype=bool),
-        joined=np.arange(lanes),
+        converged=np.zeros(len(start), dtype=bool),
+        joined=np.arange(len(start)),
     )
     return _mark_arrived(state, moving, domains, close)
 
