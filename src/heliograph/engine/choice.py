@@ -45,7 +45,7 @@ class Choice(NamedTuple):
 
     @property
     def explained(self) -> str:
-        """Return "native: ..." with the number of operations, or "xla: ..." with the reason."""
+        """Sentence "native: ..." with the number of operations, or "xla: ..." with the reason."""
         if self.code is None:
             return f"xla: {self.why}"
         slow = f", {self.code.divisions} of them divisions and roots" if self.code.divisions else ""
@@ -57,7 +57,7 @@ class Choice(NamedTuple):
 
 
 def engine_of(function: Callable[..., PyTree], *arguments: PyTree) -> str:
-    """Explain which engine computes a function of one run over runs of these arguments, and why.
+    """Return in words which engine computes a function of one run over runs of these arguments, and why.
 
     Args:
         function: a function of the arrays of one run.
@@ -85,9 +85,16 @@ def explain_refusal(function: Callable[..., PyTree], *arguments: PyTree) -> str:
 def choose_code(
     function: Callable[..., PyTree], arguments: Sequence[PyTree], differs: Sequence[bool], most: int | None = None
 ) -> Choice:
-    """Return the code of a function of one run for arguments like these, compiled once; or why there is none.
+    """Return the native code of a function for arguments like these, compiled once; or why XLA has to compute it.
 
-    XLA computes a program of more than `most` operations, where it is said, unless native code is forced.
+    Args:
+        function: a function of the arrays of one run.
+        arguments: its arguments.
+        differs: for each argument, whether it has a leading axis of runs; the others are shared by all runs.
+        most: operations above which XLA computes, unless native code is forced; no limit by default.
+
+    Raises:
+        ValueError: native code is forced and does not take the program.
     """
     engine = read_setting()
     if engine == "xla":
@@ -115,7 +122,8 @@ def compute_once(
         choice = choose_code(function, arguments, [False] * len(arguments), most)
         if choice.code is None:
             return float64.to_numpy(by_xla(*arguments))
-        return map_arrays(lambda leaf: leaf[0, ...], choice.results())  # no scalars: constants of a program
+        # The code computes runs, here one. `[0, ...]` keeps arrays, where `[0]` would make NumPy's scalars.
+        return map_arrays(lambda leaf: leaf[0, ...], choice.results())
 
 
 def map_arrays(change: Callable[[np.ndarray], np.ndarray], results: PyTree) -> PyTree:
@@ -133,6 +141,7 @@ def compile_on_call(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        """Compute the function by native code or XLA."""
         if kwargs or is_traced(*args):
             return by_xla(*args, **kwargs)
         float64.check_process()
@@ -151,7 +160,7 @@ def read_setting() -> str:
 
 
 def try_native(make: Callable[[], Code]) -> Code | None:
-    """Return native code, or None if XLA has to compute instead."""
+    """Return the native code that `make` makes, or None if XLA has to compute instead."""
     engine = read_setting()
     if engine == "xla":
         return None
@@ -167,29 +176,33 @@ def try_native(make: Callable[[], Code]) -> Code | None:
 def _find_code(
     function: Callable[..., PyTree], arguments: Sequence[PyTree], differs: Sequence[bool], most: int | None = None
 ) -> Choice:
-    """Return code for the structure of a function and its arguments, which may be objects with arrays."""
-    # Arrays become arguments; all other leaves are part of the cached key.
-    leaves, form = jax.tree.flatten((function, *arguments))
-    apart = [False] * len(jax.tree.leaves(function))
-    apart += [d for a, d in zip(arguments, differs, strict=True) for _ in jax.tree.leaves(a)]
-    is_array = [isinstance(x, np.ndarray | jax.Array) for x in leaves]
-    arrays = tuple(x for x, a in zip(leaves, is_array, strict=True) if a)
-    kinds = tuple(
-        _Array(x.shape[1:] if d else x.shape, x.dtype, d) if a else x
-        for x, a, d in zip(leaves, is_array, apart, strict=True)
-    )
+    """Return code for the structure of a function and its arguments, both of which may be trees with arrays."""
+    # Whether each leaf has an axis of runs; those of the function have none.
+    leaves, structure = jax.tree.flatten((function, *arguments))
+    leaf_differs = [False] * len(jax.tree.leaves(function))
+    for argument, argument_differs in zip(arguments, differs, strict=True):
+        leaf_differs += [argument_differs] * len(jax.tree.leaves(argument))
+    # Arrays become arguments of the code; by shape and type, like all other leaves, they are part of the cache's key.
+    arrays, key_leaves = list[Any](), list[Any]()
+    for leaf, leading_runs in zip(leaves, leaf_differs, strict=True):
+        if isinstance(leaf, np.ndarray | jax.Array):
+            arrays.append(leaf)
+            shape = leaf.shape[1:] if leading_runs else leaf.shape
+            key_leaves.append(_ArrayOfRun(shape, leaf.dtype, leading_runs))
+        else:
+            key_leaves.append(leaf)
     # A leaf without a hash has no key: XLA computes.
     try:
-        code, why = _compile_structure(form, kinds, most)
+        code, why = _compile_structure(structure, tuple(key_leaves), most)
     except TypeError as error:
         if "unhashable" not in str(error):
             raise
         return Choice(None, f"the function holds an object that cannot be compared with another: {error}")
-    return Choice(code, why, arrays)
+    return Choice(code, why, tuple(arrays))
 
 
-class _Array(NamedTuple):
-    """Shape and type of one run's array."""
+class _ArrayOfRun(NamedTuple):
+    """Shape and type of one run's array, and whether each run has its own."""
 
     shape: tuple[int, ...]
     dtype: np.dtype
@@ -199,19 +212,24 @@ class _Array(NamedTuple):
 @lru_cache(COMPILED)
 @make_room
 @no_collector()
-def _compile_structure(form: Any, kinds: tuple[Any, ...], most: int | None) -> tuple[Any, str]:
-    """Compile code for one structure, and the shapes and types of its arrays."""
-    arrays = [k for k in kinds if isinstance(k, _Array)]
+def _compile_structure(structure: Any, leaves: tuple[Any, ...], most: int | None) -> tuple[Any, str]:
+    """Return the code of a function in a tree (function, *arguments) with these leaves, or None and why there is none.
+
+    Of arrays the leaves have shapes and types: these are the arguments of the code.
+    """
+    arrays = [leaf for leaf in leaves if isinstance(leaf, _ArrayOfRun)]
 
     def call(*values: Any) -> PyTree:
+        """Call the function with these values of the arrays."""
         items = iter(values)
-        leaves = [next(items) if isinstance(k, _Array) else k for k in kinds]
-        function, *arguments = jax.tree.unflatten(form, leaves)
+        with_values = [next(items) if isinstance(leaf, _ArrayOfRun) else leaf for leaf in leaves]
+        function, *arguments = jax.tree.unflatten(structure, with_values)
         return function(*arguments)
 
     struct: Any = jax.ShapeDtypeStruct
-    examples = [struct(k.shape, k.dtype) for k in arrays]
+    examples = [struct(array.shape, array.dtype) for array in arrays]
+    shared = [n for n, array in enumerate(arrays) if not array.differs]
     try:
-        return compile(call, *examples, shared=[n for n, k in enumerate(arrays) if not k.differs], most=most), ""
+        return compile(call, *examples, shared=shared, most=most), ""
     except Unsupported as error:
         return None, str(error)

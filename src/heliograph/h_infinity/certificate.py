@@ -90,12 +90,10 @@ def certify_level(
         raise fail("gains", f"entries of at most {LARGEST:g}", f"{np.max(np.abs(K)):g}")
     P = symmetric_weight("weights", array("weights", weights, (T + 1, 2 * n, 2 * n)))
     lam = _complete_multipliers(array("multipliers", multipliers, (T, None)))
-    # Phi_k of every step, and its largest eigenvalue
+    # Phi_k of every step, and its largest eigenvalue.
     matrices = [theorem_matrix(system, k, K[k], P[k], P[k + 1], lam[k], level) for k in range(T)]
-    tops, negative = (
-        np.array([_largest_eigenvalue(phi) for phi in matrices]),
-        np.array([is_negative(phi) for phi in matrices]),
-    )
+    largest = np.array([_largest_eigenvalue(phi) for phi in matrices])
+    negative = np.array([is_negative(phi) for phi in matrices])
     # Initial condition: level^2 W - P_0 > 0.
     allowed = level**2 * system.initial_weight
     initial = float(np.linalg.eigvalsh(allowed - P[0])[0])
@@ -104,7 +102,7 @@ def certify_level(
     definite = np.array([smallest_eigenvalue(p) for p in P])
     margin = min(initial_margin, *(-_find_scaled_largest(phi) for phi in matrices))
     # Every condition that fails, in words.
-    reasons = [f"step {k}: the largest eigenvalue is {tops[k]:.3g}, not negative" for k in np.flatnonzero(~negative)]
+    reasons = [f"step {k}: the largest eigenvalue is {largest[k]:.3g}, not negative" for k in np.flatnonzero(~negative)]
     if not initial_margin > ROUNDING:
         reasons.append(f"initial condition: the smallest eigenvalue of level^2 W - P_0 is {initial:.3g}, not positive")
     reasons += [f"P_{k} is not positive definite ({definite[k]:.3g})" for k in np.flatnonzero(~(definite > ROUNDING))]
@@ -113,9 +111,17 @@ def certify_level(
     for letter, of in (("f", system.growth), ("h", system.output_growth)):
         reasons += _list_objections(of, findings[letter])
         assumed += _list_assumed(letter, of, findings[letter])
-    count = T if negative.all() else int(np.argmin(negative))
-    about = tuple(findings["f"] + findings["h"]), tuple(reasons), tuple(assumed)
-    return HInfinityCertificate(not reasons, level, tops, count, initial, margin, *about)
+    return HInfinityCertificate(
+        certified=not reasons,
+        level=level,
+        largest_eigenvalues=largest,
+        steps_certified=T if negative.all() else int(np.argmin(negative)),
+        initial=initial,
+        margin=margin,
+        growth=tuple(findings["f"] + findings["h"]),
+        reasons=tuple(reasons),
+        assumed=tuple(assumed),
+    )
 
 
 def _list_findings(name: str, given: Sequence[GrowthFinding]) -> list[GrowthFinding]:
@@ -124,7 +130,7 @@ def _list_findings(name: str, given: Sequence[GrowthFinding]) -> list[GrowthFind
 
 
 def _list_objections(growth: Growth, findings: Sequence[GrowthFinding]) -> list[str]:
-    """Reasons against a certificate: refuted constants, and findings about constants that the system does not have."""
+    """Return reasons against a certificate: refuted constants, and findings about constants above the system's."""
     reasons, constants = [], _list_positive(growth.state) + _list_positive(growth.error)
     for finding in findings:
         if finding.refuted:
@@ -173,7 +179,9 @@ def theorem_matrix(
     multipliers: Float[np.ndarray, "4"],
     level: float,
 ) -> Float[np.ndarray, "q q"]:
-    """Matrix Phi of step k over eta = (x, e, f, f~, h, h~, v, rho): negative definite if the level holds over the step.
+    """Return Phi of step k over eta = (x, e, f, f~, h, h~, v, rho): where negative definite, the step keeps the level.
+
+    f~ = f(x) - f(xhat), h~ = h(x) - h(xhat). `weight`: P_k, `following`: P_k+1, `multipliers`: of f, f~, h, h~.
 
     The next (x, e) is R eta - [0; K] H V eta with H = [G, N] random, V eta = (C x + h + D v, rho) and R eta holding the
     filter's expectation G-bar (C xhat + h(xhat)), so Phi needs E[H] and E[H_ab H_ij] and nothing else of the channel.
@@ -189,6 +197,7 @@ def theorem_matrix(
     q = 4 * n + 2 * y + v + r
 
     def row(height: int, **blocks: np.ndarray) -> Float[np.ndarray, "{height} q"]:
+        """Return rows over eta that multiply its parts by these blocks, by the letter of the part."""
         wide = np.zeros((height, q))
         for name, block in blocks.items():
             wide[:, at[name] : at[name] + block.shape[1]] = block
@@ -202,13 +211,13 @@ def theorem_matrix(
     correction = np.concatenate([np.zeros_like(gain), gain])
     inner = correction.T @ following @ correction
     cross = values.T @ following @ correction @ link.mean @ signal
-    spread = signal.T @ np.einsum("ai,abij->bj", inner, link.second) @ signal
-    phi = values.T @ following @ values - cross - cross.T + spread
+    square = signal.T @ np.einsum("ai,abij->bj", inner, link.second) @ signal
+    phi = values.T @ following @ values - cross - cross.T + square
     # - P_k + M'M - level^2 |(v, rho)|^2
     phi[: 2 * n, : 2 * n] -= weight
     phi[n : 2 * n, n : 2 * n] += M.T @ M
-    sizes = [level**2] * (v + r)
-    phi[4 * n + 2 * y :, 4 * n + 2 * y :] -= np.diag(sizes)
+    disturbances = slice(4 * n + 2 * y, q)
+    phi[disturbances, disturbances] -= level**2 * np.eye(v + r)
     _add_growth(phi, at, y, system, k, multipliers)
     return _drop_absent(phi, at, y, system)
 
@@ -221,25 +230,35 @@ def _add_growth(
     k: int,
     multipliers: Float[np.ndarray, "4"],
 ) -> None:
-    """Add the growth conditions of step k: sum_i lambda_i (a_i^2 |argument|^2 - |value|^2)."""
-    n = system.states
-    constants = [growth[k] for pair in (system.growth, system.output_growth) for growth in pair]
-    for i, (constant, weight_of) in enumerate(zip(constants, multipliers, strict=True)):
-        width, value_at, point_at = (n, n, y, y)[i], at["fghd"[i]], at["xexe"[i]]
-        value, point = slice(value_at, value_at + width), slice(point_at, point_at + n)
-        phi[value, value] -= weight_of * np.eye(width)
-        phi[point, point] += weight_of * constant**2 * np.eye(n)
+    """Add to Phi the growth conditions of step k: sum_i lambda_i (a_i^2 |argument_i|^2 - |value_i|^2).
+
+    Of f(x), f~(e), h(x), h~(e) in turn; at: where each part of eta begins; y: number of outputs.
+    """
+    n, f, h = system.states, system.growth, system.output_growth
+    conditions = [
+        ("f", n, "x", f.state[k]),
+        ("g", n, "e", f.error[k]),  # f~
+        ("h", y, "x", h.state[k]),
+        ("d", y, "e", h.error[k]),  # h~
+    ]
+    for (name, width, of, constant), multiplier in zip(conditions, multipliers, strict=True):
+        value, argument = slice(at[name], at[name] + width), slice(at[of], at[of] + n)
+        phi[value, value] -= multiplier * np.eye(width)
+        phi[argument, argument] += multiplier * constant**2 * np.eye(n)
 
 
 def _drop_absent(
     phi: Float[np.ndarray, "q q"], at: dict[str, int], y: int, system: GrowthSystem
 ) -> Float[np.ndarray, "kept kept"]:
-    """Return Phi without f and f~, or h and h~, where the function is zero throughout."""
-    stored = list(range(len(phi)))
+    """Return Phi without f and f~, or h and h~, where the function is zero throughout.
+
+    at: the first row of each part of eta; f~ stands behind f, and h~ behind h.
+    """
+    kept = list(range(len(phi)))
     for growth, name, width in ((system.growth, "f", 2 * system.states), (system.output_growth, "h", 2 * y)):
         if growth.absent:
-            stored = [i for i in stored if not at[name] <= i < at[name] + width]
-    return np.asarray(phi[np.ix_(stored, stored)])
+            kept = [i for i in kept if not at[name] <= i < at[name] + width]
+    return np.asarray(phi[np.ix_(kept, kept)])
 
 
 def _complete_multipliers(given: Float[np.ndarray, "steps count"]) -> Float[np.ndarray, "steps 4"]:

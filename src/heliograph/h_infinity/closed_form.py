@@ -44,27 +44,34 @@ def known_channel_design(
 
 
 def _run_riccati(system: GrowthSystem, level: float, multipliers: Float[np.ndarray, "steps 2"]) -> HInfinityDesign:
-    """Run the Riccati recursion over the horizon at one level; stop at the first step without a gain."""
+    """Run the Riccati recursion over the horizon at one level; return a design that ends at a step without a gain."""
     n, m, steps = system.states, system.received, system.steps
-    # a little below the level, so that the certificate has a margin
+    # A little below the level, so that the certificate has a margin.
     inner = level * (1 - SLACK)
-    start = level**2 * float(np.linalg.eigvalsh(system.initial_weight)[0]) * (1 - SLACK)
-    # P_0 = diag(state, start) as large as level^2 W allows for e, small for x
+    # P_0 = diag(state I, error I), as large as level^2 W allows for e, small for x: so small that the state's weight
+    # costs next to nothing of the level, whatever B v adds to x.
+    error_weight = level**2 * float(np.linalg.eigvalsh(system.initial_weight)[0]) * (1 - SLACK)
     input_size = float(np.max(np.linalg.norm(system.disturbance, 2, axis=(1, 2))))
-    state = SLACK * min(start, level**2 / (1 + (1 + 1 / SPARE) * input_size**2))
-    gains, weights = np.full((steps, n, m), np.nan), np.full((steps + 1, 2 * n, 2 * n), np.nan)
-    weights[0] = np.diag(np.repeat([state, start], n))
-    design = HInfinityDesign(level, gains, weights, np.full((steps, 4), np.nan), False, "")
+    state = SLACK * min(error_weight, level**2 / (1 + (1 + 1 / SPARE) * input_size**2))
+    design = HInfinityDesign(
+        level=level,
+        gains=np.full((steps, n, m), np.nan),
+        weights=np.full((steps + 1, 2 * n, 2 * n), np.nan),
+        multipliers=np.full((steps, 4), np.nan),
+        feasible=False,
+        status="",
+    )
+    design.weights[0] = np.diag(np.repeat([state, error_weight], n))
     # Step by step: K and P2 in closed form, P1 small enough that it does no harm.
     for k, step in enumerate(step_matrices(system, separate=True)):
-        gain_and_error = _compute_best_gain(system, step, weights[k, n:, n:], inner, multipliers[k])
+        gain_and_error = _compute_best_gain(system, step, design.weights[k, n:, n:], inner, multipliers[k])
         if gain_and_error is None:
             text = f"no gain exists at step {k} of {steps} with these multipliers"
             return design._replace(status=text, failed_step=k)
-        gains[k], error = gain_and_error
-        state, of_growth = _compute_state_weight(system, k, state)
-        weights[k + 1] = np.block([[state * np.eye(n), np.zeros((n, n))], [np.zeros((n, n)), error]])
-        design.multipliers[k] = [of_growth[0], multipliers[k, 0], of_growth[1], multipliers[k, 1]]
+        design.gains[k], error = gain_and_error
+        state, (multiplier_f, multiplier_h) = _compute_state_weight(system, k, state)
+        design.weights[k + 1] = np.block([[state * np.eye(n), np.zeros((n, n))], [np.zeros((n, n)), error]])
+        design.multipliers[k] = [multiplier_f, multipliers[k, 0], multiplier_h, multipliers[k, 1]]
     return design._replace(feasible=True, status="optimal")
 
 
@@ -88,16 +95,18 @@ def _compute_best_gain(
     # K* = E S U' (U S U')^-1, P2+^-1 = E S E' - K* U S E'
     cross, spread = received @ inverse @ forward.T, received @ inverse @ received.T
     best = np.linalg.lstsq(spread, cross, rcond=None)[0].T
-    following = np.linalg.inv(forward @ inverse @ forward.T - best @ cross)
-    return best, (1 - SLACK) * (following + following.T) / 2
+    next_weight = np.linalg.inv(forward @ inverse @ forward.T - best @ cross)
+    return best, (1 - SLACK) * (next_weight + next_weight.T) / 2
 
 
 def _compute_state_weight(system: GrowthSystem, k: int, state: float) -> tuple[float, tuple[float, float]]:
     """Return the next weight of the state itself, which no measurement can lower, and the multipliers of f and h.
 
-    |A x + f + B v|^2 <= (1 + d) (|A| + a)^2 |x|^2 + (1 + 1/d) |B|^2 |v|^2: any weight small enough will do.
+    |A x + f + B v|^2 <= (1 + d) (|A| + a)^2 |x|^2 + (1 + 1/d) |B|^2 |v|^2: any weight small enough will do, and
+    d = SPARE leaves a part of it for the multipliers.
     """
     size, a, b = np.linalg.norm(system.transition[k], 2), system.growth.state[k], system.output_growth.state[k]
-    following = state / ((1 + SPARE) ** 3 * max(float(size + a) ** 2, 1.0))
-    multiplier = following * (1 + SPARE) ** 2 * float(1 + size / a) if a > 0 else following * 10 / SPARE
-    return following, (multiplier, state * SPARE / (4 * (1 + float(b) ** 2)))
+    next_state = state / ((1 + SPARE) ** 3 * max(float(size + a) ** 2, 1.0))
+    multiplier_f = next_state * (1 + SPARE) ** 2 * float(1 + size / a) if a > 0 else next_state * 10 / SPARE
+    multiplier_h = state * SPARE / (4 * (1 + float(b) ** 2))
+    return next_state, (multiplier_f, multiplier_h)

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from heliograph.h_infinity.coordinates import scale_steps
 from heliograph.h_infinity.solver import (
     MARGIN,
     HorizonProblem,
@@ -25,7 +26,6 @@ from heliograph.h_infinity.step_inequality import (
     UnknownsLayout,
     all_multipliers,
     next_energy,
-    scale_steps,
     step_matrices,
 )
 from heliograph.h_infinity.system import LARGEST, GrowthSystem, symmetric_weight
@@ -163,13 +163,12 @@ def horizon_design(
     status = run_solver(problem.problem, solver)
     values = problem.unknowns.value
     if not status.startswith("optimal") or values is None:
-        return _make_unsolved_design(
-            system, separate, float("nan"), f"no level could be proven over the horizon ({status})"
-        )
+        text = f"no level could be proven over the horizon ({status})"
+        return _make_unsolved_design(system, separate, float("nan"), text)
     # The solver's answer must satisfy every step's inequality itself.
-    parts = [np.asarray(values[entries]) for entries in problem.places]
-    solved = [layout.unpack(unknown) for layout, unknown in zip(layouts, parts[1:], strict=True)]
-    square = float(parts[0][0])
+    level_part, *step_parts = [np.asarray(values[entries]) for entries in problem.places]
+    solved = [layout.unpack(part) for layout, part in zip(layouts, step_parts, strict=True)]
+    square = float(level_part[0])
     weights = [(1 - MARGIN) * square * allowed if start is None else start, *map(_weigh_state_and_error, solved)]
     failed = _find_first_failing(steps, solved, weights, square)
     if failed is not None:
@@ -181,14 +180,23 @@ def horizon_design(
         chosen = np.array([coordinates.gain(steps[k].nominal + _gain_correction(u), k) for k, u in enumerate(solved)])
     multipliers = np.array([coordinates.multipliers(u, k) for k, u in enumerate(solved)])
     unscaled = np.array([coordinates.weight(weight, k) for k, weight in enumerate(weights)])
-    proven = all_multipliers(system, multipliers, separate)
-    return HInfinityDesign(float(np.sqrt(square)) * coordinates.unit, chosen, unscaled, proven, True, status)
+    return HInfinityDesign(
+        level=float(np.sqrt(square)) * coordinates.unit,
+        gains=chosen,
+        weights=unscaled,
+        multipliers=all_multipliers(system, multipliers, separate),
+        feasible=True,
+        status=status,
+    )
 
 
 def _find_first_failing(
     steps: Sequence[StepMatrices], solved: Sequence[Unknowns], weights: Sequence[np.ndarray], square: float
 ) -> int | None:
-    """Return the number of the first step, with these weights before each, at which an inequality does not hold."""
+    """Return the number of the first step whose inequality a solution does not satisfy; None where all hold.
+
+    solved: each step's unknowns; weights: P before each step, in scaled coordinates; square: the level squared.
+    """
     for k, (step, unknowns) in enumerate(zip(steps, solved, strict=True)):
         fixed = step.target - square * step.energy
         fixed[: len(weights[k]), : len(weights[k])] -= weights[k]
@@ -198,7 +206,7 @@ def _find_first_failing(
 
 
 class _Recursion:
-    """Recursion over the horizon, with a problem compiled once and again only where the system's data change."""
+    """Recursive design over the horizon: one problem a step, compiled again only where the system's data change."""
 
     def __init__(self, system: GrowthSystem, objective: Objective, solver: Solver, separate: bool):
         self.system, self.objective, self.solver, self.separate = system, objective, solver, separate
@@ -207,39 +215,44 @@ class _Recursion:
         self.compiled: list[tuple[StepMatrices, tuple[float, float], np.ndarray | None, StepProblem]] = []
 
     def run(self, level: float, initial: Float[np.ndarray, "w w"] | None) -> HInfinityDesign:
-        """Design at one level, in units of the level squared."""
-        system, n, c = self.system, self.system.states, self.coordinates
-        # P_0 in scaled coordinates, and the initial condition
-        relative = (level / c.unit) ** 2
+        """Return the design at one level, feasible or not; every weight on the way is in units of the level squared."""
+        system, n, coordinates = self.system, self.system.states, self.coordinates
         design = _make_unsolved_design(system, self.separate, level, "")
+        # P_0 in scaled coordinates, and the initial condition. A level squared too small would make it no number.
+        square = (level / coordinates.unit) ** 2
         too_low = design._replace(status="the initial condition 0 < P_0 < level^2 W fails", failed_step=0)
-        if relative < LARGEST**-2:  # P_0 in units of it would be no number
+        if square < LARGEST**-2:
             return too_low
-        top = c.unit**2 * c.initial_weight(system.initial_weight)
-        present = (1 - MARGIN) * top if initial is None else c.initial_weight(initial) / relative
-        if np.linalg.eigvalsh(top - present)[0] <= 0 or np.linalg.eigvalsh(present)[0] <= 0:
+        largest = coordinates.unit**2 * coordinates.initial_weight(system.initial_weight)
+        weight = (1 - MARGIN) * largest if initial is None else coordinates.initial_weight(initial) / square
+        if np.linalg.eigvalsh(largest - weight)[0] <= 0 or np.linalg.eigvalsh(weight)[0] <= 0:
             return too_low
-        design.weights[0] = relative * c.weight(present, 0)
+        design.weights[0] = square * coordinates.weight(weight, 0)
         # Step by step: the inequality, then gain, weight and multipliers in the user's units.
         for k, step in enumerate(self.steps):
-            fixed = step.target / relative - step.energy
-            fixed[: 2 * n, : 2 * n] -= present
-            status, unknowns = self._find_problem(k, present if k == 0 else None).solve(fixed)
+            fixed = step.target / square - step.energy
+            fixed[: 2 * n, : 2 * n] -= weight
+            status, unknowns = self._find_problem(k, weight if k == 0 else None).solve(fixed)
             if unknowns is None or not _inequality_holds(step, unknowns, fixed, SCREEN):
                 text = f"no gain found at step {k} of {system.steps} ({status})"
                 return design._replace(status=text, failed_step=k)
-            present = _weigh_state_and_error(unknowns)
-            design.gains[k] = c.gain(step.nominal + _gain_correction(unknowns), k)
-            design.weights[k + 1] = relative * c.weight(present, k + 1)
-            design.multipliers[k] = all_multipliers(system, relative * c.multipliers(unknowns, k), self.separate)
+            weight = _weigh_state_and_error(unknowns)
+            design.gains[k] = coordinates.gain(step.nominal + _gain_correction(unknowns), k)
+            design.weights[k + 1] = square * coordinates.weight(weight, k + 1)
+            multipliers = square * coordinates.multipliers(unknowns, k)
+            design.multipliers[k] = all_multipliers(system, multipliers, self.separate)
         return design._replace(feasible=True, status="optimal")
 
     def _find_problem(self, k: int, start: Float[np.ndarray, "w w"] | None) -> StepProblem:
-        """Return the step's problem, the one compiled before where its matrices and sizes are the same."""
+        """Return the problem of step k, the one compiled before where its matrices and sizes are the same.
+
+        A weight `start` that couples x and e makes a problem of its own.
+        """
         step, sizes = self.steps[k], self.coordinates.sizes(k + 1)
         coupling = _coupled_initial_weight(start, self.system.states)
-        for matrices, single, coupled, problem in self.compiled:
-            if all(map(np.array_equal, matrices, step)) and single == sizes and coupled is coupling is None:
+        for old_step, old_sizes, old_coupling, problem in self.compiled:
+            same_step = all(map(np.array_equal, old_step, step)) and old_sizes == sizes
+            if same_step and coupling is None and old_coupling is None:
                 return problem
         problem = StepProblem(step, self.layout, self.objective, self.solver, sizes, coupling)
         self.compiled.append((step, sizes, coupling, problem))
@@ -252,16 +265,19 @@ def _coupled_initial_weight(start: Float[np.ndarray, "w w"] | None, n: int) -> F
 
 
 def _check_initial_weight(initial: ArrayLike, n: int) -> Float[np.ndarray, "w w"]:
-    """Return the initial weight diag(P1, P2) of these sizes; raise ValueError for another shape."""
+    """Return the initial weight P_0 (2n, 2n), symmetric; raise ValueError for another shape."""
     return symmetric_weight("initial weight P_0", array("initial weight P_0", initial, (2 * n, 2 * n)))
 
 
 def _inequality_holds(
     step: StepMatrices, unknowns: Unknowns, fixed: Float[np.ndarray, "q q"], strictness: float
 ) -> bool:
-    """Return whether one step is feasible: P1, P2 > 0, and the inequality with Z = K'P2 K itself strictly negative."""
+    """Decide whether one step is feasible: P1, P2 > 0, and Phi with Z = K'P2 K itself strictly negative.
+
+    fixed: the part of Phi without unknowns, S - diag(P, 0).
+    """
     gain = _gain_correction(unknowns)
-    exact = unknowns._replace(product=unknowns.error @ gain, spread=gain.T @ unknowns.error @ gain)
+    exact = unknowns._replace(product=unknowns.error @ gain, gain_square=gain.T @ unknowns.error @ gain)
     positive = min(np.linalg.eigvalsh(unknowns.state)[0], np.linalg.eigvalsh(unknowns.error)[0]) > 0
     return bool(positive and np.linalg.eigvalsh(next_energy(step, exact) + fixed)[-1] < -strictness)
 
@@ -278,11 +294,16 @@ def _weigh_state_and_error(unknowns: Unknowns) -> Float[np.ndarray, "w w"]:
 
 
 def _make_unsolved_design(system: GrowthSystem, separate: bool, level: float, status: str) -> HInfinityDesign:
-    """Design without gains, with the solver's status."""
+    """Return a design that is not feasible, whose arrays are NaN, with the solver's status."""
     n, steps = system.states, system.steps
-    shapes = (steps, n, system.received), (steps + 1, 2 * n, 2 * n), (steps, 4 if separate else 2)
-    gains, weights, multipliers = (np.full(shape, np.nan) for shape in shapes)
-    return HInfinityDesign(level, gains, weights, multipliers, False, status)
+    return HInfinityDesign(
+        level=level,
+        gains=np.full((steps, n, system.received), np.nan),
+        weights=np.full((steps + 1, 2 * n, 2 * n), np.nan),
+        multipliers=np.full((steps, 4 if separate else 2), np.nan),
+        feasible=False,
+        status=status,
+    )
 
 
 def _bisect_level(works: Callable[[float], bool], guess: float) -> float | None:

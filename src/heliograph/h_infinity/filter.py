@@ -67,9 +67,11 @@ class HInfinityFilter(AbstractSizedFilter):
     def correct(self, state: Pending, z: ArrayLike, k: Step = 0) -> tuple[Pending, Innovation]:
         """Compute the correction of the next estimate from z; the current one stays."""
         value = jnp.asarray(z) - at(self.expected_gain, k) @ at(self.sensor, k).measure(state.mean)
-        later = at(self.gains, k) @ jnp.where(jnp.isnan(value), 0.0, value)
-        nothing = jnp.where(jnp.any(~jnp.isnan(value)), jnp.nan, 0.0)
-        return Pending(state.mean, later), Innovation(value, jnp.full((len(value), len(value)), jnp.nan), nothing)
+        correction = at(self.gains, k) @ jnp.where(jnp.isnan(value), 0.0, value)
+        # Without a covariance there is no likelihood; that of a step in which nothing arrives is 0 in logarithm.
+        log_likelihood = jnp.where(jnp.any(~jnp.isnan(value)), jnp.nan, 0.0)
+        no_covariance = jnp.full((len(value), len(value)), jnp.nan)
+        return Pending(state.mean, correction), Innovation(value, no_covariance, log_likelihood)
 
     @estimates
     def estimate(self, state: Pending) -> Estimate:
@@ -85,7 +87,7 @@ def h_infinity_filter(
     design: HInfinityDesign,
     initial_mean: Float[ArrayLike, " n"] | None = None,
 ) -> HInfinityFilter:
-    """H-infinity filter with designed gains, over the steps of the system.
+    """Return the H-infinity filter with designed gains, over the steps of the system.
 
     Args:
         plant: the plant, n states, whose transition must be the system's A x + f(x).

@@ -95,9 +95,8 @@ class GrowthFinding(NamedTuple):
         if self.proved:
             return f"{self.name}: constant {self.constant:g} is proved {where} (no slope above {self.bound:.6g})"
         if not self.refuted:
-            why = self.reason or (
-                "nothing is proved" if self.bound is None else f"slopes up to {self.bound:.6g} proved"
-            )
+            proved = "nothing is proved" if self.bound is None else f"slopes up to {self.bound:.6g} proved"
+            why = self.reason or proved
             verdict = f"not refuted {where} (largest slope {self.slope:.6g})"
             return f"{self.name}: constant {self.constant:g} is assumed: {verdict}; {why}"
         return f"{self.name}: constant {self.constant:g} is false {where}: {self._describe_evidence()}"
@@ -153,12 +152,13 @@ def check_growth(
     tools, random = _SlopesAndRatios(function, float(np.linalg.norm(top - bottom))), np.random.default_rng(seed)
     starts = bottom + (top - bottom) * scipy.stats.qmc.Sobol(len(bottom), seed=seed).random(POINTS)
 
-    def with_zero(points: np.ndarray) -> np.ndarray:
+    # |f(x)| <= a |x| alone: pairs with 0.
+    def pair_with_zero(points: np.ndarray) -> np.ndarray:
         return np.concatenate([points, np.zeros_like(points)], axis=1)
 
     if not differences:
-        points = _climb_at_random(lambda x: tools.ratio(with_zero(x)), starts, bottom, top, random)
-        return _make_finding(name, constant, bottom, top, tools, points, with_zero(points), False)
+        points = _climb_at_random(lambda x: tools.ratio(pair_with_zero(x)), starts, bottom, top, random)
+        return _make_finding(name, constant, bottom, top, tools, points, pair_with_zero(points), differences)
     # Largest slope: Sobol points, then random moves from the steepest.
     points = _climb_at_random(tools.slope, starts, bottom, top, random)
     # Largest ratio: close pairs along the steepest directions, and pairs far apart.
@@ -167,11 +167,11 @@ def check_growth(
     far = bottom + (top - bottom) * random.random((POINTS, 2, len(bottom)))
     starts = np.concatenate([close, far.reshape(POINTS, -1)])
     pairs = _climb_at_random(tools.ratio, starts, np.tile(bottom, 2), np.tile(top, 2), random)
-    return _make_finding(name, constant, bottom, top, tools, points, pairs, True)
+    return _make_finding(name, constant, bottom, top, tools, points, pairs, differences)
 
 
 def _check_function(function: Function, point: Float[np.ndarray, "n"]) -> None:
-    """Raise ValueError unless a number or a vector follows from a point."""
+    """Raise ValueError unless the function returns a number or a vector at a point."""
     expected = "one of the state in operations of jax.numpy that returns a number or a vector"
     try:
         with jax.enable_x64(True):
@@ -183,7 +183,7 @@ def _check_function(function: Function, point: Float[np.ndarray, "n"]) -> None:
 
 
 def _check_box(low: ArrayLike, high: ArrayLike) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    """Return the ends of a box as arrays; raise ValueError unless low < high."""
+    """Return the corners of a box as arrays; raise ValueError unless low <= high, and low < high somewhere."""
     bottom = np.asarray(array("low corner of the region", low, (None,)))
     top = np.asarray(array("high corner of the region", high, bottom.shape))
     if np.any(top < bottom) or not np.any(top > bottom):
@@ -192,7 +192,7 @@ def _check_box(low: ArrayLike, high: ArrayLike) -> tuple[Float[np.ndarray, "n"],
 
 
 class _SlopesAndRatios:
-    """Slopes and ratios of a function at points (count, n) or pairs (count, 2n), compiled once."""
+    """Slopes and ratios of a function at points (count, n) or pairs (count, 2n), compiled once; width: of the box."""
 
     def __init__(self, function: Function, width: float):
         self.width, self.function = width, function
@@ -207,7 +207,7 @@ class _SlopesAndRatios:
         return np.where(finite, np.linalg.norm(safe, 2, axis=(-2, -1)), np.inf)
 
     def steepest(self, points: Float[np.ndarray, "count n"]) -> Float[np.ndarray, "count n"]:
-        """Return the unit direction in which the function changes most."""
+        """Return the unit direction in which the function changes most at each point."""
         return np.linalg.svd(np.nan_to_num(self.jacobian(points), posinf=0.0, neginf=0.0))[2][:, 0]
 
     def ratio(self, pairs: Float[np.ndarray, "count both"]) -> Float[np.ndarray, "count"]:
@@ -225,10 +225,11 @@ class _SlopesAndRatios:
 
 
 def _compile_by_part(function: Callable[[Any], jax.Array]) -> Callable[[np.ndarray], np.ndarray]:
-    """Compile a function of points for as many at a time as a climb tries, so that it is one program."""
+    """Return a function of points, compiled for as many at a time as a climb tries, so that it is one program."""
     compute = compile_in_float64(function)
 
     def call(points: np.ndarray) -> np.ndarray:
+        """Compute part by part, the last one padded by repetition of the last point."""
         size = CLIMBERS * TRIALS
         padded = np.concatenate([points, np.repeat(points[-1:], -len(points) % size, axis=0)])
         values = [compute(padded[start : start + size]) for start in range(0, len(padded), size)]
@@ -249,12 +250,22 @@ def _make_finding(
 ) -> GrowthFinding:
     """Return the finding from the points and pairs that a search ended at, with a bound unless it is refuted."""
     slopes, ratios = tools.slope(points), tools.ratio(pairs)
-    best, pair = int(np.argmax(slopes)), int(np.argmax(ratios))
-    x, y = np.split(pairs[pair], 2)
+    steepest, widest = int(np.argmax(slopes)), int(np.argmax(ratios))
+    x, y = np.split(pairs[widest], 2)
     finding = GrowthFinding(
-        name, float(constant), low, high, float(slopes[best]), points[best], (x, y), float(ratios[pair]),
-        tools.at_zero(len(low)), None, "", differences,
-    )  # fmt: skip
+        name=name,
+        constant=float(constant),
+        low=low,
+        high=high,
+        slope=float(slopes[steepest]),
+        point=points[steepest],
+        pair=(x, y),
+        ratio=float(ratios[widest]),
+        at_zero=tools.at_zero(len(low)),
+        bound=None,
+        reason="",
+        differences=differences,
+    )
     if finding.refuted:
         return finding
     bound = slope_bound(tools.function, low, high, finding.limit)
@@ -268,7 +279,7 @@ def _climb_at_random(
     high: Float[np.ndarray, "n"],
     random: np.random.Generator,
 ) -> Float[np.ndarray, "climbers n"]:
-    """Return the best starts, each moved to the best of random moves around it, again and again, inside the box."""
+    """Return the CLIMBERS best starts, each moved to the best of random moves around it ROUNDS times, in the box."""
     best = starts[np.argsort(-objective(starts), kind="stable")[:CLIMBERS]]
     size = (high - low) / 2
     for _ in range(ROUNDS):
@@ -296,7 +307,7 @@ class SlopeBound(NamedTuple):
 def slope_bound(
     function: Callable[[jax.Array], jax.Array], low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"], goal: float
 ) -> SlopeBound:
-    """Compute a proven bound of |f(x) - f(y)| / |x - y| over a box, below `goal` if LIMIT boxes suffice.
+    """Return a proven bound of |f(x) - f(y)| / |x - y| over a box, below `goal` if LIMIT boxes suffice.
 
     |J| <= |C| + |R| (spectral norms) for every J in the interval C +- R of a part's Jacobians; a function that is
     continuous, and differentiable but for kinks, has no larger ratio than the largest of these. Continuous is one made
@@ -305,9 +316,10 @@ def slope_bound(
     try:
         with jax.enable_x64(True):
             example = jnp.zeros((BOXES, len(low)))
-            plain = jax.vmap(lambda x: jnp.atleast_1d(function(x)))
-            whole = Interval(np.tile(low, (BOXES, 1)), np.tile(high, (BOXES, 1)))
-            evaluate(jax.make_jaxpr(plain)(example), [whole], continuous=True)
+            # The function itself over the whole box: refused unless it is continuous.
+            values = jax.vmap(lambda x: jnp.atleast_1d(function(x)))
+            whole_box = Interval(np.tile(low, (BOXES, 1)), np.tile(high, (BOXES, 1)))
+            evaluate(jax.make_jaxpr(values)(example), [whole_box], continuous=True)
             slopes = jax.make_jaxpr(jax.vmap(jax.jacfwd(lambda x: jnp.atleast_1d(function(x)))))(example)
             return SlopeBound(_sharpen_bound(slopes, low, high, goal), "")
     except UnknownError as reason:
@@ -317,7 +329,8 @@ def slope_bound(
 def _sharpen_bound(
     slopes: jax.extend.core.ClosedJaxpr, low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"], goal: float
 ) -> float:
-    """Bisect the boxes whose bound is above the goal, at most LIMIT boxes, and return the largest bound."""
+    """Return the largest bound of a slope, after halving boxes whose bound is above the goal, LIMIT boxes at most."""
+    # done: the largest bound of the boxes that are within the goal; seen: how many were looked at.
     bottoms, tops, done, seen = low[None], high[None], 0.0, 0
     while len(bottoms):
         bounds = np.concatenate(
@@ -335,20 +348,22 @@ def _sharpen_bound(
 def _bound_slopes(
     slopes: jax.extend.core.ClosedJaxpr, low: np.ndarray, high: np.ndarray
 ) -> Float[np.ndarray, " boxes"]:
-    """Bound the Jacobian's norm over each of the boxes, infinite where the interval arithmetic says nothing."""
-    short = BOXES - len(low)
-    ends = [np.concatenate([end, np.repeat(end[-1:], short, axis=0)]) for end in (low, high)]
-    (bounded,) = evaluate(slopes, [Interval(*ends)], continuous=False)
-    finite = np.isfinite(bounded.low) & np.isfinite(bounded.high)
-    a, b = np.where(finite, bounded.low, 0.0), np.where(finite, bounded.high, 0.0)
-    centre = a / 2 + b / 2
-    radius = np.nextafter(np.maximum(b - centre, centre - a), np.inf)
+    """Return a bound of the Jacobian's norm over each box, infinite where the interval arithmetic says nothing."""
+    # The program is for BOXES boxes: fewer are padded.
+    padding = BOXES - len(low)
+    ends = [np.concatenate([end, np.repeat(end[-1:], padding, axis=0)]) for end in (low, high)]
+    (jacobian,) = evaluate(slopes, [Interval(*ends)], continuous=False)
+    # |J| <= |C| + |R| for J in C +- R.
+    finite = np.isfinite(jacobian.low) & np.isfinite(jacobian.high)
+    least, largest = np.where(finite, jacobian.low, 0.0), np.where(finite, jacobian.high, 0.0)
+    centre = least / 2 + largest / 2
+    radius = np.nextafter(np.maximum(largest - centre, centre - least), np.inf)
     norms = sum(np.linalg.norm(matrix, 2, axis=(-2, -1)) for matrix in (centre, radius)) * (1 + NORM_ROUNDING)
     return np.where(finite.all(axis=(1, 2)), norms, np.inf)[: len(low)]
 
 
 def _halve_boxes(low: np.ndarray, high: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return every box in two, across its widest side, in shares of the whole box's."""
+    """Return every box in two, halved across its widest side relative to `width`, the sides of the whole region."""
     sides = np.argmax((high - low) / np.where(width > 0, width, 1.0), axis=1)
     rows = np.arange(len(low))
     middle = (low[rows, sides] + high[rows, sides]) / 2

@@ -34,9 +34,12 @@ class Interval(NamedTuple):
 
 
 def evaluate(jaxpr: core.ClosedJaxpr, arguments: Sequence[Interval], continuous: bool) -> list[Interval]:
-    """Evaluate a traced function on intervals.
+    """Return the intervals of a traced function's results on intervals of its arguments.
 
     `continuous`: refuse an open decision, where the function may jump, and a stopped slope, which its derivative lacks.
+
+    Raises:
+        UnknownError: an operation that is not known here, a decision that is refused.
     """
     values: dict[core.Var, Interval] = {}
 
@@ -71,7 +74,7 @@ def point_interval(value: object) -> Interval:
 
 
 def round_outward(low: object, high: object, ulps: int = 1) -> Interval:
-    """Interval with its ends moved outward by `ulps` units in the last place; an end that is no number is infinite."""
+    """Return the interval with its ends moved outward by `ulps` units in the last place; a NaN end is infinite."""
     low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
     low, high = np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
     for _ in range(ulps):
@@ -80,7 +83,7 @@ def round_outward(low: object, high: object, ulps: int = 1) -> Interval:
 
 
 def _apply_operation(equation: Any, x: list[Interval], continuous: bool) -> Interval:
-    """Return the interval of an operation's result."""
+    """Return the interval of an operation's result on arguments x; UnknownError where it is not known here."""
     name, params = equation.primitive.name, equation.params
     # Arithmetic, and functions of a single number.
     if name in ARITHMETIC:
@@ -125,20 +128,24 @@ def _decide(interval: Interval, continuous: bool) -> Interval:
 
 
 def _apply_to_ends(equation: Any, x: list[Interval]) -> list[Interval]:
-    """Intervals of numbers that only change places: move the low ends, and the high ends; places are whole numbers."""
+    """Return the intervals of numbers that an operation only moves: of low ends, and of high ends.
+
+    Whole numbers among its arguments are places, which have to be certain.
+    """
     if any(a.low.dtype.kind in "iu" and not np.array_equal(a.low, a.high) for a in x):
         raise UnknownError("a place that depends on x")
-    pairs = zip(_bound(equation, [a.low for a in x]), _bound(equation, [a.high for a in x]), strict=True)
-    return [Interval(*pair) for pair in pairs]
+    lows, highs = _compute(equation, [a.low for a in x]), _compute(equation, [a.high for a in x])
+    return [Interval(low, high) for low, high in zip(lows, highs, strict=True)]
 
 
-def _bound(equation: Any, ends: list[Numbers]) -> list[Numbers]:
+def _compute(equation: Any, ends: list[Numbers]) -> list[Numbers]:
+    """Return the operation's results on numbers."""
     outputs = equation.primitive.bind(*map(jax.device_put, ends), **equation.params)
     return list(map(np.asarray, outputs if equation.primitive.multiple_results else [outputs]))
 
 
 def _compare(name: str, a: Interval, b: Interval) -> Interval:
-    """Return the interval of truth values of a comparison of a and b."""
+    """Return the interval of truth values of a comparison of a and b: (certainly true, possibly true)."""
     if name in ("gt", "ge"):
         return _compare({"gt": "lt", "ge": "le"}[name], b, a)
     if name == "ne":
@@ -153,7 +160,10 @@ def _compare(name: str, a: Interval, b: Interval) -> Interval:
 
 
 def _select_case(x: list[Interval]) -> Interval:
-    """Return the interval of cases[which]: where that is open, from the lowest of the possible cases to the highest."""
+    """Return the interval of cases[which], x = [which, *cases].
+
+    Where `which` is open, from the lowest of the possible cases to the highest.
+    """
     which, cases = x[0], x[1:]
     lows, highs = [np.broadcast_arrays(*ends) for ends in ([c.low for c in cases], [c.high for c in cases])]
     first, last = which.low.astype(int), which.high.astype(int)
@@ -165,22 +175,25 @@ def _select_case(x: list[Interval]) -> Interval:
     return Interval(low.astype(kind), high.astype(kind))
 
 
-def _product(a: Interval, b: Interval) -> tuple[Numbers, Numbers]:
+def _multiply(a: Interval, b: Interval) -> tuple[Numbers, Numbers]:
+    """Return the least and the largest product of ends, not rounded outward."""
     ends = [x * y for x in a for y in b]
-    ends = [np.where(np.isnan(end), 0.0, end) for end in ends]  # 0 times an infinite end: the other ends say the rest
+    # 0 times an infinite end is 0 for every finite number near it; the other ends say the rest.
+    ends = [np.where(np.isnan(end), 0.0, end) for end in ends]
     return np.minimum.reduce(ends), np.maximum.reduce(ends)
 
 
 def _bound_quotient(a: Interval, b: Interval) -> Interval:
     """Return an interval of x / y; all numbers where y may be 0."""
-    through = (b.low <= 0) & (b.high >= 0)
-    safe = Interval(np.where(through, 1.0, b.low), np.where(through, 1.0, b.high))
+    holds_zero = (b.low <= 0) & (b.high >= 0)
+    safe = Interval(np.where(holds_zero, 1.0, b.low), np.where(holds_zero, 1.0, b.high))
     ends = [x / y for x in a for y in safe]
     low, high = np.minimum.reduce(ends), np.maximum.reduce(ends)
-    return round_outward(np.where(through, -np.inf, low), np.where(through, np.inf, high))
+    return round_outward(np.where(holds_zero, -np.inf, low), np.where(holds_zero, np.inf, high))
 
 
 def _square(a: Interval) -> Interval:
+    """Return the interval of x^2, from 0 where x may be 0; as x * x it would begin at low * high."""
     low, high = np.minimum(a.low**2, a.high**2), np.maximum(a.low**2, a.high**2)
     square = round_outward(np.where((a.low <= 0) & (a.high >= 0), 0.0, low), high)
     return Interval(np.maximum(square.low, 0.0), square.high)
@@ -197,8 +210,9 @@ def _bound_power(a: Interval, exponent: int) -> Interval:
 
 
 def _absolute(a: Interval) -> Interval:
-    ends = np.minimum(np.abs(a.low), np.abs(a.high)), np.maximum(np.abs(a.low), np.abs(a.high))
-    return Interval(np.where((a.low <= 0) & (a.high >= 0), 0.0, ends[0]), ends[1])
+    """Return the interval of |x|, from 0 where x may be 0."""
+    least, largest = np.minimum(np.abs(a.low), np.abs(a.high)), np.maximum(np.abs(a.low), np.abs(a.high))
+    return Interval(np.where((a.low <= 0) & (a.high >= 0), 0.0, least), largest)
 
 
 def _extend_monotone(
@@ -214,40 +228,46 @@ def _extend_monotone(
 
 
 def _bound_cosine(a: Interval) -> Interval:
-    """Return the interval of cos: 1 if an even multiple of pi is inside or a hair outside, -1 if an odd one is."""
+    """Return the interval of cos: up to 1 if an even multiple of pi is inside, down to -1 if an odd one is."""
     ends = np.cos(a.low), np.cos(a.high)
     cosine = round_outward(np.minimum(*ends), np.maximum(*ends), ULPS)
+    # Ends in multiples of pi, widened by more than their rounding.
     first, last = a.low / np.pi - 1e-9 * (1 + np.abs(a.low)), a.high / np.pi + 1e-9 * (1 + np.abs(a.high))
-    top = np.floor(last / 2) >= np.ceil(first / 2)
-    bottom = np.floor((last - 1) / 2) >= np.ceil((first - 1) / 2)
-    wild = ~(np.isfinite(a.low) & np.isfinite(a.high))
-    low, high = np.where(bottom | wild, -1.0, cosine.low), np.where(top | wild, 1.0, cosine.high)
+    holds_top = np.floor(last / 2) >= np.ceil(first / 2)
+    holds_bottom = np.floor((last - 1) / 2) >= np.ceil((first - 1) / 2)
+    infinite = ~(np.isfinite(a.low) & np.isfinite(a.high))
+    low = np.where(holds_bottom | infinite, -1.0, cosine.low)
+    high = np.where(holds_top | infinite, 1.0, cosine.high)
     return Interval(np.maximum(low, -1.0), np.minimum(high, 1.0))
 
 
 def _sum_intervals(a: Interval, axes: tuple[int, ...]) -> Interval:
-    """Return an interval that holds the sum over some axes, rounding included."""
+    """Return an interval that holds the sum over some axes, rounding included.
+
+    In any order a sum of n terms x_i is off by at most (n - 1) eps sum |x_i|, to first order in eps.
+    """
     count = int(np.prod([a.low.shape[i] for i in axes]))
     size = np.sum(np.maximum(np.abs(a.low), np.abs(a.high)), axis=axes)
-    room = 2 * (count + 2) * np.finfo(float).eps * size
-    return round_outward(np.sum(a.low, axis=axes) - room, np.sum(a.high, axis=axes) + room)
+    rounding = 2 * (count + 2) * np.finfo(float).eps * size
+    return round_outward(np.sum(a.low, axis=axes) - rounding, np.sum(a.high, axis=axes) + rounding)
 
 
 def _bound_contraction(a: Interval, b: Interval, dimensions: Contraction) -> Interval:
     """Return the interval of a contraction: products first, then their sum."""
     (left, right), (left_batch, right_batch) = dimensions
 
-    def laid(x: Numbers, contracted: Sequence[int], batch: Sequence[int], before: int, after: int) -> Numbers:
+    def lay_out(x: Numbers, contracted: Sequence[int], batch: Sequence[int], before: int, after: int) -> Numbers:
+        """Return x with axes (batch, `before` ones, free, `after` ones, contracted), so that both factors broadcast."""
         free = [i for i in range(x.ndim) if i not in contracted and i not in batch]
-        shape = x.shape
+        batch_sizes, free_sizes, contracted_sizes = ([x.shape[i] for i in axes] for axes in (batch, free, contracted))
         x = np.transpose(x, [*batch, *free, *contracted])
-        sizes = [shape[i] for i in batch], [shape[i] for i in free], [shape[i] for i in contracted]
-        return x.reshape(*sizes[0], *[1] * before, *sizes[1], *[1] * after, *sizes[2])
+        return x.reshape(*batch_sizes, *[1] * before, *free_sizes, *[1] * after, *contracted_sizes)
 
-    free_a, free_b = (x.low.ndim - len(c) - len(left_batch) for x, c in ((a, left), (b, right)))
-    wide = [Interval(*(laid(end, left, left_batch, 0, free_b) for end in a))]
-    wide.append(Interval(*(laid(end, right, right_batch, free_a, 0) for end in b)))
-    product = round_outward(*_product(*wide))
+    free_a = a.low.ndim - len(left) - len(left_batch)
+    free_b = b.low.ndim - len(right) - len(left_batch)
+    wide_a = Interval(*(lay_out(end, left, left_batch, 0, free_b) for end in a))
+    wide_b = Interval(*(lay_out(end, right, right_batch, free_a, 0) for end in b))
+    product = round_outward(*_multiply(wide_a, wide_b))
     axes = tuple(range(product.low.ndim - len(left), product.low.ndim))
     return _sum_intervals(product, axes)
 
@@ -256,7 +276,7 @@ ARITHMETIC: dict[str, Callable[..., Interval]] = {
     "add": lambda a, b: round_outward(a.low + b.low, a.high + b.high),
     "add_any": lambda a, b: round_outward(a.low + b.low, a.high + b.high),
     "sub": lambda a, b: round_outward(a.low - b.high, a.high - b.low),
-    "mul": lambda a, b: round_outward(*_product(a, b)),
+    "mul": lambda a, b: round_outward(*_multiply(a, b)),
     "div": _bound_quotient,
     "neg": lambda a: Interval(-a.high, -a.low),
     "max": lambda a, b: Interval(np.maximum(a.low, b.low), np.maximum(a.high, b.high)),

@@ -33,7 +33,7 @@ SCS_ITERATIONS = 100_000
 
 
 def solvers() -> ModuleType:
-    """Import cvxpy, or raise an error that says how to get it."""
+    """Return the module cvxpy, imported; ModuleNotFoundError that says how to get it."""
     try:
         import cvxpy
     except ModuleNotFoundError as error:
@@ -50,7 +50,7 @@ def check_choice(name: str, value: str, choices: Any) -> None:
 
 
 def run_solver(problem: "Problem", solver: Solver) -> str:
-    """Solve, and return the status; a solver that gives up or is not sure of its answer is a status too."""
+    """Solve a problem and return its status; a solver that gives up or is not sure of its answer is a status too."""
     cp = solvers()
     solve: Callable[..., object] = problem.solve  # it has no types
     with warnings.catch_warnings():
@@ -97,31 +97,32 @@ class StepProblem:
         self.layout, self.solver = layout, solver
         self.unknowns = cp.Variable(layout.size)
         self.fixed = cp.Parameter(step.energy.shape, symmetric=True)
-        # Phi < 0 for each part of eta that is coupled, and [[Z, Y'], [Y, P2]] > 0
+        # Phi < 0 for each part of eta that is coupled, multipliers >= 0 and [[Z, Y'], [Y, P2]] > 0.
         forms, q, n = linear_forms(step, layout), len(step.energy), layout.states
         phi = cp.reshape(forms.next @ self.unknowns, (q, q), order="C") + self.fixed
         constraints = [self.unknowns[layout.size - layout.multipliers :] >= 0]
         for coupled in independent_parts(step, forms, start):
             constraints.append(phi[coupled][:, coupled] << -MARGIN * np.eye(len(coupled)))
         for form in forms.positive:
-            k = int(np.sqrt(len(form)))
-            constraints.append(cp.reshape(form @ self.unknowns, (k, k), order="C") >> MARGIN * np.eye(k))
-        # Objectives on L, one problem after another.
+            size = int(np.sqrt(len(form)))
+            constraints.append(cp.reshape(form @ self.unknowns, (size, size), order="C") >> MARGIN * np.eye(size))
+        # Objectives on L, one problem after another; `reached`: the best value of the first, which the next keeps.
         weight = cp.reshape(forms.weight @ self.unknowns, (2 * n, 2 * n), order="C")
         self.reached = cp.Parameter()
         goals = _list_goals(cp, objective, [weight[:n, :n], weight[n:, n:]], sizes, self.reached)
         self.problems = [cp.Problem(goal, constraints + more) for goal, more in goals]
 
     def solve(self, fixed: Float[np.ndarray, "q q"]) -> tuple[str, Unknowns | None]:
-        """Solve with fixed = S - diag(P, 0) at level 1; return the status, and a solution if there is one."""
+        """Solve with fixed = S - diag(P, 0) at level 1; return the solver's status, and a solution if there is one."""
         self.fixed.value = fixed
         first, *others = self.problems
         status = run_solver(first, self.solver)
         if not status.startswith("optimal") or self.unknowns.value is None:
             return status, None
-        # Later objectives, held near the first one's best value.
+        # Later objectives, held near the first one's best value: at the narrowest tie that the solver does not find too
+        # narrow.
         values, best = np.asarray(self.unknowns.value), float(first.value)
-        for problem in others:  # next to no room is left to them, which a solver may find too narrow
+        for problem in others:
             for tie in TIES:
                 self.reached.value = (1 - tie) * best
                 if run_solver(problem, self.solver) == "optimal":
@@ -137,7 +138,11 @@ def _list_goals(
     sizes: tuple[float, float],
     reached: "Parameter",
 ) -> list[tuple["Minimize | Maximize", list["Constraint"]]]:
-    """Objectives on L = P+^-1, one after another, and the constraints that express each; `reached`: the one before."""
+    """Return the objectives on L = P+^-1, one after another, each with the constraints that express it.
+
+    weights: P1 and P2, of which P+ is made. sizes: of x and e, in whose units L is measured. reached: the value of the
+    objective before, which the next must not give up.
+    """
     if objective == "none":
         return [(cp.Minimize(0), [])]
     if objective == "log_determinant":
@@ -176,25 +181,28 @@ class HorizonProblem:
     ):
         cp = solvers()
         self.layouts = layouts
-        # One vector: the level squared, then each step's unknowns.
+        # One vector: the level squared (place 0), then each step's unknowns (places 1, 2, ...).
         sizes = [1, *(layout.size for layout in layouts)]
-        self.places = [slice(b - a, b) for a, b in zip(sizes, np.cumsum(sizes), strict=True)]
+        self.places = [slice(end - size, end) for size, end in zip(sizes, np.cumsum(sizes), strict=True)]
         self.unknowns = cp.Variable(sum(sizes))
         self.constraints: list[Constraint] = []
-        # Initial condition P_0 <= level^2 W.
-        first = weight if initial is None else initial
-        present = {0: (1 - MARGIN) * weight.ravel()[:, None]} if initial is None else {}
-        if initial is not None:
-            self._require({0: (1 - MARGIN) * weight.ravel()[:, None]}, -initial)
+        # P_0 is level^2 W, which is linear in an unknown, or fixed and required to be below that. `before` and `fixed`:
+        # the two parts of the weight before a step, the first by place of its unknowns.
+        largest = {0: (1 - MARGIN) * weight.ravel()[:, None]}
+        if initial is None:
+            before, fixed = largest, np.zeros_like(weight)
+        else:
+            self._require(largest, -initial)
+            before, fixed = dict[int, np.ndarray](), initial
+        start: np.ndarray | None = weight if initial is None else initial
         forms: LinearForms | None = None
         # Every step's inequality, from the weight before it to its own.
         for k, (step, layout) in enumerate(zip(steps, layouts, strict=True)):
             if forms is None or layout.gain is not None or not all(map(np.array_equal, step, steps[k - 1])):
                 forms = linear_forms(step, layout)
-            fixed = initial if k == 0 and initial is not None else np.zeros_like(weight)
-            self._add_step(k, step, forms, present, fixed, first if k == 0 else None)
+            self._add_step(k, step, forms, before, fixed, start)
             self.constraints.append(self.unknowns[self.places[k + 1]][layout.size - layout.multipliers :] >= 0)
-            present = {k + 1: forms.weight}
+            before, fixed, start = {k + 1: forms.weight}, np.zeros_like(weight), None
         self.problem = cp.Problem(cp.Minimize(self.unknowns[0]), self.constraints)
 
     def _add_step(
@@ -202,11 +210,15 @@ class HorizonProblem:
         k: int,
         step: StepMatrices,
         forms: LinearForms,
-        present: dict[int, np.ndarray],
+        before: dict[int, np.ndarray],
         fixed: Float[np.ndarray, "w w"],
         start: Float[np.ndarray, "w w"] | None,
     ) -> None:
-        """Add -Phi >= MARGIN level^2 for each part of eta that is coupled; the weight before is `present` + `fixed`."""
+        """Add -Phi >= MARGIN level^2 of step k for each part of eta that is coupled.
+
+        The weight before is `fixed` plus the linear maps `before` of the unknowns, by place; `start`: an initial weight
+        that may couple x and e, at the first step.
+        """
         q, width = len(step.energy), len(fixed)
         # -Phi = level^2 energy - target + weight before - next energy, part by part
         constant = -step.target
@@ -214,10 +226,10 @@ class HorizonProblem:
         for coupled in independent_parts(step, forms, start):
             entries = (coupled[:, None] * q + coupled).ravel()
             blocks = {0: (step.energy - MARGIN * np.eye(q)).ravel()[entries][:, None], k + 1: -forms.next[entries]}
-            for index, form in present.items():
-                before = np.zeros((q, q, form.shape[1]))
-                before[:width, :width] = form.reshape(width, width, -1)
-                blocks[index] = blocks.get(index, 0.0) + before.reshape(q * q, -1)[entries]
+            for index, form in before.items():
+                padded = np.zeros((q, q, form.shape[1]))
+                padded[:width, :width] = form.reshape(width, width, -1)
+                blocks[index] = blocks.get(index, 0.0) + padded.reshape(q * q, -1)[entries]
             self._require(blocks, constant[np.ix_(coupled, coupled)])
         # Positive matrices of the unknowns.
         for form in forms.positive:
@@ -225,11 +237,15 @@ class HorizonProblem:
             self._require({0: -MARGIN * np.eye(size).ravel()[:, None], k + 1: form}, np.zeros((size, size)))
 
     def _require(self, blocks: dict[int, np.ndarray], constant: np.ndarray) -> None:
-        """Require sum_i blocks_i (unknowns in place i) + constant to be positive semidefinite."""
-        results = [(block, *np.nonzero(block), self.places[index].start) for index, block in blocks.items()]
-        values = np.concatenate([block[rows, columns] for block, rows, columns, _ in results])
-        rows = np.concatenate([rows for _, rows, _, _ in results])
-        columns = np.concatenate([columns + start for _, _, columns, start in results])
-        form = csr_array((values, (rows, columns)), shape=(constant.size, self.unknowns.size))
+        """Require sum_i blocks_i (unknowns in place i) + constant, a matrix row by row, to be positive semidefinite."""
+        # One sparse matrix of all unknowns.
+        values, rows, columns = [], [], []
+        for index, block in blocks.items():
+            block_rows, block_columns = np.nonzero(block)
+            values.append(block[block_rows, block_columns])
+            rows.append(block_rows)
+            columns.append(block_columns + self.places[index].start)
+        entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
+        form = csr_array(entries, shape=(constant.size, self.unknowns.size))
         matrix = solvers().reshape(form @ self.unknowns, constant.shape, order="C") + constant
         self.constraints.append(matrix >> 0)

@@ -125,16 +125,18 @@ def growth_system(
     if links[0].inputs != y:
         raise fail("channel", f"one that takes the sensor's {y} outputs", f"{links[0].inputs} inputs")
     # Every matrix once for each step.
+    A = np.zeros((n, n)) if transition is None else transition
+    C = np.zeros((y, n)) if output is None else output
     return GrowthSystem(
-        _repeat_over(steps, "transition matrix", np.zeros((n, n)) if transition is None else transition, (n, n)),
-        B,
-        _repeat_over(steps, "output matrix", np.zeros((y, n)) if output is None else output, (y, n)),
-        D,
-        _repeat_over(steps, "wanted matrix", target, (None, n)),
-        _check_growth(steps, "growth", growth),
-        _check_growth(steps, "output growth", output_growth),
-        links,
-        _check_initial_weight(initial_weight, n),
+        transition=_repeat_over(steps, "transition matrix", A, (n, n)),
+        disturbance=B,
+        output=_repeat_over(steps, "output matrix", C, (y, n)),
+        feedthrough=D,
+        target=_repeat_over(steps, "wanted matrix", target, (None, n)),
+        growth=_check_growth(steps, "growth", growth),
+        output_growth=_check_growth(steps, "output growth", output_growth),
+        channel=links,
+        initial_weight=_check_initial_weight(initial_weight, n),
     )
 
 
@@ -195,7 +197,7 @@ def _check_initial_weight(value: ArrayLike, n: int) -> Float[np.ndarray, "w w"]:
 
 
 def symmetric_weight(name: str, matrix: Float[np.ndarray, "*many w w"]) -> Float[np.ndarray, "*many w w"]:
-    """Make a matrix exactly symmetric; its entries times a level squared, and their products, must be numbers."""
+    """Return a matrix made exactly symmetric; ValueError unless it is nearly so, with entries of at most LARGEST."""
     largest = float(np.max(np.abs(matrix), initial=0.0))
     if largest > LARGEST:
         raise fail(name, f"entries of at most {LARGEST:g}", f"{largest:g}")

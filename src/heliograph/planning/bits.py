@@ -86,7 +86,7 @@ def design_bits(network: Network, total: int) -> BitsDesign:
 
 
 def _describe_senders(network: Network) -> _Senders:
-    """Read plant, sensors and information of words from a network."""
+    """Return plant, sensors and the information of their words; ValueError of a network that is not of such senders."""
     plant = network.plant
     expected = "a stable LinearPlant without inputs, as words overload in the end of any other"
     if not isinstance(plant, LinearPlant) or not isinstance(plant.noise, AbstractNoise) or plant.inputs:
@@ -102,6 +102,7 @@ def _describe_senders(network: Network) -> _Senders:
             raise fail(f"sensor of node {name!r} of a design of bits", "a LinearSensor", type(node.sensor).__name__)
         r = np.asarray(node.sensor.noise.covariance)
         rows.append(np.asarray(node.sensor.matrix)[0])
+        # j(B) = 1 / (R + D^2/12 + U (1/g^2 - 1)), U = D^2 (4^B - 1)/12, and 0 of no bits.
         g, span = _gain_of(name, node), float(np.max(node.encoder.high) - np.min(node.encoder.low))
         counts = np.arange(1, MOST + 1)
         step = span / (2.0**counts - 1)
@@ -111,7 +112,7 @@ def _describe_senders(network: Network) -> _Senders:
 
 
 def _gain_of(name: str, node: Node) -> float:
-    """Return g of a node's link, of one word with a constant error rate."""
+    """Return the gain g = 1 - 2p of a node's link for one bit; ValueError unless its error rate is constant."""
     link = node.channel
     if isinstance(link, Flips) and isinstance(link.error, Constant):
         return float(link.gain.moment(1))
@@ -122,6 +123,7 @@ def _gain_of(name: str, node: Node) -> float:
 
 
 def _take_information(senders: _Senders, bits: Sequence[int] | np.ndarray) -> Float[np.ndarray, " senders"]:
+    """Return the information j_i of each sender's word of so many bits."""
     found: np.ndarray = senders.information[np.arange(len(senders.rows)), np.asarray(bits)]
     return found
 
@@ -145,7 +147,7 @@ def _find_error(senders: _Senders, j: Float[np.ndarray, " senders"]) -> float:
 
 
 def _find_slopes(senders: _Senders, j: Float[np.ndarray, " senders"]) -> Float[np.ndarray, " senders"]:
-    """Derivatives of the steady trace by each j: -c' P Y P c, Y = I + M' Y M with M = (I - K C) A."""
+    """Return the derivatives of the steady trace by each j: -c' P Y P c, Y = I + M' Y M with M = (I - K C) A."""
     p = _find_covariance(senders, j)
     before = senders.transition @ p @ senders.transition.T + senders.process
     m = p @ np.linalg.pinv(before) @ senders.transition
@@ -155,10 +157,14 @@ def _find_slopes(senders: _Senders, j: Float[np.ndarray, " senders"]) -> Float[n
 
 
 def _add_greedily(senders: _Senders, total: int) -> Float[np.ndarray, " senders"]:
-    """Add bits, several at once to one sender, by the decrease of the error for each bit, while there are some left."""
+    """Return bits of each sender, added where the error decreases most for a bit, until `total` of them are spent.
+
+    Several may be added at once to one sender.
+    """
     bits = np.zeros(len(senders.rows), dtype=int)
     error = _find_error(senders, _take_information(senders, bits))
     while (left := total - bits.sum()) > 0:
+        # (decrease of the error for a bit, sender, bits added, error then)
         best = (0.0, 0, 0, error)
         for i in range(len(bits)):
             for more in range(1, min(left, MOST - bits[i]) + 1):
@@ -166,15 +172,19 @@ def _add_greedily(senders: _Senders, total: int) -> Float[np.ndarray, " senders"
                 tried[i] += more
                 lower = _find_error(senders, _take_information(senders, tried))
                 best = max(best, ((error - lower) / more, i, more, lower))
-        if best[0] <= 0:
+        decrease, sender, more, error = best
+        if decrease <= 0:
             return bits
-        bits[best[1]] += best[2]
-        error = best[3]
+        bits[sender] += more
     return bits
 
 
 def _relax(senders: _Senders, total: int) -> float:
-    """Bound the error of any bits from below: the best real ones with the concave envelopes of the information."""
+    """Bound the error of any bits from below: that of the best real numbers of bits, with concave information.
+
+    By Frank and Wolfe's steps j + 2 / (k + 2) (best - j); the error is convex in j, so that the tangent at each j is
+    nowhere above it, and its least value over all bits of this total is a bound.
+    """
     hulls = [_find_envelope(values) for values in senders.information]
     j, bound = np.zeros(len(hulls)), -np.inf
     for k in range(STEPS):
@@ -201,8 +211,11 @@ def _find_envelope(values: Float[np.ndarray, " bits"]) -> list[tuple[int, float]
 
 
 def _spend(hulls: list[list[tuple[int, float]]], worth: np.ndarray, total: int) -> Float[np.ndarray, " senders"]:
-    """Maximise sum worth_i j_i over real bits: edges of the envelopes, the steepest first."""
-    edges = [
+    """Return the j_i of real bits, `total` in sum, that maximise sum_i worth_i j_i: the steepest edges first.
+
+    hulls: corners (bits, j) of each sender's concave envelope, between which j is linear.
+    """
+    edges = [  # (worth of a bit, sender, bits, information)
         (worth[i] * (high - low) / (b - a), i, b - a, high - low)
         for i, hull in enumerate(hulls)
         for (a, low), (b, high) in pairwise(hull)

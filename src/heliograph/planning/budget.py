@@ -80,22 +80,27 @@ class PowerLimits(NamedTuple):
     total: float
 
     def best(self, gain: Powers) -> Powers:
-        """Find the allowed powers q with the largest <gain, q>, zero where no gain is: limits are nested, so a sort."""
+        """Return the allowed powers q with the largest sum of gain * q; zero where the gain is not positive.
+
+        Limits are nested (an entry, its column, all), so entries are filled greedily, the largest gain first.
+        """
         powers, steps = np.zeros_like(gain), len(gain)
-        left, mean = self.total * steps, self.mean * steps
+        # What the limits of the total and of each transmitter leave, as sums over time.
+        total_left, left = self.total * steps, self.mean * steps
         for flat in np.argsort(-gain, axis=None, kind="stable"):
             k, h = np.unravel_index(flat, gain.shape)
-            if gain[k, h] <= 0 or left <= 0:
+            if gain[k, h] <= 0 or total_left <= 0:
                 break
-            if not np.isfinite(power := min(float(self.peak[k, h]), float(mean[h]), left)):
+            power = min(float(self.peak[k, h]), float(left[h]), total_left)
+            if not np.isfinite(power):
                 raise fail("budget", "one that limits every transmitter that helps", "no limit")
             powers[k, h] = power
-            mean[h] -= power
-            left -= power
+            left[h] -= power
+            total_left -= power
         return powers
 
     def even(self, on: Bool[np.ndarray, "time free"]) -> Powers:
-        """Return the largest allowed powers that are equal wherever `on` and no narrower limit binds."""
+        """Return the largest allowed powers that are zero where not `on`, and min(level, own limit) at one level."""
         limit = np.where(on, np.minimum(self.peak, self.mean), 0.0)  # a limit of the mean, at every step
         total = self.total * len(on)
         if not np.isfinite(total):
@@ -110,7 +115,10 @@ class PowerLimits(NamedTuple):
         return limit
 
     def clip(self, powers: Powers) -> Powers:
-        """Return the powers scaled down where rounding, or a solver's accuracy, puts them above a limit."""
+        """Return the powers, cut at their peaks and then scaled down where a mean or the total is above its limit.
+
+        For powers that rounding, or a solver's accuracy, puts a little outside.
+        """
         powers = np.clip(powers, 0.0, self.peak)
         mean = powers.mean(axis=0)
         powers = powers * np.divide(self.mean, mean, out=np.ones_like(mean), where=mean > self.mean)
@@ -118,7 +126,10 @@ class PowerLimits(NamedTuple):
         return powers * (self.total / total) if total > self.total else powers
 
     def rows(self) -> tuple[Float[np.ndarray, "limits entries"], Float[np.ndarray, "limits"]]:
-        """Return finite limits of means over time as rows @ powers.ravel() <= 1, or <= 0 where nothing may be sent."""
+        """Return (rows, bounds): the finite limits of mean and total as rows @ powers.ravel() <= bounds.
+
+        Each row is in units of its limit, so that bounds are 1, or 0 where nothing may be sent.
+        """
         steps, count = self.peak.shape
         rows = np.concatenate([np.tile(np.eye(count), steps), np.ones((1, steps * count))]) / steps
         most = np.append(self.mean, self.total)
@@ -140,23 +151,36 @@ def make_power_limits(
     Raises:
         ValueError: limits for transmitters that there are not, powers of the others above the budget.
     """
-    mean_limit, peak = (_list_by_name(name, getattr(budget, name), names) for name in ("per_transmitter", "peak"))
+    mean_limit = _limit_each("per_transmitter", budget.per_transmitter, names)
+    peak_limit = _limit_each("peak", budget.peak, names)
+    total_limit = np.inf if budget.total is None else budget.total
+    # What is not free has to be within the limits, and takes its part of the total.
     fixed = np.where(free, 0.0, powers)
-    mean, total = fixed.mean(axis=0), np.inf if budget.total is None else budget.total
-    needs = [(f"power of {name!r}", *pair) for name, *pair in zip(names, mean, mean_limit, strict=True)]
-    needs += [(f"peak of {name!r}", *pair) for name, *pair in zip(names, fixed.max(axis=0), peak, strict=True)]
-    for what, power, limit in (*needs, ("total", mean.sum(), total)):
-        if power > limit * (1 + MET):
-            expected = f"a {what} of at least {power:.6g}, which is sent by what is not free"
-            raise fail("budget", expected, f"{limit:.6g}")
-    return PowerLimits(np.tile(peak[free], (len(powers), 1)), mean_limit[free], max(total - mean.sum(), 0.0))
+    mean, peak = fixed.mean(axis=0), fixed.max(axis=0)
+    for name, mean_power, limit in zip(names, mean, mean_limit, strict=True):
+        _check_sent(f"power of {name!r}", mean_power, limit)
+    for name, peak_power, limit in zip(names, peak, peak_limit, strict=True):
+        _check_sent(f"peak of {name!r}", peak_power, limit)
+    _check_sent("total", mean.sum(), total_limit)
+    return PowerLimits(
+        peak=np.tile(peak_limit[free], (len(powers), 1)),
+        mean=mean_limit[free],
+        total=max(total_limit - mean.sum(), 0.0),
+    )
 
 
-def _list_by_name(what: str, limit: PerTransmitter, names: Sequence[str]) -> Float[np.ndarray, "hop"]:
-    """Return a limit for each transmitter in order, infinite where there is none."""
+def _check_sent(what: str, power: float, limit: float) -> None:
+    """Raise ValueError where transmitters that are not free send more than a limit."""
+    if power > limit * (1 + MET):
+        expected = f"a {what} of at least {power:.6g}, which is sent by what is not free"
+        raise fail("budget", expected, f"{limit:.6g}")
+
+
+def _limit_each(kind: str, limit: PerTransmitter, names: Sequence[str]) -> Float[np.ndarray, "hop"]:
+    """Return a limit for each transmitter in the order of `names`, infinite where there is none."""
     if not isinstance(limit, dict):
         return np.full(len(names), np.inf if limit is None else limit)
     unknown = sorted(set(limit) - set(names))
     if unknown:
-        raise fail(f"limit {what!r} of the budget", f"names of transmitters {list(names)}", unknown)
+        raise fail(f"limit {kind!r} of the budget", f"names of transmitters {list(names)}", unknown)
     return np.array([limit.get(name, np.inf) for name in names])

@@ -28,7 +28,7 @@ Advance = TypeAliasType("Advance", Callable[[str], None])
 
 
 def _report_nothing(what: str) -> None:
-    """No word of progress."""
+    """Do nothing: progress is not reported."""
 
 
 @readable
@@ -70,7 +70,7 @@ def error_over_power(problem: DesignProblem, totals: Sequence[float], advance: A
 
 
 def totals_about(total: float) -> list[float]:
-    """Return the totals on both sides of a design's."""
+    """Return POINTS total powers on both sides of this one, from a SPANth of it to SPAN times it."""
     return [float(power) for power in total * np.geomspace(1 / SPAN, SPAN, POINTS)]
 
 
@@ -142,7 +142,9 @@ class ChangeWorth(NamedTuple):
 def worth_of_changes(
     best: PowerDesign, exponent: float | None = None, advance: Advance = _report_nothing
 ) -> list[ChangeWorth]:
-    """Worth of each sensor once more, of each left out, and of a relay halfway of each hop: the design made again.
+    """Return what each change of a design's network is worth: a sensor more, one less, a relay halfway of a hop.
+
+    The design is made again for each sensor added once more or left out, and for a relay in each hop.
 
     A relay halfway makes two hops of one, each with 2^exponent times its power gain E g^2 and the same kappa and noise.
     A change that a design refuses, such as a last sensor left out, is not listed.
@@ -170,43 +172,55 @@ def worth_of_changes(
 
 
 def _list_changes(problem: DesignProblem, network: Network, exponent: float | None) -> dict[str, DesignProblem]:
-    """Return the problems of the changed networks, by the change."""
+    """Return the problems of the changed networks, by the name of the change."""
     nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
-    bare = {name: Node(node.sensor, node.channel, {}) for name, node in nodes.items()}
+    without_filters = {name: Node(node.sensor, node.channel, {}) for name, node in nodes.items()}
     free = None if problem.free is None else tuple(problem.free)
 
-    def with_nodes(changed: dict[str, Node], names: tuple[str, ...] | None) -> DesignProblem:
-        return replace(problem, network=Network(network.plant, changed), free=names)
+    def with_nodes(nodes: dict[str, Node], free: tuple[str, ...] | None) -> DesignProblem:
+        return replace(problem, network=Network(network.plant, nodes), free=free)
 
-    changed = {}
-    for name, node in bare.items():
+    problems = {}
+    for name, node in without_filters.items():
+        # The sensor once more.
         twin = f"{name} again"
-        changed[f"one more {name}"] = with_nodes({**bare, twin: node}, None if free is None else (*free, twin))
-        rest = None if free is None else tuple(free_name for free_name in free if _name_node(free_name) != name)
-        if len(bare) > 1 and rest != () and problem.target_error is None:
-            left = {other: node_left for other, node_left in bare.items() if other != name}
-            changed[f"without {name}"] = with_nodes(left, rest)
+        problems[f"one more {name}"] = with_nodes(
+            {**without_filters, twin: node}, None if free is None else (*free, twin)
+        )
+        # The sensor left out, unless nothing is left or nothing is free then. A target error is one of all sensors.
+        still_free = None if free is None else tuple(each for each in free if _name_node(each) != name)
+        if len(without_filters) > 1 and still_free != () and problem.target_error is None:
+            rest = {other: other_node for other, other_node in without_filters.items() if other != name}
+            problems[f"without {name}"] = with_nodes(rest, still_free)
+        # A relay in each hop. Hops behind it are counted anew, so that nodes are free as a whole.
         if exponent is not None and isinstance(node.channel, AbstractRandomAffine):
-            # Hops are counted anew behind a relay that is put between: nodes are free as a whole.
-            whole = None if free is None else tuple(dict.fromkeys(_name_node(free_name) for free_name in free))
+            free_nodes = None if free is None else tuple(dict.fromkeys(_name_node(each) for each in free))
             for hop in transmitter_names(node.channel):
-                nearer = Node(node.sensor, _insert_relay(node.channel, hop, exponent), {})
-                changed[f"a relay halfway of {name}.{hop}"] = with_nodes({**bare, name: nearer}, whole)
-    return changed
+                with_relay = Node(node.sensor, _insert_relay(node.channel, hop, exponent), {})
+                problems[f"a relay halfway of {name}.{hop}"] = with_nodes(
+                    {**without_filters, name: with_relay}, free_nodes
+                )
+    return problems
 
 
 def _name_node(transmitter: str) -> str:
+    """Return the name of a transmitter's node: "north" of "north.hop1"."""
     return transmitter.partition(".")[0]
 
 
 def _insert_relay(channel: AbstractRandomAffine, name: str, exponent: float) -> AbstractRandomAffine:
-    """Return the channel in which a relay stands halfway of one hop."""
+    """Return the channel in which a relay stands halfway of the hop of this name.
+
+    Power falls with distance^exponent: over half the distance E g^k grows by 2^(exponent k / 2). Both halves have the
+    noise of the whole hop.
+    """
 
     def change(hop_name: str, hop: AbstractHop, signal: Signal | None) -> AbstractRandomAffine:
+        """Return the two halves of this hop, any other hop as it is."""
         if hop_name != name or not isinstance(hop, GainAndNoise):
             return hop
-        first, second = (float(hop.law.moment(k)) * 2 ** (exponent * k / 2) for k in (1, 2))
-        law = GivenMoments([first, second])
+        mean, square = (float(hop.law.moment(k)) * 2 ** (exponent * k / 2) for k in (1, 2))
+        law = GivenMoments([mean, square])
         onward = GainAndNoise(law, np.eye(hop.outputs), hop.noise)
         return amplify_and_forward([GainAndNoise(law, hop.matrix, hop.noise), onward])
 

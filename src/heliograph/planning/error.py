@@ -66,7 +66,7 @@ class Error(Module):
         return self.period if self.horizon is None else self.horizon
 
     def matrix(self, states: tuple[str, ...]) -> Float[np.ndarray, "n n"]:
-        """Weight W for a plant with these states.
+        """Return the weight W (n, n) for a plant with these states.
 
         Args:
             states: names of the plant's states.
@@ -108,12 +108,15 @@ class Criterion(NamedTuple):
     sharpness: int | None
 
     def smooth(self, p: Matrices) -> tuple[float, Matrices]:
-        """Number at these covariances, smoothed where it is an eigenvalue, and its derivative by each P."""
+        """Return the number at covariances p (time, n, n), smoothed where it is an eigenvalue, and dnumber/dP of each.
+
+        The search takes it for the error; `exact` is the error itself.
+        """
         values, weights = self._differentiate_steps(p)
         return float(self.shares @ values), self.shares[:, None, None] * weights
 
     def exact(self, p: Matrices) -> float:
-        """Return the error itself, not the smooth function that a search takes for it."""
+        """Return the error itself at covariances p (time, n, n), without smoothing of an eigenvalue."""
         if self.sharpness is None:
             return self.smooth(p)[0]
         root = _root(self.weight)
@@ -132,7 +135,7 @@ class Criterion(NamedTuple):
         return [self] if self.sharpness is None else [self._replace(sharpness=q) for q in SHARPER]
 
     def _differentiate_steps(self, p: Matrices) -> tuple[Float[np.ndarray, "time"], Matrices]:
-        """Return f and its derivative at each step."""
+        """Return f(P_k) and df/dP_k of each step."""
         if self.sharpness is None:
             return np.einsum("kij,kij->k", self.weight, p), self.weight
         # tr(S^q)^(1/q) and its derivative W^1/2 S^(q-1) W^1/2 tr(S^q)^(1/q - 1), relative to the largest eigenvalue.

@@ -90,20 +90,22 @@ def simulate_rate(
     """
     check_count("runs", runs, 2)
     check_count("horizon", horizon, 4)
-    filter = event_filter(plant, sensor, channel, trigger)
-    node = Node(sensor, channel, {"event": filter}, trigger=trigger)
+    node = Node(sensor, channel, {"event": event_filter(plant, sensor, channel, trigger)}, trigger=trigger)
     record = monte_carlo(Network(plant, {"sender": node}), horizon, runs, seed)
+    # Means over time of each run, whose spread gives the standard errors.
     sent = record.transmissions["sender"][:, horizon // 4 :] != 0
-    by_run = sent.mean(axis=(1, 2))
+    rates = sent.mean(axis=(1, 2))
     squares = (record.errors("sender", "event")[:, horizon // 4 :] ** 2).mean(axis=1)
-    root = np.sqrt(runs)
     return MessageRate(
-        float(by_run.mean()), squares.mean(axis=0), float(by_run.std(ddof=1) / root), squares.std(axis=0, ddof=1) / root
+        rate=float(rates.mean()),
+        error=squares.mean(axis=0),
+        rate_error=float(rates.std(ddof=1) / np.sqrt(runs)),
+        error_error=squares.std(axis=0, ddof=1) / np.sqrt(runs),
     )
 
 
 def prediction_error_rate(plant: AnyPlant, sensor: AnySensor, delta: float, loss: float = 0.0) -> MessageRate:
-    """Rate and error of a sender with a Kalman filter that transmits its estimate where the prediction is off by delta.
+    """Return rate and error of a sender whose Kalman filter sends its estimate where the prediction is off by delta.
 
     The prediction is that from the last estimate that was acknowledged; each is lost with probability `loss`, and the
     sender knows. With P the sender's variance and e the difference of its estimate and the prediction,
@@ -127,8 +129,8 @@ def prediction_error_rate(plant: AnyPlant, sensor: AnySensor, delta: float, loss
     delta, loss = float(scalar("delta", delta, TINY)), float(scalar("loss", loss, 0.0, 1.0))
     if not loss < 1:
         raise fail("loss", "a number below 1", loss)
-    known = system.kalman_variance
-    prior = a * a * known + q
+    posterior = system.kalman_variance
+    prior = a * a * posterior + q
     s = prior / np.sqrt(prior + r / c**2)
     # Parts of the line, within delta and beyond, with nodes and weights; what is beyond counts where losses leave it.
     far = delta + REACH * s / np.sqrt(1 - loss)
@@ -138,17 +140,18 @@ def prediction_error_rate(plant: AnyPlant, sensor: AnySensor, delta: float, loss
             "delta and loss", f"a line of at most {LONGEST} deviations of a step, {LONGEST * s:.3g}", f"{far:.3g}"
         )
     nodes, weights = _make_quadrature(edges, s)
+    # The integral equation of the visits v at the nodes (Nystrom's method), then the sums over a cycle.
     kappa = np.where(np.abs(nodes) <= delta, 1.0, loss)
     kernel = kappa[:, None] * _normal(nodes[:, None] - a * nodes, s * s) * weights
     visits = np.linalg.solve(np.eye(len(nodes)) - kernel, kappa * _normal(nodes, s * s)) * weights
     cycle = 1 + visits.sum()
     rate = (1 + visits[np.abs(nodes) > delta].sum()) / cycle
-    error = known + nodes**2 @ visits / cycle
-    return MessageRate(float(rate), np.array([error]), 0.0, np.zeros(1))
+    error = posterior + nodes**2 @ visits / cycle
+    return MessageRate(rate=float(rate), error=np.array([error]), rate_error=0.0, error_error=np.zeros(1))
 
 
 def least_error(plant: AnyPlant, sensor: AnySensor, rate: float, loss: float = 0.0) -> float:
-    """Mean square error that no sender stays below who transmits at most at this rate and knows what arrived.
+    """Return the least mean square error of senders that transmit at most at this rate and know what arrived.
 
     The curve of `prediction_error_rate`, whose thresholds are optimal for first-order plants: published for links
     without loss (Lipsa and Martins 2011) and with losses that are acknowledged (Chakravorty and Mahajan 2020); here it
@@ -170,7 +173,9 @@ def least_error(plant: AnyPlant, sensor: AnySensor, rate: float, loss: float = 0
 
 
 def send_on_delta_rate(plant: AnyPlant, sensor: AnySensor, delta: float) -> float:
-    """Transmissions a step of send-on-delta in the long run; losses change none, as the reference is the value sent.
+    """Return the transmissions a step of send-on-delta in the long run.
+
+    Losses do not change them, since a value is compared with the one sent last, arrived or not.
 
     From the stationary law of (x, r), r the reference, as a Markov chain on two grids of cells, extrapolated: to 1e-3
     of itself where one step in a hundred sends, to 1 % at one in 2,500.
@@ -192,7 +197,7 @@ def send_on_delta_rate(plant: AnyPlant, sensor: AnySensor, delta: float) -> floa
 
 
 def _send_on_delta_rate(system: _Scalar, delta: float) -> float:
-    """Return the rate by two grids, however small."""
+    """Return the rate of messages, however small, extrapolated from two grids."""
     a, r, delta = system.a, system.r / system.c**2, delta / abs(system.c)  # in units of the state
     if not abs(a) < 1:
         raise fail("plant", "a stable one, which has a rate in the long run", f"a = {a:g}")
@@ -210,10 +215,11 @@ def _choose_cells(system: _Scalar, delta: float, share: float) -> tuple[int, int
     Raises:
         ValueError: more cells than can be computed.
     """
-    a, q, _, r = system
-    # Cells that hold both noises, and reach over what is measured.
+    a, q, r = system.a, system.q, system.r
+    # Cells of at most `share` deviations of either noise; delta is the edge of a cell, so h = delta / (cells + 1/2).
     cells = int(np.ceil(min(delta / (share * np.sqrt(min(q, r))), 1e9) - 0.5))
-    h = delta / (cells + 0.5)  # delta is the edge of a cell
+    h = delta / (cells + 0.5)
+    # As many as reach over 5.5 deviations of what is measured.
     n = int(np.ceil(min(5.5 * np.sqrt(q / (1 - a * a) + r) / h, 1e9)))
     if n > POINTS:
         raise fail(
@@ -227,23 +233,23 @@ def _choose_cells(system: _Scalar, delta: float, share: float) -> tuple[int, int
 def _compute_rate_on_grid(system: _Scalar, delta: float, share: float) -> tuple[float, float]:
     """Return the share of steps with a message of send-on-delta, by a grid of cells, and the cells' length.
 
-    x+ = a x + w is measured as z = x + v and sent where |z - last sent| > delta: (x, last sent) is a Markov chain, here
-    on cells of at most `share` of the lesser noise's deviation.
+    x+ = a x + w (variance q) is measured as z = x + v (variance r) and sent where |z - last sent| > delta:
+    (x, last sent) is a Markov chain, here on cells of at most `share` of the lesser noise's deviation. Its law is held
+    as f[i, j] = P(x in cell i, last sent in cell j).
     """
-    a, q, _, r = system
+    a, q, r = system.a, system.q, system.r
     deviation = np.sqrt(q / (1 - a * a))
     n, cells, h = _choose_cells(system, delta, share)
-    # A Markov chain of cells: probabilities of a cell given the middle of another, which sum to 1.
+    # Probabilities of a cell given the middle of another, which sum to 1: move[new, old], noise[x, z].
     x = np.arange(-n, n + 1) * h
-    move, noise = _cells(x, a * x, np.sqrt(q)).T, _cells(x, x, np.sqrt(r))
-    # P(no message) of x in cell i, with the value of cell j sent last.
+    move, noise = _cell_probabilities(x, a * x, np.sqrt(q)).T, _cell_probabilities(x, x, np.sqrt(r))
+    # quiet[i, j] = P(no message) of x in cell i, with the value of cell j sent last.
     quiet = ndtr((x + delta - x[:, None]) / np.sqrt(r)) - ndtr((x - delta - x[:, None]) / np.sqrt(r))
-    # The stationary law is the eigenvector of a step for its largest eigenvalue, 1.
     size = 2 * n + 1
     beyond = max(size - cells - 1, 0)  # values sent last on one side of a measured cell, more than delta away at most
 
     def send(f: np.ndarray) -> np.ndarray:
-        """Return the law of (x, last sent) after a message: last sent is what is measured now."""
+        """Return the part of the law that sends a message, after it: last sent is what is measured now."""
         # Of each measured cell the mass of values sent last that lie more than delta from it: above, then below.
         sums = np.cumsum(f, axis=1)
         far = np.zeros_like(f)
@@ -252,12 +258,13 @@ def _compute_rate_on_grid(system: _Scalar, delta: float, share: float) -> tuple[
         return np.asarray(far * noise)
 
     def step(vector: np.ndarray) -> np.ndarray:
-        """Move x, then send or stay quiet."""
+        """Return the law after a step: x moves, then is sent or not."""
         f = move @ vector.reshape(size, size)
         return np.asarray(f * quiet + send(f)).ravel()
 
-    # Power iterations (Arnoldi) from the law of the state and a value that was just sent.
-    start = _cells(x, np.zeros(1), deviation).T * noise
+    # The stationary law is the eigenvector of a step for its largest eigenvalue, 1: power iterations (Arnoldi) from the
+    # law of the state and a value that was just sent.
+    start = _cell_probabilities(x, np.zeros(1), deviation).T * noise
     operator = LinearOperator((size**2, size**2), matvec=step, dtype=np.float64)
     try:
         _, vectors = eigs(operator, 1, v0=start.ravel(), maxiter=int(PRODUCTS / size**3 / 20) + 2, tol=1e-9)
@@ -267,8 +274,11 @@ def _compute_rate_on_grid(system: _Scalar, delta: float, share: float) -> tuple[
     return float(send(move @ f).sum()), h
 
 
-def _cells(x: np.ndarray, means: np.ndarray, deviation: float) -> np.ndarray:
-    """Probabilities (mean, cell) that a Gaussian falls into the cell around x; the outermost reach to infinity."""
+def _cell_probabilities(x: np.ndarray, means: np.ndarray, deviation: float) -> np.ndarray:
+    """Return the probabilities (mean, cell) that a Gaussian falls into the cell around each x.
+
+    Cells end halfway between neighbours; the outermost reach to infinity.
+    """
     edges = np.concatenate([[-np.inf], (x[1:] + x[:-1]) / 2, [np.inf]])
     return np.diff(ndtr((edges - means[:, None]) / deviation), axis=1)
 
@@ -288,39 +298,38 @@ def delta_for_rate(plant: AnyPlant, sensor: AnySensor, rate: float) -> float:
     return _find_threshold(rate, lambda delta: _send_on_delta_rate(system, delta), system, 1e-3)
 
 
-def _find_threshold(rate: float, of: Callable[[float], float], system: _Scalar, accuracy: float = 1e-10) -> float:
-    """Find the threshold at which a rate that falls with delta has a value."""
+def _find_threshold(rate: float, rate_at: Callable[[float], float], system: _Scalar, accuracy: float = 1e-10) -> float:
+    """Return the threshold delta at which `rate_at(delta)`, which falls with delta, has this rate."""
     if not 0 < scalar("rate", rate) < 1:
         raise fail("rate", "a number between 0 and 1", rate)
     unit = np.sqrt(system.q * system.c**2 + system.r)
     low = high = unit
-    while of(low) < rate:
+    while rate_at(low) < rate:
         low /= 2
-    while of(high) > rate:
+    while rate_at(high) > rate:
         high *= 2
-    return float(brentq(lambda delta: of(delta) - rate, low, high, rtol=accuracy, xtol=accuracy * unit))
+    return float(brentq(lambda delta: rate_at(delta) - rate, low, high, rtol=accuracy, xtol=accuracy * unit))
 
 
 def _check_scalar(plant: AnyPlant, sensor: AnySensor) -> _Scalar:
-    """Return a linear plant and sensor of one state and one output."""
-    linear = isinstance(plant, LinearPlant) and isinstance(sensor, LinearSensor)
-    if not isinstance(plant, LinearPlant) or not isinstance(sensor, LinearSensor) or len(plant.states) != 1:
-        got = "several states" if linear else f"{type(plant).__name__} and {type(sensor).__name__}"
-        raise fail("rate before any data", "a LinearPlant and LinearSensor of one state and output", got)
+    """Return the four numbers of a linear plant and sensor; ValueError unless they have one state and one output."""
+    expected = "a LinearPlant and LinearSensor of one state and output"
+    if not isinstance(plant, LinearPlant) or not isinstance(sensor, LinearSensor):
+        raise fail("rate before any data", expected, f"{type(plant).__name__} and {type(sensor).__name__}")
+    if len(plant.states) != 1:
+        raise fail("rate before any data", expected, "several states")
     if len(sensor.outputs) != 1:
         raise fail("rate before any data", "one output", f"{len(sensor.outputs)}")
-    q = float(np.asarray(plant.noise_covariance(jnp.zeros(0)))[0, 0])
-    numbers = (
-        np.asarray(plant.matrix)[0, 0],
-        q,
-        np.asarray(sensor.matrix)[0, 0],
-        np.asarray(sensor.noise.covariance)[0, 0],
+    return _Scalar(
+        a=float(np.asarray(plant.matrix)[0, 0]),
+        q=float(np.asarray(plant.noise_covariance(jnp.zeros(0)))[0, 0]),
+        c=float(np.asarray(sensor.matrix)[0, 0]),
+        r=float(np.asarray(sensor.noise.covariance)[0, 0]),
     )
-    return _Scalar(*map(float, numbers))
 
 
 def _make_quadrature(edges: list[float], unit: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return Gauss-Legendre nodes and weights of parts of a line, each cut to lengths of at most 8 units."""
+    """Return Gauss-Legendre nodes and weights over the parts between `edges`, cut to lengths of at most 8 units."""
     x, w = np.polynomial.legendre.leggauss(NODES)
     parts = []
     for a, b in pairwise(edges):
@@ -331,4 +340,5 @@ def _make_quadrature(edges: list[float], unit: float) -> tuple[np.ndarray, np.nd
 
 
 def _normal(e: np.ndarray, variance: float) -> np.ndarray:
+    """Return the density N(e; 0, variance)."""
     return np.asarray(np.exp(-(e**2) / (2 * variance)) / np.sqrt(2 * np.pi * variance))

@@ -67,7 +67,7 @@ def check_constant_noise(plant: AnyPlant) -> tuple[LinearPlant, AbstractNoise]:
 
 
 def check_design_plant(plant: AnyPlant) -> LinearPlant:
-    """Plant of the first step; ValueError unless it is linear with constant noise, and has no inputs and no angles."""
+    """Return the plant of the first step; ValueError unless linear, with constant noise, without inputs and angles."""
     start, _ = check_constant_noise(plant)
     if start.inputs:
         raise fail("plant of a design", "no inputs", list(start.inputs))
@@ -91,7 +91,7 @@ def steady_moment(plant: AnyPlant) -> Float[Array, "n1 n1"]:
 
 
 def moments_over(plant: AnyPlant, horizon: int, inputs: ArrayLike | None = None) -> list[Float[Array, "n1 n1"]]:
-    """Second moments E (x, 1)(x, 1)' at each step from the plant's initial law, the first after x_0 has moved once.
+    """Return E (x, 1)(x, 1)' at each step from the plant's initial law on, the first after x_0 has moved once.
 
     Args:
         plant: a linear plant, which may vary in time.

@@ -36,7 +36,7 @@ def design(
     starts: int = 64,
     seed: int = 0,
 ) -> PowerDesign:
-    """Powers of the transmitters with which the best linear filter of all that the nodes receive has a small error.
+    """Return the powers with which the best linear filter of all that the nodes receive has a small error.
 
     Relays amplify what they receive to their power, whatever those before them send. With one free hop a path the
     problem is convex, and the certificate is a gap. With more it is not: descents begin from every choice of the paths
@@ -95,7 +95,7 @@ def design(
 
 
 def _design_powers(problem: DesignProblem) -> PowerDesign:
-    """Design of the powers of a network of independent paths, or of paths from arrays, all of whose powers are free."""
+    """Return the design of a network of independent paths, or of paths from arrays, all of whose powers are free."""
     if problem.budget is None and problem.target_error is None:
         raise fail("design", "a budget of power or a target error", "neither")
     if isinstance(problem.network, Network) and adds_up(problem.network):
@@ -131,7 +131,7 @@ Gains = dict[str, Float[np.ndarray, "slots n _"]]
 
 
 def design_relays(problem: DesignProblem, relays: RelayNetwork) -> PowerDesign:
-    """Gains of all relays with which the best linear receiver has a small steady error, on average over the slots.
+    """Return the relays' gains with which the best linear receiver has a small steady error, averaged over the slots.
 
     The gains of a relay decide what it sends, so that they are what is free; `present` is where each relay minimises
     its local error. The budget's total is what all relays together may send in each slot. Found by one descent through
@@ -151,22 +151,26 @@ def design_relays(problem: DesignProblem, relays: RelayNetwork) -> PowerDesign:
     # Errors of the designed gains, and of those that minimise each relay's error.
     gains = periodic_relays_for_best_receiver(relays, power_limit=None if limits is None else limits.total)
     local_gains = periodic_local_error_design(relays).gains
-    spread, before = (periodic_behind_relays(relays, design) for design in (gains, local_gains))
-    value, present = (float(np.trace(design, axis1=1, axis2=2).mean()) for design in (spread, before))
-    # What relays and sensor send.
+    covariance, local_covariance = (periodic_behind_relays(relays, design) for design in (gains, local_gains))
+    value, present = (float(np.trace(p, axis1=1, axis2=2).mean()) for p in (covariance, local_covariance))
+    # What relays send does not depend on the receiver, whose gains are zero; the sensor sends in slots with a link.
     slots, n = len(relays.slots), len(relays.states)
-    silent = {RECEIVER: np.zeros((slots, n, relays.received[-1]))}
-    sends = periodic_given_design(relays, gains | silent).power
+    receiver_gains = {RECEIVER: np.zeros((slots, n, relays.received[-1]))}
+    powers = periodic_given_design(relays, gains | receiver_gains).power
     y = measurement_moment(relays.sensor, steady_moment(relays.plant))
     sensed = [any(SENSOR in links for links in slot.values()) for slot in relays.slots]
+    # One descent of a problem that is not convex: no bound, and no linear model of the error.
+    certificate = Certificate(
+        convex=False, value=value, bound=float("-inf"), stationarity=float("nan"), starts=1, unit="error"
+    )
     return PowerDesign(
         problem=problem,
-        powers={SENSOR: np.trace(y[:-1, :-1]) * np.array(sensed, dtype=float), **sends},
+        powers={SENSOR: np.trace(y[:-1, :-1]) * np.array(sensed, dtype=float), **powers},
         error=value,
-        certificate=Certificate(False, value, float("-inf"), float("nan"), 1, "error"),
+        certificate=certificate,
         present=present,
-        covariance=np.asarray(spread),
-        sensitivity={name: float("nan") for name in sends},
+        covariance=np.asarray(covariance),
+        sensitivity={name: float("nan") for name in powers},
         price=float("nan"),
         numbers=dict(gains),
         realised=_run_relays(relays, gains),
@@ -174,11 +178,12 @@ def design_relays(problem: DesignProblem, relays: RelayNetwork) -> PowerDesign:
 
 
 def _run_relays(relays: RelayNetwork, gains: Gains) -> Network:
-    """Return the relays with their gains over COVERED steps and more, and the best receiver behind them."""
+    """Return a network of the relays with these gains and the best receiver behind them, for COVERED steps or more."""
     slots, n = len(relays.slots), len(relays.states)
     times = -(-COVERED // slots)
     over_time = {name: np.tile(gain, (times, 1, 1)) for name, gain in gains.items()}
-    silent = {RECEIVER: np.zeros((times * slots, n, relays.received[-1]))}
-    schedules = relay_schedules(relays, given_design(relays, over_time | silent))
+    # A design has gains of the receiver too; its schedule is dropped for that of the best one.
+    receiver_gains = {RECEIVER: np.zeros((times * slots, n, relays.received[-1]))}
+    schedules = relay_schedules(relays, given_design(relays, over_time | receiver_gains))
     schedules.pop(RECEIVER)
     return Network.of_relays(relays, schedules, {BEST: ScheduledFilter(receiver_behind_relays(relays, over_time))})

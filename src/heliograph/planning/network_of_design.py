@@ -18,6 +18,7 @@ from heliograph.planning.error import Error
 from heliograph.planning.moments import measurement_moment, moments_over, steady_moment
 from heliograph.planning.paths.model import require_at_least
 from heliograph.planning.transmitters import allocate, transmitter_names
+from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
@@ -30,8 +31,8 @@ def designed_network(network: Network, powers: Mapping[str, Float[np.ndarray, "s
     """Return the network whose transmitters send these powers, with the best linear filters behind them.
 
     Every node has the filter "best" behind its channel, and with several nodes "best" is also that of all that they
-    receive together. Codes of sensors stay; limits of received numbers stay where a node's powers do, since others move
-    what is received.
+    receive together. Codes of sensors stay. A node's limits of plausible measurements stay only where its powers are
+    unchanged: other powers change the scale of what is received.
 
     Args:
         network: the network as it is.
@@ -49,18 +50,14 @@ def designed_network(network: Network, powers: Mapping[str, Float[np.ndarray, "s
     instance("error", error, Error, "an Error")
     nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     powers = _check_powers(powers, nodes, error.steps)
-    # Channels with these powers, step by step.
+    # Channels with these powers at each step, from E (x, 1)(x, 1)' of the state.
     seconds = [steady_moment(plant)] * error.period if error.horizon is None else moments_over(plant, error.horizon)
-    steps = [
-        {
-            name: allocate(
-                at(node.channel, k), measurement_moment(node.sensor, second, k), _select_node(name, powers, k), k
-            )
-            for name, node in nodes.items()
-        }
-        for k, second in enumerate(seconds)
-    ]
-    channels = {name: _make_over_time([step[name] for step in steps]) for name in nodes}
+    by_step: dict[str, list[AbstractRandomAffine]] = {name: [] for name in nodes}
+    for k, second in enumerate(seconds):
+        for name, node in nodes.items():
+            moment = measurement_moment(node.sensor, second, k)
+            by_step[name].append(allocate(at(node.channel, k), moment, _select_node(name, powers, k), k))
+    channels = {name: _make_over_time(steps) for name, steps in by_step.items()}
     designed = {name: add_best_filter(plant, node, channels[name]) for name, node in nodes.items()}
     fused = {}
     if len(nodes) > 1:
@@ -74,18 +71,19 @@ def designed_network(network: Network, powers: Mapping[str, Float[np.ndarray, "s
 def repeat_network(network: Network) -> Network:
     """Return the network with everything in it that is OverTime repeated, over as many steps as a run may have."""
 
-    def again(leaf: object) -> object:
+    def repeat(leaf: object) -> object:
+        """Return an OverTime repeated for COVERED steps or more, anything else as it is."""
         if not isinstance(leaf, OverTime):
             return leaf
         times = -(-COVERED // leaf.steps)
         return OverTime(jax.tree.map(lambda v: np.tile(v, (times, *[1] * (np.ndim(v) - 1))), leaf.values))
 
-    covered: Network = jax.tree.map(again, network, is_leaf=lambda leaf: isinstance(leaf, OverTime))
+    covered: Network = jax.tree.map(repeat, network, is_leaf=lambda leaf: isinstance(leaf, OverTime))
     return covered
 
 
 def _check_powers(powers: object, nodes: Mapping[str, Node], steps: int) -> dict[str, Float[np.ndarray, "steps"]]:
-    """Return the powers by transmitter, of all steps."""
+    """Return the powers (steps,) by transmitter; ValueError of unknown transmitters, other shapes, negative powers."""
     known = {f"{name}.{hop}" for name, node in nodes.items() for hop in transmitter_names(first(node.channel))}
     given = table("powers of a network", powers, "powers")
     if unknown := sorted(set(given) - known):
@@ -97,9 +95,10 @@ def _check_powers(powers: object, nodes: Mapping[str, Node], steps: int) -> dict
 
 
 def add_best_filter(plant: AnyPlant, node: Node, channel: Channel) -> Node:
-    """Return the node with this channel, and the best linear filter behind it.
+    """Return the node with this channel, and only the best linear filter behind it.
 
-    Limits of what is received were made for the node's own channel: behind another one only what is invalid still is.
+    Limits of what is received were made for the node's own channel; behind another only which values are invalid still
+    holds.
     """
     filters = {BEST: linear_filter(plant, node.sensor, channel)}
     if node.limits is None or same(channel, node.channel):
@@ -108,10 +107,11 @@ def add_best_filter(plant: AnyPlant, node: Node, channel: Channel) -> Node:
 
 
 def _select_node(name: str, powers: Mapping[str, Float[np.ndarray, "steps"]], k: int) -> dict[str, float]:
+    """Return the powers at step k of a node's transmitters, by their names within the node ("hop1")."""
     start = f"{name}."
     return {key.removeprefix(start): float(power[k]) for key, power in powers.items() if key.startswith(start)}
 
 
 def _make_over_time(steps: Sequence[T]) -> T | OverTime:
-    """Return a single object for ever, or an object for each step."""
+    """Return the single object of one step, which then holds for ever; of several steps an OverTime."""
     return steps[0] if len(steps) == 1 else over_time(steps)

@@ -70,7 +70,7 @@ class SentPower(Module):
 def power(
     network: Network, horizon: int | None = None, inputs: ArrayLike | None = None, runs: int = 1000, seed: int = 0
 ) -> SentPower:
-    """Power that each transmitter of a network sends: its sensors, and relays that amplify what they receive.
+    """Return the power that each transmitter of a network sends: sensors, and relays that amplify what they receive.
 
     Exact where plant and sensors are linear without angles, from the second moment of the state itself; else from
     drawn trajectories, the channels being exact still. Transmitters are named "node.hop1", "node.hop2" along the node's
@@ -104,7 +104,7 @@ def power(
     steps = 1 if horizon is None else check_horizon(horizon, covered)
     u = np.zeros((steps, len(start.inputs))) if inputs is None else array("inputs", inputs, (steps, len(start.inputs)))
     # E (y, 1)(y, 1)' of each sensor: exact, or the mean of drawn trajectories.
-    linear = all(is_linear(network.plant, s) and not first(s).circular for s, _ in sources.values())
+    linear = all(is_linear(network.plant, sensor) and not first(sensor).circular for sensor, _ in sources.values())
     if linear and not start.circular:
         seconds = [steady_moment(network.plant)] if horizon is None else moments_over(network.plant, steps, u)
         y = {
@@ -115,18 +115,24 @@ def power(
         raise fail("power", "a horizon, since plant or sensor is not linear", "none")
     else:
         y = _draw_moments(network.plant, sources, u, check_count("runs", runs, BATCHES), check_seed("seed", seed))
-    for name, filter in _feedback_filters(network).items():
-        y[name], rate = _compute_innovation_moments(filter, u, horizon), float("nan")
-    # What the hops make of it.
+    # A sensor with feedback sends its innovation, which stays bounded or not whatever the plant does.
+    for name, informing in _find_feedback_filters(network).items():
+        y[name], rate = _compute_innovation_moments(informing, u, horizon), float("nan")
     power, error = {}, {}
     for name, (_, channel) in sources.items():
-        batches = [[_compute_powers_at(channel, k, now, horizon) for k, now in enumerate(batch)] for batch in y[name]]
-        for hop in batches[0][0]:
-            values = np.array([[now[hop] for now in batch] for batch in batches])
+        for hop, values in _compute_hop_powers(channel, y[name], horizon).items():
             power[f"{name}.{hop}"] = values.mean(axis=0)
             spread = values.std(axis=0, ddof=1) if len(values) > 1 else np.zeros(steps)
             error[f"{name}.{hop}"] = spread / np.sqrt(len(values))
-    return SentPower(power, error, rate)
+    return SentPower(over_time=power, standard_error=error, growth=rate)
+
+
+def _compute_hop_powers(
+    channel: Channel, moments: Moments, horizon: int | None
+) -> dict[str, Float[np.ndarray, "batch steps"]]:
+    """Return the powers that a channel's hops send, by name, for each batch and step of E (y, 1)(y, 1)'."""
+    batches = [[_compute_powers_at(channel, k, now, horizon) for k, now in enumerate(batch)] for batch in moments]
+    return {hop: np.array([[now[hop] for now in batch] for batch in batches]) for hop in batches[0][0]}
 
 
 def _compute_powers_at(channel: Channel, k: int, moment: np.ndarray, horizon: int | None) -> dict[str, float]:
@@ -135,12 +141,13 @@ def _compute_powers_at(channel: Channel, k: int, moment: np.ndarray, horizon: in
 
 
 def _list_sources(network: Network) -> Sources:
+    """Return sensor and channel of each node by its name, or those that all nodes share as "common"."""
     if network.common is not None:
         return {"common": (network.common.sensor, network.common.channel)}
     return {name: (node.sensor, node.channel) for name, node in network.nodes.items() if isinstance(node, Node)}
 
 
-def _feedback_filters(network: Network) -> dict[str, AbstractFilter]:
+def _find_feedback_filters(network: Network) -> dict[str, AbstractFilter]:
     """Return the filters that send their prediction back to the sensor, by node."""
     nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     return {name: node.filters[node.informed_by] for name, node in nodes.items() if node.informed_by is not None}
@@ -149,7 +156,10 @@ def _feedback_filters(network: Network) -> dict[str, AbstractFilter]:
 def _compute_innovation_moments(
     filter: AbstractFilter, inputs: Float[np.ndarray, "steps u"], horizon: int | None
 ) -> Moments:
-    """Return C P C' + R of the filter's prediction, which no data change, as one batch of E (y - r, 1)(y - r, 1)'."""
+    """Return E (y - r, 1)(y - r, 1)' of each step, with r the reference, the filter's prediction of y; one batch.
+
+    E (y - r)(y - r)' = C P C' + R, which no data change: the filter is run over zeros.
+    """
     if horizon is None or filter.claim != "exact":
         expected = "a horizon and a linear model, whose filter knows its error before any data"
         raise fail("power of a sensor with feedback", expected, "no horizon" if horizon is None else filter.claim)
@@ -167,24 +177,32 @@ def _compute_innovation_moments(
 
 
 def _compute_relay_powers(network: Network, horizon: int | None) -> dict[str, Float[np.ndarray, "steps"]]:
-    """Return the powers of relays that filter: exact for schedules made as if a relay's estimate were everybody's."""
+    """Return the powers of a sensor and relays that filter, at each step of the horizon or of their schedules.
+
+    Exact for schedules s+ = A s + K (z - B s - b) in which a relay expects the z that others would send if all of them
+    had its own estimate s, as `relay_schedules` makes them.
+
+    Raises:
+        ValueError: a schedule of another kind.
+    """
     relays = network.relays
     assert relays is not None
-    filters = {name: network.nodes[name].filters[Network.LOCAL] for name in relays.relays}
-    schedules = {name: filter.gains.values for name, filter in filters.items() if isinstance(filter, ScheduledFilter)}
-    known = min(len(schedule.gain) for schedule in schedules.values())
-    steps = known if horizon is None else check_horizon(horizon, known)
+    filters = [(name, network.nodes[name].filters[Network.LOCAL]) for name in relays.relays]
+    schedules = {name: relay.gains.values for name, relay in filters if isinstance(relay, ScheduledFilter)}
+    covered = min(len(schedule.gain) for schedule in schedules.values())
+    steps = covered if horizon is None else check_horizon(horizon, covered)
     moved = relays.steps(steps)
     rows, n = moved.predict_maps()[0], len(relays.states)
     ends = dict(zip(relays.filters, np.cumsum(relays.received), strict=True))
     gains = {RECEIVER: np.zeros((steps, n, relays.received[-1]))}
-    # Each schedule has to be s+ = A s + K (z - B s - b) with the rows that the relay expects.
+    # The schedule's A and B have to be the plant's and the rows that the relay expects.
     for (name, schedule), count in zip(schedules.items(), relays.received, strict=False):
         gains[name] = np.asarray(schedule.gain)[:steps]
         expected = rows[:, ends[name] - count : ends[name]]
         pairs = (schedule.transition, moved.transition), (schedule.expected, expected)
         if not all(np.shape(a)[1:] == b.shape[1:] and np.allclose(a[:steps], b, SAME, SAME) for a, b in pairs):
             raise fail(f"schedule of {name!r}", "s+ = A s + K (z - B s - b), as relay_schedules makes them", "another")
+    # The sensor sends y in the slots in which it transmits.
     y = np.array([measurement_moment(relays.sensor, x, k) for k, x in enumerate(moments_over(relays.plant, steps))])
     sensor = np.trace(y[:, :-1, :-1], axis1=1, axis2=2) * moved.transmits_in_slot[:, 0]
     return {SENSOR: sensor, **given_design(relays, gains).power}

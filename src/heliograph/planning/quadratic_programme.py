@@ -60,7 +60,14 @@ class Problem(NamedTuple):
 
 
 class Programme:
-    """A design problem with its limits, in x over its unit; values over their size at the start."""
+    """A design problem with its limits, as a function of z = x / unit; values are divided by `size`, that of the start.
+
+    Args:
+        problem: the design problem.
+        limits: of powers, and of the error where there is a target.
+        sharpness: the smoothing of the error.
+        start: a point x, whose value sets the size.
+    """
 
     def __init__(self, problem: Problem, limits: Limits, sharpness: int | None, start: Vector):
         self.problem, self.limits, self.sharpness = problem, limits, sharpness
@@ -71,39 +78,39 @@ class Programme:
         self.size = max(value, 1e-12) if np.isfinite(value) else 1.0
 
     def at(self, z: Vector) -> Evaluation | None:
-        """Return the evaluation at a point; the last one is cached."""
+        """Return the evaluation at a point, None where it does not exist; the last one is cached."""
         key = z.tobytes()
         if key != self._last[0]:
             self._last = key, self.problem.evaluate(np.asarray(z * self.problem.unit), self.sharpness)
         return self._last[1]
 
     def value(self, z: Vector) -> tuple[float, Vector]:
-        """Return the error, or mean total power where there is a target, and its derivative."""
-        now = self.at(z)
-        if now is None:
+        """Return the error, or mean total power where there is a target, over the size, and its derivative by z."""
+        evaluation = self.at(z)
+        if evaluation is None:
             return np.inf, np.zeros_like(z)
         if self.limits.target is None:
-            return now.error / self.size, now.error_slope * self.problem.unit / self.size
+            return evaluation.error / self.size, evaluation.error_slope * self.problem.unit / self.size
         scale = self.limits.steps * self.size
-        return float(now.powers.sum()) / scale, now.power_slope.sum(axis=0) * self.problem.unit / scale
+        return float(evaluation.powers.sum()) / scale, evaluation.power_slope.sum(axis=0) * self.problem.unit / scale
 
     def room(self, z: Vector) -> Float[np.ndarray, "limits"]:
-        """Return the remainder of each limit, as a part of it; of the target last."""
-        rows, most, target, _ = self.limits
-        now = self.at(z)
-        if now is None:
+        """Return what each limit leaves, as a part of it, of the target last: negative where a limit is exceeded."""
+        rows, most, target = self.limits.rows, self.limits.most, self.limits.target
+        evaluation = self.at(z)
+        if evaluation is None:
             return np.full(len(most) + (target is not None), -1.0)
-        left = most - rows @ now.powers
-        return left if target is None else np.append(left, 1 - now.error / target)
+        room = most - rows @ evaluation.powers
+        return room if target is None else np.append(room, 1 - evaluation.error / target)
 
     def room_slope(self, z: Vector) -> Float[np.ndarray, "limits x"]:
-        """Return the derivative of the room."""
-        rows, most, target, _ = self.limits
-        now = self.at(z)
-        if now is None:
+        """Return the derivative of the room by z."""
+        rows, most, target = self.limits.rows, self.limits.most, self.limits.target
+        evaluation = self.at(z)
+        if evaluation is None:
             return np.zeros((len(most) + (target is not None), len(z)))
-        slope = -(rows @ now.power_slope) * self.problem.unit
-        return slope if target is None else np.vstack([slope, -now.error_slope * self.problem.unit / target])
+        slope = -(rows @ evaluation.power_slope) * self.problem.unit
+        return slope if target is None else np.vstack([slope, -evaluation.error_slope * self.problem.unit / target])
 
     def feasible(self, z: Vector) -> bool:
         """Decide whether the point exists and meets the limits."""
@@ -118,6 +125,7 @@ class Programme:
         constraints = [NonlinearConstraint(self.room, 0.0, np.inf, self.room_slope)] if len(self.room(z)) else []
         before = self.merit(z)
         end = self._minimize(self.value, z, constraints, tolerance)
+        # Neither the start nor the end is within the limits: first back into them, then down again.
         if np.isinf(before) and not self.feasible(end):
             end = self._minimize(self._excess, end, [], tolerance)
             return self._minimize(self.value, end, constraints, tolerance)
@@ -143,7 +151,7 @@ class Programme:
         return self.problem.restore(end * unit) / unit if np.all(np.isfinite(end)) else z
 
     def polish(self, z: Vector) -> Vector:
-        """Take Newton's steps on the active limits, as long as the Lagrangian's exact penalty does not rise."""
+        """Return the point after Newton's steps on the active limits, as long as no exact penalty rises by them."""
         for _ in range(ROUNDS):
             newton = self._solve_newton_step(z)
             if newton is None:
@@ -153,39 +161,43 @@ class Programme:
                 break
             unit = self.problem.unit
             end = self.problem.restore(np.clip(z + step, self.bounds.lb, self.bounds.ub) * unit) / unit
-
-            penalties = [self._penalty(point, multipliers, active) for point in (z, end)]
-            if not (self.feasible(end) and penalties[1] <= penalties[0] * (1 + ROUNDING)):
+            before, after = (self._penalty(point, multipliers, active) for point in (z, end))
+            if not (self.feasible(end) and after <= before * (1 + ROUNDING)):
                 break
             z = end
         return z
 
     def _penalty(self, z: Vector, multipliers: Vector, active: Bool[np.ndarray, "limits"]) -> float:
-        """Return the value and, weighed by the multipliers, the excess over the active limits."""
+        """Return the value plus the excess over the active limits, weighed by the multipliers."""
         excess = np.maximum(-self.room(z), 0.0)
         return float(self.value(z)[0] + np.maximum(multipliers, 0.0) @ excess[active])
 
     def _solve_newton_step(self, z: Vector) -> tuple[Vector, Vector, Bool[np.ndarray, "limits"]] | None:
-        """Step d and multipliers m of H d - A' m = -g, A d = -room over what is at no bound, H of the Lagrangian."""
+        """Return the step d, the multipliers m of the active limits, and which limits are active; None without a step.
+
+        H d - A' m = -g and A d = -room over the variables at no bound, with the gradient g of the value, the slopes A
+        of the active limits' room, and H the Hessian of the Lagrangian value - m' room.
+        """
         index = np.flatnonzero((z > self.bounds.lb + ACTIVE) & (z < self.bounds.ub - ACTIVE))
         room = self.room(z)
         active = room <= ACTIVE
         if not len(index):
             return None
+        # A and g, by each variable over its own size.
         scale = np.where(z[index] != 0, np.abs(z[index]), 1.0)
         face = self.room_slope(z)[active][:, index] * scale
         gradient = self.value(z)[1][index] * scale
         # Multipliers that leave least of the gradient, then the Hessian of the Lagrangian by differences.
         multipliers = np.linalg.lstsq(face.T, gradient, rcond=None)[0]
 
-        def lagrangian(at: Vector) -> Vector:
-            return np.asarray((self.value(at)[1] - multipliers @ self.room_slope(at)[active])[index] * scale)
+        def lagrangian_gradient(point: Vector) -> Vector:
+            return np.asarray((self.value(point)[1] - multipliers @ self.room_slope(point)[active])[index] * scale)
 
-        here, hessian = lagrangian(z), np.empty((len(index), len(index)))
+        at_z, hessian = lagrangian_gradient(z), np.empty((len(index), len(index)))
         for column, variable in enumerate(index):
             shift = np.zeros_like(z)
             shift[variable] = SHIFT * scale[column]
-            hessian[:, column] = (lagrangian(z + shift) - here) / SHIFT
+            hessian[:, column] = (lagrangian_gradient(z + shift) - at_z) / SHIFT
         # The equations of Karush, Kuhn and Tucker on the active limits.
         system = np.block([[(hessian + hessian.T) / 2, -face.T], [face, np.zeros((len(face), len(face)))]])
         right = np.concatenate([-gradient, -room[active]])
@@ -198,7 +210,7 @@ class Programme:
 
 
 def search(problem: Problem, limits: Limits, starts: Sequence[Vector]) -> Vector | None:
-    """Return best of the descents from these points, refined and polished; None where no limits are met from any."""
+    """Return the best end x of descents from these points, refined and polished; None where none meets the limits."""
     points, sharpest = [start / problem.unit for start in starts], problem.sharpnesses[-1]
     # Coarse descents from everywhere, the largest eigenvalue sharper and sharper.
     for sharpness in problem.sharpnesses if len(points) > 1 else problem.sharpnesses[:-1]:
@@ -210,7 +222,6 @@ def search(problem: Problem, limits: Limits, starts: Sequence[Vector]) -> Vector
     for _ in range(ROUNDS):
         before = programme.merit(best)
         best = programme.descend(best, FINE)
-        after = programme.merit(best)
-        if not (np.isinf(before) or after < before * (1 - FINE)):
+        if not np.isinf(before) and not programme.merit(best) < before * (1 - FINE):
             break
     return programme.polish(best) * problem.unit if programme.feasible(best) else None

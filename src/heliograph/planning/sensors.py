@@ -105,27 +105,31 @@ def worth_of_sensors(
     # One filter of all that is received, and one set of draws.
     every = {**nodes, **{name: instance(f"addition {name!r}", node, Node, "a Node") for name, node in added.items()}}
     bare = {name: Node(node.sensor, node.channel, {}) for name, node in every.items()}
-    filter = _filter_of_all(network, bare)
+    best_filter = _filter_of_all(network, bare)
     drawn = monte_carlo(Network(network.plant, bare), steps, check_count("runs", runs), key, inputs=inputs)
     u = np.zeros((steps, 0)) if inputs is None else np.asarray(inputs, float)
-    exact, sizes = filter.claim == "exact", [bare[name].received for name in bare]
+    exact, sizes = best_filter.claim == "exact", [bare[name].received for name in bare]
     z, truth = np.concatenate([drawn.measurements[name] for name in bare], axis=-1), np.asarray(drawn.truth)
-    found = []
+    # Root mean square errors of each case, all of them first.
+    errors: list[ErrorWithout] = []
     for case in cases:
-        squares = _squares_at_end(filter, np.where(np.repeat(case.used, sizes, axis=1), z, np.nan), u, truth, exact)
+        used = np.where(np.repeat(case.used, sizes, axis=1), z, np.nan)
+        squares = _squares_at_end(best_filter, used, u, truth, exact)
         error = np.sqrt(squares.mean(axis=0))
+        # The standard error of a root: sd(root m) = sd(m) / (2 root m).
         spread = squares.std(axis=0) / np.sqrt(len(squares))
-        found.append((case.name, error, np.divide(spread, 2 * error, out=np.zeros_like(error), where=error > 0)))
-    whole = found[0][1]
-    complete, *others = (
-        ErrorWithout(name, error, spread, np.divide(error, whole, out=np.full_like(error, np.nan), where=whole > 0))
-        for name, error, spread in found
-    )
-    return SensorWorth(network.states, complete, tuple(others), exact)
+        uncertainty = np.divide(spread, 2 * error, out=np.zeros_like(error), where=error > 0)
+        of_all = errors[0].error if errors else error
+        increase = np.divide(error, of_all, out=np.full_like(error, np.nan), where=of_all > 0)
+        errors.append(ErrorWithout(name=case.name, error=error, uncertainty=uncertainty, increase=increase))
+    return SensorWorth(states=network.states, complete=errors[0], cases=tuple(errors[1:]), exact=exact)
 
 
 def _plain_nodes(network: Network) -> dict[str, Node]:
-    """Return the nodes, refused where more than a sensor and a link makes what they receive."""
+    """Return the nodes; ValueError where more than a sensor and a link makes what they receive.
+
+    Refused are relays that filter, nodes that share a channel, triggers and encoders.
+    """
     if network.relays is not None or network.common is not None:
         raise fail("network", "nodes that receive sensors through channels of their own", "relays that filter")
     for name, node in network.nodes.items():
@@ -138,10 +142,12 @@ def _list_cases(
     names: list[str], added: list[str], steps: int, without: Sequence[str] | None, outages: Mapping[str, int]
 ) -> Iterator[_Case]:
     """Yield the cases: all nodes first, then each left out, each outage, each addition."""
-    left = (names if len(names) > 1 else []) if without is None else items("nodes left out", without, "names")
+    each = names if len(names) > 1 else []
+    left = each if without is None else items("nodes left out", without, "names")
     for name in (*left, *outages):
         if name not in names:
             raise fail("sensor", f"one of the nodes {', '.join(names)}", repr(name))
+    # Rows (steps, nodes) that are used: those of the network's nodes, not those of additions.
     base = np.tile(np.isin([*names, *added], names), (steps, 1))
     yield _Case("all", base)
     for name in left:
@@ -161,9 +167,9 @@ def _list_cases(
 
 
 def _filter_of_all(network: Network, nodes: Mapping[str, Node]) -> AbstractFilter:
-    """Return the filter of all that the nodes receive."""
-    # Where losses are independent a filter skips what is lost, and needs the channel of what arrives; where they have
-    # memory a loss says something of the next one.
+    """Return the likelihood filter of all that the nodes receive: linear where plant, sensors and angles allow it."""
+    # Of channels without memory the channel given arrival, since the filter skips what is lost (NaN). With memory, as
+    # of bursts, a loss tells of the next one: the channel stays.
     plant = network.plant
     channels = [
         node.channel if first(node.channel).remembers else at_each_step(_given_arrival, node.channel)
@@ -175,6 +181,7 @@ def _filter_of_all(network: Network, nodes: Mapping[str, Node]) -> AbstractFilte
 
 
 def _given_arrival(channel: AbstractRandomAffine) -> AbstractRandomAffine:
+    """Return the channel of what arrives."""
     return channel.condition_on_arrival() if channel.erases else channel
 
 
@@ -185,7 +192,10 @@ def _squares_at_end(
     truth: Float[np.ndarray, "runs steps n"],
     exact: bool,
 ) -> Float[np.ndarray, "runs n"]:
-    """Return the squared error of each state after the last step, or its variance where that is exact."""
+    """Return the squared error of each state after the last step of each run, or its variance where that is exact.
+
+    One run stands for all where variances are exact and the same rows arrive in all of them.
+    """
     squares, used = [], filter.angles_used()
     alike = exact and np.array_equal(np.isnan(z), np.broadcast_to(np.isnan(z[:1]), z.shape))
     for row, x in zip(z, truth, strict=True):

@@ -26,7 +26,9 @@ UNCHANGED = 1e-12  # change of a law in a step that counts as none
 
 
 def visit_hops(channel: AbstractRandomAffine, visit: Visit, signal: Signal | None = None) -> AbstractRandomAffine:
-    """Channel with every hop replaced by visit(name, hop, signal); the signal is followed through maps without memory.
+    """Return the channel with every hop replaced by visit(name, hop, signal).
+
+    The signal, E (y, 1)(y, 1)' of what the hop receives, is followed through maps without memory.
 
     Raises:
         ValueError: a map of a kind whose transmitters are not known.
@@ -62,7 +64,7 @@ def select_transmitters(names: Sequence[str], chosen: Sequence[str], what: str) 
 
 
 def compute_sent_powers(channel: AbstractRandomAffine, second: Second, step: int = 0) -> dict[str, Any]:
-    """Power of each transmitter at a step, the mean square of what it sends, from E (y, 1)(y, 1)' of the input.
+    """Return the power of each transmitter at a step, its mean square, by name; `second`: E (y, 1)(y, 1)' of the input.
 
     Exact: modes have the law of the step.
 
@@ -85,7 +87,11 @@ def steady_powers(channel: AbstractRandomAffine, second: Second) -> dict[str, An
 
 
 def powers_of_law(channel: AbstractRandomAffine, second: Second, law: Float[Array, "modes"]) -> dict[str, Any]:
-    """Power of each transmitter where the channel's modes have this law (one mode, of a channel without memory)."""
+    """Return the power of each transmitter by name where the channel's modes have this law.
+
+    A channel without memory has one mode. The mean is that over the modes in which a transmitter is received.
+    """
+    # By transmitter: the sum of P(mode) power over modes in which it is received, and the sum of their P(mode).
     total: dict[str, Scalar] = dict.fromkeys(transmitter_names(channel), 0.0)
     occurs = dict(total)
     for weight, mode_map in zip(law, joint_modes(channel, order=2).maps, strict=True):
@@ -93,6 +99,7 @@ def powers_of_law(channel: AbstractRandomAffine, second: Second, law: Float[Arra
         powers: dict[str, Scalar] = {}
 
         def note(name: str, hop: AbstractHop, signal: Signal | None, powers: dict[str, Scalar] = powers) -> AbstractHop:
+            """Note the power tr A E[y y'] A' that a hop sends, if it receives something; the hop stays."""
             assert signal is not None and isinstance(hop, GainAndNoise)
             if not hop.is_silent:
                 powers[name] = signal.arrives * (hop.matrix @ signal.second[:-1, :-1] * hop.matrix).sum()
@@ -106,7 +113,7 @@ def powers_of_law(channel: AbstractRandomAffine, second: Second, law: Float[Arra
 
 
 def _divide_by_probability(total: Scalar, probability: Scalar) -> Scalar:
-    """Return the conditional mean; zero where the condition never holds."""
+    """Return total / probability, a conditional mean; zero where the condition never holds."""
     if is_traced(probability):
         quotient: Scalar = total / library(probability).where(probability == 0, 1.0, probability)
         return quotient
@@ -124,7 +131,7 @@ def allocate(
     for name in transmitter_names(channel):  # in order: a relay receives what those before it send
         if name in powers:
             now = compute_sent_powers(channel, second, step)[name]
-            if now <= 0 < powers[name]:
+            if now <= 0 < powers[name]:  # silent so far: it sends what it receives, and is scaled then
                 channel = amplify_transmitter(channel, name, None)
                 now = compute_sent_powers(channel, second, step)[name]
             if now <= 0 < powers[name]:
@@ -134,7 +141,7 @@ def allocate(
 
 
 def amplify_transmitter(channel: AbstractRandomAffine, name: str, factor: float | None) -> AbstractRandomAffine:
-    """Channel in which a transmitter amplifies by this factor more; None: sends what it receives, whatever it sent."""
+    """Return the channel in which a transmitter amplifies by this factor more; None: it sends just what it receives."""
 
     def change(hop_name: str, hop: AbstractHop, signal: Signal | None) -> AbstractHop:
         if hop_name != name:
@@ -150,7 +157,7 @@ def find_free(names: Sequence[str], free: Sequence[str] | Mapping[str, object] |
     """Return which transmitters are free, all unless some are named.
 
     Raises:
-        ValueError: numbers instead of names, or none of the transmitters is named.
+        ValueError: numbers instead of names, or no transmitter is left.
     """
     if isinstance(free, Mapping):
         expected = "names of transmitters (numbers are free of a function that returns a network)"

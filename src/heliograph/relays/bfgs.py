@@ -29,7 +29,7 @@ def bfgs(
     """
     x = np.asarray(start, dtype=np.float64)
     value, gradient = function(x)
-    inverse = _Dense(gradient) if memory is None else _Limited(memory)
+    inverse = _DenseInverseHessian(gradient) if memory is None else _LimitedInverseHessian(memory)
     idle = 0
     for _ in range(iterations):
         # Quasi-Newton direction, shortened until the value decreases; then the update.
@@ -46,8 +46,8 @@ def bfgs(
     return x
 
 
-class _Dense:
-    """Inverse Hessian as a matrix, first a small multiple of I and then scaled by the first update."""
+class _DenseInverseHessian:
+    """Inverse Hessian H as a matrix, first a small multiple of I and then scaled by the first update."""
 
     def __init__(self, gradient: np.ndarray):
         self.matrix = np.eye(len(gradient)) * 0.1 / max(np.linalg.norm(gradient), np.finfo(float).tiny)
@@ -60,7 +60,10 @@ class _Dense:
         return np.asarray(self.matrix @ vector)
 
     def update(self, s: np.ndarray, y: np.ndarray) -> None:
-        """H+ = (I - s y'/s'y) H (I - y s'/s'y) + s s'/s'y, skipped where the curvature s'y is not positive."""
+        """Update H after a step s that changed the gradient by y, unless the curvature s'y is not positive.
+
+        H+ = (I - s y'/s'y) H (I - y s'/s'y) + s s'/s'y.
+        """
         curvature, first = float(s @ y), self.first
         self.first = False
         if curvature <= 1e-14 * np.linalg.norm(s) * np.linalg.norm(y):
@@ -71,22 +74,25 @@ class _Dense:
         self.matrix = left @ self.matrix @ left.T + np.outer(s, s) / curvature
 
 
-class _Limited:
-    """Inverse Hessian by its last updates (s, y)."""
+class _LimitedInverseHessian:
+    """Inverse Hessian H by its last updates (s, y): steps and the changes of the gradient over them."""
 
     def __init__(self, memory: int):
         self.updates: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=memory)
 
     def times(self, vector: np.ndarray) -> np.ndarray:
-        """H v by two loops, H = V'H_before V + s s'/s'y with V = I - y s'/s'y, H = I s'y/y'y before the first."""
-        v, parts = vector, []
+        """Return H v by two loops over the updates, newest first and then oldest first.
+
+        H = V'H_before V + s s'/s'y with V = I - y s'/s'y, and H = I s'y/y'y (of the newest) before the oldest.
+        """
+        v, weights = vector, []
         for s, y in reversed(self.updates):
-            parts.append(float(s @ v / (s @ y)))
-            v = v - parts[-1] * y
+            weights.append(float(s @ v / (s @ y)))
+            v = v - weights[-1] * y
         if self.updates:
             s, y = self.updates[-1]
             v = v * float(s @ y / (y @ y))
-        for (s, y), weight in zip(self.updates, reversed(parts), strict=True):
+        for (s, y), weight in zip(self.updates, reversed(weights), strict=True):
             v = v + (weight - float(y @ v / (s @ y))) * s
         return v
 
@@ -99,7 +105,10 @@ class _Limited:
 def _backtrack(
     function: Function, x: np.ndarray, value: float, direction: np.ndarray, slope: float
 ) -> tuple[np.ndarray, float, np.ndarray] | None:
-    """Shorten the step until the value is finite and falls enough (Armijo); None where no step does."""
+    """Shorten the step until the value is finite and falls enough (Armijo); None where no step does.
+
+    Returns the step, and value and gradient at its end; `slope`: direction' gradient at x.
+    """
     length = 1.0
     while length >= SHORTEST:
         new_value, gradient = function(x + length * direction)

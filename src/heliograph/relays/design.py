@@ -109,7 +109,7 @@ def split_gains(
 
 
 def as_design(network: RelayNetwork, propagated: Propagated) -> RelayDesign:
-    """Name the parts of a propagation."""
+    """Return a design of gains and moments as propagated; ValueError unless all moments are finite."""
     moments, n = np.asarray(propagated.moments), len(network.states)
     if not np.all(np.isfinite(moments)):
         step = int(np.argmax(~np.isfinite(moments).all(axis=(1, 2))))
@@ -149,17 +149,18 @@ def relay_schedules(network: RelayNetwork, design: RelayDesign) -> dict[str, Sch
     ends = dict(zip(network.filters, np.cumsum(network.received), strict=True))
     schedules = {}
     for f, (name, size) in enumerate(zip(network.filters, network.received, strict=True)):
-        mine = slice(ends[name] - size, ends[name])
+        received = slice(ends[name] - size, ends[name])
         error = slice((1 + f) * n, (2 + f) * n)
-        believed = design.covariance[name][1:], before[:, error, error], before[:, d:, d:][:, mine, mine]
+        # Covariances of the error after and before the correction, and of the innovation.
+        covariances = design.covariance[name][1:], before[:, error, error], before[:, d:, d:][:, received, received]
         # Gains on what nobody transmits are not used.
-        gain = design.gains[name] * np.asarray(steps.receives_in_slot)[:, None, mine]
-        expected, constant = rows[:, mine], constants[:, mine]
+        gain = design.gains[name] * np.asarray(steps.receives_in_slot)[:, None, received]
+        expected, constant = rows[:, received], constants[:, received]
         # s+ = (A - K B) s + K z + a - K b.
         transition = steps.transition - gain @ expected
         offset = steps.drift - np.einsum("kir,kr->ki", gain, constant)
-        moved = transition, gain, offset
-        arrays = Gains(*moved, *moved, expected, constant, *believed)
+        moves = transition, gain, offset  # of the state and of the estimate, which are one here
+        arrays = Gains(*moves, *moves, expected, constant, *covariances)
         schedules[name] = Schedule(arrays, network.initial()[0], lower_by_noise("exact", network))
     relayed = {name: schedules[name].gains.gain for name in network.relays}
     premise = Premise(network.plant, relays=network, gains=relayed)
@@ -167,7 +168,7 @@ def relay_schedules(network: RelayNetwork, design: RelayDesign) -> dict[str, Sch
 
 
 def _check_start(network: RelayNetwork, design: RelayDesign) -> None:
-    """Raise ValueError for a design with other moments at k = 0 than the network, as a periodic one has."""
+    """Raise ValueError for a design with other moments at k = 0 than the network's, as a periodic one has."""
     expected, start = start_moments(network), design.moments[0]
     if start.shape != expected.shape or not np.allclose(start, expected, rtol=1e-9, atol=0.0):
         periodic = len(design.moments) == len(network.slots) + 1 and np.allclose(start, design.moments[-1], rtol=1e-6)
@@ -182,7 +183,7 @@ def _predict_covariances(steps: RelaySteps, moments: Float[Array, "time d d"]) -
 
 
 def receiver_weight(weights: Float[np.ndarray, "steps"], filters: int, n: int) -> Float[np.ndarray, "steps d d"]:
-    """Return the matrices C_k with <C_k, moments_k> = weights_k tr P_k."""
+    """Return the matrices C_k with <C_k, moments_k> = weight_k tr P_k, P_k the receiver's error covariance."""
     d = (1 + filters) * n
     matrices = np.zeros((len(weights), d, d))
     matrices[:, d - n :, d - n :] = np.asarray(weights)[:, None, None] * np.eye(n)
@@ -241,27 +242,27 @@ def receiver_system(network: RelayNetwork, gains: GainsByFilter) -> LinearSystem
     gains = table("gains", gains, "arrays (steps, n, received)")
     joined = relay_gains(network, gains)
     steps, n = network.steps(len(joined)), len(network.states)
-    known, received, white = _list_relay_sides(steps, start_moments(network), joined)
-    d, r = known.shape[-1], received.shape[1]
-    none = np.zeros((len(known), d + r, r))
+    side = _list_relay_sides(steps, start_moments(network), joined)
+    count, r, d = side.output.shape
     # Means: x+ has drift a, z the constant b.
-    drift = np.zeros((len(known), d + r))
+    drift = np.zeros((count, d + r))
     drift[:, :n], drift[:, d:] = steps.drift, steps.predict_maps()[1][:, -r:]
-    # (x, e, z)+ = [known; received] (x, e) + white noise, measured as z exactly.
+    # (x, e, z)+ = [A; C] (x, e) + white noise, whatever z was, and z is measured without noise.
+    moves, no_z = np.concatenate([side.transition, side.output], axis=1), np.zeros((count, d + r, r))
     system = SystemSteps(
-        transition=np.concatenate([np.concatenate([known, received], axis=1), none], axis=2),
+        transition=np.concatenate([moves, no_z], axis=2),
         drift=drift,
-        process=np.asarray(white),
-        output=np.tile(np.eye(r, d + r, d), (len(known), 1, 1)),
-        offset=np.zeros((len(known), r)),
-        noise=np.zeros((len(known), r, r)),
+        process=np.asarray(side.noise),
+        output=np.tile(np.eye(r, d + r, d), (count, 1, 1)),
+        offset=np.zeros((count, r)),
+        noise=np.zeros((count, r, r)),
     )
     mean, covariance = np.zeros(d + r), np.zeros((d + r, d + r))
     mean[:n], covariance[:d, :d] = network.initial()[0], start_moments(network)[:d, :d]
     # Gains on what nobody transmits are not used.
-    ends, live = np.cumsum(network.received), np.asarray(steps.receives_in_slot)
+    ends, receives = np.cumsum(network.received), np.asarray(steps.receives_in_slot)
     relayed = {
-        name: np.asarray(gains[name]) * live[:, None, end - size : end]
+        name: np.asarray(gains[name]) * receives[:, None, end - size : end]
         for name, size, end in zip(network.relays, network.received, ends, strict=False)
     }
     return believing(
@@ -295,29 +296,39 @@ class RelaySide(NamedTuple):
 
 
 def relay_side(step: RelaySteps, moments: Float[Array, "d d"], gain: Float[Array, "Fn R"]) -> RelaySide:
-    """Return the linear system of (x, e_relays) that the receiver estimates in one step."""
+    """Return the linear system of (x, e_relays) that the receiver estimates in one step.
+
+    moments: covariance of (x, e_1 .. e_F) before the step, which decides how much noise random gains add.
+    """
     n, r = step.transition.shape[-1], step.received[-1]
     maps, d = linear_maps(step), moments.shape[0]
-    known, rows = d - n, step.gain.shape[0] - r  # without the receiver's error, without its received rows
-    received = (step.gain @ maps.sent)[rows:]
-    full = jnp.concatenate([maps.moved[:known], maps.innovation[:rows], received])
-    relays = jnp.concatenate([jnp.zeros((n, rows)), -(gain * step.receives_in_slot)[: known - n, :rows]])
-    close = jnp.concatenate([jnp.eye(known), relays, jnp.zeros((known, r))], axis=1)
-    close = jnp.concatenate([close, jnp.eye(r, known + rows + r, known + rows)])
-    moved = close @ full
+    # (x, e_relays), and rows that the relays receive: without the receiver's error and what it receives.
+    zeta, relay_rows = d - n, step.gain.shape[0] - r
+    # (zeta+ before corrections, the relays' innovations, z), as rows over (x, e_1 .. e_F, w, v).
+    received = (step.gain @ maps.sent)[relay_rows:]
+    before = jnp.concatenate([maps.moved[:zeta], maps.innovation[:relay_rows], received])
+    # (zeta+, z) from these: e_r+ = e_r+ before its correction - K_r i_r.
+    corrections = -(gain * step.receives_in_slot)[: zeta - n, :relay_rows]
+    corrections = jnp.concatenate([jnp.zeros((n, relay_rows)), corrections])
+    close = jnp.concatenate([jnp.eye(zeta), corrections, jnp.zeros((zeta, r))], axis=1)
+    close = jnp.concatenate([close, jnp.eye(r, zeta + relay_rows + r, zeta + relay_rows)])
+    after = close @ before
+    # White noise: of plant and sensor, and what random gains make of the signals sent.
     noise = jax.scipy.linalg.block_diag(step.process, step.sensor_noise)
     _, sent = step_moments(step, moments)
     random = contract(step.spread, sent.second)
-    white = propagate_by_mode(moved[:, d:], noise, propagate_by_mode(close[:, known:], random, 0.0))
-    return RelaySide(moved[:known, :known], moved[known:, :known], white)
+    white = propagate_by_mode(after[:, d:], noise, propagate_by_mode(close[:, zeta:], random, 0.0))
+    return RelaySide(transition=after[:zeta, :zeta], output=after[zeta:, :zeta], noise=white)
 
 
 @compile_in_float64
 def _list_relay_sides(steps: RelaySteps, start: Float[Array, "d d"], gains: Float[Array, "time Fn R"]) -> RelaySide:
     """Return the system of (x, e_relays) that `relay_side` describes, at each step."""
 
-    def single(moments: jax.Array, row: tuple[RelaySteps, jax.Array]) -> tuple[jax.Array, RelaySide]:
-        p, gain = row
-        return correct_moments(step_moments(p, moments)[0], gain * p.receives_in_slot), relay_side(p, moments, gain)
+    def move(moments: jax.Array, row: tuple[RelaySteps, jax.Array]) -> tuple[jax.Array, RelaySide]:
+        """Return the moments after a step, and the system at it."""
+        step, gain = row
+        after = correct_moments(step_moments(step, moments)[0], gain * step.receives_in_slot)
+        return after, relay_side(step, moments, gain)
 
-    return jax.lax.scan(single, jnp.asarray(start), (steps, jnp.asarray(gains)))[1]
+    return jax.lax.scan(move, jnp.asarray(start), (steps, jnp.asarray(gains)))[1]

@@ -39,25 +39,24 @@ def initial_error_moments(covariance: Float[np.ndarray, "n n"], filters: int) ->
 
 
 def linear_maps(step: RelaySteps) -> LinearMaps:
-    """Return the deterministic part of one step."""
+    """Return the deterministic part of one step, with E G in place of random gains."""
     (m, n), filters = step.sensing.shape, len(step.received)
     d = (1 + filters) * n
+    # Rows that select x, e_1 .. e_F, and the noises w and v.
     unit = jnp.eye(d + n + m)
     state, w, v = unit[:d].reshape(1 + filters, n, -1), unit[d : d + n], unit[d + n :]
     moved = jnp.einsum("ab,fbc->fac", step.transition, state) + w
-    estimates = state[0] - state[1:]  # s_f = x - e_f
+    # The sensor sends y = C x+ + v, relays C s_f of their estimates before the step, s_f = x - e_f.
+    estimates = state[0] - state[1:]
     relayed = jnp.einsum("mn,fnc->fmc", step.sensing, estimates[:-1])
     sent = jnp.concatenate([(step.sensing @ moved[0] + v)[None], relayed]).reshape(-1, d + n + m)
-    local_sends = [
-        step.sensing @ step.transition,
-        *[step.sensing] * (filters - 1),
-    ]  # as if each estimate were everybody's
-    believed = jnp.stack([jnp.asarray(c) for c in local_sends])
-    expects = jnp.asarray(step.gain) @ believed.reshape(
-        -1, n
-    )  # prediction of each row, as a map of its filter's estimate
-    expected = jnp.einsum("rn,rnc->rc", expects, estimates[step.owner])
-    return LinearMaps(moved.reshape(d, -1), jnp.asarray(step.gain) @ sent - expected, sent)
+    # What would be sent if the estimate s of a filter were everybody's: C A s by the sensor, C s by each relay. Its
+    # prediction of a received row is a map of the estimate of the filter that owns the row.
+    senders = [step.sensing @ step.transition, *[step.sensing] * (filters - 1)]
+    sent_of_estimate = jnp.stack([jnp.asarray(c) for c in senders]).reshape(-1, n)
+    prediction = jnp.asarray(step.gain) @ sent_of_estimate
+    predicted = jnp.einsum("rn,rnc->rc", prediction, estimates[step.owner])
+    return LinearMaps(moved=moved.reshape(d, -1), innovation=jnp.asarray(step.gain) @ sent - predicted, sent=sent)
 
 
 def sent_mean(step: RelaySteps) -> Float[jax.Array, "sent"]:
@@ -73,11 +72,13 @@ def step_moments(step: RelaySteps, moments: Float[Array, "d d"]) -> tuple[Float[
     d = (1 + F) n, z = d + R.
     """
     maps, mean = linear_maps(step), sent_mean(step)
+    # Second moments of what is sent, from the covariance of (x, e_1 .. e_F, w, v).
     sources = jax.scipy.linalg.block_diag(moments, step.process, step.sensor_noise)
     second = jnp.outer(mean, mean).at[:-1, :-1].add(propagate_by_mode(maps.sent, sources, 0.0))
-    known = jnp.concatenate([maps.moved, maps.innovation])
+    # Z: of the known linear maps, and of innovations what the gains' spread makes of what is sent.
+    linear = jnp.concatenate([maps.moved, maps.innovation])
     d = maps.moved.shape[0]
-    z = propagate_by_mode(known, sources, 0.0).at[d:, d:].add(contract(step.spread, second))
+    z = propagate_by_mode(linear, sources, 0.0).at[d:, d:].add(contract(step.spread, second))
     m = step.sensing.shape[0]
     power = jnp.diagonal(second)[:-1].reshape(-1, m).sum(axis=1) * step.transmits_in_slot
     return z, Sent(second, power)
@@ -106,13 +107,15 @@ def innovations_above_rounding(predicted: Float[jax.Array, "z z"], step: RelaySt
     Of a relay that receives nothing but itself through a known gain the innovation is zero, computed from large ones.
     """
     n, relays, d = step.transition.shape[-1], len(step.received) - 1, predicted.shape[0] - sum(step.received)
-    reach = jnp.sqrt(jnp.maximum(jnp.diagonal(predicted)[:d], 0.0)).reshape(-1, n)  # of x, e_1 .. e_F
-    state = reach[0] + jnp.abs(step.state_mean)
-    sizes = jnp.concatenate([state[None], state + reach[1 : 1 + relays]]) @ jnp.abs(step.sensing).T
+    # Sizes of what is sent: |C| (deviation + |mean|) of x by the sensor, and of s_f = x - e_f by each relay.
+    deviations = jnp.sqrt(jnp.maximum(jnp.diagonal(predicted)[:d], 0.0)).reshape(-1, n)  # of x, e_1 .. e_F
+    state = deviations[0] + jnp.abs(step.state_mean)
+    sizes = jnp.concatenate([state[None], state + deviations[1 : 1 + relays]]) @ jnp.abs(step.sensing).T
     sent = jnp.append(sizes.ravel(), 1.0)
-    known = ROUNDING * jnp.abs(step.gain) @ sent[:-1]
-    spread = ROUNDING * jnp.einsum("iiab,a,b->i", jnp.abs(step.spread), sent, sent)
-    return jnp.where(jnp.diagonal(predicted)[d:] > known**2 + spread, 1.0, 0.0)
+    # Rounding of an innovation by the mean gains, and of its variance by their spread.
+    by_mean = ROUNDING * jnp.abs(step.gain) @ sent[:-1]
+    by_spread = ROUNDING * jnp.einsum("iiab,a,b->i", jnp.abs(step.spread), sent, sent)
+    return jnp.where(jnp.diagonal(predicted)[d:] > by_mean**2 + by_spread, 1.0, 0.0)
 
 
 def regression_gain(cross: Float[jax.Array, "n m"], received: Float[jax.Array, "m m"]) -> Float[jax.Array, "n m"]:
@@ -128,14 +131,13 @@ def local_gain(predicted: Float[jax.Array, "z z"], step: RelaySteps) -> Float[ja
     n, received = step.transition.shape[-1], sum(step.received)
     d = predicted.shape[0] - received
     gain, start = jnp.zeros((d - n, received)), 0
-    used = step.receives_in_slot * innovations_above_rounding(predicted, step)
+    informative = step.receives_in_slot * innovations_above_rounding(predicted, step)
     for f, length in enumerate(step.received):
         rows = slice(start, start + length)
-        says = used[rows]
-        inner = predicted[d:, d:][rows, rows] * says[:, None] * says + jnp.diag(
-            1.0 - says
-        )  # what says nothing: solve with 1
-        cross = predicted[(1 + f) * n : (2 + f) * n, d:][:, rows] * says
+        used = informative[rows]
+        # An innovation that tells nothing has the covariance 0 with all others and the variance 1: its gain is 0.
+        inner = predicted[d:, d:][rows, rows] * used[:, None] * used + jnp.diag(1.0 - used)
+        cross = predicted[(1 + f) * n : (2 + f) * n, d:][:, rows] * used
         gain = gain.at[f * n : (f + 1) * n, rows].set(regression_gain(cross, inner))
         start += length
     return gain
@@ -152,21 +154,22 @@ class Propagated(NamedTuple):
 def propagate_slots(
     steps: RelaySteps, start: Float[Array, "d d"], gains: Float[Array, "time Fn R"] | None = None
 ) -> Propagated:
-    """Propagate the covariance of eta from `start`, under given gains, or with each filter's own best next error.
+    """Propagate the covariance of eta from `start`, under given gains or, without, those of `local_gain`.
 
     Entries of given gains on rows that receive nothing are not used.
     """
 
-    def single(moments: jax.Array, row: tuple[RelaySteps, jax.Array | None]) -> tuple[jax.Array, tuple[jax.Array, ...]]:
-        p, gain = row
-        z, sent = step_moments(p, moments)
-        used = local_gain(z, p) if gain is None else gain * p.receives_in_slot
+    def move(moments: jax.Array, row: tuple[RelaySteps, jax.Array | None]) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+        """Return the moments after a step; and its gains, these moments and the powers."""
+        step, gain = row
+        z, sent = step_moments(step, moments)
+        used = local_gain(z, step) if gain is None else gain * step.receives_in_slot
         after = correct_moments(z, used)
         return after, (used if gain is None else gain, after, sent.power)
 
     start = jnp.asarray(start)
     items = (steps, None if gains is None else jnp.asarray(gains))
-    _, (gains, moments, power) = jax.lax.scan(single, start, items)
+    _, (gains, moments, power) = jax.lax.scan(move, start, items)
     return Propagated(gains, jnp.concatenate([start[None], moments]), power)
 
 
@@ -176,10 +179,11 @@ DAMPING = 1e-9  # relative, on the change of a gain: decides only what the recei
 def gain_hessian(
     predicted: Float[Array, "z z"], ahead: Float[Array, "d d"], step: RelaySteps, damping: float
 ) -> tuple[Float[jax.Array, "r r"], Float[jax.Array, ""]]:
-    """Return half the Hessian of tr Lam [I -(0; K)] Z [I -(0; K)]' in the free gains, damped, and the damping.
+    """Return half the Hessian of tr Lam [I -(0; K)] Z [I -(0; K)]' in the free gains, damped, and what was added.
 
-    Its entry for the gains ab and cd is Lam_ac Z_bd; 1 on the diagonal of a gain that receives nothing. `damping` is
-    relative to the mean of the diagonal.
+    Z: `predicted` moments (eta+ before corrections, innovations). Lam: `ahead`, the gradient of the cost of later steps
+    by the moments after this one. The entry for the gains ab and cd is Lam_ac Z_bd; 1 on the diagonal of a gain that
+    receives nothing. `damping` is relative to the mean of the diagonal.
     """
     rows, columns = np.nonzero(gain_mask(step))
     n, d = step.transition.shape[-1], ahead.shape[0]
@@ -191,11 +195,12 @@ def gain_hessian(
     return normal + jnp.diag(jnp.where(free > 0, added, 1.0)), added
 
 
-def best_gain(
+def minimise_cost_ahead(
     predicted: Float[Array, "z z"], ahead: Float[Array, "d d"], old: Float[Array, "Fn R"], step: RelaySteps
 ) -> Float[jax.Array, "Fn R"]:
-    """Return argmin over gains K of tr Lam [I -(0; K)] Z [I -(0; K)]', nearly; all filters together.
+    """Return the gains K of all filters that minimise the cost of later steps, tr Lam [I -(0; K)] Z [I -(0; K)]'.
 
+    Z and Lam as for `gain_hessian`; a little damped towards the gains `old`, which decides what the cost does not.
     (Lam_ee K Z_ii)_ab = (Lam_e. Z_.i)_ab for each free entry ab: a linear system of the size of the gains.
     """
     rows, columns = np.nonzero(gain_mask(step))
@@ -207,6 +212,6 @@ def best_gain(
 
 
 def moment_adjoint(step: RelaySteps, gain: Float[Array, "Fn R"], ahead: Float[Array, "d d"]) -> Float[jax.Array, "d d"]:
-    """Return the gradient of <Lam, moments after the step> by the moments before it, the adjoint of the propagation."""
-    _, pull = jax.vjp(lambda m: correct_moments(step_moments(step, m)[0], gain), jnp.zeros_like(ahead))
-    return symmetrize(pull(ahead)[0])
+    """Return the gradient of <Lam, moments after the step> by the moments before it; Lam is `ahead`."""
+    _, pull_back = jax.vjp(lambda m: correct_moments(step_moments(step, m)[0], gain), jnp.zeros_like(ahead))
+    return symmetrize(pull_back(ahead)[0])

@@ -22,10 +22,10 @@ from heliograph.relays.design import (
     start_moments,
 )
 from heliograph.relays.error_moments import (
-    best_gain,
     correct_moments,
     gain_hessian,
     gain_mask,
+    minimise_cost_ahead,
     moment_adjoint,
     propagate_slots,
     step_moments,
@@ -60,24 +60,30 @@ class Limited(NamedTuple):
 
 
 def power_limit_of(steps: RelaySteps, value: ArrayLike, d: int) -> PowerLimit:
-    """Return the limit on the moments after each step, from one on the power that all relays send at each step."""
+    """Return the limit on the moments after each step, from one on the power that all relays send at each step.
+
+    Raises:
+        ValueError: a limit below what the mean state takes.
+    """
     horizon = len(steps.receives_in_slot)
     limit = repeat_per_step("power limit", value, horizon) * (1 + POWER_TOLERANCE)
+    # Each relay that transmits sends at least |C E x|^2, since estimates are unbiased: E s = E x.
     mean_signal = np.sum((steps.sensing @ steps.state_mean[..., None]) ** 2, axis=(1, 2))
-    talkers = steps.transmits_in_slot[:, 1:].sum(axis=1)
-    fixed = mean_signal * talkers  # estimates are unbiased: E s = E x
-    low = np.flatnonzero((limit <= fixed) & (talkers > 0))
+    transmitting = steps.transmits_in_slot[:, 1:].sum(axis=1)
+    fixed = mean_signal * transmitting
+    low = np.flatnonzero((limit <= fixed) & (transmitting > 0))
     if len(low):
         step = int(low[0])
         text = f"more than {fixed[step]:.6g} at step {step}, the power of the mean state"
         raise fail("power limit", text, limit[step] / (1 + POWER_TOLERANCE))
+    # What is left for the moments: those after step k are sent at step k + 1; 0 <= 1 where nobody sends.
     forms = power_forms(steps, d)
-    left = np.where(talkers > 0, limit - fixed, 1.0)
-    return PowerLimit(np.concatenate([forms[1:], np.zeros((1, d, d))]), np.append(left[1:], 1.0))
+    left = np.where(transmitting > 0, limit - fixed, 1.0)
+    return PowerLimit(form=np.concatenate([forms[1:], np.zeros((1, d, d))]), limit=np.append(left[1:], 1.0))
 
 
 def power_forms(steps: RelaySteps, d: int) -> Float[np.ndarray, "time {d} {d}"]:
-    """Return the matrices with <form_k, moments before step k> = sum over talking relays of tr Cov(C s_r)."""
+    """Return the matrices with <form_k, moments before step k> = sum over transmitting relays of tr Cov(C s_r)."""
     time, n = steps.state_mean.shape
     forms = np.zeros((time, d, d))
     for r in range(len(steps.received) - 1):
@@ -97,8 +103,9 @@ def minimise_within_limit(
     steps at once, for ever smaller t. Every point on the way is strictly inside, so nothing hangs on a last sweep that
     happens to meet all limits at once; and t falls little at a time, since long descents multiply what rounding leaves.
     """
-    whole = float(_compute_cost_and_slack(problem, local_gains)[0])
-    problem = problem._replace(cost=problem.cost / max(whole, np.finfo(float).tiny))
+    local_cost = float(_compute_cost_and_slack(problem, local_gains)[0])
+    problem = problem._replace(cost=problem.cost / max(local_cost, np.finfo(float).tiny))
+    # Designs to choose from: the local gains, these scaled into the limit, and the end of each descent.
     results = [local_gains, _scale_into_limit(problem, local_gains)]
     for barrier in BARRIERS / len(local_gains):
         gains = results[-1]
@@ -116,21 +123,21 @@ def minimise_within_limit(
 
 def _scale_into_limit(problem: Limited, local_gains: Float[np.ndarray, "time Fn R"]) -> Float[np.ndarray, "time Fn R"]:
     """Scale the relays' gains by one factor so that ROOM of the limit is left; without gains all of it is."""
-    relays = local_gains.shape[1] - problem.steps.transition.shape[-1]
+    relay_rows = local_gains.shape[1] - problem.steps.transition.shape[-1]  # without the receiver's, the last
 
-    def smaller(factor: float) -> np.ndarray:
-        return np.concatenate([factor * local_gains[:, :relays], local_gains[:, relays:]], axis=1)
+    def scale_relays(factor: float) -> np.ndarray:
+        return np.concatenate([factor * local_gains[:, :relay_rows], local_gains[:, relay_rows:]], axis=1)
 
-    low, high = 0.0, 2.0  # the first half is 1, the gains as they are
+    low, high = 0.0, 2.0  # the first middle is 1, the gains as they are
     for _ in range(HALVINGS):
         middle = (low + high) / 2
-        if np.min(_compute_cost_and_slack(problem, smaller(middle))[1]) < ROOM:
+        if np.min(_compute_cost_and_slack(problem, scale_relays(middle))[1]) < ROOM:
             high = middle
         elif middle == 1.0:
             return local_gains
         else:
             low = middle
-    return smaller(low)
+    return scale_relays(low)
 
 
 @compile_in_float64
@@ -147,7 +154,7 @@ def _compute_cost_and_slack(
 def _change_gains(
     gains: Float[Array, "time Fn R"], units: Float[Array, "time r r"], x: Float[Array, "time r"], steps: RelaySteps
 ) -> Float[Array, "time Fn R"]:
-    """Return the gains changed by x in given units."""
+    """Return the gains with their free entries changed by x, in the units (columns) of each step."""
     rows, columns = np.nonzero(gain_mask(steps))
     return jnp.asarray(gains).at[:, rows, columns].add(jnp.einsum("kij,kj->ki", units, x))
 
@@ -178,25 +185,28 @@ def _evaluate_barrier(
 
 @compile_in_float64
 def _choose_units(problem: Limited, gains: Float[Array, "time Fn R"], barrier: float) -> Float[Array, "time r r"]:
-    """L'^-1 for each step, L L' the Hessian of its gains: in these units the cost curves alike in all directions.
+    """Return L'^-1 for each step, L L' the Hessian of its gains: in these units the cost curves alike all around.
 
-    The gradient with respect to moments, cost and barrier, is pulled back step by step.
+    The gradient of cost and barrier by the moments is taken back step by step from the last.
     """
     steps, start, cost, (form, limit) = problem
     moments = jnp.asarray(propagate_slots(steps, start, gains).moments)
     slack = limit - jnp.sum(form * moments[1:], axis=(1, 2))
     slope = jnp.asarray(cost) + (barrier / slack)[:, None, None] * form
 
-    def back(ahead: jax.Array, row: tuple[RelaySteps, jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        p, gain, before, slope_k = row
+    def step_back(
+        ahead: jax.Array, row: tuple[RelaySteps, jax.Array, jax.Array, jax.Array]
+    ) -> tuple[jax.Array, jax.Array]:
+        """Return the gradient by the moments before a step, from that of later steps, and the units of its gains."""
+        step, gain, before, slope_k = row
         ahead = ahead + slope_k
-        normal, _ = gain_hessian(step_moments(p, before)[0], ahead, p, DAMPING)
-        free = jnp.asarray(p.receives_in_slot)[np.nonzero(gain_mask(p))[1]]
-        unit = jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(normal).T, jnp.diag(free))
-        return moment_adjoint(p, gain, ahead), free[:, None] * unit
+        hessian, _ = gain_hessian(step_moments(step, before)[0], ahead, step, DAMPING)
+        free = jnp.asarray(step.receives_in_slot)[np.nonzero(gain_mask(step))[1]]
+        unit = jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(hessian).T, jnp.diag(free))
+        return moment_adjoint(step, gain, ahead), free[:, None] * unit
 
     items = (steps, jnp.asarray(gains), moments[:-1], slope)
-    return jax.lax.scan(back, jnp.zeros_like(jnp.asarray(start)), items, reverse=True)[1]
+    return jax.lax.scan(step_back, jnp.zeros_like(jnp.asarray(start)), items, reverse=True)[1]
 
 
 STEPS = 4  # of a descent within a power limit, for each sweep
@@ -252,36 +262,44 @@ def receiver_error_design(
 def _sweep_backward(
     steps: RelaySteps, start: Array, cost: Float[Array, "time d d"], gains: jax.Array
 ) -> Float[jax.Array, "time d d"]:
-    """Return the gradient of the cost with respect to the moments after each step, gains improved."""
+    """Return the gradient Lam_k of the cost by the moments after each step, from the last step to the first.
 
-    def ahead_of(moments: jax.Array, row: tuple[RelaySteps, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        p, gain = row
-        z, _ = step_moments(p, moments)
+    On the way each step's gains are the best for Lam and for the moments that the given gains lead to.
+    """
+
+    def predict(moments: jax.Array, row: tuple[RelaySteps, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        """Return the moments after a step with its given gain, and those before the correction."""
+        step, gain = row
+        z, _ = step_moments(step, moments)
         return correct_moments(z, gain), z
 
-    def back(ahead: jax.Array, row: tuple[RelaySteps, jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        p, gain, z_k, cost_k = row
+    def step_back(
+        ahead: jax.Array, row: tuple[RelaySteps, jax.Array, jax.Array, jax.Array]
+    ) -> tuple[jax.Array, jax.Array]:
+        """Return the gradient by the moments before a step, and after it."""
+        step, gain, z_k, cost_k = row
         ahead = ahead + cost_k
-        return moment_adjoint(p, best_gain(z_k, ahead, gain, p), ahead), ahead
+        return moment_adjoint(step, minimise_cost_ahead(z_k, ahead, gain, step), ahead), ahead
 
-    _, z = jax.lax.scan(ahead_of, jnp.asarray(start), (steps, gains))
+    _, z = jax.lax.scan(predict, jnp.asarray(start), (steps, gains))
     items = (steps, gains, z, jnp.asarray(cost))
-    return jax.lax.scan(back, jnp.zeros_like(start), items, reverse=True)[1]
+    return jax.lax.scan(step_back, jnp.zeros_like(start), items, reverse=True)[1]
 
 
 def _sweep_forward(steps: RelaySteps, start: Array, gains: jax.Array, ahead: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the best gains step by step and the moments after each step."""
+    """Return the best gains for the gradients `ahead`, step by step from the first, and the moments after each step."""
 
-    def single(
+    def improve(
         moments: jax.Array, row: tuple[RelaySteps, jax.Array, jax.Array]
     ) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-        p, gain, ahead_k = row
-        z, _ = step_moments(p, moments)
-        gain = best_gain(z, ahead_k, gain, p)
+        """Return the moments after a step with its best gain; and this gain and these moments."""
+        step, gain, ahead_k = row
+        z, _ = step_moments(step, moments)
+        gain = minimise_cost_ahead(z, ahead_k, gain, step)
         after = correct_moments(z, gain)
         return after, (gain, after)
 
-    return jax.lax.scan(single, jnp.asarray(start), (steps, gains, ahead))[1]
+    return jax.lax.scan(improve, jnp.asarray(start), (steps, gains, ahead))[1]
 
 
 class SweepSearch(NamedTuple):
@@ -300,7 +318,7 @@ def _alternate_sweeps(
     local_gains: Float[Array, "time Fn R"],
     count: Int[Array, "sweeps"],
 ) -> Float[Array, "time Fn R"]:
-    """Alternate backward and forward sweeps from the local gains, and keep the best gains."""
+    """Alternate backward and forward sweeps from the local gains, `count` of them, and return the best gains."""
 
     def sweep(search: SweepSearch, _: jax.Array) -> tuple[SweepSearch, None]:
         gains, moments = _sweep_forward(steps, start, search.gains, _sweep_backward(steps, start, cost, search.gains))

@@ -42,22 +42,31 @@ def design_numbers(task: DesignProblem, build: Build) -> PowerDesign:
     problem.check_ends()
     limits = _make_limit_rows(_limit_powers(problem, task.budget), target)
     draws = np.random.default_rng(seed)
-    begin = [problem.numbers.start, *(problem.numbers.drawn(draws) for _ in range(starts - 1))]
+    begin = [problem.numbers.start, *(problem.numbers.draw_start(draws) for _ in range(starts - 1))]
     descent = problem.descent_problem()
     best = search(descent, limits, begin)
     if best is None:
         raise _explain_unmet(descent, limits, begin)
-    # The design, and what Lagrange's conditions say of it.
-    now, conditions = problem.at(best), check_lagrange_conditions(descent, limits, best)
-    network, error = problem.network(best), problem.criterion.exact(now.covariances)
+    # The design, and what Lagrange's conditions say of it. The problem is not convex: there is no lower bound.
+    found, conditions = problem.at(best), check_lagrange_conditions(descent, limits, best)
+    network, error = problem.network(best), problem.criterion.exact(found.covariances)
     value, unit = (error, "error") if target is None else (conditions.value, "power")
+    certificate = Certificate(
+        convex=False,
+        value=value,
+        bound=float("-inf"),
+        stationarity=conditions.residual,
+        starts=starts,
+        unit=unit,
+    )
+    # A watt more at every step falls on one transmitter: the price is the largest worth, times the steps.
     return PowerDesign(
         problem=task,
-        powers=dict(zip(problem.names, now.powers.T, strict=True)),
+        powers=dict(zip(problem.names, found.powers.T, strict=True)),
         error=error,
-        certificate=Certificate(False, value, float("-inf"), conditions.residual, starts, unit),
+        certificate=certificate,
         present=problem.criterion.exact(before.covariances),
-        covariance=now.covariances,
+        covariance=found.covariances,
         sensitivity=dict(zip(problem.names, (-conditions.worth.sum(axis=0)).tolist(), strict=True)),
         price=float(np.max(conditions.worth, initial=0.0) * limits.steps),
         numbers=problem.numbers.named(best),
@@ -81,43 +90,61 @@ def _make_limit_rows(allowed: PowerLimits, target: float | None) -> Limits:
     rows, most = allowed.rows()
     peak = allowed.peak.ravel()
     finite = np.isfinite(peak)
-    peaks = (np.eye(peak.size) / np.where(finite, peak, 1.0)[:, None])[finite]
-    return Limits(np.concatenate([peaks, rows]), np.concatenate([np.ones(len(peaks)), most]), target, len(allowed.peak))
+    peak_rows = (np.eye(peak.size) / np.where(finite, peak, 1.0)[:, None])[finite]
+    return Limits(
+        rows=np.concatenate([peak_rows, rows]),
+        most=np.concatenate([np.ones(len(peak_rows)), most]),
+        target=target,
+        steps=len(allowed.peak),
+    )
 
 
 def _explain_unmet(problem: Problem, limits: Limits, begin: list[Vector]) -> ValueError:
-    """Error that says what is least where limits cannot be met: the error within them, or the power sent anyway."""
+    """Return the error for limits that no start meets: it names the least error within them, or the least power.
+
+    A programme's `size` is its value at its start, here the least that was found.
+    """
     starts, sharpest = len(begin), problem.sharpnesses[-1]
+    # The target error may be what cannot be met: the least error within the limits of power.
     if limits.target is not None:
-        best = search(problem, limits._replace(target=None), begin)
+        no_target = limits._replace(target=None)
+        best = search(problem, no_target, begin)
         if best is not None:
-            error = Programme(problem, limits._replace(target=None), sharpest, best).size
+            error = Programme(problem, no_target, sharpest, best).size
             return fail(
                 "target error", f"at least {error:.6g}, the least found from {starts} starts", f"{limits.target:.6g}"
             )
-    free = Limits(limits.rows[:0], limits.most[:0], np.inf, limits.steps)
-    best = search(problem, free, begin)
-    power = np.inf if best is None else Programme(problem, free, sharpest, best).size
+    # Else it is the power: the least total without limits of it (a target of infinity makes the power the value).
+    no_limit = Limits(rows=limits.rows[:0], most=limits.most[:0], target=np.inf, steps=limits.steps)
+    best = search(problem, no_limit, begin)
+    power = np.inf if best is None else Programme(problem, no_limit, sharpest, best).size
     expected = f"one that is met from some of {starts} starts (a total power of {power:.6g} is the least found)"
     return fail("budget", expected, "none that is")
 
 
 def check_lagrange_conditions(problem: Problem, limits: Limits, x: Vector) -> Conditions:
-    """Return the multipliers of the limits that leave least of the gradient, what they leave, and a watt's worth."""
+    """Return Lagrange's conditions at x: how far the gradient is from a sum of the reached limits' normals.
+
+    The multipliers m >= 0 minimise |gradient - normals' m|; in a minimum nothing of the gradient is left.
+    """
     programme, z = Programme(problem, limits, problem.sharpnesses[-1], x), x / problem.unit
     value, gradient = programme.value(z)
     reached = programme.room(z) < ACTIVE
     # Normals of the limits that are reached: of powers and target, and of the numbers' ends.
-    sides = np.eye(len(z))
+    axes = np.eye(len(z))
     low, high = x <= problem.low + ACTIVE * problem.unit, x >= problem.high - ACTIVE * problem.unit
-    normals = [*programme.room_slope(z)[reached], *sides[low], *-sides[high]]
-    multipliers, left = np.zeros(len(reached)), float(np.linalg.norm(gradient))
+    normals = [*programme.room_slope(z)[reached], *axes[low], *-axes[high]]
+    multipliers, residual = np.zeros(len(reached)), float(np.linalg.norm(gradient))
     if normals:
-        solution, left = nnls(np.array(normals).T, gradient)
+        solution, residual = nnls(np.array(normals).T, gradient)
         multipliers[reached] = solution[: int(reached.sum())]
     # A watt's worth, from the multipliers of the limits of power.
     worth = limits.rows.T @ multipliers[: len(limits.most)] * programme.size
-    if limits.target is not None:
-        of_error = multipliers[-1] * programme.size / limits.target  # the power that one less of the error costs
-        worth = (worth + 1 / limits.steps) / of_error if of_error > 0 else np.zeros_like(worth)
-    return Conditions(value * programme.size, left / max(value, 1e-300), worth.reshape(limits.steps, -1))
+    if limits.target is not None:  # the value is the power: a watt's worth in units of the error
+        power_per_error = multipliers[-1] * programme.size / limits.target
+        worth = (worth + 1 / limits.steps) / power_per_error if power_per_error > 0 else np.zeros_like(worth)
+    return Conditions(
+        value=value * programme.size,
+        residual=residual / max(value, 1e-300),
+        worth=worth.reshape(limits.steps, -1),
+    )

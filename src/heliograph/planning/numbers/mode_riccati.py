@@ -49,7 +49,7 @@ class ModeSystem(NamedTuple):
 
 
 class ModeSolution(NamedTuple):
-    """X, K and L of each step and mode."""
+    """Covariances X (parts, which sum to P over the modes), gains K and adjoint L of each step and mode."""
 
     parts: Parts
     gains: Float[np.ndarray, "time M n m"]
@@ -66,7 +66,7 @@ def solve_riccati(m: ModeSystem, criterion: Criterion) -> ModeSolution:
     growth = fail("steady error", expected, "growth")
     try:
         with np.errstate(over="ignore", invalid="ignore"):
-            parts, gains = _solve_periodic(m) if m.start is None else _step_through(m, m.start[None])
+            parts, gains = _solve_periodic(m) if m.start is None else _run_riccati(m, m.start[None])
     except np.linalg.LinAlgError:  # of numbers that are none, or of a growth of exactly 1
         raise growth from None
     if not np.all(np.isfinite(parts)) or np.linalg.eigvalsh(parts).min() < -NEAR * np.abs(parts).max():
@@ -76,11 +76,11 @@ def solve_riccati(m: ModeSystem, criterion: Criterion) -> ModeSolution:
 
 
 def _solve_periodic(m: ModeSystem) -> tuple[Parts, np.ndarray]:
-    """Return X and best gains for steps that repeat for ever."""
+    """Return X (steps, modes, n, n) and the best gains K for steps that repeat for ever."""
     # The recursion, until its gains stabilise.
     last = m.law[-1, :, None, None] * m.process[-1]
     for _ in range(PLAIN):
-        parts, gains = _step_through(m, last)
+        parts, gains = _run_riccati(m, last)
         change = np.abs(parts[-1] - last).max()
         last = parts[-1]
         if not change > NEAR * np.abs(last).max():
@@ -94,40 +94,44 @@ def _solve_periodic(m: ModeSystem) -> tuple[Parts, np.ndarray]:
     return parts, gains
 
 
-def _step_through(m: ModeSystem, parts: Float[np.ndarray, "_ n n"]) -> tuple[Parts, np.ndarray]:
-    """Run the coupled Riccati recursion over all steps: X after each (steps, modes, n, n) and its best gains.
+def _run_riccati(m: ModeSystem, parts: Float[np.ndarray, "_ n n"]) -> tuple[Parts, np.ndarray]:
+    """Run the coupled Riccati recursion over all steps; return X after each (steps, modes, n, n) and its best gains.
 
     `parts` is X before the first step, by mode; one for all modes together where their chain has no memory.
     """
-    steps = []
+    covariances, gains = [], []
     for k in range(len(m.law)):
         gain, parts = _update(m, k, parts)
-        steps.append((parts, gain))
-    return np.array([x for x, _ in steps]), np.array([gain for _, gain in steps])
+        covariances.append(parts)
+        gains.append(gain)
+    return np.array(covariances), np.array(gains)
 
 
 def _update(m: ModeSystem, k: int, parts: Float[np.ndarray, "_ n n"]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the best gains of a step, and X after it."""
+    """Return the best gain K_k,j (modes, n, m) of step k and X (modes, n, n) after it, from X before it."""
     law = m.law[k][:, None, None]
     prior = JumpSystem(m.chain[k], m.transition[k], law * m.process[k]).step(parts)
-    # A mode that never occurs has the gain zero.
+    # A mode that never occurs has X = 0, so with any regular noise its gain is zero.
     noise = np.where(law > 0, law * m.noise[k], np.eye(m.noise.shape[-1]))
     after = observe_root(roots_of(prior), m.output[k], roots_of(noise))
     return after.gain, after.covariance
 
 
 def _close_loop(m: ModeSystem, gains: Numbers) -> JumpSystem:
-    """Return the recursion of X under given gains: F = (I - K H) A, S = pi [(I - K H) Q (I - K H)' + K N K']."""
+    """Return the recursion of X under given gains, X_j = sum_i T_ij F_j X_i F_j' + S_j.
+
+    F = (I - K H) A, S = pi [(I - K H) Q (I - K H)' + K N K'].
+    """
     close = np.eye(gains.shape[2]) - gains @ m.output
     added = close @ m.process[:, None] @ close.swapaxes(-1, -2) + gains @ m.noise @ gains.swapaxes(-1, -2)
     return JumpSystem(m.chain, close @ m.transition[:, None], m.law[:, :, None, None] * added)
 
 
 def lagrangian(m: ModeSystem, solution: ModeSolution) -> jax.Array:
-    """Return sum_k,j <L, right side>, which has the error's gradient where X, K and L are fixed."""
-    parts, gains, ahead = (jnp.asarray(values) for values in solution)
+    """Return sum_k,j <L_k,j, right side of X_k,j>, whose gradient at fixed X, K and L is that of the error."""
+    parts, gains, adjoint = (jnp.asarray(values) for values in solution)
     earlier = jnp.roll(parts, 1, axis=0)
     if m.start is not None:  # the first step's chain forgets the mode before: any will do
         earlier = jnp.zeros_like(parts).at[0, 0].set(m.start).at[1:].set(parts[:-1])
     jumps = _close_loop(m, gains)
-    return jnp.sum(ahead * jumps.step(earlier))
+    return jnp.sum(adjoint * jumps.step(earlier))

@@ -50,7 +50,7 @@ class Number(NamedTuple):
 def young_scalars(steps: int) -> Number:
     """Return the scalar of Young's inequality for each step, or a single one of the steady bound."""
     shape = () if steps == 1 else (steps,)
-    return Number(*(np.full(shape, value) for value in (0.1, 1e-6, 1e3)))
+    return Number(start=np.full(shape, 0.1), low=np.full(shape, 1e-6), high=np.full(shape, 1e3))
 
 
 class Numbers(NamedTuple):
@@ -81,7 +81,7 @@ class Numbers(NamedTuple):
             begin += number.start.size
         return by_name
 
-    def drawn(self, draws: np.random.Generator) -> Vector:
+    def draw_start(self, draws: np.random.Generator) -> Vector:
         """Return another start: anywhere between the ends, or where there are none by a factor about the first."""
         between = np.isfinite(self.low) & np.isfinite(self.high)
         within = draws.uniform(np.where(between, self.low, 0.0), np.where(between, self.high, 1.0))
@@ -90,7 +90,7 @@ class Numbers(NamedTuple):
 
 
 def check_numbers(free: object) -> Numbers:
-    """Free numbers from {name: (start, low, high)}; the start may be an array, the ends numbers or of its shape.
+    """Return the free numbers of {name: (start, low, high)}; a start may be an array, ends numbers or of its shape.
 
     Raises:
         ValueError: nothing free, ends that do not enclose the start.
@@ -124,7 +124,7 @@ def _check_end(name: str, end: object, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def read_free_numbers(build: Build, free: object) -> tuple[Build, Numbers]:
-    """Function and its free numbers, from {name: (start, low, high)} or, without, from the marks `hg.free` in it.
+    """Return the function and its free numbers: {name: (start, low, high)}, or where None the marks `hg.free` in it.
 
     Raises:
         ValueError: arguments of the function that are not the free numbers, marks that are no intervals.
@@ -147,6 +147,7 @@ def read_free_numbers(build: Build, free: object) -> tuple[Build, Numbers]:
 
 
 def _mark_powers(description: Description, **values: object) -> Network:
+    """Return the network of a description with these values in place of its marks."""
     return description.at(values)
 
 
@@ -185,6 +186,7 @@ class TracedNetwork:
         return hash(self._shape())
 
     def _shape(self) -> tuple[object, ...]:
+        """Return what the shapes of a program's arrays depend on."""
         shapes = tuple((name, number.start.shape) for name, number in self.numbers.by_name.items())
         return shapes, self.error.steps, self.error.horizon is None, self.young
 
@@ -200,25 +202,25 @@ class TracedNetwork:
         return mode_system(network, self.error, young)
 
     def slopes(self, x: Array, solution: ModeSolution) -> Slopes:
-        """Return the derivatives there, at fixed gains."""
-        m, pull = jax.vjp(self.system, jnp.asarray(x))
-        # Cotangents: of the error through everything, and of each power alone.
-        of_error, size = jax.grad(lagrangian)(m, solution), m.powers.size
-        unit = jnp.eye(size).reshape(size, *m.powers.shape)
-        of_powers = jax.tree.map(lambda leaf: jnp.zeros((size, *leaf.shape)), m)._replace(powers=unit)
+        """Return the derivatives of error and powers by the numbers x, at the fixed X, K and L of the solution."""
+        system, pull_back = jax.vjp(self.system, jnp.asarray(x))
+        # Cotangents of the system: that of the error first, then a unit one for each power.
+        of_error, size = jax.grad(lagrangian)(system, solution), system.powers.size
+        unit = jnp.eye(size).reshape(size, *system.powers.shape)
+        of_powers = jax.tree.map(lambda leaf: jnp.zeros((size, *leaf.shape)), system)._replace(powers=unit)
         cotangents = jax.tree.map(lambda error, rest: jnp.concatenate([error[None], rest]), of_error, of_powers)
-        slopes = jax.vmap(pull)(cotangents)[0]
-        return Slopes(slopes[0], slopes[1:].reshape(*m.powers.shape, len(x)))
+        slopes = jax.vmap(pull_back)(cotangents)[0]
+        return Slopes(error=slopes[0], powers=slopes[1:].reshape(*system.powers.shape, len(x)))
 
 
 @lru_cache(PROGRAMS)
 def programs(network: TracedNetwork) -> tuple[Callable[[Array], ModeSystem], Callable[[Array, ModeSolution], Slopes]]:
-    """Compiled programs of the system and of the derivatives."""
+    """Return the compiled programs of a network's system and derivatives; equal networks share them."""
     return compile_on_call(network.system), compile_on_call(network.slopes)
 
 
 class Point(NamedTuple):
-    """Everything at a vector of numbers; the error smoothed where it is an eigenvalue."""
+    """System, its solution and derivatives at a vector of numbers; the error is smoothed where it is an eigenvalue."""
 
     system: ModeSystem
     solution: ModeSolution
@@ -272,42 +274,54 @@ class NumberProblem:
             for end in (low, high):
                 near = np.where(np.isfinite(end), end, start)
                 near = near + INSIDE * (start - near)
-                values = {other: near if other == name else begin for other, begin in starts.items()}
+                values = {**starts, name: near}
                 try:
-                    self.network(np.concatenate([values.ravel() for values in values.values()]))
+                    self.network(np.concatenate([value.ravel() for value in values.values()]))
                 except InputError as error:
                     what = f"{' '.join(str(end).split())}, where: {error}"
                     raise fail(f"ends of {name!r}", "numbers between which there is a network", what) from None
 
     def at(self, x: Vector, criterion: Criterion | None = None) -> Point:
-        """Return everything at a point, of an eigenvalue as sharp as the criterion has it.
+        """Return system, solution and derivatives at x, for a criterion (that of the problem unless given).
 
         Raises:
             ValueError: an error that grows without limit, powers that do.
         """
-        sharp = self.criterion if criterion is None else criterion
-        key = x.tobytes(), sharp.sharpness
+        criterion = self.criterion if criterion is None else criterion
+        key = x.tobytes(), criterion.sharpness
         if key not in self._last:
             system = ModeSystem(*(None if v is None else np.asarray(v) for v in self._system(np.asarray(x))))
             if system.start is None:
+                # With Young's scalar b the system holds sqrt(1 + b) A; the plant itself has to be stable.
                 scale = np.sqrt(1 + np.ravel(self.numbers.named(x)[YOUNG])[0]) if self.young else 1.0
                 check_stable(system.transition[0] / scale)
-            solution = solve_riccati(system, sharp)
+            solution = solve_riccati(system, criterion)
             slopes = Slopes(*(np.asarray(slope) for slope in self._slopes(np.asarray(x), solution)))
-            self._last = {key: Point(system, solution, slopes, sharp)}
+            self._last = {key: Point(system, solution, slopes, criterion)}
         return self._last[key]
 
     def evaluate(self, x: Vector, sharpness: int | None) -> Evaluation | None:
         """Return the error, powers and derivatives; None where the error or the powers grow without limit."""
         try:
-            now = self.at(x, self.criterion._replace(sharpness=sharpness))
+            point = self.at(x, self.criterion._replace(sharpness=sharpness))
         except ValueError:
             return None
-        return Evaluation(now.error, now.slopes.error, now.powers.ravel(), now.slopes.powers.reshape(-1, len(x)))
+        return Evaluation(
+            error=point.error,
+            error_slope=point.slopes.error,
+            powers=point.powers.ravel(),
+            power_slope=point.slopes.powers.reshape(-1, len(x)),
+        )
 
     def descent_problem(self) -> Problem:
         """Return the problem of a descent, in units of the numbers' ranges, or of their starts where they have none."""
         low, high = self.numbers.low, self.numbers.high
         unit = np.maximum(np.where(np.isfinite(high - low), high - low, np.abs(self.numbers.start)), 1e-12)
-        sharpnesses = [criterion.sharpness for criterion in self.criterion.sharper()]
-        return Problem(low, high, unit, sharpnesses, self.evaluate, lambda x: x)  # only a descent leads back
+        return Problem(
+            low=low,
+            high=high,
+            unit=unit,
+            sharpnesses=[criterion.sharpness for criterion in self.criterion.sharper()],
+            evaluate=self.evaluate,
+            restore=lambda x: x,  # limits of powers are no limits of x: only a descent leads back
+        )

@@ -46,7 +46,11 @@ class Source(NamedTuple):
 
 
 class Received(NamedTuple):
-    """Chain into each step, its law, H = E[G] C and noise N by mode, and the transmitters' powers."""
+    """Reception of one node.
+
+    chain: [k, i, j] = P(mode j at step k | mode i at the step before). law: P(mode j) at step k. output, noise:
+    H = E[G] C and N by mode. powers: what the node's transmitters send.
+    """
 
     chain: Float[Array, "time M M"]
     law: Float[Array, "time M"]
@@ -56,7 +60,11 @@ class Received(NamedTuple):
 
 
 class _Modes(NamedTuple):
-    """A channel by its observed modes: a chain (onwards from a step), its first law, and what arrives in each mode."""
+    """A channel by its observed modes.
+
+    onward: [i, j] = P(mode j at the next step | mode i). initial: law of the first mode. maps: the channel in each
+    mode. arrived: which outputs arrive in each. forgets: whether the next mode is independent of the mode.
+    """
 
     onward: Array
     initial: Array
@@ -107,7 +115,7 @@ def check_time(network: Network, error: Error) -> None:
 
 
 def mode_system(network: Network, error: Error, young: Array | None = None) -> ModeSystem:
-    """Return system of the network's best linear filter. Exact noises; where probabilities are uncertain, upper bounds.
+    """Return the system of a network's best linear filter. Noises are exact, upper bounds of uncertain probabilities.
 
     `young` is the scalar b of each step, None where the mean gains are known.
 
@@ -142,7 +150,7 @@ def mode_system(network: Network, error: Error, young: Array | None = None) -> M
 
 
 def _stack_nodes(nodes: list[Received]) -> tuple[Array, Array]:
-    """Return H and N of all nodes in each choice of a mode for each."""
+    """Return H and N of all nodes together, for every combination of a mode of each, the last node's fastest."""
     outputs, noises = [], []
     for modes in product(*(range(node.law.shape[1]) for node in nodes)):
         pairs = list(zip(nodes, modes, strict=True))
@@ -200,11 +208,15 @@ def _observe_modes(name: str, channel: AbstractRandomAffine) -> _Modes:
 
 
 def _make_flagged_modes(name: str, channel: AbstractRandomAffine) -> JointModes:
-    """Return the modes of a channel all of whose modes are observed, with the map in each."""
+    """Return the joint modes of a channel that delivers the modes of all its chains beside its other outputs.
+
+    Raises:
+        ValueError: a chain whose mode is not delivered.
+    """
     parts = channel.in_parallel
     rest = [affine for affine in parts if not isinstance(affine, ModeOutput)]
-    chains = memories(channel)
-    if any(memory.drifts for memory in chains.values()) or not rest or len(parts) - len(rest) != len(chains):
+    flags, chains = len(parts) - len(rest), memories(channel)
+    if any(memory.drifts for memory in chains.values()) or not rest or flags != len(chains):
         raise fail(f"channel of {name!r}", "chains whose modes are observed (hg.model.with_flag)", "one with memory")
     return joint_modes(rest[0] if len(rest) == 1 else Stack(rest), order=2)
 
@@ -212,9 +224,12 @@ def _make_flagged_modes(name: str, channel: AbstractRandomAffine) -> JointModes:
 def _propagate_laws(
     onward: Float[Array, "time M M"], initial: Float[Array, "M"], forever: bool
 ) -> tuple[Float[Array, "time M"], Float[Array, "time M M"]]:
-    """Return the law at each step, and the chain into it: around for ever, or from the initial law on."""
-    around = reduce(jnp.matmul, onward)
-    law = [stationary(around) if forever and len(around) > 1 else jnp.asarray(initial)]
+    """Return the law of the modes at each step, and the chain into it, from the chain `onward` from each step.
+
+    For ever: periodic laws, and the last step leads to the first. Else from the initial law on, whatever was before.
+    """
+    over_period = reduce(jnp.matmul, onward)
+    law = [stationary(over_period) if forever and len(over_period) > 1 else jnp.asarray(initial)]
     for step in onward[:-1]:
         law.append(law[-1] @ step)
     into_first = onward[-1] if forever else jnp.tile(law[0], (len(law[0]), 1))
@@ -224,32 +239,41 @@ def _propagate_laws(
 def _describe_steps(
     sensor: LinearSensor, channel: AbstractRandomAffine, modes: _Modes, states: Array, young: Array | None, law: Array
 ) -> tuple[Array, Array, Array]:
-    """Return H, N and powers over steps with one sensor and one channel."""
+    """Return H (time, M, m, n), N (time, M, m, m) and powers (time, hops) over steps with one sensor and channel.
+
+    states: E (x, 1)(x, 1)' of each step; law: of the modes at each step; young: the scalar b of each step, or None.
+    """
     y = jax.vmap(lambda second: measurement_moment(sensor, second))(states)
     pairs = zip(modes.maps, modes.arrived, strict=True)
     described = [_describe_mode(mode_map, arrived, y, sensor, young) for mode_map, arrived in pairs]
     output = jnp.stack([jnp.tile(h, (len(y), 1, 1)) for h, _ in described], axis=1)
 
-    def powers(now: Array, law: Array) -> Array:
-        sent = [jnp.asarray(power) for power in powers_of_law(channel, now, law).values()]
-        return jnp.stack(sent) if sent else jnp.zeros(0)
+    def compute_powers(moment: Array, law: Array) -> Array:
+        """Return the powers (hops,) of a step with E (y, 1)(y, 1)' = moment."""
+        powers = [jnp.asarray(power) for power in powers_of_law(channel, moment, law).values()]
+        return jnp.stack(powers) if powers else jnp.zeros(0)
 
-    sent = jax.vmap(powers)(y, jnp.ones((len(y), 1)) if modes.forgets else law)
-    return output, jnp.stack([noise for _, noise in described], axis=1), sent
+    # What a channel without memory loses it sends nevertheless: to its transmitters it has one mode.
+    powers = jax.vmap(compute_powers)(y, jnp.ones((len(y), 1)) if modes.forgets else law)
+    return output, jnp.stack([noise for _, noise in described], axis=1), powers
 
 
 def _describe_mode(
     channel: AbstractRandomAffine, arrived: Bool[np.ndarray, "m"], y: Array, sensor: LinearSensor, young: Array | None
 ) -> tuple[Float[Array, "m n"], Float[Array, "time m m"]]:
-    """Return H, and N: what random gains make of E (y, 1)(y, 1)', and the sensor's noise; of what is lost, noise."""
-    described, present = second_order(channel), jnp.asarray(arrived)
-    gain = jnp.where(present[:, None], jnp.asarray(described.mean_gain), 0.0)
-    sensed = gain @ jnp.asarray(sensor.noise.covariance) @ gain.T + jnp.zeros((len(y), 1, 1))
-    noise = jax.vmap(lambda now: described.spread(now, present))(y)
+    """Return H = M C and N of one mode, M the mean gain, C the sensor's matrix and R the covariance of its noise.
+
+    N = Spread(y) + M R M', and with Young's scalar b as in the module docstring Spread + Shift / b + (1 + b) M R M';
+    y: E (y, 1)(y, 1)' of each step (time, m1, m1). What is lost has H = 0 and N = 1.
+    """
+    moments, present = second_order(channel), jnp.asarray(arrived)
+    gain = jnp.where(present[:, None], jnp.asarray(moments.mean_gain), 0.0)
+    sensor_noise = gain @ jnp.asarray(sensor.noise.covariance) @ gain.T + jnp.zeros((len(y), 1, 1))
+    noise = jax.vmap(lambda moment: moments.spread(moment, present))(y)
     if young is None:
-        noise = noise + sensed
+        noise = noise + sensor_noise
     else:
-        noise = noise + (1 + young)[:, None, None] * sensed
-        if described.uncertain:
-            noise = noise + jax.vmap(lambda now: described.shift(now, present))(y) / young[:, None, None]
+        noise = noise + (1 + young)[:, None, None] * sensor_noise
+        if moments.uncertain:
+            noise = noise + jax.vmap(lambda moment: moments.shift(moment, present))(y) / young[:, None, None]
     return gain @ jnp.asarray(sensor.matrix), noise + jnp.diag(jnp.where(present, 0.0, 1.0))

@@ -61,18 +61,18 @@ class PathProblem(NamedTuple):
         return Evaluation(value, gradient.ravel(), powers.ravel(), np.eye(x.size))
 
     def linear(self, powers: Powers) -> tuple["PathProblem", float, Powers]:
-        """Return problem with the linear error that touches this one from below, its value here and its gradient."""
+        """Return the problem with the linear error that touches this one from below at p, its value and gradient."""
         problem = self._replace(criterion=self.criterion.supporting(self.covariances(powers)))
         value, _, gradient = problem.sensitivity(powers)
         return problem, value, gradient
 
     def lower_bound(self, powers: Powers) -> float:
-        """f(p) + min over the limits of grad.(q - p), which a convex f never undercuts: the gap of Frank and Wolfe."""
+        """Return Frank and Wolfe's bound f(p) + min over allowed q of grad f(p).(q - p), which no convex f is below."""
         _, value, gradient = self.linear(powers)
         return float(value + np.sum(gradient * (self.limits.best(-gradient) - powers)))
 
     def least_total(self, powers: Powers, target: float) -> float:
-        """Return least total power at which the linear model at p, below a convex f everywhere, reaches the target."""
+        """Return the least total power at which the linear model at p reaches the target: a convex f needs no less."""
         _, value, gradient = self.linear(powers)
         low, high = 0.0, float(powers.mean(axis=0).sum()) * (1 + 1e-9)
         for _ in range(100):
@@ -83,7 +83,10 @@ class PathProblem(NamedTuple):
         return low
 
     def solve(self, starts: list[Powers], target: float | None = None) -> Powers | None:
-        """Return best powers from these starts, for the least error or for the least total that reaches a target."""
+        """Return the best powers from these starts, for the least error or for the least total that reaches a target.
+
+        None where no start reaches the target.
+        """
         rows, most = self.limits.rows()
         peak = self.limits.peak
         problem = Problem(
@@ -99,7 +102,7 @@ class PathProblem(NamedTuple):
 
 
 class PowerTask(NamedTuple):
-    """A problem in the free powers, which hops are free, what the others send, and starts."""
+    """A problem in the free powers (time, free), which hops are free, what the others send, and starts of a search."""
 
     problem: PathProblem
     free: Bool[np.ndarray, "hop"]
@@ -116,20 +119,22 @@ class PowerTask(NamedTuple):
         return split_paths(self.problem.paths, self.free, self.fixed)
 
     def relax(self) -> PathProblem:
-        """Problem in the power of whole paths that carry the concave envelope: its error is below any allocation's.
+        """Return the convex problem in the power of whole paths, whose least error is a lower bound of this one's.
 
-        A path may send what its hops may together, and split it at its best.
+        A path may send what its hops may together, and split it at its best; its information is replaced by the concave
+        envelope, which is nowhere below.
         """
         problem, limits = self.problem, self.problem.limits
         steps, count = problem.paths.second.shape
+        # Limits of a path: the sums of its hops'.
         peak, mean = np.zeros((steps, count)), np.zeros(count)
         np.add.at(peak.T, problem.path, limits.peak.T)
         np.add.at(mean, problem.path, limits.mean)
         cap = np.minimum(np.minimum(peak, mean * steps), limits.total * steps)
-        bound = compute_envelope(self.whole(), cap)
+        envelope = compute_envelope(self.whole(), cap)
         return problem._replace(
             path=np.arange(count),
-            information=lambda powers: PathInformation(*bound.information(powers)),
+            information=lambda powers: PathInformation(*envelope.information(powers)),
             limits=limits._replace(peak=peak, mean=mean),
         )
 
@@ -154,9 +159,14 @@ def make_power_task(
     starts: int,
     seed: int,
 ) -> PowerTask:
-    """Return the problem in the free powers, with starts that are even over some choices of the paths that send."""
+    """Return the problem in the free powers, with starts that are even over some choices of the paths that send.
+
+    criterion: the error; limits: of the free powers; free: which hops are; fixed: what all send at present; starts: how
+    many; seed: of those that are drawn.
+    """
 
     def information(powers: Powers) -> PathInformation:
+        """Return the information of all paths and its slope by the free powers, the others being fixed."""
         every = fixed.copy()
         every[:, free] = powers
         of_paths = path_information(paths, every)
@@ -172,21 +182,34 @@ def make_power_task(
     even = [limits._replace(total=total).even(mask) for mask in masks]
     sizes = [limits.total, *limits.peak[np.isfinite(limits.peak)], float(even[0].max(initial=0.0))]
     scale = max((size for size in sizes if np.isfinite(size)), default=1.0) or 1.0
-    return PowerTask(PathProblem(paths, criterion, paths.path[free], information, limits, scale), free, fixed, even)
+    problem = PathProblem(
+        paths=paths,
+        criterion=criterion,
+        path=paths.path[free],
+        information=information,
+        limits=limits,
+        scale=scale,
+    )
+    return PowerTask(problem=problem, free=free, fixed=fixed, starts=even)
 
 
 def choose_supports(path: Int[np.ndarray, "free"], steps: int, starts: int, seed: int) -> list[Mask]:
-    """Masks of the paths that send at each step: all, then every choice or `starts` drawn ones; one mask if convex."""
+    """Return masks (steps, free) of the hops that send: all, then every choice of paths, or `starts` in all, drawn.
+
+    A convex problem has one minimum, and one start.
+    """
     whole = np.ones((steps, len(path)), dtype=bool)
     if is_convex(path):
         return [whole]
     distinct, column = np.unique(path, return_inverse=True)
     entries = steps * len(distinct)
     if entries < 63 and 2**entries - 1 <= starts:
+        # Every choice but all and none, as the bits of a number.
         choices: Iterator[np.ndarray] = (
             np.array([(number >> i) & 1 for i in range(entries)], dtype=bool) for number in range(2**entries - 2, 0, -1)
         )
     else:
+        # Each path sends with a probability that is drawn too, so that few and many are tried.
         draws = np.random.default_rng(seed)
         choices = (draws.uniform(size=entries) < draws.uniform(0.1, 0.9) for _ in range(starts - 1))
     return [whole, *(on.reshape(steps, len(distinct))[:, column] for on in choices if np.any(on))]
@@ -195,6 +218,7 @@ def choose_supports(path: Int[np.ndarray, "free"], steps: int, starts: int, seed
 def least_error_powers(task: PowerTask) -> tuple[Powers, Certificate]:
     """Return the powers of the least error within the limits of a `task`, and the certificate."""
     problem, starts = task.problem, task.starts
+    # Water filling solves a convex problem of the trace but for rounding; the descent goes on from there.
     if task.convex and problem.criterion.sharpness is None and np.all(np.isfinite(starts[0])):
         whole = SplitPaths(*(values[:, problem.path] for values in task.whole()))
         starts = [water_filling(problem.limits, problem.sensitivity, whole, starts[0])]
@@ -207,12 +231,20 @@ def least_error_powers(task: PowerTask) -> tuple[Powers, Certificate]:
         relaxed = task.relax()
         lower = relaxed.solve([task.of_paths(powers)])
         bound = relaxed.lower_bound(task.of_paths(powers) if lower is None else lower)
-    return powers, Certificate(task.convex, value, min(bound, value), stationarity, len(starts), "error")
+    return powers, Certificate(
+        convex=task.convex,
+        value=value,
+        bound=min(bound, value),
+        stationarity=stationarity,
+        starts=len(starts),
+        unit="error",
+    )
 
 
 def least_power(task: PowerTask, target: float) -> tuple[Powers, Certificate]:
     """Return the powers of the least total that reaches the target error, and the certificate."""
     _check_reachable(task, target)
+    # Without a limit of the total, which is checked afterwards.
     limits = task.problem.limits
     free_total = task._replace(problem=task.problem._replace(limits=limits._replace(total=np.inf)))
     powers = _find_least_powers(free_total.problem, task.starts, target)
@@ -232,15 +264,20 @@ def least_power(task: PowerTask, target: float) -> tuple[Powers, Certificate]:
     bound = min(problem.least_total(near, target), total)
     fixed = float(task.fixed[:, ~task.free].mean(axis=0).sum())
     return powers, Certificate(
-        task.convex, total + fixed, bound + fixed, max(stationarity, 0.0), len(task.starts), "power"
+        convex=task.convex,
+        value=total + fixed,
+        bound=bound + fixed,
+        stationarity=max(stationarity, 0.0),
+        starts=len(task.starts),
+        unit="power",
     )
 
 
 def _find_least_powers(problem: PathProblem, starts: list[Powers], target: float) -> Powers | None:
     """Return the least powers that reach a target, from starts each raised until it does; None where none can."""
-    nothing = np.zeros_like(starts[0])
-    if problem.criterion.smooth(problem.covariances(nothing))[0] <= target:
-        return nothing
+    no_power = np.zeros_like(starts[0])
+    if problem.criterion.smooth(problem.covariances(no_power))[0] <= target:
+        return no_power
     raised = [start for start in (_raise_powers(problem, start, target) for start in starts) if start is not None]
     if not raised:
         return None
@@ -249,7 +286,10 @@ def _find_least_powers(problem: PathProblem, starts: list[Powers], target: float
 
 
 def _raise_powers(problem: PathProblem, start: Powers, target: float) -> Powers | None:
-    """Start times the least factor that reaches the target, as far as peaks and means allow."""
+    """Return the start times the least factor that reaches the target, as far as peaks and means allow; None if none.
+
+    By bisection of the factor's logarithm.
+    """
 
     def reaches(factor: float) -> bool:
         return problem.criterion.smooth(problem.covariances(problem.limits.clip(start * factor)))[0] <= target

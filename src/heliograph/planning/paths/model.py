@@ -58,7 +58,7 @@ def compose(first: RiccatiMap, second: RiccatiMap) -> RiccatiMap:
 
 
 def solve_fixed_point(step: RiccatiMap) -> Float[np.ndarray, "n n"]:
-    """Return the limit of X = A X (I + G X)^-1 A' + H from X = 0, by doubling: 2^k steps after k of them.
+    """Return the limit of X+ = A X (I + G X)^-1 A' + H from X = 0, by doubling: 2^k steps after k doublings.
 
     Raises:
         ValueError: covariances that grow without limit.
@@ -81,7 +81,8 @@ def covariances(plants: Plants, information: Matrices) -> Matrices:
         ValueError: steps that repeat for ever, under which the error grows without limit.
     """
     a, q = plants.transition, plants.process
-    # Predicted covariance of the first step: fixed point over the period, or from the start.
+    # Predicted covariance of the first step: fixed point over the period, or from the start. Each map of the period
+    # takes in step k - 1's information and moves to step k.
     if plants.start is None:
         steps = [RiccatiMap(a[k], information[k - 1], q[k]) for k in (*range(1, len(a)), 0)]
         predicted = solve_fixed_point(reduce(compose, steps))
@@ -213,7 +214,7 @@ def require_at_least(least: float, name: str, value: Float[np.ndarray, "*n"]) ->
 
 
 def _broadcast_to_hops(value: ArrayLike, sensors: int, hops: int) -> Float[np.ndarray, "..."]:
-    """Return the numbers (M, H), from (M,) for one hop, or from one number for all."""
+    """Return the numbers as (sensors, hops), from one number for all, or from one for each sensor with one hop."""
     numbers = np.asarray(value)
     if numbers.ndim == 0:
         return np.broadcast_to(numbers, (sensors, hops))
@@ -228,7 +229,7 @@ def fading(paths: Paths) -> PathValues:
 def _arrange_by_place(
     paths: Paths, values: Powers
 ) -> tuple[Float[np.ndarray, "time path place"], Int[np.ndarray, "hop"]]:
-    """Return the values of hops by path and place on it, 1 where a path has no more; and the place of each hop."""
+    """Return the values of hops (time, path, place along the path), 1 where a path is shorter; and each hop's place."""
     order = np.argsort(paths.path, kind="stable")
     counts = np.bincount(paths.path, minlength=paths.second.shape[1])
     position = np.empty_like(paths.path)

@@ -31,7 +31,7 @@ class Chain(NamedTuple):
 
 
 def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "time hop"]]:
-    """Independent paths of a network, as the best linear filter of everything that its nodes receive has them.
+    """Return a network's independent paths, as the best linear filter of all that its nodes receive has them.
 
     Args:
         network: nodes with linear sensors behind chains of hops.
@@ -66,15 +66,26 @@ def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "
         seconds, start = moments_over(plant, steps), np.asarray(start_plant.initial_covariance)
     # Paths of each step, and the plant's moves.
     described = [_build_step(nodes, k, np.asarray(second)) for k, second in enumerate(seconds)]
-    rows, second, signal, kappa, alpha, powers = (np.array(values) for values in list(zip(*described, strict=True))[:6])
-    moves = [at(plant, k) for k in range(steps)]
-    plants = Plants(np.array([p.matrix for p in moves]), np.array([p.noise.covariance for p in moves]), start)
-    path, names = np.array(described[0].path), tuple(described[0].names)
-    return Paths(plants, rows, second, signal, path, kappa, alpha, names), powers
+    plant_at = [at(plant, k) for k in range(steps)]
+    paths = Paths(
+        plants=Plants(
+            transition=np.array([now.matrix for now in plant_at]),
+            process=np.array([now.noise.covariance for now in plant_at]),
+            start=start,
+        ),
+        rows=np.array([step.rows for step in described]),
+        second=np.array([step.second for step in described]),
+        signal=np.array([step.signal for step in described]),
+        path=np.array(described[0].path),
+        kappa=np.array([step.kappa for step in described]),
+        alpha=np.array([step.alpha for step in described]),
+        names=tuple(described[0].names),
+    )
+    return paths, np.array([step.powers for step in described])
 
 
 def chains_of(channel: AbstractRandomAffine, rows: Float[np.ndarray, "k m1"], prefix: str = "") -> list[Chain]:
-    """Return the chains of a channel that carries rows @ (y, 1).
+    """Return the chains of a channel that carries rows @ (y, 1), their hops' names beginning with `prefix`.
 
     Raises:
         ValueError: a channel that is not made of independent chains, each for one number.
@@ -96,35 +107,41 @@ def chains_of(channel: AbstractRandomAffine, rows: Float[np.ndarray, "k m1"], pr
 
 
 def _make_chain(parts: list[AbstractRandomAffine], rows: Float[np.ndarray, "k m1"], prefix: str) -> Chain:
-    """Return a series of maps as a path: the row of outputs that it carries, kappa and alpha of each hop."""
+    """Return a series of maps as a path: the row of outputs that it carries, kappa and alpha of each hop.
+
+    Raises:
+        ValueError: maps that are not hops of one number, wires, and unobserved losses.
+    """
     if parts[-1].outputs != 1:
         raise _unfit(f"one gain for {parts[-1].outputs} numbers")
-    row, fading, moved = rows[0], 1.0, False
+    # fading: product of 1 / P(arrival) of unobserved losses; shifted: a wire behind a hop adds a constant.
+    row, fading, shifted = rows[0], 1.0, False
     hops: dict[str, tuple[float, float]] = {}
     while parts:
         affine = parts.pop(0)
         # An unobserved loss is fading.
         if isinstance(affine, Mixture):
-            inner, lost = _split_loss(affine)
-            parts, fading = [*inner.in_series, *parts], fading * lost
+            inner, factor = _split_loss(affine)
+            parts, fading = [*inner.in_series, *parts], fading * factor
             continue
         if not isinstance(affine, GainAndNoise):
             raise _unfit(type(affine).__name__)
-        # Hops, and wires between them.
+        # Hops, and wires between them. The first map may combine several outputs; of one it keeps the units.
         if not hops:
-            row = np.asarray(affine.matrix)[0] @ rows if affine.inputs > 1 else rows[0]  # of one number, in its units
+            row = np.asarray(affine.matrix)[0] @ rows if affine.inputs > 1 else rows[0]
         if affine.transmits:
-            if moved:
+            if shifted:
                 raise _unfit("a relay that takes a reference off")
             hops[f"{prefix}hop{len(hops) + 1}"] = _describe_hop(affine)
         elif affine.inputs != 1 or affine.outputs != 1:
             raise _unfit("a wire of several numbers behind a hop")
         elif hops:
-            moved = moved or bool(np.any(np.asarray(affine.noise.mean)))
+            shifted = shifted or bool(np.any(np.asarray(affine.noise.mean)))
     # Fading multiplies the last hop.
     if hops:
         last = list(hops)[-1]
-        hops[last] = (hops[last][0] * fading, hops[last][1])
+        kappa, alpha = hops[last]
+        hops[last] = (kappa * fading, alpha)
     elif fading > 1:
         raise _unfit("a wire that loses what it carries")
     return Chain(row, hops)
@@ -143,20 +160,33 @@ def _describe_hop(hop: GainAndNoise) -> tuple[float, float]:
 
 
 def _split_loss(mixture: Mixture) -> tuple[AbstractRandomAffine, float]:
-    """Return the channel behind an unobserved loss, and 1 / (arrival probability)."""
+    """Return the channel behind an unobserved loss, and 1 / (arrival probability), the factor of its kappa.
+
+    A loss is a mixture of one channel with maps that deliver nothing.
+    """
     p = np.asarray(mixture.choice.probabilities)
-    silent = [isinstance(m, GainAndNoise) and not np.any(np.append(m.matrix, m.noise.covariance)) for m in mixture.maps]
-    if silent.count(False) != 1 or mixture.corner_count() > 1 or not (arrival := float(p[silent.index(False)])) > 0:
+    audible = [index for index, affine in enumerate(mixture.maps) if not _delivers_nothing(affine)]
+    if len(audible) != 1 or mixture.corner_count() > 1 or not p[audible[0]] > 0:
         raise _unfit("a mixture of several channels")
-    return mixture.maps[silent.index(False)], 1 / arrival
+    return mixture.maps[audible[0]], 1 / float(p[audible[0]])
+
+
+def _delivers_nothing(affine: AbstractRandomAffine) -> bool:
+    """Decide whether a map has neither a signal nor a noise."""
+    return isinstance(affine, GainAndNoise) and not np.any(np.append(affine.matrix, affine.noise.covariance))
 
 
 def _unfit(got: str) -> ValueError:
+    """Return the error that names what is no independent path."""
     return fail("network", "independent paths, each a chain of hops for one number", got)
 
 
 class _Step(NamedTuple):
-    """One step: of each path c, s and t, of each hop kappa, alpha, the power sent now, the name, and its path."""
+    """Lists of one step, filled path by path.
+
+    Of each path its row c, second = s = E y^2 and signal = t = s - Var v; of each hop kappa, alpha, the power that it
+    sends at present, its name, and the number of its path.
+    """
 
     rows: list[np.ndarray]
     second: list[float]

@@ -47,19 +47,21 @@ class SplitPaths(NamedTuple):
 def split_paths(paths: Paths, free: Bool[np.ndarray, "hop"], fixed: Powers) -> SplitPaths:
     """Return the paths by the power that their free hops send together, the others sending the powers `fixed`."""
     full = paths.second * fading(paths)
-    hops = [np.flatnonzero((paths.path == i) & free) for i in range(full.shape[1])]
-    alpha = np.zeros((*full.shape, max(1, max(len(places) for places in hops))))
-    for i, places in enumerate(hops):
-        alpha[:, i, : len(places)] = paths.alpha[:, places]
-    factor = share_of_signal(fixed, paths.alpha)
+    # alpha of the free hops of each path.
+    free_hops = [np.flatnonzero((paths.path == i) & free) for i in range(full.shape[1])]
+    alpha = np.zeros((*full.shape, max(1, max(len(hops) for hops in free_hops))))
+    for i, hops in enumerate(free_hops):
+        alpha[:, i, : len(hops)] = paths.alpha[:, hops]
+    # A hop of fixed power divides A by p / (p + alpha).
+    share = share_of_signal(fixed, paths.alpha)
     for h in np.flatnonzero(~free):
         i = paths.path[h]
-        full[:, i] = np.where(factor[:, h] > 0, full[:, i] / np.maximum(factor[:, h], 1 / DEAD), DEAD)
-    return SplitPaths(np.minimum(full, DEAD), paths.signal, alpha)
+        full[:, i] = np.where(share[:, h] > 0, full[:, i] / np.maximum(share[:, h], 1 / DEAD), DEAD)
+    return SplitPaths(full=np.minimum(full, DEAD), signal=paths.signal, alpha=alpha)
 
 
 def split_power(alpha: "Float[ArrayLike, ' H']", total: "Float[ArrayLike, '']") -> Float[np.ndarray, "H"]:
-    """Powers p_h >= 0 of a given sum that make the noise factor prod_h (1 + alpha_h / p_h) of a relay chain least.
+    """Return powers p_h >= 0 of a given sum that make the noise factor prod_h (1 + alpha_h / p_h) of a chain least.
 
     p_h = (sqrt(alpha_h^2 + 4 alpha_h / l) - alpha_h) / 2 with the multiplier l that the sum sets. Plant, sensor and
     fading do not matter. Two hops share in the ratio sqrt(alpha_1 (P + alpha_2)) to sqrt(alpha_2 (P + alpha_1)).
@@ -94,42 +96,49 @@ def check_hop_noises(alpha: ArrayLike) -> Float[np.ndarray, "H"]:
 
 
 def split_power_over_hops(whole: SplitPaths, total: PathValues) -> Split:
-    """Return the best split of each path's power: one multiplier l for its hops, by Newton's method for log l."""
+    """Return the best split of each path's power `total` over its free hops, with the path's information and slope."""
     alpha, power = whole.alpha, np.where(total > 0, total, 1.0)[..., None]
     hops = (alpha > 0).sum(axis=-1)
-    log = 2 * np.log(np.where(hops[..., None] > 0, np.sqrt(alpha).sum(axis=-1, keepdims=True), 1.0) / power)
+    # One multiplier l for a path's hops, by Newton's method for log l from l = (sum_h root alpha_h / P)^2, which is
+    # exact for much power.
+    log_l = 2 * np.log(np.where(hops[..., None] > 0, np.sqrt(alpha).sum(axis=-1, keepdims=True), 1.0) / power)
     for _ in range(NEWTON_STEPS):
-        p, falls = _split_at_multiplier(alpha, log)
+        p, falls = _split_at_multiplier(alpha, log_l)
         reached = p.sum(axis=-1, keepdims=True)
-        step = np.log(np.divide(reached, power, out=np.ones_like(power), where=reached > 0))
-        step = np.divide(step * reached, falls, out=np.zeros_like(falls), where=falls > 0)
-        log = log + step
-        if np.all(np.abs(step) <= 1e-15 * (1 + np.abs(log))):
+        excess = np.log(np.divide(reached, power, out=np.ones_like(power), where=reached > 0))
+        step = np.divide(excess * reached, falls, out=np.zeros_like(falls), where=falls > 0)
+        log_l = log_l + step
+        if np.all(np.abs(step) <= 1e-15 * (1 + np.abs(log_l))):
             break
-    p = _split_at_multiplier(alpha, log)[0]
+    # The powers, of exactly this sum.
+    p = _split_at_multiplier(alpha, log_l)[0]
     reached = p.sum(axis=-1, keepdims=True)
     p = p * np.divide(power, reached, out=np.ones_like(power), where=reached > 0)
     # j = (A / D) / (A - t A / D) and dj/dP = l D / (D - t)^2, in the ratio A / D, which vanishes with a power.
     ratio = share_of_signal(p, alpha).prod(axis=-1)
     below = whole.full - whole.signal * ratio
     sends = (total > 0) | (hops == 0)  # a path that needs no power is always there
-    slope = np.exp(log[..., 0]) * ratio * whole.full / below**2
+    slope = np.exp(log_l[..., 0]) * ratio * whole.full / below**2
     # Of no power: one hop begins with the slope 1 / (A alpha), several with none.
-    first = np.divide(1.0, whole.full * alpha.sum(axis=-1), out=np.zeros_like(ratio), where=hops == 1)
+    slope_at_zero = np.divide(1.0, whole.full * alpha.sum(axis=-1), out=np.zeros_like(ratio), where=hops == 1)
     return Split(
-        np.where(sends[..., None], p, 0.0),
-        np.where(sends, ratio / below, 0.0),
-        np.where(hops == 0, 0.0, np.where(sends, slope, first)),
+        powers=np.where(sends[..., None], p, 0.0),
+        information=np.where(sends, ratio / below, 0.0),
+        slope=np.where(hops == 0, 0.0, np.where(sends, slope, slope_at_zero)),
     )
 
 
-def _split_at_multiplier(alpha: np.ndarray, log: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return p_h(l) without cancellation, and -d sum P / d log l."""
-    over = np.exp(-log)
-    root = np.sqrt(alpha**2 + 4 * alpha * over)
-    whole = root + alpha
-    p = np.divide(2 * alpha * over, whole, out=np.zeros_like(whole), where=whole > 0)
-    falls = np.divide(alpha * over, root, out=np.zeros_like(root), where=root > 0)
+def _split_at_multiplier(alpha: np.ndarray, log_l: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return p_h(l) of each hop, and -d sum_h p_h / d log l of each path.
+
+    p_h = 2 (alpha / l) / (root + alpha) with root = sqrt(alpha^2 + 4 alpha / l): the formula of the module docstring
+    without its difference, and so without cancellation.
+    """
+    inverse = np.exp(-log_l)
+    root = np.sqrt(alpha**2 + 4 * alpha * inverse)
+    denominator = root + alpha
+    p = np.divide(2 * alpha * inverse, denominator, out=np.zeros_like(denominator), where=denominator > 0)
+    falls = np.divide(alpha * inverse, root, out=np.zeros_like(root), where=root > 0)
     return p, falls.sum(axis=-1, keepdims=True)
 
 
@@ -148,7 +157,10 @@ class Envelope(NamedTuple):
 
 
 def compute_envelope(whole: SplitPaths, cap: PathValues) -> Envelope:
-    """Concave envelopes: a ray touches where D (1 - P l) = t, by bisection in log l, as the left side falls with l."""
+    """Return the concave envelope of each path's information on [0, cap].
+
+    The ray touches j where D (1 - P l) = t: by bisection in log l, as the left side falls with l.
+    """
     alpha, hops = whole.alpha, (whole.alpha > 0).sum(axis=-1)
     largest = np.where(hops > 0, alpha.max(axis=-1), 1.0)
     low, high = np.log(1e-30 / largest), np.log(1e30 / largest)
@@ -156,11 +168,11 @@ def compute_envelope(whole: SplitPaths, cap: PathValues) -> Envelope:
         middle = (low + high) / 2
         p = _split_at_multiplier(alpha, middle[..., None])[0]
         noise = np.divide(alpha, p, out=np.zeros_like(p), where=p > 0)
-        left = whole.full * np.prod(1 + noise, axis=-1) * (1 - p.sum(axis=-1) * np.exp(middle))
-        rises = left >= whole.signal
-        low, high = np.where(rises, middle, low), np.where(rises, high, middle)
+        left_side = whole.full * np.prod(1 + noise, axis=-1) * (1 - p.sum(axis=-1) * np.exp(middle))
+        above = left_side >= whole.signal
+        low, high = np.where(above, middle, low), np.where(above, high, middle)
     touch = np.where(hops > 1, _split_at_multiplier(alpha, low[..., None])[0].sum(axis=-1), 0.0)
     touch = np.minimum(touch, cap)
-    there = split_power_over_hops(whole, touch)
-    ray = np.divide(there.information, touch, out=np.zeros_like(touch), where=touch > 0)
+    at_touch = split_power_over_hops(whole, touch)
+    ray = np.divide(at_touch.information, touch, out=np.zeros_like(touch), where=touch > 0)
     return Envelope(whole, touch, ray)

@@ -9,6 +9,7 @@ powers leads down, for the linearised error is concave in p; how far to go the s
 """
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,51 +23,69 @@ PATIENCE, TRIES = 20, 12  # iterations that close the gap no further; points on 
 STEEPEST = 1e-9  # least a, of s kappa: below, a path that power makes free of noise is a little more than linear
 
 
-Point = tuple[float, Powers, Powers]  # error, -d error / d j of each free hop's path, d error / d p
+class Slopes(NamedTuple):
+    """Error at some powers, -d error / d j of each free hop's path, and d error / d p."""
+
+    error: float
+    weights: Powers
+    gradient: Powers
 
 
 def water_filling(
-    limits: PowerLimits, sensitivity: Callable[[Powers], Point], whole: SplitPaths, start: Powers
+    limits: PowerLimits,
+    sensitivity: Callable[[Powers], tuple[float, Powers, Powers]],
+    whole: SplitPaths,
+    start: Powers,
 ) -> Powers:
     """Return the best powers within limits by the fixed point, from a start, until the gap closes or shrinks no more.
 
     `sensitivity` gives error and derivatives at powers (time, free), `whole` the path of each free hop.
     """
+    # j = p / (a p + b) of each free hop's path.
     a = np.maximum(whole.full - whole.signal, STEEPEST * whole.full)
     b = whole.full * whole.alpha[..., 0]
+
+    def slopes_at(powers: Powers) -> Slopes:
+        return Slopes(*sensitivity(powers))
+
     best = p = start
     smallest, idle = np.inf, 0
-    here = sensitivity(p)
+    slopes = slopes_at(p)
     for _ in range(STEPS):
         # The gap of Frank and Wolfe: what the error's tangent leaves to be gained.
-        gap = float(np.sum(here[2] * (p - limits.best(-here[2]))))
+        gap = float(np.sum(slopes.gradient * (p - limits.best(-slopes.gradient))))
         idle = 0 if gap < (1 - CLOSED) * smallest else idle + 1
         if gap < smallest:
             smallest, best = gap, p
-        if gap <= CLOSED * abs(here[0]) or idle > PATIENCE:
+        if gap <= CLOSED * abs(slopes.error) or idle > PATIENCE:
             break
-        p, here = _search_line(sensitivity, p, here, _fill_to_limits(limits, here[1], a, b) - p)
+        p, slopes = _search_line(slopes_at, p, slopes, _fill_to_limits(limits, slopes.weights, a, b) - p)
     return best
 
 
-def _search_line(sensitivity: Callable[[Powers], Point], p: Powers, here: Point, ahead: Powers) -> tuple[Powers, Point]:
-    """Return a point lower on the way: its end, or where the slopes at both ends say that the lowest lies.
+def _search_line(
+    slopes_at: Callable[[Powers], Slopes], p: Powers, slopes: Slopes, way: Powers
+) -> tuple[Powers, Slopes]:
+    """Return a point of less error on the way from p to p + way, and its slopes.
 
-    Where rounding hides the way down, half of it, by which the gap still shrinks.
+    The end of the way, or where the slopes at both ends say that the error is least. Where rounding hides the way down,
+    half of it, by which the gap still shrinks.
     """
-    slope = float(np.sum(here[2] * ahead))
+    slope = float(np.sum(slopes.gradient * way))
     length = 1.0
     for _ in range(TRIES if slope < 0 else 0):
-        there = sensitivity(p + length * ahead)
-        rise = float(np.sum(there[2] * ahead))
-        if rise <= -0.5 * slope and there[0] <= here[0]:
-            return p + length * ahead, there
-        length *= min(max(slope / (slope - rise), 0.1), 0.9)
-    return p + ahead / 2, sensitivity(p + ahead / 2)
+        tried = slopes_at(p + length * way)
+        end_slope = float(np.sum(tried.gradient * way))
+        if end_slope <= -0.5 * slope and tried.error <= slopes.error:
+            return p + length * way, tried
+        # Of a parabola with these slopes at its ends the lowest point, kept off both.
+        share = slope / (slope - end_slope) if end_slope != slope else 0.0  # equal only by rounding
+        length *= min(max(share, 0.1), 0.9)
+    return p + way / 2, slopes_at(p + way / 2)
 
 
 def _fill_to_limits(limits: PowerLimits, weights: Powers, a: Powers, b: Powers) -> Powers:
-    """Return the powers at the level that the limits set, under fixed weights."""
+    """Return the powers [y root(w b) - b]^+ / a = [y rise - dry]^+ at the level y that the limits set."""
     rise, dry = np.sqrt(np.maximum(weights, 0.0) * b) / a, b / a
     steps = len(dry)
     # The level at which each transmitter's mean is reached, then that of the total under these.

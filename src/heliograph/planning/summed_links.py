@@ -1,0 +1,104 @@
+"""Links of a sum z = sum_i a_i g_i y_i + noise: their information at amplitudes a, and the best a for one signal.
+
+With b_i = E[g_i] c_i (rows of B), D_ij = E[g_i] E[g_j] R_ij + (i = j) Var(g_i) t_i, t_i = E[y_i^2] and N the noise of
+links and receiver, a step tells J = B' a a' B / (a' D a + N) of the state. Of one scalar signal x that is
+j = (b' a)^2 / (a' D a + N), a generalised Rayleigh quotient:
+
+- total power sum_i a_i^2 t_i = P: a ~ (D + N T / P)^-1 b, j = b' (D + N T / P)^-1 b, T = diag(t);
+- each a_i at most cap_i, D diagonal: a_i = min(theta b_i / D_i, cap_i), theta = (a' D a + N) / b' a;
+- both: D + nu T and N - nu P in place of D and N, with nu >= 0 at which the power is P.
+
+Of several states no information is above B' (D + N T / P)^-1 B (Cauchy and Schwarz).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.numerics.check import fail
+from heliograph.numerics.types import Float
+
+Vector = Float[np.ndarray, "links"]
+ALIKE = 1e-12  # relative: rows of one signal, noises that are independent
+HALVINGS = 200  # of an interval that holds a multiplier or a power
+
+
+class SummedLinks(NamedTuple):
+    """Links of a sum: rows B, noise D, power t of a unit amplitude, noise N, and the amplitudes at present."""
+
+    rows: Float[np.ndarray, "links n"]
+    noise: Float[np.ndarray, "links links"]
+    unit: Vector
+    floor: float
+    present: Vector
+
+    def information(self, amplitudes: Vector) -> Float[np.ndarray, "n n"]:
+        """Return the information J = B' a a' B / (a' D a + N) that one step gives about the state."""
+        signal = amplitudes @ self.rows
+        noise = float(amplitudes @ self.noise @ amplitudes) + self.floor
+        return np.outer(signal, signal) / noise if noise > 0 else np.zeros((len(signal),) * 2)
+
+    def best_information(self, total: float) -> Float[np.ndarray, "n n"]:
+        """Return B' (D + N T / P)^-1 B, which no amplitudes of this total power exceed."""
+        noise = self.noise + np.diag(self.floor * self.unit / total)
+        bound: np.ndarray = self.rows.T @ np.linalg.solve(noise, self.rows)
+        return bound
+
+
+def solve_closed_form(links: SummedLinks, total: float, caps: Vector) -> Vector | None:
+    """Return the best amplitudes of one scalar signal by the formulas of the module docstring; None where none applies.
+
+    Under a total power, and under limits of each amplitude where the noises of links are independent.
+    """
+    # One signal: all rows of B are multiples b_i of one direction.
+    _, sizes, right = np.linalg.svd(links.rows)
+    if len(sizes) > 1 and sizes[1] > ALIKE * sizes[0]:
+        return None
+    b = links.rows @ right[0]
+    # Where only the total binds: a ~ (D + N T / P)^-1 b.
+    if np.isfinite(total):
+        free = np.linalg.solve(links.noise + np.diag(links.floor * links.unit / total), b)
+        free = free * np.sqrt(total / (free**2 @ links.unit))
+        if np.all(np.abs(free) <= caps):
+            return np.asarray(free)
+    diagonal = np.diagonal(links.noise)
+    if np.any(np.abs(links.noise - np.diag(diagonal)) > ALIKE * np.sqrt(np.outer(diagonal, diagonal))):
+        return None
+    # Where only the limits of each bind.
+    best: np.ndarray = np.sign(b) * _cap_amplitudes(np.abs(b), diagonal, links.floor, caps)
+    if best**2 @ links.unit <= total:
+        return best
+
+    # Both: the multiplier nu of the total, between 0 and N / P, at which the power is the total.
+    def amplitudes_at(nu: float) -> Vector:
+        sizes = _cap_amplitudes(np.abs(b), diagonal + nu * links.unit, links.floor - nu * total, caps)
+        return np.asarray(np.sign(b) * sizes)
+
+    low, high = 0.0, links.floor / total
+    for _ in range(HALVINGS):
+        nu = (low + high) / 2
+        low, high = (nu, high) if amplitudes_at(nu) ** 2 @ links.unit > total else (low, nu)
+    return amplitudes_at(high)
+
+
+def _cap_amplitudes(b: Vector, noise: Vector, floor: float, caps: Vector) -> Vector:
+    """Return a_i = min(theta b_i / D_i, cap_i) at the theta at which theta b' a = a' D a + N."""
+    ratio = np.divide(b, noise, out=np.full_like(b, np.inf), where=noise > 0)
+
+    def amplitudes_at(theta: float) -> Vector:
+        return np.asarray(np.where(b > 0, np.minimum(theta * ratio, caps), 0.0))
+
+    def excess(theta: float) -> float:
+        """Return theta b' a - (a' D a + N), which rises with theta."""
+        a = amplitudes_at(theta)
+        return theta * float(b @ a) - float(noise @ a**2) - floor
+
+    low, high = 0.0, 1.0
+    while excess(high) < 0:
+        high *= 2
+        if high > 1 / ALIKE**2:
+            raise fail("budget", "one that limits every transmitter that helps", "no limit")
+    for _ in range(HALVINGS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if excess(middle) < 0 else (low, middle)
+    return amplitudes_at(high)
