@@ -35,7 +35,7 @@ class Accumulated:
         self.once = None if self.code.once is None else Tiers(self.code.once, (1, 1))
 
     def memory(self, runs: int, lanes: int, in_flight: int) -> tuple[float, float, float]:
-        """Bytes of results of so many single runs, of sums of so many lanes, and of variables of those in flight."""
+        """Return bytes of the results of so many runs, of sums of so many lanes, and of variables of runs in flight."""
         length = row_length(self.width, self.summed.batches)
         collected = sums = 0.0
         for buffer, summed, common in zip(self.code.outputs, self.summed.outputs, self.common, strict=True):
@@ -64,6 +64,7 @@ class Accumulated:
             runs: how many.
             first: number of the first one; 0 by default.
         """
+        # Parts of whole blocks of runs, each with sums of its own.
         begun = self.begin(jax.tree.leaves(arguments), runs)
         share = -(-runs // (PARTS * self.width)) * self.width
         starts = range(first, first + runs, share)
@@ -73,14 +74,16 @@ class Accumulated:
             return begun.add(np.arange(starts[part], min(starts[part] + share, first + runs)), sums[part])
 
         collected = list(threads().map(compute, range(len(starts))))
-        totals = iter(begun.total(sums))
+        # Each result: a sum over all parts, the parts one behind another, or what all runs share.
+        totals, counts = iter(begun.total(sums)), _count_by_batch(first, runs, self.summed.batches)
         leaves: list[Any] = []
-        for fixed, is_summed, *parts in zip(begun.shared, self.summed.outputs, *collected, strict=True):
-            if fixed is None:
+        for shared, is_summed, *parts in zip(begun.shared, self.summed.outputs, *collected, strict=True):
+            if shared is None:
                 leaves.append(next(totals) if is_summed else np.concatenate(parts))
-            else:  # all runs share it
-                counts = _counts(first, runs, self.summed.batches)
-                leaves.append(fixed[..., None] * counts if is_summed else np.broadcast_to(fixed, (runs, *fixed.shape)))
+            elif is_summed:
+                leaves.append(shared[..., None] * counts)
+            else:
+                leaves.append(np.broadcast_to(shared, (runs, *shared.shape)))
         return jax.tree.unflatten(self.tree, leaves)
 
 
@@ -91,6 +94,7 @@ class Begun:
         self.program, self.summed = program, program.summed.outputs
         self.arguments = [memory_of(x, t) for x, t in zip(arguments, program.types, strict=True)]
         self.memory = aligned(program.code.shared)
+        # Compute what all runs share; the number of the run and results of runs are not used.
         self.shared: list[np.ndarray | None] = [None] * len(program.common)
         if program.once is not None:
             number, results = np.zeros(1, np.uint32), [np.empty(0)] * len(program.common)
@@ -100,8 +104,8 @@ class Begun:
         for n, (buffer, offset) in enumerate(zip(program.code.outputs, program.code.places, strict=True)):
             if program.common[n]:
                 kind = np.dtype(DTYPES[buffer.type])
-                held = self.memory[offset : offset + buffer.size * kind.itemsize]
-                self.shared[n] = held.view(kind).reshape(buffer.shape).copy()
+                computed = self.memory[offset : offset + buffer.size * kind.itemsize]
+                self.shared[n] = computed.view(kind).reshape(buffer.shape).copy()
         self._machine = None if all(program.common) else program.blocks.machine(-(-runs // program.width))
 
     def zeros(self, memory: list[list[np.ndarray]] | None = None) -> list[np.ndarray]:
@@ -127,24 +131,24 @@ class Begun:
         Runs are computed in blocks of consecutive ones, each several times as many as a vector has.
         """
         numbers = np.ascontiguousarray(runs, dtype=np.uint32)
-        # Outputs of the code: the sums themselves, or an array with a row for each run.
+        # Outputs of the code: the sums themselves, or an array with a row for each run; the latter are returned.
         totals = iter(sums)
         results: list[np.ndarray] = []
-        given: list[np.ndarray | None] = []
+        collected: list[np.ndarray | None] = []
         for (buffer, summed), common in zip(self._outputs(), self.program.common, strict=True):
             if summed:
                 results.append(next(totals))
             else:
                 shape = (0,) if common else (len(numbers), *buffer.shape)
                 results.append(np.empty(shape, DTYPES[buffer.type]))
-            given.append(None if summed or common else results[-1])
+            collected.append(None if summed or common else results[-1])
         # Compute all blocks of runs.
         if len(numbers) and self._machine is not None:
             scratch = aligned(self.program.code.scratch)
             pointers = self._pointers(numbers, results)
             blocks = -(-len(numbers) // self._machine.width)
             self._machine.run(pointers.ctypes.data, scratch.ctypes.data, 0, blocks, len(numbers))
-        return given
+        return collected
 
     def total(self, parts: Sequence[Sequence[np.ndarray]]) -> list[np.ndarray]:
         """Return the sums (..., batch) of several sums, of each summed result that runs do not share."""
@@ -193,13 +197,14 @@ def accumulate(
     leaves = jax.tree.leaves(examples)
     numbers = {n: (np.asarray(mask), np.asarray(leaves[n])) for n, mask in known.items()}
     program = lower(function, *examples, like((), np.uint32), known=numbers, single=single)
-    pair = program.tree.children()
-    if program.tree.node_data() is None or program.tree.node_data()[0] is not tuple or len(pair) != 2:
+    # The results are a pair: leaves of its first part are summed.
+    pair, data = program.tree.children(), program.tree.node_data()
+    if data is None or data[0] is not tuple or len(pair) != 2:
         expected = "a pair of what is summed and what is collected"
         raise ValueError(f"function of a run: expected {expected}, got {program.tree}")
     count = pair[0].num_leaves
     summed = tuple(n < count for n in range(len(program.outputs)))
-    return Accumulated(program, Summed(summed, batches, len(leaves)))
+    return Accumulated(program, Summed(outputs=summed, batches=batches, number=len(leaves)))
 
 
 def _add_in_order(sums: Sequence[np.ndarray]) -> np.ndarray:
@@ -211,6 +216,6 @@ def _add_in_order(sums: Sequence[np.ndarray]) -> np.ndarray:
     return total
 
 
-def _counts(first: int, runs: int, batches: int) -> np.ndarray:
-    """Return how many runs each batch has."""
+def _count_by_batch(first: int, runs: int, batches: int) -> np.ndarray:
+    """Return how many of the runs from `first` on each batch has: equal numbers, and one more of the rest."""
     return np.bincount(np.arange(first, first + runs % batches) % batches, minlength=batches) + runs // batches

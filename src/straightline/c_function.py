@@ -86,9 +86,9 @@ def to_c(
         name: name of the function in C, and beginning of the names of its tables.
         single: whether numbers are float; double unless so.
         names: of the arguments' arrays and of the results'; by default from the parameters and fields.
-        finite: which of the arguments' arrays, counted from 0, never hold NaN, so that zero times an entry is zero;
-            none by default.
-        symmetric: which of them, counted in the same way, are symmetric, so that one triangle is read; none by default.
+        finite: indices, among the arguments' arrays in order, of those that never hold NaN, so that zero times an entry
+            is zero; none by default.
+        symmetric: indices of those that are symmetric, so that one triangle is read; none by default.
         short: whether each loop stays a loop, so that the text is short; by default short loops are written out.
 
     Raises:
@@ -103,38 +103,41 @@ def to_c(
             raise Unsupported(equation.primitive.name, code_line(equation))
     graph, buffers, outputs = lower_for_c(program, finite, symmetric, short)
     real: Real = "float" if single else "double"
-    read, written = _name_arrays(function, examples, tree, names)
+    argument_names, result_names = _name_arrays(function, examples, tree, names)
     # The body: statements in the order of the graph. Arguments without axes are passed by value.
-    flat = [scalars(x) for x in outputs]
+    result_nodes = [scalars(x) for x in outputs]
     arguments = [
-        CArray(n, _name_stored_type(b.type, real), b.size, bool(b.shape)) for n, b in zip(read, buffers, strict=True)
+        CArray(name=array_name, type=_name_stored_type(b.type, real), size=b.size, is_array=bool(b.shape))
+        for array_name, b in zip(argument_names, buffers, strict=True)
     ]
-    places = {b: _place(x) for b, x in zip(buffers, arguments, strict=True)}
-    source = CSource([node for nodes in flat for node in nodes], places, real, name)
+    places = {b: _locate(x) for b, x in zip(buffers, arguments, strict=True)}
+    source = CSource([node for nodes in result_nodes for node in nodes], places, real, name)
     try:
         body = source.statements(graph.top)
     except Unsupported as error:
         raise Unsupported(error.operation, error.where or _line_of(error.operation, equations)) from None
     # The end: every result is written, after all arguments are read.
     arguments = [x._replace(used=b in source.needed) for x, b in zip(arguments, buffers, strict=True)]
-    results = _describe_results(written, program, outputs, flat, real)
-    ends = _write_assignments(source, results, flat)
-    unread = [f"    (void){x.name};" for x in (*arguments, *results) if not x.used or not x.size]
+    results = _describe_results(result_names, program, outputs, result_nodes, real)
+    assignments = _write_assignments(source, results, result_nodes)
+    # What is not used is said to be so, for compilers that warn of it.
+    unused = [f"    (void){x.name};" for x in (*arguments, *results) if not x.used or not x.size]
     head = _declare_function(name, arguments, results)
-    lines = [f"{head}\n{{", *unread, *source.declarations(), *body, *ends, "}"]
+    lines = [f"{head}\n{{", *unused, *source.declarations(), *body, *assignments, "}"]
     definition = "\n\n".join([*source.table_definitions(), "\n".join(lines)])
     return CFunction(
-        name,
-        _HEADER.format(guard=f"{name.upper()}_H", head=head),
-        _SOURCE.format(name=name, definition=definition),
-        definition,
-        arguments,
-        results,
-        source.operations,
+        name=name,
+        header=_HEADER.format(guard=f"{name.upper()}_H", head=head),
+        source=_SOURCE.format(name=name, definition=definition),
+        definition=definition,
+        arguments=arguments,
+        results=results,
+        operations=source.operations,
     )
 
 
 def _check_name(name: str) -> None:
+    """Raise ValueError for a name that C does not take for a function."""
     if not (name.isascii() and name.isidentifier()) or name in RESERVED or name.startswith("_"):
         raise ValueError(f"name: expected one that C takes for a function, got {name!r}")
 
@@ -144,7 +147,8 @@ def _name_stored_type(type: Type, real: Real) -> str:
     return "unsigned char" if type == "bool" else c_type(type, real)
 
 
-def _place(array: CArray) -> Place:
+def _locate(array: CArray) -> Place:
+    """Return the function from an index to the C expression of an argument's number there."""
     return (lambda index: f"{array.name}[{index}]") if array.is_array else (lambda index: array.name)
 
 
@@ -171,14 +175,21 @@ def _describe_results(
     results = []
     for n, (name, variable, value, nodes) in enumerate(zip(names, program.jaxpr.outvars, outputs, flat, strict=True)):
         aval: Any = variable.aval
-        same = next(k for k in range(n + 1) if flat[k] == nodes)
         results.append(
-            CArray(name, _name_stored_type(type_of(aval), real), len(nodes), True, True, same, _is_symmetric(value))
+            CArray(
+                name=name,
+                type=_name_stored_type(type_of(aval), real),
+                size=len(nodes),
+                is_array=True,
+                same=next(k for k in range(n + 1) if flat[k] == nodes),
+                symmetric=_is_symmetric(value),
+            )
         )
     return results
 
 
 def _is_symmetric(value: np.ndarray) -> bool:
+    """Return whether a matrix has the same node in entries across the diagonal."""
     if value.ndim != 2 or value.shape[0] != value.shape[1] or len(value) < 2:
         return False
     return all(value[i, j] is value[j, i] for i in range(len(value)) for j in range(i))
@@ -187,21 +198,24 @@ def _is_symmetric(value: np.ndarray) -> bool:
 def _name_arrays(
     function: Callable[..., PyTree], examples: Sequence[PyTree], tree: Any, names: tuple[Sequence[str], Sequence[str]]
 ) -> tuple[list[str], list[str]]:
-    """Return the names of the arguments' and of the results' arrays."""
-    read, written = list(names[0]), list(names[1])
-    if not read:
+    """Return the names of the arguments' and of the results' arrays, no two the same.
+
+    Where `names` has none: those of parameters and fields. A name that C has, or that is taken, gets underscores.
+    """
+    argument_names, result_names = list(names[0]), list(names[1])
+    if not argument_names:
         parameters = [p.name for p in inspect.signature(function).parameters.values() if p.kind != p.VAR_POSITIONAL]
         labels = [parameters[n] if n < len(parameters) else f"argument_{n}" for n in range(len(examples))]
-        read = [n for label, x in zip(labels, examples, strict=True) for n in _name_leaves(label, x)]
-    if not written:
-        written = _name_leaves("result", jax.tree.unflatten(tree, range(tree.num_leaves)))
+        argument_names = [n for label, x in zip(labels, examples, strict=True) for n in _name_leaves(label, x)]
+    if not result_names:
+        result_names = _name_leaves("result", jax.tree.unflatten(tree, range(tree.num_leaves)))
     taken = set[str]()
-    for some in (read, written):
-        for n in range(len(some)):
-            while some[n] in RESERVED or some[n] in taken:
-                some[n] += "_"
-            taken.add(some[n])
-    return read, written
+    for array_names in (argument_names, result_names):
+        for n in range(len(array_names)):
+            while array_names[n] in RESERVED or array_names[n] in taken:
+                array_names[n] += "_"
+            taken.add(array_names[n])
+    return argument_names, result_names
 
 
 def _name_leaves(label: str, tree: PyTree) -> list[str]:

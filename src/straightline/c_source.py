@@ -20,7 +20,7 @@ FUNCTIONS = {name: name for name in (
     "sqrt", "exp", "log", "log1p", "expm1", "sin", "cos", "tan", "tanh", "atan2", "pow", "floor", "ceil", "asin",
     "acos", "atan", "sinh", "cosh", "asinh", "acosh", "atanh", "cbrt", "exp2", "erf", "erfc", "lgamma",
 )} | {"abs": "fabs", "rem": "fmod", "round_even": "nearbyint", "round_away": "round"}  # fmt: skip
-# What is more than one operator or function; a and b are names or literals, never expressions.
+# What is more than one operator or function; arguments are names or literals, never expressions.
 COMPOSED: dict[str, Callable[..., str]] = {
     "neg": "-{0}".format,
     "max": "((isgreater({0}, {1}) || ({0} != {0}) || (({0} == {1}) && !signbit({0}))) ? {0} : {1})".format,
@@ -90,7 +90,7 @@ def literal(value: float | int | bool, type: Type, real: Real) -> str:
 
 
 def expression(node: Node, arguments: Sequence[str], real: Real) -> str:
-    """Return an operation on names and literals.
+    """Return the C expression of a node's operation on arguments, which are names and literals.
 
     Raises:
         Unsupported: an operation that C does not have.
@@ -98,58 +98,68 @@ def expression(node: Node, arguments: Sequence[str], real: Real) -> str:
     op, source = node.op, node.args[0].type
     if op == "select":
         return f"({arguments[0]} ? {arguments[1]} : {arguments[2]})"
-    if op in ("convert", "bitcast"):
-        return (_write_conversion if op == "convert" else _as_other)(source, node.type, arguments[0], real)
+    if op == "convert":
+        return _write_conversion(source, node.type, arguments[0], real)
+    if op == "bitcast":
+        return _write_bitcast(source, node.type, arguments[0], real)
     if op == "not":
         return f"!{arguments[0]}" if source == "bool" else f"({c_type(source, real)})~{arguments[0]}"
+    # Comparisons.
     if source in REAL and op in QUIET:
         return f"{QUIET[op]}({', '.join(arguments)})"
     if op in ORDER:
         return f"{arguments[0]} {ORDER[op]} {arguments[1]}"
-    # Integers first, since C's operators differ from those of floating-point numbers.
+    # Integers first, since C's operators on them leave undefined what JAX defines.
     if source == "bool" and op in ("max", "min"):
         return WHOLE[op](*arguments)
     if source not in (*REAL, "bool") and op in WHOLE:
         return _write_integer(op, source, arguments)
+    # Real numbers, and flags: several operations of C, one operator, or a function.
     if op in COMPOSED:
         return COMPOSED[op](*arguments)
     if op in INFIX:
         return f"{arguments[0]} {INFIX[op]} {arguments[1]}"
     if op in FUNCTIONS and source in REAL:
-        return f"{FUNCTIONS[op]}{'f' if c_type(source, real) == 'float' else ''}({', '.join(arguments)})"
+        ending = "f" if c_type(source, real) == "float" else ""
+        return f"{FUNCTIONS[op]}{ending}({', '.join(arguments)})"
     raise Unsupported(op)
 
 
 def _write_integer(op: str, type: Type, arguments: Sequence[str]) -> str:
     """Return the C expression of an operation on integers, defined where C leaves it open (overflow, long shifts)."""
-    bits = int(type[1:])
-    if type[0] == "u" and op in UNSIGNED:
-        return UNSIGNED[op](*arguments, t=f"uint{bits}_t")
-    by = f"(({arguments[-1]} >= 0 && {arguments[-1]} < {bits}) ? {arguments[-1]} : {bits - 1})"
-    if type[0] == "u":
-        by = by.replace(f"{arguments[-1]} >= 0 && ", "")
-    kind = f"uint{bits}_t" if type[0] == "u" else f"int{bits}_t"
-    return WHOLE[op](*arguments, t=kind, u=f"uint{bits}_t", s=f"int{bits}_t", b=bits, by=by)
+    bits, is_unsigned = int(type[1:]), type[0] == "u"
+    unsigned, signed = f"uint{bits}_t", f"int{bits}_t"
+    if is_unsigned and op in UNSIGNED:
+        return UNSIGNED[op](*arguments, t=unsigned)
+    # What a shift of a signed number is by: at most all bits but one, which leaves the sign.
+    last = arguments[-1]
+    in_range = f"{last} < {bits}" if is_unsigned else f"{last} >= 0 && {last} < {bits}"
+    by = f"(({in_range}) ? {last} : {bits - 1})"
+    return WHOLE[op](*arguments, t=unsigned if is_unsigned else signed, u=unsigned, s=signed, b=bits, by=by)
 
 
 def _write_conversion(source: Type, target: Type, name: str, real: Real) -> str:
-    """Convert a number; of a real one that an integer type does not have the nearest that it has, 0 of NaN."""
+    """Return the expression of a number in another type; of a real one the nearest integer of the type, 0 of NaN."""
     if target == "bool":
         return f"({name} != 0)"
     kind = c_type(target, real)
     if source not in REAL or target in REAL:
         return f"({kind}){name}"
-    bits, least = int(target[1:]), "0"
-    end = f"{2.0 ** (bits - (target[0] == 'i')):.1f}{'f' if c_type(source, real) == 'float' else ''}"
-    most = f"{kind[:-2].upper()}_MAX"
-    if target[0] == "i":
-        least = f"{kind[:-2].upper()}_MIN"
-    low = f"islessequal({name}, {f'-{end}' if target[0] == 'i' else '0'})"
-    return f"(isgreaterequal({name}, {end}) ? {most} : {low} ? {least} : {name} == {name} ? ({kind}){name} : 0)"
+    # A real number as an integer: the type's limits where the number is beyond them (from `end` on, up to -`end`).
+    bits, is_signed = int(target[1:]), target[0] == "i"
+    limits = kind[:-2].upper()  # int32_t -> INT32
+    end = f"{2.0 ** (bits - is_signed):.1f}{'f' if c_type(source, real) == 'float' else ''}"
+    least, low_end = (f"{limits}_MIN", f"-{end}") if is_signed else ("0", "0")
+    too_low = f"islessequal({name}, {low_end})"
+    in_range = f"{name} == {name} ? ({kind}){name} : 0"
+    return f"(isgreaterequal({name}, {end}) ? {limits}_MAX : {too_low} ? {least} : {in_range})"
 
 
-def _as_other(source: Type, target: Type, name: str, real: Real) -> str:
-    """Read the bits of a number as another; a number of single precision is one of double precision then."""
+def _write_bitcast(source: Type, target: Type, name: str, real: Real) -> str:
+    """Return the expression that reads the bits of a number as another type, by a union.
+
+    A number of single precision is one of double precision then.
+    """
     if not {source, target} & REAL:
         return f"({c_type(target, real)}){name}"
     fields = " ".join(f"{c_type(t, 'double')} {t};" for t in (source, target))
@@ -161,9 +171,11 @@ Place = Callable[[str], str]  # from an index to what stands there
 
 
 class CSource:
-    """Statements that compute some nodes, and the tables that they read.
+    """Writer of statements that compute some nodes, and of the tables that they read.
 
-    `places`: expressions of the numbers of each input. `prefix`: prefix of the names of tables.
+    `places`: for each input a function from an index to the expression of the number there. `prefix`: of the names of
+    tables. `needed`: what the statements compute; `names`: the variable of each node; `arrays`: the array of each
+    buffer; `tables`: (name, definition) by the numbers in them; `operations`: how many of each were written.
     """
 
     def __init__(self, roots: Iterable[Node], places: Mapping[Buffer, Place], real: Real, prefix: str):
@@ -200,7 +212,7 @@ class CSource:
             elif isinstance(statement, Loop):
                 lines += self._write_loop(statement, indent)
             elif isinstance(statement, Guard):
-                lines += self._guard(statement, indent)
+                lines += self._write_guard(statement, indent)
             elif isinstance(statement, Store):
                 entry = self._write_entry(statement.buffer, statement.offset, statement.strides, statement.indices)
                 lines.append(f"{indent}{entry} = {self.name(statement.node)};")
@@ -211,15 +223,16 @@ class CSource:
         return lines
 
     def declarations(self, indent: str = "    ") -> list[str]:
-        """Declare the arrays that the statements fill."""
+        """Return the declarations of the arrays that the statements fill."""
         arrays = self.arrays.items()
         return [f"{indent}{c_type(b.type, self.real)} {name}[{max(b.size, 1)}];" for b, name in arrays]
 
     def table_definitions(self) -> list[str]:
-        """Define the tables, one definition each."""
+        """Return the definitions of the tables."""
         return [text for _, text in self.tables.values()]
 
-    def _new(self) -> str:
+    def _new_name(self) -> str:
+        """Return the name of a new variable."""
         self.count += 1
         return f"v{self.count}"
 
@@ -228,29 +241,27 @@ class CSource:
         if node.op in ("constant", "counter", "parameter", "result", "guarded"):
             return []
         if node.op == "load":
-            text = self._load(node)
+            buffer, offset, strides = node.value
+            text = self._write_entry(buffer, offset, strides, node.args)
         else:
             named = self._clip_to_range if node.op in ("min", "max") else self.name
             text = expression(node, [named(a) for a in node.args], self.real)
             self.operations[node.op] = self.operations.get(node.op, 0) + 1
-        self.names[node] = self._new()
+        self.names[node] = self._new_name()
         return [f"{indent}const {c_type(node.type, self.real)} {self.names[node]} = {text};"]
 
-    def _load(self, node: Node) -> str:
-        buffer, offset, strides = node.value
-        return self._write_entry(buffer, offset, strides, node.args)
-
     def _write_entry(self, buffer: Buffer, offset: int, strides: Sequence[int], indices: Sequence[Node]) -> str:
-        """Return the expression of a number in memory, which may be part of another array."""
+        """Return the expression of buffer[offset + sum strides * indices]; a buffer may be part of another array."""
         whole, start = buffer.owner
-        index = self._at(start + offset, strides, indices)
+        index = self._write_index(start + offset, strides, indices)
         if whole.table is not None:
             return f"{self._name_table(whole)}[{index}]"
         if whole in self.places:
             return self.places[whole](index)
         return f"{self.arrays.setdefault(whole, f'a{len(self.arrays)}')}[{index}]"
 
-    def _at(self, offset: int, strides: Sequence[int], indices: Sequence[Node]) -> str:
+    def _write_index(self, offset: int, strides: Sequence[int], indices: Sequence[Node]) -> str:
+        """Return the expression offset + sum strides * indices."""
         terms = [f"{s} * {self.name(i)}" if s != 1 else self.name(i) for s, i in zip(strides, indices, strict=True)]
         return " + ".join(([str(offset)] if offset or not terms else []) + terms)
 
@@ -272,35 +283,39 @@ class CSource:
         Without a length the body has the break that ends it.
         """
         deeper, lines = f"{indent}    ", []
-        carried = [p for p, node in enumerate(loop.parameters) if {node, loop.results[p]} & self.needed.keys()]
-        for index in carried:
-            name, start = self._new(), loop.initial[index]
+        # Variables, with the numbers before the loop: they are parameters within it and results behind it.
+        carried = [k for k, node in enumerate(loop.parameters) if {node, loop.results[k]} & self.needed.keys()]
+        for k in carried:
+            name, start = self._new_name(), loop.initial[k]
             lines.append(f"{indent}{c_type(start.type, self.real)} {name} = {self.name(start)};")
-            self.names[loop.parameters[index]] = self.names[loop.results[index]] = name
+            self.names[loop.parameters[k]] = self.names[loop.results[k]] = name
         head = "for (;;) {"
         if loop.length is not None:
-            counter = self._new()
+            counter = self._new_name()
             if loop.counter is not None:
                 self.names[loop.counter] = counter
             head = f"for (int64_t {counter} = 0; {counter} < {loop.length}; ++{counter}) {{"
         lines += [f"{indent}{head}", *self.statements(loop.body, deeper)]
-        # What follows may be another parameter, which must not have changed yet.
-        ends: list[str] = []
-        for index in carried:
-            node = loop.following[index]
-            ends.append(self.name(node))
+        # The next turn's values are assigned at the end, all at once: one that is another parameter is copied before
+        # that parameter changes.
+        next_values: list[str] = []
+        for k in carried:
+            node = loop.following[k]
+            value = self.name(node)
             if node.op == "parameter":
-                ends[-1] = self._new()
-                lines.append(f"{deeper}const {c_type(node.type, self.real)} {ends[-1]} = {self.name(node)};")
-        lines += [f"{deeper}{self.names[loop.parameters[p]]} = {end};" for p, end in zip(carried, ends, strict=True)]
+                value = self._new_name()
+                lines.append(f"{deeper}const {c_type(node.type, self.real)} {value} = {self.name(node)};")
+            next_values.append(value)
+        for k, value in zip(carried, next_values, strict=True):
+            lines.append(f"{deeper}{self.names[loop.parameters[k]]} = {value};")
         return [*lines, f"{indent}}}"]
 
-    def _guard(self, guard: Guard, indent: str) -> list[str]:
+    def _write_guard(self, guard: Guard, indent: str) -> list[str]:
         """Write a guarded block; its results are zero if the condition does not hold."""
         results = [(r, v) for r, v in zip(guard.results, guard.values, strict=True) if r in self.needed]
         lines = []
         for outcome, _ in results:
-            self.names[outcome] = self._new()
+            self.names[outcome] = self._new_name()
             lines.append(f"{indent}{c_type(outcome.type, self.real)} {self.names[outcome]} = 0;")
         deeper = f"{indent}    "
         lines += [f"{indent}if ({self.name(guard.condition)}) {{", *self.statements(guard.body, deeper)]

@@ -41,20 +41,21 @@ class Compiled:
         self.code: Code = write_module(program, self.differs, width, features()[2])
         self.width, self.common = self.code.width, self.code.common
         self.operations, self.divisions = self.code.operations, self.code.divisions
+        # Code for blocks of runs, for what all runs share, and for one run alone.
         self.blocks = Tiers(self.code.blocks, (width or narrow(self.width), self.width))
         self.once = None if self.code.once is None else Tiers(self.code.once, (1, 1))
         self.single = Tiers(self.code.blocks, (1, 1))
-        self._why: str | None = None
-        self._first: list[np.ndarray] = []
-        self._spread = self.differs.index(True) if True in self.differs else None  # an argument that each run has
-        self._shared: np.ndarray | None = None  # what all runs of all calls share, once it is computed
+        self._refusal: str | None = None  # why LLVM makes no code, "" if it does, None until it was tried
+        self._first: list[np.ndarray] = []  # the first arguments, which calls leave out, and their addresses
         self._addresses, self._tables = list[int](), addresses(self.code.tables)
+        self._by_run = self.differs.index(True) if True in self.differs else None  # an argument that each run has
+        self._shared: np.ndarray | None = None  # what all runs of all calls share, once it is computed
 
     def with_first(self, *arguments: PyTree) -> "Compiled":
         """Return the same code whose first arguments are these, which calls leave out."""
         new = copy(self)
         new._first = [memory_of(x, t) for x, t in zip(jax.tree.leaves(arguments), self.types, strict=False)]
-        new._check_shapes(new._first, 0, new._runs(new._first))
+        new._check_shapes(new._first, 0, new._count_runs(new._first))
         new._addresses, new._shared = addresses(new._first), None
         return new
 
@@ -63,33 +64,34 @@ class Compiled:
         return OneRun(self)
 
     def prepare(self, arrays: Sequence[Any] = ()) -> str:
-        """Generate what a first call of these arrays takes, else of one run; return "", or why LLVM makes no code."""
-        if self._why is None:
+        """Generate what a first call of these arrays, or of one run, takes; return "", or why LLVM makes no code."""
+        if self._refusal is None:
             try:
                 if self.once is not None:
                     self.once.prepare(1)
                 if not all(self.code.common):
-                    tiers, width = self._tiers(self._runs(arrays))
-                    tiers.prepare(-(-self._runs(arrays) // width))
-                self._why = ""
+                    tiers, width = self._choose_tiers(self._count_runs(arrays))
+                    tiers.prepare(-(-self._count_runs(arrays) // width))
+                self._refusal = ""
             except Unsupported as error:
-                self._why = str(error)
-        return self._why
+                self._refusal = str(error)
+        return self._refusal
 
-    def _tiers(self, runs: int) -> tuple[Tiers, int]:
+    def _choose_tiers(self, runs: int) -> tuple[Tiers, int]:
         """Return the code for so many runs, and the most runs of its vectors: one run fills no lanes."""
         return (self.single, 1) if runs == 1 else (self.blocks, self.width)
 
-    def _runs(self, arrays: Sequence[Any]) -> int:
-        return 1 if self._spread is None or self._spread >= len(arrays) else len(arrays[self._spread])
+    def _count_runs(self, arrays: Sequence[Any]) -> int:
+        """Return the number of runs, the length of an argument that each run has; 1 if there is none."""
+        return 1 if self._by_run is None or self._by_run >= len(arrays) else len(arrays[self._by_run])
 
     def _convert_arguments(self, arguments: PyTree) -> list[np.ndarray]:
-        """Return the arguments of a call, of the types and shapes that the code has."""
-        leaves, given = jax.tree.leaves(arguments), len(self._first)
-        if len(leaves) != len(self.types) - given:
-            raise ValueError(f"arguments: expected {len(self.types) - given} arrays, got {len(leaves)}")
-        arrays = [*self._first, *(memory_of(x, t) for x, t in zip(leaves, self.types[given:], strict=True))]
-        self._check_shapes(arrays[given:], given, self._runs(arrays))
+        """Return all arguments of a call, the first ones included, of the types and shapes that the code has."""
+        leaves, count = jax.tree.leaves(arguments), len(self._first)
+        if len(leaves) != len(self.types) - count:
+            raise ValueError(f"arguments: expected {len(self.types) - count} arrays, got {len(leaves)}")
+        arrays = [*self._first, *(memory_of(x, t) for x, t in zip(leaves, self.types[count:], strict=True))]
+        self._check_shapes(arrays[count:], count, self._count_runs(arrays))
         return arrays
 
     def _check_shapes(self, arrays: Sequence[np.ndarray], first: int, runs: int) -> None:
@@ -107,22 +109,26 @@ class Compiled:
             arguments: trees like the examples; arrays of which each run has its own have a leading axis of runs.
             cores: threads that compute; those of the machine by default.
         """
-        arrays, given = self._convert_arguments(arguments), len(self._first)
-        runs = self._runs(arrays)
-        code = self.code
+        arrays, first = self._convert_arguments(arguments), len(self._first)
+        runs, code = self._count_runs(arrays), self.code
+        # Memory, and its addresses in the order that the code expects: inputs, tables, outputs, what runs share.
         outputs = [in_lines((runs, *b.shape), DTYPES[b.type]) for b in code.outputs]
         shared = aligned(code.shared) if self._shared is None else self._shared
-        ends = addresses([*outputs, shared])
-        pointers = np.array([*self._addresses, *addresses(arrays[given:]), *self._tables, *ends], dtype=np.uint64)
+        last = addresses([*outputs, shared])
+        pointers = np.array([*self._addresses, *addresses(arrays[first:]), *self._tables, *last], dtype=np.uint64)
+        # What all runs share: held for later calls unless it follows from arguments that these change.
         if self.once is not None:
             if self._shared is None:
                 once = self.once.machine(1)
                 once.run(pointers.ctypes.data, 0, 0, 1, 1)
-                self._shared = shared if all(self.differs[given:]) else None
+                self._shared = shared if all(self.differs[first:]) else None
             self._copy_common(outputs, shared)
+        # What differs, block by block.
         if not all(code.common):
-            (tiers, width), memory = self._tiers(runs), (arrays, code.tables, outputs, shared)
-            self._compute_blocks(Call(tiers.machine(-(-runs // width)), pointers, memory, runs), cores)
+            tiers, width = self._choose_tiers(runs)
+            memory = (arrays, code.tables, outputs, shared)
+            call = Call(machine=tiers.machine(-(-runs // width)), pointers=pointers, memory=memory, runs=runs)
+            self._compute_blocks(call, cores)
         return jax.tree.unflatten(self.tree, outputs)
 
     def _compute_blocks(self, call: "Call", cores: int | None) -> None:
@@ -137,11 +143,10 @@ class Compiled:
         list(threads().map(lambda start: call.compute(start, min(start + share, blocks), scratch), starts))
 
     def _copy_common(self, outputs: list[np.ndarray], shared: np.ndarray) -> None:
-        """Copy the outputs that all runs share from where they were computed."""
-        for array, common, offset, buffer in zip(
-            outputs, self.code.common, self.code.places, self.code.outputs, strict=True
-        ):
-            if common:
+        """Copy the outputs that all runs share from where they were computed, to every run."""
+        parts = zip(outputs, self.code.common, self.code.places, self.code.outputs, strict=True)
+        for array, is_common, offset, buffer in parts:
+            if is_common:
                 size = buffer.size * array.itemsize
                 array[...] = shared[offset : offset + size].view(array.dtype).reshape(buffer.shape)
 
@@ -158,9 +163,9 @@ class Call(NamedTuple):
     runs: int
 
     def compute(self, begin: int, end: int, scratch: int) -> None:
-        """Compute blocks of runs in this thread, with so many bytes of its own."""
-        own = aligned(scratch)
-        self.machine.run(self.pointers.ctypes.data, own.ctypes.data, begin, end, self.runs)
+        """Compute blocks `begin` to `end` of runs in this thread, with `scratch` bytes of its own."""
+        memory = aligned(scratch)
+        self.machine.run(self.pointers.ctypes.data, memory.ctypes.data, begin, end, self.runs)
 
 
 class OneRun:
@@ -170,23 +175,23 @@ class OneRun:
     """
 
     def __init__(self, compiled: Compiled):
-        code, given = compiled.code, len(compiled._first)
-        if not all(compiled.differs[given:]):
+        code, first = compiled.code, len(compiled._first)
+        if not all(compiled.differs[first:]):
             raise ValueError("one run: expected all arguments that runs share to be given first")
-        self.inputs = [np.zeros((1, *s), t) for s, t in zip(compiled.shapes, compiled.types, strict=True)][given:]
+        self.inputs = [np.zeros((1, *s), t) for s, t in zip(compiled.shapes, compiled.types, strict=True)][first:]
         self.outputs = [in_lines((1, *b.shape), DTYPES[b.type]) for b in code.outputs]
         self._memory = *compiled._first, *self.inputs, *code.tables, *self.outputs, aligned(code.shared)
         self._pointers = np.array(addresses(self._memory), dtype=np.uint64)
         self._scratch, self._tiers, self._is_common = aligned(code.scratch), compiled.single, all(code.common)
-        self._at = self._pointers.ctypes.data, self._scratch.ctypes.data
+        self._addresses = self._pointers.ctypes.data, self._scratch.ctypes.data
         if compiled.once is not None:
-            compiled.once.machine(1).run(self._at[0], 0, 0, 1, 1)
+            compiled.once.machine(1).run(self._pointers.ctypes.data, 0, 0, 1, 1)
             compiled._copy_common(self.outputs, self._memory[-1])
 
     def __call__(self) -> None:
         """Compute `outputs` from `inputs`."""
         if not self._is_common:
-            self._tiers.machine(1).run(*self._at, 0, 1, 1)
+            self._tiers.machine(1).run(*self._addresses, 0, 1, 1)
 
 
 class Alone:
@@ -200,16 +205,16 @@ class Alone:
         level = int(self.code.operations <= ALONE)
         self.machine, self.tree, self._in_place = generate(self.code.blocks, level, 1), program.tree, in_place
         self._arguments = [(b.shape, DTYPES[b.type]) for b in program.inputs]
-        self._place([])
+        self._allocate([])
 
     def again(self, first: Sequence[np.ndarray]) -> "Alone":
         """Return the same code with new memory; the first arguments are these arrays, which a call only reads."""
         new = copy(self)
-        new._place(first)
+        new._allocate(first)
         return new
 
-    def _place(self, first: Sequence[np.ndarray]) -> None:
-        """Allocate memory for a call."""
+    def _allocate(self, first: Sequence[np.ndarray]) -> None:
+        """Allocate the memory of calls, in which the first arguments are these arrays and results may be arguments."""
         kinds = self._arguments
         self.inputs = [np.ascontiguousarray(x, t).reshape(s) for x, (s, t) in zip(first, kinds, strict=False)]
         self.inputs += [np.zeros(*kind) for kind in kinds[len(first) :]]
@@ -305,7 +310,7 @@ def explain(
 
 
 def counted(code: Compiled) -> str:
-    """Return the operations of a run in words."""
+    """Return in words how many operations a run takes."""
     return f"{code.operations} operations{f', {code.divisions} of them divisions and roots' if code.divisions else ''}"
 
 

@@ -104,36 +104,39 @@ class _Evaluation:
         return computed
 
     def _entry_at(self, buffer: Buffer, offset: int, strides: tuple[int, ...], indices: tuple[Node, ...]) -> Any:
+        """Return the place offset + sum strides * indices in the memory that a buffer uses."""
         pairs = zip(strides, indices, strict=True)
         return sum((s * self.value(i) for s, i in pairs), buffer.owner[1] + offset)
 
-    def _within(self, block: Block) -> list[Buffer]:
-        """Return the buffers that a block stores into, or the blocks inside it."""
+    def _find_filled(self, block: Block) -> list[Buffer]:
+        """Return the buffers that a block, or a block inside it, stores into."""
         stores = [x for x in self.needed if isinstance(x, Store) and block in x.block.inwards()]
         return list(dict.fromkeys(x.buffer.owner[0] for x in sorted(stores, key=lambda x: x.node.serial)))
 
     def _evaluate_loop(self, loop: Loop) -> None:
         """Evaluate a loop: the carry is that of the graph, and the memory that the body fills."""
-        carried = [
-            k for k, pair in enumerate(zip(loop.parameters, loop.results, strict=True)) if {*pair} & self.needed.keys()
-        ]
-        filled, outer, memory = self._within(loop.body), self.values, self.memory
+        pairs = zip(loop.parameters, loop.results, strict=True)
+        carried = [k for k, pair in enumerate(pairs) if {*pair} & self.needed.keys()]
+        filled, outer, memory = self._find_filled(loop.body), self.values, self.memory
 
-        # In a turn the parameters and the memory are those of the carry.
-        def within(carry: PyTree, counter: Any) -> None:
+        def begin_turn(carry: PyTree, counter: Any) -> None:
+            """Make the parameters and the memory those of the carry (numbers, memory)."""
             self.values, self.memory = dict(outer), memory | dict(zip(filled, carry[1], strict=True))
             self.values |= zip((loop.parameters[k] for k in carried), carry[0], strict=True)
             if loop.counter is not None:
                 self.values[loop.counter] = jnp.asarray(counter, np.int64)
 
         def turn(counter: Any, carry: PyTree) -> PyTree:
-            within(carry, counter)
+            """Return the carry after the body."""
+            begin_turn(carry, counter)
             self.block(loop.body.items)
             return [self.value(loop.following[k]) for k in carried], [self.memory[b] for b in filled]
 
         def goes_on(carry: PyTree) -> jax.Array:
-            within(carry, 0)
-            self.block(loop.body.items[: next(i for i, x in enumerate(loop.body.items) if isinstance(x, Check))])
+            """Return the loop's condition, after the part of the body before its check."""
+            begin_turn(carry, 0)
+            check = next(i for i, x in enumerate(loop.body.items) if isinstance(x, Check))
+            self.block(loop.body.items[:check])
             assert loop.condition is not None
             return self.value(loop.condition)
 
@@ -149,14 +152,15 @@ class _Evaluation:
     def _evaluate_guard(self, guard: Guard) -> None:
         """Evaluate a guarded block where its condition holds; its results are zeros elsewhere."""
         used = [k for k, r in enumerate(guard.results) if r in self.needed]
-        filled, outer, memory = self._within(guard.body), self.values, self.memory
+        filled, outer, memory = self._find_filled(guard.body), self.values, self.memory
 
-        def taken() -> PyTree:
+        def evaluate_body() -> PyTree:
+            """Return the block's values, and the memory that it fills."""
             self.values, self.memory = dict(outer), dict(memory)
             self.block(guard.body.items)
             return [self.value(guard.values[k]) for k in used], [self.memory[b] for b in filled]
 
-        nothing = [jnp.zeros((), DTYPES[guard.results[k].type]) for k in used]
-        end = lax.cond(self.value(guard.condition), taken, lambda: (nothing, [memory[b] for b in filled]))
+        zeros = [jnp.zeros((), DTYPES[guard.results[k].type]) for k in used]
+        end = lax.cond(self.value(guard.condition), evaluate_body, lambda: (zeros, [memory[b] for b in filled]))
         self.values, self.memory = outer, memory | dict(zip(filled, end[1], strict=True))
         self.values |= zip((guard.results[k] for k in used), end[0], strict=True)

@@ -89,8 +89,9 @@ class InMemory:
             return self.view(shape, (0,) * len(shape))
         axes = [(n, s) for n, s in zip(self.shape, self.strides, strict=True) if n != 1]
         strides: list[int] = []
-        # New axes are split off old ones, from the last on; old axes that lie contiguously are merged.
-        axis, left = len(axes) - 1, 1  # of the axis that is dealt out, from the last one on
+        # New axes are split off old ones, from the last on; old axes that lie contiguously are merged. `axis`: the next
+        # old axis to split; `left`, `base`: entries of the present one that are not used yet, and their stride.
+        axis, left = len(axes) - 1, 1
         base = 1
         for n in reversed(shape):
             if n == 1:

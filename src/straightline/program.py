@@ -41,9 +41,9 @@ from straightline.rules import (  # noqa: F401  (they fill the rules)
 
 
 class Program(NamedTuple):
-    """A graph, a buffer for each argument of the function and the value of each result, leaf by leaf; `tree` of these.
+    """Program of one run: its graph, a buffer for each argument and the value of each result, leaf by leaf.
 
-    The words of a key of random numbers are the last axis, (2,), of its buffer.
+    `tree`: the structure of the results. The words of a key of random numbers are the last axis, (2,), of its buffer.
     """
 
     graph: Graph
@@ -62,7 +62,11 @@ def lower(
     known: Known = MappingProxyType({}),
     single: bool = False,
 ) -> Program:
-    """Lower a function of one run, for arguments of these shapes, to at most so many operations."""
+    """Lower a function of one run, for arguments of these shapes, to at most `most` operations.
+
+    known: entries of arguments, by the number of the leaf, that are the same in every call; single: whether numbers
+    are float32.
+    """
     return lower_traced(*trace_function(function, *examples, single=single), most, known, single)
 
 
@@ -73,7 +77,7 @@ def lower_traced(
     known: Known = MappingProxyType({}),
     single: bool = False,
 ) -> Program:
-    """Lower a program that is traced already, in single precision or in double."""
+    """Lower a program that is traced already, in single precision or in double; other arguments as of `lower`."""
     lowering = Lowering(most)
     avals: list[Any] = [v.aval for v in traced.jaxpr.invars]
     inputs, values = [], []

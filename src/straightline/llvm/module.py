@@ -39,10 +39,11 @@ SQUARED = ("f64", "i64", "u64", "f32")  # types whose arrays are long enough, or
 
 
 class Source(NamedTuple):
-    """Text of a function with its count of operations, and how many it executes for a block of runs, loop by loop.
+    """Text of a function, from which code is generated once or twice.
 
-    The text waits compressed, to a tenth: it is needed again only if the program turns out to be executed often.
-    `helpers` write the functions that it calls, for a count of lanes.
+    compressed: the text, to a tenth, since it is needed again only if the program turns out to be executed often.
+    helpers: write the functions that it calls, for a count of lanes. operations: how many it has; work: how many it
+    executes for a block of runs, each in a loop once a turn.
     """
 
     compressed: bytes
@@ -69,7 +70,7 @@ class Output(NamedTuple):
 
 
 class Code(NamedTuple):
-    """Text of the two functions, of which the second is for vectors of one number, and their arguments.
+    """Text of a program's two functions, for blocks of runs and once for what all runs share, and their memory.
 
     `pointers` are to memory of the inputs, the tables, the outputs and last to `shared` bytes that all runs share;
     `scratch` bytes belong to a thread. `common` says which outputs all runs share. `operations` are those in the
@@ -90,16 +91,17 @@ class Code(NamedTuple):
 
 
 def output_buffers(program: Program, last: Collection[int] = ()) -> list[Buffer]:
-    """Return a buffer for each result, no two the same: memory that the program filled is taken where it is.
+    """Return a buffer for each result, none used twice: an array that the program fills is used where it is.
 
-    What is not in memory is stored, number by number; so are the results `last`, which must be stored after all others.
+    What is not in memory is stored, number by number; so are the results with the numbers `last`, since they may
+    overwrite arguments and must be stored after all others.
     """
     lowering = Lowering()
     lowering.graph = program.graph
     results: list[Buffer] = []
     for number, value in enumerate(program.outputs):
-        is_stored = number in last or not isinstance(value, InMemory)
-        stored = _store_in_memory(lowering, value) if is_stored else _find_or_copy(lowering, value, results)
+        must_store = number in last or not isinstance(value, InMemory)
+        stored = _store_in_memory(lowering, value) if must_store else _find_or_copy(lowering, value, results)
         results.append(stored.buffer)
     return results
 
@@ -116,7 +118,7 @@ def _find_or_copy(lowering: Lowering, value: InMemory, taken: list[Buffer]) -> I
 
 
 def _store_in_memory(lowering: Lowering, value: Value) -> InMemory:
-    """Store an array in new memory, constants too."""
+    """Return an array stored entry by entry in new memory, constants too."""
     flat: list[Node] = lowering.nodes(value).ravel().tolist()
     type: Type = value.type if isinstance(value, InMemory) else flat[0].type
     buffer = Buffer("scratch", type, value.shape, lowering.graph.current)
@@ -135,28 +137,44 @@ def write_module(
     last: Collection[int] = (),
     summed: Summed | None = None,
 ) -> Code:
-    """Write a program; `differing` says of each input whether it differs between runs.
+    """Return the LLVM text of a program: a function for blocks of runs, and one that computes once what runs share.
 
-    `width`: the most runs of a vector, as many as suit the program if None. `alone`: one run, whose arrays are used in
-    place; results of the numbers `last` may overwrite arguments. `summed`: outputs that are summed over runs. The
-    program is let go of.
+    The program's graph is freed.
+
+    Args:
+        program: the program of one run.
+        differing: for each input whether it differs between runs.
+        width: the most runs of a vector; as many as suit the program if None.
+        fuse: whether products and sums are fused operations.
+        alone: whether there is one run, whose arrays are used in place.
+        last: numbers of results that may overwrite arguments.
+        summed: outputs that are summed over runs.
 
     Raises:
-        Unsupported: an operation that has no text, or a program that is too long.
+        Unsupported: an operation that LLVM's text does not have here, or a program that is too long.
     """
     outputs = output_buffers(program, last)
     lanes = [b for b, d in zip(program.inputs, differing, strict=True) if d or alone]
     items = sort_items(list_needed(outputs))
     counts = _count_operations(items)
-    # What differs between runs, and where it lies.
-    spread = {*items, *program.inputs} if alone else find_differing(items, lanes)
-    spread = {x for x in spread if not (isinstance(x, Buffer) and x.kind == "table")}
-    parts = Parts(program, items, outputs, lanes, spread, alone, width or widest(items), summed)
-    mine = crossing(items, spread)
-    layout = lay_out(parts, mine)
+    # What differs between runs, what the function of blocks needs for it, and where all of it lies.
+    differs = {*items, *program.inputs} if alone else find_differing(items, lanes)
+    differs = {x for x in differs if not (isinstance(x, Buffer) and x.kind == "table")}
+    parts = Parts(
+        program=program,
+        items=items,
+        outputs=outputs,
+        lanes=lanes,
+        spread=differs,
+        alone=alone,
+        width=width or widest(items),
+        summed=summed,
+    )
+    of_blocks = crossing(items, differs)
+    layout = lay_out(parts, of_blocks)
     # The function of blocks computes what differs, and reads the rest from slots.
     slots = Slots(layout.shared)
-    blocks = Writer(alone, mine, products_of(items) if fuse else set(), spread, slots)
+    blocks = Writer(alone, of_blocks, products_of(items) if fuse else set(), differs, slots)
     blocks.turning, blocks.flushes = layout.turning, _is_single(items)
     source = _write_blocks(blocks, parts, layout)
     # The other function fills these slots, once for all runs.
@@ -200,7 +218,7 @@ def _is_single(items: Iterable[Any]) -> bool:
 
 
 def _finish_source(text: str, writer: Writer, movers: Sequence[Callable[[int], str]]) -> Source:
-    """Count the operations of a text and the executed ones; a loop of unknown length counts as one turn."""
+    """Return the source of a written text, with its helpers and counts; a loop of unknown length counts as one turn."""
     counts = Counter([x.block for x in writer.mine if isinstance(x, Node)])
     turns = {block: turns_of(block) for block in counts}
     work = sum(count * turns[block] for block, count in counts.items())
@@ -219,7 +237,7 @@ HEAD = "(ptr %pointers, ptr %scratch, i64 %begin, i64 %end, i64 %runs)"
 
 
 def _write_blocks(writer: Writer, parts: Parts, layout: Layout) -> Source:
-    """Write the function for blocks `begin` to `end` of W runs: transpose inputs, compute, transpose outputs back."""
+    """Return the function for blocks `begin` to `end` of W runs: transpose inputs, compute, transpose outputs back."""
     names = _write_pointers(writer, parts.pointers, layout.in_shared)
     for buffer, offset in layout.in_scratch.items():
         writer.bases[buffer] = writer.add(f"getelementptr i8, ptr %scratch, i64 {offset}")
@@ -235,7 +253,8 @@ def _write_blocks(writer: Writer, parts: Parts, layout: Layout) -> Source:
     movers = {_write_move(writer, names, buffer, "take") for buffer in taken}
     _ask_for_rows(writer, parts, names, taken, given)
     if parts.summed is not None:
-        _add(writer, parts.summed, names, parts.program.inputs[parts.summed.number], parts.added, parts.width)
+        number = parts.program.inputs[parts.summed.number]
+        _add_to_sums(writer, parts.summed, names, number, parts.added, parts.width)
     writer.block(parts.program.graph.top)
     movers |= {_write_move(writer, names, buffer, "give") for buffer in given if buffer not in writer.sums}
     # Next block.
@@ -247,7 +266,7 @@ def _write_blocks(writer: Writer, parts: Parts, layout: Layout) -> Source:
     writer.start("exit")
     helpers: list[Callable[[int], str]] = [] if parts.summed is None else [lane_numbers]
     helpers += [partial(mover, *kind) for kind in sorted(movers)]
-    return _finish_source(_run("\n".join(writer.lines), writer), writer, helpers)
+    return _finish_source(_write_run("\n".join(writer.lines), writer), writer, helpers)
 
 
 def _write_move(
@@ -282,14 +301,15 @@ def _locate_rows(
     return results
 
 
-def _add(
+def _add_to_sums(
     writer: Writer, summed: Summed, names: dict[Buffer, str], number: Buffer, outputs: list[Buffer], width: int
 ) -> None:
-    """Make the stores to some outputs add to sums over runs.
+    """Make the writer's stores to these outputs add to sums over runs; `number`: the input with a run's number.
 
     A run's place in a row is that of a block of the most runs, which begins with the batch of its first run: so sums
     have the same bits whatever the number of runs in a vector.
     """
+    # Place of the vector's first lane: the batch of the first run of its block, plus the vector's place in the block.
     begin = writer.add(f"and i64 %first, {-width}")
     address = writer.add(f"getelementptr i32, ptr {names[number]}, i64 {begin}")
     run = writer.add(f"load i32, ptr {address}, align 4")
@@ -303,7 +323,7 @@ def _add(
 
 
 def _write_once(blocks: Writer, parts: Parts, layout: Layout) -> Source | None:
-    """Write the function that computes what all runs share, if blocks read it or a caller gets it."""
+    """Return the function that computes what all runs share; None if neither blocks nor a caller need any of it."""
     shared_outputs = [b for b, is_common in zip(parts.outputs, parts.common, strict=True) if is_common]
     roots: list[Any] = [*blocks.slots.places, *(b for b in blocks.read if b.kind in FILLED), *shared_outputs]
     if not roots:
@@ -312,11 +332,11 @@ def _write_once(blocks: Writer, parts: Parts, layout: Layout) -> Source | None:
     writer.turning, writer.flushes = blocks.turning, blocks.flushes
     _write_pointers(writer, parts.pointers, layout.in_shared)
     writer.block(parts.program.graph.top)
-    return _finish_source(_run("\n".join(writer.lines), writer), writer, [])
+    return _finish_source(_write_run("\n".join(writer.lines), writer), writer, [])
 
 
-def _run(body: str, writer: Writer) -> str:
-    """Write the function around its body; in single precision alone, subnormal numbers are zeros in it."""
+def _write_run(body: str, writer: Writer) -> str:
+    """Return the function `run` around its body; in single precision alone, subnormal numbers are zeros in it."""
     before = after = ""
     if writer.flushes:
         before, after = "  %control = call i32 @hg_flush()\n", "  call void @hg_restore(i32 %control)\n"

@@ -49,7 +49,7 @@ def splat(value: float | int | bool, type: Type) -> str:
 
 
 def operation(node: Node, names: list[str], emit: Emit) -> str:
-    """Emit the operation of a node on its arguments' names; return the name of the result."""
+    """Write the operation of a node on its arguments' names; return the name of the result."""
     source: Type = node.args[0].type if node.args else node.type
     operand_type = vector(source)
     op, result_type = node.op, vector(node.type)
@@ -66,7 +66,7 @@ def operation(node: Node, names: list[str], emit: Emit) -> str:
         return emit(f"bitcast {operand_type} {names[0]} to {result_type}")
     if op == "not":
         return emit(f"xor {operand_type} {names[0]}, {splat(True, 'bool') if source == 'bool' else splat(-1, source)}")
-    # Functions of `vector_math`, then arithmetic by type.
+    # Functions of their own, then arithmetic by type.
     if op in CALLED:
         typed = ", ".join(f"{vector(a.type)} {n}" for a, n in zip(node.args, names, strict=True))
         return emit(f"call {result_type} @hg_{called(node)}({typed})")
@@ -135,35 +135,40 @@ def _write_integer_operation(node: Node, names: list[str], text: str, emit: Emit
 
 
 def _write_division(node: Node, names: list[str], text: str, emit: Emit) -> str:
-    """Emit a division of integers, or its rest: by 0 all bits set, or a; the least number by -1 is itself, or 0."""
+    """Write a / b or a % b of integers; return the name of its result.
+
+    As in JAX, a / 0 has all bits set and a % 0 is a; the least number by -1 is itself, with the rest 0.
+    """
     op, type, (a, b) = node.op, node.args[0].type, names
-    how = f"{'s' if type[0] == 'i' else 'u'}{op}"
+    instruction = f"{'s' if type[0] == 'i' else 'u'}{op}"
     if node.args[1].op == "constant" and node.args[1].value not in (0, -1):
-        return emit(f"{how} {text} {a}, {b}")
+        return emit(f"{instruction} {text} {a}, {b}")
     # What LLVM does not define is divided by 1, which has the right result of the least number by -1.
-    truth = vector("bool")
-    zero = unsafe = emit(f"icmp eq {text} {b}, zeroinitializer")
+    flags = vector("bool")
+    is_zero = undefined = emit(f"icmp eq {text} {b}, zeroinitializer")
     if type[0] == "i":
-        unsafe = emit(f"or {truth} {zero}, {emit(f'icmp eq {text} {b}, {splat(-1, type)}')}")
-        least = emit(f"icmp eq {text} {a}, {splat(-(2 ** (BITS[type] - 1)), type)}")
-        unsafe = emit(f"and {truth} {unsafe}, {emit(f'or {truth} {zero}, {least}')}")
-    safe = emit(f"select {truth} {unsafe}, {text} {splat(1, type)}, {text} {b}")
-    divided = emit(f"{how} {text} {a}, {safe}")
-    return emit(f"select {truth} {zero}, {text} {splat(-1, type) if op == 'div' else a}, {text} {divided}")
+        undefined = emit(f"or {flags} {is_zero}, {emit(f'icmp eq {text} {b}, {splat(-1, type)}')}")
+        is_least = emit(f"icmp eq {text} {a}, {splat(-(2 ** (BITS[type] - 1)), type)}")
+        undefined = emit(f"and {flags} {undefined}, {emit(f'or {flags} {is_zero}, {is_least}')}")
+    divisor = emit(f"select {flags} {undefined}, {text} {splat(1, type)}, {text} {b}")
+    divided = emit(f"{instruction} {text} {a}, {divisor}")
+    by_zero = splat(-1, type) if op == "div" else a
+    return emit(f"select {flags} {is_zero}, {text} {by_zero}, {text} {divided}")
 
 
 def _write_shift(node: Node, names: list[str], text: str, emit: Emit) -> str:
-    """Emit a shift; by all bits or more, 0 is left, or the sign."""
+    """Write a shift of integers; return the name of its result. By all bits or more, 0 is left, or the sign."""
     op, type, (a, b), by = node.op, node.args[0].type, names, node.args[1]
-    how = {"shift_left": "shl", "shift_right": "lshr"}.get(op, "ashr")
+    instruction = {"shift_left": "shl", "shift_right": "lshr"}.get(op, "ashr")
     if by.op == "constant" and 0 <= by.value < BITS[type]:
-        return emit(f"{how} {text} {a}, {b}")
-    within = emit(f"call {text} @llvm.umin({text} {b}, {text} {splat(BITS[type] - 1, type)})")
-    shifted = emit(f"{how} {text} {a}, {within}")
-    if how == "ashr":
+        return emit(f"{instruction} {text} {a}, {b}")
+    # By at most all bits but one, which leaves the sign; other shifts by more are zero.
+    at_most = emit(f"call {text} @llvm.umin({text} {b}, {text} {splat(BITS[type] - 1, type)})")
+    shifted = emit(f"{instruction} {text} {a}, {at_most}")
+    if instruction == "ashr":
         return shifted
-    inside = emit(f"icmp ult {text} {b}, {splat(BITS[type], type)}")
-    return emit(f"select {vector('bool')} {inside}, {text} {shifted}, {text} zeroinitializer")
+    in_range = emit(f"icmp ult {text} {b}, {splat(BITS[type], type)}")
+    return emit(f"select {vector('bool')} {in_range}, {text} {shifted}, {text} zeroinitializer")
 
 
 def _write_conversion(source: Type, target: Type, name: str, emit: Emit) -> str:
@@ -176,15 +181,18 @@ def _write_conversion(source: Type, target: Type, name: str, emit: Emit) -> str:
     if target in REAL:
         return emit(f"{'sitofp' if source[0] == 'i' else 'uitofp'} {operand_type} {name} to {result_type}")
     if source in REAL:
-        how = "fptosi" if target[0] == "i" else "fptoui"
-        return emit(f"call {result_type} @llvm.{how}.sat({operand_type} {name})")
+        instruction = "fptosi" if target[0] == "i" else "fptoui"
+        return emit(f"call {result_type} @llvm.{instruction}.sat({operand_type} {name})")
     if BITS[target] < BITS[source]:
         return emit(f"trunc {operand_type} {name} to {result_type}")
     return emit(f"{'sext' if source[0] == 'i' else 'zext'} {operand_type} {name} to {result_type}")
 
 
 def write_fused(node: Node, product: Node, names: list[str], emit: Emit) -> str:
-    """Emit a b + c, c - a b or a b - c, rounded once, from the names of a, b, c."""
+    """Write a b + c, c - a b or a b - c, rounded once, from the names of a, b, c; return the name of the result.
+
+    `product`: the argument a b of the node, whose place tells the sign.
+    """
     reals = vector(node.type)
     a, b, c = names
     if node.op == "sub":

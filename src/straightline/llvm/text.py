@@ -65,10 +65,14 @@ def turns_of(block: Block) -> int:
 
 
 class Writer:
-    """Writer of a program's operations in the set `mine`: those that differ between runs, or those that do not.
+    """Writer of one of a program's two functions: of those of its operations that are in the set `mine`.
 
-    `single`: vectors are of one number. `bases` has each buffer's address, `spread` the buffers with a number for each
-    lane. `shared` locates numbers that all runs share and that the other function computes.
+    Args:
+        single: whether vectors are of one number, as in the function of what all runs share.
+        mine: the items that this function computes: those that differ between runs, or those that do not.
+        products: products that are fused with the sum that uses them.
+        spread: the buffers with a number for each lane.
+        slots: places of numbers that all runs share and that the other function computes.
     """
 
     def __init__(self, single: bool, mine: Collection[Any], products: set[Node], spread: set[Any], slots: Slots):
@@ -110,7 +114,7 @@ class Writer:
                 continue
             if isinstance(statement, Node):
                 if statement not in self.products:
-                    self._keep(statement, self._write_node(statement))
+                    self._name(statement, self._write_node(statement))
             elif isinstance(statement, Store):
                 self._write_store(statement)
             elif isinstance(statement, Loop):
@@ -118,7 +122,8 @@ class Writer:
             elif isinstance(statement, Guard):
                 self._write_guard(statement)
 
-    def _keep(self, node: Node, name: str) -> None:
+    def _name(self, node: Node, name: str) -> None:
+        """Note the name of a node's value, and store it where the other function reads it."""
         self.scopes[-1][node] = name
         if self.single and node in self.slots.places:
             self.slots.store(self, node, name)
@@ -167,6 +172,7 @@ class Writer:
         return name
 
     def _is_scalar(self, node: Node) -> bool:
+        """Return whether a number is the same in all lanes."""
         return node.op in ("constant", "counter") or node not in self.mine or self.single
 
     def everywhere(self, name: str, type: Type) -> str:
@@ -181,6 +187,7 @@ class Writer:
         """Return the address of entry offset + sum strides * indices; `entry` is the type of one."""
         owner, start = buffer.owner
         base = self._write_base(owner)
+        # The address of the row by the indices, written once for all entries of it.
         if indices:
             key = ("row", owner, tuple(strides), tuple(indices))
             row = next((scope[key] for scope in reversed(self.scopes) if key in scope), None)
@@ -257,7 +264,7 @@ class Writer:
         return self.add(f"bitcast %i{bits} {loaded} to {vector(node.type)}") if node.type in REAL else loaded
 
     def _write_store(self, store: Store) -> None:
-        """Write the store of a number; where sums are kept, add it to what is there in lanes that count."""
+        """Write the store of a number; where sums over runs are kept, add it to what is there, in lanes that count."""
         name, kind, bits = self.operand(store.node), vector(store.node.type), BITS[store.node.type]
         entry = f"[{self.sums[store.buffer]} x i64]" if store.buffer in self.sums else f"%i{bits}"
         address = self._address(store.buffer, store.offset, store.strides, store.indices, entry)
@@ -272,7 +279,7 @@ class Writer:
         self.line(f"store {kind} {name}, ptr {address}, align {bits // 8}")
 
     def _write_loop(self, loop: Loop) -> None:
-        """Write a loop: parameters are phi nodes of the carry; a counted loop has at least one turn."""
+        """Write a loop, whose parameters are phi nodes of the carry; a counted loop has at least one turn."""
         self.count += 1
         name, before = f"loop{self.count}", self.label
         # Only the carried numbers that this function computes or reads.
@@ -282,14 +289,15 @@ class Writer:
         self.line(f"br label %{name}")
         self.start(name)
         begin = len(self.lines)
+        # Names within a turn.
         self.scopes.append({})
         counter = f"%{name}.counter"
         if loop.counter is not None:
             self.scopes[-1]["scalar", loop.counter] = counter
         for k in moving:
-            self._keep(loop.parameters[k], f"%{name}.p{k}")
+            self._name(loop.parameters[k], f"%{name}.p{k}")
         if loop.counter is not None and loop.counter in self.mine:
-            self._keep(loop.counter, self.operand(loop.counter))
+            self._name(loop.counter, self.operand(loop.counter))
         for rows in self.asked if loop is self.asking else ():
             self.lines += [f"  {line}" for line in write_requests(rows, loop.length or 1, counter, WIDTH, self.add)]
         # Counted: body, then the latch. Conditional: the check is inside the body.
@@ -306,7 +314,7 @@ class Writer:
         self.start(f"{name}.end")
         self.scopes.pop()
         for k, final in zip(moving, finals, strict=True):
-            self._keep(loop.results[k], final)
+            self._name(loop.results[k], final)
 
     def _write_counted_loop(self, loop: Loop, name: str, counter: str, moving: list[int]) -> list[str]:
         """Write the body and the latch of a loop of known length; return the names of what it carries on."""
@@ -320,17 +328,19 @@ class Writer:
         return following
 
     def _write_conditional_loop(self, loop: Loop, name: str, moving: list[int]) -> tuple[list[str], list[str]]:
-        """Write a loop that ends when no lane's condition holds."""
+        """Write the body of a loop that ends when no lane's condition holds.
+
+        Returns the names of what it carries on, and of what is left at its end.
+        """
         # The body up to the loop's check, and what follows it in a turn.
-        checks = (i for i, s in enumerate(loop.body.items) if isinstance(s, Check) and s.loop is loop)
-        check = next(checks)
+        check = next(i for i, s in enumerate(loop.body.items) if isinstance(s, Check) and s.loop is loop)
         head, tail = Block(loop.body.parent), Block(loop.body.parent)
         head.items, tail.items = loop.body.items[:check], loop.body.items[check + 1 :]
         self.block(head)
         assert loop.condition is not None
         # Another turn if some lane needs it.
-        some = self._any(loop.condition)
-        self.line(f"br i1 {some}, label %{name}.turn, label %{name}.end")
+        any_lane = self._any(loop.condition)
+        self.line(f"br i1 {any_lane}, label %{name}.turn, label %{name}.end")
         self.start(f"{name}.turn")
         self.block(tail)
         following = [self.operand(loop.following[k]) for k in moving]
@@ -340,7 +350,7 @@ class Writer:
         return following, [f"%{name}.p{k}" for k in moving]
 
     def _any(self, condition: Node) -> str:
-        """Emit whether a condition holds in some lane."""
+        """Return the name of whether a condition holds in some lane."""
         return self.add(f"icmp ne %lanes {self.add(f'bitcast %i1 {self.operand(condition)} to %lanes')}, 0")
 
     def _write_guard(self, guard: Guard) -> None:
@@ -348,9 +358,9 @@ class Writer:
         self.count += 1
         name = f"guard{self.count}"
         # Jump past the body if no lane needs it.
-        some = self._any(guard.condition)
+        any_lane = self._any(guard.condition)
         before = self.label
-        self.line(f"br i1 {some}, label %{name}, label %{name}.end")
+        self.line(f"br i1 {any_lane}, label %{name}, label %{name}.end")
         self.start(name)
         self.scopes.append({})
         self.block(guard.body)
@@ -366,4 +376,4 @@ class Writer:
             kind = vector(guard.results[k].type)
             merged.append(self.add(f"phi {kind} [{value}, %{after}], [zeroinitializer, %{before}]"))
         for k, result in zip(used, merged, strict=True):
-            self._keep(guard.results[k], result)
+            self._name(guard.results[k], result)

@@ -23,6 +23,7 @@ CALLS = (
 
 
 def _call(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    """Inline the function of a call (jit, custom_jvp, ...)."""
     params = equation.params
     inner = next(params[name] for name in ("jaxpr", "call_jaxpr", "fun_jaxpr") if name in params)
     return lowering.inline(inner, inputs)

@@ -31,26 +31,30 @@ def eigh(a: jax.Array) -> tuple[jax.Array, jax.Array]:
     """
     n, eps = len(a), float(np.finfo(a.dtype).eps)
     finite = jnp.all(jnp.isfinite(a))
-    unit = _unit(a)
+    # The upper triangle of the symmetric part, in units in which its squares are numbers, and eigenvectors I so far.
+    unit = _choose_unit(a)
     entries = {(i, j): (a[i, j] / unit + a[j, i] / unit) / 2 for i in range(n) for j in range(i, n)}
-    # Off-diagonal entries below eps ||A||_F / n are rounding.
-    size = eps * jnp.sqrt(sum((1 if i == j else 2) * x * x for (i, j), x in entries.items())) / n
     vectors = {(i, j): jnp.asarray(float(i == j), a.dtype) for i in range(n) for j in range(n)}
+    # Off-diagonal entries below eps ||A||_F / n are rounding.
+    rounding = eps * jnp.sqrt(sum((1 if i == j else 2) * x * x for (i, j), x in entries.items())) / n
 
     def goes_on(state: tuple[Numbers, Numbers, jax.Array]) -> jax.Array:
-        rest = [jnp.abs(state[0][pair]) > size for pair in combinations(range(n), 2)]
-        return jnp.any(jnp.stack(rest)) & (state[2] < SWEEPS)
+        """Return whether an off-diagonal entry is above rounding, and sweeps are left."""
+        entries, _, sweeps = state
+        large = [jnp.abs(entries[pair]) > rounding for pair in combinations(range(n), 2)]
+        return jnp.any(jnp.stack(large)) & (sweeps < SWEEPS)
 
     turns, turn = _tournament(n)
 
-    # One sweep: after so many turns each pair was rotated once, and each row is in its place again.
     def sweep(state: tuple[Numbers, Numbers, jax.Array]) -> tuple[Numbers, Numbers, jax.Array]:
-        rotated, _ = jax.lax.scan(turn, state[:2], length=turns)
-        return *rotated, state[2] + 1
+        """Rotate each pair once; after all turns each row is in its place again."""
+        entries, vectors, sweeps = state
+        rotated, _ = jax.lax.scan(turn, (entries, vectors), length=turns)
+        return *rotated, sweeps + 1
 
     if n > 1:
         entries, vectors, _ = jax.lax.while_loop(goes_on, sweep, (entries, vectors, jnp.asarray(0)))
-
+    # Eigenvalues in ascending order, with their columns.
     values, columns = _sort_by_transposition(
         [entries[i, i] for i in range(n)], [[vectors[i, j] for i in range(n)] for j in range(n)]
     )
@@ -58,7 +62,7 @@ def eigh(a: jax.Array) -> tuple[jax.Array, jax.Array]:
     return jnp.where(finite, rows, jnp.nan), jnp.where(finite, jnp.stack(values) * unit, jnp.nan)
 
 
-def _unit(a: jax.Array) -> jax.Array:
+def _choose_unit(a: jax.Array) -> jax.Array:
     """Return a power of two in whose units squares of the matrix's entries neither overflow nor vanish, mostly 1."""
     largest, power = jnp.max(jnp.abs(a)), 300 if a.dtype == np.float64 else 50
     return jnp.where(largest > 2.0**power, 4.0**power, jnp.where(largest < 2.0**-power, 4.0**-power, 1.0))
@@ -66,6 +70,7 @@ def _unit(a: jax.Array) -> jax.Array:
 
 def _tournament(n: int) -> tuple[int, Callable[[tuple[Numbers, Numbers], None], tuple[tuple[Numbers, Numbers], None]]]:
     """Return the count of turns of a sweep, and one turn: A <- J' A J, V <- V J for pairs (p, q), then rows move on."""
+    # As in a tournament of n players, all but the last move around; with n odd one pauses in each turn.
     turns = n - 1 + n % 2
     pairs = [(k, turns - k) for k in range(1, turns // 2 + 1)] + [(0, n - 1)] * (1 - n % 2)
     moved = [*((i + 1) % turns for i in range(turns)), *range(turns, n)]
@@ -81,12 +86,13 @@ def _tournament(n: int) -> tuple[int, Callable[[tuple[Numbers, Numbers], None], 
 
 
 def _rotate(a: Numbers, vectors: Numbers, p: int, q: int, n: int) -> None:
-    """Rotate rows and columns p and q so that a_pq = 0."""
+    """Rotate rows and columns p and q of A, in place, so that a_pq = 0, and columns p and q of the eigenvectors."""
+    # The smaller root t = tan(angle) of t^2 + 2 h t - 1 = 0, h = (a_qq - a_pp) / (2 a_pq); c and s: cosine and sine.
     off = a[p, q]
-    none = off == 0
-    half = (a[q, q] - a[p, p]) / jnp.where(none, 1.0, 2 * off)
-    tangent = jnp.where(half < 0, -1.0, 1.0) / (jnp.abs(half) + jnp.sqrt(half * half + 1))
-    t = jnp.where(none, 0.0, tangent)
+    is_zero = off == 0
+    h = (a[q, q] - a[p, p]) / jnp.where(is_zero, 1.0, 2 * off)
+    tangent = jnp.where(h < 0, -1.0, 1.0) / (jnp.abs(h) + jnp.sqrt(h * h + 1))
+    t = jnp.where(is_zero, 0.0, tangent)
     c = 1 / jnp.sqrt(t * t + 1)
     s = t * c
     a[p, p], a[q, q], a[p, q] = a[p, p] - t * off, a[q, q] + t * off, jnp.zeros_like(off)
@@ -101,21 +107,22 @@ def _rotate(a: Numbers, vectors: Numbers, p: int, q: int, n: int) -> None:
 def _sort_by_transposition(
     values: list[jax.Array], columns: list[list[jax.Array]]
 ) -> tuple[list[jax.Array], list[list[jax.Array]]]:
-    """Sort by odd-even transposition, which needs no branches."""
+    """Return eigenvalues in ascending order, with their columns, by odd-even transposition, which needs no branches."""
     n = len(values)
 
-    def exchanges(state: tuple[list[jax.Array], list[list[jax.Array]]], _: None) -> tuple[Any, None]:
+    def exchange_neighbours(state: tuple[list[jax.Array], list[list[jax.Array]]], _: None) -> tuple[Any, None]:
+        """Exchange neighbours in the wrong order: at even places, then at odd ones."""
         values, columns = list(state[0]), list(state[1])
         for i in (*range(0, n - 1, 2), *range(1, n - 1, 2)):
             _exchange(values, columns, i)
         return (values, columns), None
 
-    after, _ = jax.lax.scan(exchanges, (values, columns), length=(n + 1) // 2)
+    after, _ = jax.lax.scan(exchange_neighbours, (values, columns), length=(n + 1) // 2)
     return after
 
 
 def _exchange(values: list[jax.Array], columns: list[list[jax.Array]], i: int) -> None:
-    """Exchange places i and i + 1 unless they are in ascending order."""
+    """Exchange places i and i + 1, in place, unless they are in ascending order."""
     wrong = values[i] > values[i + 1]
     values[i], values[i + 1] = jnp.minimum(values[i], values[i + 1]), jnp.maximum(values[i], values[i + 1])
     low, high = columns[i], columns[i + 1]
@@ -124,26 +131,27 @@ def _exchange(values: list[jax.Array], columns: list[list[jax.Array]], i: int) -
 
 
 def _eigh(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Write eigenvalues and eigenvectors of small symmetric matrices out."""
+    """Return eigenvectors and eigenvalues of small symmetric matrices, by `eigh` written out."""
     avals: list[Any] = [v.aval for v in equation.invars]
     shape = avals[0].shape
     if shape[-1] > FEW or equation.params.get("subset_by_index") is not None:
         raise Unsupported(f"eigenvalues of a matrix of {shape[-1]} rows")
-    return _decompose_each(lowering, _program(shape[-1], avals[0].dtype), equation, inputs[0])
+    return _decompose_each(lowering, _eigh_program(shape[-1], avals[0].dtype), equation, inputs[0])
 
 
 def _decompose_each(lowering: Lowering, program: ClosedJaxpr, equation: JaxprEqn, matrices: Value) -> list[Value]:
     """Return the results of a program of one matrix for each of many, along leading axes, one after another."""
-    (one,) = program.in_avals
-    before = matrices.shape[: len(matrices.shape) - len(one.shape)]
-    flat = lowering.nodes(matrices).reshape(math.prod(before), *one.shape)
+    (single,) = program.in_avals
+    leading = matrices.shape[: len(matrices.shape) - len(single.shape)]
+    flat = lowering.nodes(matrices).reshape(math.prod(leading), *single.shape)
     items = [[lowering.nodes(x) for x in lowering.inline(program, [matrix])] for matrix in flat]
     shapes = [result_shape(equation, k) for k in range(len(equation.outvars))]
     return [array_of((x for item in items for x in item[k].ravel()), shape) for k, shape in enumerate(shapes)]
 
 
 @cache
-def _program(n: int, dtype: Any) -> ClosedJaxpr:
+def _eigh_program(n: int, dtype: Any) -> ClosedJaxpr:
+    """Return `eigh` of a matrix (n, n), traced."""
     with jax.enable_x64(True):
         return jax.make_jaxpr(eigh)(like((n, n), dtype))
 
@@ -193,7 +201,7 @@ def permutation(pivots: jax.Array, size: int) -> jax.Array:
 
 
 def _lu(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Write the factors of small square matrices out."""
+    """Return the factors, pivots and order of rows of small square matrices, by `lu` written out."""
     avals: list[Any] = [v.aval for v in equation.invars]
     shape = avals[0].shape
     if shape[-2] != shape[-1] or shape[-1] > FEW:
@@ -203,28 +211,34 @@ def _lu(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Val
 
 @cache
 def _lu_program(n: int, dtype: Any) -> ClosedJaxpr:
+    """Return `lu` of a matrix (n, n), traced."""
     with jax.enable_x64(True):
         return jax.make_jaxpr(lu)(like((n, n), dtype))
 
 
 def _permutation(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    """Return the order of rows after the exchanges of each vector of pivots."""
     program = _permutation_program(inputs[0].shape[-1], equation.params["permutation_size"])
     return _decompose_each(lowering, program, equation, inputs[0])
 
 
 @cache
 def _permutation_program(count: int, size: int) -> ClosedJaxpr:
+    """Return `permutation` of so many pivots, traced."""
     with jax.enable_x64(True):
         return jax.make_jaxpr(lambda pivots: permutation(pivots, size))(like((count,), np.int32))
 
 
 def _linear_solve(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Solve a system by the solver that it comes with."""
+    """Solve a system by the solver that it comes with.
+
+    Its inputs are constants of the four programs matvec, vecmat, solve and transpose_solve, then right sides.
+    """
     programs, lengths = equation.params["jaxprs"], equation.params["const_lengths"]
     before = lengths.matvec + lengths.vecmat
-    fixed = inputs[before : before + lengths.solve]
+    constants = inputs[before : before + lengths.solve]
     right = inputs[before + lengths.solve + lengths.transpose_solve :]
-    return lowering.inline(programs.solve, [*fixed, *right])
+    return lowering.inline(programs.solve, [*constants, *right])
 
 
 IN_MEMORY |= {"lu": _lu, "lu_pivots_to_permutation": _permutation, "custom_linear_solve": _linear_solve}

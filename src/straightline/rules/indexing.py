@@ -16,7 +16,7 @@ from straightline.rules.shapes import select_array
 
 
 def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Gather at clipped indices; where they fill, a window that is not inside is filled with a value."""
+    """Gather windows at clipped indices; where the mode fills, a window that is not inside is filled with a value."""
     x, indices = inputs
     if not fills(equation):
         return [_gather_clipped(equation, lowering, x, indices)]
@@ -42,15 +42,16 @@ def _is_inside(lowering: Lowering, equation: JaxprEqn, shape: tuple[int, ...], i
 
 def _gather_clipped(equation: JaxprEqn, lowering: Lowering, x: np.ndarray, indices: np.ndarray) -> np.ndarray:
     """Gather at indices that are clipped to the array; where data decide them, all places are compared."""
-    at = known_integers(indices)
-    if at is None:
+    known = known_integers(indices)
+    if known is None:
         return _gather_by_cases(lowering, equation, x, indices)
-    # Places in the flat array, with the axes of windows where the result has them.
+    # Places in the flat array: axes of the indices, then those of the window, moved to where the result has them.
     params, numbers = equation.params, equation.params["dimension_numbers"]
     batching = list(zip(numbers.operand_batching_dims, numbers.start_indices_batching_dims, strict=True))
     removed = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
-    places = places_of(x.shape, params["slice_sizes"], at, numbers.start_index_map, batching, removed, True)
-    first = at.ndim - 1
+    index_map = numbers.start_index_map
+    places = places_of(x.shape, params["slice_sizes"], known, index_map, batching, removed, clips=True)
+    first = known.ndim - 1
     places = np.moveaxis(places, range(first, places.ndim), numbers.offset_dims)
     gathered: np.ndarray = x.ravel()[places.ravel()].reshape(places.shape)
     return gathered

@@ -27,10 +27,11 @@ def repeat_turns(
     """
     graph, outer = lowering.graph, lowering.graph.current
 
-    def body(loop: Loop, now: list[np.ndarray]) -> tuple[Sequence[np.ndarray], list[InMemory]]:
+    def body(loop: Loop, carry: list[np.ndarray]) -> tuple[Sequence[np.ndarray], list[InMemory]]:
+        """Return the next carry, and the memory in which each turn stores a row."""
         loop.counter = counter = graph.fresh("counter", "i64", (), loop.body, loop)
         row = graph.node("sub", "i64", graph.constant(length - 1, "i64"), counter) if backwards else counter
-        following, stacked = turn(row, now)
+        following, stacked = turn(row, carry)
         return following, [_stack(lowering, length, x, counter, backwards, outer) for x in stacked]
 
     return _lower_loop(lowering, length, carry, body)
@@ -47,18 +48,19 @@ def _lower_loop(
     graph, outer = lowering.graph, lowering.graph.current
     halves = [is_symmetric(x) for x in carry]
     while True:
-        begun = graph.serial
+        serial = graph.serial
         loop = Loop(Block(outer), length, _entries(carry, halves))
         # In the body the carry is a parameter; the turn is traced once.
         loop.parameters = _stand_ins(graph, "parameter", loop, loop.body)
         graph.current = loop.body
         following, rest = body(loop, _restore_arrays(carry, loop.parameters, halves))
         graph.current = outer
-        kept = [half and is_symmetric(x) for half, x in zip(halves, following, strict=True)]
-        if kept == halves:
+        still_symmetric = [half and is_symmetric(x) for half, x in zip(halves, following, strict=True)]
+        if still_symmetric == halves:
             break
-        halves = kept
-        graph.max_nodes += graph.serial - begun
+        # Once more; the nodes of this try do not count.
+        halves = still_symmetric
+        graph.max_nodes += graph.serial - serial
     loop.following = _entries(following, halves)
     outer.items.append(loop)
     # After the loop the carry is a result.
@@ -87,10 +89,11 @@ def _entries(arrays: Sequence[np.ndarray], halves: Sequence[bool]) -> list[Node]
 def _stack(
     lowering: Lowering, length: int, value: np.ndarray, counter: Node, backwards: bool, outer: Block
 ) -> InMemory:
-    """Store one turn's array as one row of memory."""
+    """Store one turn's array as one row of memory; return the array (length, ...) of all turns."""
     flat = _list_numbers(value)
     type: Type = flat[0].type if flat else "f64"
     buffer = Buffer("scratch", type, (length, *value.shape), outer)
+    # The first place of each node in a row, if some nodes have several.
     size, places = len(flat), {node: place for place, node in reversed(list(enumerate(flat)))}
     buffer.first = [places[node] for node in flat] if len(places) < size else []
     start, stride = ((length - 1) * size, -size) if backwards else (0, size)
@@ -113,16 +116,14 @@ def _restore_arrays(arrays: Sequence[np.ndarray], nodes: Sequence[Node], halves:
     results = []
     for a, half in zip(arrays, halves, strict=True):
         n = a.shape[-1] if half else 0
-        shape = (*a.shape[:-2], n * (n + 1) // 2) if half else a.shape
-        kinds = a[..., *np.triu_indices(n)] if half else a
-        x = array_of(
-            [Key(next(rest), next(rest)) if isinstance(k, Key) else next(rest) for k in kinds.ravel().tolist()], shape
-        )
-        results.append(_mirrored(x, n) if half else x)
+        old = a[..., *np.triu_indices(n)] if half else a
+        new = [Key(next(rest), next(rest)) if isinstance(x, Key) else next(rest) for x in old.ravel().tolist()]
+        restored = array_of(new, old.shape)
+        results.append(_mirror(restored, n) if half else restored)
     return results
 
 
-def _mirrored(upper: np.ndarray, n: int) -> np.ndarray:
+def _mirror(upper: np.ndarray, n: int) -> np.ndarray:
     """Return symmetric matrices (..., n, n) from their upper triangles, row by row (..., n (n + 1) / 2)."""
     places = np.zeros((n, n), dtype=int)
     places[np.triu_indices(n)] = np.arange(upper.shape[-1])
@@ -132,30 +133,30 @@ def _mirrored(upper: np.ndarray, n: int) -> np.ndarray:
 def _lower_scan(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     """Lower `scan`: written out if it is short, else as a loop, whose long arrays stay in memory."""
     params = equation.params
-    (consts, carried), length = _counts(params), params["length"]
+    (consts, carried), length = _count_arguments(params), params["length"]
     fixed, carry, rows = inputs[:consts], inputs[consts : consts + carried], inputs[consts + carried :]
     # Short loops are written out.
     if length * size_of(lowering, params["jaxpr"].jaxpr) <= lowering.written_out or length <= 1:
         return _write_out_scan(lowering, equation, fixed, [lowering.nodes(x) for x in carry], rows)
     jaxpr = params["jaxpr"].jaxpr
-    # A carried number that the body returns unchanged is a constant of the loop; a long array is carried in memory.
-    same = [jaxpr.outvars[k] is jaxpr.invars[consts + k] for k in range(carried)]
-    held = {k: Held(lowering, carry[k]) for k in range(carried) if not same[k] and carry[k].size > WRITTEN_OUT}
-    moving = [k for k in range(carried) if not same[k] and k not in held]
+    # Of the carried arrays, by number: what the body returns unchanged is a constant of the loop, a long array is
+    # carried in memory (`held`), all others as numbers (`moving`).
+    unchanged = [jaxpr.outvars[k] is jaxpr.invars[consts + k] for k in range(carried)]
+    held = {k: Held(lowering, carry[k]) for k in range(carried) if not unchanged[k] and carry[k].size > WRITTEN_OUT}
+    moving = [k for k in range(carried) if not unchanged[k] and k not in held]
     rows = [in_memory(lowering, x) for x in rows]
 
-    # One turn: the body for one row of the stacked arguments.
-    def turn(row: Node, now: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        arrays: dict[int, Value] = dict(zip(moving, now, strict=True)) | {k: x.in_turn() for k, x in held.items()}
-        given = [arrays.get(k, carry[k]) for k in range(carried)]
-        results = lowering.inline(params["jaxpr"], [*fixed, *given, *(x.row(row) for x in rows)])
+    def turn(row: Node, numbers: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Lower the body for one row of the stacked arguments; return the moving carry, and what is stacked."""
+        arrays: dict[int, Value] = dict(zip(moving, numbers, strict=True)) | {k: x.in_turn() for k, x in held.items()}
+        whole_carry = [arrays.get(k, carry[k]) for k in range(carried)]
+        results = lowering.inline(params["jaxpr"], [*fixed, *whole_carry, *(x.row(row) for x in rows)])
         nodes = [x if k in held else lowering.nodes(x) for k, x in enumerate(results)]
         hold(lowering, [(x, nodes[k]) for k, x in held.items()])
         return [nodes[k] for k in moving], nodes[carried:]
 
-    finals, stacked = repeat_turns(
-        lowering, length, [lowering.nodes(carry[k]) for k in moving], turn, params["reverse"]
-    )
+    start = [lowering.nodes(carry[k]) for k in moving]
+    finals, stacked = repeat_turns(lowering, length, start, turn, params["reverse"])
     after: dict[int, Value] = dict(zip(moving, finals, strict=True)) | {k: x.after() for k, x in held.items()}
     return [*(after.get(k, carry[k]) for k in range(carried)), *stacked]
 
@@ -198,7 +199,7 @@ def hold(lowering: Lowering, filled: Sequence[tuple[Held, Value]]) -> None:
         held.fill(lowering, x)
 
 
-def _counts(params: dict[str, Any]) -> tuple[int, int]:
+def _count_arguments(params: dict[str, Any]) -> tuple[int, int]:
     """Return how many arguments of a scan are constants, and how many are carried: numbers in JAX 0.10, trees later."""
     if "num_consts" in params:
         return params["num_consts"], params["num_carry"]
@@ -232,7 +233,7 @@ def _entry(x: np.ndarray, turn: int) -> np.ndarray:
 
 
 def in_memory(lowering: Lowering, value: Value) -> InMemory:
-    """Store an array of nodes in memory."""
+    """Return an array in memory: as it is if it is there, a table of constants, else stored entry by entry."""
     if isinstance(value, InMemory):
         return value
     flat = _list_numbers(value)
@@ -261,28 +262,26 @@ def _lower_while(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
     conditional, fixed = params["cond_nconsts"], params["body_nconsts"]
     of_condition, of_body = inputs[:conditional], inputs[conditional : conditional + fixed]
 
-    def body(loop: Loop, now: list[np.ndarray]) -> tuple[list[np.ndarray], None]:
-        # The check comes before the body; there the carry is selected by each run's condition.
-        active = lowering.nodes(lowering.inline(params["cond_jaxpr"], [*of_condition, *now])[0])
+    def body(loop: Loop, carry: list[np.ndarray]) -> tuple[list[np.ndarray], None]:
+        """Write the check, then the body; return the next carry, selected by each run's condition."""
+        active = lowering.nodes(lowering.inline(params["cond_jaxpr"], [*of_condition, *carry])[0])
         loop.condition = reduce(lambda a, b: graph.node("or", "bool", a, b), scalars(active))
         loop.body.items.append(Check(loop))
-        moved = [lowering.nodes(x) for x in lowering.inline(params["body_jaxpr"], [*of_body, *now])]
-        return [_where_active(graph, active, new, old) for new, old in zip(moved, now, strict=True)], None
+        moved = [lowering.nodes(x) for x in lowering.inline(params["body_jaxpr"], [*of_body, *carry])]
+        return [_where_active(graph, active, new, old) for new, old in zip(moved, carry, strict=True)], None
 
     return _lower_loop(lowering, None, [lowering.nodes(x) for x in inputs[conditional + fixed :]], body)[0]
 
 
 def _where_active(graph: Graph, active: np.ndarray, new: np.ndarray, old: np.ndarray) -> np.ndarray:
     """Return new entries where a loop goes on, and the old ones elsewhere."""
-    going = np.repeat(active.ravel(), new.size // active.size).tolist()
-    return array_of(
-        [select(graph, a, x, y) for a, x, y in zip(going, new.ravel().tolist(), old.ravel().tolist(), strict=True)],
-        old.shape,
-    )
+    conditions = np.repeat(active.ravel(), new.size // active.size).tolist()
+    entries = zip(conditions, new.ravel().tolist(), old.ravel().tolist(), strict=True)
+    return array_of([select(graph, condition, x, y) for condition, x, y in entries], old.shape)
 
 
 def size_of(lowering: Lowering, jaxpr: Any) -> int:
-    """Estimate the count of numbers that a traced program computes, once for each that is lowered."""
+    """Estimate the count of numbers that a traced program computes: a scan's body once a turn, a while loop's once."""
     if jaxpr in lowering.sizes:
         return lowering.sizes[jaxpr]
     total = 0
@@ -295,6 +294,7 @@ def size_of(lowering: Lowering, jaxpr: Any) -> int:
 
 
 def _programs(params: dict[str, Any]) -> list[Any]:
+    """Return the programs among the parameters of an operation."""
     values = [x for p in params.values() for x in (p if isinstance(p, tuple) else (p,))]
     return [x for x in values if hasattr(x, "eqns") or hasattr(x, "jaxpr")]
 

@@ -26,20 +26,20 @@ def _reduce_by(op: str, empty: float) -> Rule:
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
         axes, shape, type = equation.params["axes"], result_shape(equation), result_type(equation)
-        terms = math.prod(inputs[0].shape[axis] for axis in axes)  # none of a sum over nothing
+        # (entry of the result, terms); no terms of a sum over nothing.
+        terms = math.prod(inputs[0].shape[axis] for axis in axes)
         x = np.moveaxis(inputs[0], axes, range(-len(axes), 0)).reshape(math.prod(shape), terms)
-        return [
-            array_of([total(lowering.graph, op, type, row, _clip_to_type(type, empty)) for row in x.tolist()], shape)
-        ]
+        neutral = _clip_to_type(type, empty)
+        return [array_of([total(lowering.graph, op, type, row, neutral) for row in x.tolist()], shape)]
 
     return rule
 
 
-ALL_BITS = np.nan  # of "and": true, -1, or the greatest unsigned integer
+ALL_BITS = np.nan  # stands for the neutral element of "and": true, -1, or the greatest unsigned integer
 
 
 def _clip_to_type(type: Type, number: float) -> float:
-    """Return the number of this type that is nearest to one: infinity is no integer. ALL_BITS: that of all bits."""
+    """Return the number of a type that is nearest to this one, as an integer to infinity; of ALL_BITS all bits set."""
     if type in REAL or np.isfinite(number):
         return number
     greatest = number > 0 or number is ALL_BITS
@@ -55,38 +55,37 @@ def _accumulate_by(op: str) -> Rule:
     """Return the rule that accumulates along an axis by `op`."""
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-        axis, type = equation.params["axis"], result_type(equation)
+        axis, type, reverse = equation.params["axis"], result_type(equation), equation.params["reverse"]
         if not inputs[0].size:
             return inputs
+        # Rows along the axis, each combined with what is accumulated before it.
         x = np.moveaxis(inputs[0], axis, 0)
-        x = (x[::-1] if equation.params["reverse"] else x).reshape(len(x), -1)
+        shape = x.shape
+        x = (x[::-1] if reverse else x).reshape(len(x), -1)
         rows = [x[0].tolist()]
         for row in x[1:].tolist():
             rows.append([lowering.graph.node(op, type, a, b) for a, b in zip(rows[-1], row, strict=True)])
-        cumulated = array_of([n for row in rows for n in row], np.moveaxis(inputs[0], axis, 0).shape)
-        return [np.moveaxis(cumulated[::-1] if equation.params["reverse"] else cumulated, 0, axis)]
+        cumulated = array_of([n for row in rows for n in row], shape)
+        return [np.moveaxis(cumulated[::-1] if reverse else cumulated, 0, axis)]
 
     return rule
 
 
-def _arg(op: str) -> Rule:
-    """Make a rule for the first index of the greatest or least entry; as in JAX, of the first NaN if there is one."""
+def _find_extreme(op: str) -> Rule:
+    """Return the rule of the first index of the greatest ("gt") or least ("lt") entry; of the first NaN, as in JAX."""
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-        """Return the index of the first largest (or smallest) entry along the axis, of NaN if there is one."""
-        graph, type = lowering.graph, result_type(equation)
-        x = np.moveaxis(inputs[0], equation.params["axes"][0], -1).reshape(
-            -1, inputs[0].shape[equation.params["axes"][0]]
-        )
+        graph, type, axis = lowering.graph, result_type(equation), equation.params["axes"][0]
+        x = np.moveaxis(inputs[0], axis, -1).reshape(-1, inputs[0].shape[axis])
         results = []
         for row in x.tolist():
             best, index = row[0], graph.constant(0, type)
             for number, entry in enumerate(row[1:], 1):
                 # A later entry replaces the best one if it is beyond it or NaN, unless the best is NaN.
-                known = graph.node("eq", "bool", best, best)
+                best_is_number = graph.node("eq", "bool", best, best)
                 beyond = graph.node(op, "bool", entry, best)
                 is_nan = graph.node("ne", "bool", entry, entry)
-                better = graph.node("and", "bool", known, graph.node("or", "bool", beyond, is_nan))
+                better = graph.node("and", "bool", best_is_number, graph.node("or", "bool", beyond, is_nan))
                 best = graph.node("select", entry.type, better, entry, best)
                 index = graph.node("select", type, better, graph.constant(number, type), index)
             results.append(index)
@@ -96,99 +95,103 @@ def _arg(op: str) -> Rule:
 
 
 def write_product(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Sum products over the contracted axes, with batch axes first."""
+    """Write `dot_general` out: for each batch the products A B' of A (free, contracted) and B (free, contracted)."""
     (left, right), (left_batch, right_batch) = equation.params["dimension_numbers"]
     type = result_type(equation)
-    x, y = (_of_type(lowering.graph, type, x) for x in inputs)
-    a, b = _batched(x, left, left_batch), _batched(y, right, right_batch)
+    x, y = (_convert(lowering.graph, type, x) for x in inputs)
+    a, b = _as_matrices(x, left, left_batch), _as_matrices(y, right, right_batch)
     products = [_multiply_matrices(lowering, type, rows, columns) for rows, columns in zip(a, b, strict=True)]
     return [array_of([n for product in products for n in product.ravel().tolist()], result_shape(equation))]
 
 
 def _multiply_matrices(lowering: Lowering, type: Type, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Compute A B' of A (n, k) and B (m, k). Of a congruence C P C' both triangles are the upper one.
+    """Return A B' of A (n, k) and B (m, k); of a congruence C P C' only the upper triangle is computed.
 
-    A = C P and B = C with a symmetric P, or A = C and B = C P. That A A' is symmetric needs no rule, since equal
-    expressions are one node.
+    A congruence is A = C P and B = C with a symmetric P, or A = C and B = C P. That A A' is symmetric needs no rule,
+    since equal expressions are one node.
     """
-    mirrored = any(_is_weighted(x, y) or _is_congruence(lowering, x, y) for x, y in ((a, b), (b, a)))
-    places = [(i, j) for i in range(len(a)) for j in range(i if mirrored else 0, len(b))]
+    is_symmetric = any(_is_weighted(x, y) or _is_congruence(lowering, x, y) for x, y in ((a, b), (b, a)))
+    places = [(i, j) for i in range(len(a)) for j in range(i if is_symmetric else 0, len(b))]
     product = np.empty((len(a), len(b)), dtype=object)
     sums = _sums_of_products(lowering.graph, type, [(a[i], b[j]) for i, j in places])
     for (i, j), entry in zip(places, sums, strict=True):
         product[i, j] = entry
-        if mirrored:
+        if is_symmetric:
             product[j, i] = entry
+    # What the product is made of, by which a later product knows that it is a congruence.
     for entries, factors in ((product, (a, b)), (product.T, (b, a))):
         lowering.products[_key(entries)] = factors
     return product
 
 
 def _sums_of_products(graph: Graph, type: Type, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[Node]:
-    """Sum the products of pairs of vectors, all sums term by term at once, so that none waits for the last of another.
+    """Return sum_k a_k b_k of each pair of vectors (a, b).
 
-    A term of data that is multiplied by a known zero is none, whatever the data: a zero in a matrix of a model says
-    what does not depend on what, and NaN passes only to what does.
+    All sums grow term by term at once, so that none waits for the last of another. A term of data that is multiplied by
+    a known zero is left out, whatever the data: a zero in a matrix of a model says what does not depend on what, and
+    NaN passes only to what does.
     """
     product, sum_ = ("and", "or") if type == "bool" else ("mul", "add")
     sums: list[Node | None] = [None] * len(pairs)
     for k in range(len(pairs[0][0]) if pairs else 0):
         for place, (a, b) in enumerate(pairs):
-            if _leaves_out(a[k], b[k]) or _leaves_out(b[k], a[k]):
+            if _is_zero_term(a[k], b[k]) or _is_zero_term(b[k], a[k]):
                 continue
             term, before = graph.node(product, type, a[k], b[k]), sums[place]
             sums[place] = term if before is None else graph.node(sum_, type, before, term)
     return [graph.constant(0.0 if type in REAL else 0, type) if s is None else s for s in sums]
 
 
-def _leaves_out(x: Node, y: Node) -> bool:
-    """Return whether x is a known zero, and y anything but what is known to be no number, or infinite."""
+def _is_zero_term(x: Node, y: Node) -> bool:
+    """Return whether x is a known zero, and y no constant that is infinite or NaN."""
     return x.op == "constant" and not x.value and (y.op != "constant" or math.isfinite(y.value))
 
 
 def _is_weighted(a: np.ndarray, b: np.ndarray) -> bool:
-    """Return whether A = B diag(w)."""
+    """Return whether A = B diag(w): in each column all entries of A are those of B times the same node."""
     if a.shape != b.shape:
         return False
-    weights = [[_weight(x, y) for x, y in zip(*columns, strict=True)] for columns in zip(a.T, b.T, strict=True)]
+    weights = [[_find_weight(x, y) for x, y in zip(*columns, strict=True)] for columns in zip(a.T, b.T, strict=True)]
     return all(w is not None and w is column[0] for column in weights for w in column)
 
 
-def _weight(x: Node, y: Node) -> Node | None:
-    """Return w of a number x = w y."""
+def _find_weight(x: Node, y: Node) -> Node | None:
+    """Return w of a number x that was computed as w y, None of any other."""
     if y.op == "constant" and y.value == 1:
         return x
     return x.args[x.args[0] is y] if x.op == "mul" and any(a is y for a in x.args) else None
 
 
 def _is_congruence(lowering: Lowering, a: np.ndarray, b: np.ndarray) -> bool:
-    """Return whether A = B P of a symmetric P."""
+    """Return whether A was computed as B P of a symmetric P."""
     factor, p = lowering.products.get(_key(a), (a[:0], a[:0]))
     return _is_same(factor, b) and _is_same(p, p.T)
 
 
 def _is_same(a: np.ndarray, b: np.ndarray) -> bool:
+    """Return whether two arrays have the same nodes."""
     return a.shape == b.shape and all(x is y for x, y in zip(a.ravel().tolist(), b.ravel().tolist(), strict=True))
 
 
 def _key(matrix: np.ndarray) -> Any:
+    """Return the shape and the nodes of a matrix, by which it is known."""
     return matrix.shape, *matrix.ravel().tolist()
 
 
-def _of_type(graph: Graph, type: Type, x: np.ndarray) -> np.ndarray:
-    """Convert integers and truth values, with which numbers may be multiplied."""
+def _convert(graph: Graph, type: Type, x: np.ndarray) -> np.ndarray:
+    """Return an array in another type: integers and truth values, with which numbers may be multiplied."""
     return array_of((n if n.type == type else graph.node("convert", type, n) for n in x.ravel().tolist()), x.shape)
 
 
-def _batched(x: np.ndarray, contracted: Sequence[int], batch: Sequence[int]) -> np.ndarray:
-    """Arrange as (batch, free, contracted)."""
+def _as_matrices(x: np.ndarray, contracted: Sequence[int], batch: Sequence[int]) -> np.ndarray:
+    """Return an array as (batch, free, contracted), each of one axis."""
     free = [d for d in range(x.ndim) if d not in contracted and d not in batch]
     sizes = [math.prod(x.shape[d] for d in axes) for axes in (batch, free, contracted)]
     return np.transpose(x, [*batch, *free, *contracted]).reshape(sizes)
 
 
-def _each_matrix(function: Any) -> Rule:
-    """Make a rule of the last two axes: function(graph, parameters, *matrices) for each index of the others."""
+def _for_each_matrix(function: Any) -> Rule:
+    """Return a rule of the last two axes: function(graph, parameters, *matrices) for each index of the others."""
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
         flat = [x.reshape(math.prod(x.shape[:-2]), *x.shape[-2:]) for x in inputs]
@@ -205,9 +208,9 @@ def _type_of(matrix: np.ndarray) -> Type:
 
 
 def _cholesky(graph: Graph, params: Any, a: np.ndarray) -> np.ndarray:
-    """Compute A = L L' column by column, one reciprocal each; all NaN if the matrix is not positive definite."""
+    """Return L of A = L L', column by column, one reciprocal each; all NaN if A is not positive definite."""
     n, real = len(a), _type_of(a)
-    zero, missing = graph.constant(0.0, real), graph.constant(float("nan"), real)
+    zero, nan = graph.constant(0.0, real), graph.constant(float("nan"), real)
     definite = graph.constant(True, "bool")
     lower = np.full((n, n), zero, dtype=object)
     for j in range(n):
@@ -226,12 +229,12 @@ def _cholesky(graph: Graph, params: Any, a: np.ndarray) -> np.ndarray:
         lower[j, j] = root
         for i in range(j + 1, n):
             lower[i, j] = graph.node("mul", real, rests[i - j], scale)
-    numbers = [graph.node("select", real, definite, x, missing) for x in lower.ravel().tolist()]
+    numbers = [graph.node("select", real, definite, x, nan) for x in lower.ravel().tolist()]
     return array_of(numbers, lower.shape)
 
 
 def _triangular_solve(graph: Graph, params: Any, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Solve A X = B (or X A = B, or with A') by substitution, one reciprocal for each diagonal entry."""
+    """Return X of A X = B (or X A = B, or with A') by substitution, one reciprocal for each diagonal entry."""
     if params["conjugate_a"]:
         raise Unsupported("complex numbers")
     lower, transposed = params["lower"], params["transpose_a"]
@@ -259,6 +262,7 @@ RULES |= {
     "reduce_and": _reduce_by("and", ALL_BITS), "reduce_xor": _reduce_by("xor", 0),
     "reduce_max": _reduce_by("max", -np.inf), "reduce_min": _reduce_by("min", np.inf),
     "cumsum": _accumulate_by("add"), "cumprod": _accumulate_by("mul"), "cummax": _accumulate_by("max"),
-    "cummin": _accumulate_by("min"), "argmax": _arg("gt"), "argmin": _arg("lt"), "dot_general": write_product,
-    "cholesky": _each_matrix(_cholesky), "triangular_solve": _each_matrix(_triangular_solve),
+    "cummin": _accumulate_by("min"), "argmax": _find_extreme("gt"), "argmin": _find_extreme("lt"),
+    "dot_general": write_product,
+    "cholesky": _for_each_matrix(_cholesky), "triangular_solve": _for_each_matrix(_triangular_solve),
 }  # fmt: skip

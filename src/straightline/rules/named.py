@@ -63,19 +63,20 @@ def operation(native: Callable[P, R]) -> Callable[[Callable[P, R]], Callable[P, 
             """Trace the plain function for arguments of these shapes and types; return it and its results' tree."""
             result_tree: list[Any] = []
 
-            def leaves_of(function: Callable[..., R], *leaves: Any) -> list[Any]:
+            def call_on_leaves(function: Callable[..., R], *leaves: Any) -> list[Any]:
+                """Return the leaves of the function's results from those of its arguments; note the results' tree."""
                 args, kwargs = jax.tree.unflatten(tree, leaves)
                 results, structure = jax.tree.flatten(function(*args, **kwargs))
                 result_tree[:] = [structure]
                 return results
 
-            traced = jax.make_jaxpr(partial(leaves_of, plain))(*(like(*kind) for kind in kinds))
+            traced = jax.make_jaxpr(partial(call_on_leaves, plain))(*(like(*kind) for kind in kinds))
             name = f"{plain.__module__}.{plain.__qualname__}"
-            return _Program(name, traced, partial(leaves_of, native), x64), result_tree[0]
+            return _Program(name, traced, partial(call_on_leaves, native), x64), result_tree[0]
 
         @wraps(plain)
         def call(*args: P.args, **kwargs: P.kwargs) -> R:
-            """Bind the function as one primitive of JAX, which is traced once for arguments of one kind."""
+            """Trace the function once for these shapes, then bind it as one primitive, which `vmap` and others see."""
             leaves, tree = jax.tree.flatten((args, kwargs))
             leaves = [jnp.asarray(leaf) for leaf in leaves]
             kinds = tuple((leaf.shape, leaf.dtype) for leaf in leaves)
@@ -90,7 +91,10 @@ def operation(native: Callable[P, R]) -> Callable[[Callable[P, R]], Callable[P, 
 
 
 def _apply_plain(*leaves: Any, program: _Program, levels: tuple[Axes, ...], sizes: tuple[int, ...]) -> list[Any]:
-    """Compute the plain function under its levels of `vmap`, the innermost first."""
+    """Compute the plain function, not the native one, under its levels of `vmap`, the innermost first.
+
+    `sizes` is a parameter of the primitive only.
+    """
     function = jaxpr_as_fun(program.plain)
     for axes in levels:
         function = jax.vmap(function, in_axes=axes)
@@ -114,16 +118,18 @@ def _batch_operation(
     return results, [0] * len(results)
 
 
-def _with_tangents(primals: Sequence[Any], tangents: Sequence[Any], **params: Any) -> tuple[list[Any], list[Any]]:
-    """Differentiate the plain function by the arguments that have tangents."""
-    moves = [not isinstance(tangent, ad.Zero) for tangent in tangents]
+def _differentiate(primals: Sequence[Any], tangents: Sequence[Any], **params: Any) -> tuple[list[Any], list[Any]]:
+    """Return the plain function's results and their tangents, by the arguments that have tangents."""
+    has_tangent = [not isinstance(tangent, ad.Zero) for tangent in tangents]
 
-    def of_moving(*moving: Any) -> list[Any]:
-        rest = iter(moving)
-        return _apply_plain(*(next(rest) if m else x for m, x in zip(moves, primals, strict=True)), **params)
+    def call(*varying: Any) -> list[Any]:
+        """Call the plain function with these in place of the arguments that have tangents."""
+        rest = iter(varying)
+        return _apply_plain(*(next(rest) if has else x for has, x in zip(has_tangent, primals, strict=True)), **params)
 
-    at, along = ([x for m, x in zip(moves, values, strict=True) if m] for values in (primals, tangents))
-    results, slopes = jax.jvp(of_moving, at, along)
+    values = [x for has, x in zip(has_tangent, primals, strict=True) if has]
+    directions = [x for has, x in zip(has_tangent, tangents, strict=True) if has]
+    results, slopes = jax.jvp(call, values, directions)
     return results, slopes
 
 
@@ -147,26 +153,27 @@ def _trace_in_loops(lowering: Lowering, equation: JaxprEqn, function: Callable[.
     key = program, function is program.native, levels, kinds
     if key not in lowering.kernels:
         for axes in levels:
-            function = partial(_one_by_one, function, axes)
+            function = partial(_apply_one_by_one, function, axes)
         with jax.enable_x64(program.x64):
             lowering.kernels[key] = jax.make_jaxpr(function)(*(like(*kind) for kind in kinds))
     return lowering.kernels[key]
 
 
-def _one_by_one(function: Callable[..., list[Any]], axes: Axes, *leaves: Any) -> list[Any]:
-    """Apply a function to one entry of a batch after another; `axes` says which leaves have a batch."""
+def _apply_one_by_one(function: Callable[..., list[Any]], axes: Axes, *leaves: Any) -> list[Any]:
+    """Apply a function to one entry of a batch after another; `axes`: 0 for leaves that have a batch, else None."""
 
-    def of_one(moving: list[Any]) -> list[Any]:
-        rest = iter(moving)
+    def call(entries: list[Any]) -> list[Any]:
+        """Call the function for one entry of each leaf that has a batch."""
+        rest = iter(entries)
         return function(*(x if axis is None else next(rest) for x, axis in zip(leaves, axes, strict=True)))
 
-    results: list[Any] = jax.lax.map(of_one, [x for x, axis in zip(leaves, axes, strict=True) if axis == 0])
+    results: list[Any] = jax.lax.map(call, [x for x, axis in zip(leaves, axes, strict=True) if axis == 0])
     return results
 
 
 _primitive.def_impl(jax.jit(_apply_plain, static_argnames=("program", "levels", "sizes")))
 _primitive.def_abstract_eval(_shapes)
 batching.primitive_batchers[_primitive] = _batch_operation
-ad.primitive_jvps[_primitive] = _with_tangents
+ad.primitive_jvps[_primitive] = _differentiate
 mlir.register_lowering(_primitive, mlir.lower_fun(_apply_plain, multiple_results=True))
 IN_MEMORY["operation"] = _apply_native

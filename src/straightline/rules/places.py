@@ -38,7 +38,7 @@ def inside(graph: Graph, start: Node, last: int) -> Node:
 
 
 def fills(equation: JaxprEqn) -> bool:
-    """Return whether what a gather reads outside of the array, or a scatter writes there, is another matter."""
+    """Return whether a gather fills what is outside of the array with a value, and a scatter drops it."""
     return bool(equation.params["mode"] == GatherScatterMode.FILL_OR_DROP)
 
 
@@ -82,12 +82,12 @@ def places_of(
     inside = np.all((starts >= 0) & (starts <= last), axis=-1)
     strides = np.array(contiguous(shape), dtype=np.int64)
     base = np.sum(np.clip(starts, 0, last) * strides, axis=-1)
-    if not clips:
+    if not clips:  # so far below 0 that all of the window is
         base = np.where(inside, base, -1 - int(np.prod(shape, dtype=np.int64)))
     # Offsets of the entries of a window from its corner.
-    left = [a for a in range(len(shape)) if a not in removed]
-    offsets = np.zeros([sizes[a] for a in left], dtype=np.int64)
-    for position, a in enumerate(left):
-        offsets += strides[a] * np.arange(sizes[a]).reshape([-1 if p == position else 1 for p in range(len(left))])
+    axes = [a for a in range(len(shape)) if a not in removed]
+    offsets = np.zeros([sizes[a] for a in axes], dtype=np.int64)
+    for position, a in enumerate(axes):
+        offsets += strides[a] * np.arange(sizes[a]).reshape([-1 if p == position else 1 for p in range(len(axes))])
     places = np.reshape(base, (*base.shape, *[1] * offsets.ndim)) + offsets
     return np.maximum(places, -1)

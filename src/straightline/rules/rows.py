@@ -37,6 +37,7 @@ def is_long(inputs: list[Value]) -> bool:
 
 
 def _is_table(x: Value) -> bool:
+    """Return whether an array is a table of constants, at a place that is known."""
     return isinstance(x, InMemory) and x.buffer.kind == "table" and not x.moves
 
 
@@ -55,10 +56,12 @@ def _apply_by_row(name: str) -> Rule:
         shape, ndim = result_shape(equation), max(len(x.shape) for x in inputs)
         if not is_long(inputs):
             return list(RULES[name](lowering, equation, [lowering.nodes(x) for x in inputs]))
+        # Arguments with rows are read from memory; those that all rows share stay as they are.
         items = [x if len(x.shape) < ndim or x.shape[0] == 1 else in_memory(lowering, x) for x in inputs]
         row_equation = like_row(equation)
 
         def turn(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+            """Return no carry, and the operation's result for one row."""
             rows = [row_of(lowering, x, row, ndim) for x in items]
             return [], list(lowering.equation(row_equation, rows))
 
@@ -68,7 +71,7 @@ def _apply_by_row(name: str) -> Rule:
 
 
 def as_nodes(lowering: Lowering, results: tuple[list[Value], list[Value]]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Load carried and stacked arrays."""
+    """Return the carried and the stacked arrays of a turn as nodes, loaded where they are in memory."""
     carried, stacked = results
     return [lowering.nodes(x) for x in carried], [lowering.nodes(x) for x in stacked]
 
@@ -93,52 +96,51 @@ def like_row(equation: JaxprEqn, **params: Any) -> Any:
 
 
 def _dot_general(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Loop over the first batch axis, else the first free axis of the left argument, else that of the right one.
+    """Return a product of long arrays, computed row by row in a loop.
 
-    A sum over all axes is accumulated over the first of them.
+    The loop is over the first batch axis, else the first free axis of the left argument, else that of the right one. A
+    sum over all axes is accumulated over the first of them.
     """
     (left, right), (left_batch, right_batch) = equation.params["dimension_numbers"]
     to_number = not result_shape(equation) and all(x.size <= LOADED for x in inputs)
     if to_number or not is_long(inputs):
         return list(RULES["dot_general"](lowering, equation, [lowering.nodes(x) for x in inputs]))
+    # A known matrix whose zeros leave few terms is written out.
     short = [x if _is_table(x) or x.size > LOADED else lowering.nodes(x) for x in inputs]
     if (factors := _find_few_terms(equation, short)) is not None:
         return list(_write_out_product(lowering, equation, factors))
+    # The axis of each argument that is looped over, None where an argument is used whole in every turn.
     a, b = (in_memory(lowering, x) for x in inputs)
-    free_left, free_right = (
-        next((d for d in range(x.ndim) if d not in axes), None) for x, axes in ((a, left), (b, right))
-    )
-    in_left, in_right = (left_batch[0], right_batch[0]) if left_batch else (free_left, None)
+    in_left, in_right = (left_batch[0], right_batch[0]) if left_batch else (_find_free_axis(a, left), None)
     if in_left is None:
-        in_right = free_right
+        in_right = _find_free_axis(b, right)
     summed = in_left is None and in_right is None
     if summed:
         (in_left, *left), (in_right, *right) = left, right
-    # Dimension numbers of one row: without the axis that is looped over.
-    numbers = tuple(
-        tuple(
-            axes if gone is None else _without(axes, gone) for axes, gone in zip(pair, (in_left, in_right), strict=True)
-        )
-        for pair in ((left, right), (left_batch[1:], right_batch[1:]))
-    )
-    a, b = (x if axis is None else _first(x, axis) for x, axis in ((a, in_left), (b, in_right)))
-    # The operation on one row, in a loop.
-    row_equation = like_row(equation, dimension_numbers=numbers)
+    # The operation on one row: dimension numbers without that axis, which comes first.
+    contracted = _without(left, in_left), _without(right, in_right)
+    batch = _without(left_batch[1:], in_left), _without(right_batch[1:], in_right)
+    row_equation = like_row(equation, dimension_numbers=(contracted, batch))
+    a, b = (x if axis is None else _move_to_front(x, axis) for x, axis in ((a, in_left), (b, in_right)))
 
     def turn(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Return no carry, and the product for one row."""
         rows: list[Value] = [x if axis is None else x.row(row) for x, axis in ((a, in_left), (b, in_right))]
         return as_nodes(lowering, ([], list(lowering.equation(row_equation, rows))))
 
     count = (b if in_left is None else a).shape[0]
-    return (
-        _accumulate_turns(lowering, equation, count, turn)
-        if summed
-        else list(repeat_turns(lowering, count, [], turn)[1])
-    )
+    if summed:
+        return _accumulate_turns(lowering, equation, count, turn)
+    return list(repeat_turns(lowering, count, [], turn)[1])
 
 
-def _of_nodes(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> Sequence[Value]:
-    """Write a product of matrices out, but for one of many terms: a loop over rows in memory."""
+def _find_free_axis(x: InMemory, contracted: Sequence[int]) -> int | None:
+    """Return the first axis that is not summed over; None if all are."""
+    return next((d for d in range(x.ndim) if d not in contracted), None)
+
+
+def _multiply_nodes(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> Sequence[Value]:
+    """Return a product of arrays of nodes: written out, or of many terms by a loop over rows in memory."""
     (left, right), (batch, _) = equation.params["dimension_numbers"]
     if batch or len(left) != 1 or _count_terms(inputs[0], left[0], inputs[1], right[0]) <= MANY_TERMS:
         return write_product(lowering, equation, inputs)
@@ -149,9 +151,8 @@ def _count_terms(a: np.ndarray, left: int, b: np.ndarray, right: int) -> int:
     """Count the terms of all sums over an axis of a and one of b, without those that a known zero leaves out."""
     if a.size * b.size <= MANY_TERMS * a.shape[left]:
         return 0
-    # Of each place along the axis, how many entries of a and of b are no known zero: each of these meets each.
-    met = [_count_data(x, axis) for x, axis in ((a, left), (b, right))]
-    return int(met[0] @ met[1])
+    # At each place along the axis, each entry of a that is no known zero meets each such entry of b.
+    return int(_count_data(a, left) @ _count_data(b, right))
 
 
 def _count_data(x: np.ndarray, axis: int) -> np.ndarray:
@@ -162,10 +163,11 @@ def _count_data(x: np.ndarray, axis: int) -> np.ndarray:
 
 
 def _accumulate_turns(lowering: Lowering, equation: JaxprEqn, count: int, turn: Turn) -> list[Value]:
-    """Sum a number that each turn of a loop gives."""
+    """Return the sum over the turns of a loop of the number that each gives."""
     pair: Any = SimpleNamespace(params={"axes": (0,)}, outvars=equation.outvars)
 
     def add(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Return the sum so far with this turn's number, and nothing to stack."""
         return [np.asarray(RULES["reduce_sum"](lowering, pair, [np.stack([carry[0], *turn(row, [])[1]])])[0])], []
 
     start = RULES["reduce_sum"](lowering, pair, [np.empty(0, dtype=object)])[0]
@@ -179,24 +181,28 @@ def _find_few_terms(equation: JaxprEqn, inputs: list[Value]) -> tuple[np.ndarray
     """
     dimensions, (batch, _) = equation.params["dimension_numbers"]
     tables = [_is_table(x) for x in inputs]
-    loaded = [x.numbers() if t else x for x, t in zip(inputs, tables, strict=True)]
-    if batch or not any(tables) or any(isinstance(x, InMemory) for x in loaded):
+    arrays = [x.numbers() if is_table else x for x, is_table in zip(inputs, tables, strict=True)]
+    if batch or not any(tables) or any(isinstance(x, InMemory) for x in arrays):
         return None
-    factors, count = [], np.ones(1, dtype=np.int64)
-    for x, table, contracted in zip(loaded, tables, dimensions, strict=True):
+    # Terms at each place along the contracted axes: entries of the one that are no zeros times those of the other.
+    factors, terms = [], np.ones(1, dtype=np.int64)
+    for x, is_table, contracted in zip(arrays, tables, dimensions, strict=True):
         free = [d for d in range(x.ndim) if d not in contracted]
         rows = np.transpose(x, [*free, *contracted]).reshape(-1, math.prod(x.shape[d] for d in contracted))
-        count = count * (np.count_nonzero(rows, axis=0) if table else _count_data(rows, 1))
+        terms = terms * (np.count_nonzero(rows, axis=0) if is_table else _count_data(rows, 1))
         factors.append(rows)
-    return (factors[0], factors[1]) if count.sum() <= WRITTEN_OUT else None
+    return (factors[0], factors[1]) if terms.sum() <= WRITTEN_OUT else None
 
 
 def _write_out_product(
     lowering: Lowering, equation: JaxprEqn, factors: tuple[np.ndarray, np.ndarray]
 ) -> list[np.ndarray]:
-    """Sum the terms of a product that known zeros leave, of each entry in the order of the contracted axis."""
+    """Write out A B' entry by entry, terms with a known zero left out: entry (a, b) is the sum over k of a_k b_k.
+
+    `factors`: A and B as (rows, contracted axis); k ascends.
+    """
     graph, type = lowering.graph, result_type(equation)
-    left, right = ([_terms_of(graph, type, row) for row in factor] for factor in factors)
+    left, right = ([_find_data(graph, type, row) for row in factor] for factor in factors)
     entries = []
     for a in left:
         for b in right:
@@ -205,59 +211,59 @@ def _write_out_product(
     return [array_of(entries, result_shape(equation))]
 
 
-def _terms_of(graph: Graph, type: Type, row: np.ndarray) -> dict[int, Node]:
+def _find_data(graph: Graph, type: Type, row: np.ndarray) -> dict[int, Node]:
     """Return the entries of a row that are no known zeros, by their places."""
     if row.dtype != object:
         return {int(k): graph.constant(row[k].item(), type) for k in np.flatnonzero(row)}
     return {k: n for k, n in enumerate(row.tolist()) if n.op != "constant" or n.value}
 
 
-def _first(x: InMemory, axis: int) -> InMemory:
-    """Move an axis to the front."""
+def _move_to_front(x: InMemory, axis: int) -> InMemory:
+    """Return a view with this axis first."""
     order = [axis, *(a for a in range(x.ndim) if a != axis)]
     return x.view([x.shape[a] for a in order], [x.strides[a] for a in order])
 
 
-def _without(axes: tuple[int, ...], removed: int) -> tuple[int, ...]:
-    return tuple(a - (a > removed) for a in axes)
+def _without(axes: Sequence[int], removed: int | None) -> tuple[int, ...]:
+    """Return the numbers of these axes in an array without the removed axis, or as they are if none is."""
+    return tuple(axes) if removed is None else tuple(a - (a > removed) for a in axes)
 
 
-def _reduction(name: str) -> Rule:
-    """Make a rule that reduces the first axis row after row, and other axes within each row."""
+def _reduce_by_row(name: str) -> Rule:
+    """Return the rule of a reduction: of short arrays at once, of long ones row by row in a loop."""
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-        """Reduce short arrays at once, long ones row by row in a loop, which accumulates over rows if need be."""
         x, axes = inputs[0], equation.params["axes"]
         if not is_long(inputs):
             return list(RULES[name](lowering, equation, [lowering.nodes(x)]))
-        # The reduction within a row, and that of two rows.
+        # The reduction within a row, and that of two rows to one.
         inner = tuple(a - 1 for a in axes if a)
         shape = tuple(n for a, n in enumerate(x.shape[1:]) if a not in inner)
         dtype = equation.outvars[0].aval.dtype  # type: ignore[attr-defined]
         row = SimpleNamespace(aval=like(shape, dtype))
-        params = equation.params | {"axes": inner}
-        within: Any = SimpleNamespace(params=params, outvars=[row])
-        pair: Any = SimpleNamespace(params=equation.params | {"axes": (0,)}, outvars=[row])
+        within: Any = SimpleNamespace(params=equation.params | {"axes": inner}, outvars=[row])
+        of_two: Any = SimpleNamespace(params=equation.params | {"axes": (0,)}, outvars=[row])
 
-        def reduced(row_index: Node) -> np.ndarray:
-            return np.asarray(RULES[name](lowering, within, [lowering.nodes(x.row(row_index))])[0])
+        def reduce_row(index: Node) -> np.ndarray:
+            """Return a row reduced along its own axes."""
+            return np.asarray(RULES[name](lowering, within, [lowering.nodes(x.row(index))])[0])
 
-        # Rows stay apart, or are accumulated from the neutral element.
-        if 0 not in axes:
-            return list(repeat_turns(lowering, x.shape[0], [], lambda row_index, _: ([], [reduced(row_index)]))[1])
-        nothing = np.empty((0, *shape), dtype=object)
-        start = RULES[name](lowering, pair, [nothing])[0]
+        if 0 not in axes:  # rows stay apart
+            return list(repeat_turns(lowering, x.shape[0], [], lambda index, _: ([], [reduce_row(index)]))[1])
+        # Rows are accumulated from the neutral element, the reduction of no row.
+        start = RULES[name](lowering, of_two, [np.empty((0, *shape), dtype=object)])[0]
 
-        def turn(row_index: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-            return [np.asarray(RULES[name](lowering, pair, [np.stack([carry[0], reduced(row_index)])])[0])], []
+        def accumulate(index: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+            """Return the rows reduced so far with this one, and nothing to stack."""
+            return [np.asarray(RULES[name](lowering, of_two, [np.stack([carry[0], reduce_row(index)])])[0])], []
 
-        return list(repeat_turns(lowering, x.shape[0], [start], turn)[0])
+        return list(repeat_turns(lowering, x.shape[0], [start], accumulate)[0])
 
     return rule
 
 
 REDUCTIONS = ("reduce_sum", "reduce_prod", "reduce_or", "reduce_and", "reduce_max", "reduce_min")
 IN_MEMORY |= {name: _apply_by_row(name) for name in OF_ENTRIES}
-IN_MEMORY |= {name: _reduction(name) for name in REDUCTIONS}
+IN_MEMORY |= {name: _reduce_by_row(name) for name in REDUCTIONS}
 IN_MEMORY |= {"dot_general": _dot_general}
-RULES |= {"dot_general": _of_nodes}
+RULES |= {"dot_general": _multiply_nodes}

@@ -29,28 +29,30 @@ def _scatter(op: str | None) -> Rule:
         removed = (*numbers.inserted_window_dims, *numbers.operand_batching_dims)
         windows = iter(updates.shape[a] for a in numbers.update_window_dims)
         sizes = [1 if a in removed else next(windows) for a in range(x.ndim)]
-        at = known_integers(indices)
-        if at is None:
+        known = known_integers(indices)
+        if known is None:
             return [_scatter_by_cases(lowering, equation, op, inputs, indices, sizes)]
-        # Places of all updates in the flat array, which are applied in order.
+        # Places of all updates in the flat array, -1 outside, with axes in the order of the updates'.
         batching = list(zip(numbers.operand_batching_dims, numbers.scatter_indices_batching_dims, strict=True))
         index_map = numbers.scatter_dims_to_operand_dims
-        places = places_of(x.shape, sizes, at, index_map, batching, removed, _clips(equation))
-        places = np.moveaxis(places, range(at.ndim - 1, places.ndim), numbers.update_window_dims)
+        places = places_of(x.shape, sizes, known, index_map, batching, removed, _clips(equation))
+        places = np.moveaxis(places, range(known.ndim - 1, places.ndim), numbers.update_window_dims)
         updated = x.ravel().copy()
         for index, new in zip(places.ravel().tolist(), updates.ravel().tolist(), strict=True):
             if index >= 0:
-                updated[index] = _combined(lowering.graph, op, updated[index], new)
+                updated[index] = _combine(lowering.graph, op, updated[index], new)
         return [updated.reshape(x.shape)]
 
     return rule
 
 
 def _clips(equation: JaxprEqn) -> bool:
+    """Return whether windows beyond the array are moved into it, where other modes drop them."""
     return bool(equation.params["mode"] == GatherScatterMode.CLIP)
 
 
-def _combined(graph: Graph, op: str | None, old: Any, new: Any) -> Any:
+def _combine(graph: Graph, op: str | None, old: Any, new: Any) -> Any:
+    """Return `old op new`, or `new` in place of the old number where there is no operation."""
     return new if op is None else graph.node(op, new.type, old, new)
 
 
@@ -62,50 +64,63 @@ def _scatter_by_cases(
     indices: np.ndarray,
     sizes: list[int],
 ) -> np.ndarray:
-    """Apply each update at every place that it may have, where its index is that of the place."""
+    """Scatter at indices that data decide: at every place where an update may land, select(it lands here, new, old).
+
+    `sizes`: of a window along each axis of the array.
+    """
     (x, _, updates), numbers, graph = inputs, equation.params["dimension_numbers"], lowering.graph
     removed = (*numbers.inserted_window_dims, *numbers.operand_batching_dims)
-    left = [a for a in range(x.ndim) if a not in removed]
-    # Updates as rows of windows: (index, window).
+    window_axes = [a for a in range(x.ndim) if a not in removed]
+    # Updates with axes (index, window).
     along = numbers.update_window_dims
     windows = np.moveaxis(updates, along, range(updates.ndim - len(along), updates.ndim))
     updated, count = x.copy(), 0
     for row in np.ndindex(*indices.shape[:-1]):
-        for start, here in _yield_starts(graph, equation, x.shape, sizes, row, indices[row]):
+        for start, is_here in _yield_starts(graph, equation, x.shape, sizes, row, indices[row]):
             count += math.prod(sizes)
             if count > WRITTEN_OUT:
                 raise Unsupported(f"{equation.primitive.name} at one of many places that data decide")
             for entry in np.ndindex(*windows.shape[len(row) :]):
                 place = list(start)
-                for axis, offset in zip(left, entry, strict=True):
+                for axis, offset in zip(window_axes, entry, strict=True):
                     place[axis] += offset
                 old = updated[tuple(place)]
-                updated[tuple(place)] = select(graph, here, _combined(graph, op, old, windows[row + entry]), old)
+                new = _combine(graph, op, old, windows[row + entry])
+                updated[tuple(place)] = select(graph, is_here, new, old)
     return updated
 
 
 def _yield_starts(
     graph: Graph, equation: JaxprEqn, shape: tuple[int, ...], sizes: list[int], row: tuple[int, ...], index: np.ndarray
 ) -> Iterator[tuple[tuple[int, ...], Node]]:
-    """Yield each place where a window may start, and whether it starts there."""
+    """Yield each place where the window of an index may start, and the node of whether it starts there.
+
+    `row` is the number of the index among all, `index` its numbers, one for each axis that an index selects.
+    """
     numbers, clips = equation.params["dimension_numbers"], _clips(equation)
     nodes = dict(zip(numbers.scatter_dims_to_operand_dims, index.tolist(), strict=True))
-    fixed = dict(zip(numbers.operand_batching_dims, numbers.scatter_indices_batching_dims, strict=True))
-    ranges = []
+    batch_axes = dict(zip(numbers.operand_batching_dims, numbers.scatter_indices_batching_dims, strict=True))
+    # Possible starts along each axis: all that the window fits into, the row's own of a batch, else 0.
+    ranges: list[Any] = []
     for axis, size in enumerate(sizes):
-        last = shape[axis] - size
-        ranges.append(range(last + 1) if axis in nodes else [row[fixed[axis]] if axis in fixed else 0])
+        if axis in nodes:
+            ranges.append(range(shape[axis] - size + 1))
+        else:
+            ranges.append([row[batch_axes[axis]] if axis in batch_axes else 0])
     for start in product(*ranges):
-        here = graph.constant(True, "bool")
+        is_here = graph.constant(True, "bool")
         for axis, node in nodes.items():
             last = shape[axis] - sizes[axis]
-            if clips and not last:
+            if clips and not last:  # the one place there is
                 continue
-            op = "eq" if not clips or 0 < start[axis] < last else "ge" if start[axis] else "le"
-            is_there = graph.node(op, "bool", node, graph.constant(start[axis], node.type))
-            here = graph.node("and", "bool", here, is_there)
-        if here.op != "constant" or here.value:
-            yield start, here
+            # Clipped, the first place stands for all below it, and the last one for all above.
+            op = "eq"
+            if clips and start[axis] in (0, last):
+                op = "ge" if start[axis] else "le"
+            along_axis = graph.node(op, "bool", node, graph.constant(start[axis], node.type))
+            is_here = graph.node("and", "bool", is_here, along_axis)
+        if is_here.op != "constant" or is_here.value:
+            yield start, is_here
 
 
 RULES |= {

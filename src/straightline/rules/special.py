@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from fractions import Fraction
 from functools import cache, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,52 +19,74 @@ BERNOULLI = [1 / 12, -1 / 120, 1 / 252, -1 / 240, 1 / 132, -691 / 32760, 1 / 12,
 TINY = float(np.finfo(np.float64).tiny) / EPSILON
 LARGE, TERMS = 2000.0, 20  # the shape from which gamma masses are expanded, to a^-3, and the terms of a coefficient
 TURNS = 5000  # of a series or a fraction, several times as many as it takes
-Quotients = tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]  # turn, Lentz's C and D, value, last change
+
+
+class Series(NamedTuple):
+    """State of a series: a number that counts its terms, the last term, and the sum."""
+
+    step: jax.Array
+    term: jax.Array
+    total: jax.Array
+
+
+class Quotients(NamedTuple):
+    """State of a continued fraction: the turn, Lentz's quotients C and D, the value, and its last relative change."""
+
+    turn: jax.Array
+    c: jax.Array
+    d: jax.Array
+    value: jax.Array
+    change: jax.Array
 
 
 def gamma_masses(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Compute the mass below and above x of the gamma law of shape a: P(a, x) and Q(a, x) = 1 - P; NaN below zero.
+    """Compute the mass below and above x of the gamma law of shape a: P(a, x) and Q(a, x) = 1 - P.
 
     P = x^a e^-x / Gamma(a) sum_n x^n / (a (a + 1) ... (a + n)) converges fast below a + 1; above it Q's fraction does,
-    x^a e^-x / Gamma(a) / (x + 1 - a - 1 (1 - a) / (x + 3 - a - ...)), evaluated from the front.
+    x^a e^-x / Gamma(a) / (x + 1 - a - 1 (1 - a) / (x + 3 - a - 2 (2 - a) / (x + 5 - a - ...))). NaN where a or x is
+    below zero.
 
     Source: Abramowitz and Stegun, Handbook of mathematical functions, 6.5.29 and 6.5.31; Lentz, Generating Bessel
     functions in Mie scattering calculations using continued fractions (1976).
     """
     valid = (a > 0) & (x >= 0)
-    large, whole, at_zero = a > LARGE, x, (a == 0) & (x > 0)
+    large, given_x, at_zero = a > LARGE, x, (a == 0) & (x > 0)
     by_expansion = large_masses(a, x)
     a, x = jnp.where(large | ~valid, 1.0, a), jnp.where(large | ~valid, 1.0, x)
     above = x > a + 1
     density = jnp.exp(a * jnp.log(x) - x - jax.lax.lgamma(a))
 
     # Below the mean the series; each loop ends at once where the other serves.
-    def add(state: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def add_term(state: Series) -> Series:
         shape, term, total = state
         term = term * x / (shape + 1)
-        return shape + 1, term, total + term
+        return Series(shape + 1, term, total + term)
+
+    def has_more_terms(state: Series) -> jax.Array:
+        return (state.term > EPSILON * state.total) & (state.step < a + TURNS)
 
     first = jnp.where(above, 0.0, 1 / a)
-    lower = (
-        density * jax.lax.while_loop(lambda s: (s[1] > EPSILON * s[2]) & (s[0] < a + TURNS), add, (a, first, first))[2]
-    )
+    lower = density * jax.lax.while_loop(has_more_terms, add_term, Series(a, first, first)).total
 
-    # Above it the continued fraction by Lentz's two quotients C and D.
+    # Above it the continued fraction by Lentz's two quotients C and D, from the front.
     def continue_fraction(state: Quotients) -> Quotients:
         n, c, d, fraction, _ = state
         numerator, b = n * (a - n), x + 2 * n + 1 - a
         c, d = b + numerator / c, 1 / _keep_from_zero(b + numerator * d)
-        return n + 1, _keep_from_zero(c), d, fraction * c * d, jnp.abs(c * d - 1)
+        return Quotients(n + 1, _keep_from_zero(c), d, fraction * c * d, jnp.abs(c * d - 1))
+
+    def still_changes(state: Quotients) -> jax.Array:
+        return (state.change > EPSILON) & (state.turn < TURNS)
 
     start = 1 / jnp.where(above, x + 1 - a, 1.0)
-    state = (jnp.ones_like(x), jnp.full_like(x, 1 / TINY), start, start, jnp.where(above, 1.0, 0.0))
-    upper = density * jax.lax.while_loop(lambda s: (s[4] > EPSILON) & (s[0] < TURNS), continue_fraction, state)[3]
+    state = Quotients(jnp.ones_like(x), jnp.full_like(x, 1 / TINY), start, start, jnp.where(above, 1.0, 0.0))
+    upper = density * jax.lax.while_loop(still_changes, continue_fraction, state).value
 
     # Both masses, the smaller one to all its digits.
     below = jnp.where(x == jnp.inf, 1.0, jnp.where(above, 1 - upper, lower))
     beyond = jnp.where(above & (x < jnp.inf), upper, 1 - below)
-    p, q = (jnp.where(large & (whole < jnp.inf), e, y) for e, y in zip(by_expansion, (below, beyond), strict=True))
-    p, q = jnp.where(whole == jnp.inf, 1.0, p), jnp.where(whole == jnp.inf, 0.0, q)
+    p, q = (jnp.where(large & (given_x < jnp.inf), e, y) for e, y in zip(by_expansion, (below, beyond), strict=True))
+    p, q = jnp.where(given_x == jnp.inf, 1.0, p), jnp.where(given_x == jnp.inf, 0.0, q)
     # A law of shape 0 is all at 0.
     p, q = jnp.where(at_zero, 1.0, p), jnp.where(at_zero, 0.0, q)
     return jnp.where(valid | at_zero, p, jnp.nan), jnp.where(valid | at_zero, q, jnp.nan)
@@ -84,7 +106,7 @@ def large_masses(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     tail = jnp.zeros_like(m)
     for n in range(27, 1, -2):
         tail = (tail + 1 / n) * s * s
-    half = jnp.where(jnp.abs(m) < 0.4, m * s - 2 * s * tail, m - jnp.log1p(m))
+    half = jnp.where(jnp.abs(m) < 0.4, m * s - 2 * s * tail, m - jnp.log1p(m))  # y^2 / 2
     y = jnp.where(m < 0, -1.0, 1.0) * jnp.sqrt(2 * half)
     # The three coefficients as power series of y.
     rest = jnp.zeros_like(y)
@@ -137,14 +159,19 @@ def scaled_bessel(order: int, x: jax.Array) -> jax.Array:
     size = jnp.abs(x)
     large = size > FAR
 
-    def add(state: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
+    # Both series, each term the last one times a ratio, until terms are rounding.
+    def add_term(state: Series) -> Series:
         k, term, total = state
-        near = size * size / (4 * k * (k + order))
-        ratio = jnp.where(large, ((2 * k - 1) ** 2 - 4 * order**2) / (8 * k * jnp.where(large, size, 1.0)), near)
-        return k + 1, term * ratio, total + term * ratio
+        power_ratio = size * size / (4 * k * (k + order))
+        asymptotic_ratio = ((2 * k - 1) ** 2 - 4 * order**2) / (8 * k * jnp.where(large, size, 1.0))
+        ratio = jnp.where(large, asymptotic_ratio, power_ratio)
+        return Series(k + 1, term * ratio, total + term * ratio)
+
+    def has_more_terms(state: Series) -> jax.Array:
+        return jnp.abs(state.term) > EPSILON / 8 * state.total
 
     first = jnp.where(large | (order == 0), 1.0, size / 2)
-    total = jax.lax.while_loop(lambda s: jnp.abs(s[1]) > EPSILON / 8 * s[2], add, (jnp.ones_like(x), first, first))[2]
+    total = jax.lax.while_loop(has_more_terms, add_term, Series(jnp.ones_like(x), first, first)).total
     scale = jnp.where(large, 1 / (np.sqrt(2 * np.pi) * jnp.sqrt(jnp.where(large, size, 1.0))), jnp.exp(-size))
     value = jnp.where(jnp.isnan(x), jnp.nan, total * scale)
     return jnp.where(x < 0, -value, jnp.where(x == 0, x, value)) if order else value
@@ -157,52 +184,55 @@ def digamma(x: jax.Array) -> jax.Array:
 
     Source: Abramowitz and Stegun, Handbook of mathematical functions, 6.3.5, 6.3.7 and 6.3.18.
     """
+    # Where x is not positive, psi(1 - x) first. From `large` = y + n >= 10 back: psi(y) = psi(y + n) - sum 1 / (y + i).
     mirrored = x <= 0
-    at = jnp.where(mirrored, 1 - x, x)
-    passed = jnp.zeros_like(x)
+    large = jnp.where(mirrored, 1 - x, x)
+    reciprocals = jnp.zeros_like(x)
     for _ in range(10):
-        low = at < 10
-        passed, at = passed + jnp.where(low, 1 / at, 0.0), jnp.where(low, at + 1, at)
-    square, tail = 1 / (at * at), jnp.zeros_like(x)
+        low = large < 10
+        reciprocals, large = reciprocals + jnp.where(low, 1 / large, 0.0), jnp.where(low, large + 1, large)
+    square, tail = 1 / (large * large), jnp.zeros_like(x)
     for coefficient in BERNOULLI[::-1]:
         tail = (tail + coefficient) * square
-    value = jnp.log(at) - 0.5 / at - tail - passed
-    nearest = x - jnp.round(x)
-    turned = np.pi / jnp.tan(np.pi * jnp.where(nearest == 0, 1.0, nearest))
-    return jnp.where(mirrored, jnp.where(nearest == 0, jnp.nan, value - turned), value)
+    value = jnp.log(large) - 0.5 / large - tail - reciprocals
+    # tan(pi x) by the distance from the nearest whole number, which is exact; a pole at each of these.
+    distance = x - jnp.round(x)
+    reflection = np.pi / jnp.tan(np.pi * jnp.where(distance == 0, 1.0, distance))
+    return jnp.where(mirrored, jnp.where(distance == 0, jnp.nan, value - reflection), value)
 
 
-def _masses(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    both = _inline_in_double(gamma_masses, lowering, equation, inputs)
-    return [both[equation.primitive.name == "igammac"]]
+def _lower_igamma(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    """Return P(a, x) of `igamma`, or Q(a, x) of `igammac`."""
+    below, above = _inline_in_double(gamma_masses, lowering, equation, inputs)
+    return [above if equation.primitive.name == "igammac" else below]
 
 
 def _inline_in_double(
     function: Callable[..., Any], lowering: Lowering, equation: JaxprEqn, inputs: list[Value]
 ) -> list[Value]:
-    """Compute in double precision, of numbers of single precision too, for whose results it has digits to spare."""
+    """Return the results of a function of scalars over arrays, computed in double precision of either."""
     avals: list[Any] = [v.aval for v in equation.invars]
     if avals[0].dtype not in (np.float64, np.float32):
         raise Unsupported(f"{equation.primitive.name} of numbers of type {avals[0].dtype}")
-    results = lowering.inline(
-        _trace_over(function, len(avals), avals[0].shape), [_of_type(lowering, "f64", x) for x in inputs]
-    )
-    return [_of_type(lowering, type_of(avals[0]), x) for x in results]
+    program = _trace_over(function, len(avals), avals[0].shape)
+    results = lowering.inline(program, [_convert(lowering, "f64", x) for x in inputs])
+    return [_convert(lowering, type_of(avals[0]), x) for x in results]
 
 
-def _of_type(lowering: Lowering, type: Type, value: Value) -> Value:
+def _convert(lowering: Lowering, type: Type, value: Value) -> Value:
+    """Return an array's numbers in another type."""
     nodes = lowering.nodes(value)
     return array_of((lowering.graph.node("convert", type, n) for n in nodes.ravel().tolist()), nodes.shape)
 
 
 @cache
 def _trace_over(function: Callable[..., Any], count: int, shape: tuple[int, ...]) -> ClosedJaxpr:
-    """Return the program of a function of scalars over arrays of a shape."""
-    over = function
+    """Return the program of a function of `count` scalars over arrays of a shape."""
+    over_arrays = function
     for _ in shape:
-        over = jax.vmap(over)
+        over_arrays = jax.vmap(over_arrays)
     with jax.enable_x64(True):
-        return jax.make_jaxpr(over)(*[like(shape, np.float64)] * count)
+        return jax.make_jaxpr(over_arrays)(*[like(shape, np.float64)] * count)
 
 
 OF_ONE: dict[str, Callable[[jax.Array], jax.Array]] = {
@@ -210,5 +240,5 @@ OF_ONE: dict[str, Callable[[jax.Array], jax.Array]] = {
     "bessel_i1e": partial(scaled_bessel, 1),
     "digamma": digamma,
 }
-IN_MEMORY |= {"igamma": _masses, "igammac": _masses}
+IN_MEMORY |= {"igamma": _lower_igamma, "igammac": _lower_igamma}
 IN_MEMORY |= {name: partial(_inline_in_double, function) for name, function in OF_ONE.items()}

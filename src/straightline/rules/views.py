@@ -20,7 +20,7 @@ View = Callable[[InMemory, Any, tuple[int, ...]], InMemory | None]
 
 
 def _make_view_rule(name: str, view: View) -> Rule:
-    """Make a rule of one array: its view, or the rearranged nodes if there is none."""
+    """Return a rule of one array: its view, or the rearranged nodes if there is none."""
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
         viewed = view(inputs[0], equation.params, result_shape(equation))
@@ -84,7 +84,7 @@ def _lower_dynamic_slice(lowering: Lowering, equation: JaxprEqn, inputs: list[Va
 
 
 def _dynamic_slice_of_nodes(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[Value]:
-    """Slice one axis after another, each start clamped so that the slice lies inside; from memory if it may be many."""
+    """Slice one axis after another, each start clamped so that the slice lies inside; in memory if places are many."""
     x, sizes, starts = inputs[0], equation.params["slice_sizes"], [lowering.scalar(x) for x in inputs[1:]]
     for axis, (start, size) in enumerate(zip(starts, sizes, strict=True)):
         last = x.shape[axis] - size
@@ -96,13 +96,11 @@ def _dynamic_slice_of_nodes(lowering: Lowering, equation: JaxprEqn, inputs: list
 
 def _slice_window(lowering: Lowering, x: np.ndarray, axis: int, start: Node, size: int) -> np.ndarray:
     """Return `size` entries along an axis from a start that may depend on data."""
-    last = x.shape[axis] - size
-    cases = [x[(slice(None),) * axis + (slice(first, first + size),)] for first in range(last + 1)]
-    return (
-        cases[min(max(int(start.value), 0), last)]
-        if start.op == "constant"
-        else select_array(lowering.graph, start, cases)
-    )
+    last: int = x.shape[axis] - size
+    cases: list[np.ndarray] = [x[(slice(None),) * axis + (slice(first, first + size),)] for first in range(last + 1)]
+    if start.op == "constant":
+        return cases[min(max(int(start.value), 0), last)]
+    return select_array(lowering.graph, start, cases)
 
 
 def make_indexable(lowering: Lowering, x: Value, places: list[Value]) -> Value:
@@ -122,30 +120,34 @@ def make_indexable(lowering: Lowering, x: Value, places: list[Value]) -> Value:
 
 
 def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Gather x[i, j, ...] of whole rows as a view, where no other value fills what is outside; others use nodes."""
+    """Gather one window x[i, j, ...] of an array in memory as a view; other gathers use nodes.
+
+    Where the mode fills what is outside, a window that is not inside is replaced by the value.
+    """
     numbers, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
     axes, indices = numbers.start_index_map, lowering.nodes(inputs[1])
     indices = narrowed(lowering, indices) if fills(equation) else indices
     x = make_indexable(lowering, inputs[0], [indices])
     if not isinstance(x, InMemory) or indices.size != len(axes) or numbers.operand_batching_dims:
         return list(RULES["gather"](lowering, equation, [lowering.nodes(i) for i in inputs]))
-    offset, moves, flag = 0, [], lowering.graph.constant(True, "bool")
+    # Where the window starts, clamped to the array: a known offset, and moves by places that data decide.
+    offset, moves, is_inside = 0, [], lowering.graph.constant(True, "bool")
     for axis, start in zip(axes, indices.ravel().tolist(), strict=True):
         last = x.shape[axis] - sizes[axis]
         first = clamp_place(lowering, start, last)
-        flag = lowering.graph.node("and", "bool", flag, inside(lowering.graph, start, last))
+        is_inside = lowering.graph.node("and", "bool", is_inside, inside(lowering.graph, start, last))
         if isinstance(first, int):
             offset += x.strides[axis] * first
         else:
             moves.append((x.strides[axis], first))
-    left = [a for a in range(x.ndim) if a not in numbers.collapsed_slice_dims]
-    view = x.view([sizes[a] for a in left], [x.strides[a] for a in left], offset, *moves)
-    row = view.view(result_shape(equation), _match_strides(view, result_shape(equation)))
-    if not fills(equation) or (flag.op == "constant" and flag.value):
-        return [row]
-    # A row that is not inside is filled with a value.
-    missing, nodes = fill_of(lowering, equation), lowering.nodes(row)
-    return [array_of([select(lowering.graph, flag, n, missing) for n in nodes.ravel().tolist()], nodes.shape)]
+    # The window as a view, in the result's shape.
+    window_axes = [a for a in range(x.ndim) if a not in numbers.collapsed_slice_dims]
+    view = x.view([sizes[a] for a in window_axes], [x.strides[a] for a in window_axes], offset, *moves)
+    window = view.view(result_shape(equation), _match_strides(view, result_shape(equation)))
+    if not fills(equation) or (is_inside.op == "constant" and is_inside.value):
+        return [window]
+    filling, nodes = fill_of(lowering, equation), lowering.nodes(window)
+    return [array_of([select(lowering.graph, is_inside, n, filling) for n in nodes.ravel().tolist()], nodes.shape)]
 
 
 def _match_strides(view: InMemory, shape: tuple[int, ...]) -> list[int]:
@@ -173,7 +175,10 @@ def _concatenate(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
 
 
 def join_arrays(lowering: Lowering, parts: list[Value], shape: tuple[int, ...]) -> InMemory:
-    """Join arrays into one in memory: an array that fills its own memory is written there directly."""
+    """Return arrays one after another in one buffer of this shape, which is that of their concatenation.
+
+    An array that has a buffer of its own (`_is_alone`) is computed into it directly, all others are copied.
+    """
     graph = lowering.graph
     type = next(x for x in parts if isinstance(x, InMemory)).type
     buffer, start = Buffer("scratch", type, shape, graph.current), 0
