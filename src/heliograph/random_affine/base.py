@@ -219,18 +219,18 @@ class AbstractRandomAffine(Module):
         return self
 
     def list_outcomes(self) -> list["Outcome"]:
-        """List every set of losses of a map without memory; those of probability 0 are left out."""
+        """Return every set of losses of a map without memory; those of probability 0 are left out."""
         check_forgets("channel with erasures", self)
         if not self.erases:
             return [Outcome(1.0, self, np.ones(self.outputs, dtype=bool))]
         return [o for o in self._outcomes() if is_traced(o.probability) or o.probability > 0]
 
     def _outcomes(self) -> list["Outcome"]:
-        """List the sets of losses of a map that erases; by default a refusal."""
+        """Return the sets of losses of a map that erases; by default a refusal."""
         raise fail("channel with erasures", "erasures in series and stacks", type(self).__name__)
 
     def list_atoms(self) -> list[Component]:
-        """List all combinations of gains and noises, where these are finitely many; by default a refusal."""
+        """Return all combinations of gains and noises, where these are finitely many; by default a refusal."""
         raise fail("mixture filter", "maps made of hops, series, stacks, sums and mixtures", type(self).__name__)
 
     def disturb_gain(self) -> DisturbedGain:
@@ -265,7 +265,7 @@ class AbstractRandomAffine(Module):
         return [self]
 
     def covers(self, own: "AbstractRandomAffine", same_noise: SameNoise) -> bool:
-        """Test whether another map is written like this one, its laws within what this one believes possible.
+        """Decide whether another map is written like this one, its laws within what this one believes possible.
 
         Args:
             own: the other map.
@@ -280,7 +280,7 @@ class AbstractRandomAffine(Module):
         return len(believed) == len(parts) and all(x.covers(y, same_noise) for x, y in pairs)
 
     def covers_kind(self, own: "AbstractRandomAffine", same_noise: SameNoise) -> bool:
-        """As `covers`, of a map that is no series; by default, the same alone."""
+        """Decide the same as `covers` of a map that is no series; by default only an equal map is covered."""
         return same(self, own)
 
     @property

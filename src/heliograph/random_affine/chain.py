@@ -161,7 +161,7 @@ class MarkovChain(AbstractMemory):
         return bool(np.any(self.radius > 0))
 
     def covers(self, own: "MarkovChain") -> bool:
-        """Test whether another chain is this memory, its transition within the radius."""
+        """Decide whether another chain is this memory, its transition within the radius."""
         if own.identity != self.identity or not equal_to_rounding(self.initial, own.initial):
             return False
         return within(own.transition, own.radius, self.transition, self.radius)
@@ -267,7 +267,9 @@ class Autoregression(AbstractMemory):
         return (jnp.asarray(x) if state is None else rho * state + jnp.sqrt(1 - rho**2) * x), w
 
     def chain(self, modes: int) -> Nodes:
-        """A chain with the same mean, variance and correlation: binomial nodes, E[c+ | c] = rho c, no negative entry.
+        """Return a chain with the same mean, variance and correlation, without negative entries.
+
+        Its states are binomial nodes, and E[c+ | c] = rho c.
 
         Source: Rouwenhorst, Asset pricing implications of equilibrium business cycle models (1995).
         """
@@ -279,7 +281,7 @@ class Autoregression(AbstractMemory):
 
 
 def stationary(transition: Rows) -> Law:
-    """Return the law p = p Pi of a chain that has only one."""
+    """Return the law p = p Pi of a chain that has only one; ValueError of one that has several."""
     m = len(transition)
     xp = library(transition)
     if not is_traced(transition) and np.linalg.matrix_rank(transition - np.eye(m), tol=PROBABILITY_TOLERANCE) < m - 1:

@@ -62,7 +62,7 @@ class AbstractCombination(AbstractComposite):
         return max(affine.degree_in(identity) for affine in self.maps)
 
     def covers_maps(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
-        """Test whether another map is of this kind and each of its maps covered by that of this one."""
+        """Decide whether another map is of this kind and each of its maps covered by that of this one."""
         if not isinstance(own, AbstractCombination) or type(own) is not type(self) or len(own.maps) != len(self.maps):
             return False
         return all(x.covers(y, same_noise) for x, y in zip(self.maps, own.maps, strict=True))
@@ -79,7 +79,7 @@ class AbstractCombination(AbstractComposite):
 def _join_outcomes(
     a: list[Outcome], b: list[Outcome], join: Callable[[Outcome, Outcome], tuple[AbstractRandomAffine, np.ndarray]]
 ) -> list[Outcome]:
-    """Return the losses of independent parts: probabilities multiply."""
+    """Return the sets of losses of two independent parts together; join(x, y) gives the map and what arrives."""
     if len(a) * len(b) > OUTCOME_LIMIT:
         raise fail("channel with erasures", f"at most {OUTCOME_LIMIT} sets of losses", f"{len(a) * len(b):,}")
     return [Outcome(x.probability * y.probability, *join(x, y)) for x in a for y in b]
@@ -155,7 +155,7 @@ class Series(AbstractCombination):
         return self.rebuilt(*(affine.condition_on_arrival() for affine in self.maps))
 
     def _outcomes(self) -> list[Outcome]:
-        """An output is lost where the later map loses it or has a gain on what the earlier one lost."""
+        """Return the sets of losses: an output is lost where a map loses it, or has a gain on what one before lost."""
         return reduce(partial(_join_outcomes, join=_join_in_series), (m.list_outcomes() for m in self.maps))
 
     def list_atoms(self) -> list[Component]:
@@ -200,7 +200,7 @@ def _join_in_series(x: Outcome, y: Outcome) -> tuple[AbstractRandomAffine, np.nd
 
 
 def _compose_draws(second: jax.Array, first: jax.Array) -> jax.Array:
-    """Return the product of two drawn maps, where NaN rows of the first are lost: what has no gain on them is not."""
+    """Return the product of two drawn maps, whose NaN rows are lost outputs: what has a gain on these is lost too."""
     lost = jnp.isnan(first).any(axis=1)
     reached = jnp.any((second != 0) & lost, axis=1) | jnp.isnan(second).any(axis=1)
     return jnp.where(reached[:, None], jnp.nan, second @ jnp.where(lost[:, None], 0.0, first))
@@ -272,7 +272,7 @@ class Stack(AbstractCombination):
         return self.rebuilt(*(affine.condition_on_arrival() for affine in self.maps))
 
     def _outcomes(self) -> list[Outcome]:
-        """Every set of losses of each map with every one of the others."""
+        """Return every set of losses of each map with every one of the others."""
         return reduce(partial(_join_outcomes, join=_join_in_stack), (m.list_outcomes() for m in self.maps))
 
     def list_atoms(self) -> list[Component]:
@@ -302,6 +302,7 @@ class Stack(AbstractCombination):
 
 
 def _join_in_stack(x: Outcome, y: Outcome) -> tuple[AbstractRandomAffine, np.ndarray]:
+    """Return y below x, and which of the outputs of both arrive."""
     return Stack([x.map, y.map]), np.concatenate([x.arrived, y.arrived])
 
 
@@ -318,12 +319,14 @@ def stack_rows(channel: Stack, order: int, tables: list[list[Any]], times: Calla
     for powers in exponents(channel.outputs + 1, order):
         polynomial, degree, start = np.ones(1), 0, 0
         for m, table in zip(channel.maps, tables, strict=True):
+            # The powers of this part's outputs, and its polynomial of them.
             a = powers[start : start + m.outputs]
             start, k = start + m.outputs, sum(a)
             if k:
                 factor = table[k][..., position(m.outputs + 1, k)[(*a, 0)], :]
                 polynomial, degree = times(polynomial, degree, factor, k, variables), degree + k
-        constant = np.zeros(count_monomials(variables, powers[-1]))
-        constant[-1] = 1.0  # 1^(order - |a|)
-        rows.append(times(polynomial, degree, constant, powers[-1], variables))
+        # Times 1^(order - |a|), so that all rows have the degree `order`.
+        power_of_one = np.zeros(count_monomials(variables, powers[-1]))
+        power_of_one[-1] = 1.0
+        rows.append(times(polynomial, degree, power_of_one, powers[-1], variables))
     return rows

@@ -125,18 +125,17 @@ class Delayed(AbstractDelayLine):
         (self.link,) = check_maps("delayed link", [link])
         if link.past:
             raise fail("delayed link", "one that is not late itself", f"one late by up to {link.past} steps")
-        self.times, self.timestamped = (
-            _list_delays(delay),
-            instance("timestamped", timestamped, bool, "True or False"),
-        )
-        items = [_make_selection(d, self.past, link.inputs, timestamped) for d in self.times]
+        self.times = _list_delays(delay)
+        self.timestamped = instance("timestamped", timestamped, bool, "True or False")
+        # The selection S_d of each possible delay, drawn by its law, by a chain, or certain.
+        selections = [_make_selection(d, self.past, link.inputs, timestamped) for d in self.times]
         match delay:
             case Discrete():
-                self.delay = Mixture(items, delay.probabilities, delay.radius)
+                self.delay = Mixture(selections, delay.probabilities, delay.radius)
             case MarkovChain():
-                self.delay = Modes(delay, items)
+                self.delay = Modes(delay, selections)
             case _:
-                self.delay = items[0]
+                self.delay = selections[0]
 
     @property
     def line(self) -> AbstractRandomAffine:
@@ -181,7 +180,7 @@ class Delayed(AbstractDelayLine):
 
 
 def _list_delays(delay: Delay) -> tuple[int, ...]:
-    """List the possible delays in steps."""
+    """Return the possible delays in steps; ValueError of what is no delay."""
     match delay:
         case Discrete():
             values = [int(d) if d == int(d) else float(d) for d in np.asarray(delay.values)]
@@ -203,13 +202,13 @@ def _make_selection(d: int, longest: int, size: int, timestamped: bool) -> GainA
 
 
 def place_on_delay_line(channel: T) -> T:
-    """Return the channel (or all channels in a tree) as a plain map of the line."""
+    """Return the channel, or a tree in which each channel with delays is the same map of the line without delay."""
 
-    def plain(leaf: object) -> object:
+    def take_line(leaf: object) -> object:
         return leaf.line if isinstance(leaf, AbstractDelayLine) else leaf
 
-    without_line: T = jax.tree.map(plain, channel, is_leaf=lambda leaf: isinstance(leaf, AbstractDelayLine))
-    return without_line
+    replaced: T = jax.tree.map(take_line, channel, is_leaf=lambda leaf: isinstance(leaf, AbstractDelayLine))
+    return replaced
 
 
 def signal_size(channel: AbstractRandomAffine) -> int:
@@ -218,7 +217,10 @@ def signal_size(channel: AbstractRandomAffine) -> int:
 
 
 def place_part(channel: AbstractRandomAffine, total: int, start: int, past: int) -> AbstractRandomAffine:
-    """Return the channel of y[start:start + sent] as one of all of y, and of a line at least as long as its own."""
+    """Return a channel of y[start:start + size] as one of all of y (total,), and of a line of `past` steps.
+
+    The line is at least as long as the channel's own.
+    """
     longest, size = channel.past, signal_size(channel)
     rows = np.concatenate([t * total + start + np.arange(size) for t in range(longest + 1)])
     chosen = Series([known(np.eye((1 + past) * total)[rows]), place_on_delay_line(channel) if longest else channel])
@@ -264,6 +266,7 @@ class DelayedLine(AbstractMapWrapper):
         """Draw the present reception, and put it before the earlier ones."""
         inner, before = state
         inner, h = self.base.draw(inner, key)
+        # Each reception takes its own part of the line: that of t steps ago begins t signals later.
         receptions = jnp.concatenate([h[None, :-1], before])
         rows = [
             jnp.pad(reception[:, :-1], ((0, 0), (t * self.size, (self.steps - t) * self.size)))
@@ -336,21 +339,24 @@ def _join_stage(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAffine:
     if links[0].past and not isinstance(links[0], Delayed):
         raise fail("series", "links each delayed by itself", "a combination of delayed links")
     # The random delay comes first; constant ones are added to it.
-    start, added = (delays[0], delays[1:]) if isinstance(links[0], Delayed) else (None, delays)
+    first, added = (delays[0], delays[1:]) if isinstance(links[0], Delayed) else (None, delays)
+    # A time stamp would have to be that of the whole delay: only the last delay may have one, and of the first link's
+    # own none may follow.
     timestamped = [link.timestamped for link in delays]
-    if any(timestamped[:-1]) or (timestamped[-1] and len(delays) > 1 and start is not None):
+    if any(timestamped[:-1]) or (timestamped[-1] and len(delays) > 1 and first is not None):
         raise fail("time stamps", "those of one link", "those of several in series")
+    # A link that remembers cannot be moved to behind the delay.
     last = max(i for i, link in enumerate(links) if isinstance(link, Delayed))
     for link in links[:last]:
         if link.remembers:
             raise fail("link before a delay", "one that forgets", f"{type(link).__name__}, which remembers")
     chain = Series([link.link if isinstance(link, Delayed) else link for link in links])
     more = sum(link.times[0] for link in added)
-    return Delayed(chain, more if start is None else _add_delay(start, more), any(timestamped))
+    return Delayed(chain, more if first is None else _add_delay(first, more), any(timestamped))
 
 
 def _add_delay(link: Delayed, more: int) -> Delay:
-    """Add a number of steps to a link's delay, none after a chain."""
+    """Return a link's delay with a number of steps more; a chain's as it is, since its mode is the number of steps."""
     match link.delay:
         case Mixture():
             times = np.array(link.times, dtype=float) + more

@@ -42,7 +42,7 @@ class Erasure(AbstractMapWrapper):
         return self.base.condition_on_arrival()
 
     def _outcomes(self) -> list[Outcome]:
-        """Either what the map delivers, or nothing."""
+        """Return the two outcomes: what the map delivers, or nothing."""
         arrival, lost = plain(self.arrival), np.zeros(self.outputs, dtype=bool)
         listed = [o._replace(probability=arrival * o.probability) for o in self.base.list_outcomes()]
         return [*listed, Outcome(1 - arrival, known(np.zeros((self.outputs, self.inputs))), lost)]

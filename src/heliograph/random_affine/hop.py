@@ -53,6 +53,7 @@ class AbstractHop(AbstractRandomAffine):
 
     @property
     def _gain_is_one(self) -> bool:
+        """True of a gain that is known to be one; by default none is."""
         return False
 
     def visit_hops(self, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
@@ -138,10 +139,11 @@ class GainAndNoise(AbstractHop):
         """Sum the known B_k with the exact range of each E[g^k], from the closed-form LP of a discrete law."""
         basis, xp = self.gain_coefficients(order), library(self.gain_coefficients(order))
         ends = [self.law.moment_interval(k) for k in range(order + 1)]
-        products = [
-            (xp.minimum(b * lo, b * hi), xp.maximum(b * lo, b * hi)) for b, (lo, hi) in zip(basis, ends, strict=True)
-        ]
-        return sum(low for low, _ in products), sum(high for _, high in products)
+        lows, highs = [], []
+        for b, (low, high) in zip(basis, ends, strict=True):
+            lows.append(xp.minimum(b * low, b * high))
+            highs.append(xp.maximum(b * low, b * high))
+        return sum(lows), sum(highs)
 
     def covers_kind(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
         """Return a hop of this matrix whose gain has a law that is believed possible."""
@@ -203,8 +205,8 @@ class GainAndNoise(AbstractHop):
         """Take the noise away where its law has outliers."""
         if not self.noise.has_outliers:
             return self, None
-        still = Gaussian(np.zeros((self.outputs, self.outputs)), self.noise.mean)
-        return GainAndNoise(self.law, self.matrix, still), self.noise
+        mean_alone = Gaussian(np.zeros((self.outputs, self.outputs)), self.noise.mean)
+        return GainAndNoise(self.law, self.matrix, mean_alone), self.noise
 
     @property
     def is_silent(self) -> bool:

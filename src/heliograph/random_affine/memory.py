@@ -61,23 +61,23 @@ def draw_with_shared_memories(
 
 
 def memories(channel: PyTree) -> dict[str, AbstractMemory]:
-    """The memories on which the modes of a map (or of all maps in a tree) depend, by identity, in their order."""
+    """Return the memories on which the modes of a map (or of all maps in a tree) depend, by identity, in order."""
     parts = jax.tree.leaves(channel, is_leaf=is_modal)
     return unique_memories(leaf.memory for leaf in parts if is_modal(leaf))
 
 
 def condition_on_memories(channel: T, states: Sequence[int | float | jax.Array | np.ndarray]) -> T:
-    """The map that forgets which modes, for the states of its `memories`; whatever is combined of maps stays so."""
+    """Return the map without memory that a map is for these states of its `memories`, put together in the same way."""
     return condition_on_states(channel, dict(zip(memories(channel), states, strict=True)))
 
 
 def condition_on_states(channel: T, by_identity: Mapping[str, int | float | jax.Array | np.ndarray]) -> T:
     """Return `condition_on_memories` for states by the identity of their memory, among which there may be others."""
 
-    def chosen(leaf: PyTree) -> PyTree:
+    def condition(leaf: PyTree) -> PyTree:
         return leaf.given(by_identity[leaf.memory.identity]) if is_modal(leaf) else leaf
 
-    memoryless: T = jax.tree.map(chosen, channel, is_leaf=is_modal)
+    memoryless: T = jax.tree.map(condition, channel, is_leaf=is_modal)
     return memoryless
 
 
@@ -87,7 +87,7 @@ def is_modal(leaf: object) -> bool:
 
 
 def drop_names(channel: T) -> T:
-    """The map with its memories called 0, 1, ... in order of appearance: maps that share no others then look alike."""
+    """Return a map whose memories are called 0, 1, ... in order, so that maps that differ in names alone look alike."""
     held = memories(channel)
     return replace_memories(channel, {key: memory.labelled(str(i)) for i, (key, memory) in enumerate(held.items())})
 
@@ -101,13 +101,13 @@ def drop_identities(model: T) -> T:
 
 def separate_memories(maps: Sequence[T]) -> list[T]:
     """Return maps that share no unnamed memory: one that stands in several of them becomes one of each."""
-    apart, taken = [], set[str]()
+    separate, taken = [], set[str]()
     for index, affine in enumerate(maps):
         held = memories(affine)
-        again = {key: m.labelled(f"{key} of {index}") for key, m in held.items() if m.name is None and key in taken}
-        apart.append(replace_memories(affine, again))
+        twins = {key: m.labelled(f"{key} of {index}") for key, m in held.items() if m.name is None and key in taken}
+        separate.append(replace_memories(affine, twins))
         taken |= set(held)
-    return apart
+    return separate
 
 
 def align_memories_over_time(maps: Sequence[T]) -> list[T]:
@@ -125,10 +125,10 @@ def align_memories_over_time(maps: Sequence[T]) -> list[T]:
 def replace_memories(channel: T, twins: Mapping[str, AbstractMemory]) -> T:
     """Return the map with other memories in place of those of these identities."""
 
-    def replaced(leaf: PyTree) -> PyTree:
+    def replace(leaf: PyTree) -> PyTree:
         if not is_modal(leaf) or leaf.memory.identity not in twins:
             return leaf
         return eqx.tree_at(lambda m: m.memory, leaf, twins[leaf.memory.identity])
 
-    exchanged: T = jax.tree.map(replaced, channel, is_leaf=is_modal) if twins else channel
+    exchanged: T = jax.tree.map(replace, channel, is_leaf=is_modal) if twins else channel
     return exchanged

@@ -71,7 +71,7 @@ class Modes(AbstractUniform, AbstractModal):
 
 
 class _Chosen(AbstractUniform):
-    """One of several maps, by a traced index."""
+    """The map of a traced index among several."""
 
     maps: tuple[AbstractRandomAffine, ...]
     index: jax.Array
@@ -101,7 +101,7 @@ class ModeOutput(AbstractModal):
         return self.sent
 
     def carry_angles(self, sent: Angles) -> Angles:
-        """None: the number of a mode, whatever is sent."""
+        """Return none: the output is the number of a mode, whatever is sent."""
         return ()
 
     def visit_hops(self, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
@@ -203,7 +203,7 @@ class JointModes(Module):
         transition: law of the next mode by present mode (modes, modes).
         radius: how far each transition may be off, differently at each step (modes, modes).
         maps: the map in each mode.
-        beside: what else has the modes, in each of them.
+        beside: other models with the same memories, such as plant and sensor, in each of the modes.
     """
 
     initial: Law
@@ -238,6 +238,7 @@ def joint_modes(
     """
     check_count("order", order)
     instance("channel", channel, AbstractRandomAffine, "a channel, such as hop(...)")
+    # Each memory as finitely many states.
     held = memories((beside, channel))
     chains = [_nodes_of_memory(m, order * channel.degree_in(identity), nodes) for identity, m in held.items()]
     total = prod(len(chain.initial) for chain in chains)
@@ -247,16 +248,22 @@ def joint_modes(
     # Independent memories: their laws multiply.
     initial = reduce(xp.kron, [chain.initial for chain in chains], np.ones(1))
     transition = reduce(xp.kron, [chain.transition for chain in chains], np.ones((1, 1)))
+    largest = reduce(xp.kron, [chain.transition + chain.radius for chain in chains], np.ones((1, 1)))
+    # The state of each memory in each joint mode, and the maps given these.
     by_mode = [
-        dict(zip(held, [s.item() for s in chosen], strict=True))
-        for chosen in product(*(chain.states for chain in chains))
+        dict(zip(held, [state.item() for state in states], strict=True))
+        for states in product(*(chain.states for chain in chains))
     ]
     maps = tuple(condition_on_states(channel, states) for states in by_mode)
     for m in maps:
         check_forgets("channel of a filter", m)
-    most = reduce(xp.kron, [chain.transition + chain.radius for chain in chains], np.ones((1, 1)))
-    others = tuple(condition_on_states(beside, states) for states in by_mode)
-    return JointModes(initial, transition, most - transition, maps, others)
+    return JointModes(
+        initial=initial,
+        transition=transition,
+        radius=largest - transition,
+        maps=maps,
+        beside=tuple(condition_on_states(beside, states) for states in by_mode),
+    )
 
 
 def _nodes_of_memory(memory: AbstractMemory, degree: int, nodes: int | None) -> Nodes:
@@ -287,7 +294,7 @@ def mix_maps(modes: JointModes, law: np.ndarray | None = None) -> AbstractRandom
 
 
 def long_run_law(initial: Float[np.ndarray, " modes"], chain: Float[np.ndarray, "modes modes"]) -> np.ndarray:
-    """p (I + Pi)^n / 2^n for a large n: the mean of the laws of all steps, of a chain that goes in circles too."""
+    """Return the mean of the laws of all steps, of a chain that goes in circles too: p ((I + Pi) / 2)^n, n large."""
     rows = (np.eye(len(chain)) + chain) / 2
     for _ in range(DOUBLINGS):
         rows = rows @ rows
@@ -304,10 +311,12 @@ def mode_laws_over_time(steps: Sequence[JointModes]) -> list[np.ndarray]:
 
 
 def is_memory_irrelevant_for_linear_filter(steps: Sequence[JointModes], constant: bool) -> bool:
-    """Return whether the best linear filter may ignore memory: Cov(Hbar_k, Hbar_l) = 0 for k < l.
+    """Decide whether the best linear filter may ignore memory: Cov(Hbar_k, Hbar_l) = 0 for k < l.
 
-    Hbar_k = E[H_k | mode]. Where nothing varies (`constant`, one step given), the law of the modes must be that of all
-    steps, and lags up to the number of modes decide, since Pi^t is a combination of lower powers (Cayley-Hamilton).
+    Hbar_k,i = E[H_k | mode i]. With the law p_k of the modes the covariance is
+    sum_ij p_k,i (Hbar_k,i - E Hbar_k) (Pi^(l - k))_ij Hbar_l,j. Where nothing varies (`constant`, one step given), the
+    law must be that of all steps, and lags up to the number of modes decide, since Pi^t is a combination of lower
+    powers (Cayley-Hamilton).
     """
     items = list(steps) * (len(steps[0].initial) + 1) if constant else list(steps)
     if constant and not np.allclose(steps[0].initial @ steps[0].transition, steps[0].initial, rtol=0, atol=ROUNDING):
@@ -317,9 +326,9 @@ def is_memory_irrelevant_for_linear_filter(steps: Sequence[JointModes], constant
     size = max(float(np.max(np.abs(m))) for m in means) ** 2
     starts = 1 if constant else len(items)
     for k, law in enumerate(mode_laws_over_time(items)[:starts]):
-        apart = law[:, None] * (means[k] - law @ means[k])
+        deviations = law[:, None] * (means[k] - law @ means[k])
         for step, later in zip(items[k:-1], means[k + 1 :], strict=True):
-            apart = np.asarray(step.transition).T @ apart
-            if np.max(np.abs(apart.T @ later)) > ROUNDING * size:
+            deviations = np.asarray(step.transition).T @ deviations
+            if np.max(np.abs(deviations.T @ later)) > ROUNDING * size:
                 return False
     return True

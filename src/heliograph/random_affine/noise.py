@@ -88,7 +88,7 @@ class AbstractNoise(Module):
         return SignalNoise(self.columns, self.covariance)
 
     def list_atoms(self) -> list[NoiseAtom]:
-        """List all combinations of the atoms of the noise, where these are finitely many; by default a refusal."""
+        """Return all combinations of the atoms of the noise, where these are finitely many; by default a refusal."""
         raise fail("mixture filter", "noises of finite support or Gaussian", type(self).__name__)
 
     def split(self, groups: Sequence[Sequence[int]]) -> "list[AbstractNoise] | None":
@@ -162,6 +162,7 @@ class Gaussian(AbstractNoise):
 
         @cache
         def expectation(a: Exponents) -> Number:
+            """Return E[n^a], with n_i taken out of n^a = n_i g(n)."""
             if sum(a) == 0:
                 return 1.0
             i = next(index for index, power in enumerate(a) if power)
@@ -224,7 +225,7 @@ class FiniteSupport(AbstractNoise):
         return [NoiseAtom(plain(p), v, none) for p, v in zip(self.probabilities, self.atoms, strict=True)]
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """Invert the distribution function at a uniform draw."""
+        """Draw one of the values, by inverting the distribution function at a uniform draw."""
         return jnp.asarray(self.atoms)[draw_index(self.probabilities, key)]
 
     def moment(self, powers: Exponents) -> Number:
@@ -286,8 +287,8 @@ class Independent(AbstractNoise):
         """Return the parts of each group, where no part is of two."""
         owners = np.repeat(np.arange(len(self.parts)), [component.dimension for component in self.parts])
         owned = [[self.parts[i] for i in dict.fromkeys(owners[list(group)].tolist())] for group in groups]
-        whole = [sum(part.dimension for part in parts) for parts in owned] == [len(group) for group in groups]
-        return [Independent(parts) for parts in owned] if whole else None
+        apart = [sum(part.dimension for part in parts) for parts in owned] == [len(group) for group in groups]
+        return [Independent(parts) for parts in owned] if apart else None
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw each part."""
@@ -357,12 +358,13 @@ class Shaped(AbstractNoise):
 
 def _multiply_by_linear(polynomial: dict[Exponents, Number], row: Vector) -> dict[Exponents, Number]:
     """Return the coefficients of p(u) sum_j row_j u_j."""
-    raised_polynomial: dict[Exponents, Number] = {}
+    product: dict[Exponents, Number] = {}
+    used = [j for j, entry in enumerate(row) if not is_zero(entry)]
     for a, c in polynomial.items():
-        for j in (j for j, entry in enumerate(row) if not is_zero(entry)):
+        for j in used:
             raised = (*a[:j], a[j] + 1, *a[j + 1 :])
-            raised_polynomial[raised] = raised_polynomial.get(raised, 0.0) + c * plain(row[j])
-    return raised_polynomial
+            product[raised] = product.get(raised, 0.0) + c * plain(row[j])
+    return product
 
 
 NoiseLike = TypeAliasType("NoiseLike", AbstractNoise | ArrayLike)  # a law, a covariance, or a variance

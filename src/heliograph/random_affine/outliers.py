@@ -144,8 +144,9 @@ class Contaminated(AbstractNoise):
         self.means = xp.stack([xp.zeros(n), *centers])
         self.covariances = xp.stack([inlier, *spreads])
         self.mean = self.shares @ self.means
-        apart = self.means - self.mean
-        self.covariance = xp.einsum("j,jab->ab", self.shares, self.covariances + apart[:, :, None] * apart[:, None])
+        deviations = self.means - self.mean
+        second = self.covariances + deviations[:, :, None] * deviations[:, None]
+        self.covariance = xp.einsum("j,jab->ab", self.shares, second)
         self.bounded = False
 
     @classmethod
@@ -171,7 +172,7 @@ class Contaminated(AbstractNoise):
 
     @classmethod
     def at_most(cls, covariance: ArrayLike, share: ArrayLike, outlier_second_moment: ArrayLike) -> "Contaminated":
-        """Noise of mean zero of which bounds are known: at most this share of outliers, E[o o'] at most this matrix.
+        """Return zero-mean noise known by bounds: at most this share of outliers, E[o o'] at most this matrix.
 
         (1 - e) R + e G dominates the covariance for every share up to e, since G >= R.
 
@@ -222,7 +223,7 @@ class Contaminated(AbstractNoise):
 
 
 def precision_shares(degrees: ArrayLike) -> Vector:
-    """Mass of the gamma law of l between the geometric means of neighbouring PRECISIONS, at least LEAST_SHARE."""
+    """Return the gamma law's mass of l between geometric means of neighbouring PRECISIONS, at least LEAST_SHARE."""
     xp: Any = library(degrees)
     half = xp.asarray(degrees) / 2
     between = np.sqrt(PRECISIONS[1:] * PRECISIONS[:-1])
@@ -243,6 +244,7 @@ def has_bounded_noise(*parts: PyTree) -> bool:
 
 
 def _size(value: ArrayLike) -> int | None:
+    """Return the size of the matrix that a number is, 1; None of a matrix, which has its own."""
     return None if rank("covariance", value) else 1
 
 

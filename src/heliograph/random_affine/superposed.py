@@ -99,11 +99,15 @@ class Superposed(AbstractCombination):
         return Series([stack, GainAndNoise(Constant(1.0), total, self.noise)])
 
     def in_places(self, parts: Mapping[int, jax.Array | np.ndarray], axes: int) -> jax.Array | np.ndarray:
-        """Sum of arrays of some of the maps, whose last `axes` (1 or 2) are of what each takes and 1, in those of y."""
+        """Return the sum of arrays of some of the maps, each put at the places in (y, 1) of what its map takes.
+
+        parts: arrays by number of the map, whose last `axes` (1 or 2) have the length of (y_i, 1).
+        """
         size = self.inputs + 1
+        # Places of each part's entries in the flat axis or axes of (y, 1).
         where = [np.array([*self.places[i], self.inputs]) for i in parts]
         if axes == 2:
-            where = [(size * at[:, None] + at).reshape(-1) for at in where]
+            where = [(size * of_part[:, None] + of_part).reshape(-1) for of_part in where]
         if not parts:
             return np.zeros((self.outputs,) * axes + (size,) * axes)
         flat = [part.reshape(*part.shape[:-axes], -1) for part in parts.values()]
@@ -169,8 +173,8 @@ class Superposed(AbstractCombination):
         """Take the noise of the receiver where its law has outliers."""
         if not self.noise.has_outliers:
             return self, None
-        still = Gaussian(np.zeros((self.outputs, self.outputs)), self.noise.mean)
-        return Superposed(self.maps, still, self.places, self.inputs), self.noise
+        mean_alone = Gaussian(np.zeros((self.outputs, self.outputs)), self.noise.mean)
+        return Superposed(self.maps, mean_alone, self.places, self.inputs), self.noise
 
     def visit_hops(self, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
         """Visit each map as one link, with the part of the signal that it takes."""
@@ -186,15 +190,14 @@ class Superposed(AbstractCombination):
             _expand_map(matrix, m.outputs, chosen, order)
             for matrix, m, chosen in zip(parts, self.maps, self.places, strict=True)
         ]
-        law = noise_vector(self.noise, order)[None, :, None]
-        whole = _add_powers(
-            _sum_by_halves(terms, self.outputs), _expand_map(law, self.outputs, (), order), self.outputs
-        )
-        return _assemble_moments(whole, self.outputs, self.inputs, order)
+        # The noise as a map that takes nothing.
+        noise = _expand_map(noise_vector(self.noise, order)[None, :, None], self.outputs, (), order)
+        powers = _add_powers(_sum_by_halves(terms, self.outputs), noise, self.outputs)
+        return _assemble_moments(powers, self.outputs, self.inputs, order)
 
 
 class _Powers(NamedTuple):
-    """E[t^a | y] of a sum t of maps at each corner, by degree |a| = 0, 1, ...: homogeneous polynomials in (y, 1).
+    """Powers of a sum t of maps: E[t^a | y] at each corner, by degree |a|, homogeneous polynomials in (y, 1).
 
     places: of the components of y on which t depends, in order; by_degree: each (corners, monomials of t, monomials).
     """
@@ -224,7 +227,7 @@ def _find_degree(outputs: int, degree: int, order: int) -> np.ndarray:
 
 
 def _sum_by_halves(terms: Sequence[_Powers], outputs: int) -> _Powers:
-    """E[t^a | y] of a sum of terms from those of its halves: polynomials of few variables are multiplied first."""
+    """Return E[t^a | y] of a sum t of terms, from its halves: so polynomials of few variables are multiplied first."""
     if len(terms) == 1:
         return terms[0]
     middle = len(terms) // 2
@@ -232,18 +235,22 @@ def _sum_by_halves(terms: Sequence[_Powers], outputs: int) -> _Powers:
 
 
 def _add_powers(a: _Powers, b: _Powers, outputs: int) -> _Powers:
-    """E[(t + r)^c | y] = sum_{b <= c} C(c, b) E[t^b | y] E[r^(c-b) | y], at each pair of corners, the first slowest."""
+    """Return the powers of a sum t + r of independent maps at each pair of corners, those of t slowest.
+
+    E[(t + r)^c | y] = sum_{b <= c} C(c, b) E[t^b | y] E[r^(c-b) | y].
+    """
     places = tuple(sorted({*a.places, *b.places}))
     size, corners = len(places) + 1, len(a.by_degree[0]) * len(b.by_degree[0])
     left_variables, right_variables = ((*(places.index(i) for i in part.places), size - 1) for part in (a, b))
     by_degree = [library(a.by_degree[0], b.by_degree[0]).ones((corners, 1, 1))]
     for degree in range(1, len(a.by_degree)):
         total: Corners = np.zeros((count_monomials(size, degree), count_monomials(outputs, degree), corners))
-        for first, (row, mine, other, ways) in enumerate(_list_binomial_terms(outputs, degree)):
-            left = a.by_degree[first][:, None, mine, :, None] * ways[:, None, None]
-            right = b.by_degree[degree - first][None, :, other, None, :]
+        # Terms with |b| = first: the places of c, b and c - b, and C(c, b).
+        for first, (row, of_t, of_r, ways) in enumerate(_list_binomial_terms(outputs, degree)):
+            left = a.by_degree[first][:, None, of_t, :, None] * ways[:, None, None]
+            right = b.by_degree[degree - first][None, :, of_r, None, :]
             products = (left * right).reshape(corners, len(row), -1)
-            where = _products(left_variables, right_variables, first, degree - first, size).reshape(-1)
+            where = _place_products(left_variables, right_variables, first, degree - first, size).reshape(-1)
             rows = scatter((count_monomials(outputs, degree), len(where), corners), row, products.transpose(1, 2, 0))
             total = total + scatter((count_monomials(size, degree), *rows.shape[::2]), where, rows.swapaxes(0, 1))
         by_degree.append(total.transpose(2, 1, 0))
@@ -254,17 +261,20 @@ def _add_powers(a: _Powers, b: _Powers, outputs: int) -> _Powers:
 def _list_binomial_terms(outputs: int, degree: int) -> tuple[tuple[np.ndarray, ...], ...]:
     """Return terms of (t + r)^c with |c| = degree: places of c, b, c - b and C(c, b), for |b| = 0, 1, ..., degree."""
     names = exponents(outputs + 1, degree)
-    ways: list[list[tuple[int, ...]]] = [[] for _ in range(degree + 1)]
+    by_degree_of_b: list[list[tuple[int, ...]]] = [[] for _ in range(degree + 1)]
     for c, b, rest, weight in zip(*sum_plan(outputs, degree), strict=True):
-        if not names[c][-1]:
-            at = [position(outputs, sum(names[i][:-1]))[names[i][:-1]] for i in (c, b, rest)]
-            ways[sum(names[b][:-1])].append((*at, weight))
-    return tuple(tuple(np.array(column) for column in zip(*terms, strict=True)) for terms in ways)
+        if not names[c][-1]:  # |c| = degree: no power of 1
+            places = [position(outputs, sum(names[i][:-1]))[names[i][:-1]] for i in (c, b, rest)]
+            by_degree_of_b[sum(names[b][:-1])].append((*places, weight))
+    return tuple(tuple(np.array(column) for column in zip(*terms, strict=True)) for terms in by_degree_of_b)
 
 
 @cache_arrays
-def _products(a: Places, b: Places, first: int, second: int, size: int) -> np.ndarray:
-    """Return the positions of the products of monomials of two sets of variables among those of all `size`."""
+def _place_products(a: Places, b: Places, first: int, second: int, size: int) -> np.ndarray:
+    """Return the positions of products of monomials of degree `first` in variables a and of degree `second` in b.
+
+    Among the monomials of all `size` variables: entry (i, j) is that of monomial i times monomial j.
+    """
     left, right = np.array(a)[factor_variables(len(a), first)], np.array(b)[factor_variables(len(b), second)]
     shape = len(left), len(right)
     both = [np.broadcast_to(left[:, None], (*shape, first)), np.broadcast_to(right, (*shape, second))]
@@ -272,7 +282,7 @@ def _products(a: Places, b: Places, first: int, second: int, size: int) -> np.nd
 
 
 def _assemble_moments(powers: _Powers, outputs: int, inputs: int, order: int) -> Corners:
-    """Assemble E[Sym^order(H)] at each corner from the polynomials of each degree."""
+    """Return E[Sym^order(H)] at each corner from the polynomials of each degree."""
     size, corners = len(powers.places) + 1, len(powers.by_degree[0])
     names = np.array([*powers.places, inputs])
     xp = library(powers.by_degree)

@@ -123,6 +123,7 @@ class AbstractTold(AbstractModal):
         return " and ".join(said)
 
     def _say_told(self, what: str) -> str:
+        """Return in brackets what is told, and what is not promised of it."""
         return f"(told {what}{', not exogenous' * (not self.exogenous)}{', not fresh' * (not self.fresh)})"
 
     @property
@@ -140,7 +141,7 @@ class AbstractTold(AbstractModal):
         """Return the map without memory, as the receiver knows it given the numbers."""
 
     def give_law(self, numbers: Numbers) -> jax.Array:
-        """Test whether numbers give a law; by default all that are finite do."""
+        """Decide whether numbers give a law; by default all that are finite do."""
         return jnp.all(jnp.isfinite(numbers))
 
 
@@ -211,7 +212,7 @@ class Told(AbstractTold):
         return self.make(numbers)
 
     def give_law(self, numbers: Numbers) -> jax.Array:
-        """Test whether the map has finite numbers, and noises whose covariances are some.
+        """Decide whether the map has finite numbers, and noises whose covariances are some.
 
         A variance of zero is one only where it is zero for typical numbers as well: elsewhere it means that nobody
         knows. A gain that is told decides no noise.
@@ -279,7 +280,7 @@ class PilotedHop(AbstractHop, AbstractTold):
         return GainAndNoise(Constant(jnp.asarray(state)[0]), self.matrix, self.noise)
 
     def give_law(self, numbers: Numbers) -> jax.Array:
-        """Always: without a reading the gain has its own law."""
+        """Return True: without a reading the gain has its own law."""
         return jnp.asarray(True)
 
     def believed(self, numbers: Numbers) -> GainAndNoise:
@@ -329,7 +330,7 @@ def believe_told(channel: T, numbers: Numbers) -> T:
 
 
 def give_law(channel: AbstractRandomAffine, numbers: Numbers) -> jax.Array:
-    """Test whether what is told of each of the channel's maps gives a law.
+    """Decide whether what is told of each of the channel's maps gives a law.
 
     Args:
         channel: a channel.
@@ -355,7 +356,7 @@ def _list_noise_covariances(link: AbstractRandomAffine) -> list[jax.Array | np.n
 
 
 def _is_covariance(matrix: jax.Array | np.ndarray, typical: jax.Array | np.ndarray) -> jax.Array:
-    """Test whether L diag(d) L' with d not negative is the matrix, to rounding, and its variances are not lost."""
+    """Decide whether L diag(d) L' with d not negative is the matrix, to rounding, and its variances are not lost."""
     lower, pivots = eliminate(jnp.asarray(matrix))
     variances = jnp.diagonal(jnp.asarray(matrix))
     positive = (variances > 0) | (jnp.asarray(jnp.diagonal(jnp.asarray(typical)) == 0) & (variances == 0))

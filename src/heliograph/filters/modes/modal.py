@@ -55,7 +55,7 @@ from heliograph.numerics.traced import stack_parts
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, PyTree
 from heliograph.random_affine.memory import drop_names
 from heliograph.random_affine.modes import JointModes, joint_modes
-from heliograph.random_affine.moments.second_moments import divide_spread, join_gain_and_noise, nominal_spread
+from heliograph.random_affine.moments.second_moments import join_gain_and_noise, nominal_spread, split_off_noise
 
 
 class ChannelByMode(Module):
@@ -372,7 +372,7 @@ def channels_by_mode(channel: Channel, beside: PyTree = ()) -> tuple[Float[Array
 def channel_by_mode(now: JointModes, before: JointModes) -> ChannelByMode:
     """Return the moments of the channel by mode at one step, and the transition from the step before."""
     mean = stack_parts([m.moments(1).mean[:-1] for m in now.maps])
-    gains, noises = zip(*(divide_spread(nominal_spread(m).center) for m in now.maps), strict=True)
+    gains, noises = zip(*(split_off_noise(nominal_spread(m).center) for m in now.maps), strict=True)
     noise = Columns(*(stack_parts(part) for part in zip(*noises, strict=True)))
     return ChannelByMode(
         transition=before.transition, radius=before.radius, mean=mean, gain_spread=stack_parts(gains), noise=noise

@@ -13,7 +13,7 @@ from heliograph.numerics.types import Array, Bool, Float
 from heliograph.random_affine.base import Outcome
 from heliograph.random_affine.erasure import second_moments
 from heliograph.random_affine.modes import JointModes
-from heliograph.random_affine.moments.second_moments import divide_spread, join_gain_and_noise
+from heliograph.random_affine.moments.second_moments import join_gain_and_noise, split_off_noise
 from heliograph.random_affine.moments.tensors import symmetric_product
 
 
@@ -75,7 +75,7 @@ def _describe_step_by_pattern(
     divisor = np.where(chance > 0, chance, 1.0)
     mean, second = mean / divisor[..., None, None], second / divisor[..., None, None, None, None]
     spread = second - np.array([[symmetric_product(gain, gain) for gain in row] for row in mean])
-    gains, noises = zip(*(divide_spread(part) for row in spread for part in row), strict=True)
+    gains, noises = zip(*(split_off_noise(part) for row in spread for part in row), strict=True)
     noise = Columns(*(np.reshape(part, (*shape, *np.shape(part[0]))) for part in zip(*noises, strict=True)))
     return SideInformation(
         transition=before.transition,

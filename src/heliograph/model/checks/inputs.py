@@ -238,7 +238,7 @@ def do_inputs_spoil(
 
 
 def _is_spoilt(model: AbstractPlant | AbstractSensor, u: jax.Array, precision: type | None) -> jax.Array:
-    """Test whether a function of a model's inputs returns what is none."""
+    """Decide whether a function of a model's inputs returns what is none."""
     spoilt = jnp.asarray(False)
     for name, function in _list_functions(model).items():
         value = function(model, u)

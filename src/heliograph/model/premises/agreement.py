@@ -106,7 +106,7 @@ def part_of(premise: Premise, rows: Sequence[int]) -> Premise:
 
 
 def _test_all_steps(agree: Callable[..., bool], a: object, b: object, order: int | None) -> bool:
-    """Test whether two models agree at each step; one that does not vary is the same at all of them."""
+    """Decide whether two models agree at each step; one that does not vary is the same at all of them."""
     if same(a, b):
         return True
     if steps_covered((a, b)) is None:
@@ -222,19 +222,19 @@ def matrix_of(sensor: AbstractSensor) -> np.ndarray | None:
 
 
 def _same_trigger(believed: AbstractTrigger | None, own: AbstractTrigger | None) -> bool:
-    """Test whether a filter knows why nothing came; what is not sent by a schedule is missing whatever its value."""
+    """Decide whether a filter knows why nothing came; what is not sent by a schedule is missing whatever its value."""
     if believed is None:
         return own is None or isinstance(own, Periodic)
     return same(believed, own)
 
 
 def _same_gains(believed: Premise, own: Premise) -> bool:
-    """Test whether the relays that are there run the believed gains; others were left out of a recording."""
+    """Decide whether the relays that are there run the believed gains; others were left out of a recording."""
     return all(equal_to_rounding(gain, own.gains[name]) for name, gain in believed.gains.items() if name in own.gains)
 
 
 def _same_channel(a: Channel, b: Channel, order: int | None, loses: bool) -> bool:
-    """Test whether two channels agree, their memories told apart by where they stand; `loses`: whatever is lost."""
+    """Decide whether two channels agree, their memories told apart by where they stand; `loses`: whatever is lost."""
     if a is b:
         return True
     if isinstance(a, AbstractRandomAffine) and isinstance(b, AbstractRandomAffine):
@@ -268,7 +268,7 @@ def _same_map(a: AbstractRandomAffine, b: AbstractRandomAffine, order: int | Non
 
 
 def _same_given_arrival(a: AbstractRandomAffine, b: AbstractRandomAffine) -> bool:
-    """Test whether two maps are the same but for what is lost; False where losses depend on gains."""
+    """Decide whether two maps are the same but for what is lost; False where losses depend on gains."""
     try:
         return same(a.condition_on_arrival(), b.condition_on_arrival())
     except ValueError:
@@ -276,7 +276,7 @@ def _same_given_arrival(a: AbstractRandomAffine, b: AbstractRandomAffine) -> boo
 
 
 def _same_moments(a: AbstractRandomAffine, b: AbstractRandomAffine) -> bool:
-    """Test whether E[(G, n)] and Cov(z | y) of what arrives through b are those of a, at every step.
+    """Decide whether E[(G, n)] and Cov(z | y) of what arrives through b are those of a, at every step.
 
     Bounds of laws would have to be compared as laws.
     """
@@ -312,7 +312,7 @@ def _take_moments_by_arrival(channel: AbstractRandomAffine) -> list[tuple[np.nda
 
 
 def _agree(a: Moments, b: Moments, there: np.ndarray) -> bool:
-    """Test whether moments of the components that are there are equal to rounding, each in units of its own size."""
+    """Decide whether moments of the components that are there are equal to rounding, each in units of its own size."""
     rows = np.ix_(there, there)
     power = [np.abs(np.einsum("iiaa->ia", second))[there] for _, second in (a, b)]
     size = np.sqrt(np.maximum(*power))
@@ -324,7 +324,7 @@ def _agree(a: Moments, b: Moments, there: np.ndarray) -> bool:
 def _same_observation(
     a: tuple[AbstractSensor, AbstractRandomAffine], b: tuple[AbstractSensor, AbstractRandomAffine], order: int | None
 ) -> bool:
-    """Test whether what is received of the state agrees, though sensors and channels are written in other ways."""
+    """Decide whether what is received of the state agrees, though sensors and channels are written in other ways."""
     if order != MEAN_AND_COVARIANCE or is_traced(a, b):
         return False
     maps = [whole for observation in (a, b) if (whole := _compose_with_sensor(*observation)) is not None]

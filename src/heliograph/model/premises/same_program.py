@@ -13,7 +13,7 @@ ASIDE = ("name", "jvp_jaxpr_fun", "fwd_jaxpr_thunk", "bwd")  # labels, and rules
 
 
 def same_function(f: Callable[..., Any], g: Callable[..., Any], *shapes: tuple[int, ...]) -> bool:
-    """Test whether two functions of arrays of these shapes are one, or the same program when JAX traces them.
+    """Decide whether two functions of arrays of these shapes are one, or the same program when JAX traces them.
 
     Args:
         f: one function, written with jax.numpy.

@@ -69,11 +69,11 @@ class AbstractLaw(Module):
         return plain(ends.min()), plain(ends.max())
 
     def covers(self, own: "AbstractLaw") -> bool:
-        """Test whether another law, with all that it may be, is one of those that this one may be."""
+        """Decide whether another law, with all that it may be, is one of those that this one may be."""
         return same(self, own)
 
     def list_atoms(self) -> list[tuple[float | jax.Array, float | jax.Array]]:
-        """List probability and value of each of finitely many gains; by default a refusal."""
+        """Return probability and value of each of finitely many gains; by default a refusal."""
         raise fail("mixture filter", "gains of finitely many values", type(self).__name__)
 
     def quantile(self, probability: Vector) -> np.ndarray:
@@ -86,6 +86,7 @@ class AbstractLaw(Module):
 
     @in_float64
     def _draw_values(self) -> np.ndarray:
+        """Draw DRAWS gains."""
         values: np.ndarray = np.asarray(jax.vmap(self.sample)(jax.random.split(jax.random.key(0), DRAWS)))
         return values
 
@@ -149,7 +150,7 @@ class Discrete(AbstractLaw):
         self.radius = radii("probability radius", radius, self.probabilities)
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """Invert the distribution function at a uniform draw."""
+        """Draw one of the values, by inverting the distribution function at a uniform draw."""
         return jnp.asarray(self.values)[draw_index(self.probabilities, key)]
 
     def moment(self, order: int) -> float | jax.Array:
@@ -162,7 +163,7 @@ class Discrete(AbstractLaw):
         return (-self.worst(-powers), self.worst(powers)) if order else (1.0, 1.0)
 
     def covers(self, own: AbstractLaw) -> bool:
-        """Return a law of the same values whose probabilities stay within the radius."""
+        """Decide whether another law has the same values, and its probabilities stay within the radius."""
         if not isinstance(own, Discrete) or not equal_to_rounding(self.values, own.values):
             return same(self, own)
         return within(own.probabilities, own.radius, self.probabilities, self.radius)
@@ -172,7 +173,7 @@ class Discrete(AbstractLaw):
         return [(plain(p), plain(v)) for p, v in zip(self.probabilities, self.values, strict=True)]
 
     def worst(self, payoff: ArrayLike) -> float:
-        """Exact maximum of sum_i (p_i + dp_i) payoff_i over the polytope of probabilities.
+        """Return the exact maximum of sum_i (p_i + dp_i) payoff_i over the polytope of probabilities.
 
         Start with every probability at its lower end and give the mass that is left to the largest payoffs first (the
         fractional knapsack, which solves this linear programme).
@@ -180,10 +181,10 @@ class Discrete(AbstractLaw):
         gain = array("payoff", payoff, self.values.shape)
         low = np.maximum(self.probabilities - self.radius, 0.0)
         high = np.minimum(self.probabilities + self.radius, 1.0)
-        left, total = 1.0 - low.sum(), float(low @ gain)
+        mass, total = 1.0 - low.sum(), float(low @ gain)
         for i in np.argsort(-gain, kind="stable"):
-            step = min(left, high[i] - low[i])
-            total, left = total + step * gain[i], left - step
+            step = min(mass, high[i] - low[i])
+            total, mass = total + step * gain[i], mass - step
         return total
 
     def extremes(self) -> tuple[AbstractLaw, ...]:

@@ -72,8 +72,10 @@ def gain_given_reading(law: AbstractLaw, reading: Float[Array, ""], variance: Fl
         log_density = jnp.log(law.probabilities) - jnp.square(a - law.values) / (2 * variance)
         return Discrete(law.values, jnp.where(known, jax.nn.softmax(log_density), law.probabilities))
     mean, spread = _integrate_posterior(law, a, jnp.asarray(variance))
-    own = law.moment(1), law.moment(2)
-    return GivenReading(jnp.where(known, mean, own[0]), jnp.where(known, spread, own[1] - own[0] ** 2))
+    own_mean, own_square = law.moment(1), law.moment(2)
+    return GivenReading(
+        mean=jnp.where(known, mean, own_mean), variance=jnp.where(known, spread, own_square - own_mean**2)
+    )
 
 
 def _integrate_posterior(law: AbstractLaw, a: jax.Array, variance: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -83,30 +85,31 @@ def _integrate_posterior(law: AbstractLaw, a: jax.Array, variance: jax.Array) ->
     """
     deviation = jnp.sqrt(variance)
 
-    def gain_at(t: jax.Array) -> jax.Array:
+    def to_gain(t: jax.Array) -> jax.Array:
         return jnp.exp(t) if law.logarithmic else t**4
 
-    def place_of(g: Float[Array, ""]) -> jax.Array:
+    def from_gain(g: Float[Array, ""]) -> jax.Array:
         return jnp.log(jnp.maximum(g, np.finfo(float).tiny)) if law.logarithmic else jnp.maximum(g, 0.0) ** 0.25
 
     def log_density(t: jax.Array) -> jax.Array:
         """Return log p(t | a) but for a constant: the law's density in t, and the reading's."""
-        g = gain_at(t)
-        stretch = t if law.logarithmic else 3 * jnp.log(t)
+        g = to_gain(t)
+        stretch = t if law.logarithmic else 3 * jnp.log(t)  # log dg/dt, but for a constant
         return law.log_density(g) + stretch - jnp.square((a - g) / deviation) / 2
 
     # All gains that may count: those of the law, those near the reading, and all between.
     low, high = law.bulk()
-    low = place_of(jnp.minimum(low, a - 9 * deviation))
-    high = place_of(jnp.maximum(high, a + 9 * deviation))
-    top = _find_top(log_density, low, high)
-    least = log_density(top) - NATS
-    left, right = _find_end(log_density, low, top, least), _find_end(log_density, high, top, least)
+    low = from_gain(jnp.minimum(low, a - 9 * deviation))
+    high = from_gain(jnp.maximum(high, a + 9 * deviation))
+    # The part of these that does count: within NATS of the mode.
+    mode = _find_mode(log_density, low, high)
+    least = log_density(mode) - NATS
+    left, right = _find_end(log_density, low, mode, least), _find_end(log_density, high, mode, least)
     # Weights p(t | a) dt at the nodes, normalised; the variance about the mean, so that nothing cancels.
     x, w = np.polynomial.legendre.leggauss(NODES)
     t = (left + right) / 2 + (right - left) / 2 * x
     weights = jax.nn.softmax(np.log(w) + jax.vmap(log_density)(t))
-    g = gain_at(t)
+    g = to_gain(t)
     mean = weights @ g
     return mean, weights @ jnp.square(g - mean)
 
@@ -114,12 +117,14 @@ def _integrate_posterior(law: AbstractLaw, a: jax.Array, variance: jax.Array) ->
 LogDensity = Callable[[jax.Array], jax.Array]
 
 
-def _find_top(log_density: LogDensity, low: jax.Array, high: jax.Array) -> jax.Array:
+def _find_mode(log_density: LogDensity, low: jax.Array, high: jax.Array) -> jax.Array:
     """Return where a density with one mode in [low, high] is largest: at a grid's best point, refined about it."""
     steps = np.linspace(0.0, 1.0, GRID)
 
     def zoom(_: int, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        points = ends[0] + (ends[1] - ends[0]) * steps
+        """Return the neighbours of the best point of a grid between these ends."""
+        left, right = ends
+        points = left + (right - left) * steps
         best = jnp.argmax(jax.vmap(log_density)(points))
         return points[jnp.maximum(best - 1, 0)], points[jnp.minimum(best + 1, GRID - 1)]
 
@@ -128,18 +133,20 @@ def _find_top(log_density: LogDensity, low: jax.Array, high: jax.Array) -> jax.A
     return middle
 
 
-def _find_end(log_density: LogDensity, outer: jax.Array, top: jax.Array, least: jax.Array) -> jax.Array:
-    """Return a place between `outer` and the mode beyond which the density is below `least`, and shortly before not."""
+def _find_end(log_density: LogDensity, outer: jax.Array, mode: jax.Array, least: jax.Array) -> jax.Array:
+    """Return a place from which to `outer` the density is below `least`, and close to where it rises above it."""
     steps = np.linspace(0.0, 1.0, GRID)
 
     def zoom(_: int, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        points = ends[0] + (ends[1] - ends[0]) * steps
+        """Return the cell of a grid in which the density rises above `least`, from the outer end to the inner one."""
+        outside, inside = ends
+        points = outside + (inside - outside) * steps
         counts = (jax.vmap(log_density)(points) > least).at[-1].set(True)
-        first = jnp.argmax(counts)  # from outside
+        first = jnp.argmax(counts)
         return points[jnp.maximum(first - 1, 0)], points[first]
 
-    end: jax.Array = jax.lax.fori_loop(0, ZOOMS // 2, zoom, (outer, top))[0]
-    return end
+    outside: jax.Array = jax.lax.fori_loop(0, ZOOMS // 2, zoom, (outer, mode))[0]
+    return outside
 
 
 def gain_nodes(

@@ -49,10 +49,10 @@ from .route import carry_by_moments as carry_by_moments
 from .route import refuse_gain_on_angles as refuse_gain_on_angles
 from .second_moments import SecondOrder as SecondOrder
 from .second_moments import describe_second_moments as describe_second_moments
-from .second_moments import divide_spread as divide_spread
 from .second_moments import has_known_mean as has_known_mean
 from .second_moments import has_random_gain as has_random_gain
 from .second_moments import join_gain_and_noise as join_gain_and_noise
 from .second_moments import nominal_spread as nominal_spread
 from .second_moments import second_order as second_order
+from .second_moments import split_off_noise as split_off_noise
 from .tensors import symmetric_product as symmetric_product

@@ -72,6 +72,7 @@ def combine(parts: Sequence[list[Atom]], join: Callable[[Atom, Atom], Atom]) -> 
 
 
 def _join_ends(a: Array, b: Array) -> Array:
+    """Return b behind a, along the first axis."""
     joined: Array = library(a, b).concatenate([a, b])
     return joined
 

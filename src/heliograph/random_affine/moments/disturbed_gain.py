@@ -49,7 +49,7 @@ class DisturbedGain(NamedTuple):
         return factors
 
     def then(self, other: "DisturbedGain") -> "DisturbedGain":
-        """[G2, N2] diag([G1, N1], I) = [G2 G1, G2 N1, N2] of a map and one after it, with independent factors."""
+        """Return the moments of this map and one after it: [G2, N2] diag([G1, N1], I) = [G2 G1, G2 N1, N2]."""
         identity = np.eye(other.disturbances)
         passed = stack_gains([self, DisturbedGain(identity, np.multiply.outer(identity, identity), 0)], shared=0)
         second = np.einsum("aicj,ibjd->abcd", other.second, passed.second)
@@ -86,7 +86,7 @@ def disturb_hop(gain: np.ndarray, moments: tuple[float, float], root: np.ndarray
 
 
 def mix_gains(parts: Sequence[DisturbedGain], weights: Float[np.ndarray, " parts"], inputs: int) -> DisturbedGain:
-    """Return the moments of one map, drawn from `parts` by `weights`: the weighted means of theirs.
+    """Return the moments of a map drawn from `parts` with `weights`: sum_i w_i E_i and sum_i w_i E_i[H_ab H_ij].
 
     The noises of each part stand in columns of their own.
     """
@@ -109,7 +109,10 @@ def _place_columns(gain: DisturbedGain, shared: int, parts: Sequence[DisturbedGa
 
 
 def stack_gains(parts: Sequence[DisturbedGain], shared: int) -> DisturbedGain:
-    """Independent maps one above the other that share their first `shared` inputs; E[H_ab H_ij] factors across maps."""
+    """Return the moments of independent maps one above the other that share their first `shared` inputs.
+
+    Between rows of two maps E[H_ab H_ij] is the product of the means.
+    """
     placed = [_place_columns(gain, shared, parts, i) for i, gain in enumerate(parts)]
     mean = np.concatenate([gain.mean for gain in placed])
     second = np.multiply.outer(mean, mean)

@@ -78,10 +78,12 @@ def check_moments(moments: np.ndarray) -> None:
     (finitely many atoms) h must lie in its range.
     """
     sequence = np.concatenate([[1.0], moments])
+    # Moments in units of the second one's root, so that one tolerance serves all orders; up to the first order whose
+    # unit is no double.
     scale = max(float(sequence[2]) ** 0.5, np.finfo(float).tiny) if sequence[2] > 0 else 1.0
     size = scale ** np.arange(len(sequence))
     representable = np.cumprod((size > np.finfo(float).tiny) & np.isfinite(size), dtype=bool)
-    m = sequence[representable] / size[representable]  # unit second moment, so that one tolerance serves all orders
+    m = sequence[representable] / size[representable]
     # Range condition: h = E[V n^j] lies in the range of H = E[V V'].
     for j in range(1, len(m) // 2 + 1):
         H = np.array([[m[a + b] for b in range(j)] for a in range(j)])
@@ -122,6 +124,7 @@ def recorded_noise(samples: "Float[ArrayLike, 'samples *components']", order: in
     check_count("order of the noise moments", order)
     absolute = np.abs(values)
     worst, where = 0.0, 1
+    # The moment that is known worst, relative to its largest possible size, and its order.
     for powers in (a for k in range(1, order + 1) for a in exponents(values.shape[1], k)):
         degree = sum(powers)
         # Standard error of the mean of n^a, and Hölder's bound of its size.
@@ -140,7 +143,7 @@ def recorded_noise(samples: "Float[ArrayLike, 'samples *components']", order: in
 
 
 class AboutMean(AbstractNoise):
-    """n - E[n] for a law of any kind: its moments are sums of the law's own."""
+    """Noise n - E[n] of a law of any kind: its moments are sums of the law's own."""
 
     source: AbstractNoise
     mean: Vector
@@ -159,8 +162,8 @@ class AboutMean(AbstractNoise):
         total: Number = 0.0
         for b in product(*(range(a + 1) for a in powers)):
             weights = [
-                comb(a, lower) * plain((-self.source.mean[i]) ** (a - lower))
-                for i, (a, lower) in enumerate(zip(powers, b, strict=True))
+                comb(a_i, b_i) * plain((-self.source.mean[i]) ** (a_i - b_i))
+                for i, (a_i, b_i) in enumerate(zip(powers, b, strict=True))
             ]
             total += prod(weights) * (self.source.moment(b) if any(b) else 1.0)
         return total

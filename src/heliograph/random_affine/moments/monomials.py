@@ -28,7 +28,7 @@ Numbers = Any  # NumPy's or JAX's, or a list of such
 
 @cache
 def exponents(variables: int, degree: int) -> tuple[Exponents, ...]:
-    """Exponents of all monomials of total degree `degree` in `variables` variables; degree 1 gives y_1, ..., y_p, 1."""
+    """Return the exponents of all monomials of total degree `degree`; degree 1 gives y_1, ..., y_p, 1."""
     monomials = []
     for choice in combinations_with_replacement(range(variables), degree):
         powers = [0] * variables
@@ -51,26 +51,26 @@ def count_monomials(variables: int, degree: int) -> int:
 
 @cache_arrays
 def factor_variables(variables: int, degree: int) -> np.ndarray:
-    """List the variables that each monomial of `exponents` multiplies, in order: (count, degree)."""
+    """Return the variables that each monomial of `exponents` multiplies, in order: (count, degree)."""
     choices = combinations_with_replacement(range(variables), degree)
     flat = np.fromiter((variable for choice in choices for variable in choice), np.int64)
     return flat.reshape(count_monomials(variables, degree), degree)
 
 
 def place(chosen: np.ndarray, variables: int) -> np.ndarray:
-    """Position of each monomial in `exponents`, from the variables (..., degree) that it multiplies, in any order.
+    """Return the position of each monomial in `exponents`, from the variables (..., degree) that it multiplies.
 
-    Before variables s_1 <= s_2 <= ... stand, for each t, those with the same first ones and a smaller t-th.
+    These may be in any order. Before variables s_1 <= s_2 <= ... stand, for each t, those with the same first ones and
+    a smaller t-th.
     """
     ordered = np.sort(chosen, axis=-1)
     before = np.concatenate([np.zeros_like(ordered[..., :1]), ordered], axis=-1)
     rank = np.zeros(chosen.shape[:-1], dtype=np.int64)
     for t in range(chosen.shape[-1]):
+        # counts[n]: monomials of the `rest` variables from the t-th on among the last n variables.
         rest = chosen.shape[-1] - t
-        starting = np.array(
-            [count_monomials(n, rest) for n in range(variables + 1)]
-        )  # of `rest` variables among the last n
-        rank += starting[variables - before[..., t]] - starting[variables - before[..., t + 1]]
+        counts = np.array([count_monomials(n, rest) for n in range(variables + 1)])
+        rank += counts[variables - before[..., t]] - counts[variables - before[..., t + 1]]
     return rank
 
 
@@ -95,7 +95,7 @@ def evaluate_monomials(y: Numbers, degree: int) -> Numbers:
 
 @cache_arrays
 def _raise_table(variables: int, degree: int) -> np.ndarray:
-    """Entry (i, c): position at degree - 1 of monomial i divided by variable c; one past the end if it has no c."""
+    """Return at [i, c] the position at degree - 1 of monomial i over variable c; one past the end if it has no c."""
     lower = position(variables, degree - 1)
     table = np.full((count_monomials(variables, degree), variables), len(lower), dtype=np.int64)
     for i, powers in enumerate(exponents(variables, degree)):

@@ -120,7 +120,7 @@ def _positions_of_lower_order(dimension: int, order: int, above: int) -> np.ndar
 
 
 def products_of_monomials(moments: Array1, variables: int, degree: int) -> Array2:
-    """E[Y Y'] of the monomials Y of `degree` in (y, 1), gathered from the moments of order 2 degree; last row E[Y'].
+    """Return E[Y Y'] of the monomials Y of `degree` in (y, 1) from the moments of order 2 degree; last row E[Y'].
 
     Shapes: (C(p + 2 k, 2 k),) -> (C(p + k, k), C(p + k, k)), with variables p + 1.
     """

@@ -49,7 +49,7 @@ def map_of_known_law(tensor: Tensor) -> QuadraticMap:
 
 
 def signal_of_map(bound: QuadraticMap) -> QuadraticMap:
-    """Leave what the map makes of y alone, without the constant 1."""
+    """Return what the map makes of y alone, without the constant 1."""
     return QuadraticMap(drop_constant(bound.center), drop_constant(bound.radius))
 
 

@@ -68,21 +68,21 @@ def describe_second_moments(
     mean: Matrix, spread: QuadraticMap, shift: QuadraticMap, power: QuadraticMap, nominal: QuadraticMap, uncertain: bool
 ) -> SecondOrder:
     """Return second moments of z = G y + n from E[(G, n)] and the maps, the nominal one divided into gain and noise."""
-    gain, noise = divide_spread(nominal.center)
+    gain, noise = split_off_noise(nominal.center)
     return SecondOrder(mean[:, :-1], mean[:, -1], spread, shift, power, nominal, gain, noise, uncertain)
 
 
-def divide_spread(spread: Tensor) -> tuple[Tensor, Columns]:
+def split_off_noise(spread: Tensor) -> tuple[Tensor, Columns]:
     """Split the covariances of (A, n), (m, m, n + 1, n + 1) by output, into those of A and m columns of Cov n.
 
     Where A and n are correlated nothing is split: the covariances as they are, and columns of zero.
     """
     xp, covariance = library(spread), spread[..., -1, -1]
-    apart = xp.all(spread[..., :-1, -1] == 0)
+    uncorrelated = xp.all(spread[..., :-1, -1] == 0)
     corner = np.zeros(spread.shape[-2:])
     corner[-1, -1] = 1.0
-    noise = _pad_columns(columns_of(xp.where(apart, covariance, 0.0)))
-    return spread - xp.where(apart, covariance, 0.0)[..., None, None] * corner, noise
+    noise = _pad_columns(columns_of(xp.where(uncorrelated, covariance, 0.0)))
+    return spread - xp.where(uncorrelated, covariance, 0.0)[..., None, None] * corner, noise
 
 
 def _pad_columns(noise: Columns) -> Columns:
@@ -92,7 +92,7 @@ def _pad_columns(noise: Columns) -> Columns:
 
 
 def join_gain_and_noise(gain: Tensor, noise: Columns) -> Tensor:
-    """Join spread of the gain and noise columns to one spread: the inverse of `divide_spread`."""
+    """Join spread of the gain and noise columns to one spread: the inverse of `split_off_noise`."""
     xp = library(gain, noise)
     covariance = (noise.matrix * noise.weights[..., None, :]) @ xp.swapaxes(noise.matrix, -1, -2)
     corner = np.zeros(gain.shape[-2:])
@@ -138,10 +138,17 @@ def second_order(channel: AbstractRandomAffine) -> SecondOrder:
     if uncertain or not channel.has_known_gain:
         return describe_second_moments(*bounds, uncertain)
     # A known gain has no spread: the noise of the parts of a channel is all, and no tensor of all outputs is needed.
-    mean, spread, shift, power, nominal = bounds
-    noise = _pad_columns(columns_of(_noise_covariance(channel)))
-    none = np.zeros(nominal.center.shape)
-    return SecondOrder(mean[:, :-1], mean[:, -1], spread, shift, power, nominal, none, noise, uncertain)
+    return SecondOrder(
+        mean_gain=bounds.mean[:, :-1],
+        offset=bounds.mean[:, -1],
+        spread=bounds.spread,
+        shift=bounds.shift,
+        power=bounds.power,
+        nominal=bounds.nominal,
+        gain_spread=np.zeros(bounds.nominal.center.shape),
+        noise=_pad_columns(columns_of(_noise_covariance(channel))),
+        uncertain=uncertain,
+    )
 
 
 class MomentBounds(NamedTuple):
@@ -155,7 +162,11 @@ class MomentBounds(NamedTuple):
 
 
 def _bound_moments(channel: AbstractRandomAffine) -> MomentBounds:
-    """Nominal mean of (G, n), and maps W -> matrix that dominate spread, shift and power under every possible law."""
+    """Return E[(G, n)] under the nominal law, and maps W -> matrix above spread, shift and power of every possible law.
+
+    Exact where the law is known.
+    """
+    # Whether corner laws are few enough to be listed.
     corners = count_corners(channel)
     listed = corners is not None and corners <= CORNERS and corners * (channel.inputs + 1) ** 2 <= MEMORY_LIMIT_ENTRIES
     # Independent maps, added up or side by side: of known laws their spreads are all; else bounded part by part.
@@ -177,11 +188,10 @@ def _bound_moments(channel: AbstractRandomAffine) -> MomentBounds:
     if isinstance(channel, Stack):
         parts = _bound_stacked_maps(channel)
     elif listed:
-        laws = (
-            Moments(corner_moment, nominal.outputs, nominal.inputs, 2) for corner_moment in channel.corner_moments(2)
-        )
-        stacks = zip(*(tensors_of_law(corner, mean) for corner in laws), strict=True)
-        parts = [dominate(stack_parts(tensors), mean) for tensors in stacks]
+        laws = [Moments(corner, nominal.outputs, nominal.inputs, 2) for corner in channel.corner_moments(2)]
+        # One map above all laws for each of spread, shift and power.
+        by_kind = zip(*(tensors_of_law(law, mean) for law in laws), strict=True)
+        parts = [dominate(stack_parts(tensors), mean) for tensors in by_kind]
     else:
         parts = bound_from_intervals(channel, nominal, mean)
     spread, shift, power = parts
@@ -195,41 +205,44 @@ def nominal_spread(channel: AbstractRandomAffine) -> QuadraticMap:
 
 
 def _drop_known_gain(channel: AbstractRandomAffine, spread: Tensor) -> Tensor:
-    """Set the spread of a known gain to the zero that it is, of which a difference of moments leaves rounding."""
+    """Return a spread in which that of known gains is zero, where a difference of moments leaves rounding."""
     random = ~channel.known_gains
     varies = np.pad(np.ones((len(random), channel.inputs)) * random[:, None], ((0, 0), (0, 1)), constant_values=1.0)
-    own: Tensor = library(spread).where(symmetric_product(varies, varies) > 0, spread, 0.0)
-    return own
+    cleaned: Tensor = library(spread).where(symmetric_product(varies, varies) > 0, spread, 0.0)
+    return cleaned
 
 
 def _bound_stacked_maps(channel: Stack) -> list[QuadraticMap]:
-    """Return the diagonal blocks from each part; off the diagonal, independent parts meet through their means only.
+    """Return bounds of spread, shift and power of a stack of independent maps.
 
-    E[(H_i - M_i) Y Y' (H_j - M_j)'] = D_i Y Y' D_j' with |D| at most the reach of each mean.
+    Diagonal blocks are those of each part. Off the diagonal, parts meet through their means only:
+    E[(H_i - M_i) Y Y' (H_j - M_j)'] = D_i Y Y' D_j' with |D_i| at most the reach of the mean of part i.
     """
     n, mean, start = channel.outputs, channel.moments(1).mean[:-1], 0
-    blocks: list[list[QuadraticMap]] = []
-    reach = []
+    blocks: list[list[QuadraticMap]] = []  # (spread, shift, power) of each part
+    reaches = []
     for affine in channel.maps:
         stop = start + affine.outputs
-        # Diagonal block, and the reach |H_i - M_i| of the mean of each part.
+        # Diagonal block, and the largest |E[H_i] - M_i| under any law.
         moments = second_order(affine)
         low, high = affine.moment_interval(1)
         xp = library(low, high, mean)
-        reach.append(xp.maximum(xp.abs(high[:-1] - mean[start:stop]), xp.abs(low[:-1] - mean[start:stop])))
+        reaches.append(xp.maximum(xp.abs(high[:-1] - mean[start:stop]), xp.abs(low[:-1] - mean[start:stop])))
         blocks.append([place_on_diagonal(q, start, n) for q in (moments.spread, moments.shift, moments.power)])
         start = stop
-    label = np.repeat(np.arange(len(channel.maps)), [affine.outputs for affine in channel.maps])
-    apart = (label[:, None] != label[None, :])[:, :, None, None]
-    xp = library(mean, reach)
-    far, size = xp.concatenate(reach), xp.abs(mean)
-    # Off-diagonal blocks: bounds of |D_i Y Y' D_j'| by the product of reaches.
-    cross = symmetric_product(far, far)
-    power_cross = drop_constant(symmetric_product(size, far) + symmetric_product(far, size) + cross)
+    part_of_output = np.repeat(np.arange(len(channel.maps)), [affine.outputs for affine in channel.maps])
+    off_diagonal = (part_of_output[:, None] != part_of_output[None, :])[:, :, None, None]
+    # Off-diagonal blocks: |D_i Y Y' D_j'| by the product of reaches; of the power (M_i + D_i) Y Y' (M_j + D_j)'.
+    xp = library(mean, reaches)
+    reach, size = xp.concatenate(reaches), xp.abs(mean)
+    cross = symmetric_product(reach, reach)
+    power_cross = drop_constant(symmetric_product(size, reach) + symmetric_product(reach, size) + cross)
     centers = (0.0, 0.0, drop_constant(symmetric_product(mean, mean)))
     radii = (cross, cross, power_cross)
     return [
-        QuadraticMap(sum(q.center for q in maps) + apart * center, sum(q.radius for q in maps) + apart * radius)
+        QuadraticMap(
+            sum(q.center for q in maps) + off_diagonal * center, sum(q.radius for q in maps) + off_diagonal * radius
+        )
         for maps, center, radius in zip(zip(*blocks, strict=True), centers, radii, strict=True)
     ]
 
@@ -266,15 +279,16 @@ def _stack_spreads(spreads: Sequence[Tensor]) -> Tensor:
     """Return the spreads of independent maps side by side, as diagonal blocks of that of all outputs."""
     sizes, size = [len(spread) for spread in spreads], spreads[0].shape[-1]
     outputs = sum(sizes)
+    # Places of the blocks' entries (i, j) in the flat (outputs, outputs).
     rows = [np.arange(start, start + m) for start, m in zip(np.cumsum([0, *sizes]), sizes, strict=False)]
-    where = np.concatenate([(outputs * at[:, None] + at).reshape(-1) for at in rows])
+    where = np.concatenate([(outputs * of_part[:, None] + of_part).reshape(-1) for of_part in rows])
     flat = library(spreads).concatenate([spread.reshape(-1, size**2) for spread in spreads])
     whole: Tensor = scatter((outputs**2, size**2), where, flat).reshape(outputs, outputs, size, size)
     return whole
 
 
 def _bound_sum(channel: Superposed, parts: Sequence[MomentBounds]) -> MomentBounds:
-    """Spreads of independent maps add up, and their means meet in every pair.
+    """Return the bounds of a sum of independent maps: their spreads add up, and their means meet in every pair.
 
     With D_i the shift of a mean, (sum D_i) Y (sum D_i)' <= sum_i D_i Y D_i' / w_i for weights w of sum 1, which are as
     the sizes of the shifts; the spread about the nominal means is within sum_i Spread_i + (1 / w_i - 1) D_i Y D_i'.
@@ -293,8 +307,8 @@ def _bound_sum(channel: Superposed, parts: Sequence[MomentBounds]) -> MomentBoun
     shift = _sum_maps(channel, {i: (parts[i].shift, weight) for i, weight in inverse.items()})
     cross = _sum_maps(channel, {i: (parts[i].shift, weight - 1) for i, weight in inverse.items()})
     # Power of the mean, (m + d)^2 <= (1 + d / m) m^2 + (1 + m / d) d^2, and the variances.
-    sure = size_of_map(of_mean)
-    ratio = total / library(sure).where(sure > 0, sure, 1.0)
+    mean_size = size_of_map(of_mean)
+    ratio = total / library(mean_size).where(mean_size > 0, mean_size, 1.0)
     power = add_maps(signal_of_map(own), scale_map(of_mean, 1 + ratio), scale_map(signal_of_map(shift), 1 + 1 / ratio))
     nominal = add_maps(_sum_maps(channel, {i: (parts[i].nominal, 1.0) for i in every}), noise)
     return MomentBounds(mean, add_maps(own, cross), shift, power, nominal)
@@ -308,5 +322,5 @@ def _sum_maps(channel: Superposed, weighted: Mapping[int, tuple[QuadraticMap, An
 
 
 def _constant_power(size: int) -> np.ndarray:
-    """Return the matrix of zeros, but 1 as its last entry: W of the constant 1 alone."""
+    """Return the matrix W = Y Y' of zeros, but 1 as its last entry: that of the constant 1 alone."""
     return np.outer(np.eye(size)[-1], np.eye(size)[-1])

@@ -26,10 +26,10 @@ def tensors_of_law(moments: Moments, mean: Matrix) -> tuple[Tensor, Tensor, Tens
 
 
 def dominate(tensors: Tensor, mean: Matrix) -> QuadraticMap:
-    """Return one map above all of the (law, m, m, p + 1, p + 1) tensors.
+    """Return one map above all of the (law, m, m, p + 1, p + 1) tensors, such as the spreads under corner laws v.
 
-    Where y enters as s_v M y y' M' and the noise part has a largest matrix, that of the largest s_v and the largest
-    noise; else the middle of the range of each entry, with its half as radius.
+    Where y enters as s_v M y y' M' under every law, and one noise matrix is above all others, the map of the largest
+    s_v and that noise; else the middle of the range of each entry, with half the range as radius.
     """
     xp = library(tensors)
     low, high = tensors.min(axis=0), tensors.max(axis=0)
@@ -38,17 +38,20 @@ def dominate(tensors: Tensor, mean: Matrix) -> QuadraticMap:
 
 
 def _find_common_gain(tensors: Tensor, mean: Matrix) -> tuple[Tensor, np.ndarray | jax.Array]:
-    """Return the tensor of the largest common gain and the largest noise, and whether it dominates all of them."""
+    """Return max_v s_v M y y' M' + N_max, the largest noise, and whether it dominates the tensors of all laws v.
+
+    It does if to rounding gains_v = s_v M y y' M', gain and noise are uncorrelated, and N_max - N_v >= 0.
+    """
     xp = library(tensors, mean)
-    shape = symmetric_product(mean[:, :-1], mean[:, :-1])
+    shape = symmetric_product(mean[:, :-1], mean[:, :-1])  # M y y' M'
     gains, noises, cross = tensors[..., :-1, :-1], tensors[..., -1, -1], tensors[..., :-1, -1]
     mean_size: Matrix = xp.abs(mean[:, :-1])
-    # Sizes of the entries, for relative tolerances.
-    scale = xp.max(xp.abs(gains), axis=0, initial=0.0) + symmetric_product(mean_size, mean_size)
-    loud = xp.sqrt(xp.max(xp.abs(xp.diagonal(noises, axis1=1, axis2=2)), axis=0)) + xp.abs(mean[:, -1])
-    reach = xp.sqrt(xp.einsum("iiaa->ia", scale))[:, None, :] * loud[:, None]
-    size = xp.sum(shape**2)
+    # Sizes of the entries of gains and of gain times noise, for relative tolerances.
+    gain_size = xp.max(xp.abs(gains), axis=0, initial=0.0) + symmetric_product(mean_size, mean_size)
+    noise_size = xp.sqrt(xp.max(xp.abs(xp.diagonal(noises, axis1=1, axis2=2)), axis=0)) + xp.abs(mean[:, -1])
+    cross_size = xp.sqrt(xp.einsum("iiaa->ia", gain_size))[:, None, :] * noise_size[:, None]
     # Least squares for s_v in gains_v = s_v M y y' M'.
+    size = xp.sum(shape**2)
     multiples = xp.einsum("vijab,ijab->v", gains, shape) / xp.where(size > 0, size, 1.0)
     residual = xp.abs(gains - multiples[:, None, None, None, None] * shape)
     # Largest noise matrix: N_max - N_v >= 0 for all v, judged of correlations.
@@ -56,8 +59,8 @@ def _find_common_gain(tensors: Tensor, mean: Matrix) -> tuple[Tensor, np.ndarray
     unit = xp.sqrt(xp.diagonal(largest))
     unit = stop_gradient(xp.where(unit > 0, unit, 1.0))
     gaps = xp.linalg.eigvalsh(stop_gradient(largest - noises) / (unit[:, None] * unit))
-    holds = xp.all(residual <= PROPORTIONAL_TOLERANCE * scale)
-    holds = holds & xp.all(xp.abs(cross) <= PROPORTIONAL_TOLERANCE * (reach + reach.swapaxes(0, 1)))
+    holds = xp.all(residual <= PROPORTIONAL_TOLERANCE * gain_size)
+    holds = holds & xp.all(xp.abs(cross) <= PROPORTIONAL_TOLERANCE * (cross_size + cross_size.swapaxes(0, 1)))
     corner = np.zeros((mean.shape[1], mean.shape[1]))
     corner[-1, -1] = 1.0
     # max_v s_v M y y' M' + N_max.
@@ -67,7 +70,10 @@ def _find_common_gain(tensors: Tensor, mean: Matrix) -> tuple[Tensor, np.ndarray
 
 
 def bound_from_intervals(channel: AbstractRandomAffine, nominal: Moments, mean: Matrix) -> list[QuadraticMap]:
-    """Bound spread, shift and power from the interval of each moment: raw - H0 m' - m H0' + H0 H0'."""
+    """Return bounds of spread, shift and power from the interval of each moment.
+
+    With the nominal mean H0 and raw second moments and means m of any law the spread is raw - H0 m' - m H0' + H0 H0'.
+    """
     low, high = channel.moment_interval(2)
     xp = library(low, high, mean)
     # Middle and half width of each moment.

@@ -127,23 +127,25 @@ class Rounded(AbstractNoise):
         if self.dither not in ("stochastic", "subtracted") or not self.gaussian:
             whole = self.source.covariance + known.whole * self._squares()
             return SignalNoise(self.columns, whole)
-        share = self._average_place(mean, variances + jnp.diagonal(jnp.asarray(self.source.covariance)))
+        share = self._bound_rounding(mean, variances + jnp.diagonal(jnp.asarray(self.source.covariance)))
         error = known.error if self.dither == "subtracted" else share
         whole = jnp.asarray(self.source.covariance) + jnp.diag(share * jnp.asarray(self.step) ** 2)
         return SignalNoise(self._with_error(error * self.step**2), whole)
 
-    def _average_place(self, mean: Vector, variances: Vector) -> jax.Array:
-        """Bound E f (1 - f) from above, f the place of y between two words, in steps D, for y of N(m, s^2).
+    def _bound_rounding(self, mean: Vector, variances: Vector) -> jax.Array:
+        """Return an upper bound of E f (1 - f), f the place of y between two words in steps D, for y of N(m, s^2).
+
+        Dithered rounding has the variance D^2 f (1 - f). With the lowest word `low`
 
         E f (1 - f) = 1/6 - sum_k exp(-2 pi^2 k^2 s^2 / D^2) cos(2 pi k (m - low) / D) / (pi k)^2. The series is cut
         after K = TERMS, and the bound of its tail is added: sum_{k > K} 1 / (pi k)^2 <= 1 / (pi^2 K).
         """
         k = np.arange(1, TERMS + 1)[:, None]
-        size = jnp.asarray(variances) / jnp.asarray(self.step) ** 2
+        relative_variance = jnp.asarray(variances) / jnp.asarray(self.step) ** 2
         place = (jnp.asarray(mean) + jnp.asarray(self.half)) / jnp.asarray(self.step)
         place = place - jnp.floor(place)
-        damped = jnp.exp(-2 * np.pi**2 * k**2 * size) / (np.pi * k) ** 2
-        tail = jnp.exp(-2 * np.pi**2 * TERMS**2 * size) / (np.pi**2 * TERMS)
+        damped = jnp.exp(-2 * np.pi**2 * k**2 * relative_variance) / (np.pi * k) ** 2
+        tail = jnp.exp(-2 * np.pi**2 * TERMS**2 * relative_variance) / (np.pi**2 * TERMS)
         share = 1 / 6 - jnp.sum(damped * jnp.cos(2 * np.pi * k * place), axis=0) + tail
         return jnp.clip(share, 0.0, 0.25)
 
@@ -159,6 +161,7 @@ class Rounded(AbstractNoise):
         return self.source.dimension
 
     def _with_error(self, variances: Vector) -> Columns:
+        """Return the columns of v, then those of independent rounding errors of these variances."""
         return join_columns(self.source.columns, Columns(np.eye(self.dimension), variances))
 
     def branches(self) -> Branches:
@@ -196,7 +199,7 @@ class Rounded(AbstractNoise):
 
 
 def find_rounded(*models: PyTree) -> Sequence[Rounded]:
-    """List the noises of rounded measurements in these models."""
+    """Return the noises of rounded measurements in these models."""
     leaves = jax.tree.leaves(models, is_leaf=lambda leaf: isinstance(leaf, Rounded))
     return [leaf for leaf in leaves if isinstance(leaf, Rounded)]
 
