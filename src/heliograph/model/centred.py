@@ -61,7 +61,10 @@ def _subtract_reference(channel: AbstractRandomAffine, reference: ArrayLike | Ov
 def predict_signal(
     plant: AbstractPlant, sensor: AbstractSensor, x: Float[Array, " n"], u: ArrayLike
 ) -> Float[jax.Array, " m"]:
-    """Prediction h(f(x, u) + E w) + E v of a signal from the state a step before, which both ends of a link compute."""
+    """Return h(f(x, u) + E w) + E v, the prediction of a signal from the state x a step before.
+
+    Both ends of a link compute it.
+    """
     predicted = plant.transition(jnp.asarray(x), jnp.asarray(u)) + plant.noise_mean()
     return jnp.asarray(sensor.measure(predicted) + sensor.noise.mean)
 

@@ -38,7 +38,7 @@ def gilbert_elliott(
     recover: ArrayLike,
     name: str | None = None,
 ) -> Modes:
-    """A link that is `good` or `bad` for a while: it fails with probability `fail` at each step and then recovers.
+    """Return a link that is `good` or `bad` for a while: it fails with a probability at each step, and then recovers.
 
     `good` and `bad` are any channels, with losses too: `erasure(link, arrival)` in each makes losses in bursts. It
     starts in its stationary law. Links of one `name` are good and bad together.
@@ -65,7 +65,7 @@ def markov_fading(
     noise: NoiseLike | None = None,
     name: str | None = None,
 ) -> Modes:
-    """A link whose gain moves as a Markov chain: `gains` are numbers, with one `noise`, or a channel for each mode.
+    """Return a link whose gain moves as a Markov chain: numbers, with one `noise`, or a channel for each mode.
 
     `transition` is P(next j | now i), started in its stationary law, or a chain. Links of one `name`, or of
     chains of one name, move together.
@@ -133,10 +133,8 @@ def with_flag(
     Args:
         channel: the channel.
         probabilities: P(flag | mode), shape (modes, flags), as of a received strength or a modem's quality class.
-            Without
-            it, and without `chain`, the states of all memories are received after z: the number of a mode, the value of
-                a
-            drift.
+            Without it, and without `chain`, the states of all memories are received after z: the number of a mode, the
+            value of a drift.
         chain: the chain on which the flag depends; that of the channel unless given.
         late: True if each step receives the flag of the step before, and none at the first; False unless given.
 
@@ -153,9 +151,10 @@ def with_flag(
     memory = held[0] if chain is None else chain
     if not isinstance(memory, MarkovChain):
         raise fail("chain", "a MarkovChain, of whose modes classes tell", type(memory).__name__)
+    # In each mode a noise whose values are the flags, and nothing of what is sent.
     rows = array("flags", probabilities, (memory.modes, None))
-    nothing, values = np.zeros((1, channel.inputs)), np.arange(rows.shape[1])[:, None]
-    classes = Modes(memory, [GainAndNoise(Constant(1.0), nothing, FiniteSupport(values, row)) for row in rows])
+    no_signal, flags = np.zeros((1, channel.inputs)), np.arange(rows.shape[1])[:, None]
+    classes = Modes(memory, [GainAndNoise(Constant(1.0), no_signal, FiniteSupport(flags, row)) for row in rows])
     return Stack([channel, OneStepLate(classes) if late else classes])
 
 
@@ -218,12 +217,11 @@ def memory_matters(channel: Channel) -> bool:
         return False
     if uncertain_chain(channel):
         return True
+    # Parts of the channel with memories of their own, each over all steps.
     terms = zip(*(terms_without_common_memory(step) for step in unstack(channel)), strict=True)
+    constant = not isinstance(channel, OverTime)
     return any(
-        not is_memory_irrelevant_for_linear_filter(
-            [joint_modes(step) for step in term], not isinstance(channel, OverTime)
-        )
-        for term in terms
+        not is_memory_irrelevant_for_linear_filter([joint_modes(step) for step in term], constant) for term in terms
     )
 
 

@@ -46,8 +46,9 @@ class SwitchingRates(Module):
         if is_traced(G):
             raise fail("rates", "numbers, which are not free", "traced ones")
         G = np.asarray(G, float)
-        apart = G[~np.eye(len(G), dtype=bool)]
-        if len(G) != G.shape[1] or (apart < 0).any() or np.max(np.abs(G.sum(axis=1))) > SUM * np.max(np.abs(G)):
+        off_diagonal = G[~np.eye(len(G), dtype=bool)]
+        is_balanced = np.max(np.abs(G.sum(axis=1))) <= SUM * np.max(np.abs(G))
+        if len(G) != G.shape[1] or (off_diagonal < 0).any() or not is_balanced:
             raise fail(
                 "rates", "a square matrix, 0 or more beside its diagonal, of which each row sums to 0", G.tolist()
             )
@@ -313,11 +314,14 @@ def markov_sensor(
 
 
 def transition_over(plant: AbstractPlant, u: jax.Array, chain: jax.Array) -> jax.Array:
-    """Return the transition (M, M) of joint modes, plant's first: that of a plant's rates over dt, then the chain's."""
+    """Return the transition (M, M) of joint modes over a row with inputs u.
+
+    The plant's mode is the slowest: it moves by the plant's rates over dt, if it has some, then all by the chain.
+    """
     if not isinstance(plant, ModalPlant) or plant.rates is None:
         return chain
-    own = plant.rates.over(u[plant.inputs.index(TIME_STEP)])
-    return jnp.kron(own, jnp.eye(len(chain) // len(own))) @ chain
+    by_rates = plant.rates.over(u[plant.inputs.index(TIME_STEP)])
+    return jnp.kron(by_rates, jnp.eye(len(chain) // len(by_rates))) @ chain
 
 
 def models_of(model: Any) -> tuple[Any, ...]:

@@ -109,7 +109,7 @@ class AbstractPlant(Module):
         return changed
 
     def near(self, x: A, other: Array) -> A:
-        """The same state x (..., n), its angles within half a turn of those of `other`: so they can be averaged."""
+        """Return the state x (..., n) with its angles within half a turn of those of `other`, so that they average."""
         return self.manifold.near(x, other)
 
     def moves(
@@ -171,6 +171,7 @@ class JointNoise(Module):
     places: tuple[tuple[int, ...], ...] = eqx.field(static=True)
 
     def _each(self, u: jax.Array) -> list[tuple[AbstractPlant, jax.Array]]:
+        """Return each plant with its own inputs."""
         return [(plant, jnp.asarray(u)[np.array(at, int)]) for plant, at in zip(self.plants, self.places, strict=True)]
 
     def __call__(self, u: jax.Array) -> jax.Array:

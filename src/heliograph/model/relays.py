@@ -109,7 +109,7 @@ class RelayNetwork(Module):
         varies = steps_covered(self.slots) is not None
         period = horizon if varies else min(len(self.slots), horizon)
         tables = [_compute_slot_moments(self, self.slots[k % len(self.slots)], k) for k in range(period)]
-        gain, offset, spread, live, talks = (
+        gain, offset, spread, receives, transmits = (
             np.stack(parts)[np.arange(horizon) % period] for parts in zip(*tables, strict=True)
         )
         transition = _repeat_over_steps(self.plant, horizon, lambda p: p.matrix, 2)
@@ -129,8 +129,8 @@ class RelayNetwork(Module):
             gain=gain,
             offset=offset,
             spread=spread,
-            receives_in_slot=live,
-            transmits_in_slot=talks,
+            receives_in_slot=receives,
+            transmits_in_slot=transmits,
             received=self.received,
         )
 
@@ -140,11 +140,12 @@ class RelaySteps(Module):
 
     The F filters together receive R numbers; T = (1 + relays) m numbers are sent: y, then the signal of each relay.
     With W = E (sent, 1)(sent, 1)', what is received has mean gain sent + offset and conditional covariance spread_ij :
-    W (noise included). Rows with `receives_in_slot` = 1 have some link; `state_mean` is E x before the step.
+    W (noise included). Rows with `receives_in_slot` = 1 have some link, senders with `transmits_in_slot` = 1 too;
+    `state_mean` is E x before the step.
 
     Shapes: transition, process (time, n, n), drift, state_mean (time, n), sensing (time, m, n), sensor_noise
-    (time, m, m), sensor_offset (time, m), gain (time, R, T), offset, live (time, R), spread
-    (time, R, R, T + 1, T + 1), talks (time, 1 + relays).
+    (time, m, m), sensor_offset (time, m), gain (time, R, T), offset, receives_in_slot (time, R), spread
+    (time, R, R, T + 1, T + 1), transmits_in_slot (time, 1 + relays).
     """
 
     transition: np.ndarray
@@ -179,12 +180,12 @@ class RelaySteps(Module):
 
 
 def _compute_slot_moments(network: RelayNetwork, slot: Slot, k: int) -> tuple[np.ndarray, ...]:
-    """Return gain, offset, spread, live rows and active senders of one slot, with the shapes of `RelaySteps`."""
+    """Return gain, offset, spread, receiving rows and transmitting senders of a slot, shaped as in `RelaySteps`."""
     m, senders = len(first(network.sensor).outputs), (SENSOR, *network.relays)
     rows, columns = sum(network.received), len(senders) * m
     starts = dict(zip(network.filters, np.cumsum((0, *network.received[:-1])), strict=True))
-    gain, offset, live = np.zeros((rows, columns)), np.zeros(rows), np.zeros(rows)
-    spread, talks = np.zeros((rows, rows, columns + 1, columns + 1)), np.zeros(len(senders))
+    gain, offset, receives = np.zeros((rows, columns)), np.zeros(rows), np.zeros(rows)
+    spread, transmits = np.zeros((rows, rows, columns + 1, columns + 1)), np.zeros(len(senders))
     for listener, links in slot.items():
         for sender, link in links.items():
             moments = second_order(at(link, k))
@@ -197,8 +198,8 @@ def _compute_slot_moments(network: RelayNetwork, slot: Slot, k: int) -> tuple[np
             offset[received] += moments.offset
             with_one = np.append(sent, columns)
             spread[np.ix_(received, received, with_one, with_one)] += moments.nominal.center
-            live[received], talks[senders.index(sender)] = 1.0, 1.0
-    return gain, offset, spread, live, talks
+            receives[received], transmits[senders.index(sender)] = 1.0, 1.0
+    return gain, offset, spread, receives, transmits
 
 
 def _repeat_over_steps(model: PyTree, horizon: int, read: Callable[[PyTree], Array], dimensions: int) -> np.ndarray:

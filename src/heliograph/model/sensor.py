@@ -223,7 +223,7 @@ class LinearSensor(AbstractSensor):
         return LinearSensor(matrix(u) if isinstance(matrix, OfInputs) else matrix, noise, self.outputs, self.circular)
 
     def check_states(self, states: int) -> None:
-        """Refuse a state of another length: by the shape of the matrix, since a trace for each node would take long."""
+        """Raise ValueError unless the matrix is for states of this length: to trace the function would take long."""
         if self.inputs:
             super().check_states(states)
         elif self.matrix.shape[-1] != states:
@@ -235,9 +235,8 @@ def _round_to(noise: AbstractNoise, resolution: ArrayLike | None, circular: Sequ
     if resolution is None:
         return noise
     if isinstance(noise, NoiseOfInputs):
-        raise fail(
-            "resolution of a sensor", "a noise that depends on no inputs beside it", f"one of {list(noise.inputs)}"
-        )
+        expected = "a noise that depends on no inputs beside it"
+        raise fail("resolution of a sensor", expected, f"one of {list(noise.inputs)}")
     if circular:
         raise fail("resolution of a sensor", "outputs that are no angles", list(circular))
     m = noise.dimension
@@ -249,6 +248,7 @@ def _round_to(noise: AbstractNoise, resolution: ArrayLike | None, circular: Sequ
 
 @in_float64
 def _give(sensor: AbstractSensor, u: Array) -> AbstractSensor:
+    """Return the sensor under its inputs u, computed in double precision."""
     return sensor.given(jnp.asarray(u))
 
 
@@ -270,9 +270,8 @@ def _take_state_alone(measure: object) -> Callable[[jax.Array], ArrayLike]:
 def _constant(name: str, value: object) -> Any:
     """Return a constant; raise ValueError where it is a function of inputs that have no names."""
     if callable(value):
-        raise fail(
-            name, "a constant, or inputs=[...], the names of those of the plant that a function takes", "a function"
-        )
+        expected = "a constant, or inputs=[...], the names of those of the plant that a function takes"
+        raise fail(name, expected, "a function")
     return value
 
 
@@ -283,17 +282,18 @@ def _find_shape(measure: Callable[[jax.Array], ArrayLike]) -> tuple[int, ...]:
     """
 
     def shape(states: int) -> tuple[int, ...] | None:
+        """Return the shape of h for a state of this length, None where h does not take it."""
         try:
             with jax.enable_x64(True):
                 return tuple(jax.eval_shape(lambda x: jnp.asarray(measure(x)), np.zeros(states)).shape)
         except Exception:  # not for this length; what is wrong for all is said where the plant is known
             return None
 
-    first_, second = (shape(states) for states in LONG)
-    if first_ is not None and second is not None:
-        return first_ if first_ == second else (1,)
-    taken = [taken_shape for states in SHORT if (taken_shape := shape(states)) is not None]
-    return taken[0] if len(taken) == 1 else (1,)
+    one, other = (shape(states) for states in LONG)
+    if one is not None and other is not None:
+        return one if one == other else (1,)
+    shapes = [taken for states in SHORT if (taken := shape(states)) is not None]
+    return shapes[0] if len(shapes) == 1 else (1,)
 
 
 def without_output_names(model: T) -> T:

@@ -27,7 +27,7 @@ StuckLike = TypeAliasType("StuckLike", "bool | int | Sequence[bool | int | None]
 
 
 class Repeats(NamedTuple):
-    """Of each received number its newest reading, and how many in a row are equal to it; () before the first.
+    """Runs of equal readings: the newest of each received number, and how many in a row equal it; () before the first.
 
     Args:
         newest: newest readings (m,), NaN before the first.
@@ -73,12 +73,12 @@ def count_repeats(z: Float[np.ndarray, "time m"], before: Repeats) -> tuple[Int[
         rows = np.flatnonzero(~np.isnan(z[:, i]))
         if len(rows) == 0:
             continue
-        came, place = z[rows, i], np.arange(len(rows))
-        begins = came != np.concatenate([[newest[i]], came[:-1]])
-        # Place of the newest beginning; that of the run before these rows is before the first.
-        begun = np.maximum.accumulate(np.where(begins, place, -lengths[i]))
-        counts[rows, i] = place - begun + 1
-        newest[i], lengths[i] = float(came[-1]), int(counts[rows[-1], i])
+        readings, place = z[rows, i], np.arange(len(rows))
+        begins = readings != np.concatenate([[newest[i]], readings[:-1]])
+        # Place where the present run began; that of the run before these rows is before the first.
+        start = np.maximum.accumulate(np.where(begins, place, -lengths[i]))
+        counts[rows, i] = place - start + 1
+        newest[i], lengths[i] = float(readings[-1]), int(counts[rows[-1], i])
     return counts, Repeats(tuple(newest), tuple(lengths))
 
 
@@ -107,10 +107,10 @@ def bound_equal_readings(
         return np.concatenate([bound_equal_readings(*part) for part in zip(noise.parts, of_parts, strict=True)])
     if steps is None:
         raise fail("stuck", "a sensor with resolution=, or after how many equal readings", "no resolution")
-    return _bound(noise, steps)
+    return _bound_in_step(noise, steps)
 
 
-def _bound(noise: AbstractNoise, step: Float[np.ndarray, " outputs"]) -> Float[np.ndarray, " outputs"]:
+def _bound_in_step(noise: AbstractNoise, step: Float[np.ndarray, " outputs"]) -> Float[np.ndarray, " outputs"]:
     """Return the largest probability that one noise lies in an interval of a step, of each output."""
     if isinstance(noise, StudentT):
         scale = np.sqrt(np.diagonal(np.asarray(noise.scale)))
@@ -155,20 +155,20 @@ def stuck_counts(
         ValueError: another count of them, fewer than 2 readings, a sensor or a channel that does not say.
     """
     expected = f"True, a whole number of equal readings from 2 to {MOST:,}, None, or a list of {received} of these"
-    alone = stuck is None or isinstance(stuck, bool | np.bool_) or is_whole(stuck)
-    if not alone and not isinstance(stuck, Sequence | np.ndarray):
+    for_all = stuck is None or isinstance(stuck, bool | np.bool_) or is_whole(stuck)
+    if not for_all and not isinstance(stuck, Sequence | np.ndarray):
         raise fail("stuck", expected, show_value(stuck))
-    several = [stuck] * received if alone else list(stuck)  # type: ignore[arg-type]
-    if isinstance(stuck, str) or len(several) != received:
+    each = [stuck] * received if for_all else list(stuck)  # type: ignore[arg-type]
+    if isinstance(stuck, str) or len(each) != received:
         raise fail("stuck", expected, show_value(stuck))
     counts = np.full(received, np.inf)
-    for i, one in enumerate(several):
-        if one is None or (isinstance(one, bool | np.bool_) and not one):
+    for i, wanted in enumerate(each):
+        if wanted is None or (isinstance(wanted, bool | np.bool_) and not wanted):
             continue
-        if isinstance(one, bool | np.bool_):
+        if isinstance(wanted, bool | np.bool_):
             counts[i] = _count_by_law(received, sensor, channel)[i]
-        elif is_whole(one) and 2 <= one <= MOST:
-            counts[i] = one
+        elif is_whole(wanted) and 2 <= wanted <= MOST:
+            counts[i] = wanted
         else:
             raise fail("stuck", expected, show_value(stuck))
     return None if np.all(np.isinf(counts)) else counts
@@ -191,7 +191,7 @@ def _count_by_law(received: int, sensor: AnySensor | None, channel: Channel | No
 
 
 def delivers_as_sent(link: AbstractRandomAffine, outputs: tuple[int, ...]) -> bool:
-    """Ask whether a link loses outputs or delivers them as they are: no radio with a gain and noise of its own."""
+    """Decide whether a link loses outputs or delivers them as they are: no radio with a gain and noise of its own."""
     if any(isinstance(hop, AbstractHop) and hop.transmits for hop in (link, *all_inner_maps(link))):
         return False
     try:

@@ -96,6 +96,7 @@ def told(
 
 
 def _check_law(law: object) -> AbstractLaw | AbstractNoise | None:
+    """Return a law of numbers, or None; ValueError of anything else."""
     if law is None or isinstance(law, AbstractLaw | AbstractNoise):
         return law
     raise fail("law of the numbers told", "a noise law, a law of gains, or a MarkovChain", show_value(law))
@@ -130,6 +131,7 @@ def deliver_told(link: AbstractRandomAffine) -> Stack:
 
 
 def _announce(link: AbstractRandomAffine, sent: int) -> list[ModeOutput]:
+    """Return the outputs that tell what each told map of a link tells, beside `sent` numbers."""
     return [ModeOutput(affine.memory, sent) for affine in told_maps(link)]
 
 

@@ -15,7 +15,7 @@ from heliograph.numerics.types import Float, PyTree
 
 
 def find_function_fault(filter: PyTree, before: Estimate, u: Float[np.ndarray, " inputs"], step: int) -> str:
-    """Name the function of a filter's model that returned no finite number, and for what; "" where none is found.
+    """Return in words which function of a filter's model returned no finite number, and for what; "" if none did.
 
     The functions are tried at the mean before the step and one deviation from it in each state, as filters do.
 
@@ -53,6 +53,7 @@ def _iterate_trials(before: Estimate) -> Iterator[Float[np.ndarray, " n"]]:
 
 
 def _takes(plant: AbstractPlant, x: np.ndarray, u: np.ndarray) -> bool:
+    """Return whether a plant has as many states and inputs."""
     return len(plant.states) == len(x) and len(plant.inputs) == len(u)
 
 

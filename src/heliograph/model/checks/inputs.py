@@ -42,14 +42,13 @@ def find_time_step_fault(dt: Float[np.ndarray, " steps"]) -> Fault | None:
     if not bad.any():
         return None
     row = int(np.argmax(bad))
-    came = f"{dt[row]:.10g}"
+    got = f"{dt[row]:.10g}"
     if dt[row] < 0:
-        return Fault(row, "a time step that does not go backwards", came)
+        return Fault(row, "a time step that does not go backwards", got)
     if dt[row] > LONGEST:
-        return Fault(row, "a time step of at most 2^53 units, as far as a double counts", came)
-    return Fault(
-        row, "a time step", f"{came}: {dt[row] - WRAPPED:.10g} as a difference of unsigned counters of 32 bits"
-    )
+        return Fault(row, "a time step of at most 2^53 units, as far as a double counts", got)
+    wrapped = f"{dt[row] - WRAPPED:.10g} as a difference of unsigned counters of 32 bits"
+    return Fault(row, "a time step", f"{got}: {wrapped}")
 
 
 def check_time_step(names: Sequence[str], u: Float[np.ndarray, "... inputs"]) -> None:
@@ -68,6 +67,7 @@ def check_time_step(names: Sequence[str], u: Float[np.ndarray, "... inputs"]) ->
 
 
 def _is_time_step(dt: Array) -> Array:
+    """Return whether each number is from 0 to 2^53, and no difference of unsigned counters below zero."""
     wrapped = (dt >= WRAPPED - NEAR) & (dt < WRAPPED) & (dt.round() == dt)
     return (dt >= 0) & (dt <= LONGEST) & ~wrapped
 
@@ -146,6 +146,7 @@ COVARIANCES = NOISE, SENSOR_NOISE
 
 
 def _sensor_matrix(sensor: LinearSensor, u: jax.Array) -> jax.Array:
+    """Return C(u) of a linear sensor."""
     return matrix_of(sensor.matrix, u)
 
 
@@ -162,7 +163,7 @@ def _input_matrix(plant: AbstractPlant, u: jax.Array) -> jax.Array:
 def _check_functions(plant: AnyPlant | AnySensor, u: Float[np.ndarray, "steps inputs"], steps: np.ndarray) -> None:
     """Raise one line that names the row if a matrix or covariance is no such thing for some inputs u."""
     functions = _list_functions(first(plant))
-    parts = list(_evaluate_in_parts(plant, tuple(functions.values()), u, steps)) if functions else []
+    parts = list(_evaluate_by_parts(plant, tuple(functions.values()), u, steps)) if functions else []
     for name, values in zip(functions, map(np.concatenate, zip(*parts, strict=True)), strict=True):
         wrong = find_wrong_covariances(values) if name in COVARIANCES else ~np.isfinite(values).all(axis=(1, 2))
         if wrong.any():
@@ -173,7 +174,7 @@ def _check_functions(plant: AnyPlant | AnySensor, u: Float[np.ndarray, "steps in
             raise fail(name, "a covariance" if name in COVARIANCES else "finite numbers", came)
 
 
-def _evaluate_in_parts(
+def _evaluate_by_parts(
     plant: AnyPlant | AnySensor,
     functions: tuple[MatrixOfInputs, ...],
     u: Float[np.ndarray, "steps inputs"],
@@ -181,11 +182,13 @@ def _evaluate_in_parts(
 ) -> Iterator[tuple[np.ndarray, ...]]:
     """Yield what functions return, some steps at a time."""
     for start in range(0, len(u), ROWS):
-        yield _evaluate(plant, functions, u[start : start + ROWS], steps[start : start + ROWS])
+        yield _evaluate_at_steps(plant, functions, u[start : start + ROWS], steps[start : start + ROWS])
 
 
 @compile_in_float64
-def _evaluate(plant: AnyPlant | AnySensor, functions: tuple[MatrixOfInputs, ...], u: Array, steps: Array) -> Any:
+def _evaluate_at_steps(
+    plant: AnyPlant | AnySensor, functions: tuple[MatrixOfInputs, ...], u: Array, steps: Array
+) -> Any:
     """Return what functions return at each step, each (steps, n, m): compiled, for operation by operation is slow."""
 
     def of_step(k: jax.Array, u_k: jax.Array) -> tuple[jax.Array, ...]:
@@ -196,6 +199,7 @@ def _evaluate(plant: AnyPlant | AnySensor, functions: tuple[MatrixOfInputs, ...]
 
 
 def _shorten(value: np.ndarray) -> str:
+    """Return a matrix as text of at most MOST_SHOWN characters."""
     shown = str(np.round(value, 12).tolist())
     return shown if len(shown) <= MOST_SHOWN else shown[: MOST_SHOWN - 3] + "..."
 
@@ -215,7 +219,7 @@ def find_wrong_covariances(values: Float[np.ndarray, "steps n n"]) -> np.ndarray
 def do_inputs_spoil(
     model: PyTree, names: Sequence[str], u: jax.Array, k: jax.Array | int, precision: type | None = None
 ) -> jax.Array:
-    """Test in a compiled step whether the time step is none or a plant's function of the inputs returns what is none.
+    """Decide in a compiled step whether the time step is none, or a function of the inputs returns what is none.
 
     Args:
         model: a filter, or anything else that holds plants with these inputs.
@@ -248,7 +252,9 @@ def _is_spoilt(model: AbstractPlant | AbstractSensor, u: jax.Array, precision: t
 
 
 def _is_covariance(matrix: jax.Array, precision: type | None) -> jax.Array:
-    """Test a matrix (n, n) by elimination of its correlations: finite, symmetric, no pivot below zero.
+    """Decide whether a matrix (n, n) is a covariance, by elimination of its correlations.
+
+    It has to be finite and symmetric, without a pivot below zero.
 
     Where a pivot is zero, nothing may be left of its column: |c_ij|^2 <= c_ii c_jj.
     """

@@ -55,48 +55,55 @@ def with_bias(
     instance("sensor with a bias", sensor, AbstractSensor, "one that does not vary")
     n, outputs = len(plant.states), len(sensor.outputs)
     check_sensor(sensor, n)
-    # E and D; how many biases there are, the first that is known says.
-    alone = coupling is None and loading is None
-    count = len(bias.states) if isinstance(bias, LinearPlant) else outputs if alone else "biases"
-    entering = None if coupling is None else array("coupling of the bias", coupling, (n, count))
-    count = count if entering is None else entering.shape[1]
-    seen: Any = np.eye(outputs) if alone else np.zeros((outputs, count)) if loading is None else loading
+    # How many biases there are: the first that is known says.
+    by_output = coupling is None and loading is None
+    count: int | str = "biases"
+    if isinstance(bias, LinearPlant):
+        count = len(bias.states)
+    elif by_output:
+        count = outputs
+    # E (n, biases) and D (outputs, biases).
+    drives = None if coupling is None else array("coupling of the bias", coupling, (n, count))
+    count = count if drives is None else drives.shape[1]
+    seen: Any = loading
+    if loading is None:
+        seen = np.eye(outputs) if by_output else np.zeros((outputs, count))
     seen = array("loading of the bias", seen, (outputs, count))
-    entering = np.zeros((n, seen.shape[1])) if entering is None else entering
+    drives = np.zeros((n, seen.shape[1])) if drives is None else drives
     if not isinstance(bias, LinearPlant):
-        named = (
-            [rename(name, f"{name}_bias") for name in sensor.outputs]
-            if alone
-            else [f"bias{i}" for i in range(seen.shape[1])]
-        )
-        bias = _make_gauss_markov(plant, named, bias, time, dt)
-    return driven_by(plant, bias, entering), _append_to_sensor(sensor, seen, n)
+        names = [f"bias{i}" for i in range(seen.shape[1])]
+        if by_output:
+            names = [rename(name, f"{name}_bias") for name in sensor.outputs]
+        bias = _make_gauss_markov(plant, names, bias, time, dt)
+    return driven_by(plant, bias, drives), _append_to_sensor(sensor, seen, n)
 
 
 def _make_gauss_markov(
     plant: AbstractPlant, names: list[str], deviation: ArrayLike, time: ArrayLike, dt: ArrayLike | str
 ) -> LinearPlant:
     """Return the Gauss-Markov processes: b+ = a b + xi, a = exp(-dt / T), Var xi = (1 - a^2) deviation^2."""
-    count = len(names)
-    sizes = [
-        scalar("deviation of a bias", x, 0.0) for x in _broadcast_to_biases("deviation of a bias", deviation, count)
-    ]
+    count, what = len(names), "deviation of a bias"
+    deviations = [scalar(what, x, 0.0) for x in _broadcast_to_biases(what, deviation, count)]
     rates = [_compute_rate(x) for x in _broadcast_to_biases("time of a bias", time, count)]
-    size, rate = (library(values).stack([library(x).asarray(x) for x in values]) for values in (sizes, rates))
-    # With a step that is a number, or as functions of the input that says it.
+    # Deviation and 1 / T of each bias, as arrays (biases,).
+    size, rate = (library(values).stack([library(x).asarray(x) for x in values]) for values in (deviations, rates))
     xp = library(size, rate)
     start, center = xp.diag(size**2), np.zeros(count)
+    # A step that is a number makes constants; else the matrices are functions of the input that says it.
     if not isinstance(dt, str):
         step = scalar("time of a step", dt, 0.0)
-        fresh = xp.diag(size**2 * -xp.expm1(-2 * step * rate))
-        return LinearPlant(xp.diag(xp.exp(-step * rate)), fresh, center, start, states=names)
+        noise = xp.diag(size**2 * -xp.expm1(-2 * step * rate))
+        return LinearPlant(xp.diag(xp.exp(-step * rate)), noise, center, start, states=names)
     if dt not in plant.inputs:
         raise fail("dt", f"a number, or one of the inputs {list(plant.inputs)}", repr(dt))
 
-    def fresh_in(u: jax.Array) -> jax.Array:
+    def matrix_over(u: jax.Array) -> jax.Array:
+        return jnp.diag(jnp.exp(-u[0] * rate))
+
+    def noise_over(u: jax.Array) -> jax.Array:
         return jnp.diag(jnp.asarray(size) ** 2 * -jnp.expm1(-2 * u[0] * rate))
 
-    return LinearPlant(lambda u: jnp.diag(jnp.exp(-u[0] * rate)), fresh_in, center, start, states=names, inputs=[dt])
+    return LinearPlant(matrix_over, noise_over, center, start, states=names, inputs=[dt])
 
 
 class Driven(Module):
@@ -126,18 +133,20 @@ def driven_by(plant: AbstractPlant, bias: LinearPlant, coupling: np.ndarray) -> 
     models = plant, bias
     if set(bias.inputs) - set(plant.inputs):
         raise fail("bias", f"a plant whose inputs are some of {list(plant.inputs)}", list(bias.inputs))
-    new = {name: rename(name, f"bias_{name}") if name in plant.states else name for name in bias.states}
-    states = (*plant.states, *new.values())
-    circular = (*plant.circular, *(new[name] for name in bias.circular))
-    limits = (*plant.limits, *((new[name], ends) for name, ends in bias.limits))
+    # Names of the states of b, changed where x has one of the same name.
+    new_names = {name: rename(name, f"bias_{name}") if name in plant.states else name for name in bias.states}
+    states = (*plant.states, *new_names.values())
+    circular = (*plant.circular, *(new_names[name] for name in bias.circular))
+    limits = (*plant.limits, *((new_names[name], ends) for name, ends in bias.limits))
     # Both laws of the initial state, and of the noises.
     laws = [model.deviation or Gaussian(model.initial_covariance) for model in models]
     centers = [model.initial_mean - law.mean for model, law in zip(models, laws, strict=True)]
     center, start = library(*centers).concatenate(centers), Independent(laws)
+    # Independent noises: as one law, or under the inputs where one of them depends on these.
     places = tuple(plant.inputs.index(name) for name in bias.inputs)
     noises = [model.noise for model in models if isinstance(model.noise, AbstractNoise)]
-    every = tuple(range(len(plant.inputs)))
-    noise = Independent(noises) if len(noises) == 2 else JointNoise(models, (every, places))
+    all_inputs = tuple(range(len(plant.inputs)))
+    noise = Independent(noises) if len(noises) == 2 else JointNoise(models, (all_inputs, places))
     if not isinstance(plant, LinearPlant):
         move = Driven(plant, bias, coupling, places)
         if np.any(np.asarray(coupling)[list(plant.manifold.rotations)]):
@@ -156,8 +165,8 @@ def _stack_blocks(plant: LinearPlant, bias: LinearPlant, coupling: np.ndarray, p
         return matrix, xp.concatenate([plant.input_matrix, bias.input_matrix @ pick])
 
     def move(u: jax.Array) -> jax.Array:
-        own = bias.transition_matrix(pick @ u)
-        return jnp.block([[plant.transition_matrix(u), jnp.asarray(coupling)], [jnp.asarray(below), own]])
+        of_bias = bias.transition_matrix(pick @ u)
+        return jnp.block([[plant.transition_matrix(u), jnp.asarray(coupling)], [jnp.asarray(below), of_bias]])
 
     def drive(u: jax.Array) -> jax.Array:
         return jnp.concatenate([matrix_of(plant.input_matrix, u), matrix_of(bias.input_matrix, pick @ u) @ pick])
@@ -178,7 +187,7 @@ class Biased(Module):
 
 
 def _append_to_sensor(sensor: AbstractSensor, loading: np.ndarray, states: int) -> LinearSensor | Sensor:
-    """Return the sensor of [x; b]."""
+    """Return the sensor y = h(x) + D b + v of [x; b], D the loading and `states` the length of x."""
     if not isinstance(sensor, LinearSensor):
         return Sensor(Biased(sensor, loading, states), sensor.noise, sensor.outputs, sensor.circular)
     stacked = library(sensor.matrix, loading).concatenate([sensor.matrix, loading], axis=1)

@@ -24,8 +24,9 @@ Motion = Callable[[jax.Array], ArrayLike] | Matrix  # dx/dt, or the matrix of it
 class Clock(NamedTuple):
     """A clock that shows t + offset at t; the offset grows by `drift` a unit of time, the drift wanders.
 
-    offset, drift: their standard deviations at the start; wander: variance that the drift gains at each step; delay:
-    mean of the offset at the start, by which stamps are late (`fit` learns it against a truth). The drift has mean 0.
+    offset, drift: their standard deviations at the start; wander: variance that the drift gains, at each step where
+    dt is a number, in each unit of time where it is an input; delay: mean of the offset at the start, by which stamps
+    are late (`fit` learns it against a truth). The drift has mean 0.
     """
 
     offset: float
@@ -84,22 +85,23 @@ def with_clocks(
     instance("plant with clocks", plant, AbstractPlant, "a plant that does not vary")
     sensors, clocks = table("sensors", sensors, "sensors of nodes"), table("clocks", clocks, "clocks of nodes")
     n = len(plant.states)
-    step = _step(plant, dt)
+    step = _read_step(plant, dt)
     if set(clocks) - set(sensors) or not clocks:
         raise fail("clocks", f"those of some of the nodes {list(sensors)}", list(clocks))
     for name, sensor in sensors.items():
         check_sensor(instance(f"sensor of node {name!r}", sensor, AbstractSensor, "one that does not vary"), n)
         sensor.refuse_inputs("a node with a clock")
     moving = function("motion", motion, "x") if callable(motion) else array("motion", motion, (n, n))
-    places = {name: n + 2 * i for i, name in enumerate(clocks)}
+    # States: those of the plant, then offset and drift of each clock.
+    total = n + 2 * len(clocks)
+    offsets = {name: n + 2 * i for i, name in enumerate(clocks)}
     larger = driven_by(plant, _make_clocks(clocks, step), np.zeros((n, 2 * len(clocks))))
     return larger, {
-        name: _enlarge_sensor(sensor, moving, n, n + 2 * len(clocks), places.get(name))
-        for name, sensor in sensors.items()
+        name: _enlarge_sensor(sensor, moving, n, total, offsets.get(name)) for name, sensor in sensors.items()
     }
 
 
-def _step(plant: AbstractPlant, dt: ArrayLike | str) -> Any:
+def _read_step(plant: AbstractPlant, dt: ArrayLike | str) -> Any:
     """Return the time of a step, or the name of the plant's input that says it."""
     if not isinstance(dt, str):
         return scalar("time of a step", dt, 0.0)
@@ -114,39 +116,44 @@ def _make_clocks(clocks: Mapping[str, Clock], dt: str | Any) -> LinearPlant:
     Steps of one length: the drift gains the variance `wander` at each. Lengths that vary, by an input: it gains
     wander dt within a step, as white noise does, and the offset what that makes of it.
     """
-    spread, wander, start_at, states = [], [], [], []
+    means, variances, wanders, states = [], [], [], []
     for name, clock in clocks.items():
         instance(f"clock of {name!r}", clock, Clock, "a Clock")
-        start_at += [scalar(f"delay of the clock of {name!r}", clock.delay), 0.0]
-        offset_deviation, drift_deviation, wander_of = (
+        means += [scalar(f"delay of the clock of {name!r}", clock.delay), 0.0]
+        offset_deviation, drift_deviation, wander = (
             scalar(f"{field} of the clock of {name!r}", getattr(clock, field), 0.0)
             for field in ("offset", "drift", "wander")
         )
-        spread += [offset_deviation**2, drift_deviation**2]
-        wander.append(wander_of)
+        variances += [offset_deviation**2, drift_deviation**2]
+        wanders.append(wander)
         offset = f"{name}_offset"  # in the unit of dt, where that is an input with one
         states += [rename(dt, offset) if isinstance(dt, str) else offset, f"{name}_drift"]
-    center, start, strength = (library(x).asarray(library(x).stack(x)) for x in (start_at, spread, wander))
-    each, xp = np.eye(len(clocks)), library(start, strength)
-    start, strength = xp.diag(start), xp.diag(strength)
+    mean, variance, wander = (library(x).asarray(library(x).stack(x)) for x in (means, variances, wanders))
+    each, xp = np.eye(len(clocks)), library(variance, wander)
+    start, strength = xp.diag(variance), xp.diag(wander)
+    # Steps of one length.
     if not isinstance(dt, str):
         noise = xp.kron(strength, np.diag([0.0, 1.0]))
-        return LinearPlant(np.kron(each, [[1.0, dt], [0.0, 1.0]]), noise, center, start, states=states)
+        return LinearPlant(np.kron(each, [[1.0, dt], [0.0, 1.0]]), noise, mean, start, states=states)
 
-    def move(u: jax.Array) -> jax.Array:
+    # Steps of a length that an input says: the integral of white noise in the drift, and of that in the offset.
+    def matrix_over(u: jax.Array) -> jax.Array:
         return jnp.kron(each, jnp.array([[1.0, u[0]], [0.0, 1.0]]))
 
-    def gained(u: jax.Array) -> jax.Array:  # the integral of white noise in the drift, and of that in the offset
-        of_step = jnp.array([[u[0] ** 3 / 3, u[0] ** 2 / 2], [u[0] ** 2 / 2, u[0]]])
-        return jnp.kron(jnp.asarray(strength), of_step)
+    def noise_over(u: jax.Array) -> jax.Array:
+        of_clock = jnp.array([[u[0] ** 3 / 3, u[0] ** 2 / 2], [u[0] ** 2 / 2, u[0]]])
+        return jnp.kron(jnp.asarray(strength), of_clock)
 
-    return LinearPlant(move, gained, center, start, states=states, inputs=[dt])
+    return LinearPlant(matrix_over, noise_over, mean, start, states=states, inputs=[dt])
 
 
 def _enlarge_sensor(
     sensor: AbstractSensor, motion: Motion, states: int, total: int, offset: int | None
 ) -> LinearSensor | Stamped:
-    """Return the sensor of a state that has more components behind the plant's, which it does not see."""
+    """Return the sensor for a state of `total` components, of which the first `states` are those that it measures.
+
+    `offset`: the place of its clock's offset; None of a sensor whose clock is right.
+    """
     if offset is None and isinstance(sensor, LinearSensor):
         matrix = library(sensor.matrix).pad(sensor.matrix, ((0, 0), (0, total - states)))
         return LinearSensor(matrix, sensor.noise, sensor.outputs, sensor.circular)

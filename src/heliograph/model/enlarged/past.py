@@ -41,32 +41,31 @@ def with_past(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> tuple[Any
 
 
 def _append_line(plant: Any, sensor: Any, past: int) -> LinearPlant:
-    """Return x+ = A x + B u + w, y+ = C x+ + v as one plant whose line of past outputs is shifted by one."""
+    """Return the plant of (x, y_k, ..., y_{k-past}): x+ = A x + B u + w, y+ = C x+ + v, and the line moves on."""
     if not isinstance(plant.noise, AbstractNoise):
         raise fail("noise of a plant behind a random delay", "a covariance or a noise law", "a function of the inputs")
     c = sensor.matrix
     xp = library(plant.matrix, plant.input_matrix, c)
     m, n = c.shape
     length = past * m
-    # (w, v) enters x+ and y+ = C w + v.
-    enters = xp.block([[np.eye(n), np.zeros((n, m))], [c, np.eye(m)], [np.zeros((length, n + m))]])
-    # y_k, ..., y_{k-D+1} move on by one place.
-    shift = np.eye(length, length + m)
-    moves = xp.concatenate([plant.matrix, c @ plant.matrix, np.zeros((length, n))])
-    rest = np.concatenate([np.zeros((n + m, length + m)), shift])
+    # Columns of x, and of the line, of which y_k, ..., y_{k-past+1} move on by one place.
+    from_state = xp.concatenate([plant.matrix, c @ plant.matrix, np.zeros((length, n))])
+    from_line = np.concatenate([np.zeros((n + m, length + m)), np.eye(length, length + m)])
     driven = xp.concatenate([plant.input_matrix, c @ plant.input_matrix, np.zeros((length, len(plant.inputs)))])
+    # (w, v) enters x+ and y+ = C w + v.
+    noise_matrix = xp.block([[np.eye(n), np.zeros((n, m))], [c, np.eye(m)], [np.zeros((length, n + m))]])
     # Nothing was sent before the start.
     law = Gaussian(plant.initial_covariance) if plant.deviation is None else plant.deviation
     line = [
         rename(name, f"{name}_{d}_ago" if d else f"{name}_sent") for d in range(past + 1) for name in sensor.outputs
     ]
     return LinearPlant(
-        xp.concatenate([moves, rest], axis=1),
-        Shaped(enters, Independent([plant.noise, sensor.noise])),
-        xp.concatenate([plant.initial_mean - law.mean, np.zeros(length + m)]),
-        Independent([law, Gaussian(np.zeros((length + m, length + m)))]),
-        driven,
-        (*plant.states, *line),
-        plant.inputs,
+        matrix=xp.concatenate([from_state, from_line], axis=1),
+        noise=Shaped(noise_matrix, Independent([plant.noise, sensor.noise])),
+        initial_mean=xp.concatenate([plant.initial_mean - law.mean, np.zeros(length + m)]),
+        initial_covariance=Independent([law, Gaussian(np.zeros((length + m, length + m)))]),
+        input_matrix=driven,
+        states=(*plant.states, *line),
+        inputs=plant.inputs,
         limits=plant.limits,
     )

@@ -61,6 +61,7 @@ class Words(Module):
             raise fail("range of words", "low below high", f"{self.low.tolist()} and {self.high.tolist()}")
         if (bits is None) == (resolution is None):
             raise fail("encoder", "bits or resolution, one of them", "both" if bits is not None else "none")
+        # The fewest bits with which words from `low` on reach `high`: 2^bits - 1 >= span / D, but for rounding.
         if resolution is not None:
             step = float(scalar("resolution", resolution, np.finfo(float).tiny))
             spans = (self.high - self.low) / step
@@ -179,13 +180,14 @@ def _read_end(name: str, value: ArrayLike) -> Float[np.ndarray, "..."]:
 
 
 def _checksum(node: str) -> int:
+    """Return the CRC-32 of a node's name."""
     from zlib import crc32
 
     return crc32(node.encode())
 
 
 def _mix(state: np.ndarray) -> np.ndarray:
-    """Mix 64 bits (splitmix64, Steele, Lea and Flood 2014)."""
+    """Return 64 bits mixed by a round of splitmix64 (Steele, Lea and Flood 2014)."""
     state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return cast(np.ndarray, state ^ (state >> np.uint64(31)))

@@ -51,9 +51,9 @@ def in_bits(encoder: Words, channel: Channel) -> Channel:
     beside = encoder.carried - encoder.bits
     eye = np.eye(encoder.carried)
     form = Form(
-        lambda link, places: link.on_bits(encoder.bits, beside),
-        lambda matrix: known(np.kron(matrix, eye)),
-        encoder.carried,
+        flips=lambda link, places: link.on_bits(encoder.bits, beside),
+        selection=lambda matrix: known(np.kron(matrix, eye)),
+        size=encoder.carried,
     )
     carried: Channel = at_each_step(lambda link: route(link, form).map, channel)
     return carried
@@ -97,7 +97,7 @@ def route(channel: AbstractRandomAffine, form: Form) -> Routed:
 
 
 def _route(link: AbstractRandomAffine, places: Places, form: Form) -> Routed:
-    """Write a map of words, of which these components come in, in another form."""
+    """Write a map of words in another form; `places`: the components that come in, word by word."""
     match link:
         case Flips():
             return Routed(form.flips(link, places), places)
@@ -128,9 +128,9 @@ def _route(link: AbstractRandomAffine, places: Places, form: Form) -> Routed:
 def _route_selection(link: GainAndNoise, places: Places, form: Form) -> Routed:
     """Return the route of a wire that selects components; words pass no other gain."""
     matrix, gain = np.asarray(link.matrix), link.law.constant
-    still = not np.any(np.asarray(link.noise.covariance)) and not np.any(np.asarray(link.noise.mean))
-    one_each = np.isin(matrix, (0, 1)).all() and (matrix.sum(axis=1) == 1).all()
-    if gain is None or float(gain) != 1.0 or not still or not one_each:
+    is_noiseless = not np.any(np.asarray(link.noise.covariance)) and not np.any(np.asarray(link.noise.mean))
+    selects_one_each = np.isin(matrix, (0, 1)).all() and (matrix.sum(axis=1) == 1).all()
+    if gain is None or float(gain) != 1.0 or not is_noiseless or not selects_one_each:
         raise refuse_link(link.in_words() or "a gain")
     return Routed(form.selection(matrix), tuple(places[int(np.argmax(row))] for row in matrix))
 
@@ -154,6 +154,6 @@ def _route_choice(link: AbstractUniform, places: Places, form: Form) -> Routed:
 
 
 def refuse_link(got: str) -> Exception:
-    """Build the error of a link that words do not pass."""
+    """Return the error of a link that words do not pass."""
     expected = "one that words pass, which are not amplified: hg.decode_and_forward([p]), perfect(), erasure, delays"
     return fail("channel of a node with an encoder", expected, got)
