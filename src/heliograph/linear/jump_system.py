@@ -64,8 +64,8 @@ class JumpSystem(NamedTuple):
     def after(self, moments: Float[Array, "*axes _ n n"]) -> list[Any]:
         """Propagate X from before the first step: X after each step."""
         steps = []
-        for one in zip(*self, strict=True):
-            moments = JumpSystem(*one).step(moments)
+        for fields in zip(*self, strict=True):
+            moments = JumpSystem(*fields).step(moments)
             steps.append(moments)
         return steps
 
@@ -100,6 +100,7 @@ class JumpSystem(NamedTuple):
         shape = self.shape
 
         def back(behind: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+            """Return what L sends back from before the first step, and L of each, given what comes from behind."""
             ahead = []
             for chain, maps, weight in zip(self.chain[::-1], self.maps[::-1], weights[::-1], strict=True):
                 ahead.append(weight + behind)
@@ -139,7 +140,10 @@ def unpack_entries(entries: Float[Array, "e"], shape: tuple[int, ...]) -> Any:
 
 @lru_cache(8)
 def _place_in_triangles(shape: tuple[int, ...]) -> tuple[Int[np.ndarray, "..."], tuple[np.ndarray, ...], np.ndarray]:
-    """Place of each matrix entry among those of the upper triangles, these entries, and matrices of one entry each."""
+    """Return each matrix entry's place among those of the upper triangles, where these are, and unit matrices of each.
+
+    A unit matrix has one of these entries, and its mirror image, at 1 and all else at zero.
+    """
     where = np.nonzero(np.triu(np.ones(shape)))
     places = np.empty(shape, dtype=int)
     places[where] = places[*where[:-2], where[-1], where[-2]] = np.arange(len(where[0]))

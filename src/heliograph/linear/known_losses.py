@@ -110,11 +110,14 @@ def find_gains(system: KnownLossSystem) -> KindGains:
     if system.closed(gains).radius() < BELOW_ONE:
         return gains
     fresh = tuple(system.transition @ np.linalg.pinv(c) for c in system.outputs)
-    return min(gains, fresh, key=lambda items: system.closed(items).radius())
+    return min(gains, fresh, key=lambda candidate: system.closed(candidate).radius())
 
 
 def _iterate_policy(system: KnownLossSystem, gains: KindGains) -> KindGains:
-    """Policy iteration: gains for what remains under the last ones, their steady bound or the part that grows most."""
+    """Return better gains by policy iteration: the best for what the last ones leave, until they stop improving.
+
+    What gains leave is their steady bound, or, where they have none, the covariances that grow fastest.
+    """
     jumps = system.closed(gains)
     values, vectors = np.linalg.eig(jumps.operator())
     radius = float(np.max(np.abs(values)))
@@ -197,8 +200,8 @@ def find_fastest_unobserved_mode(
         for value, space in find_eigenspaces(matrix)
         for modes, vectors in _find_unobserving_modes(space, outputs)
     ]
-    nothing = UnobservedGrowth(0.0, 0j, (), np.zeros((len(matrix), 0)))
-    return max(results, key=lambda items: items.growth, default=nothing)
+    no_growth = UnobservedGrowth(0.0, 0j, (), np.zeros((len(matrix), 0)))
+    return max(results, key=lambda found: found.growth, default=no_growth)
 
 
 def _find_unobserving_modes(

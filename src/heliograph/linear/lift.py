@@ -1,24 +1,22 @@
 """A linear model lifted to monomials: powers of the state and of the measurement, and modes, as one linear system."""
 
 from collections.abc import Sequence
-from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import numpy as np
 
+from heliograph.linear.routes import Route, check_model, model_routes
 from heliograph.linear.system import LinearSystem, Steps, repeat_last
-from heliograph.model.channel import Channel, check_link
-from heliograph.model.over_time import OverTime, first, list_steps, steps_covered
+from heliograph.model.channel import Channel
+from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.premises.premise import Premise, believing
-from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
+from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import check_count, check_horizon, fail
 from heliograph.numerics.lapack import spectral_radius
-from heliograph.numerics.types import Array, Float, PyTree
+from heliograph.numerics.types import Array, Float
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.combine import Series
 from heliograph.random_affine.hop import GainAndNoise
-from heliograph.random_affine.laws.law import Constant
 from heliograph.random_affine.modes import JointModes, joint_modes
 from heliograph.random_affine.moments.monomials import (
     MEMORY_LIMIT_ENTRIES,
@@ -27,9 +25,8 @@ from heliograph.random_affine.moments.monomials import (
     exponents,
     position,
 )
-from heliograph.random_affine.moments.push import Tabulated, products_of_monomials, push_known, push_moments
-from heliograph.random_affine.noise import AbstractNoise, Gaussian, noise_vector
-from heliograph.random_affine.superposed import sensed_by_link
+from heliograph.random_affine.moments.push import products_of_monomials, push_known, push_moments
+from heliograph.random_affine.noise import Gaussian, noise_vector
 
 EPS = float(np.finfo(np.float64).eps)
 
@@ -76,13 +73,17 @@ def lift_modes(
 ) -> LinearSystem:
     """Return the system of Y 1{mode} for every mode, Y = (monomials of x up to `degree`, 1), measured by those of z.
 
+    Args:
+        plants: map x -> x+ of each step.
+        measurements: map x+ -> z of each step, with its modes.
+        degree: of the monomials.
+        moments: E[monomials of (x_0, 1)] of order 2 `degree`.
+        projection: matrix that reads x off Y.
+
     E[Y+ 1{j}] = sum_i Pi_ij M Y 1{i} and E[Z | Y, modes] = sum_j K_j Y 1{j}, with M and K_j the moments of the plant
     and of the route in mode j. Noises, with B = E[Y Y']:
     Cov(w) = sum_i p_i (diag(Pi_i) - Pi_i' Pi_i) x M B M' + diag(p+) x (B+ - M B M'),
     Cov(v) = sum_j p_j (E[Z Z' | j] - K_j B+ K_j').
-
-    `plants` and `measurements` (from x+ to z) of each step; `moments` of x_0 up to 2 degree; `projection` reads x off
-    Y.
     """
     n, modes = plants[0].inputs, len(measurements[0].initial)
     law, rows = np.asarray(measurements[0].initial), np.eye(modes)
@@ -90,7 +91,7 @@ def lift_modes(
     mean = np.kron(law, before[:, -1])
     start = np.kron(np.diag(law), before) - np.outer(mean, mean)
     # Matrices of each distinct measurement and plant once.
-    step_matrices, roundings, earlier = [], [], law
+    steps, roundings, earlier = list[Steps](), list[tuple[np.ndarray, np.ndarray]](), law
     distinct = {id(measurement): measurement for measurement in measurements}
     varies = len(distinct) > 1
     of_modes = {i: [LiftedMap(m, degree, varies) for m in measurement.maps] for i, measurement in distinct.items()}
@@ -112,19 +113,36 @@ def lift_modes(
         process = np.kron(chosen, carried) + np.kron(np.diag(law), after - carried)
         noise, rounding_of_noise = _average_noise(law, lifts, moments)
         output = np.concatenate([lift.matrix for lift in lifts], axis=1)[:-1]
-        zero = np.zeros(len(mean)), np.zeros(len(output))
-        step_matrices.append((np.kron(rows.T, moved), zero[0], process, output, zero[1], noise))
+        step = Steps(
+            transition=np.kron(rows.T, moved),
+            drift=np.zeros(len(mean)),
+            process=process,
+            output=output,
+            offset=np.zeros(len(output)),
+            noise=noise,
+        )
+        steps.append(step)
         roundings.append((EPS * np.kron(law, np.diag(after)), rounding_of_noise))
         before, rows = after, np.asarray(measurement.transition)
-    steps = Steps(*(repeat_last(values, len(plants)) for values in zip(*step_matrices, strict=True)))
-    lost = (repeat_last(values, len(plants)) for values in zip(*roundings, strict=True))
-    return LinearSystem(steps, mean, start, np.tile(projection, (1, modes)), *lost)
+    over_time = Steps(*(repeat_last(values, len(plants)) for values in zip(*steps, strict=True)))
+    process_rounding, received_rounding = (repeat_last(values, len(plants)) for values in zip(*roundings, strict=True))
+    return LinearSystem(
+        over_time,
+        mean=mean,
+        covariance=start,
+        projection=np.tile(projection, (1, modes)),
+        rounding=process_rounding,
+        received_rounding=received_rounding,
+    )
 
 
 def _average_noise(
     law: Float[np.ndarray, " modes"], lifts: "Sequence[LiftedMap]", moments: Moments
 ) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, "m"]]:
-    """Measurement noise in the mean over the modes, sum_j p_j E[Cov(Z | y, j)], and the rounding of its diagonal."""
+    """Return the mean noise over the modes, sum_j p_j E[Cov(Z | y, j)], and the rounding of its diagonal.
+
+    `law` holds the modes' probabilities p_j, `lifts` each mode's map to Z, `moments` those of y.
+    """
     spreads, losses = zip(*(lift.conditional_spread(moments) for lift in lifts), strict=True)
     return np.tensordot(law, spreads, axes=1), np.abs(law) @ np.array(losses)
 
@@ -136,16 +154,8 @@ def _keep_if_unchanged(
     return law if np.allclose(law, after, rtol=4 * EPS, atol=0) else after
 
 
-T = TypeVar("T")
 HIGHEST = 31  # degree: C(62, 31) is below 2^63
 STORED_ENTRIES = 100_000  # of a matrix that is kept for the whole horizon
-
-
-class Route(NamedTuple):
-    """One step of the model as two maps: the plant's, x -> x+, and from the state to what arrives, x+ -> z."""
-
-    plant: GainAndNoise
-    measurement: AbstractRandomAffine
 
 
 def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: int, horizon: int) -> LinearSystem:
@@ -193,19 +203,28 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
     start_lost = EPS * np.diag(before)[:-1]
     varies = isinstance(plant, OverTime), isinstance(sensor, OverTime) or isinstance(channel, OverTime)
     steps, process_rounding, received_rounding = _lift_steps(routes, degree, moments, varies)
-    rounding = process_rounding, received_rounding, start_lost
-    system = LinearSystem(steps, mean, spread, linear_rows(n, degree), *rounding)
+    system = LinearSystem(
+        steps,
+        mean=mean,
+        covariance=spread,
+        projection=linear_rows(n, degree),
+        rounding=process_rounding,
+        received_rounding=received_rounding,
+        start_rounding=start_lost,
+    )
     return believing(system, Premise(plant, sensor, channel, order=2 * degree))
 
 
 def _lift_steps(
     routes: Sequence[Route], degree: int, moments: Float[np.ndarray, "M"], varies: tuple[bool, bool]
 ) -> tuple[Steps, np.ndarray, np.ndarray]:
-    """Lift each step to monomials; return the system's steps, and the roundings of both noises.
+    """Lift each step to monomials; return the system's steps, and the roundings of process and received noise.
 
-    Where nothing varies and the moments of the state are steady, all later steps equal the last, to rounding.
+    `moments` are those of x_0 up to twice the degree; `varies` says of the plant and of the measurement whether it
+    differs between steps. Where nothing varies and the moments of the state are steady, all later steps equal the
+    last, to rounding.
     """
-    parts, roundings = [], []
+    steps, roundings = list[Steps](), list[tuple[np.ndarray, np.ndarray]]()
     steady = SteadyMoments(np.asarray(routes[0].plant.matrix), 2 * degree, any(varies))
     last: Route | None = None
     for k, route in enumerate(routes):
@@ -221,11 +240,13 @@ def _lift_steps(
         moments = plant_lift.push(moments)
         check_finite_moments(moments, k, 2 * degree)
         noise, rounding_of_noise = measurement_lift.conditional_spread(moments)
-        parts.append((*affine(plant_lift.matrix), process, *affine(measurement_lift.matrix), noise))
+        transition, drift = affine(plant_lift.matrix)
+        output, offset = affine(measurement_lift.matrix)
+        steps.append(Steps(transition, drift, process, output, offset, noise))
         roundings.append((rounding_of_process, rounding_of_noise))
-    steps = Steps(*(repeat_last(values, len(routes)) for values in zip(*parts, strict=True)))
+    over_time = Steps(*(repeat_last(values, len(routes)) for values in zip(*steps, strict=True)))
     process_rounding, received_rounding = (repeat_last(values, len(routes)) for values in zip(*roundings, strict=True))
-    return steps, process_rounding, received_rounding
+    return over_time, process_rounding, received_rounding
 
 
 def _are_identical(left: AbstractRandomAffine, right: AbstractRandomAffine) -> bool:
@@ -285,7 +306,10 @@ class LiftedMap:
 def mean_and_spread(
     second: Float[Array, "N N"],
 ) -> tuple[Float[np.ndarray, "N-1"], Float[np.ndarray, "N-1 N-1"]]:
-    """Mean and covariance from the second moments of (y, 1), with n + 2 units of rounding of what is subtracted."""
+    """Return the mean and covariance of y, given the second moments of (y, 1).
+
+    The diagonal is raised by n + 2 units of rounding of what is subtracted, so that the covariance stays one.
+    """
     second = np.asarray(second)
     mean = second[:-1, -1]
     rounding = (len(mean) + 2) * EPS * np.diag(np.diag(second)[:-1])
@@ -309,70 +333,11 @@ def linear_rows(variables: int, degree: int, expected: int | None = None) -> Flo
 
 
 def initial_monomial_moments(plant: LinearPlant, order: int) -> Float[np.ndarray, "monomials"]:
-    """Return E[mono_order(x_0)]."""
+    """Return E[monomials of (x_0, 1)] of this order, under the plant's law of x_0."""
     law = plant.deviation if plant.deviation is not None else Gaussian(plant.initial_covariance)
     shift = np.eye(len(plant.states) + 1)
     shift[:-1, -1] = plant.initial_mean - law.mean
     return np.asarray(push_known(shift, order, noise_vector(law, order)))
-
-
-def check_model(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> None:
-    """Raise ValueError unless plant and sensor are linear, fit the channel, and have noises with moments."""
-    start = first(plant)
-    check_linear("polynomial filter", plant, sensor)
-    check_link(first(sensor), first(channel), len(start.states))
-    if start.inputs:
-        expected = "a plant without inputs (take the response to known inputs off the measurements first)"
-        raise fail("polynomial filter", expected, list(start.inputs))
-    if not isinstance(start.noise, AbstractNoise):
-        raise fail("polynomial filter", "process noise with a law", "a covariance that depends on inputs")
-
-
-def model_routes(plant: AnyPlant, sensor: AnySensor, channel: Channel, order: int, horizon: int) -> list[Route]:
-    """Return the maps of each step, with the noises' moments up to `order` computed once for what does not vary."""
-    plants = _convert_models(each_step(plant, horizon), order)
-    sensors, channels = each_step(sensor, horizon), each_step(channel, horizon)
-    if not isinstance(sensor, OverTime) and not isinstance(channel, OverTime):
-        measurements = [_make_measurement_maps(sensors[:1], channels[:1], order)[0]] * horizon
-    else:
-        measurements = _make_measurement_maps(sensors, channels, order)
-    return [Route(*pair) for pair in zip(plants, measurements, strict=True)]
-
-
-def _make_measurement_maps(
-    sensors: Sequence[AnySensor], channels: Sequence[AbstractRandomAffine], order: int
-) -> list[AbstractRandomAffine]:
-    """Return the maps from the state to z; a sum of links whose sensors' noises are independent is one of x itself."""
-    apart = list[AbstractRandomAffine]()
-    for sensor, channel in zip(sensors, channels, strict=True):
-        assert isinstance(sensor, LinearSensor)  # checked before
-        by_link = sensed_by_link(sensor.matrix, sensor.noise, channel)
-        apart += [] if by_link is None else [by_link]
-    if len(apart) == len(sensors):
-        return apart
-    return [Series(pair) for pair in zip(_convert_models(sensors, order), channels, strict=True)]
-
-
-def _convert_models(models: Sequence[PyTree], order: int) -> list[GainAndNoise]:
-    """Map A x + noise of each plant or sensor; `check_model` has seen that all are linear."""
-    maps: list[GainAndNoise] = []
-    before, noise = None, Tabulated(models[0].noise, order)
-    for model in models:
-        if model is before:
-            maps.append(maps[-1])
-            continue
-        if not eqx.tree_equal(model.noise, noise.source):
-            noise = Tabulated(model.noise, order)
-        maps.append(GainAndNoise(Constant(1.0), model.matrix, noise))
-        before = model
-    return maps
-
-
-def each_step(model: T | OverTime, horizon: int) -> list[T]:
-    """Return a plant, sensor or channel at each of `horizon` steps."""
-    check_horizon(horizon)
-    check_horizon(horizon, steps_covered(model))
-    return list_steps(model, horizon)
 
 
 def refuse_lift(degree: int, states: int, outputs: int, horizon: int, modes: int = 1) -> None:

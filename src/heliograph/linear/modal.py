@@ -3,7 +3,7 @@
 import numpy as np
 
 from heliograph.linear.jump_system import mix_modes, propagate_by_mode
-from heliograph.linear.lift import each_step
+from heliograph.linear.routes import each_step
 from heliograph.linear.system import LinearSystem, Steps
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import first
@@ -65,7 +65,7 @@ def modal_system(
     law, rows = np.asarray(steps[0].initial), np.eye(len(steps[0].initial))
     moments = law[:, None, None] * (np.outer(mean, mean) + spread)
     start = np.kron(np.diag(law), spread) + np.kron(np.diag(law) - np.outer(law, law), np.outer(mean, mean))
-    parts = []
+    parts = list[Steps]()
     for step in steps:
         maps = [m.maps for m in step.maps if isinstance(m, Stack)]
         move_moments, received = (_take_moments_by_mode([m[i] for m in maps]) for i in range(2))
@@ -73,13 +73,26 @@ def modal_system(
         transition, process, moments = _propagate_modes(move_moments, rows, moments)
         noise = np.einsum("jabcd,jcd->ab", received[1], moments)
         output = np.concatenate(list(received[0]), axis=1)
-        parts.append((transition, np.zeros(len(transition)), process, output, np.zeros(len(output)), noise))
+        of_step = Steps(
+            transition=transition,
+            drift=np.zeros(len(transition)),
+            process=process,
+            output=output,
+            offset=np.zeros(len(output)),
+            noise=noise,
+        )
+        parts.append(of_step)
         rows = np.asarray(step.transition)
-    whole = np.tile(np.pad(read, ((0, 0), (0, 1))), (1, len(law)))
-    return LinearSystem(Steps(*map(np.array, zip(*parts, strict=True))), np.kron(law, mean), start, whole)
+    return LinearSystem(
+        Steps(*map(np.array, zip(*parts, strict=True))),
+        mean=np.kron(law, mean),
+        covariance=start,
+        projection=np.tile(np.pad(read, ((0, 0), (0, 1))), (1, len(law))),
+    )
 
 
 def _take_moments_by_mode(maps: list[AbstractRandomAffine]) -> Moments:
+    """Return E[(G, n)] and the covariances of its entries, of the map of each mode."""
     means, spreads = zip(*((m.moments(1).mean[:-1], nominal_spread(m).center) for m in maps), strict=True)
     return np.array(means), np.array(spreads)
 
@@ -87,7 +100,10 @@ def _take_moments_by_mode(maps: list[AbstractRandomAffine]) -> Moments:
 def _propagate_modes(
     move: Moments, rows: np.ndarray, moments: np.ndarray
 ) -> tuple[Float[np.ndarray, "N N"], Float[np.ndarray, "N N"], Float[np.ndarray, "M n1 n1"]]:
-    """Return F, Cov(w) and E[y~+ y~+' 1{j}]."""
+    """Return F, Cov(w) and E[y~+ y~+' 1{j}] of one step.
+
+    `move` holds the maps' moments by mode, `rows` the chain's transition, `moments` E[y~ y~' 1{i}].
+    """
     mean, spread = move
     modes, size = len(moments), moments.shape[-1]
     whole = np.concatenate([mean, np.tile(np.eye(1, size, size - 1), (modes, 1, 1))], axis=1)

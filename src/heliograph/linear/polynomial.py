@@ -8,15 +8,14 @@ import numpy as np
 
 from heliograph.linear.lift import (
     affine,
-    check_model,
     initial_monomial_moments,
     lifted_system,
     linear_rows,
     mean_and_spread,
-    model_routes,
     refuse_lift,
 )
 from heliograph.linear.recursion import lmmse
+from heliograph.linear.routes import check_model, model_routes
 from heliograph.linear.system import Gains, LinearSystem, Schedule, Steps, state_moments
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import first
@@ -38,10 +37,18 @@ from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
 def quadratic_system_with_linear_estimate(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, linear: Schedule
 ) -> LinearSystem:
-    """Linear system of all products up to degree 2 of (x, q, z), q the estimate of a linear filter, measured by z's.
+    """Return the system of all products up to degree 2 of (x, q, z), q the estimate of a linear filter.
 
     Measured are z, z z' and z q' of the present step: components of the lifted state, so without noise of their own.
-    `linear` is a schedule whose state is an estimate of all of x, as `lmmse` makes one from a system of degree 1.
+
+    Args:
+        plant: linear plant without inputs.
+        sensor: linear sensor.
+        channel: its channel.
+        linear: schedule whose state is an estimate of all of x, as `lmmse` makes one from a system of degree 1.
+
+    Raises:
+        ValueError: a schedule of another shape, or what `lifted_system` refuses.
     """
     check_model(plant, sensor, channel)
     start, horizon = first(plant), linear.horizon
@@ -55,22 +62,33 @@ def quadratic_system_with_linear_estimate(
     moments = push_known(beginning, 4, initial_monomial_moments(start, 4))
     before = products_of_monomials(moments, total + 1, 2)
     mean, spread = mean_and_spread(before)
-    received, parts, rounding, stored = _make_received_products(n, m), [], [], _MomentCache()
+    received, stored = _make_received_products(n, m), _MomentCache()
+    steps, rounding = list[Steps](), list[np.ndarray]()
     for k, route in enumerate(model_routes(plant, sensor, channel, 4, horizon)):
-        move, listen = stored.move(route.plant, m), _make_filter_map(Gains(*(field[k] for field in linear.gains)))
-        wide = stored.append_measurement(route.measurement, n)
+        # (x, q, z) -> (x+, q) -> (x+, q, z+) -> (x+, q+, z+).
+        move = stored.move(route.plant, m)
+        measure_squares, measure_fourth = stored.append_measurement(route.measurement, n)
+        update = _make_filter_map(Gains(*(field[k] for field in linear.gains)))
         # E[(x, q, z)+^2 | (x, q, z)^2] = Sym^2(filter) E Sym^2(channel) E Sym^2(plant).
-        transition = symmetric_power(listen, 2) @ wide[0] @ move.moments(2).matrix
-        moments = push_known(listen, 4, wide[1] @ push_moments(move, 4, moments))
+        transition = symmetric_power(update, 2) @ measure_squares @ move.moments(2).matrix
+        moments = push_known(update, 4, measure_fourth @ push_moments(move, 4, moments))
         after = products_of_monomials(moments, total + 1, 2)
         # Cov(w) = E[Y+ Y+'] - M E[Y Y'] M'.
         process = after - transition @ before @ transition.T
-        nothing = np.zeros(len(received)), np.zeros((len(received), len(received)))
-        parts.append((*affine(transition), process[:-1, :-1], received, *nothing))
+        matrix, drift = affine(transition)
+        step = Steps(
+            transition=matrix,
+            drift=drift,
+            process=process[:-1, :-1],
+            output=received,
+            offset=np.zeros(len(received)),
+            noise=np.zeros((len(received), len(received))),
+        )
+        steps.append(step)
         rounding.append(np.finfo(float).eps * np.diag(after)[:-1])
         before = after
-    steps = Steps(*map(np.array, zip(*parts, strict=True)))
-    system = LinearSystem(steps, mean, spread, linear_rows(total, 2, n), rounding)
+    over_time = Steps(*map(np.array, zip(*steps, strict=True)))
+    system = LinearSystem(over_time, mean, spread, projection=linear_rows(total, 2, n), rounding=rounding)
     return believing(system, Premise(plant, sensor, channel, order=4))
 
 
@@ -80,7 +98,7 @@ def _affine_matrix(matrix: Float[np.ndarray, "m n"], offset: Float[np.ndarray, "
 
 
 def _make_filter_map(g: Gains) -> np.ndarray:
-    """Map (x+, q, z+) to (x+, F q + K z+ + c, z+), one step of the linear filter."""
+    """Return the homogeneous matrix of (x+, q, z+) -> (x+, F q + K z+ + c, z+), one step of the linear filter."""
     n, m = g.gain.shape
     after = np.eye(2 * n + m)
     after[n : 2 * n, n : 2 * n], after[n : 2 * n, 2 * n :] = g.transition, g.gain
@@ -97,7 +115,7 @@ class _MomentCache:
         self.wide: tuple[np.ndarray, np.ndarray] = np.zeros((0, 0)), np.zeros((0, 0))
 
     def move(self, plant: GainAndNoise, m: int) -> GainAndNoise:
-        """Return (x, q, z) -> (x+, q)."""
+        """Return the map (x, q, z) -> (x+, q) of a plant's step, q being n numbers and z m."""
         n = plant.inputs
         if self.joint is None or plant.noise is not self.noise:
             still = Gaussian(np.zeros((n, n)))

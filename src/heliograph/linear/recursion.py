@@ -71,7 +71,10 @@ def take_noise_roots(s: Steps, size: Float[np.ndarray, " N"]) -> NoiseRoots:
 
 
 def _root_with_rounding(covariance: Float[np.ndarray, "n n"], seconds: Float[np.ndarray, " n"]) -> np.ndarray:
-    """Root of a noise covariance and of the rounding of the numbers (of these second moments) that it is added to."""
+    """Return a root of a noise covariance, beside that of the rounding of what the noise is added to.
+
+    `seconds` are the second moments of the numbers it is added to.
+    """
     rounding = rounding_of(seconds + np.maximum(np.diag(covariance), 0.0))
     return np.concatenate([roots_of(covariance), rounding.matrix * np.sqrt(rounding.weights)], axis=1)
 

@@ -12,9 +12,10 @@ from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, c
 from heliograph.filters.linear.scheduled import LinearSystemFilter, ScheduledFilter, ScheduleState
 from heliograph.filters.modes.modal import claim_of_modes
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
-from heliograph.linear.lift import check_model, lifted_system
+from heliograph.linear.lift import lifted_system
 from heliograph.linear.polynomial import quadratic_system_with_linear_estimate
 from heliograph.linear.recursion import lmmse
+from heliograph.linear.routes import check_model
 from heliograph.linear.system import LinearSystem
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, Innovation, lower_by_noise
