@@ -174,7 +174,7 @@ def _eliminate_column_by_column(covariance: jax.Array, least: jax.Array) -> Colu
 
 
 def decorrelate(lower: jax.Array, rows: jax.Array) -> jax.Array:
-    """L^-1 times rows (m, ...): of z = rows x + n with Cov n = L diag(d) L', rows whose noises are uncorrelated."""
+    """Return L^-1 times rows (m, ...): of z = rows x + n with Cov n = L diag(d) L', rows of uncorrelated noises."""
     solved: list[jax.Array] = []
     for i in range(len(rows)):
         known = jnp.stack(solved) if solved else jnp.zeros((0, rows.shape[1]))
@@ -183,7 +183,7 @@ def decorrelate(lower: jax.Array, rows: jax.Array) -> jax.Array:
 
 
 def root_of(covariance: np.ndarray) -> np.ndarray:
-    """W (n, rank) with W W' = P of a known covariance: Cholesky's, with pivots, in units of each component's deviation.
+    """Return W (n, rank) with W W' = P of a known covariance: Cholesky's, with pivots, in units of the deviations.
 
     Source: Higham, Analysis of the Cholesky decomposition of a semi-definite matrix (1990).
     """
@@ -221,7 +221,10 @@ def columns_of(covariance: Array) -> Columns:
 
 
 def columns_of_each(covariances: Array) -> Columns:
-    """Columns (count, n, n) of covariances (count, n, n): of known ones roots, padded by zeros, else by elimination."""
+    """Return the columns (count, n, n) of covariances (count, n, n), one after another.
+
+    Of covariances that are known they are roots, padded by columns of zeros; of others they come by elimination.
+    """
     if not isinstance(covariances, np.ndarray):
         eliminated: Columns = jax.vmap(eliminate)(covariances)
         return eliminated
@@ -236,7 +239,7 @@ def columns_of_each(covariances: Array) -> Columns:
 
 
 def rounding_of(seconds: Array) -> Columns:
-    """Rounding of numbers with second moments E[s_i^2], (n,): noise of variance (UNITS eps)^2 E[s_i^2] in each.
+    """Return the rounding of numbers with second moments E[s_i^2], (n,): noise of variance (UNITS eps)^2 E[s_i^2].
 
     It is put where a model is made: of the state beside Q, of a measurement beside R; as columns, since added to a
     variance it would be lost.
@@ -296,6 +299,7 @@ def _triangularise_many(columns: Columns) -> Columns:
     n = len(rows)
 
     def body(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+        """Take row j off the rows below it, and put its column of L and its entry of d in their places."""
         rows, lower, variances = carry
         weighted = weights * rows[j]
         d = rows[j] @ weighted
@@ -313,6 +317,7 @@ def _eliminate_many(covariance: jax.Array, least: jax.Array) -> Columns:
     n = len(covariance)
 
     def body(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+        """Take column j off what is left of P, and put it into L and its pivot into d."""
         rest, lower, variances = carry
         d = _bound_below(rest[j, j], least[j])
         share = jnp.where(np.arange(n) > j, rest[:, j] * reciprocal_or_zero(d), 0.0)

@@ -115,13 +115,16 @@ def start_diffuse(mean: jax.Array, known: Columns, unknown: np.ndarray) -> Diffu
 
 def predict_diffuse(x: Diffuse, matrix: jax.Array, shift: jax.Array, noise: Columns) -> Diffuse:
     """Predict x over x+ = F x + b + w."""
-    rows, weights = _moved(matrix @ x.root, x, noise)
+    rows, weights = _append_noise(matrix @ x.root, x, noise)
     lower, levels, _ = triangularise_levels(rows, weights, len(x.mean))
     return Diffuse(matrix @ x.mean + shift, below_diagonal(lower), *levels)
 
 
-def _moved(slopes: jax.Array, x: Diffuse, noise: Columns) -> tuple[jax.Array, Levels]:
-    """Rows [slopes | N] of x+, with the weights of their columns."""
+def _append_noise(slopes: jax.Array, x: Diffuse, noise: Columns) -> tuple[jax.Array, Levels]:
+    """Return the rows [slopes | N] of x+ = m+ + slopes xi + N omega, with the weights of their columns.
+
+    x gives the weights of xi, finite and infinite ones; those of omega are finite.
+    """
     rows = jnp.concatenate([slopes, jnp.asarray(noise.matrix)], axis=1)
     own = jnp.asarray(noise.weights)
     return rows, Levels(jnp.concatenate([x.variances, own]), jnp.concatenate([x.infinite, jnp.zeros(len(own))]))
@@ -158,7 +161,11 @@ def observe_diffuse(x: Diffuse, matrix: jax.Array, innovation: jax.Array, noise:
 
 
 def _hear(x: Diffuse, h: jax.Array, noise: jax.Array) -> tuple[Diffuse, jax.Array, jax.Array, jax.Array]:
-    """Hear h'x + v, column by column from the last: return x given it, the gain, s or s_inf, and whether it is s_inf.
+    """Condition x on one number h'x + v, column by column of L from the last.
+
+    Returns:
+        x given the number, its mean as it was; the gain (n,) by which the innovation moves the mean; the variance of
+        the number, s, or s_inf of one that hears an unknown direction; and whether it hears one.
 
     Source: Bierman, Factorization methods for discrete sequential estimation (1977), at two levels.
     """
@@ -187,12 +194,20 @@ def _hear(x: Diffuse, h: jax.Array, noise: jax.Array) -> tuple[Diffuse, jax.Arra
 
 
 def condition_on_next_diffuse(x: Diffuse, matrix: jax.Array, ahead: jax.Array, noise: Columns) -> BackwardGain:
-    """Regress x on the next state x+ = F x + b + w: Rauch's way back, of what both levels know.
+    """Return the regression of x on the next state x+ = F x + b + w, of what both levels know.
 
     What of x stays unknown given x+ has a variance that is no number, and so have the estimates that rest on it.
+
+    Args:
+        x: the state before the step.
+        matrix: F.
+        ahead: mean of x+, F m + b.
+        noise: columns of Cov w.
+
+    Source: Rauch, Tung and Striebel, Maximum likelihood estimates of linear dynamic systems (1965).
     """
     n = len(x.mean)
-    moved, weights = _moved(matrix @ x.root, x, noise)
+    moved, weights = _append_noise(matrix @ x.root, x, noise)
     own = jnp.concatenate([x.root, jnp.zeros((n, moved.shape[1] - n))], axis=1)
     lower, _, rest = triangularise_levels(jnp.concatenate([moved, own]), weights, n)
     left, levels, _ = triangularise_levels(rest[n:], weights, n, own**2 @ weights.infinite)

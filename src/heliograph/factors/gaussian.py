@@ -139,9 +139,9 @@ def image_by_slopes(mean: jax.Array, slopes: jax.Array, x: Gaussian, curvature: 
 
 
 def append_rows(x: Gaussian, mean: jax.Array, slopes: jax.Array, noise: Columns) -> Gaussian:
-    """Law of (x, t) with t = mean + slopes xi + v, of the factors N diag(r) N' of Cov v: [[L, 0], [slopes, N]], (d, r).
+    """Return the law of (x, t) with t = mean + slopes xi + v: its factors are [[L, 0], [slopes, N]] and (d, r).
 
-    Shapes: mean (m,), slopes (m, n), noise (m, m).
+    `noise` holds the factors N diag(r) N' of Cov v. Shapes: mean (m,), slopes (m, n), noise (m, m).
     """
     root = jnp.concatenate([jnp.pad(x.root, ((0, 0), (0, len(mean)))), jnp.concatenate([slopes, noise.matrix], axis=1)])
     variances = jnp.concatenate([x.variances, noise.weights])
@@ -239,6 +239,7 @@ def gain_of(x: Gaussian, slopes: jax.Array, noise: Columns) -> jax.Array:
     def measure_part(
         i: int | jax.Array, root: jax.Array, d: jax.Array, rounding: jax.Array
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Measure component i: return the rows and variances after it, and its gain."""
         return _measure_row(root, d, root[n + i], weights[i], rounding)[:3]
 
     *_, gains = measure_parts(measure_part, jnp.concatenate([x.root, rows]), x.variances, least)
@@ -256,7 +257,7 @@ def correct_by_gain(x: Gaussian, slopes: jax.Array, noise: Columns, gain: jax.Ar
 
 
 def impose_moments_of_combination(x: Gaussian, row: jax.Array, shift: jax.Array, ratio: jax.Array) -> Gaussian:
-    """Give t = E t + row xi a new mean and variance (shift, ratio) and leave x given t: a rank-one update of L, d.
+    """Change the mean and variance of t = E t + row xi, and with them x, whose law given t stays: rank one in L, d.
 
     The mean of t moves by `shift`, its variance V = row diag(d) row' becomes `ratio` times V, as by a likelihood of t
     of any shape: mean + K shift and P - (1 - ratio) K V K', K = Cov(x, t) / V. With f = row and
@@ -320,7 +321,7 @@ class BackwardGain(NamedTuple):
 
 
 def condition_on_next_state(x: Gaussian, slopes: jax.Array, ahead: jax.Array, noise: Columns) -> BackwardGain:
-    """Regress x = m + L_x xi on x+ = ahead + slopes xi + N omega, taking x+ as a measurement, part by part.
+    """Return the regression of x = m + L_x xi on x+ = ahead + slopes xi + N omega, measuring x+ part by part.
 
     (x, x+) has the factors [[L_x, 0], [slopes, N]] and (d, r). Each part of x+, without a noise but omega, is measured:
     its innovation, given those before it, is a part of e, its gain a column of K and, of the parts to come, of L. Where
@@ -336,6 +337,7 @@ def condition_on_next_state(x: Gaussian, slopes: jax.Array, ahead: jax.Array, no
     def measure_part(
         i: int | jax.Array, root: jax.Array, d: jax.Array, rounding: jax.Array
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Measure part i of x+: return the rows and variances after it, and its gain."""
         # Of omega, part i has its own component left, and determines it: those before it are determined.
         f, own, r = root[n + i], beside[:, i], weights[i]
         product = d * f
@@ -363,7 +365,7 @@ def rts_step(back: BackwardGain, later: Gaussian) -> Gaussian:
 def _measure_row(
     root: jax.Array, d: jax.Array, f: jax.Array, noise: jax.Array, least: jax.Array | None
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Measure f' xi + v as `measure_scalar`; slopes of a variance up to `least` are rounding and say nothing.
+    """Measure f' xi + v as `measure_scalar` does; slopes of a variance up to `least` are rounding and say nothing.
 
     They are measured with a noise beside which they are nothing to the last digit.
     """
@@ -378,4 +380,5 @@ def _measure_row(
 
 
 def _stack_numbers(entries: list[jax.Array]) -> jax.Array:
+    """Return numbers as a vector, of none an empty one."""
     return jnp.stack(entries) if entries else jnp.zeros(0)

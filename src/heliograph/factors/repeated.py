@@ -26,7 +26,7 @@ from straightline import operation
 
 
 def triangularise_noise(noise: Columns) -> Columns:
-    """`triangularise` of the noises of m components, in which those that repeat others leave nothing but their own.
+    """Triangularise the noises of m components, of which those that repeat others keep nothing but their own.
 
     With w_i = W_i - sum_j L_ij w_j: an entry |w_ik| <= RANK (|W_ik| + sum_j |L_ij| |w_jk|) is zero, where components
     follow that might be correlated with it.
@@ -44,10 +44,10 @@ def rounding_of_products(n: int, variance: jax.Array) -> jax.Array:
 
 
 def rounding_of_slopes(n: int, lower: jax.Array, whole: jax.Array) -> jax.Array:
-    """Variance (m,) up to which n slopes of w_i = s_i - sum_k L_ik w_k count as rounding, of rows of variances `whole`.
+    """Return the variance (m,) up to which n slopes of w_i = s_i - sum_k L_ik w_k count as rounding.
 
-    UNITS n eps of each s_i, from which measuring takes what was known, and RANK of what is subtracted: a correlation of
-    noises is not known to more.
+    `whole` holds the variances (m,) of the rows s_i. UNITS n eps of each s_i, from which measuring takes what was
+    known, and RANK of what is subtracted: a correlation of noises is not known to more.
     """
     share, below = max(UNITS * n * unit_of(whole), RANK), jnp.tril(lower, -1)
     return rounding_of_products(n, whole) + share**2 * (below**2 @ whole)
@@ -85,10 +85,11 @@ def _triangularise_row_by_row(rows: jax.Array, weights: jax.Array) -> Columns:
 
 @operation(_triangularise_row_by_row)
 def _triangularise_in_loop(rows: jax.Array, weights: jax.Array) -> Columns:
-    """Do the same as `_triangularise_row_by_row` in a loop, for so many rows that a long program would be slow."""
+    """Compute `_triangularise_row_by_row` in a loop, for so many rows that a long program would be slow."""
     m, share = len(rows), max(UNITS * rows.shape[1] * unit_of(rows), RANK)
 
     def body(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+        """Take row j, its rounding cleared, off the rows below it, and put it into L and d."""
         rows, size, lower, variances = carry
         row = _clear(rows[j], share * size[j])
         weighted = weights * row

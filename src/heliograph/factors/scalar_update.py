@@ -75,6 +75,7 @@ def measure_parts(
     if n > WRITTEN:
 
         def body(i: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+            """Measure part i, and put its gain beside those of the parts before it."""
             root, d, least, gains = carry
             root, d, gain = measure_part(i, root, d, least[i])
             gains = jnp.where(np.arange(n) == i, gain[:, None], gains)

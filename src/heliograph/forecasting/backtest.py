@@ -10,6 +10,7 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.engine.choice import compute_once
+from heliograph.filters.filter_angles import FilterAngles
 from heliograph.forecasting.forecast import Target, targets_of
 from heliograph.forecasting.outlook import Moments, Outlook
 from heliograph.forecasting.scores import LEVELS, Law, Mean, below, crps, log_score, overlapping_mean
@@ -215,35 +216,68 @@ def measured_by(target: Target, record: Record) -> np.ndarray:
     return z if target.outlook.filter.received else z[:, :0]
 
 
+class _Compared(NamedTuple):
+    """Forecasts from each row, and what came: of the numbers that a filter receives, or of its states.
+
+    part "received" or "state", names of the numbers, moments of their forecasts, came (rows, numbers), and the places
+    of the angles among them.
+    """
+
+    part: str
+    names: Sequence[str]
+    moments: Moments
+    came: np.ndarray
+    angles: Sequence[int]
+
+
 def _score_filter(
     segments: list[tuple[int, Target]], record: Record, u: np.ndarray, ahead: list[int], first: int
 ) -> list[Score]:
     """Score what one filter says ahead of each number that it receives, and of each state whose truth is known.
 
-    `segments`: the rows from which it is another one, refitted, and itself.
+    Args:
+        segments: rows from which the filter is another one, refitted, and the filter as it is from there on.
+        record: of the run that is scored.
+        u: inputs (rows, inputs).
+        ahead: horizons.
+        first: first row from which a forecast counts.
     """
     target = segments[0][1]
     filter, node = target.outlook.filter, target.node
     if filter.claim == "none":
         return []
     z = measured_by(target, record)
-    rolled = [roll(each.outlook, z, u, ahead) for _, each in segments]
-    ends = [*(row for row, _ in segments[1:]), len(z)]
-    starts = [0, *ends[:-1]]
-    states, received = jax.tree.map(
-        lambda *parts: np.concatenate([np.asarray(p)[a:b] for p, a, b in zip(parts, starts, ends, strict=True)]),
-        *rolled,
-    )
-    used = filter.angles_used()
-    parts = [] if received is None else [("received", target.received, received, z, used.received if used else ())]
+    states, received = _roll_segments(segments, z, u, ahead)
+    angles = filter.angles_used() or FilterAngles((), ())
+    compared = list[_Compared]()
+    if received is not None:
+        compared.append(_Compared("received", target.received, received, z, angles.received))
     if record.truth is not None:
-        parts.append(("state", filter.states, states, record.truth, used.states if used else ()))
-    return [
-        _score_number((node, target.filter, part, name), h, _law(moments, i, j), values[:, i], first, i in angles)
-        for part, names, moments, values, angles in parts
-        for i, name in enumerate(names)
-        for j, h in enumerate(ahead)
-    ]
+        compared.append(_Compared("state", filter.states, states, record.truth, angles.states))
+    scores = list[Score]()
+    for c in compared:
+        for i, name in enumerate(c.names):
+            of = node, target.filter, c.part, name
+            for j, horizon in enumerate(ahead):
+                law = _law(c.moments, i, j)
+                scores.append(_score_number(of, horizon, law, c.came[:, i], first, is_angle=i in c.angles))
+    return scores
+
+
+def _roll_segments(
+    segments: list[tuple[int, Target]], z: np.ndarray, u: np.ndarray, ahead: list[int]
+) -> tuple[Moments, Moments | None]:
+    """Return forecasts from each row, as of `roll`, by the filter of the segment that the row lies in."""
+    rolled = [roll(target.outlook, z, u, ahead) for _, target in segments]
+    ends = [*(row for row, _ in segments[1:]), len(z)]
+    bounds = list(zip([0, *ends[:-1]], ends, strict=True))
+
+    def join(*parts: np.ndarray) -> np.ndarray:
+        """Return the rows of each segment from its own part."""
+        return np.concatenate([np.asarray(part)[a:b] for part, (a, b) in zip(parts, bounds, strict=True)])
+
+    joined: tuple[Moments, Moments | None] = jax.tree.map(join, *rolled)
+    return joined
 
 
 def _law(moments: Moments, number: int, horizon: int) -> Law:
@@ -255,7 +289,10 @@ def _law(moments: Moments, number: int, horizon: int) -> Law:
 def _score_number(
     of: tuple[str, str, str, str], horizon: int, law: Law, values: np.ndarray, first: int, is_angle: bool
 ) -> Score:
-    """Score forecasts from each row against the number `horizon` rows later."""
+    """Score forecasts from each row against the number `horizon` rows later.
+
+    `of` says which number: its node, filter, part and name; `law` is its forecast from each row, `values` what it was.
+    """
     law, came = Law(*(part[first:-horizon] for part in law)), values[first + horizon :]
     # An angle within half a turn of what was expected.
     came = law.mean + wrap_angles((came - law.mean)[:, None], (0,) if is_angle else ())[:, 0]
@@ -269,8 +306,9 @@ def _score_number(
 
 
 def roll(outlook: Outlook, z: np.ndarray, u: np.ndarray, horizons: Sequence[int]) -> tuple[Moments, Moments | None]:
-    """Forecast from each row at each horizon: states, and what would arrive, (rows, horizons, K, ...), with variances.
+    """Return forecasts from each row at each horizon: of the states, and of what would arrive.
 
+    Their moments (rows, horizons, K, ...) have variances in the place of covariances.
     Inputs ahead are those of the rows; behind the last one it stays.
     """
     longest = horizons[-1]
@@ -284,16 +322,21 @@ def roll(outlook: Outlook, z: np.ndarray, u: np.ndarray, horizons: Sequence[int]
 def _forecast_from_each_row(
     outlook: Outlook, z: jax.Array, u: jax.Array, windows: jax.Array, places: jax.Array
 ) -> PyTree:
-    """Filter a recording, and from each of its rows predict the rows of its window; moments at `places` of each."""
+    """Filter a recording, and predict from each of its rows those ahead; return the moments at `places` among these.
+
+    `windows` (rows, ahead, inputs) holds the inputs ahead of each row.
+    """
     filter, length = outlook.filter, windows.shape[1]
 
     def with_variances(moments: Moments | None) -> Moments | None:
+        """Return the moments at `places`, with variances in the place of covariances."""
         if moments is None:
             return None
         variances = jnp.diagonal(moments.covariances, axis1=-2, axis2=-1)
         return Moments(moments.weights[places], moments.means[places], variances[places])
 
     def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:
+        """Return the state after a row, and the moments ahead of it."""
         k, z_k, u_k, window = row
         after, _ = filter.correct(filter.predict(state, u_k, k), z_k, k)
         numbers = k + 1 + jnp.arange(length)

@@ -160,6 +160,7 @@ def _find_sensor(network: Network, node: str) -> AnySensor | None:
 
 
 def _received(network: Network, node: str) -> tuple[str, ...]:
+    """Return the names of the numbers that a node receives, or all nodes together."""
     if node != FUSED:
         return network.nodes[node].received_names
     return tuple(f"{name}_{part}" for name in network.names for part in network.nodes[name].received_names)

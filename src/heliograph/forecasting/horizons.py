@@ -78,19 +78,19 @@ def _convert_to_steps(origin: Origin, horizons: Horizons) -> np.ndarray:
     if is_whole(horizons):
         return np.arange(1.0, _check_steps(horizons) + 1)
     steps = []
-    for one in _list_horizons(horizons):
-        if origin.months and isinstance(one, datetime | np.datetime64) and _convert_to_seconds(origin, one):
-            steps.append(_count_months(origin, one))
+    for horizon in _list_horizons(horizons):
+        if origin.months and isinstance(horizon, datetime | np.datetime64) and _convert_to_seconds(origin, horizon):
+            steps.append(_count_months(origin, horizon))
             continue
-        if (seconds := _convert_to_seconds(origin, one)) is None:
-            steps.append(float(_check_steps(one)))
+        if (seconds := _convert_to_seconds(origin, horizon)) is None:
+            steps.append(float(_check_steps(horizon)))
             continue
         if not origin.spacing > 0:
-            raise fail("horizons", "numbers of steps, where the time between them is not known", show_value(one))
+            raise fail("horizons", "numbers of steps, where the time between them is not known", show_value(horizon))
         count = seconds / origin.spacing
         if abs(count - round(count)) > OFF:
             raise fail(
-                "horizons", f"whole steps of {origin.spacing:g} s", f"{show_value(one)}, {count:.4g} steps ahead"
+                "horizons", f"whole steps of {origin.spacing:g} s", f"{show_value(horizon)}, {count:.4g} steps ahead"
             )
         steps.append(float(round(count)))
     return np.array(steps)
@@ -106,14 +106,20 @@ def _count_months(origin: Origin, date: datetime | np.datetime64) -> float:
 
 
 def _convert_to_times(origin: Origin, horizons: Horizons) -> np.ndarray:
-    """Horizons as times ahead in the unit of dt, of dates in seconds; a whole number counts steps of the usual size."""
+    """Return the horizons as times ahead in the unit of dt, of dates in seconds.
+
+    A single whole number counts steps of the usual size.
+    """
     if is_whole(horizons):
         if not origin.spacing > 0:
             raise fail("horizons", "times ahead, such as [1.0, 5.0], where no step is usual", horizons)
         return origin.spacing * np.arange(1, _check_steps(horizons) + 1)
-    listed = [(one, _convert_to_seconds(origin, one)) for one in _list_horizons(horizons)]
+    listed = [(horizon, _convert_to_seconds(origin, horizon)) for horizon in _list_horizons(horizons)]
     return np.array(
-        [float(array("horizon", cast(ArrayLike, one), ())) if seconds is None else seconds for one, seconds in listed]
+        [
+            float(array("horizon", cast(ArrayLike, horizon), ())) if seconds is None else seconds
+            for horizon, seconds in listed
+        ]
     )
 
 
@@ -134,23 +140,23 @@ def _list_horizons(horizons: object) -> list[object]:
     return listed
 
 
-def _convert_to_seconds(origin: Origin, one: object) -> float | None:
+def _convert_to_seconds(origin: Origin, horizon: object) -> float | None:
     """Return the seconds ahead of a span of time or a date; None of a number."""
-    if isinstance(one, timedelta | np.timedelta64):
+    if isinstance(horizon, timedelta | np.timedelta64):
         unit = units_in(origin.model.inputs).get(TIME_STEP, "s") if isinstance(origin.model, HasInputs) else "s"
         if unit != "s":
-            raise fail("horizons", f"numbers of {unit}, the unit of dt", show_value(one))
-        return float(np.timedelta64(one, "ns").astype(np.int64)) / SECOND
-    if not isinstance(one, datetime | np.datetime64):
+            raise fail("horizons", f"numbers of {unit}, the unit of dt", show_value(horizon))
+        return float(np.timedelta64(horizon, "ns").astype(np.int64)) / SECOND
+    if not isinstance(horizon, datetime | np.datetime64):
         return None
-    end = _find_end(origin, one)
-    ahead = np.datetime64(one).astype("datetime64[ns]") - end.astype("datetime64[ns]")
+    end = _find_end(origin, horizon)
+    ahead = np.datetime64(horizon).astype("datetime64[ns]") - end.astype("datetime64[ns]")
     if ahead <= np.timedelta64(0, "ns"):
-        raise fail("horizons", f"dates after the data, which end at {end}", show_value(one))
+        raise fail("horizons", f"dates after the data, which end at {end}", show_value(horizon))
     return float(ahead.astype(np.int64)) / SECOND
 
 
-def _find_end(origin: Origin, one: datetime | np.datetime64) -> np.datetime64:
+def _find_end(origin: Origin, horizon: datetime | np.datetime64) -> np.datetime64:
     """Return the date at which the data end, of several sources all of them.
 
     Raises:
@@ -158,9 +164,9 @@ def _find_end(origin: Origin, one: datetime | np.datetime64) -> np.datetime64:
     """
     ends = np.unique(np.asarray(origin.time))
     if ends.dtype.kind != "M":
-        raise fail("horizons", "how far ahead, as the data have no dates", show_value(one))
+        raise fail("horizons", "how far ahead, as the data have no dates", show_value(horizon))
     if len(ends) > 1:
-        raise fail("horizons", "how far ahead, as the sources end at different dates", show_value(one))
+        raise fail("horizons", "how far ahead, as the sources end at different dates", show_value(horizon))
     end: np.datetime64 = ends[0]
     return end
 

@@ -97,6 +97,7 @@ def _predict_each_row(outlook: Outlook, z: jax.Array, u: jax.Array) -> PyTree:
     """Filter a recording; return the moments predicted for each row from those before it."""
 
     def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:
+        """Return the state after a row, and the moments that were predicted for it."""
         k, z_k, u_k = row
         prior, moments = outlook.step(state, u_k, k)
         return outlook.filter.correct(prior, z_k, k)[0], moments

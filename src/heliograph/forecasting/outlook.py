@@ -59,7 +59,7 @@ class Outlook(Module):
     receives: bool = eqx.field(static=True)
 
     def mixture(self, state: PyTree) -> Moments:
-        """Moments of the states, one part of a filter that has no more; the means alone where nothing is claimed."""
+        """Return the moments of the states: a part for each of the filter's, only means if nothing is claimed."""
         filter = self.filter
         if isinstance(filter, LimitedFilter):  # each part within the limits
             state, filter = filter.condition(state), filter.base
@@ -92,6 +92,7 @@ class Outlook(Module):
             return Moments(jnp.ones(1), mean[None], mark_unknown(covariance + noise, unknown)[None])
 
         def of_part(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
+            """Return the mean and covariance of the outputs, under one part of the mixture of states."""
             signal = signal_of(plant, sensor, self.transform, from_covariance(mean, covariance), start)
             return signal.mean, signal.covariance
 
@@ -99,7 +100,10 @@ class Outlook(Module):
         return Moments(states.weights, means, covariances)
 
     def received(self, prior: PyTree, k: jax.Array) -> Moments | None:
-        """Moments of what would arrive: of z = 0 the innovation is minus what is expected, with that covariance."""
+        """Return the moments of what would arrive; None where the filter does not say them.
+
+        Of z = 0 the innovation is minus what is expected, with the covariance of what arrives.
+        """
         if not self.receives:
             return None
         _, innovation = self.filter.correct(prior, jnp.zeros(self.filter.received), k)
@@ -116,7 +120,7 @@ class Outlook(Module):
 
 
 def outlook_of(filter: AbstractFilter, sensor: AnySensor | None = None, plant: AnyPlant | None = None) -> Outlook:
-    """Return outlook of a filter, by the plant and sensor that it believes in, or by these where it does not say."""
+    """Return the outlook of a filter, by the plant and sensor that it believes in, or by these if it does not say."""
     premise = filter.premise
     plant = plant if premise is None else premise.plant
     believed = sensor if premise is None or premise.sensor is None else premise.sensor
@@ -133,6 +137,7 @@ def outlook_of(filter: AbstractFilter, sensor: AnySensor | None = None, plant: A
 
 @compile_on_call
 def _now(outlook: Outlook, state: PyTree) -> Moments:
+    """Return the moments of the states at the row where the outlook begins."""
     return outlook.mixture(state)
 
 
@@ -167,6 +172,7 @@ def _look_ahead(outlook: Outlook, state: PyTree, u: jax.Array, step: jax.Array) 
     """Return the moments of each step ahead, from a state, under inputs `u` (steps, inputs)."""
 
     def body(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
+        """Return the state a row ahead, and the moments there."""
         return outlook.step(state, *row)
 
     rows = jnp.asarray(u), jnp.asarray(step) + jnp.arange(len(u))
@@ -174,6 +180,7 @@ def _look_ahead(outlook: Outlook, state: PyTree, u: jax.Array, step: jax.Array) 
 
 
 def _look_ahead_of_each(outlook: Outlook, states: PyTree, u: jax.Array, steps: jax.Array) -> PyTree:
+    """Return the moments of each step ahead for several plants, whose states, inputs and steps have a leading axis."""
     return jax.vmap(lambda *plant: _look_ahead(outlook, *plant))(states, u, steps)
 
 
@@ -195,8 +202,9 @@ def prediction_of(moments: Moments, names: tuple[str, ...], claim: Claim, angles
     covariance = within + np.einsum("...k,...ki,...kj->...ij", weights, apart, apart)
     if claim == "none":
         covariance, variances = np.full_like(covariance, np.nan), np.full_like(variances, np.nan)
-    near = wrap_angles(mean, angles)
-    return Prediction(names, near, covariance, claim, weights, means + (near - mean)[..., None, :], variances)
+    wrapped = wrap_angles(mean, angles)
+    whole_turns = (wrapped - mean)[..., None, :]
+    return Prediction(names, wrapped, covariance, claim, weights, means + whole_turns, variances)
 
 
 def output_claim(filter: AbstractFilter, outlook: Outlook) -> Claim:

@@ -29,7 +29,7 @@ def below(law: Law, values: np.ndarray) -> np.ndarray:
 
 
 def log_score(law: Law, values: np.ndarray) -> np.ndarray:
-    """Log density of what came (rows,), in nats: the larger the better."""
+    """Return the log density of what came (rows,), in nats: the larger the better."""
     terms = (
         np.log(law.weights)
         - ((values[:, None] - law.means) ** 2 / law.variances + np.log(law.variances) + LOG_TURN) / 2

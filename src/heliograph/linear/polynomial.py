@@ -216,7 +216,9 @@ def gain_over_linear(
 
 
 def skewness(square: LinearSystem, states: int, outputs: int) -> float:
-    """Largest |E (a - Ea)(b - Eb)(c - Ec)| / (sd a sd b sd c) over a, b, c among x_k, z_k, from the system of degree 2.
+    """Return the largest |E (a - Ea)(b - Eb)(c - Ec)| / (sd a sd b sd c) over a, b, c among x_k and z_k.
+
+    All comes from the system of degree 2.
 
     k3(a, b, c) = Cov(a b, c) - E a Cov(b, c) - E b Cov(a, c), with a b a monomial of the square.
     """

@@ -101,6 +101,7 @@ class Continuous(Module):
         """Return the integral of exp(A s), and that of exp(A s) S exp(A s)', over a short step h."""
 
         def add_term(k: Any, parts: tuple[Any, ...]) -> tuple[Any, ...]:
+            """Return the terms of order k of both series, and the sums with them."""
             power, spread, integral, noise = parts
             power, moved = a @ power * (h / k), a @ spread * (h / k)
             spread = moved + moved.T
@@ -117,7 +118,7 @@ class Continuous(Module):
 
 
 def _double(growth: Any, matrix: Any, integral: Any, noise: Any) -> tuple[Any, Any, Any, Any]:
-    """From F - I, F, the integral of F and Q over a step to those over twice the step."""
+    """Return F - I, F, the integral of F, and Q over twice the step, given those over the step."""
     moved = noise + growth @ noise
     return (
         2 * growth + growth @ growth,
@@ -131,6 +132,7 @@ def _double_where(count: Any) -> Callable[[Any, tuple[Any, ...]], tuple[Any, ...
     """Return the turn of a loop that doubles `count` times and then leaves all as it is."""
 
     def turn(i: Any, parts: tuple[Any, ...]) -> tuple[Any, ...]:
+        """Double the parts if i is below the count."""
         # What is not doubled any more is taken as zero, so that nothing overflows and derivatives stay finite.
         goes_on = i < count
         doubled = _double(*(jnp.where(goes_on, part, 0.0) for part in parts))

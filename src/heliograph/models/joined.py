@@ -97,9 +97,29 @@ def join(plants: "Sequence[AbstractPlant]") -> LinearPlant | Plant:
     limits = tuple(pair for plant in parts for pair in plant.limits)
     if not all(isinstance(plant, LinearPlant) for plant in parts):
         move = SideBySide(tuple(parts), places)
-        return Plant(move, noise, center, start, states, inputs, circular, attitude, limits)
+        return Plant(
+            move,
+            noise,
+            initial_mean=center,
+            initial_covariance=start,
+            states=states,
+            inputs=inputs,
+            circular=circular,
+            attitude=attitude,
+            limits=limits,
+        )
     matrix, driven = _matrices(parts, places, len(inputs))
-    return LinearPlant(matrix, noise, center, start, driven, states, inputs, circular, limits)
+    return LinearPlant(
+        matrix,
+        noise,
+        initial_mean=center,
+        initial_covariance=start,
+        input_matrix=driven,
+        states=states,
+        inputs=inputs,
+        circular=circular,
+        limits=limits,
+    )
 
 
 def _join_starts(parts: list[Any]) -> tuple[Any, Any]:
@@ -129,8 +149,8 @@ def _join_starts(parts: list[Any]) -> tuple[Any, Any]:
 def _matrices(parts: list[Any], places: tuple[tuple[int, ...], ...], count: int) -> tuple[Any, Any]:
     """Return A and B of linear plants side by side: constants, or functions of the inputs where some part is one."""
     if any(isinstance(value, OfInputs) for plant in parts for value in (plant.matrix, plant.input_matrix)):
-        every = tuple(parts), places
-        return MatrixSideBySide(*every), InputsSideBySide(*every)
+        plants = tuple(parts)
+        return MatrixSideBySide(plants, places), InputsSideBySide(plants, places)
     pick = np.eye(count)
     rows = [plant.input_matrix @ pick[list(at)] for plant, at in zip(parts, places, strict=True)]
     return block_diagonal([plant.matrix for plant in parts]), library(*rows).concatenate(rows)

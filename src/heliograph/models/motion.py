@@ -179,6 +179,7 @@ def two_axes(axes: Names) -> list[str]:
 
 
 def _deviation_and_rate(deviation: ArrayLike, time: ArrayLike) -> tuple[Any, Any]:
+    """Return a deviation, checked, and the rate 1 / time at which it is forgotten."""
     return scalar("deviation", deviation, 0.0, LARGEST), 1 / scalar("time", time, 1 / LARGEST)
 
 

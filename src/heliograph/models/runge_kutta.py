@@ -38,6 +38,7 @@ class RungeKuttaStep(Motion):
         h = dt / self.substeps
 
         def turn(_: object, x: jax.Array) -> jax.Array:
+            """Return the state after one of the shorter steps."""
             first = as_real(self.drift(x, own))
             second = as_real(self.drift(x + h / 2 * first, own))
             third = as_real(self.drift(x + h / 2 * second, own))

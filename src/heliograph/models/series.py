@@ -323,11 +323,13 @@ def _read_start(variance: "ArrayLike | DiffuseStart") -> Any:
 
 
 def _rotation(angle: Any) -> Any:
+    """Return the matrix (2, 2) that turns a wave's pair of states by an angle in a step."""
     xp = library(angle)
     c, s = xp.cos(angle), xp.sin(angle)
     return xp.stack([xp.stack([c, s]), xp.stack([-s, c])])
 
 
 def _diagonal(variances: list[Any]) -> Any:
+    """Return the diagonal matrix of variances, some of which may be traced."""
     xp = library(variances)
     return xp.diag(xp.stack([xp.asarray(value) for value in variances]))

@@ -127,7 +127,8 @@ def coordinated_turn(
     step = None if dt is None else scalar("length of a step", dt, 0.0)
     states = [first, f"{first}_velocity", second, f"{second}_velocity", "turn_rate"]
     inputs = [] if dt is not None else with_time_step(())
-    return Plant(Turn(step), TurnNoise(step, q, wander), initial_mean, initial_covariance, states, inputs)
+    noise = TurnNoise(step, q, wander)
+    return Plant(Turn(step), noise, initial_mean, initial_covariance, states=states, inputs=inputs)
 
 
 def unicycle(
@@ -196,7 +197,10 @@ def _vehicle(
     dt: ArrayLike | None,
     axes: Names,
 ) -> Plant:
-    """Return a vehicle that drives over arcs."""
+    """Return the plant of a vehicle that drives over arcs of circles.
+
+    Its inputs are "speed" and `steered_by`: the turn rate, or with a wheelbase the angle of its front wheel.
+    """
     step = None if dt is None else scalar("length of a step", dt, 0.0)
     spread = covariance("noise intensity", intensity, 3)
     inputs = ["speed", steered_by]
@@ -205,7 +209,7 @@ def _vehicle(
         ScaledNoise(step, spread) if step is None else spread * step,
         initial_mean,
         initial_covariance,
-        [*two_axes(axes), "heading"],
-        with_time_step(inputs) if step is None else inputs,
-        ["heading"],
+        states=[*two_axes(axes), "heading"],
+        inputs=with_time_step(inputs) if step is None else inputs,
+        circular=["heading"],
     )

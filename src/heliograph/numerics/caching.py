@@ -85,5 +85,6 @@ def cache_arrays(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def _close(leaf: Any) -> None:
+    """Close an array to writing; leave all else as it is."""
     if isinstance(leaf, np.ndarray):
         leaf.setflags(write=False)

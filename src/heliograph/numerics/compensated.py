@@ -84,6 +84,7 @@ class _Evaluation:
         values |= zip(jaxpr.invars, inputs, strict=True)
 
         def read(v: Any) -> Compensated:
+            """Return the value of a variable or of a number in the program."""
             return self._divide_known(v.val) if isinstance(v, Literal) else values[v]
 
         for equation in jaxpr.eqns:
@@ -128,6 +129,7 @@ class _Evaluation:
         return results
 
     def _add(self, a: Compensated, b: Compensated, **_: Any) -> Compensated:
+        """Add two numbers, with what the sum's rounding and theirs lost."""
         total, error = split_sum(a.high, b.high)
         return Compensated(total, _add_up(error, a.low, b.low))
 
@@ -135,6 +137,7 @@ class _Evaluation:
         return self._add(a, Compensated(-b.high, None if b.low is None else -b.low))
 
     def _multiply(self, a: Compensated, b: Compensated, **_: Any) -> Compensated:
+        """Multiply two numbers, with what the product's rounding and theirs lost."""
         lost = [x.low * y.high for x, y in ((a, b), (b, a)) if x.low is not None]
         return Compensated(a.high * b.high, _add_up(self._find_product_error(a.high, b.high), *lost))
 
@@ -221,6 +224,7 @@ def _differentiate(function: Callable[..., Any], inputs: Sequence[Compensated], 
     lost = [i for i, x in enumerate(inputs) if x.low is not None]
 
     def of_lost(*some: Any) -> Any:
+        """Return f with these values in the places of the inputs of which something was lost."""
         arguments = [x.high for x in inputs]
         for i, value in zip(lost, some, strict=True):
             arguments[i] = value
@@ -270,6 +274,7 @@ def _arrange(a: Compensated, same: Sequence[int], over: Sequence[int], left: boo
 
 
 def _as_array(x: Any) -> Any:
+    """Return a part of a number as an array; None and JAX's arrays as they are."""
     return x if x is None or isinstance(x, jax.Array) else np.asarray(x)
 
 

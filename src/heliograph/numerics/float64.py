@@ -53,10 +53,11 @@ def fully_optimised(function: Callable[P, R]) -> Callable[P, R]:
 def _compile_at_call(
     function: Callable[P, R], options: Callable[[], Options], donate: Donated = "none"
 ) -> Callable[P, R]:
-    """The compiler is asked for its options at the first call, not where a function is defined."""
+    """Return the function, compiled at its first call: only then is the compiler asked for its options."""
 
     @cache
     def jitted() -> Callable[P, R]:
+        """Return the compiled function, the same at every call."""
         program: Callable[P, R] = eqx.filter_jit(function, donate=donate, compiler_options=options())  # type: ignore[call-overload]
         return program
 

@@ -79,6 +79,7 @@ def _factor_in_loop(a: jax.Array) -> tuple[jax.Array, jax.Array]:
     n, whole = len(a), jnp.diagonal(a)
 
     def eliminate(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+        """Take column j of the factor off what is left of the matrix, and put it in its place."""
         left, lower, scales, growth = carry
         scale = pivot_scale(left[j, j], whole[j], growth)
         column = jnp.where(np.arange(n) >= j, left[:, j] * scale, 0.0)
@@ -93,11 +94,11 @@ def _factor_in_loop(a: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def pivot_scale(pivot: jax.Array, whole: jax.Array, growth: jax.Array) -> jax.Array:
-    """1 / root of a pivot; 0 for one that is zero up to rounding of the whole diagonal entry, NaN for a negative one.
+    """Return 1 / root of a pivot; 0 of one that is zero up to rounding of the `whole` entry, NaN of a negative one.
 
-    `growth`: the largest ratio of a diagonal entry to its pivot before; dividing by such a pivot multiplies by it what
-    rounding makes of this one. The root is taken of a positive number in any case, of infinity where nothing is left:
-    the derivative there is 0.
+    `whole` is the diagonal entry of the matrix, of which the pivot is left. `growth` is the largest ratio of a diagonal
+    entry to its pivot before; dividing by such a pivot multiplies by it what rounding makes of this one. The root is
+    taken of a positive number in any case, of infinity where nothing is left: the derivative there is 0.
     """
     singular = pivot >= -negative_tolerance(pivot, growth) * whole
     beyond = jnp.where(singular, jnp.inf, jnp.nan)
@@ -138,6 +139,7 @@ def solver(a: Float[Array, "n n"]) -> Callable[[Array], jax.Array]:
     lower, scales = factor(jnp.asarray(a))
 
     def solve(b: Array) -> jax.Array:
+        """Return X of A X = B."""
         # L Y = B, then L' X = Y, which is lower again from the last row up.
         y = _substitute(lower, scales, jnp.asarray(b)) * scales[:, None]
         upside_down = _substitute(lower.T[::-1, ::-1], scales[::-1], y[::-1])
@@ -152,6 +154,7 @@ def _substitute(lower: jax.Array, scales: jax.Array, b: jax.Array) -> jax.Array:
     n, left, numerators = len(b), b, list[jax.Array]()
 
     def take_off(j: jax.Array, rest: jax.Array) -> jax.Array:
+        """Take row j of Y, times its entries of L, off the rows below it."""
         return jnp.where((np.arange(n) > j)[:, None], rest - outer(lower[:, j], rest[j] * scales[j]), rest)
 
     if not 0 < n <= WRITTEN:

@@ -111,7 +111,7 @@ def readable(kind: T) -> T:
 
 
 def _write_repr(self: object) -> str:
-    """One line, or a line for each part."""
+    """Return the object as text: one line, or a line for each part."""
     whole = line(self, DEPTH)
     if len(whole) <= WIDTH:
         return whole
@@ -157,6 +157,7 @@ def line(value: object, depth: int) -> str:
 
 
 def _is_ours(value: object) -> bool:
+    """Return whether an object is written by this module."""
     return getattr(type(value), "__repr__", None) is _write_repr
 
 
@@ -180,6 +181,7 @@ def _format_array(value: np.ndarray | np.generic | jax.Array) -> str:
 
 
 def _round_numbers(numbers: object) -> str:
+    """Return a number, or a list of lists of them, with four digits each."""
     if isinstance(numbers, list):
         return f"[{', '.join(map(_round_numbers, numbers))}]"
     return f"{numbers:.4g}"

@@ -25,7 +25,7 @@ class Share(NamedTuple):
 
 
 def wilson(hits: float, of: float) -> Share:
-    """Share k / n with Wilson's interval, |k - n p| <= 1.96 sqrt(n p (1 - p)) for its ends p; (NaN, 0, 1) of nothing.
+    """Return k / n with Wilson's interval, |k - n p| <= 1.96 sqrt(n p (1 - p)) for its ends p; (NaN, 0, 1) of nothing.
 
     Source: Wilson, Probable inference (1927).
     """
@@ -47,7 +47,7 @@ def count_independent(values: Float[np.ndarray, " time"]) -> float:
 
 
 def average_correlated(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
-    """Mean of the values that are not NaN, and its standard error by Bartlett's weights, of values correlated in time.
+    """Return the mean of correlated values that are not NaN, and its standard error by Bartlett's weights.
 
     The weights reach over the cube root of the length.
     """

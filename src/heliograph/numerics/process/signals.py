@@ -15,7 +15,7 @@ IMPORTS = ExtensionFileLoader.exec_module.__code__.co_filename
 
 @contextmanager
 def handlers(handler: Callable[[int, FrameType | None], object]) -> Iterator[None]:
-    """Within a block of the main thread, handle the signals to stop so, but for those that the process ignores.
+    """Handle the signals to stop so within a block of the main thread, but for those that the process ignores.
 
     A process in the background ignores SIGINT: nobody's Ctrl-C is meant for it. While a module in C is imported the
     handler waits: such a module prints what is raised in the Python that it calls, or dies of it.

@@ -28,7 +28,7 @@ def looks_like_date(text: str) -> bool:
 
 
 def dates(texts: Iterable[object], name: str) -> np.ndarray:
-    """Dates of ISO 8601 as datetime64[ns] in UTC; empty is NaT. Without a zone they are taken as they stand, as UTC."""
+    """Return dates of ISO 8601 as datetime64[ns] in UTC, empty ones as NaT; one without a zone is taken as UTC."""
     results, zones = [], set()
     for row, element in enumerate(texts, 1):
         text = element.isoformat() if hasattr(element, "isoformat") else "" if element is None else str(element).strip()
