@@ -98,19 +98,17 @@ def certify_level(
     allowed = level**2 * system.initial_weight
     initial = float(np.linalg.eigvalsh(allowed - P[0])[0])
     initial_margin = smallest_eigenvalue(allowed - P[0], np.sqrt(np.diagonal(allowed)))
-    # Distance from failing, free of units.
-    definite = np.array([smallest_eigenvalue(p) for p in P])
-    margin = min(initial_margin, *(-_find_scaled_largest(phi) for phi in matrices))
+    margin = min(initial_margin, *(-_find_scaled_largest(phi) for phi in matrices))  # from failing, free of units
     # Every condition that fails, in words.
+    definite = np.array([smallest_eigenvalue(p) for p in P])
     reasons = [f"step {k}: the largest eigenvalue is {largest[k]:.3g}, not negative" for k in np.flatnonzero(~negative)]
     if not initial_margin > ROUNDING:
         reasons.append(f"initial condition: the smallest eigenvalue of level^2 W - P_0 is {initial:.3g}, not positive")
     reasons += [f"P_{k} is not positive definite ({definite[k]:.3g})" for k in np.flatnonzero(~(definite > ROUNDING))]
     reasons += [f"step {k}: a multiplier is negative" for k in np.flatnonzero((lam < 0).any(axis=1))]
-    assumed: list[str] = []
-    for letter, of in (("f", system.growth), ("h", system.output_growth)):
-        reasons += _list_objections(of, findings[letter])
-        assumed += _list_assumed(letter, of, findings[letter])
+    reasons += _list_objections(system.growth, findings["f"]) + _list_objections(system.output_growth, findings["h"])
+    assumed = _list_assumed("f", system.growth, findings["f"])
+    assumed += _list_assumed("h", system.output_growth, findings["h"])
     return HInfinityCertificate(
         certified=not reasons,
         level=level,

@@ -179,11 +179,10 @@ def horizon_design(
     if chosen is None:
         chosen = np.array([coordinates.gain(steps[k].nominal + _gain_correction(u), k) for k, u in enumerate(solved)])
     multipliers = np.array([coordinates.multipliers(u, k) for k, u in enumerate(solved)])
-    unscaled = np.array([coordinates.weight(weight, k) for k, weight in enumerate(weights)])
     return HInfinityDesign(
         level=float(np.sqrt(square)) * coordinates.unit,
         gains=chosen,
-        weights=unscaled,
+        weights=np.array([coordinates.weight(weight, k) for k, weight in enumerate(weights)]),
         multipliers=all_multipliers(system, multipliers, separate),
         feasible=True,
         status=status,

@@ -113,27 +113,14 @@ def lift_modes(
         process = np.kron(chosen, carried) + np.kron(np.diag(law), after - carried)
         noise, rounding_of_noise = _average_noise(law, lifts, moments)
         output = np.concatenate([lift.matrix for lift in lifts], axis=1)[:-1]
-        step = Steps(
-            transition=np.kron(rows.T, moved),
-            drift=np.zeros(len(mean)),
-            process=process,
-            output=output,
-            offset=np.zeros(len(output)),
-            noise=noise,
-        )
-        steps.append(step)
+        no_drift, no_offset = np.zeros(len(mean)), np.zeros(len(output))
+        steps.append(Steps(np.kron(rows.T, moved), no_drift, process, output, no_offset, noise))
         roundings.append((EPS * np.kron(law, np.diag(after)), rounding_of_noise))
         before, rows = after, np.asarray(measurement.transition)
     over_time = Steps(*(repeat_last(values, len(plants)) for values in zip(*steps, strict=True)))
     process_rounding, received_rounding = (repeat_last(values, len(plants)) for values in zip(*roundings, strict=True))
-    return LinearSystem(
-        over_time,
-        mean=mean,
-        covariance=start,
-        projection=np.tile(projection, (1, modes)),
-        rounding=process_rounding,
-        received_rounding=received_rounding,
-    )
+    whole = np.tile(projection, (1, modes))
+    return LinearSystem(over_time, mean, start, whole, rounding=process_rounding, received_rounding=received_rounding)
 
 
 def _average_noise(

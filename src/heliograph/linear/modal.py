@@ -73,15 +73,8 @@ def modal_system(
         transition, process, moments = _propagate_modes(move_moments, rows, moments)
         noise = np.einsum("jabcd,jcd->ab", received[1], moments)
         output = np.concatenate(list(received[0]), axis=1)
-        of_step = Steps(
-            transition=transition,
-            drift=np.zeros(len(transition)),
-            process=process,
-            output=output,
-            offset=np.zeros(len(output)),
-            noise=noise,
-        )
-        parts.append(of_step)
+        no_drift, no_offset = np.zeros(len(transition)), np.zeros(len(output))
+        parts.append(Steps(transition, no_drift, process, output, no_offset, noise))
         rows = np.asarray(step.transition)
     return LinearSystem(
         Steps(*map(np.array, zip(*parts, strict=True))),

@@ -76,15 +76,8 @@ def quadratic_system_with_linear_estimate(
         # Cov(w) = E[Y+ Y+'] - M E[Y Y'] M'.
         process = after - transition @ before @ transition.T
         matrix, drift = affine(transition)
-        step = Steps(
-            transition=matrix,
-            drift=drift,
-            process=process[:-1, :-1],
-            output=received,
-            offset=np.zeros(len(received)),
-            noise=np.zeros((len(received), len(received))),
-        )
-        steps.append(step)
+        no_offset, no_noise = np.zeros(len(received)), np.zeros((len(received), len(received)))
+        steps.append(Steps(matrix, drift, process[:-1, :-1], received, no_offset, no_noise))
         rounding.append(np.finfo(float).eps * np.diag(after)[:-1])
         before = after
     over_time = Steps(*map(np.array, zip(*steps, strict=True)))

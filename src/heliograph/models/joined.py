@@ -97,29 +97,9 @@ def join(plants: "Sequence[AbstractPlant]") -> LinearPlant | Plant:
     limits = tuple(pair for plant in parts for pair in plant.limits)
     if not all(isinstance(plant, LinearPlant) for plant in parts):
         move = SideBySide(tuple(parts), places)
-        return Plant(
-            move,
-            noise,
-            initial_mean=center,
-            initial_covariance=start,
-            states=states,
-            inputs=inputs,
-            circular=circular,
-            attitude=attitude,
-            limits=limits,
-        )
+        return Plant(move, noise, center, start, states, inputs, circular=circular, attitude=attitude, limits=limits)
     matrix, driven = _matrices(parts, places, len(inputs))
-    return LinearPlant(
-        matrix,
-        noise,
-        initial_mean=center,
-        initial_covariance=start,
-        input_matrix=driven,
-        states=states,
-        inputs=inputs,
-        circular=circular,
-        limits=limits,
-    )
+    return LinearPlant(matrix, noise, center, start, driven, states, inputs, circular=circular, limits=limits)
 
 
 def _join_starts(parts: list[Any]) -> tuple[Any, Any]:

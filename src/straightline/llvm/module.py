@@ -161,14 +161,7 @@ def write_module(
     differs = {*items, *program.inputs} if alone else find_differing(items, lanes)
     differs = {x for x in differs if not (isinstance(x, Buffer) and x.kind == "table")}
     parts = Parts(
-        program=program,
-        items=items,
-        outputs=outputs,
-        lanes=lanes,
-        spread=differs,
-        alone=alone,
-        width=width or widest(items),
-        summed=summed,
+        program, items, outputs, lanes, spread=differs, alone=alone, width=width or widest(items), summed=summed
     )
     of_blocks = crossing(items, differs)
     layout = lay_out(parts, of_blocks)

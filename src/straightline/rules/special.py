@@ -50,8 +50,7 @@ def gamma_masses(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     functions in Mie scattering calculations using continued fractions (1976).
     """
     valid = (a > 0) & (x >= 0)
-    large, given_x, at_zero = a > LARGE, x, (a == 0) & (x > 0)
-    by_expansion = large_masses(a, x)
+    large, by_expansion, given_x, at_zero = a > LARGE, large_masses(a, x), x, (a == 0) & (x > 0)
     a, x = jnp.where(large | ~valid, 1.0, a), jnp.where(large | ~valid, 1.0, x)
     above = x > a + 1
     density = jnp.exp(a * jnp.log(x) - x - jax.lax.lgamma(a))
@@ -87,8 +86,7 @@ def gamma_masses(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     beyond = jnp.where(above & (x < jnp.inf), upper, 1 - below)
     p, q = (jnp.where(large & (given_x < jnp.inf), e, y) for e, y in zip(by_expansion, (below, beyond), strict=True))
     p, q = jnp.where(given_x == jnp.inf, 1.0, p), jnp.where(given_x == jnp.inf, 0.0, q)
-    # A law of shape 0 is all at 0.
-    p, q = jnp.where(at_zero, 1.0, p), jnp.where(at_zero, 0.0, q)
+    p, q = jnp.where(at_zero, 1.0, p), jnp.where(at_zero, 0.0, q)  # a law of shape 0 is all at 0
     return jnp.where(valid | at_zero, p, jnp.nan), jnp.where(valid | at_zero, q, jnp.nan)
 
 

@@ -52,12 +52,7 @@ def design_numbers(task: DesignProblem, build: Build) -> PowerDesign:
     network, error = problem.network(best), problem.criterion.exact(found.covariances)
     value, unit = (error, "error") if target is None else (conditions.value, "power")
     certificate = Certificate(
-        convex=False,
-        value=value,
-        bound=float("-inf"),
-        stationarity=conditions.residual,
-        starts=starts,
-        unit=unit,
+        convex=False, value=value, bound=float("-inf"), stationarity=conditions.residual, starts=starts, unit=unit
     )
     # A watt more at every step falls on one transmitter: the price is the largest worth, times the steps.
     return PowerDesign(
