@@ -376,9 +376,8 @@ def memory_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon:
     """
     check_forgets("channel of a memory filter", check_maps("channel", [first(channel)])[0])
     claim = polynomial_claim(plant, sensor, channel, 2)
-    # The linear filter's gains are needed for the moments of its products with z.
     centre, system = _lift_about_mean(plant, sensor, channel, 1, horizon)
-    linear = lmmse(system, claim)
+    linear = lmmse(system, claim)  # its gains give the moments of its products with z
     centred_plant = plant if centre is None else centre_plant(plant)
     products = lmmse(quadratic_system_with_linear_estimate(centred_plant, sensor, channel, linear), linear.claim)
     names = first(plant).states
