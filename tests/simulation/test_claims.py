@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
+from heliograph import serving
 
 PLANT = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0)
 SENSOR = hg.LinearSensor([[1.0]], 0.1)
@@ -198,8 +199,8 @@ def test_the_word_goes_into_tables_timelines_single_precision_and_what_a_service
     assert timeline.estimates()["a"]["f"].claim == "nominal"
     kept = hg.monte_carlo(network, 4, 2, 0, keep=hg.Statistics())
     assert kept.to_pandas().loc["a", "f"]["claim"] == "nominal"
-    fleet = hg.serving.Fleet(hg.serving.NetworkProgram(network), hg.serving.Options(window=5.0, step=1.0))
-    service = hg.serving.Service(fleet, hg.serving.InMemoryStore())
+    fleet = serving.Fleet(serving.NetworkProgram(network), serving.Options(window=5.0, step=1.0))
+    service = serving.Service(fleet, serving.InMemoryStore())
     body = {"plant": "p", "node": "a", "sequence": 0, "time": 0.0, "values": [0.5]}
     told = [json.loads(output.body) for output in service.take([json.dumps(body).encode()])]
     assert {message["estimates"]["a"]["f"]["claim"] for message in told if "estimates" in message} == {"nominal"}

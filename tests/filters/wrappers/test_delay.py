@@ -290,3 +290,13 @@ def test_a_link_of_the_last_two_signals():
     assert found.claim == "exact" and low < 1 < high and channel.in_words().endswith("of the last 2 signals")
     with pytest.raises(ValueError, match="link: expected inputs of 3 signals of one length, got 2"):
         hg.random_affine.DelayLine(hg.random_affine.known([[0.5, 0.5]]), 2)
+
+
+def test_a_robust_filter_behind_a_delay_tells_what_it_weighed_down():
+    """As it does of the same values in time, two rows before."""
+    robust = hg.robust_filter(PLANT, SENSOR, LINK, hg.filters.Gate())
+    z = np.full((12, 1), 0.3)
+    z[6] = 40.0
+    at_once, late = robust.run(z), hg.filters.late_filter(robust, 2).run(np.vstack([np.full((2, 1), np.nan), z]))
+    assert at_once.weights[6] < 1e-3 and np.isnan(late.weights[:2]).all()
+    np.testing.assert_allclose(late.weights[2:], at_once.weights, rtol=1e-12)

@@ -227,7 +227,8 @@ class LateFilter(AbstractWrapper):
         after, innovation = self.base.correct(state.base, z, jnp.maximum(sent_at, 0))
         base = jax.tree.map(lambda new, old: jnp.where(sent_at >= 0, new, old), after, state.base)
         likelihood = jnp.where(sent_at >= 0, innovation.log_likelihood, 0.0)
-        return state._replace(base=base), Innovation(innovation.value, innovation.covariance, likelihood)
+        weight = None if innovation.weight is None else jnp.where(sent_at >= 0, innovation.weight, jnp.nan)
+        return state._replace(base=base), replace(innovation, log_likelihood=likelihood, weight=weight)
 
     @estimates
     def estimate(self, state: LateState) -> Estimate:
@@ -292,7 +293,8 @@ class KnownDelayFilter(AbstractWrapper):
         # The delay itself is a component of z too, of which the innovation tells nothing.
         delay_innovation, covariance = append_flag(innovation.covariance, delay)
         likelihood = jnp.where(is_known, innovation.log_likelihood, 0.0)
-        return after, Innovation(jnp.append(innovation.value, delay_innovation), covariance, likelihood)
+        weight = None if innovation.weight is None else jnp.append(innovation.weight, jnp.nan)
+        return after, Innovation(jnp.append(innovation.value, delay_innovation), covariance, likelihood, weight)
 
 
 Make = Callable[[AnyPlant, AnySensor, Channel], AbstractFilter]
