@@ -59,9 +59,15 @@ class Compiled:
         new._addresses, new._shared = addresses(new._first), None
         return new
 
-    def for_one(self) -> "OneRun":
-        """Return the same code for one run at a time, with memory of its own: no call of it makes an array."""
-        return OneRun(self)
+    def for_runs(self, runs: int, inputs: Mapping[int, np.ndarray] = MappingProxyType({})) -> "InPlace":
+        """Return the same code for so many runs at a time, with memory of its own: no call of it makes an array.
+
+        Args:
+            runs: how many.
+            inputs: arrays that are read in place, by the numbers of the arguments that calls do not leave out; others
+                are made.
+        """
+        return InPlace(self, runs, inputs)
 
     def prepare(self, arrays: Sequence[Any] = ()) -> str:
         """Generate what a first call of these arrays, or of one run, takes; return "", or why LLVM makes no code."""
@@ -133,12 +139,11 @@ class Compiled:
 
     def _compute_blocks(self, call: "Call", cores: int | None) -> None:
         """Compute all blocks of runs of a call: here if that is little work, else shared among threads."""
-        blocks, scratch = -(-call.runs // call.machine.width), self.code.scratch
-        if cores == 1 or blocks * self.code.blocks.work < LITTLE:
+        blocks, scratch, work = -(-call.runs // call.machine.width), self.code.scratch, self.code.blocks.work
+        share = max(-(-blocks // ((cores or cpu_count()) * SHARES)), -(-LITTLE // max(work, 1)))
+        if cores == 1 or share >= blocks:
             call.compute(0, blocks, scratch)
             return
-        cores = cores or cpu_count()
-        share = -(-blocks // (cores * SHARES))
         starts = range(0, blocks, share)
         list(threads().map(lambda start: call.compute(start, min(start + share, blocks), scratch), starts))
 
@@ -168,30 +173,50 @@ class Call(NamedTuple):
         self.machine.run(self.pointers.ctypes.data, memory.ctypes.data, begin, end, self.runs)
 
 
-class OneRun:
-    """Code of a `Compiled` for one run at a time, in arrays of its own: a call computes `outputs` from `inputs`.
+class InPlace:
+    """Code of a `Compiled` for so many runs, in arrays of its own: a call computes `outputs` from `inputs`.
 
-    What all runs share has to be among the first arguments, which calls leave out. Bits are those of many runs.
+    What all runs share, but the first arguments, which calls leave out, is computed in every call. Bits are those of
+    any number of runs.
     """
 
-    def __init__(self, compiled: Compiled):
-        code, first = compiled.code, len(compiled._first)
-        if not all(compiled.differs[first:]):
-            raise ValueError("one run: expected all arguments that runs share to be given first")
-        self.inputs = [np.zeros((1, *s), t) for s, t in zip(compiled.shapes, compiled.types, strict=True)][first:]
-        self.outputs = [in_lines((1, *b.shape), DTYPES[b.type]) for b in code.outputs]
+    def __init__(self, compiled: Compiled, runs: int, inputs: Mapping[int, np.ndarray]):
+        code, given, self.runs = compiled.code, len(compiled._first), runs
+        self._compiled, differs = compiled, compiled.differs[given:]
+        shapes = [(runs, *s) if d else s for s, d in zip(compiled.shapes[given:], differs, strict=True)]
+        fresh = [np.zeros(s, t) for s, t in zip(shapes, compiled.types[given:], strict=True)]
+        self.inputs = [inputs.get(n, x) for n, x in enumerate(fresh)]
+        compiled._check_shapes(self.inputs, given, runs)
+        for n, (x, new) in enumerate(zip(self.inputs, fresh, strict=True)):
+            if x.dtype != new.dtype or not x.flags.c_contiguous:
+                raise ValueError(f"array {n} read in place: expected contiguous numbers of type {new.dtype}")
+        self.outputs = [in_lines((runs, *b.shape), DTYPES[b.type]) for b in code.outputs]
         self._memory = *compiled._first, *self.inputs, *code.tables, *self.outputs, aligned(code.shared)
         self._pointers = np.array(addresses(self._memory), dtype=np.uint64)
-        self._scratch, self._tiers, self._is_common = aligned(code.scratch), compiled.single, all(code.common)
-        self._addresses = self._pointers.ctypes.data, self._scratch.ctypes.data
-        if compiled.once is not None:
-            compiled.once.machine(1).run(self._pointers.ctypes.data, 0, 0, 1, 1)
-            compiled._copy_common(self.outputs, self._memory[-1])
+        self._scratch, self._is_common = aligned(code.scratch), all(code.common)
+        (self._tiers, width), self._at = compiled._tiers(runs), (self._pointers.ctypes.data, self._scratch.ctypes.data)
+        self._blocks = -(-runs // width)
+        self._is_little = runs == 1 or self._blocks * code.blocks.work < LITTLE
+        self._varies = compiled.once is not None and not all(differs)
+        if compiled.once is not None and not self._varies:
+            self._compute_shared(compiled.once)
 
     def __call__(self) -> None:
         """Compute `outputs` from `inputs`."""
-        if not self._is_common:
-            self._tiers.machine(1).run(*self._addresses, 0, 1, 1)
+        if self._varies and self._compiled.once is not None:
+            self._compute_shared(self._compiled.once)
+        if self._is_common:
+            return
+        machine = self._tiers.machine(self._blocks)
+        if self._is_little:
+            machine.run(*self._at, 0, -(-self.runs // machine.width), self.runs)
+        else:
+            self._compiled._compute_blocks(Call(machine, self._pointers, self._memory, self.runs), None)
+
+    def _compute_shared(self, once: Tiers) -> None:
+        """Compute what all runs share."""
+        once.machine(1).run(self._at[0], 0, 0, 1, 1)
+        self._compiled._copy_common(self.outputs, self._memory[-1])
 
 
 class Alone:

@@ -14,8 +14,9 @@ OFTEN = 200_000
 # particles of two states, 77,000 operations, 41 s instead of 4) to save a third to half of its 0.25 ms. So with care
 # the longest takes as long as the longest of all programs in haste.
 ALONE = LONGEST // 10
-# Operations of vectors in a call: fewer are done sooner than other threads are woken, 30 us.
-LITTLE = 100_000
+# Operations of vectors in a thread's part of a call, 100 us: to wake a thread takes 30, and a processor that others use
+# 60 more in all.
+LITTLE = 400_000
 
 # Numbers of a known array that are constants, a longer one is a table in memory; rows of a matrix that is loaded whole.
 # Sums of products by 64 known numbers take 21 ns a run written out and 23 in memory; by 512 152 and 220, made in 0.13 s

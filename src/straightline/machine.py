@@ -132,7 +132,7 @@ class Tiers:
             executions = self._of(blocks)
             self._executions += executions
             machine = self._first(self._executions)
-            if machine.level < self._level(self._executions):
+            if not machine.level and self._level(self._executions):  # JAX takes 30 us to say its setting
                 self._careful = self._careful or background().submit(_with_care, self._source, self._widths[1], machine)
                 if executions >= OFTEN or self._careful.done():
                     self._machine = machine = self._careful.result()

@@ -209,7 +209,7 @@ def test_one_run_has_the_bits_of_many_in_memory_of_its_own():
     rng = np.random.default_rng(0)
     shared, x = rng.uniform(size=(3, 3)), rng.normal(size=(9, 3))
     code = compile(step, shared, x[0], shared=[0]).with_first(shared)
-    one, other = code.for_one(), code.for_one()
+    one, other = code.for_runs(1), code.for_runs(1)
     moved, root = code(x)
     for run in range(9):
         one.inputs[0][0] = x[run]
@@ -218,5 +218,15 @@ def test_one_run_has_the_bits_of_many_in_memory_of_its_own():
         assert code(x[run : run + 1])[0].tobytes() == moved[run].tobytes()
     assert one.outputs[1][0].tobytes() == root[0].tobytes()
     assert not other.inputs[0].any()
-    with pytest.raises(ValueError, match="one run: expected all arguments that runs share to be given first"):
-        compile(step, shared, x[0], shared=[0]).for_one()
+    # Many runs at a time, whose memory is given, and what they share anew in every call.
+    loose = compile(step, shared, x[0], shared=[0])
+    many = loose.for_runs(9, {1: x})
+    for scale in (1.0, 2.0):
+        many.inputs[0][...] = scale * shared
+        many()
+        for held, right in zip(many.outputs, loose(scale * shared, x), strict=True):
+            assert held.tobytes() == right.tobytes()
+    with pytest.raises(ValueError, match="array 1 read in place: expected contiguous numbers of type float64"):
+        loose.for_runs(9, {1: x.astype(np.float32)})
+    with pytest.raises(ValueError, match="array 1 of the arguments: expected shape"):
+        loose.for_runs(8, {1: x})

@@ -175,7 +175,7 @@ class RowStep:
 
     def for_one(self) -> "OneRowStep":
         """Return the step of one row at a time, which has memory of its own."""
-        return OneRowStep(self, None if self._code is None else self._code.for_one())
+        return OneRowStep(self, None if self._code is None else self._code.for_runs(1))
 
     def __call__(self, rows: Float[np.ndarray, "row column"], alone: bool = False) -> Float[np.ndarray, "row column"]:
         """Step each row; `alone`: calls with a single row, for which XLA needs no loop."""
