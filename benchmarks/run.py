@@ -39,7 +39,7 @@ OTHER = "heliograph, the other release"
 AGREEMENT = 1e-8  # largest difference of any estimate; all are of order one
 ALONE = (
     "startup", "stream", "timeline", "nodes", "h_infinity", "quadratic", "successive_relays", "cubature_fusion",
-    "links_with_memory", "event_triggered", "fleet", "network_design", "robust", "own_filters",
+    "links_with_memory", "event_triggered", "fleet", "network_design", "robust", "own_filters", "particles",
 )  # fmt: skip
 WITH_PEERS = ("learning", "one_series")  # like those alone, but they ask peers of their own
 

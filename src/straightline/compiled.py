@@ -194,7 +194,8 @@ class InPlace:
         self._memory = *compiled._first, *self.inputs, *code.tables, *self.outputs, aligned(code.shared)
         self._pointers = np.array(addresses(self._memory), dtype=np.uint64)
         self._scratch, self._is_common = aligned(code.scratch), all(code.common)
-        (self._tiers, width), self._at = compiled._tiers(runs), (self._pointers.ctypes.data, self._scratch.ctypes.data)
+        self._at = self._pointers.ctypes.data, self._scratch.ctypes.data
+        self._tiers, width = compiled._choose_tiers(runs)
         self._blocks = -(-runs // width)
         self._is_little = runs == 1 or self._blocks * code.blocks.work < LITTLE
         self._varies = compiled.once is not None and not all(differs)

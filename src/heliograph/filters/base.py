@@ -11,6 +11,7 @@ from typing_extensions import TypeAliasType
 
 from heliograph.engine.choice import compile_on_call
 from heliograph.filters.calls import call_with_inputs, call_with_state
+from heliograph.filters.chunks import Pass
 from heliograph.filters.filter_angles import FilterAngles
 from heliograph.filters.filter_data import Filtered, run_over_data, scan_inside_jit
 from heliograph.filters.plausibility import Judgement, judge_step
@@ -224,6 +225,10 @@ class AbstractFilter(Module):
     def after_step(self, state: PyTree, k: Step) -> Estimate:
         """`estimate(state)` after the correction of step k, for a filter that looks its covariance up by the step."""
         return self.estimate(state)
+
+    def filter_rows(self, z: Array, u: Array, state: PyTree | None = None, begin: Array | int = 0) -> Pass | None:
+        """Filter rows by native code of its own, from number `begin` on behind a state; None of most filters."""
+        return None
 
     @property
     def is_linear(self) -> bool:

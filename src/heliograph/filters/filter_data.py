@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compute_once
-from heliograph.filters.chunks import filter_in_chunks
+from heliograph.filters.chunks import Pass, filter_in_chunks
 from heliograph.model.checks.inputs import check_inputs
 from heliograph.model.checks.row_times import common_dates, judge_dates
 from heliograph.model.estimate import Claim, Estimate, Innovation
@@ -57,6 +57,9 @@ class SteppedFilter(Protocol):
 
     def after_step(self, state: PyTree, k: Array) -> Estimate:
         """Return the estimate of a row."""
+
+    def filter_rows(self, z: Array, u: Array, state: PyTree | None = None, begin: Array | int = 0) -> Pass | None:
+        """Filter rows by native code of its own, None where it has none."""
 
 
 @readable
@@ -143,8 +146,9 @@ def run_over_data(filter: SteppedFilter, z: ArrayLike, u: ArrayLike | None, afte
     if before is not None and clock is not None and len(clock):
         _check_later(before, clock)
     start = () if before is None else (before.state, np.asarray(begin))
-    in_chunks = filter_in_chunks(filter, rows_z, rows_u, _collect_row, *start)
-    state, outputs = in_chunks or compute_once(_compute_filtered, _by_xla, (filter, rows_z, rows_u, *start))
+    whole = filter_in_chunks(filter, rows_z, rows_u, _collect_row, *start)
+    whole = whole or filter.filter_rows(rows_z, rows_u, *start)
+    state, outputs = whole or compute_once(_compute_filtered, _by_xla, (filter, rows_z, rows_u, *start))
     mean, covariance, innovation, modes, counts = outputs
     lost = find_lost(mean, 1)
     if lost.any():

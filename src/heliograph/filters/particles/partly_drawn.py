@@ -140,7 +140,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
 
     def _draw_states(self, x: Gaussian, key: jax.Array) -> Gaussian:
         """Return Gaussians (N, n) given their drawn states, which are drawn here."""
-        draws = draw_normals(key, (self.particles, self.drawn))
+        draws = draw_normals(key, None, self.drawn, self.particles)
         return jax.vmap(condition_on_draw)(x, draws)
 
     def _move(self, plant: AbstractPlant, x: Gaussian, u: jax.Array) -> Gaussian:
@@ -174,7 +174,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         before = jax.nn.logsumexp(jax.nn.log_softmax(state.log_weight)[:, None] + log_mode)
         key = fold_in_bits(state.key, z)
         key_of_states, key_of_choice = jax.random.split(jax.random.fold_in(key, 2))
-        draws = draw_normals(key_of_states, (self.particles, self.drawn))
+        draws = draw_normals(key_of_states, None, self.drawn, self.particles)
         uniform = jax.random.uniform(key_of_choice, (self.particles, 3), dtype=float)
         draw_and_weigh = jax.vmap(partial(self._draw_and_weigh, sensors, received))
         x, mode, log_ratio = draw_and_weigh(state.gaussian, log_mode, draws, uniform)

@@ -12,6 +12,7 @@ import numpy as np
 
 from heliograph.factors.columns import Columns, columns_of
 from heliograph.filters.particles.received_density import Atoms
+from heliograph.filters.particles.resampling import draw_uniforms
 from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor, LinearSensor
 from heliograph.numerics.angle import Angles, nearest
@@ -41,7 +42,14 @@ class Proposed(NamedTuple):
 
 
 def propose(
-    moved: Moved, sensor: AbstractSensor, atoms: Atoms, z: jax.Array, angles: Angles, key: jax.Array
+    moved: Moved,
+    sensor: AbstractSensor,
+    atoms: Atoms,
+    z: jax.Array,
+    angles: Angles,
+    key: jax.Array,
+    numbers: jax.Array | None,
+    particles: int,
 ) -> Proposed:
     """Draw x = center + G e of each particle, e near what z says of it, and weigh it for not being drawn from N(0, I).
 
@@ -57,8 +65,8 @@ def propose(
     gain, offset, noise = atoms.moments()
     arrived = ~jnp.isnan(z)
     noise = jnp.where(arrived[:, None] & arrived, noise, jnp.eye(len(z)))
-    count = moved.center.shape[:1]
-    from_prior = jnp.zeros(count, bool) if is_exact else jax.random.uniform(key, count, dtype=float) < prior_share
+    drawn = draw_uniforms(key, numbers, 1, particles)[:, 0]
+    from_prior = jnp.zeros(len(drawn), bool) if is_exact else drawn < prior_share
 
     def propose_one(center: jax.Array, draw: jax.Array, from_prior: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return the position of one particle, and the correction of its log weight."""

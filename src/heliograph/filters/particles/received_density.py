@@ -58,7 +58,8 @@ class Atoms(Module):
 
         atoms = jnp.asarray(self.gain), jnp.asarray(self.offset), jnp.asarray(self.noise)
         by_atom = jax.vmap(compute_log_density)(*atoms)
-        total = jax.nn.logsumexp(jnp.log(jnp.asarray(self.weight))[:, None] + by_atom, axis=0)
+        joint = jnp.log(jnp.asarray(self.weight))[:, None] + by_atom
+        total = joint[0] if len(joint) == 1 else jax.nn.logsumexp(joint, axis=0)
         return jnp.where(jnp.isnan(total), -jnp.inf, total)
 
     def moments(self) -> tuple[jax.Array, jax.Array, jax.Array]:

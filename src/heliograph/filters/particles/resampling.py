@@ -1,7 +1,5 @@
 """Random numbers of particles: resampling of weighted ones, their normal numbers, and keys that depend on the data."""
 
-import math
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,22 +18,52 @@ def resample_systematically(weight: jax.Array, start: jax.Array) -> jax.Array:
     return invert_distribution(weight, (start + jnp.arange(len(weight))) / len(weight))
 
 
-def draw_normals(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
-    """Return standard normal numbers.
+def resample_known(weight: np.ndarray, start: float) -> np.ndarray:
+    """Resample known weights (N,) of any sum like `resample_systematically`, in a time that does not grow by log N.
 
-    From MANY numbers on in single precision, two from each 64 random bits: 2^23 distinct values, |x| <= 5.3, in a
-    third of the time. Only XLA runs draws of that size; smaller ones run in native code too, and must agree to the
-    last digit.
+    Particle i is drawn for the j with N C_(i-1) < start + j <= N C_i, C the distribution function.
     """
-    size = math.prod(shape)
-    if size < MANY:
-        return jax.random.normal(key, shape, dtype=float)
-    words = jax.random.bits(key, (-(-size // 2),), dtype=jnp.uint64)
-    halves = jnp.concatenate([(words >> 32).astype(jnp.uint32), words.astype(jnp.uint32)])[:size]
+    count, ends = len(weight), np.cumsum(weight)
+    ends *= count / ends[-1]
+    ends += 1 - start
+    places = np.minimum(ends.astype(np.int64), count)
+    places[-1] = count  # whatever rounding says
+    places[1:] -= places[:-1].copy()
+    return np.repeat(np.arange(count), places)
+
+
+def draw_normals(key: jax.Array, numbers: jax.Array | None, size: int, particles: int) -> jax.Array:
+    """Draw standard normal numbers (B, size) for the particles of these numbers (B,), None: for all, of so many.
+
+    Word w of a particle is the hash of its place among all words, so that particles draw the same side by side or one
+    by one. Of MANY numbers in all on they are of single precision, two from each 64 bits: those have 2^23 values, at
+    most 5.3, and take half of the time, in native code and in XLA's, which agree on them to single precision. Fewer
+    are those of `jax.random.normal(key, (particles, size))`, to the last digits in both.
+    """
+    if size * particles < MANY:
+        least = np.nextafter(-1.0, 0.0)
+        uniform = jnp.maximum(least, 2 * draw_uniforms(key, numbers, size, particles) + least)
+        return jnp.sqrt(2.0) * jax.lax.erf_inv(uniform)
+    words = draw_words(key, numbers, -(-size // 2), particles)
+    halves = jnp.concatenate([words >> np.uint64(32), words], axis=1)[:, :size].astype(jnp.uint32)
     # The middles of 2^23 parts of (-1, 1).
     uniform = (halves >> 9).astype(jnp.int32).astype(jnp.float32) * np.float32(STEP) + np.float32(STEP / 2 - 1)
-    normal = np.float32(np.sqrt(2)) * jax.lax.erf_inv(uniform)
-    return normal.astype(float).reshape(shape)
+    return (np.float32(np.sqrt(2)) * jax.lax.erf_inv(uniform)).astype(float)
+
+
+def draw_uniforms(key: jax.Array, numbers: jax.Array | None, size: int, particles: int) -> jax.Array:
+    """Draw numbers of [0, 1), (B, size), for particles: those of `jax.random.uniform(key, (particles, size))`."""
+    mantissa = draw_words(key, numbers, size, particles) >> np.uint64(12)
+    return jax.lax.bitcast_convert_type(mantissa | np.float64(1.0).view(np.uint64), jnp.float64) - 1.0
+
+
+def draw_words(key: jax.Array, numbers: jax.Array | None, size: int, particles: int) -> jax.Array:
+    """Draw `size` words of 64 bits, (B, size), for each of the particles of these numbers (B,), or for all."""
+    if numbers is None:
+        return jax.random.bits(key, (particles, size), dtype=jnp.uint64)
+    places = numbers[:, None].astype(jnp.uint32) * np.uint32(size) + jnp.arange(size, dtype=jnp.uint32)
+    halves = jax.vmap(jax.vmap(lambda place: jax.random.fold_in(key, place)))(places).astype(jnp.uint64)
+    return halves[..., 0] << np.uint64(32) | halves[..., 1]
 
 
 def effective_number(weight: jax.Array) -> jax.Array:

@@ -8,8 +8,11 @@ import numpy as np
 
 from heliograph.factors.columns import Columns, columns_of, join_columns, square_root, triangularise
 from heliograph.filters.base import Step, corrects, estimates, make_sizes, predicts
-from heliograph.filters.innovation import innovation_of_means
+from heliograph.filters.chunks import Pass
 from heliograph.filters.particles.base import AbstractStateParticleFilter, keep_unused, relative_to_largest
+from heliograph.filters.particles.expected import Expected, find_reference
+from heliograph.filters.particles.lanes import filter_particles
+from heliograph.filters.particles.moments import first_sums, second_sums
 from heliograph.filters.particles.proposal import Moved, noise_columns, propose
 from heliograph.filters.particles.received_density import Atoms, find_received_density
 from heliograph.filters.particles.resampling import draw_normals, effective_number, fold_in_bits
@@ -18,15 +21,16 @@ from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import at, first, list_steps, restack, steps_covered, unstack
 from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor
-from heliograph.numerics.angle import nearest, wrap_angles
+from heliograph.numerics.angle import wrap_angles
 from heliograph.numerics.check import check_count, fail, instance, scalar
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.types import ArrayLike, Bool, Float, Int
+from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int, PyTree
 from heliograph.random_affine.noise import AbstractNoise, Gaussian
 
 Proposal = Literal["optimal", "prior"]
 PROPOSALS: tuple[Proposal, ...] = ("optimal", "prior")
 MANY = 1000
+ENOUGH = 200  # particles; of 100 a row takes 80 us in lanes and half of it otherwise, of 300 90 and three times that
 
 
 class StateParticles(NamedTuple):
@@ -57,101 +61,152 @@ class StateParticles(NamedTuple):
         return effective_number(self.weight)
 
 
+class Weighed(NamedTuple):
+    """Particles that were weighed by z.
+
+    Args:
+        position: x (B, n), drawn with z.
+        log_likelihood: log p(z | x), less what the proposal adds (B,).
+        predicted: h(x) before z was known (B, p).
+    """
+
+    position: jax.Array
+    log_likelihood: jax.Array
+    predicted: jax.Array
+
+
 class StateParticleFilter(AbstractStateParticleFilter):
-    """Weighted particles of the whole state, which are drawn from the prior or with z. Built by `particle_filter`."""
+    """Weighted particles of the whole state, which are drawn from the prior or with z. Built by `particle_filter`.
+
+    What is done with particles takes any of them side by side, by their numbers: all at once (None), or a lane each.
+    """
+
+    def filter_rows(self, z: Array, u: Array, state: PyTree | None = None, begin: Array | int = 0) -> Pass | None:
+        """Filter rows with a lane for each particle where these are enough."""
+        return filter_particles(self, z, u, state, begin) if self.particles >= ENOUGH else None
 
     @in_float64
     def init(self) -> StateParticles:
         """Draw the particles from the law of x_0."""
-        plant, n = at(self.plant, 0), self.particles
-        key, key_of_start = jax.random.split(jax.random.PRNGKey(self.seed))
-        x = jax.vmap(plant.sample_initial)(jax.random.split(key_of_start, n))
-        size = x.shape[1]
-        law = Moved(x, jnp.zeros((size, size)), jnp.zeros((n, size))) if self.optimal else None
-        return StateParticles(x, jnp.zeros(n), law, key, jnp.asarray(False))
+        key, own = self.start_keys()
+        x = self.draw_start(own, jnp.arange(self.particles))
+        return self.state_of(x, jnp.zeros(self.particles), key)._replace(moved=jnp.asarray(False))
+
+    def state_of(self, position: jax.Array, log_weight: jax.Array, key: jax.Array) -> StateParticles:
+        """Return the state of particles (N, n) with these log weights, of which none is left to draw."""
+        size = position.shape[1]
+        law = Moved(position, jnp.zeros((size, size)), jnp.zeros_like(position)) if self.optimal else None
+        return StateParticles(position, log_weight, law, key, jnp.asarray(True))
+
+    def start_keys(self) -> tuple[jax.Array, jax.Array]:
+        """Return the key of the first step, and that of the draws of x_0."""
+        key, own = jax.random.split(jax.random.PRNGKey(self.seed))
+        return key, own
+
+    def draw_start(self, key: jax.Array, numbers: jax.Array) -> jax.Array:
+        """Draw x_0 (B, n) of the particles of these numbers."""
+        plant = at(self.plant, 0)
+        drawn: jax.Array = jax.vmap(lambda number: plant.sample_initial(jax.random.fold_in(key, number)))(numbers)
+        return drawn
 
     @predicts
     def predict(self, state: StateParticles, u: ArrayLike = (), k: Step = 0) -> StateParticles:
         """Resample where the effective number is too small, then move each particle with a noise of its own."""
-        plant, u = at(self.plant, k), jnp.asarray(u)
-        key, key_of_choice, key_of_noise = jax.random.split(jax.random.fold_in(state.key, 0), 3)
-        which, log_weight = self.resampled(state.log_weight, key_of_choice)
-        center = jax.vmap(lambda x: plant.transition(x, u))(state.position[which])
-        if isinstance(plant.noise, AbstractNoise) and not isinstance(plant.noise, Gaussian):
-            keys = jax.random.split(key_of_noise, self.particles)
-            noise = jax.vmap(lambda key: plant.sample_noise(key, u))(keys)
-            position = wrap_angles(center + noise, plant.angles)
-            return StateParticles(position, log_weight, None, key, jnp.asarray(True))
-        draws = draw_normals(key_of_noise, center.shape)
-        center, root = center + plant.noise_mean(), _root_of(noise_columns(plant, u))
-        position = wrap_angles(center + draws @ root.T, plant.angles)
-        law = self._find_law_of_move(plant, state, Moved(center, root, draws), u) if self.optimal else None
+        key, choice, own = self.keys_of_prediction(state.key)
+        which, log_weight = self.resampled(state.log_weight, choice)
+        position, law = self.move(state.position[which], None, own, jnp.asarray(u), k, state.moved)
         return StateParticles(position, log_weight, law, key, jnp.asarray(True))
 
-    def _find_law_of_move(self, plant: AbstractPlant, state: StateParticles, moved: Moved, u: jax.Array) -> Moved:
+    def keys_of_prediction(self, key: jax.Array) -> jax.Array:
+        """Return keys of what follows, of the choice of particles, and of their noise (3, 2)."""
+        return jax.random.split(jax.random.fold_in(key, 0), 3)
+
+    def move(
+        self, x: jax.Array, numbers: jax.Array | None, key: jax.Array, u: jax.Array, k: Step, moved: jax.Array
+    ) -> tuple[jax.Array, Moved | None]:
+        """Move particles x (B, n) with noises of their own; return with them the law of the move, if z is to use it."""
+        plant = at(self.plant, k)
+        center = jax.vmap(lambda one: plant.transition(one, u))(x)
+        if isinstance(plant.noise, AbstractNoise) and not isinstance(plant.noise, Gaussian):
+            every = jnp.arange(self.particles) if numbers is None else numbers
+            noise = jax.vmap(lambda number: plant.sample_noise(jax.random.fold_in(key, number), u))(every)
+            return wrap_angles(center + noise, plant.angles), None
+        draws = draw_normals(key, numbers, x.shape[1], self.particles)
+        center, root = center + plant.noise_mean(), _root_of(noise_columns(plant, u))
+        position = wrap_angles(center + draws @ root.T, plant.angles)
+        return position, self._law(plant, moved, Moved(center, root, draws), u) if self.optimal else None
+
+    def _law(self, plant: AbstractPlant, moved: jax.Array, law: Moved, u: jax.Array) -> Moved:
         """Return the law of x+ of each particle; at the first step of a linear plant that of x_0 and w together.
 
         So a first measurement that is far more precise than x_0 leaves more than few of the particles.
         """
         if not isinstance(plant, LinearPlant) or plant.deviation is not None or plant.circular:
-            return moved
+            return law
         start = at(self.plant, 0)
         start_moved = columns_of(start.initial_covariance).through(plant.transition_matrix(u))
         mean = plant.transition(jnp.asarray(start.initial_mean), u) + plant.noise_mean()
-        center = jnp.where(state.moved, moved.center, mean)
-        root = jnp.where(state.moved, moved.root, _root_of(join_columns(start_moved, noise_columns(plant, u))))
-        return moved._replace(center=center, root=root)
+        center = jnp.where(moved, law.center, mean)
+        root = jnp.where(moved, law.root, _root_of(join_columns(start_moved, noise_columns(plant, u))))
+        return law._replace(center=center, root=root)
 
     @corrects
     def correct(self, state: StateParticles, z: ArrayLike, k: Step = 0) -> tuple[StateParticles, Innovation]:
         """Weight each particle by the density of z, where the proposal is optimal after drawing it anew with z."""
-        z, sensor = jnp.asarray(z), at(self.sensor, k)
-        atoms = jax.tree.map(lambda leaf: leaf[0], at(self.density, k).given_arrivals(z)[0])
-        key = fold_in_bits(state.key, z)
-        predicted = received = jax.vmap(sensor.measure)(state.position)
-        position, correction = state.position, jnp.zeros(self.particles)
-        if state.law is not None:
-            drawn = propose(state.law, sensor, atoms, z, self.observed_angles, jax.random.fold_in(key, 2))
+        z = jnp.asarray(z)
+        key, proposing = self.keys_of_correction(state.key, z)
+        weighed = self.weigh(state.position, state.law, None, proposing, z, k)
+        density = jax.nn.logsumexp(jax.nn.log_softmax(state.log_weight) + weighed.log_likelihood)
+        log_weight = relative_to_largest(state.log_weight + weighed.log_likelihood)
+        used = ~jnp.all(jnp.isnan(z)) & (density > -jnp.inf)
+        updated = self.state_of(weighed.position, log_weight, key)._replace(moved=state.moved)
+        after = keep_unused(used, updated, state._replace(key=key))
+        return after, self._innovation(state.weight, weighed.predicted, z, k, density)
+
+    def keys_of_correction(self, key: jax.Array, z: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return keys of what follows, and of the choice of those drawn from the prior."""
+        key = fold_in_bits(key, z)
+        return key, jax.random.fold_in(key, 2)
+
+    def weigh(
+        self, position: jax.Array, law: Moved | None, numbers: jax.Array | None, key: jax.Array, z: jax.Array, k: Step
+    ) -> Weighed:
+        """Weigh particles (B, n) by z, after they are drawn anew with it where the law of their move is given."""
+        sensor, atoms = at(self.sensor, k), self.atoms_of(z, k)
+        predicted = received = jax.vmap(sensor.measure)(position)
+        correction = jnp.zeros(len(position))
+        if law is not None:
+            drawn = propose(law, sensor, atoms, z, self.observed_angles, key, numbers, self.particles)
             position, correction = wrap_angles(drawn.position, at(self.plant, k).angles), drawn.correction
             received = jax.vmap(sensor.measure)(position)
         likelihood = atoms.log_densities(received, z, self.observed_angles) + correction
-        density = jax.nn.logsumexp(jax.nn.log_softmax(state.log_weight) + likelihood)
-        # The positions are drawn: no law is left to draw them from.
-        law = None if state.law is None else state.law._replace(center=position, root=jnp.zeros_like(state.law.root))
-        log_weight = relative_to_largest(state.log_weight + likelihood)
-        used = ~jnp.all(jnp.isnan(z)) & (density > -jnp.inf)
-        before = state._replace(key=key)
-        after = keep_unused(used, StateParticles(position, log_weight, law, key, state.moved), before)
-        return after, self._innovation(state.weight, atoms, predicted, z, density)
+        return Weighed(position, likelihood, predicted)
+
+    def atoms_of(self, z: jax.Array, k: Step) -> Atoms:
+        """Return the atoms of what is received given h(x)."""
+        atoms: Atoms = jax.tree.map(lambda leaf: leaf[0], at(self.density, k).given_arrivals(z)[0])
+        return atoms
+
+    def expected(self, reference: jax.Array, z: jax.Array, k: Step) -> Expected:
+        """Return what is expected of z, about what a particle of reference expects (p,)."""
+        return Expected(self.atoms_of(z, k), z, reference, self.observed_angles)
 
     def _innovation(
-        self, weight: jax.Array, atoms: Atoms, predicted: jax.Array, z: jax.Array, density: jax.Array
+        self, weight: jax.Array, predicted: jax.Array, z: jax.Array, k: Step, density: jax.Array
     ) -> Innovation:
-        """Return z less its mean over particles and atoms, the covariance of these, and the log-likelihood.
-
-        Over those particles where h(x) is a number.
-        """
-        valid = jnp.all(jnp.isfinite(predicted), axis=1)
-        predicted = jnp.where(valid[:, None], predicted, 0.0)
-        share = jnp.sum(jnp.where(valid, weight, 0.0))
-        weight = jnp.where(share > 0, jnp.where(valid, weight, 0.0) / jnp.where(share > 0, share, 1.0), weight)
-        expected, present = jax.vmap(atoms.expected)(predicted), ~jnp.isnan(z)
-        value = nearest(z - expected, jnp.zeros(len(z)), self.observed_angles).reshape(-1, len(z))
-        value = nearest(value, value[jnp.argmax(weight)], self.observed_angles)
-        weight_of_both = (weight[:, None] * jnp.asarray(atoms.weight)).ravel()
-        within = jnp.einsum("a,aij->ij", jnp.asarray(atoms.weight), jnp.asarray(atoms.noise))
-        within = jnp.where(present[:, None] & present, within, jnp.nan)
-        return innovation_of_means(weight_of_both, value, within, density)
+        """Return z less its mean over particles and atoms, the covariance of these, and the log-likelihood."""
+        reference = find_reference(weight, predicted)
+        received = self.expected(reference, z, k)
+        both, apart = received.apart(weight, predicted)
+        first = first_sums(both, apart, ())
+        return received.innovation(first, second_sums(both, apart - first.mean(())), density)
 
     @estimates
     def estimate(self, state: StateParticles) -> Estimate:
         """Return the weighted mean and covariance; of an angle its mean direction, and second moments about it."""
         angles, weight, x = first(self.plant).angles, jnp.asarray(state.weight), jnp.asarray(state.position)
-        mean = weight @ x
-        for i in angles:
-            mean = mean.at[i].set(jnp.arctan2(weight @ jnp.sin(x[:, i]), weight @ jnp.cos(x[:, i])))
-        deviation = wrap_angles(x - mean, angles)
-        return Estimate(mean, (deviation * weight[:, None]).T @ deviation, self.claim)
+        mean = first_sums(weight, x, angles).mean(angles)
+        return Estimate(mean, second_sums(weight, wrap_angles(x - mean, angles)), self.claim)
 
 
 def _root_of(columns: Columns) -> jax.Array:

@@ -1,0 +1,63 @@
+"""What particles expect of a measurement: the moments of its innovation over those where h(x) is a number."""
+
+from typing import NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.particles.moments import FirstSums
+from heliograph.filters.particles.received_density import Atoms
+from heliograph.model.estimate import Innovation
+from heliograph.numerics.angle import Angles, nearest
+from heliograph.numerics.traced import library
+
+Number = TypeVar("Number", jax.Array, np.ndarray)
+
+
+class Expected(NamedTuple):
+    """The atoms of z (m,) given h(x), and h(x) of a particle of reference (p,), which is no number if all are none.
+
+    Innovations are summed as differences from that of the reference's first atom: of angles within half a turn of it.
+    """
+
+    atoms: Atoms
+    z: jax.Array
+    reference: jax.Array
+    angles: Angles
+
+    @property
+    def base(self) -> jax.Array:
+        """Return the innovation (m,) of the reference's first atom."""
+        value = self.z - self.atoms.expected(jnp.nan_to_num(self.reference, nan=0.0, posinf=0.0, neginf=0.0))[0]
+        return nearest(value, jnp.zeros(len(self.z)), self.angles)
+
+    def apart(self, weight: jax.Array, predicted: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return weights (B a,) of particles and atoms, and how far their innovations are from the base (B a, m).
+
+        Args:
+            weight: weights (B,) of particles before z is known, of any sum.
+            predicted: their h(x), (B, p); where it is no number they do not count, unless none does.
+        """
+        valid, known = jnp.all(jnp.isfinite(predicted), axis=1), jnp.all(jnp.isfinite(self.reference))
+        both = jnp.where(valid | ~known, weight, 0.0)[:, None] * jnp.asarray(self.atoms.weight)
+        value = self.z - jax.vmap(self.atoms.expected)(jnp.where(valid[:, None], predicted, 0.0))
+        apart = nearest(value - self.base, jnp.zeros(len(self.z)), self.angles)
+        return both.ravel(), apart.reshape(-1, len(self.z))
+
+    def innovation(self, first: FirstSums, second: jax.Array, density: jax.Array) -> Innovation:
+        """Return mean and covariance of the innovation, by the sums of what is apart from the base, and log p(z)."""
+        present = ~jnp.isnan(self.z)
+        within = jnp.einsum("a,aij->ij", jnp.asarray(self.atoms.weight), jnp.asarray(self.atoms.noise))
+        within = jnp.where(present[:, None] & present, within, jnp.nan)
+        value, nothing = self.base + first.mean(()), ~jnp.any(present)  # of nothing the density is 1, to rounding
+        return Innovation(value, within + second / first.weight, jnp.where(nothing, 0.0, density))
+
+
+def find_reference(weight: Number, predicted: Number) -> Number:
+    """Return h(x) of the heaviest particle where it is a number; of particles (N,), (N, p) without any, no number."""
+    xp = library(weight, predicted)
+    counts = xp.all(xp.isfinite(predicted), axis=1) & (weight > 0)
+    best = predicted[xp.argmax(xp.where(counts, weight, 0.0))]
+    reference: Number = xp.where(xp.any(counts), best, xp.nan)
+    return reference
