@@ -137,3 +137,17 @@ def test_a_service_says_it_once_and_its_page_and_metrics_name_each_plant():
     assert said[0].endswith("stuck=10 refuses such; not said again, nor of other plants")
     words = "a: 1 runs of equal readings longer than its noise allows: it is stuck, or has no noise"
     assert watch.view("q")["warnings"][-1] == words and watch.links()["a"]["held"] == 2
+
+
+def test_a_sensor_with_modes_is_not_watched():
+    """One of its modes may be that it is stuck."""
+    sensor = hg.markov_sensor([SENSOR, hg.LinearSensor([[0.0]], 4.0, outputs=["v"])], [[0.9, 0.1], [0.5, 0.5]])
+    item = hg.filters.imm_filter(PLANT, sensor, hg.perfect())
+    stream, line = (
+        hg.Stream(item),
+        hg.Timeline(hg.Network(PLANT, {"a": hg.Node(sensor, hg.perfect(), {"k": item})}), window=0.0),
+    )
+    for k in range(40):
+        stream.push([0.5])
+        line.push("a", k, k, [0.5])
+    assert stream.held.tolist() == [0] and not line.held.get("a")

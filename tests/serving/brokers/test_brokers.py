@@ -80,7 +80,7 @@ def test_one_cancellation_ends_a_wait_whatever_the_client_makes_of_it(error, mon
         transport = make_transport(parse_address("nats://127.0.0.1:1/away", {}))
         deaf = Deaf(error)
         monkeypatch.setattr(transport, "_reader", deaf)
-        monkeypatch.setattr(transport, "_require_connection", lambda: True)
+        monkeypatch.setattr(transport, "_is_connected", lambda: True)
         monkeypatch.setattr(transport, "_open", lambda: asyncio.sleep(0, deaf))
         waits = [transport.receive] if error is None else [transport.receive, lambda: transport.publish(item)]
         for wait in waits:
