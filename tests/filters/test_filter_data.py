@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas
 import pytest
 
 import heliograph as hg
@@ -72,3 +73,9 @@ def test_likelihoods_are_differentiated_through_the_same_scan():
     with jax.enable_x64(True):
         slope = jax.jit(jax.grad(value))(jnp.asarray(0.5))
     assert slope == pytest.approx((value(0.5 + 1e-5) - value(0.5 - 1e-5)) / 2e-5, rel=1e-7)  # central difference
+
+
+def test_a_table_without_rows_gives_none():
+    table = pandas.DataFrame({"y0": [], "y1": []}, index=pandas.DatetimeIndex([]))
+    item = hg.kalman_filter(*hg.state_space(np.eye(2), np.eye(2), 0.1, 0.5, [0.0, 0.0], 1.0))
+    assert item.run(table).means.shape == (0, 2)

@@ -215,3 +215,18 @@ def test_a_value_of_a_noise_with_two_values_is_learned():
     node = fitted.network.nodes["a"]
     by_filter = hg.log_likelihood(hg.linear_filter(fitted.network.plant, node.sensor, node.channel), z)
     np.testing.assert_allclose(fitted.log_likelihoods["linear"], by_filter, rtol=1e-10)  # 400 terms of order 1
+
+
+def test_a_plant_is_learned_from_its_true_states_where_nothing_arrived():
+    """E x_k+1 = a x_k of 199 pairs: least squares, whose deviation is some .04."""
+    rng, x = np.random.default_rng(0), np.zeros((200, 1))
+    for k in range(1, 200):
+        x[k] = 0.8 * x[k - 1] + 0.3 * rng.normal()
+    sensor = hg.LinearSensor([[1.0]], 0.1)
+
+    def build():
+        plant = hg.LinearPlant([[hg.free(0.5, "a", "real")]], 0.1, [0.0], 1.0)
+        return hg.Network(plant, {"node": hg.Node(sensor, hg.perfect(), {"k": hg.kalman_filter(plant, sensor)})})
+
+    found = hg.fit(build, {"node": np.full((200, 1), np.nan)}, truth=x, starts=1)
+    assert abs(found.values["a"] - 0.8) < 0.12

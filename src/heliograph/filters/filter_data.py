@@ -143,7 +143,8 @@ def run_over_data(filter: SteppedFilter, z: ArrayLike, u: ArrayLike | None, afte
     begin = 0 if before is None else int(before.step)
     rows_z, rows_u = check_data(filter, z, u, begin)
     clock = common_dates(_tables(z, u))
-    if before is not None and clock is not None and len(clock):
+    clock = None if clock is None or not len(clock) else clock  # a table without rows says no time
+    if before is not None and clock is not None:
         _check_later(before, clock)
     start = () if before is None else (before.state, np.asarray(begin))
     whole = filter_in_chunks(filter, rows_z, rows_u, _collect_row, *start)

@@ -161,6 +161,6 @@ def _check_enough(data: Data, free: int) -> None:
     flat = z.reshape(-1, z.shape[-1])
     received = [column[~np.isnan(column)] for column in flat.T]
     constant = [i for i, column in enumerate(received) if len(column) and np.ptp(column) == 0]
-    if len(constant) == sum(len(column) > 0 for column in received):
+    if constant and len(constant) == sum(len(column) > 0 for column in received):
         value = array("m", received[constant[0]], (None,))[0]
         raise fail("recording", "measurements that vary", f"{value:g} throughout")
