@@ -86,7 +86,7 @@ def write_plant(
 ) -> list[str]:
     """Write a plant's estimates, and beside them those of a lag later where there is one; return lines on these."""
     write = _choose_writer(plant.data, module)
-    predicted = _select_predicted(plant.predicted, plant.data.rows)
+    predicted = _select_rows_of_predicted(plant.predicted, plant.data.rows)
     _write_rows(write, plant.written, plant.forecasts, predicted, place, plant.data)
     return _write_lagged(network, plant.data, lag, options, place, write)
 
@@ -164,7 +164,7 @@ def _describe_forecasts(forecasts: "ByFilter") -> str:
     return f"forecast: {len(any_forecast.steps)} rows behind the data, to {any_forecast.time[-1]}{held}"
 
 
-def _select_predicted(predicted: "ByFilter", rows: "np.ndarray | None") -> "ByFilter":
+def _select_rows_of_predicted(predicted: "ByFilter", rows: "np.ndarray | None") -> "ByFilter":
     """Return what was predicted of some of the rows; `rows`: a mask, None for all."""
     if rows is None or rows.all():
         return predicted

@@ -16,7 +16,7 @@ from heliograph.numerics.linalg import (
     NEGATIVE_TOLERANCE,
     rounding,
     squared_distance,
-    squared_distances,
+    squared_distance_terms,
 )
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, Float, PyTree
@@ -217,13 +217,13 @@ def _judge_value(innovation: Innovation, z: Float[Array, " m"], of_atoms: bool) 
     # Squared distance of each component given those before it, and which are determined.
     present, expected = ~jnp.isnan(value), z - value
     size = jnp.where(jnp.isfinite(expected), jnp.abs(z) + jnp.abs(expected), 0.0)
-    every, certain = _squared_distances_in_turn(value, covariance, present, size)
+    every, certain = _squared_distance_terms_in_turn(value, covariance, present, size)
     distance, count = jnp.sum(every), jnp.sum(present.astype(value.dtype))
     # Far: components larger than expected, beyond the bound of this precision.
     larger = present & ~(jnp.abs(z) <= jnp.abs(expected))
     squares, determined = every, certain
     if len(value) > 1:
-        squares, determined = _squared_distances_in_turn(value, covariance, larger, size)
+        squares, determined = _squared_distance_terms_in_turn(value, covariance, larger, size)
     free = jnp.where(larger & ~determined, squares, 0.0)
     most = greatest_distance(value.dtype)
     far = jnp.any((free > most) | (larger & jnp.isinf(value))) | (jnp.sum(free) > most)
@@ -234,12 +234,12 @@ def _judge_value(innovation: Innovation, z: Float[Array, " m"], of_atoms: bool) 
     return _JudgedValue(distance, count, far, excluded, (count > 0) | jnp.any(~jnp.isnan(z)))
 
 
-def _squared_distances_in_turn(
+def _squared_distance_terms_in_turn(
     value: jax.Array, covariance: jax.Array, used: jax.Array, size: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Return e_j^2 / s_j of each component in use given those before it, and which of them the others determine."""
     padded = jnp.where(used[:, None] & used, covariance, jnp.eye(len(value), dtype=value.dtype))
-    squares, determined = squared_distances(padded, jnp.where(used, value, 0.0), jnp.where(used, size, 0.0))
+    squares, determined = squared_distance_terms(padded, jnp.where(used, value, 0.0), jnp.where(used, size, 0.0))
     return jnp.where(used, squares, 0.0), used & determined
 
 

@@ -92,7 +92,7 @@ def _apply_operation(equation: Any, x: list[Interval], continuous: bool) -> Inte
     # Sums, comparisons and choices, which need their parameters.
     match name:
         case "integer_pow":
-            return _bound_power(x[0], params["y"])
+            return _raise_interval_to_power(x[0], params["y"])
         case "convert_element_type":
             kind = np.dtype(params["new_dtype"])
             if kind.kind not in "fb" and not np.array_equal(x[0].low, x[0].high):
@@ -199,10 +199,10 @@ def _square(a: Interval) -> Interval:
     return Interval(np.maximum(square.low, 0.0), square.high)
 
 
-def _bound_power(a: Interval, exponent: int) -> Interval:
+def _raise_interval_to_power(a: Interval, exponent: int) -> Interval:
     """Return an interval of x^k for a whole number k."""
     if exponent < 0:
-        return _bound_quotient(point_interval(np.ones_like(a.low)), _bound_power(a, -exponent))
+        return _bound_quotient(point_interval(np.ones_like(a.low)), _raise_interval_to_power(a, -exponent))
     if exponent % 2 == 0:
         inner = _absolute(a)
         return round_outward(inner.low**exponent, inner.high**exponent, ULPS)

@@ -244,7 +244,10 @@ def _are_identical(left: AbstractRandomAffine, right: AbstractRandomAffine) -> b
 class LiftedMap:
     """A map z = G y + n on monomials: E[Z | y] = K Y, and how moments of y of twice the degree become those of z.
 
-    The matrix that does the latter is formed for a map that stays, if it is small; one that varies is used but once.
+    `matrix` is K, (monomials of z, monomials of y) up to `degree`. `whole` takes moments of y of twice the degree to
+    those of z; it is formed for a map that stays, if it is small, and None of one that varies, which is used but once.
+    `given` has the degree of each of these monomials of y, `highest` [i, j] the highest degree of moments of y that
+    Cov(Z_i, Z_j | y) needs.
     """
 
     def __init__(self, route: AbstractRandomAffine, degree: int, varies: bool):

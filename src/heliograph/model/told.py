@@ -180,8 +180,11 @@ def stack_with_told(
 ) -> Stack:
     """Return channels side by side, each one's told numbers after its own outputs, as its receiver gets them.
 
+    Told numbers come with a message and say what the link did to it, such as its gain.
+
     Args:
-        place: makes of the links of several signals as many of all of them.
+        place: takes each channel's link, of its own signal, and returns as many links of all signals, one above the
+            other.
         channels: the channels.
     """
     links = [separate_told(channel).link for channel in channels]

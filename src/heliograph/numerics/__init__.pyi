@@ -84,7 +84,7 @@ from .linalg import rounding as rounding
 from .linalg import scale as scale
 from .linalg import solver as solver
 from .linalg import squared_distance as squared_distance
-from .linalg import squared_distances as squared_distances
+from .linalg import squared_distance_terms as squared_distance_terms
 from .linalg import symmetric as symmetric
 from .linalg import symmetrize as symmetrize
 from .linalg import whiten as whiten

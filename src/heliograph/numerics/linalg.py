@@ -172,10 +172,10 @@ def squared_distance(a: jax.Array, x: jax.Array, size: Array | float = 0.0) -> j
     the limit, where x says what they say, and is infinite where it does not; `size` (n,) is what x is a difference of,
     for its rounding.
     """
-    return jnp.sum(squared_distances(a, x, size, KNOWN)[0])
+    return jnp.sum(squared_distance_terms(a, x, size, KNOWN)[0])
 
 
-def squared_distances(
+def squared_distance_terms(
     a: jax.Array, x: jax.Array, size: Array | float = 0.0, roundings: float = 0.0
 ) -> tuple[jax.Array, jax.Array]:
     """Return the terms of `squared_distance`, each given those before it, and which of them these determine.

@@ -146,7 +146,7 @@ class GainAndNoise(AbstractHop):
         return sum(lows), sum(highs)
 
     def covers_kind(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
-        """Return a hop of this matrix whose gain has a law that is believed possible."""
+        """Return whether `own` is a hop of this matrix and noise whose law of the gain is covered by this one's."""
         if not isinstance(own, GainAndNoise) or not self.law.covers(own.law):
             return False
         return equal_to_rounding(self.matrix, own.matrix) and same_noise(self.noise, own.noise)

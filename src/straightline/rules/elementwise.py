@@ -163,7 +163,8 @@ def _total_order(op: str) -> Callable[..., Node]:
     """Compare in the order of IEEE 754 that has all numbers: -NaN < -inf < ... < -0 < 0 < ... < inf < NaN."""
 
     def rank(graph: Graph, x: Node) -> Node:
-        # Bits as an integer without sign: all of a negative number's are turned round, of others the sign's.
+        """Return a float's bits as an unsigned integer, in the order of the floats; other numbers as they are."""
+        # All bits of a negative number are turned round, of others the sign's.
         if x.type not in REAL:
             return x
         whole, last = WORDS[x.type][0], int(x.type[1:]) - 1

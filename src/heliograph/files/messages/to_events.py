@@ -230,7 +230,7 @@ def _append_message(
                 continue
             if came is None and reading.time is not None and events.dated:
                 sources.clocks.note(topic, content, reading.time, (single.source for single in sources.of(topic)))
-            events.add(sources.date_copy(reading, came), arrival)
+            events.add(sources.date_as_original(reading, came), arrival)
             sources.senders.note(topic, reading.plant, reading.node, content, sources.list_fields(topic))
     except InputError as error:
         events.refuse(error, strict)

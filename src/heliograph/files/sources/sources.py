@@ -211,7 +211,7 @@ class Sources:
                 results += [] if reading is None else [reading]
         return results
 
-    def date_copy(self, reading: Reading, arrival: int | None) -> Reading:
+    def date_as_original(self, reading: Reading, arrival: int | None) -> Reading:
         """Return a reading as it is; of a copy of the node's message before, with the time of that.
 
         A copy has the same count and values, and comes within ten seconds: gateways and senders repeat messages, and
@@ -257,7 +257,7 @@ class Sources:
         if node not in places:
             raise fail(f"{where}, node", f"one of {', '.join(places)}", _suggest_name(node, places))
         source.check_valid(message, where)
-        sequence, missing = self._find_count(source, pattern, message, where)
+        sequence, missing = self._read_message_count(source, pattern, message, where)
         # Values; of a message that has its count they may be absent.
         values = np.full(len(self.names[node]), np.nan)
         for column, path, scale, offset in zip(places[node], source.paths, source.scale, source.offset, strict=True):
@@ -276,7 +276,7 @@ class Sources:
         """Return plant, node, count and time of a message whose values cannot be read; None if these cannot either."""
         try:
             plant, node = _read_names(mapped, topic, message, where)
-            sequence, missing = self._find_count(mapped.source, mapped.pattern, message, where)
+            sequence, missing = self._read_message_count(mapped.source, mapped.pattern, message, where)
         except InputError:
             return None
         if sequence is None or missing or node not in mapped.places:
@@ -289,7 +289,7 @@ class Sources:
         period = 0 if mapped.source.sequence is None else mapped.source.sequence.period
         return Reading(plant, node, sequence, time, no_values, period)
 
-    def _find_count(self, source: Source, pattern: str, message: object, where: str) -> tuple[int | None, bool]:
+    def _read_message_count(self, source: Source, pattern: str, message: object, where: str) -> tuple[int | None, bool]:
         """Return a message's count, None if the source has none, and whether it is absent, which means 0."""
         if source.sequence is None:
             return None, False

@@ -129,7 +129,10 @@ class WordFilter(AbstractBeliefFilter):
         return Prior(joint.mean[place], jnp.sqrt(joint.root[place] ** 2 @ joint.variances))
 
     def condition_by_leading_bits(self, i: int, words: "Received", prior: Prior, leading: int) -> Change:
-        """Return what its word does to y_i, if the word was right in its `leading` bits and if not, (2,) each."""
+        """Return what its word does to y_i, if the word was right in its `leading` bits and if not, (2,) each.
+
+        A pair of `words.pairs` has, bit by bit, the likelihoods of a sent 0 and of a sent 1, (bits, 2).
+        """
         pairs, bits = [pair[i] for pair in words.pairs], np.arange(self.bits)
         bit = jnp.mod(jnp.floor(words.numbers[i] / 2.0**bits), 2.0)
         as_received = jnp.stack([1 - bit, bit], axis=-1)

@@ -113,6 +113,8 @@ def _are_copies(again: list[int], run: list[int], stretch: list[int]) -> bool:
 
     A few are, if all of them came within the last COPY. More are where all that came from a number on comes again, and
     the run goes on from there, as from a broker that was not told of their arrival; but not from the first number on.
+    After 5, 6, 7, 8 come 7, 8, 9: `stretch` [5, 6, 7, 8] came before, `run` [7, 8, 9] rises from the break on, and
+    `again` [7, 8] are those of it that had come.
     """
     lately = stretch[-COPY:]
     if not set(again) <= set(lately):

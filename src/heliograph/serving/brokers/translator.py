@@ -185,7 +185,9 @@ class Translator:
                 f"{topic}, plant", f"a name of at most {NAME} characters, without NUL", show_value(reading.plant)
             )
         arrival = datetime.now(UTC) if known is None else known
-        reading = self.sources.date_copy(reading, None if known is None else (arrival - EPOCH) // MICROSECOND * 1000)
+        reading = self.sources.date_as_original(
+            reading, None if known is None else (arrival - EPOCH) // MICROSECOND * 1000
+        )
         time: datetime | float = arrival
         came: datetime | None = None
         if reading.time is not None and self.sources.steps and self.sources.step is None:
