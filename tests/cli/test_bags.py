@@ -45,6 +45,7 @@ def test_estimates_go_back_into_a_bag(folder, capsys):
     assert all(not m.pose.covariance[1:].any() for _, m in rows)
 
 
+@pytest.mark.slow
 def test_a_bag_has_the_same_rows_where_later_data_count(folder, capsys):
     assert cli.main([*RUN, "--out", "plain.csv"]) == 0
     assert cli.main([*RUN, "--out", "out.csv", "--smooth", "all", "--lag", "1"]) == 0

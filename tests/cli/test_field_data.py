@@ -188,6 +188,7 @@ def test_uplinks_of_chirpstack(folder, capsys):
     assert "a840, a: 3 used, 1 without a value\n" in out
 
 
+@pytest.mark.slow
 def test_each_plant_has_estimates_of_its_own(folder, capsys):
     (folder / "net.py").write_text(f"{WALK}\nsources = hg.files.the_things_stack('t', node='a')\n")
     (folder / "up.jsonl").write_text("\n".join(UPLINKS))

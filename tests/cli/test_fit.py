@@ -85,6 +85,7 @@ def test_the_page_says_what_was_learned(folder, fits):
         assert (folder / "out" / f"{name}.png").stat().st_size > 5000
 
 
+@pytest.mark.slow
 def test_the_losses_of_the_recording_are_informed(folder):
     """A tenth of the rows was lost, independently: the interval holds that, and the test finds no memory."""
     (losses,) = json.loads((folder / "out" / "summary.json").read_text())["losses"].values()

@@ -13,6 +13,7 @@ from heliograph.disk import quote_for_cell, unquote_cell, visible
 matplotlib.use("agg")
 
 
+@pytest.mark.slow
 @given(st.text())
 def test_a_cell_is_no_formula_and_can_be_read_again(text):
     cell = quote_for_cell(text)

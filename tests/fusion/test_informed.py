@@ -49,6 +49,7 @@ def test_every_rule_gives_the_best_linear_estimate_of_what_it_has(name):
     assert set(net.claims()["fused"].values()) == {"exact"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 7, 8])
 def test_reports_that_bring_no_news_take_no_digits(seed):
     """Of 12 numbers in four reports at most 6 are new: what rounding leaves of the others must not count.

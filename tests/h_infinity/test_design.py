@@ -111,6 +111,7 @@ def test_the_smallest_level_of_a_largest_eigenvalue_is_found():
     np.testing.assert_allclose(level, 0.02649, rtol=5e-4)  # bisection to 1e-4
 
 
+@pytest.mark.slow
 def test_a_second_solver_finds_the_same_level():
     """SCS to 1e-9 against Clarabel to 1e-8: both stop well below 1e-5 relative."""
     third, short = node(2, steps=2), node(0, steps=2)

@@ -11,6 +11,7 @@ from heliograph.simulation.rows.row_smoother import RowSmoother
 GAPS = {"a": (3, 5, 11), "b": (3, 5, 7, 11)}  # two of them at both nodes, one at the end
 
 
+@pytest.mark.slow
 def test_in_steps_it_is_the_smoother_of_the_rows():
     plant = hg.LinearPlant([[1.0, 1.0], [0.0, 0.95]], np.diag([0.01, 0.05]), [0.0, 1.0], np.eye(2))
     sensor, channel = hg.LinearSensor([[1.0, 0.0]], 0.3), hg.hop(hg.Rayleigh(1.0), 0.05)

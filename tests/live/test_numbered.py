@@ -37,6 +37,7 @@ def test_the_count_says_what_was_lost(network):
     assert not np.array_equal(estimate(line), estimate(unknown))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 def test_in_whatever_order_they_come(network, seed):
     """What comes between two values takes a lost one from the later of them; final ones count as they were."""

@@ -164,6 +164,7 @@ def test_a_function_without_a_number_is_named_and_never_silent(named):
         filter.run(z)
 
 
+@pytest.mark.slow
 def test_the_test_in_a_step_agrees_with_that_of_all_rows():
     """By elimination and by eigenvalues, on covariances of every rank and the same with one sign or entry changed."""
     rng = np.random.default_rng(0)

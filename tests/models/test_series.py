@@ -52,6 +52,7 @@ def test_co2_with_gaps_is_statsmodels():
     np.testing.assert_allclose(hg.forecast(found, 5).outputs.mean[:, 0], right, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_components_of_co2_add_up():
     """Mean and variance of trend + season are those of the output less its noise; names are kept."""
     model = co2_model()

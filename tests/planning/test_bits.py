@@ -63,6 +63,7 @@ def test_a_sender_of_a_precise_sensor_gets_several_bits_or_none():
     assert few.bound <= few.error
 
 
+@pytest.mark.slow
 def test_more_bits_are_never_worse():
     errors = [hg.planning.design_bits(NETWORK, total).error for total in (1, 3, 6, 9, 14)]
     assert np.all(np.diff(errors) < 0)

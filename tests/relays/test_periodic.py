@@ -54,6 +54,7 @@ def test_tuned_together_at_no_more_power(local):
     assert relative(given_design(example(), gains).moments[-2:], quiet.moments[1:]) < 1e-6  # what 0.974 a period leaves
 
 
+@pytest.mark.slow
 def test_the_best_receiver_behind_given_relays(local):
     behind = periodic_behind_relays(example(), local.gains)
     assert np.sum(traces(behind)) == pytest.approx(1.05316e-5, rel=1e-5)  # digits given

@@ -29,6 +29,7 @@ def ratio(design, local):
     return design.trace("receiver")[1:] / local.trace("receiver")[1:]
 
 
+@pytest.mark.slow
 def test_tuned_together_the_receiver_errs_less(local):
     tuned = receiver_error_design(example(), HORIZON, sweeps=50)
     assert np.mean(ratio(tuned, local)) <= 0.775  # found: 0.7680

@@ -81,5 +81,6 @@ def test_of_nodes_that_filter_by_themselves_the_one_that_is_off_is_named(error):
     assert abs(value - error) < 2 * half < 0.5 * abs(error)
 
 
+@pytest.mark.slow
 def test_equal_nodes_that_filter_by_themselves_are_not_doubted():
     assert [line for seed in range(4, 8) for line in doubts_of_local_nodes(0.0, seed)] == []

@@ -109,6 +109,7 @@ def test_four_thermometers_that_only_say_that_they_live_write_less_than_ten_mega
     assert service.fleet.pool.table[again.slot].tobytes() == numbers.tobytes()
 
 
+@pytest.mark.slow
 def test_what_was_received_becomes_final_in_silence_and_once(program, clock, tmp_path):
     service = begun(program, tmp_path / "a.db")
     send(service, 0.0, 0.2, 0)
@@ -117,6 +118,7 @@ def test_what_was_received_becomes_final_in_silence_and_once(program, clock, tmp
     assert [json.loads(output.body)["time"][17:19] for output in told if output.kind == "final"] == ["00", "01"]
 
 
+@pytest.mark.slow
 def test_silence_is_that_of_a_timeline_and_a_value_ends_it(program, clock, tmp_path):
     service, line = begun(program, tmp_path / "a.db", every=1.0), hg.Timeline(program.network, window=5.0)
     send(service, 0.0, 0.2, 0)
@@ -130,6 +132,7 @@ def test_silence_is_that_of_a_timeline_and_a_value_ends_it(program, clock, tmp_p
         line.push("a", 1, 21, [1.1])
 
 
+@pytest.mark.slow
 def test_every_so_many_seconds_it_is_told_if_asked_for(program, clock, tmp_path):
     quiet, often = begun(program, tmp_path / "a.db"), begun(program, tmp_path / "b.db", every=10.0)
     for service in (quiet, often):
@@ -142,6 +145,7 @@ def test_every_so_many_seconds_it_is_told_if_asked_for(program, clock, tmp_path)
     assert len(wait(often, clock, 300)) == 10
 
 
+@pytest.mark.slow
 def test_a_dead_sender_is_dead_after_a_restart_too(program, clock, tmp_path, monkeypatch):
     service = begun(program, tmp_path / "a.db")
     send(service, 0.0, 0.2, 0)

@@ -94,6 +94,7 @@ def test_the_mean_of_points_is_on_the_group(make):
     np.testing.assert_allclose(np.asarray(prior.covariance), expected + beta, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_filters_agree_where_errors_are_small_and_find_the_attitude():
     z, truth = measured()
     results = [make(PLANT, SENSOR).run(z, RATES).means for make in (hg.extended_filter, hg.cubature_filter)]
@@ -119,6 +120,7 @@ def test_the_same_attitude_by_another_rotation_vector_is_the_same_filter():
     np.testing.assert_allclose(other.covariances, here.covariances, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_smoothers_of_one_step_agree():
     """A lag beyond the end is the whole interval; so is a fixed point, but for squares of what later data change."""
     z, _ = measured()
@@ -145,6 +147,7 @@ NETWORK = hg.Network(PLANT, {"imu": hg.Node(SENSOR, hg.perfect(6), {
     "ekf": EXTENDED, "ckf": hg.cubature_filter(PLANT, SENSOR)})})  # fmt: skip
 
 
+@pytest.mark.slow
 def test_simulated_errors_are_what_is_claimed():
     """Errors are turns: NEES per dimension 1 within five deviations of its mean (nominal, of .3 rad at the start)."""
     statistics = hg.monte_carlo(NETWORK, 40, 400, key=0, inputs=RATES, keep=hg.Statistics())["imu"]
@@ -171,6 +174,7 @@ def test_records_know_that_errors_are_turns(tmp_path):
     assert pooled.rmse()[0] == pytest.approx(np.sqrt((errors**2).sum(axis=-1).mean()))
 
 
+@pytest.mark.slow
 def test_a_recording_with_the_truth_is_judged_by_turns():
     z, truth = measured()
     record = hg.run(NETWORK, {"imu": z}, inputs=RATES, truth=truth)

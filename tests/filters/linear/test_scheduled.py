@@ -24,6 +24,7 @@ def measurements(outputs, seed=0):
     return np.random.default_rng(seed).normal(size=(HORIZON, outputs))
 
 
+@pytest.mark.slow
 def test_estimates_are_the_papers():
     """(14), repaired, on the same measurements; the full form needs a pseudo-inverse for two sensors."""
     for system, outputs in ((EXAMPLE, 1), (two_sensors(), 2)):

@@ -47,6 +47,7 @@ def check_equal(channel, count, parts, steps=6, missing=(2,)):
         np.testing.assert_allclose(mine, other, rtol=1e-10, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_chains_of_their_own_need_a_function_for_each_mode_but_the_first():
     """Two and three modes: 1 + 1 + 2 functions, where the joint modes are 6; a link without memory needs none."""
     check_equal(hg.superposed([chain(1.0, 0.2), memoryless(), chain(0.5, -0.3, 1.2)], 0.1), 3, 4)

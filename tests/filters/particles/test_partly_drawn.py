@@ -145,6 +145,7 @@ def test_modes_of_a_link_and_its_losses_are_counted():
     assert abs(got.log_likelihood - right.log_likelihood) < 0.06
 
 
+@pytest.mark.slow
 def test_it_runs_in_a_network_with_a_sensor_that_gets_stuck():
     stuck = hg.LinearSensor([[0.0, 0.0]], 0.1)
     sensor = hg.markov_sensor([hg.LinearSensor([[1.0, 0.0]], 0.5), stuck], [[0.95, 0.05], [0.3, 0.7]])

@@ -71,6 +71,7 @@ def test_the_gradient_is_that_of_the_sequential_pass(monkeypatch, network, z):
     np.testing.assert_allclose(by_row.density, row_by_row.density, rtol=1e-9, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_long_recording_is_summed_by_chunks():
     assert evaluated(walk, Z, np.zeros((ROWS, 0))).density.shape == (1, 1, 1)
 

@@ -102,6 +102,7 @@ def test_ends_of_a_stretch_are_no_trials():
     assert held >= 25  # fewer has a probability of 1e-3 where each holds with 95 %
 
 
+@pytest.mark.slow
 def test_the_laws_of_losses_take_them():
     """The share of losses among the packets between ends, and laws that are judged on the later ones."""
     numbers = sessions(np.random.default_rng(5), 60, 10, 0.3, 0.7)

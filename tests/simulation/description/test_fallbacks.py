@@ -102,6 +102,7 @@ def test_nothing_falls_back_where_xla_is_forced(monkeypatch):
     assert list_fallbacks(network({"own": Own(by_svd=True)})) == []
 
 
+@pytest.mark.slow
 def test_a_mesh_of_many_neighbours_is_named():
     names = [f"n{i}" for i in range(30)]
     nodes = {name: hg.Node(SENSOR, hg.perfect(2), {"own": hg.kalman_filter(PLANT, SENSOR)}) for name in names}

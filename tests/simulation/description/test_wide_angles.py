@@ -81,6 +81,7 @@ def test_exact_moments_are_right_where_a_heading_is_unknown():
     np.testing.assert_allclose(np.sqrt(np.diagonal(moved.covariances[-1])[:2]), [41.65, 42.42], atol=0.1)
 
 
+@pytest.mark.slow
 def test_what_is_known_well_enough_is_not():
     """Points of 4 states lie 2 deviations away: at 0.9 rad still before half a turn; of more than 9 states at less."""
     for network in (driving(0.9), driving(2.0, circular=())):

@@ -182,6 +182,7 @@ def code(network: hg.Network, seed: int = 0):
         return compile_runs(world, np.zeros((HORIZON, 0)), seed_key(seed), Trajectories(), 8)
 
 
+@pytest.mark.slow
 def test_many_nodes_are_what_each_is_alone(monkeypatch):
     """A few at a time: each node's numbers are those of a network of its own."""
     monkeypatch.setenv("HELIOGRAPH_ENGINE", "native")
