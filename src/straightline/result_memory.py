@@ -47,9 +47,10 @@ def from_line(memory: np.ndarray) -> np.ndarray:
 
 
 def _take(size: int) -> np.ndarray:
-    """Return at least so many bytes: kept ones, of which at most half would be idle, else fresh ones."""
-    for key, memory in tuple(_kept.items()):
-        if size <= len(memory) <= 2 * size and _kept.pop(key, None) is not None:
+    """Return at least so many bytes: those kept last, of which at most half would be idle, else fresh ones."""
+    for key in reversed(tuple(_kept)):
+        memory = _kept.get(key)  # None where another thread took it
+        if memory is not None and size <= len(memory) <= 2 * size and _kept.pop(key, None) is not None:
             return memory
     return np.empty(size, np.uint8)
 
