@@ -7,15 +7,16 @@ from .centred import centred_from_covariance as centred_from_covariance
 from .changes import settle as settle
 from .changes import unsettle as unsettle
 from .columns import Columns as Columns
-from .columns import UNITS as UNITS
 from .columns import below_diagonal as below_diagonal
 from .columns import columns_of as columns_of
 from .columns import columns_of_each as columns_of_each
 from .columns import decorrelate as decorrelate
 from .columns import eliminate as eliminate
 from .columns import join_columns as join_columns
+from .columns import noise_beside_repeated as noise_beside_repeated
 from .columns import reciprocal_or_zero as reciprocal_or_zero
 from .columns import rounding_of as rounding_of
+from .columns import rounding_of_variances as rounding_of_variances
 from .columns import side_by_side as side_by_side
 from .columns import square_root as square_root
 from .columns import triangularise as triangularise
@@ -52,6 +53,7 @@ from .gaussian import predict_affine as predict_affine
 from .gaussian import rts_step as rts_step
 from .gaussian import sum_unexplained as sum_unexplained
 from .gaussian import take_leading as take_leading
+from .repeated import rounding_of_products as rounding_of_products
 from .repeated import triangularise_noise as triangularise_noise
 from .roots import covariance_of_root as covariance_of_root
 from .roots import observe_information as observe_information

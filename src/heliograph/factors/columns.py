@@ -24,7 +24,7 @@ from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array
 from straightline import operation
 
-UNITS = 4  # of rounding of a number, which are noise of it
+ROUNDING_UNITS = 4  # how many eps of a number are noise of it
 LARGEST = 1e30  # variance by rounding: beyond it numbers are absurd, and their squares none in single precision
 RANK = 1e-12  # of a component's variance: less of a pivot of a known covariance is none
 
@@ -239,13 +239,34 @@ def columns_of_each(covariances: Array) -> Columns:
 
 
 def rounding_of(seconds: Array) -> Columns:
-    """Return the rounding of numbers with second moments E[s_i^2], (n,): noise of variance (UNITS eps)^2 E[s_i^2].
+    """Return the rounding of numbers of second moments E[s_i^2] (n,), as noise of (ROUNDING_UNITS eps)^2 E[s_i^2].
 
     It is put where a model is made: of the state beside Q, of a measurement beside R; as columns, since added to a
     variance it would be lost.
     """
-    variances = (UNITS * unit_of(seconds)) ** 2 * seconds
+    variances = (ROUNDING_UNITS * unit_of(seconds)) ** 2 * seconds
     return Columns(np.eye(len(seconds)), library(seconds).minimum(variances, LARGEST))
+
+
+def rounding_of_pivots(covariance: Array) -> float:
+    """Return the share of its variance to which elimination of n columns knows a pivot: n eps, one for each column."""
+    return len(covariance) * unit_of(covariance)
+
+
+def rounding_of_variances(variances: Array, products: int) -> Array:
+    """Return by how much variances that are sums of so many products may be off: ROUNDING_UNITS products eps of each.
+
+    For what is left of a variance from which a known part was subtracted: it is known to no less than this.
+    """
+    return ROUNDING_UNITS * products * unit_of(variances) * variances
+
+
+def noise_beside_repeated(sizes: Array) -> Array:
+    """Return variances eps s^2 of a noise beside which a number of size s that others determine says nothing.
+
+    Of what others determine slopes of an eps s are left. Squared they are eps times this noise, and so is the gain.
+    """
+    return unit_of(sizes) * sizes**2
 
 
 _precision: ContextVar[type[np.floating[Any]]] = ContextVar("precision", default=np.float64)

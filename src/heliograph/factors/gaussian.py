@@ -21,9 +21,9 @@ from heliograph.factors.columns import (
     join_columns,
     reciprocal_or_one,
     reciprocal_or_zero,
+    rounding_of_pivots,
     triangularise,
     unit_lower,
-    unit_of,
     zero_covariance,
 )
 from heliograph.factors.repeated import (
@@ -87,7 +87,7 @@ def from_summed_covariance(mean: jax.Array, *parts: Columns) -> Gaussian:
 
 def from_covariance_by_elimination(mean: jax.Array, covariance: jax.Array) -> Gaussian:
     """Return the Gaussian of a covariance matrix that was summed of squares, by elimination."""
-    factors = eliminate(covariance, len(covariance) * unit_of(covariance))
+    factors = eliminate(covariance, rounding_of_pivots(covariance))
     return Gaussian(mean, below_diagonal(factors.matrix), factors.weights)
 
 
@@ -96,7 +96,7 @@ def from_covariance(mean: Array, covariance: Array) -> Gaussian:
     if isinstance(covariance, np.ndarray):
         factors: Any = (mean if is_traced(mean) else np.asarray(mean), *factor_constant(covariance))
         return Gaussian(*factors)
-    columns = eliminate(jnp.asarray(covariance), len(covariance) * unit_of(covariance))
+    columns = eliminate(jnp.asarray(covariance), rounding_of_pivots(covariance))
     return Gaussian(jnp.asarray(mean), below_diagonal(columns.matrix), columns.weights)
 
 

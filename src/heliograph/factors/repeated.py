@@ -12,7 +12,7 @@ from jax import lax
 
 from heliograph.factors.columns import (
     RANK,
-    UNITS,
+    ROUNDING_UNITS,
     Columns,
     assemble_factors,
     column_below_diagonal,
@@ -39,17 +39,17 @@ def triangularise_noise(noise: Columns) -> Columns:
 
 def rounding_of_products(n: int, variance: jax.Array) -> jax.Array:
     """Return the variance by the rounding of n slopes, each a sum of n products, of rows of these variances."""
-    rounding: jax.Array = (UNITS * n * unit_of(variance)) ** 2 * variance
+    rounding: jax.Array = (ROUNDING_UNITS * n * unit_of(variance)) ** 2 * variance
     return rounding
 
 
 def rounding_of_slopes(n: int, lower: jax.Array, whole: jax.Array) -> jax.Array:
     """Return the variance (m,) up to which n slopes of w_i = s_i - sum_k L_ik w_k count as rounding.
 
-    `whole` holds the variances (m,) of the rows s_i. UNITS n eps of each s_i, from which measuring takes what was
-    known, and RANK of what is subtracted: a correlation of noises is not known to more.
+    `whole` holds the variances (m,) of the rows s_i. It is ROUNDING_UNITS n eps of each s_i, from which measuring takes
+    what was known, and RANK of what is subtracted: a correlation of noises is not known to more.
     """
-    share, below = max(UNITS * n * unit_of(whole), RANK), jnp.tril(lower, -1)
+    share, below = max(ROUNDING_UNITS * n * unit_of(whole), RANK), jnp.tril(lower, -1)
     return rounding_of_products(n, whole) + share**2 * (below**2 @ whole)
 
 
@@ -58,7 +58,7 @@ def noise_beside_rounding(n: int, least: jax.Array) -> jax.Array:
 
     An innovation as large as its deviation moves a mean by n eps / 256 of its own; single precision holds the noise.
     """
-    return 1024 / (UNITS * n * unit_of(least)) ** 2 * least
+    return 1024 / (ROUNDING_UNITS * n * unit_of(least)) ** 2 * least
 
 
 def _clear(numbers: jax.Array, least: jax.Array) -> jax.Array:
@@ -68,7 +68,7 @@ def _clear(numbers: jax.Array, least: jax.Array) -> jax.Array:
 
 def _triangularise_row_by_row(rows: jax.Array, weights: jax.Array) -> Columns:
     """Write Gram-Schmidt out row by row: L and d with L diag(d) L' = A W A', A's `rows` and W's `weights`."""
-    m, share, size = len(rows), max(UNITS * rows.shape[1] * unit_of(rows), RANK), jnp.abs(rows)
+    m, share, size = len(rows), max(ROUNDING_UNITS * rows.shape[1] * unit_of(rows), RANK), jnp.abs(rows)
     lower, variances = list[jax.Array](), list[jax.Array]()
     for j in range(m):
         row = lax.index_in_dim(rows, j, keepdims=False)
@@ -86,7 +86,7 @@ def _triangularise_row_by_row(rows: jax.Array, weights: jax.Array) -> Columns:
 @operation(_triangularise_row_by_row)
 def _triangularise_in_loop(rows: jax.Array, weights: jax.Array) -> Columns:
     """Compute `_triangularise_row_by_row` in a loop, for so many rows that a long program would be slow."""
-    m, share = len(rows), max(UNITS * rows.shape[1] * unit_of(rows), RANK)
+    m, share = len(rows), max(ROUNDING_UNITS * rows.shape[1] * unit_of(rows), RANK)
 
     def body(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         """Take row j, its rounding cleared, off the rows below it, and put it into L and d."""

@@ -6,7 +6,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import Columns, columns_of, eliminate, join_columns, rounding_of, square_root, unit_of
+from heliograph.factors.columns import (
+    Columns,
+    columns_of,
+    eliminate,
+    join_columns,
+    noise_beside_repeated,
+    rounding_of,
+    square_root,
+)
 from heliograph.factors.gaussian import Gaussian, correct_by_gain, from_columns, gain_of, predict_affine, take_leading
 from heliograph.filters.gaussian.signal import augmented_second_moment
 from heliograph.fusion.cross_covariance import ErrorMap, ErrorMoments
@@ -187,7 +195,7 @@ def _compute_gain(
     one, shape = np.eye(past.noise.shape[-1]), past.offset.shape
     terms = jnp.reshape(jnp.abs(output) @ square_root(x.columns.diagonal), shape)
     quantized = (past.gain * (past.error**2 / 3)[..., None, :]) @ past.gain.swapaxes(-1, -2)
-    noise = past.noise + quantized + one * (unit_of(terms) * terms**2)[..., None]
+    noise = past.noise + quantized + one * noise_beside_repeated(terms)[..., None]
     # What did not arrive has slopes of zero and a noise of its own.
     arrived = present.reshape(shape)
     noise = jnp.where(arrived[..., :, None] & arrived[..., None, :], noise, one)

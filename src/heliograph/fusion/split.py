@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import UNITS, unit_of
+from heliograph.factors.columns import rounding_of_variances
 from heliograph.fusion.joint_covariance_weights import matrix_weights, weigh_covariance
 from heliograph.fusion.rules import AbstractIntersection, Covariances, Fused, Means
 from heliograph.numerics.check import DEFINITENESS_TOLERANCE, array, fail, rank
@@ -99,6 +99,6 @@ def _add_rounding(unknown: jax.Array, covariances: jax.Array) -> jax.Array:
     A share may be small: divided by it, an eps of P_i that is missing would be much of the bound.
     """
     n = unknown.shape[-1]
-    rounding = UNITS * n * unit_of(covariances) * jnp.einsum("aii->ai", covariances)
+    rounding = rounding_of_variances(jnp.einsum("aii->ai", covariances), n)
     is_some = jnp.any(unknown != 0, axis=(-1, -2), keepdims=True)
     return unknown + jnp.where(is_some, rounding[..., None] * jnp.eye(n, dtype=unknown.dtype), 0.0)

@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import UNITS, decorrelate, square_root, unit_of
+from heliograph.factors.columns import decorrelate, square_root
 from heliograph.factors.gaussian import Gaussian
+from heliograph.factors.repeated import rounding_of_products
 
 LOG_TURN = float(np.log(2 * np.pi))
 
@@ -38,8 +39,7 @@ def find_certain(x: Gaussian, d: jax.Array) -> jax.Array:
     """Return which of the leading states d, given those before them, have no variance but rounding's (drawn,)."""
     drawn = len(d)
     second = x.root[:drawn, :drawn] ** 2 @ x.variances[:drawn] + d**2
-    certain: jax.Array = x.variances[:drawn] <= (UNITS * drawn * unit_of(d)) ** 2 * second
-    return certain
+    return x.variances[:drawn] <= rounding_of_products(drawn, second)
 
 
 def condition_on_leading(x: Gaussian, d: jax.Array, certain: jax.Array) -> tuple[Gaussian, jax.Array]:
