@@ -238,6 +238,11 @@ class AbstractFilter(Module):
         """
         return False
 
+    @property
+    def has_known_gain(self) -> bool:
+        """True of a `LinearFilter` behind a known gain, where no noise depends on the signal: Kalman's filter."""
+        return False
+
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> "AbstractFilter":
         """Return the same filter for these inputs and complete data, with all that does not depend on z precomputed."""
         return self

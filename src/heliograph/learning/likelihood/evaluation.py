@@ -142,7 +142,7 @@ def evaluate_recording(objective: Objective, x: Array, z: Array, u: Array, truth
 def _kalman_of(objective: Objective) -> Any:
     """Return the filter at the start where it is a linear one behind a known gain; None of others."""
     start = filter_of(objective.description.start, objective.form)
-    return start if getattr(start, "has_known_gain", False) else None
+    return start if start.has_known_gain else None
 
 
 _by_xla = quickly_compiled(evaluate_recording)
