@@ -115,6 +115,8 @@ from .smoothing.rts import (
 )
 from .fusion.rules import (
     CovarianceIntersection as CovarianceIntersection,
+)
+from .fusion.network_fusion import (
     Fusion as Fusion,
 )
 from .simulation.node import (

@@ -10,7 +10,7 @@ import numpy as np
 from heliograph.disk.quoting import visible
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.innovation import InnovationSummary, Weighed
-from heliograph.fusion.rules import Fusion
+from heliograph.fusion.network_fusion import Fusion
 from heliograph.model.estimate import STRENGTH, weakest
 from heliograph.numerics.shares import average_correlated
 from heliograph.numerics.shares import round_to as round_to

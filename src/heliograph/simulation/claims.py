@@ -8,7 +8,7 @@ import jax
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.scheduled import ScheduledFilter
-from heliograph.fusion.rules import Fusion
+from heliograph.fusion.network_fusion import Fusion
 from heliograph.model.estimate import Claim
 from heliograph.model.premises.agreement import RANGE, join_premises, list_differences, part_of
 from heliograph.model.premises.premise import Kept, Premise

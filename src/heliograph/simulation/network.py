@@ -11,7 +11,7 @@ import equinox as eqx
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.scheduled import ScheduledFilter
 from heliograph.fusion.informed import AbstractInformedFusion
-from heliograph.fusion.rules import Fusion
+from heliograph.fusion.network_fusion import Fusion
 from heliograph.linear.system import Schedule
 from heliograph.model.channel import Channel, check_link, find_received_angles
 from heliograph.model.estimate import Claim

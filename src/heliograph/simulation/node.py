@@ -7,7 +7,7 @@ import equinox as eqx
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.wrappers.fed_back import FedBackFilter
-from heliograph.fusion.rules import Fusion
+from heliograph.fusion.network_fusion import Fusion
 from heliograph.model.channel import Channel, check_sent
 from heliograph.model.estimate import Claim
 from heliograph.model.limits import Limits, LimitsLike, limits_of

@@ -1,18 +1,13 @@
 """Recordings: every filter of a network over recorded measurements."""
 
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.engine.choice import compute_once
-from heliograph.filters.chunks import scan_in_chunks
-from heliograph.filters.recursion import Recursion
 from heliograph.model.checks.row_times import common_dates, warn_of_unequal_steps
 from heliograph.model.limits import Limits
 from heliograph.model.origin import Origin, last_input, usual_months, usual_spacing
@@ -20,12 +15,12 @@ from heliograph.model.plant import TIME_STEP
 from heliograph.model.stuck import Repeats
 from heliograph.model.timeouts import find_long_silences
 from heliograph.numerics.check import array, check_columns, fail, instance, rank, table
-from heliograph.numerics.float64 import check_process, quickly_compiled, to_numpy
+from heliograph.numerics.float64 import check_process
 from heliograph.numerics.times.row_times import check_times
-from heliograph.numerics.types import Array, ArrayLike, Float, PyTree, units_in
+from heliograph.numerics.types import ArrayLike, Float, PyTree, units_in
 from heliograph.simulation.arguments import inputs_of, measurement_of
 from heliograph.simulation.centres.blame import refuse_centrally
-from heliograph.simulation.centres.uplinks import Drawn, SentReports
+from heliograph.simulation.centres.uplinks import SentReports
 from heliograph.simulation.description.possible import doubt_estimates
 from heliograph.simulation.description.remarks import say_remarks
 from heliograph.simulation.description.wide_angles import warn_beyond_a_turn, warn_wide_in_rows
@@ -37,25 +32,14 @@ from heliograph.simulation.plausible_step import (
     describe_doubts,
     find_refused_rows,
     forbidden_rows,
-    step_plausibly,
 )
+from heliograph.simulation.recorded_rows import FilteringTask, central_states_before_rows, filter_rows
 from heliograph.simulation.results.record import Record, warn_of_no_numbers
-from heliograph.simulation.smoothed import Smoother, add_truth, make_record, select_smoothed_part
-from heliograph.simulation.stepping import AllFilters, initial_states
+from heliograph.simulation.results.reducer import trajectories_record
+from heliograph.simulation.smoothed import add_truth, make_smoothed_record, select_smoothed_part
+from heliograph.simulation.stepping import AllFilters
 from heliograph.simulation.transmission.shared_dithers import refuse_shared_dithers
 from heliograph.smoothing.fixed_interval_lag_point import AbstractSmoothing
-
-
-class Rest(NamedTuple):
-    """What a recording's measurements are filtered with: filters, a smoother, inputs, and what arrived by fusion."""
-
-    filters: AllFilters
-    later: Smoother | None
-    u: np.ndarray
-    arrivals: dict[str, PyTree]
-
-
-ROWS = 128  # of a recording with fusions between neighbours, whose weights are in memory at a time
 
 Reports = TypeAliasType("Reports", Mapping[str, Mapping[str, SentReports | ArrayLike]])  # by fusion and node
 
@@ -119,8 +103,7 @@ def run(
     clock = np.arange(steps, dtype=np.float64) if times is None else times
     refuse_shared_dithers(network, z)
     z, said = _screen_measurements(network, z, u)
-    for line in (*said, *warn_beyond_a_turn(network, z)):
-        warnings.warn(line, stacklevel=2)
+    _warn_of_each((*said, *warn_beyond_a_turn(network, z)))
     # Filters, on what a recording without implausible data has.
     smoothing = None if smooth is None else select_smoothed_part(network, smooth, steps)
     filters = AllFilters(network, None if smoothing is None else smoothing.kinds, judges=True)
@@ -128,18 +111,26 @@ def run(
         sent = {} if reports is None else table("reports", reports, "reports by fusion")
         arrivals = _collect_arrivals(filters, sent, steps)
         smoother = None if smoothing is None else smoothing.smoother(filters)
-        outputs = _filter_plausible(network, z, Rest(filters, smoother, u, arrivals))
+        outputs = _filter_plausible(network, z, FilteringTask(filters, smoother, u, arrivals))
     state = outputs.pop("state")
-    record = make_record(network, smoothing, outputs, clock)
+    if smoothing is None:
+        record = trajectories_record(network, {"truth": None, **outputs}, clock)
+    else:
+        record = make_smoothed_record(network, smoothing, outputs, clock)
     if time is not None and (unit := units_in(network.inputs).get(TIME_STEP)):
         record = replace(record, units=record.units | {"time": unit})
     warn_of_no_numbers(record)
     doubts = *warn_wide_in_rows(network, record), *doubt_estimates(network, record)
-    for line in (*doubts, *_describe_left_out(network, record), *say_remarks(network, state)):
-        warnings.warn(line, stacklevel=2)
+    _warn_of_each((*doubts, *_describe_left_out(network, record), *say_remarks(network, state)))
     # Row numbers are one apart: two of them say so.
     origin = _make_origin(network, record, state, u, usual_spacing(clock if times is not None else clock[:2]))
     return (record if true is None else add_truth(record, network.plant, true, smooth)).with_origin(origin)
+
+
+def _warn_of_each(lines: Sequence[str]) -> None:
+    """Warn of each line, at the place from which `run` was called."""
+    for line in lines:
+        warnings.warn(line, stacklevel=3)
 
 
 def _count_rows(measurements: ArrayLike) -> int:
@@ -233,7 +224,7 @@ def _collect_arrivals(filters: AllFilters, reports: Reports, steps: int) -> dict
     return centre_arrivals | mesh_arrivals
 
 
-def _filter_plausible(network: Network, z: dict[str, np.ndarray], rest: Rest) -> PyTree:
+def _filter_plausible(network: Network, z: dict[str, np.ndarray], task: FilteringTask) -> PyTree:
     """Return the results of filtering a recording without implausible data, and warn of these.
 
     If there are any, the recording is first filtered step by step without them to find all rows; then, without those
@@ -246,28 +237,28 @@ def _filter_plausible(network: Network, z: dict[str, np.ndarray], rest: Rest) ->
         return tuple(np.stack([z[name] for name in names], axis=1) for names in network.groups)
 
     # Usually nothing is implausible.
-    outputs = _filter_rows(*rest, group_measurements(), False)
+    outputs = filter_rows(task, group_measurements(), judged=False)
     if not any_implausible(outputs):
-        doubts = describe_doubts(network, outputs, {}, rest.u)
+        doubts = describe_doubts(network, outputs, {}, task.u)
     else:
         # Find all rows that are, then filter again without them.
-        outputs = first_time = _filter_rows(*rest, group_measurements(), True)
+        outputs = first_time = filter_rows(task, group_measurements(), judged=True)
         refused = dict[str, dict[int, str]]()
-        while new := _find_refused(network, outputs, z, group_measurements(), rest, refused):
+        while new := _find_refused(network, outputs, z, group_measurements(), task, refused):
             for name, rows in new.items():
                 refused[name] = dict(sorted((refused.get(name, {}) | rows).items()))
                 z[name] = z[name].copy()
                 z[name][list(rows)] = np.nan
-            again = _filter_rows(*rest, group_measurements(), False)
-            outputs = _filter_rows(*rest, group_measurements(), True) if any_implausible(again) else again
-        doubts = describe_doubts(network, first_time, refused, rest.u)
+            again = filter_rows(task, group_measurements(), judged=False)
+            outputs = filter_rows(task, group_measurements(), judged=True) if any_implausible(again) else again
+        doubts = describe_doubts(network, first_time, refused, task.u)
     for line in doubts:
         warnings.warn(line, stacklevel=3)
     return {name: values for name, values in outputs.items() if not name.startswith("judged")}
 
 
 def _find_refused(
-    network: Network, outputs: PyTree, z: dict[str, np.ndarray], grouped: tuple[np.ndarray, ...], rest: Rest,
+    network: Network, outputs: PyTree, z: dict[str, np.ndarray], grouped: tuple[np.ndarray, ...], task: FilteringTask,
     before: dict[str, dict[int, str]],
 ) -> dict[str, dict[int, str]]:  # fmt: skip
     """Return, by node, the rows that its filters refuse and that were not refused `before`, with the reason.
@@ -275,123 +266,11 @@ def _find_refused(
     Rows that the central filters refuse are those of the node to blame.
     """
     refused, centrally = find_refused_rows(network, outputs)
-    filters, u = rest.filters, rest.u
+    filters, u = task.filters, task.u
     if centrally:
-        states = compute_once(_collect_central_states, _central_states_by_xla, (filters, u, rest.arrivals, grouped))
+        states = central_states_before_rows(task, grouped)
         in_order = {name: z[name] for name in network.names}
         nodes = Judges(network).without_own
         refused |= refuse_centrally(filters.central, states, in_order, u, centrally, nodes)
     new = {name: {k: why for k, why in rows.items() if k not in before.get(name, ())} for name, rows in refused.items()}
     return {name: rows for name, rows in new.items() if rows}
-
-
-def _collect_central_states(
-    filters: AllFilters, u: np.ndarray, arrivals: dict[str, Drawn], z: tuple[np.ndarray, ...]
-) -> PyTree:
-    """Return the states of the central filters before each row."""
-
-    def step(states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
-        """Step all filters; the central ones' states before the step are the output."""
-        k, u_k, z_k, drawn = row
-        return step_plausibly(filters, states, z_k, u_k, k, drawn)[0], states[1]
-
-    before: PyTree = jax.lax.scan(step, filters.init(), (jnp.arange(len(u)), u, z, arrivals))[1]
-    return before
-
-
-def _filter_rows(*arguments: PyTree) -> PyTree:
-    """Return what `_run_filters` does, as NumPy arrays: in chunks side by side, by native code, or by XLA."""
-    results = _filter_in_chunks(*arguments)
-    if results is not None:
-        return results
-    # XLA for a joint covariance: the graph, an argument here, decides where its blocks are stored.
-    filters, *_ = arguments
-    by_xla = any(mesh.is_long or mesh.needs_joint for mesh in filters.meshes.values())
-    return _scan_in_parts(*arguments) if by_xla else compute_once(_run_filters, _by_xla, arguments)
-
-
-class NetworkRows(Recursion):
-    """Recursion of all filters of a network over rows; each row's output is all that they estimate and judge."""
-
-    filters: AllFilters
-
-    def step(self, state: PyTree, row: tuple[PyTree, Array], k: Array) -> tuple[PyTree, PyTree]:
-        """Step all filters over one row; return their states and what is recorded of them."""
-        z, u = row
-        return self.filters.step(state, z, jnp.asarray(u), jnp.asarray(k), {})
-
-
-def _filter_in_chunks(
-    filters: AllFilters, later: Smoother | None, u: np.ndarray, arrivals: dict[str, Drawn], z: tuple[np.ndarray, ...],
-    judged: bool,
-) -> PyTree | None:  # fmt: skip
-    """Filter rows in chunks side by side; None where that cannot be. Arguments as of `_run_filters`.
-
-    All filters must be linear, and take each measurement as it is; results are not smoothed, and rows are many.
-    """
-    if judged or later is not None or not filters.are_linear:
-        return None
-    whole = scan_in_chunks(NetworkRows(filters), to_numpy(initial_states(filters)), (z, u))
-    return None if whole is None else _collect_results(later, z, *whole)
-
-
-def _scan_in_parts(
-    filters: AllFilters, later: Smoother | None, u: np.ndarray, arrivals: dict[str, Drawn], z: tuple[np.ndarray, ...],
-    judged: bool,
-) -> PyTree:  # fmt: skip
-    """Run `_run_filters` by XLA, some rows at a time, whose weights between neighbours are computed ahead."""
-    # As few parts of at most ROWS rows as there can be, of one size, so that they share a program.
-    count = -(-len(u) // ROWS)
-    size = -(-len(u) // count)
-    rows, states, parts = (np.arange(len(u)), u, z, arrivals), initial_states(filters), []
-    for start in range(0, len(u), size):
-        # The last part is filled with its last row, which does not count again.
-        indices = np.minimum(np.arange(start, start + size), len(u) - 1)
-        k, u_k, z_k, drawn = jax.tree.map(lambda leaf, rows=indices: np.asarray(leaf)[rows], rows)
-        drawn |= {name: (drawn[name], mesh.ahead(drawn[name])) for name, mesh in filters.meshes.items()}
-        counts = np.arange(start, start + size) < len(u)
-        states, results = _scanned_by_xla(filters, states, (k, u_k, z_k, drawn), judged, counts)
-        parts.append(to_numpy(results))
-    all_rows = jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(u)], *parts)
-    return to_numpy(_collect_results(later, z, states, all_rows))
-
-
-def _run_filters(
-    filters: AllFilters, later: Smoother | None, u: np.ndarray, arrivals: dict[str, Drawn], z: tuple[np.ndarray, ...],
-    judged: bool,
-) -> PyTree:  # fmt: skip
-    """Filter all rows in one scan: filters, smoother, inputs and what arrived as in `Rest`.
-
-    z are the measurements (steps, node, received) by group; if `judged`, what is implausible is left out.
-    """
-    return _collect_results(later, z, *_scan(filters, filters.init(), (jnp.arange(len(u)), u, z, arrivals), judged))
-
-
-def _scan(
-    filters: AllFilters, states: PyTree, rows: tuple[PyTree, ...], judged: bool, counts: np.ndarray | None = None
-) -> tuple[PyTree, dict[str, PyTree]]:
-    """Step over rows: return the last states, and the results by row; rows that do not count change no state."""
-
-    def step_row(states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
-        (k, u_k, z_k, drawn), row_counts = row
-        step = step_plausibly if judged else AllFilters.step
-        after, results = step(filters, states, z_k, u_k, k, drawn)
-        if row_counts is not None:
-            after = jax.tree.map(lambda new, old: jnp.where(row_counts, new, old), after, states)
-        return after, results
-
-    states, results = jax.lax.scan(step_row, states, (rows, counts))
-    return states, results
-
-
-def _collect_results(
-    later: Smoother | None, z: tuple[np.ndarray, ...], state: PyTree, results: dict[str, PyTree]
-) -> PyTree:
-    """Return what the filters judged, their last state, and their results, smoothed if there is a smoother."""
-    results = {"measurements": z, **results}
-    judged = {name: results.pop(name) for name in ("judged", "judged_centrally")}
-    return (results if later is None else later.smooth_run(results)) | judged | {"state": state}
-
-
-_by_xla, _scanned_by_xla = quickly_compiled(_run_filters), quickly_compiled(_scan)
-_central_states_by_xla = quickly_compiled(_collect_central_states)

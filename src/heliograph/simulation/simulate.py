@@ -23,6 +23,7 @@ from heliograph.simulation.arguments import Precision, check_precision, inputs_o
 from heliograph.simulation.centres.mesh_building import build_meshes
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
+from heliograph.simulation.plan import has_plan, plan
 from heliograph.simulation.results.record import Record, warn_of_no_numbers
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Result, Trajectories
 from heliograph.simulation.results.statistics import BATCHES
@@ -40,7 +41,7 @@ from heliograph.simulation.runs.lanes import (
 from heliograph.simulation.runs.memory import Needed, check_memory, explain_out_of_memory, size_of
 from heliograph.simulation.runs.native import simulate_natively
 from heliograph.simulation.smoothed import Recorded, Smoother, finish, reduce_run, select_smoothed_part
-from heliograph.simulation.stepping import AllFilters, has_plan, plan
+from heliograph.simulation.stepping import AllFilters
 from heliograph.simulation.transmission.reception import make_reception
 from heliograph.simulation.world import World
 from heliograph.smoothing.fixed_interval_lag_point import AbstractSmoothing

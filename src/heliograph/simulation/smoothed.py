@@ -11,7 +11,7 @@ import numpy as np
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.fusion.informed import AbstractInformedFusion
-from heliograph.fusion.rules import Fusion
+from heliograph.fusion.network_fusion import Fusion
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant
@@ -192,10 +192,8 @@ def _warn_of_inconsistency(network: Network, nis: PyTree) -> None:
         warn_if_inconsistent(f"{FUSED}/{name}", np.asarray(sums))
 
 
-def make_record(network: Network, smoothing: SmoothedPart | None, outputs: PyTree, time: np.ndarray) -> Record:
-    """Return the record of a recording, with its smoothed part."""
-    if smoothing is None:
-        return trajectories_record(network, {"truth": None, **outputs}, time)
+def make_smoothed_record(network: Network, smoothing: SmoothedPart, outputs: PyTree, time: np.ndarray) -> Record:
+    """Return the record of a recording with its smoothed part, from `Smoother.smooth_run`; warn of bad consistency."""
     _warn_of_inconsistency(smoothing.network, outputs["nis"])
     filtered = trajectories_record(network, {"truth": None, **outputs["filtered"]}, time)
     length = outputs["smoothed"]["measurements"][0].shape[0]

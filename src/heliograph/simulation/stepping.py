@@ -1,27 +1,26 @@
-"""One step of a whole network's filters, under the scan over time; precomputed where nothing depends on data."""
+"""One step of a whole network's filters, under the scan over time."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from typing import cast
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import choose_code, compile_on_call, compute_once, map_arrays
+from heliograph.engine.choice import compile_on_call
 from heliograph.filters.base import AbstractFilter, make_sizes
 from heliograph.filters.linear.plan import LinearStep
 from heliograph.filters.smoother_step import gaussian_of
 from heliograph.fusion.all_reports import AllReports
-from heliograph.fusion.rules import Fusion
+from heliograph.fusion.network_fusion import Fusion
 from heliograph.model.estimate import Estimate
 from heliograph.model.over_time import stack
 from heliograph.model.sensor import without_output_names
 from heliograph.numerics.check import fail, instance, text
-from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.module import Module
-from heliograph.numerics.types import Array, Float, PyTree
+from heliograph.numerics.types import PyTree
 from heliograph.simulation.centres.centre import (
     Centre,
     CentreFilter,
@@ -36,8 +35,7 @@ from heliograph.simulation.centres.mesh_building import build_meshes
 from heliograph.simulation.centres.uplinks import uplinks_of
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node, ReceivingNode
-from heliograph.simulation.runs.side_by_side import StackedFilters, filter_step, initial_state, map_all
-from heliograph.smoothing.backward_pass import plan_with_past
+from heliograph.simulation.runs.side_by_side import StackedFilters, filter_step, initial_state
 
 
 class AllFilters(Module):
@@ -164,14 +162,22 @@ class AllFilters(Module):
         drawn: Mapping[str, PyTree] | None = None,
         skip: tuple[Sequence[jax.Array], Mapping[str, jax.Array]] | None = None,
     ) -> tuple[PyTree, dict[str, PyTree]]:
-        """Step all filters with the measurements of each group, and with the draws of the uplinks, by fusion.
+        """Step all filters with the measurements z of each group (node, received), and inputs u, over step k.
 
-        Returns "estimates" by kind, (filter, node, ...), "fused" by name, "uplinks" of fusions with quantizers, and
-        "reports" with their delays by fusion, as the nodes send them; if asked for, the smoother steps,
-        "smoother_steps" by kind and "central_steps" by name; "judged" and "judged_centrally" if filters judge, and
-        "weighed" and "weighed_centrally" of those that weigh;
-        "tested": squared innovations of the fused estimates, by name.
-        `skip` has the reasons of the same form not to use data.
+        Args:
+            states: of all filters and fusions, as `init` returns them.
+            z: measurements by group of nodes.
+            u: inputs of the plant over the step.
+            k: number of the step.
+            drawn: what was drawn of the uplinks and links between neighbours, by fusion; without, nothing is lost.
+            skip: reasons not to use data, of each kind and by name of central filters, in the form of judgements.
+
+        Returns:
+            The states after the step, and its outputs: "estimates" by kind, (filter, node, ...), then those between
+            neighbours; "fused" by name; "uplinks" of fusions with quantizers, and "reports" with their delays by
+            fusion, as the nodes send them; where filters smooth, their "smoother_steps" by kind and "central_steps" by
+            name; where they judge, "judged" and "weighed" by kind, "judged_centrally" and "weighed_centrally" by name,
+            and "tested", the squared innovations of fused estimates by name.
         """
         filter_states, central, quantizer_states, centre_states, reporting, tested = states
         # The nodes' filters, and central ones on all measurements in the order of the nodes.
@@ -189,11 +195,16 @@ class AllFilters(Module):
         }
         # Fusions of the nodes' estimates.
         estimates = tuple(output.estimate for _, output in stepped)
-        following, outputs = self._step_fusions(
+        following, of_fusions = self._step_fusions(
             (filter_states, quantizer_states, centre_states, reporting), z, estimates, u, k, drawn or {}
         )
-        fused = {name: output.estimate for name, (_, output) in stepped_centrally.items()} | outputs["fused"]
-        outputs["fused"] = fused
+        fused = {name: output.estimate for name, (_, output) in stepped_centrally.items()} | of_fusions.fused
+        outputs: dict[str, PyTree] = {
+            "estimates": (*estimates, *of_fusions.between_neighbours),
+            "fused": fused,
+            "uplinks": of_fusions.uplinks,
+            "reports": of_fusions.reports,
+        }
         # Tests of fused estimates, by what arrived after the last of them.
         distances = {
             name: test.step(tested[name], self.alike, filter_states, z, u, k, reasons)
@@ -222,10 +233,11 @@ class AllFilters(Module):
         u: jax.Array,
         k: jax.Array,
         drawn: Mapping[str, PyTree],
-    ) -> tuple[tuple[PyTree, ...], dict[str, PyTree]]:
-        """Step all fusions of the nodes' estimates, whose filters had these states before.
+    ) -> tuple[tuple[PyTree, ...], "FusionOutputs"]:
+        """Step all fusions with the nodes' `estimates` of this step.
 
-        Returns the next states of quantizers, centres and reports, and the outputs that every step has.
+        `states`, before the step: of the nodes' filters, quantizers, centres and reports. Returns those of the last
+        three after the step, and what the fusions put out: nothing where there are none.
         """
         filter_states, quantizer_states, centre_states, reporting = states
         fused, uplinks, reports, links_after = (dict[str, PyTree]() for _ in range(4))
@@ -248,13 +260,15 @@ class AllFilters(Module):
                 reporting[name], estimates, arrivals, u, k
             )
             uplinks |= {name: traffic} if traffic else {}
-        # Fusions between neighbours: estimates of each node, after those of the filters, in the order of their names.
+        # Fusions between neighbours, which have an estimate at each node.
+        between_neighbours = list[Estimate]()
         for name, mesh in sorted(self.meshes.items()):
             arrivals = drawn[name] if name in drawn else mesh.edges.lossless()  # within a process nothing is lost
             flags, ahead = arrivals if isinstance(arrivals, tuple) else (arrivals, ())
             links_after[name], of_mesh = mesh.step(reporting[name], z, jnp.asarray(flags), u, k, ahead)
-            estimates, reports[name] = (*estimates, *of_mesh), (flags, jnp.zeros(()))
-        outputs = {"estimates": estimates, "fused": fused, "uplinks": uplinks, "reports": reports}
+            between_neighbours.extend(of_mesh)
+            reports[name] = flags, jnp.zeros(())
+        outputs = FusionOutputs(tuple(between_neighbours), fused, uplinks, reports)
         return (tuple(quantizers_after), tuple(centres_after), links_after), outputs
 
     def _step_centre(
@@ -279,53 +293,26 @@ class AllFilters(Module):
         return centre.step(state, matrices, means, u, k)
 
 
+class FusionOutputs(NamedTuple):
+    """What the fusions of a network put out at a step; each is empty where there is none of its kind.
+
+    Args:
+        between_neighbours: estimates (1, node, ...) by group of nodes, of each such fusion in the order of their names.
+        fused: estimates of all others, by name.
+        uplinks: what the nodes' quantizers sent, by name.
+        reports: which reports arrived and their delays, by name.
+    """
+
+    between_neighbours: tuple[Estimate, ...]
+    fused: dict[str, PyTree]
+    uplinks: dict[str, PyTree]
+    reports: dict[str, PyTree]
+
+
 @compile_on_call
 def initial_states(filters: AllFilters) -> PyTree:
     """Return the states before the first step, computed by one program instead of one for each operation."""
     return jax.tree.map(jnp.asarray, filters.init())
-
-
-def plan(filters: AllFilters, u: Float[Array, "horizon inputs"]) -> AllFilters:
-    """Return the filters with all that depends on no data precomputed for inputs u, where all data arrive."""
-    central = filters.central if all(filters.complete) else {}
-    planned = [_plan_alike(a, u) if filters.complete[a.group] else a for a in filters.alike]
-    central = {
-        name: compute_once(_plan_filter, _planned_by_xla, (filter, u, filters.smooths))
-        for name, filter in central.items()
-    }
-    changed = eqx.tree_at(lambda f: (f.alike, f.central), filters, (tuple(planned), filters.central | central))
-    return cast(AllFilters, to_numpy(changed))
-
-
-def _plan_alike(alike: StackedFilters, u: Array) -> StackedFilters:
-    """Return filters that differ in numbers alone, planned by one program: native code, or XLA's where it must be."""
-    count, arguments = alike.count * alike.nodes, (alike.filters, u, alike.smooths)
-    with jax.enable_x64(True):
-        choice = choose_code(_plan_filter, arguments, (True, False, False))
-        if choice.code is None:
-            return replace(alike, filters=to_numpy(_all_planned_by_xla(*arguments, count)))
-    planned = map_arrays(lambda leaf: np.broadcast_to(leaf, (count, *leaf.shape[1:])), choice.results())
-    return replace(alike, filters=planned)
-
-
-def _plan_filter(filter: AbstractFilter, u: Array, smooths: bool) -> AbstractFilter:
-    """Return a filter planned for inputs u, also for smoothing where it `smooths`."""
-    return plan_with_past(filter, u) if smooths else filter.planned(u)
-
-
-_planned_by_xla = quickly_compiled(_plan_filter)
-
-
-@quickly_compiled
-def _all_planned_by_xla(filters: AbstractFilter, u: Array, smooths: bool, count: int) -> PyTree:
-    """Return `count` stacked filters, each planned for inputs u."""
-    return map_all(lambda filter: _plan_filter(filter, u, smooths), count)(filters)
-
-
-def has_plan(filters: AllFilters) -> bool:
-    """Return whether some filter has anything to precompute: a `planned` of its own."""
-    every = [*(stacked.filters for stacked in filters.alike), *filters.central.values()]
-    return any(type(filter).planned is not AbstractFilter.planned for filter in every)
 
 
 def _make_reporting(network: Network) -> dict[str, Reporting]:

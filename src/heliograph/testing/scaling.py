@@ -8,7 +8,8 @@ from heliograph.filters.gaussian.sequential import SequentialFilter
 from heliograph.filters.linear.linear import LinearFilter
 from heliograph.filters.wrappers.fed_back import PredictionFilter
 from heliograph.fusion.informed import ScalarWeights
-from heliograph.fusion.rules import CovarianceIntersection, Fusion, InverseCovarianceIntersection
+from heliograph.fusion.network_fusion import Fusion
+from heliograph.fusion.rules import CovarianceIntersection, InverseCovarianceIntersection
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Estimate
 from heliograph.model.over_time import OverTime, first, over_time, unstack

@@ -12,7 +12,7 @@ from prometheus_client import CollectorRegistry, Histogram
 from pydantic_core import from_json
 
 from heliograph.disk.quoting import join_names
-from heliograph.fusion.rules import Fusion
+from heliograph.fusion.network_fusion import Fusion
 from heliograph.model.estimate import Claim
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.types import unit_of, units_in

@@ -11,7 +11,7 @@ from heliograph.filters.linear.plan import LinearStep
 from heliograph.fusion.cross_covariance import ErrorSources, SourceFactors, initial_factors
 from heliograph.fusion.informed import MatrixWeights
 from heliograph.fusion.joint_covariance_weights import matrix_weights, solve_factored_weights
-from heliograph.fusion.rules import Fusion
+from heliograph.fusion.network_fusion import Fusion
 from heliograph.numerics.check import check_horizon, fail, instance
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.module import readable
@@ -19,7 +19,8 @@ from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.simulation.arguments import inputs_of
 from heliograph.simulation.centres.centre import Together
 from heliograph.simulation.network import Network
-from heliograph.simulation.stepping import AllFilters, plan
+from heliograph.simulation.plan import plan
+from heliograph.simulation.stepping import AllFilters
 
 REGULAR = 1e-6  # least eigenvalue of the independent part of an error, relative to the error: then U has an inverse
 

@@ -33,8 +33,8 @@ from heliograph.fusion.cross_covariance import (
     propagate_state,
 )
 from heliograph.fusion.informed import AbstractInformedFusion, CentreStep
+from heliograph.fusion.network_fusion import Fusion
 from heliograph.fusion.report_link import ReportModel
-from heliograph.fusion.rules import Fusion
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, Innovation, lower_by_noise, weakest
 from heliograph.model.over_time import OverTime, at, at_each_step, first, stack, unstack

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.fusion.mesh.graph import Graph
-from heliograph.fusion.rules import Fusion
+from heliograph.fusion.network_fusion import Fusion
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, at, first, unstack
 from heliograph.numerics.check import array, fail, instance, spread_over_names

@@ -13,7 +13,7 @@ from heliograph.filters.gaussian.adaptive import AdaptiveBelief
 from heliograph.filters.linear.belief import LinearBelief
 from heliograph.filters.plausibility import innovation_distance
 from heliograph.filters.smoother_step import gaussian_of, with_gaussian
-from heliograph.fusion.rules import Fusion
+from heliograph.fusion.network_fusion import Fusion
 from heliograph.model.estimate import Estimate
 from heliograph.model.over_time import at
 from heliograph.numerics.float64 import in_float64

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.fusion.informed import AbstractInformedFusion
+from heliograph.fusion.network_fusion import Fusion
 from heliograph.fusion.quantizer import widen
-from heliograph.fusion.rules import AbstractFusion, Fusion
+from heliograph.fusion.rules import AbstractFusion
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.model.over_time import at, first, stack, structure
 from heliograph.numerics.angle import Angles, nearest, wrap_angles

@@ -10,8 +10,8 @@ from heliograph.factors.roots import covariance_of_root, observe_information, ro
 from heliograph.fusion.mesh.graph import Graph, graph_of, upstream
 from heliograph.fusion.mesh.joint import scatter_blocks
 from heliograph.fusion.mesh.neighbour_rules import DiffusionWeights, FrozenWeights
+from heliograph.fusion.network_fusion import Fusion
 from heliograph.fusion.quantizer import UniformQuantizer
-from heliograph.fusion.rules import Fusion
 from heliograph.linear.jump_system import propagate_by_mode
 from heliograph.model.estimate import Claim, weakest
 from heliograph.model.over_time import OverTime, first

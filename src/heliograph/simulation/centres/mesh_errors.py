@@ -12,7 +12,7 @@ import scipy
 from heliograph.factors.roots import covariance_of_root, observe_information, roots_of
 from heliograph.fusion.mesh.joint import blocks_of, error_transitions, joint_after, measurement_weights, scatter_blocks
 from heliograph.fusion.mesh.neighbour_rules import FrozenWeights
-from heliograph.fusion.rules import Fusion
+from heliograph.fusion.network_fusion import Fusion
 from heliograph.linear.jump_system import propagate_by_mode
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import check_count, fail, instance, is_whole

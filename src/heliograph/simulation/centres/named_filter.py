@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.fusion.rules import Fusion
+from heliograph.fusion.network_fusion import Fusion
 from heliograph.numerics.check import fail, instance, text
 from heliograph.numerics.module import readable
 from heliograph.simulation.centres.node_filter import node_filter

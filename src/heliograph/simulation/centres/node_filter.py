@@ -14,8 +14,8 @@ from jax.scipy.linalg import block_diag
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.innovation import gaussian_innovation, no_innovation
 from heliograph.fusion.mesh.graph import Graph, graph_of
+from heliograph.fusion.network_fusion import Fusion
 from heliograph.fusion.quantizer import AbstractQuantizer
-from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.premises.premise import believing
 from heliograph.numerics.check import fail, instance, text

@@ -12,7 +12,7 @@ from heliograph.filters.smoother_step import gaussian_of
 from heliograph.fusion.cross_covariance import ErrorSources, initial_factors
 from heliograph.fusion.informed import MatrixWeights
 from heliograph.fusion.joint_covariance_weights import matrix_weights
-from heliograph.fusion.rules import Fusion
+from heliograph.fusion.network_fusion import Fusion
 from heliograph.model.estimate import Claim
 from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.fusion.network_fusion import Fusion
 from heliograph.fusion.quantizer import AbstractQuantizer
 from heliograph.fusion.report_link import ReportModel
-from heliograph.fusion.rules import Fusion
 from heliograph.model.channel import Channel, perfect
 from heliograph.model.over_time import OverTime, at, at_each_step, stack
 from heliograph.numerics.check import array, fail

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from heliograph.filters.innovation import Weighed
-from heliograph.fusion.rules import Fusion
+from heliograph.fusion.network_fusion import Fusion
 from heliograph.numerics.types import Float, PyTree
 from heliograph.simulation.centres.uplinks import SentReports, Uplink
 from heliograph.simulation.network import FUSED, Network

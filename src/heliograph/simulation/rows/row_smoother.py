@@ -12,7 +12,7 @@ import numpy as np
 from heliograph.engine.choice import choose_code, map_arrays, read_setting
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.smoother_step import SmootherStep
-from heliograph.fusion.rules import Fusion
+from heliograph.fusion.network_fusion import Fusion
 from heliograph.model.estimate import Claim, Estimate, lower_unsound_claim
 from heliograph.numerics.check import InputError, fail, instance, is_whole, show_value
 from heliograph.numerics.float64 import to_numpy, understood

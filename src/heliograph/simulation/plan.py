@@ -1,0 +1,59 @@
+"""Filters of a network with all that depends on no data computed beforehand: covariances and gains of linear ones."""
+
+from dataclasses import replace
+from typing import cast
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from heliograph.engine.choice import choose_code, compute_once, map_arrays
+from heliograph.filters.base import AbstractFilter
+from heliograph.numerics.float64 import quickly_compiled, to_numpy
+from heliograph.numerics.types import Array, Float, PyTree
+from heliograph.simulation.runs.side_by_side import StackedFilters, map_all
+from heliograph.simulation.stepping import AllFilters
+from heliograph.smoothing.backward_pass import plan_with_past
+
+
+def plan(filters: AllFilters, u: Float[Array, "horizon inputs"]) -> AllFilters:
+    """Return the filters with all that depends on no data precomputed for inputs u, where all data arrive."""
+    central = filters.central if all(filters.complete) else {}
+    planned = [_plan_alike(a, u) if filters.complete[a.group] else a for a in filters.alike]
+    central = {
+        name: compute_once(_plan_filter, _planned_by_xla, (filter, u, filters.smooths))
+        for name, filter in central.items()
+    }
+    changed = eqx.tree_at(lambda f: (f.alike, f.central), filters, (tuple(planned), filters.central | central))
+    return cast(AllFilters, to_numpy(changed))
+
+
+def _plan_alike(alike: StackedFilters, u: Array) -> StackedFilters:
+    """Return filters that differ in numbers alone, planned by one program: native code, or XLA's where it must be."""
+    count, arguments = alike.count * alike.nodes, (alike.filters, u, alike.smooths)
+    with jax.enable_x64(True):
+        choice = choose_code(_plan_filter, arguments, (True, False, False))
+        if choice.code is None:
+            return replace(alike, filters=to_numpy(_all_planned_by_xla(*arguments, count)))
+    planned = map_arrays(lambda leaf: np.broadcast_to(leaf, (count, *leaf.shape[1:])), choice.results())
+    return replace(alike, filters=planned)
+
+
+def _plan_filter(filter: AbstractFilter, u: Array, smooths: bool) -> AbstractFilter:
+    """Return a filter planned for inputs u, also for smoothing where it `smooths`."""
+    return plan_with_past(filter, u) if smooths else filter.planned(u)
+
+
+_planned_by_xla = quickly_compiled(_plan_filter)
+
+
+@quickly_compiled
+def _all_planned_by_xla(filters: AbstractFilter, u: Array, smooths: bool, count: int) -> PyTree:
+    """Return `count` stacked filters, each planned for inputs u."""
+    return map_all(lambda filter: _plan_filter(filter, u, smooths), count)(filters)
+
+
+def has_plan(filters: AllFilters) -> bool:
+    """Return whether some filter has anything to precompute: a `planned` of its own."""
+    every = [*(stacked.filters for stacked in filters.alike), *filters.central.values()]
+    return any(type(filter).planned is not AbstractFilter.planned for filter in every)

@@ -1,0 +1,142 @@
+"""All filters of a network over the rows of a recording: in one scan, in chunks side by side, or part after part."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.engine.choice import compute_once
+from heliograph.filters.chunks import scan_in_chunks
+from heliograph.filters.recursion import Recursion
+from heliograph.numerics.float64 import quickly_compiled, to_numpy
+from heliograph.numerics.types import Array, PyTree
+from heliograph.simulation.centres.uplinks import Drawn
+from heliograph.simulation.plausible_step import step_plausibly
+from heliograph.simulation.smoothed import Smoother
+from heliograph.simulation.stepping import AllFilters, initial_states
+
+ROWS = 128  # of a recording with fusions between neighbours, whose weights are in memory at a time
+
+
+class FilteringTask(NamedTuple):
+    """All that a recording is filtered with but its measurements: filters, smoother, inputs (steps, inputs), arrivals.
+
+    `arrivals`: which reports arrived of each fusion by reports, and which messages of one between neighbours, by name.
+    """
+
+    filters: AllFilters
+    smoother: Smoother | None
+    u: np.ndarray
+    arrivals: dict[str, PyTree]
+
+
+def filter_rows(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool) -> PyTree:
+    """Return what all filters made of a recording's rows, as NumPy arrays: what `AllFilters.step` puts out, by row.
+
+    z are the measurements (steps, node, received) by group; if `judged`, what is implausible is left out. Beside them
+    stand "measurements", z, and "state", the last one; with a smoother it is what `Smoother.smooth_run` returns. It is
+    computed in chunks side by side, by native code, or by XLA.
+    """
+    results = None if judged else _filter_in_chunks(task, z)
+    if results is not None:
+        return results
+    # XLA for a joint covariance: the graph, an argument here, decides where its blocks are stored.
+    by_xla = any(mesh.is_long or mesh.needs_joint for mesh in task.filters.meshes.values())
+    return _scan_in_parts(task, z, judged) if by_xla else compute_once(_run_filters, _by_xla, (task, z, judged))
+
+
+class NetworkRows(Recursion):
+    """Recursion of all filters of a network over rows; each row's output is all that they estimate and judge."""
+
+    filters: AllFilters
+
+    def step(self, state: PyTree, row: tuple[PyTree, Array], k: Array) -> tuple[PyTree, PyTree]:
+        """Step all filters over one row; return their states and what is recorded of them."""
+        z, u = row
+        return self.filters.step(state, z, jnp.asarray(u), jnp.asarray(k), {})
+
+
+def _filter_in_chunks(task: FilteringTask, z: tuple[np.ndarray, ...]) -> PyTree | None:
+    """Return what `filter_rows` does, of rows in chunks side by side; None where that cannot be.
+
+    All filters must be linear, and take each measurement as it is; results are not smoothed, and rows are many.
+    """
+    if task.smoother is not None or not task.filters.are_linear:
+        return None
+    filtered = scan_in_chunks(NetworkRows(task.filters), to_numpy(initial_states(task.filters)), (z, task.u))
+    return None if filtered is None else _collect_results(None, z, *filtered)
+
+
+def _scan_in_parts(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool) -> PyTree:
+    """Return what `filter_rows` does, by XLA, some rows at a time, whose weights between neighbours come ahead."""
+    filters, smoother, u, arrivals = task
+    # As few parts of at most ROWS rows as there can be, of one size, so that they share a program.
+    count = -(-len(u) // ROWS)
+    size = -(-len(u) // count)
+    rows, states, parts = (np.arange(len(u)), u, z, arrivals), initial_states(filters), []
+    for start in range(0, len(u), size):
+        # The last part is filled with its last row, which does not count again.
+        indices = np.minimum(np.arange(start, start + size), len(u) - 1)
+        k, u_k, z_k, drawn = jax.tree.map(lambda leaf, rows=indices: np.asarray(leaf)[rows], rows)
+        drawn |= {name: (drawn[name], mesh.ahead(drawn[name])) for name, mesh in filters.meshes.items()}
+        counts = np.arange(start, start + size) < len(u)
+        states, results = _scanned_by_xla(filters, states, (k, u_k, z_k, drawn), judged, counts)
+        parts.append(to_numpy(results))
+    all_rows = jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(u)], *parts)
+    return to_numpy(_collect_results(smoother, z, states, all_rows))
+
+
+def _run_filters(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool) -> PyTree:
+    """Return what `filter_rows` does, of all rows in one scan."""
+    filters, smoother, u, arrivals = task
+    return _collect_results(smoother, z, *_scan(filters, filters.init(), (jnp.arange(len(u)), u, z, arrivals), judged))
+
+
+def _scan(
+    filters: AllFilters, states: PyTree, rows: tuple[PyTree, ...], judged: bool, counts: np.ndarray | None = None
+) -> tuple[PyTree, dict[str, PyTree]]:
+    """Step over rows: return the last states, and the results by row; rows that do not count change no state."""
+
+    def step_row(states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
+        (k, u_k, z_k, drawn), row_counts = row
+        step = step_plausibly if judged else AllFilters.step
+        after, results = step(filters, states, z_k, u_k, k, drawn)
+        if row_counts is not None:
+            after = jax.tree.map(lambda new, old: jnp.where(row_counts, new, old), after, states)
+        return after, results
+
+    states, results = jax.lax.scan(step_row, states, (rows, counts))
+    return states, results
+
+
+def _collect_results(
+    smoother: Smoother | None, z: tuple[np.ndarray, ...], state: PyTree, results: dict[str, PyTree]
+) -> PyTree:
+    """Return what the filters judged, their last state, and their results, smoothed if there is a smoother."""
+    results = {"measurements": z, **results}
+    judged = {name: results.pop(name) for name in ("judged", "judged_centrally")}
+    return (results if smoother is None else smoother.smooth_run(results)) | judged | {"state": state}
+
+
+def central_states_before_rows(task: FilteringTask, z: tuple[np.ndarray, ...]) -> PyTree:
+    """Return the states of the central filters before each row, by name; z as of `filter_rows`."""
+    return compute_once(_collect_central_states, _central_states_by_xla, (task.filters, task.u, task.arrivals, z))
+
+
+def _collect_central_states(
+    filters: AllFilters, u: np.ndarray, arrivals: dict[str, Drawn], z: tuple[np.ndarray, ...]
+) -> PyTree:
+    """Return the states of the central filters before each row."""
+
+    def step(states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
+        """Step all filters; the central ones' states before the step are the output."""
+        k, u_k, z_k, drawn = row
+        return step_plausibly(filters, states, z_k, u_k, k, drawn)[0], states[1]
+
+    before: PyTree = jax.lax.scan(step, filters.init(), (jnp.arange(len(u)), u, z, arrivals))[1]
+    return before
+
+
+_by_xla, _scanned_by_xla = quickly_compiled(_run_filters), quickly_compiled(_scan)
+_central_states_by_xla = quickly_compiled(_collect_central_states)
