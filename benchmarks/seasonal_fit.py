@@ -1,9 +1,8 @@
 """Fit of a trend with a season (thirteen states, 400 rows, four variances) beside statsmodels, in processor seconds.
 
-Run: python benchmarks/seasonal_fit.py. The second call counts, as the first compiles; statsmodels searches from one
-start, and so does the fit that is compared, beside which the one of six starts is told. Maximisers must agree to 1 %:
-the two begin from wide laws that differ, and statsmodels stops at its own tolerance. Ends with an error where ours
-takes longer.
+Run: python benchmarks/seasonal_fit.py. The second call counts, as the first compiles. statsmodels searches from one
+start; ours from one, and from the six of the default. Maximisers must agree to 1 %: the two begin from wide laws that
+differ, and statsmodels stops at its own tolerance. Ends with an error where either of ours takes longer.
 """
 
 import json
@@ -84,5 +83,5 @@ if __name__ == "__main__":
     print(json.dumps(results, indent=1))
     if results["maximisers differ by"] > AGREE:
         raise SystemExit("seasonal_fit: another maximum than statsmodels'")
-    if results["heliograph, one start"] > results["statsmodels, one start"]:
+    if max(results["heliograph, one start"], results["heliograph, six starts"]) > results["statsmodels, one start"]:
         raise SystemExit("seasonal_fit: longer than statsmodels")

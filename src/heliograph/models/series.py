@@ -142,11 +142,10 @@ def seasonal(
     q, start = scalar("variance of the season", variance, 0.0), _read_start(initial_variance)
     matrix = np.eye(n, k=-1)
     matrix[0] = -1.0
-    only_first = np.zeros((n, n))
-    only_first[0, 0] = 1.0
+    noise = _diagonal([q] + [0.0] * (n - 1))
     named = text("name of a component", name)
     states = [named, *(f"{named}_{i}_ago" for i in range(1, n))]
-    return Component(named, LinearPlant(matrix, q * only_first, np.zeros(n), start, states=states), np.eye(n)[0])
+    return Component(named, LinearPlant(matrix, noise, np.zeros(n), start, states=states), np.eye(n)[0])
 
 
 def trigonometric_seasonal(

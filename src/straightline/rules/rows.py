@@ -29,11 +29,14 @@ OF_ENTRIES = (
 def is_long(inputs: list[Value]) -> bool:
     """Return whether nodes for all entries of an argument would be too many.
 
-    Those of tables are constants: they are no more where the other arguments are known too, or are as many nodes.
+    Those of tables are constants: they are no more where the other arguments are as many nodes, or where all that is
+    left to compute is known or, as in q I, of few entries. Zeros stay structure then.
     """
-    longest = max((x.size for x in inputs if isinstance(x, InMemory)), default=0)
-    known = all(map(_is_table, (x for x in inputs if isinstance(x, InMemory))))
-    return longest > LOADED or (longest > TABLE and not (known and _are_written_out(inputs, longest)))
+    views = [x for x in inputs if isinstance(x, InMemory)]
+    longest = max((x.size for x in views), default=0)
+    if not TABLE < longest <= LOADED:
+        return longest > TABLE
+    return not (all(map(_is_table, views)) and _are_written_out(inputs, longest))
 
 
 def _is_table(x: Value) -> bool:
@@ -42,11 +45,17 @@ def _is_table(x: Value) -> bool:
 
 
 def _are_written_out(inputs: list[Value], count: int) -> bool:
-    """Return whether arrays are nodes already, or constants, so that a result is written out as nodes too."""
+    """Return whether a result of tables and other arrays is written out as nodes.
+
+    So it is where one of these is as many nodes already, where all are known, or where there are but single numbers
+    beside tables of few entries that are not zero.
+    """
     arrays = [x for x in inputs if not isinstance(x, InMemory)]
-    return any(x.size >= count for x in arrays) or all(
-        isinstance(n, Node) and n.op == "constant" for x in arrays for n in x.ravel().tolist()
-    )
+    tables = [x for x in inputs if isinstance(x, InMemory)]
+    are_known = all(isinstance(n, Node) and n.op == "constant" for x in arrays for n in x.ravel().tolist())
+    are_single = all(x.size == 1 for x in arrays)
+    are_sparse = all(np.count_nonzero(x.numbers()) <= TABLE for x in tables)
+    return are_known or any(x.size >= count for x in arrays) or (are_single and are_sparse)
 
 
 def _apply_by_row(name: str) -> Rule:

@@ -39,6 +39,19 @@ def test_a_table_with_numbers_that_are_written_out_is_written_out_too():
     assert explain(mirrored, np.zeros(9)) == "99 operations"
 
 
+def test_a_number_times_a_table_of_few_entries_is_written_out():
+    """(n I) x of ten numbers and a whole n, which is finite: eleven are read, n made a double, and ten products.
+
+    So as if the table of a hundred were n itself. A full table goes through a loop, to the same digits.
+    """
+    sparse, full, x = np.eye(10), RANDOM.normal(size=(10, 10)), RANDOM.normal(size=(RUNS, 10))
+    assert explain(lambda n, x: (n * sparse) @ x, 2, x[0]) == "22 operations"
+    with jax.enable_x64(True):
+        for table in (sparse, full):
+            scaled = over_runs(lambda n, x, table=table: (n * table) @ x, np.full(RUNS, 2), x)
+            np.testing.assert_allclose(scaled, x @ (2.0 * table).T, rtol=1e-14, atol=1e-14)
+
+
 def test_of_a_product_by_a_long_known_matrix_its_zeros_are_left_out():
     """G x, and sum_ab T_ijab x_a x_b, of 40 outputs on their own: 40 entries that are read and one product each."""
     gain, spread = np.diag(np.arange(1.0, 41.0)), np.zeros((40, 40, 41, 41))
