@@ -8,6 +8,7 @@ from tests.export.test_apart import MAKERS, SENSOR, VEHICLE, recorded
 from tests.follow import apart, follow_known
 
 FILTERS = {
+    "extended": MAKERS["extended"](VEHICLE, SENSOR),
     "cubature": MAKERS["cubature"](VEHICLE, SENSOR),
     "polynomial": hg.filters.gaussian_filter(VEHICLE, SENSOR, hg.perfect(2), hg.filters.PolynomialMoments(2)),
 }
@@ -18,10 +19,10 @@ FILTERS = {
 @pytest.mark.parametrize("name", FILTERS)
 @pytest.mark.parametrize(("precision", "most"), [("double", 1e-12), ("float", 1e-4)])
 def test_the_numbers_are_the_same(name, precision, most, tmp_path):
-    """In deviations; of three states a fifth of the text is not there in single precision, where points are dearer."""
+    """In deviations; of three states a fifth of the text of points is gone in single precision, where it is long."""
     filter_, (z, u) = FILTERS[name], recorded()
     small = Device(filter_, tmp_path, precision=precision, size=True)
     assert max(apart(small.follow(z, u), follow_known(filter_, z, u))) < most
     fast = hg.export_c(filter_, tmp_path / "fast.c", precision)
-    lines = [path.read_text().count("\n") for path in (small.exported.source, fast.source)]
-    assert lines[0] <= (0.8 if precision == "float" else 1.0) * lines[1]
+    sizes = [len(path.read_text()) for path in (small.exported.source, fast.source)]
+    assert sizes[0] <= (0.8 if precision == "float" and name != "extended" else 1.0) * sizes[1]

@@ -29,6 +29,7 @@ from heliograph.factors import (
     zero_covariance,
 )
 from heliograph.factors.gaussian import Gaussian, from_summed_covariance
+from heliograph.numerics import write_short_programs
 from tests.factors.exact import after, congruence, exactly, total
 
 # One program for each size, not one for each of its hundred operations.
@@ -88,6 +89,61 @@ def test_observing_is_kalman_s_update(n, m, missing):
     np.testing.assert_allclose(known.covariance, p - gain @ s @ gain.T, **EXACT)
     density = multivariate_normal(np.zeros(len(z)), s).logpdf(z) if len(z) else 0.0
     np.testing.assert_allclose(seen.log_density(used, jnp.abs(innovation)), density, **EXACT)
+
+
+def added_in_a_loop(slopes, weights, noise):
+    """The law of slopes xi + w, its columns added one by one."""
+    x = Gaussian(jnp.zeros(len(weights)), jnp.zeros(len(weights) * (len(weights) - 1) // 2), jnp.asarray(weights))
+    with write_short_programs():
+        return jax.jit(lambda *given: add_noise_to_image.__wrapped__(*given))(
+            image_by_slopes(jnp.zeros(len(slopes)), jnp.asarray(slopes), x), noise
+        )
+
+
+@pytest.mark.parametrize("known", [0.0, 0.3])
+@pytest.mark.parametrize("n", [1, 2, 5])
+def test_columns_added_in_a_loop_give_the_sum(n, known):
+    """Beside factors of a known covariance, or of none."""
+    rng = np.random.default_rng(n)
+    slopes, weights = rng.normal(size=(n, n + 3)), rng.uniform(0.1, 2.0, n + 3)
+    noise = triangularise(columns_of(covariance(rng, n))).times(known)
+    total = added_in_a_loop(slopes, weights, noise)
+    right = (slopes * weights) @ slopes.T + Columns(*noise).covariance
+    np.testing.assert_allclose(total.covariance, right, **EXACT)
+
+
+def test_columns_added_in_a_loop_keep_what_their_squares_would_lose():
+    """Of weights 1e-24 to 1e24: each root of d to 4 eps of its row, against fractions."""
+    rng = np.random.default_rng(0)
+    slopes, weights = rng.normal(size=(4, 7)), 10.0 ** rng.uniform(-24, 24, 7)
+    got = added_in_a_loop(slopes, weights, Columns(jnp.eye(4), jnp.zeros(4)))
+    rows, parts = exactly(slopes), exactly([weights])[0]
+    left = [[sum(a * b * w for a, b, w in zip(x, y, parts, strict=True)) for y in rows] for x in rows]
+    size, right = np.sqrt([float(left[i][i]) for i in range(4)]), []
+    for j in range(4):
+        right.append(float(left[j][j]))
+        share = [x[j] / left[j][j] for x in left]
+        left = [[a - s * b for a, b in zip(x, left[j], strict=True)] for x, s in zip(left, share, strict=True)]
+    assert np.max(np.abs(np.sqrt(got.variances) - np.sqrt(right)) / size) < 4 * np.finfo(float).eps
+
+
+@pytest.mark.parametrize("missing", [False, True])
+def test_measured_in_a_loop_it_is_the_same(missing):
+    """Components that are correlated, one of them twice the one before it, whose slopes are rounding then."""
+    mean, p, h, r, z = problem(4, 4)
+    root = np.linalg.cholesky(r)
+    h[2], root[2], z[2] = 2 * h[1], 2 * root[1], 2 * z[1]
+    x, innovation = from_covariance(mean, p), np.where(missing & (np.arange(4) == 1), np.nan, z)
+
+    def condition(short):
+        with write_short_programs(short):
+            noise = Columns(jnp.asarray(root), np.ones(4))
+            return jax.jit(lambda *given: condition_on_observation.__wrapped__(*given))(
+                x, h @ x.root, jnp.asarray(innovation), noise
+            )
+
+    for a, b in zip(jax.tree.leaves(condition(True)), jax.tree.leaves(condition(False)), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-15)
 
 
 def test_nothing_that_arrives_changes_nothing():

@@ -151,6 +151,39 @@ def _triangularise_row_by_row(columns: Columns) -> Columns:
     return assemble_factors(lower, variances, rows.dtype)
 
 
+def absorb_columns(factors: Columns, columns: Columns) -> Columns:
+    """Find L and d of L diag(d) L' + W diag(w) W', W's columns one after another in a loop: short rather than fast.
+
+    A column c of weight w goes from row to row j: with d_j' = d_j + w c_j^2, s = d_j / d_j' and g = w c_j / d_j',
+    column j of L becomes s L_j + g c, c loses c_j L_j, and w becomes s w. These rotations without roots keep each row
+    to eps of itself, as `triangularise` does, by 3/2 of its products, and a reciprocal for each d and column.
+
+    Source: Gentleman, Least squares computations by Givens transformations without square roots (1973).
+    """
+    n, dtype = len(factors.matrix), jnp.asarray(columns.matrix).dtype
+    rows, places = np.tril_indices(n, -1)
+    entry = {(i, j): e for e, (i, j) in enumerate(zip(rows.tolist(), places.tolist(), strict=True))}
+
+    def absorb(carry: tuple[jax.Array, jax.Array], column: tuple[jax.Array, jax.Array]) -> tuple[Any, None]:
+        """Rotate one column into the factors, from the first row down."""
+        lower, variances = list(carry[0]), list(carry[1])
+        c, weight = list(column[0]), column[1]
+        for j in range(n):
+            d = variances[j] + weight * c[j] ** 2
+            over = reciprocal_or_one(d)
+            kept, gain = jnp.where(is_positive(d), variances[j] * over, 1.0), weight * c[j] * over
+            variances[j] = d
+            for i in range(j + 1, n):
+                e = entry[i, j]
+                lower[e], c[i] = kept * lower[e] + gain * c[i], c[i] - c[j] * lower[e]
+            weight = weight * kept
+        return (jnp.asarray(lower, dtype), jnp.asarray(variances, dtype)), None
+
+    start = below_diagonal(jnp.asarray(factors.matrix)).astype(dtype), jnp.asarray(factors.weights).astype(dtype)
+    (lower, variances), _ = lax.scan(absorb, start, (jnp.asarray(columns.matrix).T, jnp.asarray(columns.weights)))
+    return Columns(unit_lower(lower), variances)
+
+
 def eliminate(covariance: jax.Array, least: float = 0.0) -> Columns:
     """Factor P = L diag(d) L' by elimination: n^3 / 6 products, n reciprocals.
 

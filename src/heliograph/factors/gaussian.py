@@ -14,6 +14,7 @@ from jax import lax
 
 from heliograph.factors.columns import (
     Columns,
+    absorb_columns,
     below_diagonal,
     decorrelate,
     eliminate,
@@ -27,13 +28,13 @@ from heliograph.factors.columns import (
     zero_covariance,
 )
 from heliograph.factors.repeated import (
-    noise_beside_rounding,
     rounding_of_products,
     rounding_of_slopes,
     triangularise_noise,
 )
-from heliograph.factors.scalar_update import carry_rounding, measure_parts, measure_product, revise_columns
+from heliograph.factors.scalar_update import measure_parts, measure_product, measure_row, measure_rows, revise_columns
 from heliograph.numerics.linalg import OFF_SUPPORT, OFF_VALUE, PIVOT_TOLERANCE, rounding, symmetric
+from heliograph.numerics.short_programs import writes_short_programs
 from heliograph.numerics.traced import is_traced, library
 from heliograph.numerics.types import Array, Float
 
@@ -161,8 +162,12 @@ def sum_unexplained(image: Image, noise: Columns) -> Columns:
 def add_noise_to_image(image: Image, noise: Columns) -> Gaussian:
     """Return the Gaussian of f(x) + w: mean of f(x), covariance slopes diag(d) slopes' + curvature + Cov w.
 
+    `noise` holds factors of Cov w, L unit lower.
     Slopes by orthogonal rows, as `predict_affine` does: a prior may tie what a precise measurement has to tell apart.
     """
+    if writes_short_programs():
+        factors = absorb_columns(noise, image.columns)
+        return Gaussian(image.mean, below_diagonal(factors.matrix), factors.weights)
     return from_columns(image.mean, join_columns(image.explained, sum_unexplained(image, noise)))
 
 
@@ -204,7 +209,7 @@ def condition_on_observation(
     (m, n), innovation (m,), noise (m, columns), present (m,): which components arrived, by default those whose
     innovation is a number.
     """
-    n, m = len(x.mean), len(innovation)
+    n = len(x.mean)
     present = ~jnp.isnan(innovation) if present is None else present
     # Rows (slopes, innovation) of what arrived, with uncorrelated noises.
     fresh = triangularise_noise(Columns(jnp.where(present[:, None], noise.matrix, 0.0), noise.weights))
@@ -214,16 +219,9 @@ def condition_on_observation(
     rows, variance = decorrelate(fresh.matrix, rows), jnp.where(present, fresh.weights, 1.0)
     least = rounding_of_slopes(n, fresh.matrix, whole)
     # The rows of L, and below them those of the components to come, change alike; so do the mean and the innovations.
-    root, d = jnp.concatenate([x.root, rows[:, :n]]), x.variances
-    news, values, totals = jnp.concatenate([x.mean, -rows[:, n]]), [], []
-    for i in range(m):
-        root, d, gain, total = _measure_row(root, d, root[n + i], variance[i], least[i] if i else None)
-        values.append(-news[n + i])
-        totals.append(total)
-        news = news + gain * values[i]
-        least = carry_rounding(least, gain[n:], least[i] if i else rounding_of_products(n, total))
-    after = Gaussian(news[:n], below_diagonal(root[:n]), d)
-    return after, Innovations(_stack_numbers(values), _stack_numbers(totals), whole)
+    root, news = jnp.concatenate([x.root, rows[:, :n]]), jnp.concatenate([x.mean, -rows[:, n]])
+    root, d, news, values, totals = measure_rows(root, x.variances, news, variance, least)
+    return Gaussian(news[:n], below_diagonal(root[:n]), d), Innovations(values, totals, whole)
 
 
 def gain_of(x: Gaussian, slopes: jax.Array, noise: Columns) -> jax.Array:
@@ -240,7 +238,7 @@ def gain_of(x: Gaussian, slopes: jax.Array, noise: Columns) -> jax.Array:
         i: int | jax.Array, root: jax.Array, d: jax.Array, rounding: jax.Array
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Measure component i: return the rows and variances after it, and its gain."""
-        return _measure_row(root, d, root[n + i], weights[i], rounding)[:3]
+        return measure_row(root, d, root[n + i], weights[i], rounding)[:3]
 
     *_, gains = measure_parts(measure_part, jnp.concatenate([x.root, rows]), x.variances, least)
     entering = unit_lower(below_diagonal(gains[n:]))
@@ -360,25 +358,3 @@ def rts_step(back: BackwardGain, later: Gaussian) -> Gaussian:
     """
     carried = Columns(back.gain @ back.apply_inverse_factor(later.root), later.variances)
     return from_columns(back.mean_given(later.mean), join_columns(carried, back.left.columns))
-
-
-def _measure_row(
-    root: jax.Array, d: jax.Array, f: jax.Array, noise: jax.Array, least: jax.Array | None
-) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Measure f' xi + v as `measure_scalar` does; slopes of a variance up to `least` are rounding and say nothing.
-
-    They are measured with a noise beside which they are nothing to the last digit.
-    """
-    product = d * f
-    power = f * product
-    if least is None:
-        return measure_product(root, d, f, (product, power), noise)
-    nothing = jnp.sum(power) <= least
-    beside = jnp.where(nothing, noise + noise_beside_rounding(len(d), least), noise)
-    root, d, gain, total = measure_product(root, d, f, (product, power), beside)
-    return root, d, gain, jnp.where(nothing, noise, total)
-
-
-def _stack_numbers(entries: list[jax.Array]) -> jax.Array:
-    """Return numbers as a vector, of none an empty one."""
-    return jnp.stack(entries) if entries else jnp.zeros(0)

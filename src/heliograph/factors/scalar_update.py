@@ -8,7 +8,9 @@ import numpy as np
 from jax import lax
 
 from heliograph.factors.columns import is_positive, reciprocal_or_one
+from heliograph.factors.repeated import noise_beside_rounding, rounding_of_products
 from heliograph.numerics.linalg import WRITTEN
+from heliograph.numerics.short_programs import writes_short_programs
 
 
 def measure_scalar(
@@ -96,3 +98,86 @@ def carry_rounding(least: jax.Array, gain: jax.Array, measured: jax.Array) -> ja
     Slopes become f_j - gain_j f_i: what rounding left of f_i, of a variance `measured`, is in those of all others.
     """
     return least + gain**2 * measured
+
+
+def measure_row(
+    root: jax.Array, d: jax.Array, f: jax.Array, noise: jax.Array, least: jax.Array | None
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """Measure f' xi + v as `measure_scalar` does; slopes of a variance up to `least` are rounding and say nothing.
+
+    They are measured with a noise beside which they are nothing to the last digit.
+    """
+    product = d * f
+    power = f * product
+    if least is None:
+        return measure_product(root, d, f, (product, power), noise)
+    nothing = jnp.sum(power) <= least
+    beside = jnp.where(nothing, noise + noise_beside_rounding(len(d), least), noise)
+    root, d, gain, total = measure_product(root, d, f, (product, power), beside)
+    return root, d, gain, jnp.where(nothing, noise, total)
+
+
+Carried = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
+Measured = tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]
+
+
+def measure_rows(root: jax.Array, d: jax.Array, news: jax.Array, variance: jax.Array, least: jax.Array) -> Measured:
+    """Measure the rows below the n of a state, one by one: rows, variances, news, innovations and their variances.
+
+    Args:
+        root: rows (n + m, n) of L, and of the m components' slopes below.
+        d: variances (n,) of the columns.
+        news: mean, and less the innovations (n + m,).
+        variance: of the components' noises (m,).
+        least: variance (m,) up to which slopes are rounding.
+    """
+    measure = _measure_in_turns if writes_short_programs() and len(variance) > 1 else _measure_one_by_one
+    return measure(root, d, news, variance, least)
+
+
+def _measure_one_by_one(
+    root: jax.Array, d: jax.Array, news: jax.Array, variance: jax.Array, least: jax.Array
+) -> Measured:
+    """Write `measure_rows` out, row after row."""
+    n, values, totals = len(d), list[jax.Array](), list[jax.Array]()
+    for i in range(len(variance)):
+        root, d, gain, total = measure_row(root, d, root[n + i], variance[i], least[i] if i else None)
+        values.append(-news[n + i])
+        totals.append(total)
+        news = news + gain * values[i]
+        least = carry_rounding(least, gain[n:], least[i] if i else rounding_of_products(n, total))
+    return root, d, news, _stack_numbers(values), _stack_numbers(totals)
+
+
+def _measure_in_turns(
+    root: jax.Array, d: jax.Array, news: jax.Array, variance: jax.Array, least: jax.Array
+) -> Measured:
+    """Compute `measure_rows` in a loop: each turn measures the first row below the state's, and puts it last.
+
+    Before the first one nothing was rounded: what is least there is below every variance.
+    """
+    n = len(d)
+
+    def turn(carry: Carried, noise: jax.Array) -> tuple[Carried, tuple[jax.Array, jax.Array]]:
+        """Measure the row of this noise; return what is next, and its innovation with the variance."""
+        root, d, news, least = carry
+        after, d, gain, total = measure_row(root, d, root[n], noise, least[0])
+        value = -news[n]
+        rounded = jnp.where(least[0] < 0, rounding_of_products(n, total), least[0])
+        least = carry_rounding(least, gain[n:], rounded)
+        carry = _put_last(after, n), d, _put_last(news + gain * value, n), _put_last(least, 0)
+        return carry, (value, total)
+
+    start = root, d, news, jnp.concatenate([jnp.full_like(least[:1], -1.0), least[1:]])
+    (root, d, news, _), (values, totals) = lax.scan(turn, start, variance)
+    return root, d, news, values, totals
+
+
+def _put_last(rows: jax.Array, i: int) -> jax.Array:
+    """Return rows with row i behind all others."""
+    return jnp.concatenate([rows[:i], rows[i + 1 :], rows[i : i + 1]])
+
+
+def _stack_numbers(entries: list[jax.Array]) -> jax.Array:
+    """Return numbers as a vector, of none an empty one."""
+    return jnp.stack(entries) if entries else jnp.zeros(0)

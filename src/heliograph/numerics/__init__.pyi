@@ -123,6 +123,7 @@ from .shares import round_to as round_to
 from .shares import wilson as wilson
 from .short_programs import evaluate_at_points as evaluate_at_points
 from .short_programs import write_short_programs as write_short_programs
+from .short_programs import writes_short_programs as writes_short_programs
 from .times.dates import MISSING as MISSING
 from .times.dates import UNITS as UNITS
 from .times.dates import dates as dates

@@ -23,3 +23,8 @@ def evaluate_at_points(function: Callable[[jax.Array], jax.Array], points: jax.A
     """Return f of each point (points, n), as rows (points, p): side by side, or one after another in a loop."""
     values: jax.Array = jax.lax.map(function, points) if _short.get() else jax.vmap(function)(points)
     return values
+
+
+def writes_short_programs() -> bool:
+    """Return whether what is traced is written as short programs."""
+    return _short.get()
