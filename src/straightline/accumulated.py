@@ -35,7 +35,10 @@ class Accumulated:
         self.once = None if self.code.once is None else Tiers(self.code.once, (1, 1))
 
     def memory(self, runs: int, lanes: int, in_flight: int) -> tuple[float, float, float]:
-        """Return bytes of the results of so many runs, of sums of so many lanes, and of variables of runs in flight."""
+        """Return bytes of what is collected of `runs`, of `lanes` sums kept apart, and of the variables of all runs.
+
+        Of those variables all runs share some; each of the blocks that are computed at once (`in_flight`) has others.
+        """
         length = row_length(self.width, self.summed.batches)
         collected = sums = 0.0
         for buffer, summed, common in zip(self.code.outputs, self.summed.outputs, self.common, strict=True):
@@ -48,7 +51,7 @@ class Accumulated:
         return runs * collected, lanes * sums, float(self.code.shared) + in_flight * float(self.code.scratch)
 
     def begin(self, arguments: Sequence[Any], runs: int) -> "Begun":
-        """Compute everything that the runs share, from the arguments other than the number of the run.
+        """Return the program with its arguments (all but the run's number), and what all runs share, computed.
 
         The code is made for as many runs as will follow.
         """

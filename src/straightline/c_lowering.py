@@ -50,13 +50,14 @@ class FiniteGraph(Graph):
         return made
 
     def load(self, buffer: Buffer, offset: int, strides: Sequence[int] = (), indices: Sequence[Node] = ()) -> Node:
-        """Load a number; those of tables are finite too."""
+        """Load a number; note that it is finite if all of its buffer are."""
         made = super().load(buffer, offset, strides, indices)
         if buffer in self.buffers:
             self.finite.add(made)
         return made
 
     def _is_finite(self, node: Node) -> bool:
+        """Return whether a number is finite by what it depends on, or whatever the data."""
         return node in self.finite or is_finite(node)
 
 

@@ -46,17 +46,21 @@ def wrapped(number: int, like: Any) -> Any:
 
 
 def _shift_left(a: Any, b: Any) -> Any:
+    """Return a << b; 0 where b is no number of bits of the type."""
     return wrapped(int(a) << int(b), a) if 0 <= b < 8 * a.itemsize else a * 0
 
 
 def _shift_right(a: Any, b: Any) -> Any:
+    """Return a >> b with zeros from the left; 0 where b is no number of bits of the type."""
     bits = 8 * a.itemsize
     return wrapped(int(a) % (1 << bits) >> int(b), a) if 0 <= b < bits else a * 0
 
 
 def _shift_right_signed(a: Any, b: Any) -> Any:
+    """Return a >> b with copies of the highest bit from the left, also of an unsigned a; all copies for a large b."""
     last = 8 * a.itemsize - 1
-    signed = int(a) - (int(a) >> last << last + 1 if a > 0 else 0)  # the highest bit is the sign, of any type
+    is_negative = int(a) >> last == 1  # an unsigned number whose highest bit is set is read as one below zero
+    signed = int(a) - (1 << last + 1) if is_negative else int(a)
     return wrapped(signed >> (int(b) if 0 <= b <= last else last), a)
 
 
@@ -75,6 +79,7 @@ def _remainder(a: Any, b: Any) -> Any:
 
 
 def _quotient(a: int, b: int) -> int:
+    """Return a / b rounded toward zero."""
     return abs(a) // abs(b) * (1 if (a < 0) == (b < 0) else -1)
 
 
@@ -84,14 +89,17 @@ def _maximum(a: Any, b: Any) -> Any:
 
 
 def _minimum(a: Any, b: Any) -> Any:
+    """Return the smaller number, -0 of two zeros unless both are 0; NaN if either is."""
     return -_maximum(-a, -b) if isinstance(a, np.floating) else np.minimum(a, b)
 
 
 def _sign(a: Any) -> Any:
+    """Return 1 or -1 by the sign; a zero as it is."""
     return a if a == 0 else np.sign(a)
 
 
 def _round_away(a: Any) -> Any:
+    """Return the nearest whole number, of halves the one further from zero."""
     whole = np.trunc(a)
     return whole + np.copysign(1.0, a) if np.abs(a - whole) >= 0.5 else whole
 
@@ -162,6 +170,7 @@ def _evaluate(graph: Graph, op: str, type: Type, args: tuple[Node, ...]) -> Node
 
 
 def _is(node: Node, number: float) -> bool:
+    """Return whether a node is the constant of this number."""
     return bool(node.op == "constant" and node.value == number)
 
 
@@ -212,7 +221,8 @@ def _fold_mul(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
         return graph.node("neg", type, b)
     if a.value == 0.5 and b.op == "add" and b.args[0] is b.args[1]:
         return b.args[0]
-    if a.value == -0.0 or b.op != "neg":
+    # c (-x) = (-c) x. Not of c = 0: which zero comes out is left to the run.
+    if a.value == 0 or b.op != "neg":
         return None
     return graph.node("mul", type, graph.constant(-a.value, type), b.args[0])
 
@@ -221,6 +231,7 @@ def _fold_div(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
     """Replace a division by a power of two by the product with its reciprocal, which is exact."""
     if type not in REAL or b.op != "constant" or not b.value or not math.isfinite(b.value):
         return None
+    # A power of two has the mantissa 1/2; both it and its reciprocal must be normal numbers.
     largest = 1e300 if type == "f64" else 1e37
     if abs(math.frexp(b.value)[0]) != 0.5 or not 1 / largest < abs(b.value) < largest:
         return None

@@ -38,7 +38,7 @@ class Graph:
     def constant(self, value: Number, type: Type) -> Node:
         """Make a constant, rounded to single precision if it is of that type."""
         value = DTYPES[type](value).item() if type == "f32" else value
-        key = (type, value if value != 0 or type not in REAL else str(value))  # two zeros
+        key = (type, value if value != 0 or type not in REAL else str(value))  # 0.0 == -0.0, but they differ
         known = self.top.seen.get(key)
         if known is None:
             known = self.top.seen[key] = self.fresh("constant", type, (), self.top, value)
@@ -68,7 +68,8 @@ class Graph:
         if buffer.table is not None and not pairs:
             return self.constant(buffer.table.ravel()[offset].item(), buffer.type)
         row = len(buffer.first)
-        if row and all(s % row == 0 for s, _ in pairs):  # another row alone
+        # Indices choose the row alone: of entries of a row that are the same number, the first one is loaded.
+        if row and all(s % row == 0 for s, _ in pairs):
             offset += buffer.first[offset % row] - offset % row
         indices = tuple(i for _, i in pairs)
         value = (buffer, offset, tuple(s for s, _ in pairs))

@@ -61,6 +61,7 @@ class Lowering:
         return [x if x.size else self._empty(a) for x, a in zip(values, avals, strict=True)]
 
     def _empty(self, aval: Any) -> InMemory:
+        """Return an array without entries, in memory of its type and shape."""
         return InMemory.whole(Buffer("scratch", type_of(aval), tuple(aval.shape), self.graph.top))
 
     def equation(self, equation: JaxprEqn, inputs: list[Value]) -> Sequence[Value]:
@@ -115,6 +116,7 @@ class Lowering:
         return array_of([self.graph.constant(x, type) for x in array.ravel().tolist()], array.shape)
 
     def _read(self, values: dict[Var, Value], v: Any) -> Value:
+        """Return the value of an operation's argument: a literal's constant, else what was computed."""
         return self.known(_as_traced(v.val, v)) if isinstance(v, Literal) else values[v]
 
 
@@ -212,7 +214,7 @@ def code_line(equation: JaxprEqn) -> str:
 
 
 class _Held(NamedTuple):
-    """A part of a result that is no array, such as a function: what is restored in its place is it itself."""
+    """A part of a result that is no array, such as a function: it is put back as it is when the result is restored."""
 
     value: Any
 

@@ -81,6 +81,7 @@ def background() -> ThreadPoolExecutor:
 
 @cache
 def _hasty() -> ThreadPoolExecutor:
+    """Return the thread that generates code for which the main thread waits."""
     return ThreadPoolExecutor(1)
 
 
@@ -150,5 +151,6 @@ class Tiers:
         return blocks * self._source.work / max(self._source.operations, 1)
 
     def _level(self, executions: float) -> int:
+        """Return 1, with care, if that pays for so many executions and JAX's setting allows it, else 0, in haste."""
         pays = executions >= OFTEN
         return int(pays and not jax.config.values["jax_disable_most_optimizations"])

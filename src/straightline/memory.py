@@ -67,7 +67,7 @@ class InMemory:
         return np.lib.stride_tricks.as_strided(table, self.shape, [s * table.itemsize for s in self.strides])
 
     def nodes(self, graph: Graph) -> np.ndarray:
-        """Load all numbers."""
+        """Return a node for each entry, which loads it: once in a block, for the blocks inside it too."""
         if self.loaded is None or self.loaded[0] not in graph.current.inwards():
             if self.size > LOADED:
                 raise Unsupported(f"an array of {self.size} numbers at once")

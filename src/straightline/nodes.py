@@ -99,8 +99,8 @@ class Buffer:
 
     `kind`: "input", "scratch", "table", or "carried" by a loop, of which each turn fills it anew. A buffer that the
     program fills is read after the statement of `block` that fills it. A buffer `inside` another starts at a place of
-    it. `first`: of rows in which some entries are the same
-    number, as across the diagonal of a symmetric matrix, the first place in the row that has each entry's number.
+    it. `first`: for each entry of a row the first place in the row that has the same number, as across the diagonal of
+    a symmetric matrix; empty where all entries differ.
     """
 
     __slots__ = ("block", "first", "inside", "kind", "parts", "shape", "stores", "table", "type")

@@ -168,8 +168,11 @@ def fusable(node: Node, products: set[Node]) -> Node | None:
 
 
 def products_of(items: Iterable[Any]) -> set[Node]:
-    """Find products used once, by a sum or difference; mark each with its user, of two the later one."""
-    users: dict[Node, Any] = {}
+    """Return products that are fused with their user, the one sum or difference that uses them, noted as `value`.
+
+    Of two products of one user the later one is taken.
+    """
+    users: dict[Node, Any] = {}  # None of products that are used twice
     for statement in items:
         for used in uses(statement):
             if used.op == "mul" and used.type in REAL:
@@ -203,6 +206,7 @@ def sort_items(items: Iterable[Any]) -> list[Any]:
     """Sort items: each number after those that it is computed of, but for what a loop carries, and buffers first."""
 
     def position(x: Any) -> int:
+        """Return the serial of the number after which an item stands, -1 for the beginning."""
         if isinstance(x, Store):
             return x.node.serial
         if isinstance(x, Loop | Guard):
@@ -241,8 +245,8 @@ def find_varying(items: Iterable[Any], inputs: Iterable[Buffer]) -> set[Any]:
 def find_differing(items: list[Any], inputs: Iterable[Buffer]) -> set[Any]:
     """Return what of these items, in order, differs between runs: what varies with these inputs, and some memory more.
 
-    Runs read what they share after it is computed, when of an array that a loop carries in memory the last turn is
-    left: where they need it within a turn, each has its own.
+    What runs share is computed once, before them. Of an array that a loop carries in memory the numbers of the last
+    turn are left then: where runs need those of every turn, each has an array of its own.
     """
     spread = find_varying(items, inputs)
     carried = {x for x in items if isinstance(x, Buffer) and x.kind == "carried"}

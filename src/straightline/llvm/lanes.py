@@ -29,7 +29,10 @@ def gather_name(bits: int, spread: bool) -> str:
 
 
 def gather(bits: int, spread: bool, width: int) -> str:
-    """Write `%i64 @hg_gather64_table(ptr start, %i64 places)`, a load for each lane; of its entries if `spread`."""
+    """Write `%i64 @hg_gather64_table(ptr start, %i64 places)`, which loads in each lane the number at its place.
+
+    If `spread`, a place has a number for each lane, of which each lane loads its own.
+    """
     vector, text, total = f"%i{bits}", Lines(), "poison"
     row, entry = (f"[{width} x i{bits}]", ", i64 {}") if spread else (f"i{bits}", "")
     for lane in range(width):

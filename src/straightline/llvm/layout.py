@@ -98,7 +98,10 @@ def _read(items: Iterable[Any]) -> set[Buffer]:
 def _place_buffers(
     buffers: Iterable[Buffer], width: int, turning: Collection[Buffer] = ()
 ) -> tuple[int, dict[Buffer, int]]:
-    """Place buffers one after another; return the end and each one's offset, in bytes; of some one for each turn."""
+    """Place buffers of `width` runs one after another; return the end and each one's offset, in bytes.
+
+    Those in `turning` have a copy for each turn of the loops around them.
+    """
     start, places = 0, dict[Buffer, int]()
     for buffer in buffers:
         places[buffer] = start

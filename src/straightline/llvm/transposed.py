@@ -68,7 +68,7 @@ def mover(bits: int, inwards: bool, squared: bool, width: int) -> str:
 def _write_square(
     text: Lines, rows: list[str], width: int, group: int, bits: int, inwards: bool
 ) -> Callable[[str], None]:
-    """Move as many entries as there are lanes."""
+    """Return what writes the move of entries i, i + 1, ... of as many runs: a square, from rows to lanes or back."""
 
     def body(i: str) -> None:
         """Write the transposition of one square: load its rows, exchange halves until each is a column, store."""
@@ -89,11 +89,12 @@ def _write_square(
 
 
 def _exchange_squares(text: Lines, rows: list[str], half: int, bits: int) -> list[str]:
-    """Do one step of a transposition: exchange off-diagonal squares of this size."""
+    """Return rows with the off-diagonal squares of side `half` exchanged: one step of a transposition."""
     exchanged, side = rows[:], len(rows)
     for i in range(side):
         if i & half:
             continue
+        # Row i keeps its left part and takes row j's left part for its right one; row j the right parts of both.
         j = i | half
         low = [k if not k & half else k - half + side for k in range(side)]
         high = [k + half if not k & half else k + side for k in range(side)]
@@ -107,9 +108,10 @@ def _exchange_squares(text: Lines, rows: list[str], half: int, bits: int) -> lis
 def _write_single(
     text: Lines, rows: list[str], width: int, group: int, bits: int, inwards: bool
 ) -> Callable[[str], None]:
-    """Move one entry of each lane."""
+    """Return what writes the move of entry i of each run, from its row to its lane or back."""
 
     def body(i: str) -> None:
+        """Write the move of each lane, one after another."""
         base = text.add(f"mul i64 {i}, {width}")
         base = text.add(f"add i64 {base}, {group}")
         base = text.add(f"getelementptr i{bits}, ptr %lanes, i64 {base}")

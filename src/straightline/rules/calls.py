@@ -30,6 +30,7 @@ def _call(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[V
 
 
 def _custom_vmap_call(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    """Inline a function that has a rule of its own for `vmap`."""
     return lowering.inline(equation.params["call"], inputs)
 
 
@@ -136,6 +137,7 @@ def _dissolve(block: Block, outer: Block) -> None:
 
 
 def _where(lowering: Lowering, condition: Node, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return array a where the condition, one for all entries, holds, else b."""
     pairs = zip(a.ravel().tolist(), b.ravel().tolist(), strict=True)
     return array_of([select(lowering.graph, condition, x, y) for x, y in pairs], a.shape)
 

@@ -72,7 +72,8 @@ def _select_n(graph: Graph, type: Type, params: Any, which: Node, *cases: Any) -
     return chosen
 
 
-def _key_select(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+def _lower_select_n(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    """Lower `select_n`, of numbers or of keys: the first input says for each entry which of the others is taken."""
     shape = result_shape(equation)
     entries = zip(*broadcast(inputs, shape), strict=True)
     return [array_of([_select_n(lowering.graph, "u32", None, *entry) for entry in entries], shape)]
@@ -99,10 +100,12 @@ def _power_of_number(graph: Graph, type: Type, params: Any, x: Node, exponent: N
 
 
 def _clamp(graph: Graph, type: Type, params: Any, low: Node, x: Node, high: Node) -> Node:
+    """Return x between `low` and `high`."""
     return graph.node("min", type, graph.node("max", type, low, x), high)
 
 
 def _convert(graph: Graph, type: Type, params: Any, x: Node) -> Node:
+    """Return x as a number of the result's type."""
     return graph.node("convert", type, x)
 
 
@@ -122,24 +125,29 @@ def _bitcast(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -
 
 
 def _logistic(graph: Graph, type: Type, params: Any, x: Node) -> Node:
+    """Return 1 / (1 + e^-x)."""
     unit = graph.constant(1.0, type)
     power = graph.node("exp", type, graph.node("neg", type, x))
     return graph.node("div", type, unit, graph.node("add", type, unit, power))
 
 
 def _root_reciprocal(graph: Graph, type: Type, params: Any, x: Node) -> Node:
+    """Return 1 / sqrt(x)."""
     return graph.node("div", type, graph.constant(1.0, type), graph.node("sqrt", type, x))
 
 
 def _square(graph: Graph, type: Type, params: Any, x: Node) -> Node:
+    """Return x^2."""
     return graph.node("mul", type, x, x)
 
 
 def _one_minus_square(graph: Graph, type: Type, params: Any, x: Node) -> Node:
+    """Return 1 - x^2."""
     return graph.node("sub", type, graph.constant(1.0, type), graph.node("mul", type, x, x))
 
 
 def _log2(graph: Graph, type: Type, params: Any, x: Node) -> Node:
+    """Return log x / log 2."""
     return graph.node("mul", type, graph.node("log", type, x), graph.constant(1 / math.log(2), type))
 
 
@@ -152,15 +160,17 @@ def _polynomial(graph: Graph, type: Type, params: Any, x: Node, *coefficients: N
 
 
 def _round(graph: Graph, type: Type, params: Any, x: Node) -> Node:
+    """Return the nearest whole number, of halves the even one or that further from zero."""
     return graph.node("round_even" if int(params["rounding_method"]) else "round_away", type, x)
 
 
 def _as_it_is(lowering: Lowering, equation: JaxprEqn, inputs: list[Any]) -> list[Any]:
+    """Return the arguments: an operation that changes no number."""
     return inputs
 
 
 def _total_order(op: str) -> Callable[..., Node]:
-    """Compare in the order of IEEE 754 that has all numbers: -NaN < -inf < ... < -0 < 0 < ... < inf < NaN."""
+    """Return the comparison by the total order of IEEE 754, -NaN < -inf < ... < -0 < 0 < ... < inf < NaN."""
 
     def rank(graph: Graph, x: Node) -> Node:
         """Return a float's bits as an unsigned integer, in the order of the floats; other numbers as they are."""
@@ -194,12 +204,13 @@ def _next_after(graph: Graph, type: Type, params: Any, x: Node, y: Node) -> Node
 
 
 def _shift_right_arithmetic(graph: Graph, type: Type, params: Any, x: Node, by: Node) -> Node:
+    """Return x >> by, with copies of the sign from the left."""
     return graph.node("shift_right_signed", type, x, by)
 
 
 RULES |= {name: _elementwise(op) for name, op in ELEMENTWISE.items()}
 RULES |= {
-    "select_n": _key_select, "integer_pow": _make_rule(_power), "square": _make_rule(_square),
+    "select_n": _lower_select_n, "integer_pow": _make_rule(_power), "square": _make_rule(_square),
     "pow": _make_rule(_power_of_number),
     "rsqrt": _make_rule(_root_reciprocal), "logistic": _make_rule(_logistic), "clamp": _make_rule(_clamp),
     "convert_element_type": _make_rule(_convert), "bitcast_convert_type": _bitcast,

@@ -31,18 +31,20 @@ def present(x: Shaped[jax.Array | np.ndarray, "*shape"]) -> Shaped[jax.Array, "*
     return marked
 
 
-def _rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+def _mark_present(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    """Note that the argument's numbers are never NaN, and return them."""
     lowering.graph.never_nan.update(inputs[0].ravel().tolist())
     return inputs
 
 
-def _mapped(arrays: Sequence[jax.Array], axes: Sequence[int]) -> tuple[jax.Array, int]:
+def _batch_present(arrays: Sequence[jax.Array], axes: Sequence[int]) -> tuple[jax.Array, int]:
+    """Mark a batch: the axis that `vmap` maps stays where it is."""
     return present(arrays[0]), axes[0]
 
 
-RULES["present"] = _rule
+RULES["present"] = _mark_present
 _present.def_impl(lambda x: x)
 _present.def_abstract_eval(lambda x: x)
 ad.primitive_jvps[_present] = lambda primals, tangents: (present(*primals), *tangents)
-batching.primitive_batchers[_present] = _mapped
+batching.primitive_batchers[_present] = _batch_present
 mlir.register_lowering(_present, lambda context, x: [x])

@@ -35,17 +35,20 @@ def threefry(graph: Graph, key: Key, high: Node, low: Node) -> Node:
 
 
 def _new_key(graph: Graph, key: Key, high: Node, low: Node) -> Key:
+    """Return the hash of a counter's two words by a key, as a key."""
     both = threefry(graph, key, high, low)
     shifted = graph.node("shift_right", "u64", both, graph.constant(32, "u64"))
     return Key(graph.node("convert", "u32", shifted), graph.node("convert", "u32", both))
 
 
 def _wrap(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    """Return keys (...) made of words (..., 2)."""
     _check(equation.outvars[0])
     return [keys_of(inputs[0])]
 
 
 def _unwrap(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    """Return the words (..., 2) of keys (...)."""
     _check(equation.invars[0])
     words = [word for key in inputs[0].ravel().tolist() for word in (key.first, key.second)]
     return [array_of(words, result_shape(equation))]
@@ -88,6 +91,7 @@ def _seed(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> l
     graph = lowering.graph
 
     def words(number: Node) -> Key:
+        """Return the key of a number: its high word, 0 of one of 32 bits, and its low word."""
         if number.type[1:] == "32":
             return Key(graph.constant(0, "u32"), graph.node("convert", "u32", number))
         whole = graph.node("convert", "u64", number)
@@ -114,6 +118,7 @@ def _gamma(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> 
 
 
 def _same(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    """Return the keys as they are."""
     return inputs
 
 
@@ -139,7 +144,10 @@ RULES |= {
 
 
 def hash_words(first: Word, second: Word, high: Word, low: Word) -> Word:
-    """Hash words: 20 rounds of addition, rotation and exclusive or; key words are added every four rounds."""
+    """Return the hash, of 64 bits, of a counter's words by a key's: Threefry of two words of 32 bits.
+
+    20 rounds of addition, rotation and exclusive or; key words are added every four rounds.
+    """
     keys = (first, second, first ^ second ^ PARITY)
     x, y, mask = (high + first) & 0xFFFFFFFF, (low + second) & 0xFFFFFFFF, 0xFFFFFFFF
     for four in range(5):

@@ -29,8 +29,9 @@ OF_ENTRIES = (
 def is_long(inputs: list[Value]) -> bool:
     """Return whether nodes for all entries of an argument would be too many.
 
-    Those of tables are constants: they are no more where the other arguments are as many nodes, or where all that is
-    left to compute is known or, as in q I, of few entries. Zeros stay structure then.
+    More than LOADED numbers in memory always are. More than TABLE are, unless all arrays in memory are tables of
+    constants and the other arguments are as many nodes, or what is left to compute is known or, as in q I, of few
+    entries. Zeros stay structure then.
     """
     views = [x for x in inputs if isinstance(x, InMemory)]
     longest = max((x.size for x in views), default=0)

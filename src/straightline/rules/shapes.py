@@ -30,24 +30,29 @@ def _broadcast_in_dim(x: np.ndarray, params: Any, shape: tuple[int, ...]) -> np.
 
 
 def _slice(x: np.ndarray, params: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Return entries from start to limit along each axis, by steps."""
     steps = params["strides"] or (1,) * x.ndim
     return x[tuple(map(slice, params["start_indices"], params["limit_indices"], steps))]
 
 
 def _split(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    """Return an array's parts along an axis."""
     ends = np.cumsum(equation.params["sizes"])[:-1]
     return np.split(inputs[0], ends, axis=equation.params["axis"])
 
 
 def _concatenate(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    """Return arrays one after another along an axis."""
     return [np.concatenate(inputs, axis=equation.params["dimension"])]
 
 
 def _stack(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    """Return arrays along a new axis."""
     return [np.stack(inputs, axis=equation.params["axis"])]
 
 
 def _unstack(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    """Return an array's entries along an axis."""
     rows = np.moveaxis(inputs[0], equation.params["axis"], 0)
     return [rows[i : i + 1].reshape(rows.shape[1:]) for i in range(len(rows))]
 
@@ -68,6 +73,7 @@ def _lower_pad(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray])
 
 
 def _iota(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[Any]:
+    """Return 0, 1, 2, ... along one axis, the same along the others."""
     shape, axis = result_shape(equation), equation.params["dimension"]
     along = np.arange(shape[axis]).astype(equation.params["dtype"])
     return [lowering.known(np.broadcast_to(along.reshape([-1 if d == axis else 1 for d in range(len(shape))]), shape))]

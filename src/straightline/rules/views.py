@@ -30,22 +30,26 @@ def _make_view_rule(name: str, view: View) -> Rule:
 
 
 def _slice(x: InMemory, params: Any, shape: tuple[int, ...]) -> InMemory:
+    """Return a view from start to limit along each axis, by steps."""
     steps = params["strides"] or (1,) * x.ndim
     offset = sum(s * first for s, first in zip(x.strides, params["start_indices"], strict=True))
     return x.view(shape, [s * step for s, step in zip(x.strides, steps, strict=True)], offset)
 
 
 def _reverse(x: InMemory, params: Any, shape: tuple[int, ...]) -> InMemory:
+    """Return a view that goes backwards along some axes."""
     axes = params["dimensions"]
     offset = sum(x.strides[a] * (x.shape[a] - 1) for a in axes)
     return x.view(shape, [-s if a in axes else s for a, s in enumerate(x.strides)], offset)
 
 
 def _transpose(x: InMemory, params: Any, shape: tuple[int, ...]) -> InMemory:
+    """Return a view with the axes in another order."""
     return x.view(shape, [x.strides[a] for a in params["permutation"]])
 
 
 def _reshape(x: InMemory, params: Any, shape: tuple[int, ...]) -> InMemory | None:
+    """Return a view of another shape; None if no strides describe it."""
     return x.reshaped(shape)
 
 

@@ -118,7 +118,7 @@ def erf_inv(x: Vector) -> Vector:
     w = -_log1p(-(x * x))
 
     def outer() -> Vector:
-        # One draw in a thousand.
+        """Return the factor for w >= 6.25, which one draw in a thousand needs."""
         middle, root = w < 16.0, sqrt(w)
         tail = polynomial(root - 5, INVERSE[2][::-1])
         end = polynomial(root - 3.25, INVERSE[1][::-1])

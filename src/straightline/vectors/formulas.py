@@ -1,6 +1,6 @@
 """Formulas on vectors as text of LLVM IR: `a * b + c` on `Vector`s appends operations to a `Body`.
 
-Every function of `vector_math` is one straight line of such operations. Numbers of Python stand for vectors of that
+Every function of this folder is one straight line of such operations. Numbers of Python stand for vectors of that
 number. Operations are written as they stand: no contraction, no reordering; `fma` rounds once.
 """
 
@@ -51,7 +51,10 @@ class Body:
 
 
 def _operator(real: str, whole: str, turned: bool = False) -> Callable[["Vector", Operand], "Vector"]:
-    """Operator of vectors: an instruction on real numbers, another on integers, arguments turned round or not."""
+    """Return the method of an operator of vectors: the instruction `real` on real numbers, `whole` on integers.
+
+    `turned`: whether the other argument is the first one, as in `2 - x`.
+    """
 
     def apply(self: "Vector", other: Operand) -> "Vector":
         pair = (self, self.like(other))

@@ -144,4 +144,5 @@ def atan2(y: Vector, x: Vector) -> Vector:
 
 
 def _is_number(x: Vector) -> Vector:
+    """Return where x is not NaN."""
     return x.equals(x)
