@@ -101,7 +101,7 @@ def _take_entries(entries: jax.Array, places: np.ndarray) -> jax.Array:
 
 
 def is_positive(x: jax.Array) -> jax.Array:
-    """Test whether x is above zero and 1 / x is a number too, which it is not of the smallest: these count as 0."""
+    """Return whether x is a positive normal number: of smaller ones 1 / x may be infinite, so that they count as 0."""
     return x > float(np.finfo(np.dtype(x.dtype)).tiny)
 
 
@@ -117,7 +117,7 @@ def reciprocal_or_zero(x: jax.Array) -> jax.Array:
 
 
 def square_root(x: jax.Array) -> jax.Array:
-    """Return the root of x, of slope 0 at 0: what is even in it has one there, and 0 times infinity would be none."""
+    """Return the root of x, with the derivative 0 at 0: times the infinite one a derivative of 0 would be NaN."""
     positive = x > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
 

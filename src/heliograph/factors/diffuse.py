@@ -170,20 +170,24 @@ def _hear(x: Diffuse, h: jax.Array, noise: jax.Array) -> tuple[Diffuse, jax.Arra
     Source: Bierman, Factorization methods for discrete sequential estimation (1977), at two levels.
     """
     n, root = len(x.mean), x.root
+    # Sums over the columns k > j that are done: s = r + sum f_k^2 d_k, far = sum f_k^2 d_inf,k, and k = Cov(x, number).
     s, far, k = noise, jnp.zeros_like(noise), jnp.zeros(n)
     columns, d, d_inf = [root[:, j] for j in range(n)], list(x.variances), list(x.infinite)
     for j in reversed(range(n)):
         column = columns[j]
         f, reach = h @ column, jnp.abs(h) @ jnp.abs(column)
         is_far, heard = d_inf[j] > 0, jnp.abs(f) > DEAF * reach
-        new = is_far & heard
+        new = is_far & heard  # an unknown direction that the number tells of
         first_heard = new & (far == 0)
         # Level of the step: the finite sum before anything unknown is heard, the infinite one after.
         level = jnp.where(far > 0, far, s)
+        # Bierman's step, L_j - (f_j / s_{j+1}) w_{j+1}; slopes of an unknown direction that is not heard are rounding.
         columns[j] = jnp.where(is_far & ~heard, column, column - f * reciprocal_or_zero(level) * k)
         s_after, far_after = s + jnp.where(is_far, 0.0, f**2 * d[j]), far + jnp.where(new, f**2 * d_inf[j], 0.0)
+        # Beside an unknown direction that is heard, all finite ones are nothing.
         finite_gain = jnp.where(is_far | (far > 0), 0.0, d[j] * f)
         k = jnp.where(first_heard, 0.0, k) + column * jnp.where(new, d_inf[j] * f, finite_gain)
+        # d_j s_{j+1} / s_j; the first unknown direction that is heard is known then with the variance s / f^2.
         shrunk = jnp.where(far > 0, d[j], d[j] * s * reciprocal_or_zero(s_after))
         d[j] = jnp.where(is_far, jnp.where(first_heard, s * reciprocal_or_zero(f**2), 0.0), shrunk)
         d_inf[j] = jnp.where(first_heard, 0.0, jnp.where(new, d_inf[j] * far * reciprocal_or_zero(far_after), d_inf[j]))

@@ -32,11 +32,11 @@ def angles_named(name: str, circular: Sequence[str], names: Sequence[str]) -> An
 
 
 def angles_at(angles: object, size: int) -> Angles:
-    """Return places of angles among so many components, as a user lists them."""
-    which = array("angles", items("angles", angles, "places"), (None,)).tolist()
-    if not set(which) <= set(range(size)):
-        raise fail("angles", f"places from 0 to {size - 1}", which)
-    return tuple(map(int, which))
+    """Return the places of angles among `size` components, from a user's list of them, checked."""
+    places = array("angles", items("angles", angles, "places"), (None,)).tolist()
+    if not set(places) <= set(range(size)):
+        raise fail("angles", f"places from 0 to {size - 1}", places)
+    return tuple(map(int, places))
 
 
 def nearest(value: A, reference: Array, angles: Angles) -> A:

@@ -60,6 +60,7 @@ def share_by_object(make: Callable[[S], T]) -> Callable[[S], T]:
 
     @wraps(make, updated=())
     def once(source: S) -> T:
+        """Return what was made of this object and is still in use, else make it."""
         made = in_use.get(id(source))
         if made is None:
             made = in_use[id(source)] = make(source)

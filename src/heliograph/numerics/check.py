@@ -109,11 +109,8 @@ def array(name: str, value: ArrayLike, shape: tuple[int | str | None, ...], miss
 
 def check_numbers(name: str, numbers: Any, shape: tuple[int | str | None, ...], missing: bool = False) -> Any:
     """Return an array of numbers that has the shape, and finite ones as `array` says; not a copy of it."""
-    matches = numbers.ndim == len(shape) and all(
-        not isinstance(projection, int) or projection == have
-        for projection, have in zip(shape, numbers.shape, strict=True)
-    )
-    if not matches:
+    fixed = [(axis, length) for axis, length in enumerate(shape) if isinstance(length, int)]
+    if numbers.ndim != len(shape) or any(numbers.shape[axis] != length for axis, length in fixed):
         raise fail(name, _describe_shape(shape, numbers.ndim), f"shape {numbers.shape}")
     if not isinstance(numbers, np.ndarray):  # traced
         return numbers
@@ -183,6 +180,7 @@ def scalar(name: str, value: ArrayLike, low: float = -np.inf, high: float = np.i
 
 
 def _describe_range(low: float, high: float) -> str:
+    """Return in words which numbers lie between two limits."""
     if 0 < low <= TINY:
         return "a positive number" + (f" up to {high:g}" if high < np.inf else "")
     return f"a number of at least {low:g}" if high == np.inf else f"a number from {low:g} to {high:g}"

@@ -55,6 +55,7 @@ def compensate(function: Callable[[jax.Array], jax.Array], unit: float) -> Calla
     """
 
     def evaluate(x: Compensated) -> Compensated:
+        """Return f(high + low) as high + low, 0 where the low part is no number."""
         program = jax.make_jaxpr(function)(x.high)
         result = _Evaluation(unit).inline(program, [x])[0]
         low = jnp.zeros_like(result.high) if result.low is None else result.low
@@ -134,6 +135,7 @@ class _Evaluation:
         return Compensated(total, _add_up(error, a.low, b.low))
 
     def _subtract(self, a: Compensated, b: Compensated, **_: Any) -> Compensated:
+        """Subtract: add the negative."""
         return self._add(a, Compensated(-b.high, None if b.low is None else -b.low))
 
     def _multiply(self, a: Compensated, b: Compensated, **_: Any) -> Compensated:
@@ -156,9 +158,11 @@ class _Evaluation:
         return Compensated(root, rest / (2 * root))
 
     def _square(self, a: Compensated, **_: Any) -> Compensated:
+        """Multiply a number by itself."""
         return self._multiply(a, a)
 
     def _raise_to_integer(self, a: Compensated, y: int, **_: Any) -> Compensated:
+        """Return a^y as y products; its reciprocal for y < 0, 1 for y = 0."""
         if y < 1:
             return self._divide(Compensated(np.ones(())), self._raise_to_integer(a, y=-y)) if y else _one_like(a)
         return reduce(self._multiply, [a] * y)
@@ -183,11 +187,13 @@ class _Evaluation:
 
     def _contract(self, a: Compensated, b: Compensated, dimension_numbers: Any, **_: Any) -> Compensated:
         """Multiply matrices by the products of entries, added one after another."""
+        # Axes that are summed over, and axes of a batch; the result has the axes batch, rest of a, rest of b.
         (over_a, over_b), (same_a, same_b) = dimension_numbers
         left, right = (_arrange(*part) for part in ((a, same_a, over_a, True), (b, same_b, over_b, False)))
-        shape = [jnp.shape(x.high)[n] for x, same in ((a, same_a),) for n in same]
-        shape += [n for x, gone in ((a, (*same_a, *over_a)), (b, (*same_b, *over_b)))
-                  for i, n in enumerate(jnp.shape(x.high)) if i not in gone]  # fmt: skip
+        size_a, size_b = jnp.shape(a.high), jnp.shape(b.high)
+        shape = [size_a[axis] for axis in same_a]
+        shape += [n for axis, n in enumerate(size_a) if axis not in (*same_a, *over_a)]
+        shape += [n for axis, n in enumerate(size_b) if axis not in (*same_b, *over_b)]
         products = [self._multiply(x, y) for x, y in zip(_take_apart(left, 1), _take_apart(right, 1), strict=True)]
         if not products:
             return Compensated(jnp.zeros(shape))
@@ -285,8 +291,10 @@ def _add_up(*terms: Any) -> Any:
 
 
 def _or_zero(x: Any) -> Any:
+    """Return a low part, 0 where nothing was lost."""
     return 0.0 if x is None else x
 
 
 def _one_like(a: Compensated) -> Compensated:
+    """Return ones of a number's shape."""
     return Compensated(jnp.ones_like(a.high))

@@ -12,6 +12,7 @@ import numpy as np
 
 from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.process.collector import no_collector
+from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import PyTree
 
 _first: list[int] = []  # the process in which something was computed first; a fork inherits it
@@ -120,7 +121,7 @@ def in_float64(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def scoped(*args: P.args, **kwargs: P.kwargs) -> R:
-        if _is_traced((args, kwargs)):
+        if is_traced((args, kwargs)):
             return function(*args, **kwargs)
         check_process()
         with jax.enable_x64(True):
@@ -155,7 +156,7 @@ def _known_in_float64(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def scoped(*args: P.args, **kwargs: P.kwargs) -> R:
-        if jax.dtypes.canonicalize_dtype(float).itemsize == 8 or _is_traced((args, kwargs)):
+        if jax.dtypes.canonicalize_dtype(float).itemsize == 8 or is_traced((args, kwargs)):
             return function(*args, **kwargs)
         with jax.ensure_compile_time_eval(), jax.enable_x64(True):
             arrays: R = to_numpy(function(*args, **kwargs))
@@ -174,7 +175,7 @@ def compile_in_float64(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        if _is_traced((args, kwargs)):
+        if is_traced((args, kwargs)):
             return function(*args, **kwargs)
         check_process()
         with jax.enable_x64(True):
@@ -182,10 +183,6 @@ def compile_in_float64(function: Callable[P, R]) -> Callable[P, R]:
         return arrays
 
     return call
-
-
-def _is_traced(tree: PyTree) -> bool:
-    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
 
 
 def as_array(leaf: object) -> object:

@@ -15,9 +15,9 @@ from heliograph.numerics.types import Array, Float
 WRITTEN = 24  # rows that are written out one after another; more are a loop
 PIVOT_TOLERANCE = 1e-14  # of a component's own variance: what is left of it, given those before it, is zero
 NEGATIVE_TOLERANCE = 1e-10  # of the same: a pivot this far below zero is rounding of a singular matrix
-OFF_SUPPORT = 1e-6  # standard deviations, and
+# How far a component that others determine may be from what they say: OFF_SUPPORT deviations and OFF_VALUE of its size.
+OFF_SUPPORT, OFF_VALUE = 1e-6, 1e-9
 KNOWN = 16  # roundings of its size: a deviation of no more says that a component is known
-OFF_VALUE = 1e-9  # of its size: how far a component that the others determine may be from what they say
 
 
 def symmetric(a: jax.Array) -> jax.Array:
@@ -55,7 +55,7 @@ def rounding(tolerance: float, like: jax.Array | np.ndarray, units: int = 10) ->
 
 @jax.jit
 def factor(a: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Lower L with A = L L' of a positive semidefinite A, and the reciprocals of its diagonal, (n, n) and (n,).
+    """Return lower L with A = L L' of a positive semidefinite A, and the reciprocals of its diagonal, (n, n) and (n,).
 
     Column by column: the first column of what is left of A, times the reciprocal root of its pivot; of a zero column
     that is 0. A pivot is judged by the component's own diagonal entry: units do not decide what is singular.
@@ -112,7 +112,7 @@ def negative_tolerance(like: jax.Array, growth: jax.Array) -> jax.Array:
 
 
 def cholesky(a: Float[Array, "n n"]) -> Float[jax.Array, "n n"]:
-    """Lower factor L of a positive semidefinite matrix, A = L L'.
+    """Return the lower factor L of a positive semidefinite matrix, A = L L'.
 
     A pivot that is zero to rounding of its own diagonal entry gives a zero column, so a singular covariance (a
     component known exactly) has its factor whatever the units; a negative pivot gives NaN, which the driver reports

@@ -219,6 +219,7 @@ def _list_entries(value: object) -> Iterable[tuple[str, object]]:
 
 
 def _format_cell(value: object, depth: int) -> str:
+    """Return a value as a cell of HTML: a line of text, which opens to a table of the value's parts if it has some."""
     text = escape(cut(line(value, depth)))
     opens = _is_ours(value) or (isinstance(value, Mapping) and value)
     return f"<details><summary>{text}</summary>{_format_table(value, depth)}</details>" if opens and depth > 0 else text

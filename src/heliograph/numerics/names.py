@@ -25,6 +25,7 @@ def lazy_names(package: str, file: str) -> tuple[Callable[[str], object], Callab
     load, listed, names = lazy_loader.attach_stub(package, file)
 
     def attribute(name: str) -> object:
+        """Return a public name, loaded; raise with the names most like it where there is none."""
         if name in names or name.startswith("_"):
             with no_collector():
                 return load(name)
@@ -68,6 +69,7 @@ def closest(name: str, known: Mapping[str, str]) -> list[str]:
 
 
 def _plain(name: str) -> str:
+    """Return a name in small letters without underscores."""
     return name.lower().replace("_", "")
 
 
@@ -84,4 +86,5 @@ def _list_public(package: str, names: list[str]) -> dict[str, str]:
 
 
 def _is_room(package: str, name: str) -> bool:
+    """Return whether a public name is that of a folder or file of the package."""
     return find_spec(f"{package}.{name}") is not None

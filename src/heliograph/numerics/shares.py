@@ -39,7 +39,7 @@ def wilson(hits: float, of: float) -> Share:
 
 
 def count_independent(values: Float[np.ndarray, " time"]) -> float:
-    """Return number of independent values that say as much, N (1 - a) / (1 + a), a the correlation of neighbours."""
+    """Return how many independent values say as much: N (1 - a) / (1 + a), a the correlation of neighbours."""
     apart = values - np.mean(values)
     power = float(np.sum(apart**2))
     a = np.clip(np.sum(apart[1:] * apart[:-1]) / power, 0.0, 0.999) if power and len(values) > 2 else 0.0

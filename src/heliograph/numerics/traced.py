@@ -67,6 +67,7 @@ def describe_rounded(rounded: tuple[float, float]) -> str:
 
 @cache
 def _say(text: str) -> None:
+    """Warn once in a process, at the line that called the check of a user's array."""
     warnings.warn(text, stacklevel=4)
 
 

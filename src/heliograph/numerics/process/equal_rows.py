@@ -40,9 +40,10 @@ def repeat_row(row: np.ndarray, count: int) -> np.ndarray:
 def _map_rows(row: np.ndarray, count: int) -> np.ndarray | None:
     """Return the rows as pieces of memory that are mapped again and again; None where the system has no such."""
     map_memory, size = _system_call(), row.nbytes * count
-    unit = math.lcm(row.nbytes, mmap.PAGESIZE)  # whole rows in whole pages
+    # A piece: whole rows in whole pages, of PIECE bytes at least, and of so many that PIECES of them are enough.
+    unit = math.lcm(row.nbytes, mmap.PAGESIZE)
     piece = unit * max(-(-PIECE // unit), -(-size // (unit * PIECES)))
-    if map_memory is None or size < 4 * piece or len(_held) >= MOST:
+    if map_memory is None or size < 4 * piece or len(_held) >= MOST:  # of fewer than four pieces little is saved
         return None
     try:
         file = os.memfd_create("heliograph-rows", os.MFD_CLOEXEC)

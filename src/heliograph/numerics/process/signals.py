@@ -22,6 +22,7 @@ def handlers(handler: Callable[[int, FrameType | None], object]) -> Iterator[Non
     """
 
     def handle(number: int, frame: FrameType | None) -> None:
+        """Pass a signal to the handler, or raise it again soon while a module in C is imported."""
         if _imports_in_c(frame):
             again = Timer(SOON, interrupt_main, (number,))
             again.daemon = True

@@ -18,13 +18,16 @@ def find_out_of_order(time: np.ndarray) -> Bool[np.ndarray, " rows"]:
     """
     if np.all(time[1:] >= time[:-1]):
         return np.zeros(len(time), dtype=bool)
+    # A subsequence of times that does not fall, read from its end, is one of negated times that does not fall.
     falling = (-time.astype(np.int64) if time.dtype.kind in "Mi" else -time)[::-1].tolist()
-    tails, last = list[float](), list[int]()  # of each length, the least end of a subsequence, and its row
+    # Of subsequences of each length the least end, and its row; and for each row the one before it in its subsequence.
+    tails, last = list[float](), list[int]()
     before = list[int]()
     for row, value in enumerate(falling):
         length = bisect_right(tails, value)
         before.append(last[length - 1] if length else -1)
         tails[length : length + 1], last[length : length + 1] = [value], [row]
+    # All rows are out of order but those of the longest subsequence, from its end back.
     out = np.ones(len(time), dtype=bool)
     row = last[-1]
     while row >= 0:
@@ -44,15 +47,17 @@ def find_astray(time: np.ndarray, year: float = YEAR) -> Bool[np.ndarray, " even
         time: the stamps.
         year: a year in their unit (default nanoseconds).
     """
+    # Stretches of messages between which the stamp jumps by more than a year.
     stretches = np.split(np.arange(len(time)), np.flatnonzero(np.abs(np.diff(time)) > year) + 1)
     astray = np.zeros(len(time), dtype=bool)
     for before, one, after in zip(stretches, stretches[1:], stretches[2:], strict=False):
         returns = abs(int(time[after[0]]) - int(time[before[-1]])) <= year
         astray[one] = returns and len(one) < len(before) + len(after)
-    first, later = stretches[0], time[len(stretches[0]) :][~astray[len(stretches[0]) :]]
-    astray[first] = (
-        len(later) and later.min() >= CENTURY / YEAR * year and np.all((time[first] >= 0) & (time[first] < year))
-    )
+    # The first stretch: in the year from which clocks count, where all sound stamps after it are of this century.
+    first = stretches[0]
+    later = time[len(first) :][~astray[len(first) :]]
+    in_first_year = bool(np.all((time[first] >= 0) & (time[first] < year)))
+    astray[first] = in_first_year and len(later) > 0 and bool(later.min() >= CENTURY / YEAR * year)
     if not astray.any():
         return astray
     others = time[~astray]

@@ -88,6 +88,7 @@ def _list_elements(value: object) -> list[Any]:
 
 
 def _is_date(part: object) -> bool:
+    """Return whether something may be a date: a text, a datetime64, a date or datetime, or a period of pandas."""
     return isinstance(part, str | np.datetime64) or hasattr(part, "isoformat") or hasattr(part, "to_timestamp")
 
 

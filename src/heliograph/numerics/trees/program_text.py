@@ -52,15 +52,18 @@ class _Writer:
         return "\n".join([*head, *body, self._write_uses(numbers, jaxpr.outvars)])
 
     def _line(self, numbers: dict[Var, int], equation: JaxprEqn) -> str:
+        """Return the line of an operation: types of its results, its name, its parameters and its arguments."""
         used, how = self._write_uses(numbers, equation.invars), self._write_value(equation.params)
         return f"{self._write_definitions(numbers, equation.outvars)} = {equation.primitive.name} {how} {used}"
 
     def _write_definitions(self, numbers: dict[Var, int], variables: Sequence[Var]) -> str:
+        """Number new variables, in `numbers`; return their types."""
         for variable in variables:
             numbers[variable] = len(numbers)
         return " ".join(str(variable.aval) for variable in variables)
 
     def _write_uses(self, numbers: Mapping[Var, int], atoms: Sequence[Var | Literal]) -> str:
+        """Return the numbers of variables, and literals as they are."""
         return " ".join(self._write_value(x.val) if isinstance(x, Literal) else str(numbers[x]) for x in atoms)
 
     def _write_value(self, value: Any) -> str:
@@ -82,6 +85,7 @@ class _Writer:
         return getattr(value, "__name__", "") if callable(value) else ADDRESS.sub("", repr(value))
 
     def _hash(self, program: object, jaxpr: Jaxpr, consts: Sequence[Any]) -> str:
+        """Return the hash of an inner program's text, written once."""
         if id(program) not in self._hashes:
             self._hashes[id(program)] = program, short_name(self.lines(jaxpr, consts))
         return self._hashes[id(program)][1]

@@ -33,4 +33,5 @@ def cast(whole: object) -> tuple[list[jax.Array], Static]:
 
 
 def _convert_leaf(leaf: object) -> object:
+    """Return a number of Python as an array, anything else as it is."""
     return np.asarray(leaf) if isinstance(leaf, int | float) else leaf
