@@ -197,7 +197,12 @@ class EventFilter(AbstractSizedFilter):
     ) -> GaussianSum:
         """Condition the sum on silence: nothing was sent, or it was sent and lost.
 
-        `lost`: whether the receiver was told of a loss, or how many; NaN where it was not.
+        Args:
+            augmented: law of (x, r, y), r what the sender compares y with.
+            channel: the link, by mode.
+            lost: whether the receiver was told of a loss, or how many; NaN where it was not.
+            s: number of the sender.
+            begun: whether the sender has something to compare with.
         """
         n, m, sender = len(self.states), self.outputs, self.senders[s]
         state_and_reference, label = np.r_[0 : n + m], augmented.label[:, s]
@@ -239,7 +244,10 @@ class EventFilter(AbstractSizedFilter):
     def _condition_on_value(
         self, augmented: GaussianSum, channel: SideInformation, z: jax.Array, lost: jax.Array, s: int, begun: jax.Array
     ) -> tuple[GaussianSum, jax.Array, jax.Array]:
-        """Condition on a value: a Kalman update of each Gaussian, weighed by its density and by why it was sent."""
+        """Condition on a value: a Kalman update of each Gaussian, weighed by its density and by why it was sent.
+
+        Returns the sum, and mean and covariance predicted of a value that comes; arguments as `_condition_on_silence`.
+        """
         # Probability that this pattern of values arrives, by mode.
         sender, arrived = self.senders[s], ~jnp.isnan(z)
         pattern = arrived if len(self.senders) == 1 else jnp.ones(self.outputs, dtype=bool)

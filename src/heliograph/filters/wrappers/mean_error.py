@@ -87,6 +87,7 @@ def _bound(filter: ToldFilter, contexts: Contexts, u: Array) -> jax.Array:
         return covariance
 
     def step(carry: Carry, row: tuple[jax.Array, jax.Array]) -> tuple[Carry, jax.Array]:
+        """Step over one row: the mean covariance in each mode, and as output that in the mean over the modes."""
         state, before, law = carry
         k, u_k = row
 

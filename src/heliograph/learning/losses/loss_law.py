@@ -208,6 +208,7 @@ def _condition_on_ends(counts: np.ndarray, spans: np.ndarray, intervals: bool) -
     """
 
     def likelihood(x: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return l at the logits x of (a, b), and its slope in them."""
         # P_m = again / total; power = (1 - a - b)^m, slope its derivative in a and in b.
         a, b = shares = 1 / (1 + np.exp(-x))
         kept = 1 - a - b

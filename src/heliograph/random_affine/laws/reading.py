@@ -86,9 +86,11 @@ def _integrate_posterior(law: AbstractLaw, a: jax.Array, variance: jax.Array) ->
     deviation = jnp.sqrt(variance)
 
     def to_gain(t: jax.Array) -> jax.Array:
+        """Return the gain g at t."""
         return jnp.exp(t) if law.logarithmic else t**4
 
     def from_gain(g: Float[Array, ""]) -> jax.Array:
+        """Return the t of a gain, of a negative one that of 0."""
         return jnp.log(jnp.maximum(g, np.finfo(float).tiny)) if law.logarithmic else jnp.maximum(g, 0.0) ** 0.25
 
     def log_density(t: jax.Array) -> jax.Array:

@@ -46,11 +46,13 @@ def _listen_mqtt(address: Address, seconds: float, topics: dict[str, Topic]) -> 
     ready = threading.Event()
 
     def subscribe(client: Client, data: object, flags: ConnectFlags, code: ReasonCode, more: Properties | None) -> None:
+        """Ask for all topics once connected, and say that it is ready; a refused connection says so by its silence."""
         if not code.is_failure:
             client.subscribe("#", 0)
             ready.set()
 
     def note_message(client: Client, data: object, message: MQTTMessage) -> None:
+        """Note a message under its topic, with the time of its arrival."""
         if not message.retain:  # a stored message says nothing of rate and lateness
             note(topics, message.topic, bytes(message.payload), time.time_ns())
 
@@ -79,6 +81,7 @@ async def _listen_nats(address: Address, seconds: float, topics: dict[str, Topic
     from nats.errors import Error
 
     async def note_message(received: Msg) -> None:
+        """Note a message under its topic, words between slashes, but for the server's own."""
         if not received.subject.startswith(INTERNAL):
             note(topics, received.subject.replace(".", "/"), received.data, time.time_ns())
 

@@ -162,6 +162,7 @@ class Nats:
             failures = list[Exception]()  # the client reports these by a callback and raises another error
 
             async def note_failure(error: Exception) -> None:
+                """Keep an error of the connection that is being made."""
                 failures.append(error)
 
             connecting = self._client.connect(

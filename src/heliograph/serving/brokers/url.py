@@ -78,8 +78,9 @@ def parse_address(url: str, environment: Mapping[str, str] | None = None) -> Add
         host, port = parts.hostname, parts.port
     except ValueError:
         raise fail("broker", shape, "an address that cannot be read") from None
-    own = parts.scheme not in PORTS and bool(parts.scheme) and find_plugin(BROKERS, parts.scheme) is not None
-    if (parts.scheme not in PORTS and not own) or not host or parts.query or parts.fragment:
+    is_known = parts.scheme in PORTS
+    is_offered = not is_known and bool(parts.scheme) and find_plugin(BROKERS, parts.scheme) is not None
+    if not (is_known or is_offered) or not host or parts.query or parts.fragment:
         raise fail("broker", shape, f"{parts.scheme}://{host or ''}")
     user = environment.get(USER) or (unquote(parts.username) if parts.username else None)
     password = environment.get(PASSWORD) or (unquote(parts.password) if parts.password else None)
@@ -90,7 +91,7 @@ def parse_address(url: str, environment: Mapping[str, str] | None = None) -> Add
     topic = unquote(parts.path).strip("/") or TOPIC
     if any(sign in topic for sign in "*>+#.$ ") or not topic.isprintable():
         raise fail("broker, topic", "words between slashes, without . * > + # $ and spaces", topic)
-    if own:
+    if is_offered:
         return Address(parts.scheme, host, port or 0, topic, False, user, password)
     kind = "mqtt" if parts.scheme.startswith("mqtt") else "nats"
     return Address(kind, host, port or PORTS[parts.scheme], topic, parts.scheme in SECURE, user, password)

@@ -266,23 +266,26 @@ def make_application(watch: Watch, token: str | None, stopped: asyncio.Event, ho
     tallies = ServiceMetrics(watch)
     overview = LastAnswers(watch.lock, lambda _: make_overview_page(watch), make_overview_page(watch))
 
-    # The first view is written into the page, in place of its only "null"; all others come from /events.
     def page(request: Request) -> Response:
+        """Answer with the page, the first view in place of its only "null"; all others come from /events."""
         # Without a "<" no name ends the element that the view stands in.
         first = json.dumps(watch.view(request.query_params.get("plant"))).replace("<", "\\u003c")
         return Response(_read_page_file("page.html").replace("null", first, 1), media_type="text/html", headers=POLICY)
 
     def metrics(_: Request) -> Response:
+        """Answer with all counts, in the text format of Prometheus."""
         return Response(tallies.text(), media_type=CONTENT_TYPE_LATEST)
 
     def events(request: Request) -> Response:
+        """Answer with a stream of views, a server-sent event each."""
         return StreamingResponse(_yield_events(watch, request, stopped), media_type="text/event-stream")
 
     def plants(_: Request) -> Response:
+        """Answer with the page of all plants."""
         return Response(overview.ask(), media_type="text/html", headers=POLICY)
 
-    # It says only that the service serves, so that it needs no token.
     def health(_: Request) -> Response:
+        """Answer whether the service serves, or a batch is stuck: no more than that, so that it needs no token."""
         busy = watch.busy()
         if busy > STUCK:
             return PlainTextResponse(f"a batch has been taken for {busy:.0f} s", 503)

@@ -89,6 +89,7 @@ def sweep_back(static: Static, dt: int | None) -> tuple[Callable[..., PyTree], C
         sweep: Sweep = static.filled(numbers)
         begin, stop = span
         last = stop - 1, history.step[stop - 1]
+        # Steps from the last row back to row `begin`.
         count = stop - 1 - begin if dt is not None else history.step[stop - 1] - history.step[begin]
         # Zeros of the shapes of a smoother step, without computing one.
         shapes = jax.eval_shape(lambda: step_into(sweep, history, last))

@@ -37,7 +37,7 @@ from heliograph.simulation.transmission.shared_fading import (
     start_modes,
 )
 
-ObservationModel = tuple[jax.Array, ...]  # (node, received) of each group
+Measurements = tuple[jax.Array, ...]  # (node, received) of each group
 
 
 class AbstractMedium(Module):
@@ -49,7 +49,7 @@ class AbstractMedium(Module):
 
     def receive(
         self, state: PyTree, x: jax.Array, u: jax.Array, key: jax.Array, k: jax.Array
-    ) -> tuple[PyTree, ObservationModel]:
+    ) -> tuple[PyTree, Measurements]:
         """Deliver the measurements of the nodes of each group at step k, x the state to which u led; NaN for none."""
         raise unwritten(self, "receive")
 
@@ -123,7 +123,7 @@ class SeparateChannels(AbstractMedium):
 
     def receive(
         self, state: PyTree, x: jax.Array, u: jax.Array, key: jax.Array, k: jax.Array
-    ) -> tuple[PyTree, ObservationModel]:
+    ) -> tuple[PyTree, Measurements]:
         """Measure x, subtract the reference of sensors with feedback, and deliver through the channels."""
 
         def receive_one(group: NodeGroup, link: LinkState) -> tuple[LinkState, jax.Array]:
@@ -208,7 +208,7 @@ class CommonChannel(AbstractMedium):
 
     def receive(
         self, state: PyTree, x: jax.Array, u: jax.Array, key: jax.Array, k: jax.Array
-    ) -> tuple[PyTree, ObservationModel]:
+    ) -> tuple[PyTree, Measurements]:
         """Measure x and deliver through the channel."""
         sensor, source = at(self.sensor, k), checksum(SENDER)
         y = measure(sensor, x, draw_key(key, k, source, SENSOR))
@@ -247,7 +247,7 @@ class Slots(AbstractMedium):
 
     def receive(
         self, state: Relayed, x: jax.Array, u: jax.Array, key: jax.Array, k: jax.Array
-    ) -> tuple[Relayed, ObservationModel]:
+    ) -> tuple[Relayed, Measurements]:
         """Sum the hops of this step's slot, at each listener."""
         # Signals: of the sensor, and C s of each relay.
         sensor = at(self.relays.sensor, k)
