@@ -81,12 +81,12 @@ from .model.words.encoder import (
 from .filters.event.factory import (
     event_filter as event_filter,
 )
-from .filters.gaussian.gaussian import (
+from .filters.gaussian.factories import (
     cubature_filter as cubature_filter,
     extended_filter as extended_filter,
     mean_gain_filter as mean_gain_filter,
 )
-from .filters.gaussian.gaussian import (
+from .filters.gaussian.factories import (
     kalman_filter as kalman_filter,
 )
 from .filters.gaussian.unscented import (

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.learning.likelihood.trust_region import maximise, trust_region_step
+from heliograph.learning.likelihood.trust_region import maximise
+from heliograph.learning.likelihood.trust_region_step import trust_region_step
 
 NATS = 1e-3  # below another search
 FOLDER = Path(__file__).resolve().parents[2] / "benchmarks"

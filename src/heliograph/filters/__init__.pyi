@@ -26,7 +26,7 @@ from .wrappers.delay import (
 from .wrappers.fed_back import (
     fed_back_filter as fed_back_filter,
 )
-from .gaussian.gaussian import (
+from .gaussian.factories import (
     gaussian_filter as gaussian_filter,
 )
 from .innovation import (

@@ -1,7 +1,7 @@
 """The filter whose innovations say how likely data are: by what plant, sensor and channel are."""
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.gaussian.gaussian import cubature_filter, kalman_filter
+from heliograph.filters.gaussian.factories import cubature_filter, kalman_filter
 from heliograph.filters.linear.linear import linear_filter
 from heliograph.filters.modes.multiple_model import imm_filter
 from heliograph.model.channel import Channel

@@ -42,7 +42,7 @@ from heliograph.simulation.runs.memory import Needed, check_memory, explain_out_
 from heliograph.simulation.runs.native import simulate_natively
 from heliograph.simulation.smoothed import Recorded, Smoother, finish, reduce_run, select_smoothed_part
 from heliograph.simulation.stepping import AllFilters
-from heliograph.simulation.transmission.reception import make_reception
+from heliograph.simulation.transmission.build_reception import make_reception
 from heliograph.simulation.world import World
 from heliograph.smoothing.fixed_interval_lag_point import AbstractSmoothing
 

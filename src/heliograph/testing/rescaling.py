@@ -14,7 +14,8 @@ from heliograph.filters.gaussian.belief import OpenLoop
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.gaussian.sequential import SequentialFilter
 from heliograph.filters.linear.linear import LinearFilter
-from heliograph.filters.linear.polynomial import MeanBeforeData, PolynomialFilter
+from heliograph.filters.linear.mean_before_data import MeanBeforeData
+from heliograph.filters.linear.polynomial import PolynomialFilter
 from heliograph.filters.linear.scheduled import LinearSystemFilter
 from heliograph.filters.modes.additive import AdditiveModalFilter
 from heliograph.filters.modes.mixture import AtomCombinations, MixtureFilter

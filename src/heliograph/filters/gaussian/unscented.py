@@ -4,7 +4,8 @@ import jax.numpy as jnp
 
 from heliograph.factors.columns import Columns, square_root
 from heliograph.factors.gaussian import Gaussian, Image
-from heliograph.filters.gaussian.gaussian import GaussianFilter, gaussian_filter
+from heliograph.filters.gaussian.factories import gaussian_filter
+from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.gaussian.transform import AbstractTransform, Function, evaluate_beside_mean
 from heliograph.filters.gaussian.update import AbstractUpdate
 from heliograph.filters.wrappers.limited import keeps_limits

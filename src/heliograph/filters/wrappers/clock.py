@@ -8,14 +8,10 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.factors.gaussian import Gaussian, correct_by_gain
-from heliograph.filters.base import (
-    Step,
-    corrects,
-    make_sizes,
-    predicts,
-)
+from heliograph.filters.base import Step, corrects, make_sizes, predicts
 from heliograph.filters.gaussian.belief import second_moments_at_start
-from heliograph.filters.gaussian.gaussian import GaussianFilter, gaussian_filter_of
+from heliograph.filters.gaussian.factories import gaussian_filter_of
+from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.gaussian.signal import innovation_covariance, make_received_noise, signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform, PolynomialMoments
 from heliograph.filters.gaussian.update import Polytope

@@ -6,14 +6,10 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.factors.gaussian import Gaussian
-from heliograph.filters.base import (
-    AbstractFilter,
-    Step,
-    corrects,
-    predicts,
-)
+from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.belief import second_moments_at_start
-from heliograph.filters.gaussian.gaussian import GaussianFilter, correct_signal, gaussian_filter_of
+from heliograph.filters.gaussian.factories import gaussian_filter_of
+from heliograph.filters.gaussian.gaussian import GaussianFilter, correct_signal
 from heliograph.filters.gaussian.signal import signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
 from heliograph.filters.gaussian.update import AbstractUpdate, Polytope

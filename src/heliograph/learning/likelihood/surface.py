@@ -9,7 +9,8 @@ import numpy as np
 from heliograph.learning.likelihood.data import Data
 from heliograph.learning.likelihood.evaluation import Evaluation, evaluate_at_points
 from heliograph.learning.likelihood.objective import Objective
-from heliograph.learning.likelihood.trust_region import FLAT, Domains, Evaluated, maximise
+from heliograph.learning.likelihood.trust_region import Domains, Evaluated, maximise
+from heliograph.learning.likelihood.trust_region_step import FLAT
 from heliograph.learning.parameters import Parameter
 from heliograph.numerics.types import Bool, Float
 

@@ -5,22 +5,22 @@ from typing import NamedTuple
 
 import numpy as np
 
+from heliograph.learning.likelihood.trust_region_step import (
+    expected_gain,
+    find_flat_directions,
+    multiply_lanes,
+    trust_region_step,
+)
 from heliograph.numerics.types import Bool, Float
 
 MOST_STEPS = 200
 FIRST_RADIUS = 10.0  # of the trust region, in standard errors
 WIDER, NARROWER = 3.0, 0.25  # factors of the radius after a step that the model foretold well, and badly
-FLAT = 1e-10  # eigenvalue of the scaled information below which a direction is not identified
 CLOSE = 1e-15  # g' H^-1 g: twice the log-likelihood that a full step gains, 3e-8 standard errors away
 NEAR = 1e-8  # the same where rounding lets nothing better be found: 1e-4 standard errors
 NOISE = 1e-13  # rounding of a log-likelihood, as a share of its size
 AT_LIMIT = 1e-6  # nats that remain to be gained on the way to the end of a domain
 SMALLEST_RADIUS = 1e-12
-SECULAR_STEPS = 20
-LONGEST = 5.0  # step of a logarithm or a logit: a factor of 150
-ROUNDING = 1e-14
-LEAST = 1e-150  # information, of which the square is a number
-LARGEST = 1e12  # curvature in units of standard errors: beyond this a model is taken for rounding
 JOINED = 0.1  # standard errors between two lanes that climb to one top, and of either from it
 BENT = 0.5  # of the information between two such lanes, that the likelihood bends by at least
 ALIKE = 0.1  # of the gain between two such lanes, that their slopes may leave unexplained
@@ -286,11 +286,11 @@ def _update_hessian(
     """
     # B+ = B + r r' / r' p with r = y - B p, so that B+ p = y, y the gradient before less that after the step.
     base = np.nan_to_num(state.model)
-    residual = np.where(sound[:, None], np.nan_to_num(state.gradient - gradient), 0.0) - _multiply_lanes(base, step)
+    residual = np.where(sound[:, None], np.nan_to_num(state.gradient - gradient), 0.0) - multiply_lanes(base, step)
     diagonal = np.diagonal(state.information, axis1=1, axis2=2)
     residual = np.where(domains.free | (diagonal > INVISIBLE), residual, 0.0)  # elsewhere y is but rounding
     along = np.sum(residual * step, axis=1)
-    unit, _ = _find_flat_directions(state.information, step != 0)
+    unit, _ = find_flat_directions(state.information, step != 0)
     size = np.sqrt(np.sum((residual * unit) ** 2, axis=1) * np.sum((step / np.where(unit > 0, unit, 1.0)) ** 2, axis=1))
     # r' p must be more than rounding of |r| |p|, both in standard errors.
     is_defined = sound & (np.abs(along) > 1e-8 * size)
@@ -298,103 +298,9 @@ def _update_hessian(
     secant = base + np.where(is_defined[:, None, None], update, 0.0)
     # Of the two the one that would have foretold this gain.
     slope = np.sum(state.gradient * step, axis=1)
-    by_model = slope - np.sum(step * _multiply_lanes(base, step), axis=1) / 2
-    by_information = slope - np.sum(step * _multiply_lanes(np.nan_to_num(state.information), step), axis=1) / 2
+    by_model = slope - np.sum(step * multiply_lanes(base, step), axis=1) / 2
+    by_information = slope - np.sum(step * multiply_lanes(np.nan_to_num(state.information), step), axis=1) / 2
     current_information = np.where(taken[:, None, None], information, state.information)
     model_is_better = sound & (np.abs(gain - by_model) <= np.abs(gain - by_information))
     corrected = np.where(sound[:, None, None], secant, base)
     return np.where((model_is_better | ~sound)[:, None, None], corrected, current_information)
-
-
-def trust_region_step(
-    gradient: np.ndarray,
-    information: np.ndarray,
-    model: np.ndarray,
-    radius: np.ndarray,
-    moving: np.ndarray,
-    free: np.ndarray,
-) -> tuple[Float[np.ndarray, "lanes p"], Float[np.ndarray, " lanes"], Float[np.ndarray, " lanes"]]:
-    """Return the maximiser p of g' p - p' B p / 2 over |D p| <= radius, |D p|, and the gain that B foretells.
-
-    It is (B + s D^2)^-1 g with the least s >= 0 for which B + s D^2 is not indefinite and |D p| <= radius: Newton's
-    method for 1 / |D p| = 1 / radius, from below. All in units u of standard errors, in which B is of order 1 and
-    D = max(1, radius u / LONGEST) where a logarithm moves, else 1: matrices scaled by a diagonal are solved as exactly
-    as without. To B is added v v' for each direction v that is not identified, whose gradient is but rounding.
-
-    Args:
-        gradient: g (lanes, p).
-        information: its diagonal gives the standard errors.
-        model: B, minus the Hessian or near it; it may be indefinite. Where it is not finite, or huge, the information
-            takes its place.
-        radius: of the trust region (lanes,).
-        moving: which coordinates may move (lanes, p).
-        free: which are no logarithms, and so not limited by LONGEST (p,).
-    """
-    unit, flat = _find_flat_directions(information, moving)
-    stays = unit == 0
-    d = np.where(free | stays, 1.0, np.maximum(1.0, radius[:, None] * unit / LONGEST))
-    g = np.nan_to_num(gradient) * unit
-    b = _scale_both_sides(model, unit)
-    sane = np.all(np.abs(b) < LARGEST, axis=(1, 2))  # NaN is not
-    b = np.where(sane[:, None, None], b, _scale_both_sides(information, unit))
-    b = (b + b.swapaxes(1, 2)) / 2 + flat @ flat.swapaxes(1, 2) + np.eye(len(free)) * stays[:, :, None]
-    # s: none at first, or what makes the matrix positive.
-    least = np.linalg.eigvalsh(b / d[:, :, None] / d[:, None, :])[:, 0]
-    shift = np.where(least > -ROUNDING, 0.0, -least * (1 + 1e-6))
-    for _ in range(SECULAR_STEPS):
-        step = _solve_shifted(b, shift, d, g)
-        length = np.linalg.norm(d * step, axis=1)
-        beyond = length > 1.01 * radius
-        if not beyond.any():
-            break
-        slope = np.sum(d * d * step * _solve_shifted(b, shift, d, d * d * step), axis=1)  # -|D p| d|D p| / ds
-        newton = length**2 / np.where(beyond, slope, 1.0) * (length - radius) / radius
-        shift = np.where(beyond, shift + newton, shift)
-    inside = np.minimum(1.0, radius / np.where(length > 0, length, 1.0))
-    step, length = step * inside[:, None], length * inside
-    foretold = np.sum(step * (g - _multiply_lanes(b, step) / 2), axis=1)
-    return step * unit, length, foretold
-
-
-def _solve_shifted(b: np.ndarray, shift: np.ndarray, d: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return (B + s D^2)^-1 g of each lane; nothing along directions in which the matrix is singular."""
-    matrix = b + (shift[:, None] * d * d)[:, :, None] * np.eye(b.shape[1])
-    try:
-        return np.asarray(np.linalg.solve(matrix, right[..., None])[..., 0])
-    except np.linalg.LinAlgError:  # a pivot that is exactly 0
-        return _multiply_lanes(np.linalg.pinv(matrix, ROUNDING, hermitian=True), right)
-
-
-def expected_gain(
-    gradient: np.ndarray, information: np.ndarray, counting: Bool[np.ndarray, "lanes p"]
-) -> Float[np.ndarray, " lanes"]:
-    """Return g' I^-1 g of the coordinates that count, along directions that are identified: squared standard errors."""
-    unit, _ = _find_flat_directions(information, counting)
-    scaled = _scale_both_sides(information, unit)
-    values, vectors = np.linalg.eigh((scaled + scaled.swapaxes(1, 2)) / 2)
-    along = np.einsum("lij,li->lj", vectors, np.nan_to_num(gradient) * unit)
-    return np.asarray(np.sum(np.where(values > FLAT, along**2 / np.where(values > FLAT, values, 1.0), 0.0), axis=1))
-
-
-def _find_flat_directions(information: np.ndarray, moving: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the standard error of each coordinate alone (lanes, p), and the directions without information.
-
-    The errors are 0 of coordinates that stay; directions stand in columns (lanes, p, p), the others are zeros.
-    """
-    diagonal = np.diagonal(information, axis1=1, axis2=2)
-    informed = moving & (diagonal > LEAST) & np.isfinite(diagonal)
-    unit = np.where(informed, 1 / np.sqrt(np.where(informed, diagonal, 1.0)), 0.0)
-    scaled = _scale_both_sides(information, unit)
-    values, vectors = np.linalg.eigh((scaled + scaled.swapaxes(1, 2)) / 2)
-    return unit, np.where(((values <= FLAT)[:, None, :]), vectors, 0.0) * informed[:, :, None]
-
-
-def _scale_both_sides(matrix: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """Return U A U with U = diag(unit); 0 for coordinates that stay, whatever A has there."""
-    stays = (unit == 0)[:, :, None] | (unit == 0)[:, None, :]
-    return np.where(stays, 0.0, matrix * unit[:, :, None] * unit[:, None, :])
-
-
-def _multiply_lanes(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Return A x of each lane."""
-    return np.asarray(np.einsum("lij,lj->li", matrix, vector))

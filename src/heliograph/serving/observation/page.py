@@ -1,4 +1,4 @@
-"""Web page for watching a service, and its metrics, on one port: for this machine, or with a token for others."""
+"""Web page for watching a service, with its metrics, on one port: for this machine, or with a token for others."""
 
 import asyncio
 import hmac
@@ -7,16 +7,13 @@ import json
 import os
 import re
 import socket
-from collections.abc import AsyncIterator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, contextmanager, suppress
-from functools import partial
 from importlib.resources import files
 from typing import NamedTuple
 
 import uvicorn
-from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
-from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
-from prometheus_client.registry import Collector
+from prometheus_client import CONTENT_TYPE_LATEST
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
@@ -25,168 +22,13 @@ from starlette.responses import PlainTextResponse, RedirectResponse, Response, S
 from starlette.routing import Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from heliograph.live.event import VERDICTS
 from heliograph.numerics.check import fail
-from heliograph.report.outputs import summarise_output
 from heliograph.serving.observation.last_answers import LastAnswers
+from heliograph.serving.observation.metrics import ServiceMetrics
 from heliograph.serving.observation.overview import make_plants_page
 from heliograph.serving.observation.watch import LISTED, Watch
 
-
-class ServiceMetrics(Collector):
-    """Collector of the metrics of a watch: by node and filter, and by plant where there are few, else of the worst."""
-
-    def __init__(self, watch: Watch):
-        self.watch = watch
-        watch.registry.register(self)
-        text = partial(generate_latest, watch.registry)
-        self._texts = LastAnswers(watch.lock, lambda _: text(), text())
-
-    def collect(self) -> Iterable[Metric]:
-        """Yield the current metrics."""
-        yield from _collect_links(self.watch)
-        yield from _collect_nis(self.watch)
-        yield from _collect_outputs(self.watch)
-        yield from _collect_plants(self.watch)
-        yield _collect_crossings(self.watch)
-        yield _collect_fusion_doubts(self.watch)
-        yield _collect_dead_senders(self.watch)
-        yield _collect_remarks(self.watch)
-        yield GaugeMetricFamily("heliograph_plants", "Plants known.", sum(1 for _ in self.watch.plants()))
-        malformed = sum(service.malformed for service in self.watch.services)
-        yield CounterMetricFamily("heliograph_malformed", "Messages that could not be read.", malformed)
-
-    def text(self) -> bytes:
-        """Return all metrics in Prometheus's text format; while a batch takes long, those before it."""
-        return self._texts.ask()
-
-
-def _collect_plants(watch: Watch) -> Iterable[Metric]:
-    """Yield the tests of each plant where there are few, else of the worst, and how many plants are wrong."""
-    worst, labels = watch.worst(), ["plant", "node", "filter"]
-    wrong = GaugeMetricFamily("heliograph_plants_wrong", "Plants with something wrong.", labels=["what"])
-    wrong.add_metric(["dead sender"], sum(bool(item.dead) for item in worst))
-    wrong.add_metric(["doubted claim"], sum(bool(item.doubts) for item in worst))
-    wrong.add_metric(["refused messages"], sum(bool(item.refused) for item in worst))
-    families = [GaugeMetricFamily(f"heliograph_plant_{name}", words, labels=labels) for name, words in NIS.items()]
-    dead = GaugeMetricFamily("heliograph_plant_dead_sender", "1: its sender is dead.", labels=["plant", "node"])
-    names = [name for name, _ in watch.plants()]
-    shown = names if len(names) <= SHOWN else [item.plant for item in worst[:SHOWN]]
-    for plant in dict.fromkeys(shown):
-        for key, test in watch.tests(plant).items():
-            for family, value in zip(families, (test.ratio, *test.band()), strict=True):
-                family.add_metric([plant, *key], value)
-    for item in worst[:SHOWN]:
-        for node in item.dead:
-            dead.add_metric([item.plant, node], 1.0)
-    return wrong, *families, dead
-
-
-def _collect_crossings(watch: Watch) -> Metric:
-    """Return the metric of thresholds that may be crossed, of the plants in which that is most probable."""
-    what = "Probability that a level of --threshold is passed by so far ahead."
-    labels = ["plant", "node", "filter", "threshold", "ahead"]
-    crossings = GaugeMetricFamily("heliograph_plant_passing", what, labels=labels)
-    for key, probability in watch.crossings(SHOWN):
-        crossings.add_metric(list(key), probability)
-    return crossings
-
-
-def _collect_links(watch: Watch) -> Iterable[Metric]:
-    """Return the metrics of the nodes' messages: by verdict, lost, values beyond limits or stuck, and timeouts."""
-    messages = CounterMetricFamily("heliograph_messages", "Messages by node and verdict.", labels=["node", "verdict"])
-    lost = GaugeMetricFamily("heliograph_lost", "Gaps in a node's sequence numbers, now.", labels=["node"])
-    what = "Values beyond a node's limits, or codes, which count as not arrived."
-    dropped = CounterMetricFamily("heliograph_dropped", what, labels=["node"])
-    why = "Values that repeat for longer than their noise allows, which count as not arrived."
-    stuck = CounterMetricFamily("heliograph_stuck", why, labels=["node"])
-    quiet = "Silences longer than a node's timeout that have ended; heliograph_dead_senders has those that last."
-    timeouts = CounterMetricFamily("heliograph_timeouts", quiet, labels=["node"])
-    said = "Runs of equal readings longer than noise allows, of a node that does not refuse them (stuck=)."
-    held = CounterMetricFamily("heliograph_held", said, labels=["node"])
-    for node, tally in watch.links().items():
-        for verdict in VERDICTS:
-            messages.add_metric([node, verdict], tally[verdict] or 0)
-        if tally["lost"] is not None:
-            lost.add_metric([node], tally["lost"])
-        dropped.add_metric([node], tally["dropped"] or 0)
-        stuck.add_metric([node], tally["stuck"] or 0)
-        timeouts.add_metric([node], tally["timeouts"] or 0)
-        held.add_metric([node], tally["held"] or 0)
-    return messages, lost, dropped, stuck, timeouts, held
-
-
-def _collect_dead_senders(watch: Watch) -> Metric:
-    """Return the metric of the dead senders, by node."""
-    what = "Plants in memory whose sender at a node misses its heartbeats, and not by chance, or is past its timeout."
-    dead = GaugeMetricFamily("heliograph_dead_senders", what, labels=["node"])
-    for node, count in watch.dead_senders().items():
-        dead.add_metric([node], count)
-    return dead
-
-
-def _collect_remarks(watch: Watch) -> Metric:
-    """Return the metric of what filters say happened to their states."""
-    what = "Times that a gate gave in: it took up what it had refused for long."
-    gave_in = CounterMetricFamily("heliograph_gave_in", what, labels=["node", "filter"])
-    for key, count in watch.remarks().items():
-        gave_in.add_metric(list(key), count)
-    return gave_in
-
-
-def _collect_fusion_doubts(watch: Watch) -> Metric:
-    """Return the metric of filters under fusions whose claims are doubted."""
-    what = "1 if a filter whose estimates a fusion without a test of itself takes is doubted."
-    doubted = GaugeMetricFamily("heliograph_fusion_doubted", what, labels=["filter"])
-    for row in watch.judge_fusions(watch.nis):
-        doubted.add_metric([str(row["filter"])], float(bool(row["doubt"])))
-    return doubted
-
-
-def _collect_nis(watch: Watch) -> Iterable[Metric]:
-    """Return the metrics of each filter's NIS over its expectation, with the band in which it should be."""
-    labels = ["node", "filter"]
-    ratio = GaugeMetricFamily(
-        "heliograph_nis", "Normalised innovation squared over its expectation, of the last rows; 1.", labels=labels
-    )
-    low = GaugeMetricFamily("heliograph_nis_low", "Least that is expected of an honest filter.", labels=labels)
-    high = GaugeMetricFamily("heliograph_nis_high", "Most that is expected of an honest filter.", labels=labels)
-    for key, nis in watch.nis.items():
-        for metric, value in zip((ratio, low, high), (nis.ratio, *nis.band()), strict=True):
-            metric.add_metric(list(key), value)
-    return ratio, low, high
-
-
-def _collect_outputs(watch: Watch) -> Iterable[Metric]:
-    """Return the metrics of each output of filters that weigh: weight, share down-weighted, its innovations' bias."""
-    what = {
-        "weight": "Mean weight of an output's values, of the last rows of a filter that weighs; 1 counts in full.",
-        "share": "Share of an output's values that were down-weighted, below a weight of 1/2.",
-        "share_low": "Lower end of its interval of 95 %.",
-        "share_high": "Upper end of its interval of 95 %.",
-        "bias": "Median of an output's innovations, in its unit.",
-        "squared": "Mean square of an output's innovations over their variance; 1.",
-    }
-    metrics = {
-        name: GaugeMetricFamily(f"heliograph_output_{name}", words, labels=["node", "filter", "output"])
-        for name, words in what.items()
-    }
-    # Numbers of each output of each filter that weighs; none where there are too few rows.
-    for output in watch.outputs.health():
-        numbers = summarise_output(output)
-        for name, metric in metrics.items():
-            if isinstance(value := numbers[name], float):
-                metric.add_metric([output.node, output.filter, output.judged.output], value)
-    return metrics.values()
-
-
-SHOWN = 50  # plants with metrics of their own; of more the worst
 STUCK = 60.0  # seconds after which a batch that is being taken is no sign of health
-NIS = {
-    "nis": "Normalised innovation squared of what a filter used over its expectation, of a plant's last rows; 1.",
-    "nis_low": "Least that is expected of an honest filter.",
-    "nis_high": "Most that is expected of an honest filter.",
-}
 TOKEN = "HELIOGRAPH_PAGE_TOKEN"
 HEALTH = "/healthz"
 EVERY = 0.5  # seconds between looks

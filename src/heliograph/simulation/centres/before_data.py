@@ -17,7 +17,7 @@ from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.simulation.arguments import inputs_of
-from heliograph.simulation.centres.centre import Together
+from heliograph.simulation.centres.observation_model import Together
 from heliograph.simulation.network import Network
 from heliograph.simulation.plan import plan
 from heliograph.simulation.stepping import AllFilters

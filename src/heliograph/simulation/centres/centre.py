@@ -10,7 +10,6 @@ import numpy as np
 
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.gaussian.gaussian import GaussianFilter
-from heliograph.filters.gaussian.signal import augmented_second_moment
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.linear.plan import Linearised, LinearStep, linear_step
 from heliograph.fusion.all_reports import (
@@ -24,7 +23,6 @@ from heliograph.fusion.cross_covariance import (
     ErrorMoments,
     ErrorStep,
     Motion,
-    Observation,
     SourceFactors,
     error_step,
     initial_errors,
@@ -37,96 +35,14 @@ from heliograph.fusion.network_fusion import Fusion
 from heliograph.fusion.report_link import ReportModel
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, Innovation, lower_by_noise, weakest
-from heliograph.model.over_time import OverTime, at, at_each_step, first, stack, unstack
+from heliograph.model.over_time import OverTime, at, first, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant
-from heliograph.model.sensor import AnySensor, LinearSensor, refuse_angles, without_output_names
+from heliograph.model.sensor import AnySensor, LinearSensor, refuse_angles
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, PyTree
-from heliograph.random_affine.moments.second_moments import SecondOrder, second_order
-
-
-class ObservationModel(Module):
-    """Sensors and channels of nodes of one structure, stacked; the nodes share none of them."""
-
-    sensor: AnySensor
-    channel: SecondOrder | OverTime
-
-    def observe(self, mean: jax.Array, covariance: jax.Array, k: jax.Array, size: int) -> Observation:
-        """Return the nodes' measurement models at step k for a plant with these moments, zero rows up to `size`."""
-
-        def observe_one(sensor: AnySensor, channel: SecondOrder | OverTime) -> Observation:
-            """Return the measurement model of one node."""
-            return _linearise_observation(at(sensor, k), at(channel, k), mean, covariance)
-
-        gain, offset, noise = eqx.filter_vmap(observe_one, in_axes=(eqx.if_array(0), eqx.if_array(0)))(
-            self.sensor, self.channel
-        )
-        padding = (0, size - offset.shape[-1])
-        return Observation(
-            jnp.pad(gain, ((0, 0), padding, (0, 0))),
-            jnp.pad(offset, ((0, 0), padding)),
-            jnp.pad(noise, ((0, 0), padding, padding)),
-        )
-
-
-def _linearise_observation(
-    sensor: LinearSensor, channel: SecondOrder, mean: jax.Array, covariance: jax.Array
-) -> Observation:
-    """Return M, o and Cov(z - M x) of z = G (C x + v) + n, G a random gain, for a plant with these moments.
-
-    M = E[G] C and o = E[G] E v + E n; the covariance is that of noise through the mean gain, and of the gain's spread.
-    """
-    c, noise = jnp.asarray(sensor.matrix), jnp.asarray(sensor.noise.covariance)
-    signal = c @ mean + sensor.noise.mean
-    second = augmented_second_moment(c @ covariance @ c.T + noise + jnp.outer(signal, signal), signal, 1.0)
-    gain = jnp.asarray(channel.mean_gain)
-    spread = channel.nominal.middle(second, jnp.ones(len(gain), dtype=bool))
-    return Observation(gain @ c, gain @ sensor.noise.mean + channel.offset, gain @ noise @ gain.T + spread)
-
-
-class Apart(Module):
-    """Measurement models of nodes that share nothing, by groups; `order` brings them into the order of the nodes.
-
-    `counts` of the groups' nodes are needed where a group measures nothing, None among the groups.
-    """
-
-    groups: tuple[ObservationModel | None, ...]
-    order: np.ndarray
-    size: int = eqx.field(static=True)
-    counts: tuple[int, ...] = eqx.field(static=True, default=())
-
-    def observe(self, mean: jax.Array, covariance: jax.Array, k: jax.Array) -> Observation:
-        """Return the nodes' measurement models at step k, in the order of the nodes, for a plant with these moments."""
-        m, n = self.size, len(mean)
-        parts = []
-        for i, group in enumerate(self.groups):
-            if group is None:
-                shapes = (m, n), (m,), (m, m)
-                parts.append(Observation(*(jnp.zeros((self.counts[i], *shape)) for shape in shapes)))
-            else:
-                parts.append(group.observe(mean, covariance, k, m))
-        return Observation(*(jnp.concatenate(leaves)[self.order] for leaves in zip(*parts, strict=True)))
-
-
-class Together(Module):
-    """Measurement models of nodes that share a sensor and a channel.
-
-    `rows` (node, size): which outputs of the channel each node receives, -1 beyond its own.
-    """
-
-    sensor: AnySensor
-    channel: SecondOrder | OverTime
-    rows: np.ndarray
-
-    def observe(self, mean: jax.Array, covariance: jax.Array, k: jax.Array) -> Observation:
-        """Return gain (node, size, n) and offset of each node, and the noise's covariance (node, size, node, size)."""
-        gain, offset, noise = _linearise_observation(at(self.sensor, k), at(self.channel, k), mean, covariance)
-        # A last row of zeros, which index -1 takes.
-        gain, offset = jnp.pad(gain, ((0, 1), (0, 0))), jnp.pad(offset, (0, 1))
-        noise = jnp.pad(noise, (0, 1))
-        return Observation(gain[self.rows], offset[self.rows], noise[self.rows[:, :, None, None], self.rows])
+from heliograph.simulation.centres.observation_model import Apart, Together
 
 
 class CentreState(NamedTuple):
@@ -231,20 +147,6 @@ def gather_steps(parts: Sequence[Matrices], order: np.ndarray, size: int) -> Mat
     matrices = type(parts[0])
     joined = {f: jnp.concatenate([pad(f, getattr(part, f)) for part in parts]) for f in matrices._fields}
     return matrices(**{f: leaf[order] for f, leaf in joined.items()})
-
-
-def stack_nodes(sensors: Sequence[AnySensor], channels: Sequence[Channel]) -> ObservationModel:
-    """Return the measurement models of nodes of one structure, stacked along a first axis of nodes."""
-    return ObservationModel(
-        stack([without_output_names(sensor) for sensor in sensors]),
-        stack([describe_channel(channel) for channel in channels]),
-    )
-
-
-def describe_channel(channel: Channel) -> SecondOrder | OverTime:
-    """Return the second moments of the channel where all of it arrives, for each step where it varies."""
-    moments: SecondOrder | OverTime = at_each_step(lambda step: second_order(step.condition_on_arrival()), channel)
-    return moments
 
 
 Parts = Mapping[str, tuple[AnySensor, Channel, AbstractFilter]]  # sensor, channel and filter of each node

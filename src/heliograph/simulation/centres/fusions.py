@@ -16,16 +16,9 @@ from heliograph.model.over_time import at, first, stack, structure
 from heliograph.numerics.angle import Angles, nearest, wrap_angles
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, PyTree
-from heliograph.simulation.centres.centre import (
-    Apart,
-    Centre,
-    CentreFilter,
-    Together,
-    along_estimates,
-    describe_channel,
-    stack_nodes,
-)
+from heliograph.simulation.centres.centre import Centre, CentreFilter, along_estimates
 from heliograph.simulation.centres.linearised import LinearisedCentre
+from heliograph.simulation.centres.observation_model import Apart, Together, describe_channel, stack_nodes
 from heliograph.simulation.centres.uplinks import Drawn, InFlight, Uplinks
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node

@@ -28,7 +28,6 @@ from heliograph.model.over_time import at, first
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, Bool, Float, PyTree
-from heliograph.simulation.centres.centre import Apart
 from heliograph.simulation.centres.edges import Edges
 from heliograph.simulation.centres.messages import (
     Messages,
@@ -37,6 +36,7 @@ from heliograph.simulation.centres.messages import (
     step_messages_on_the_way,
     test_moved_beyond,
 )
+from heliograph.simulation.centres.observation_model import Apart
 
 Arrived = Bool[Array, "node rounds degree"]  # which messages arrived, each node's from itself first
 Ahead = Sequence[Sequence[Array]]  # weights computed before a step: parts and covariance by bucket; empty: none are

@@ -5,9 +5,9 @@ import numpy as np
 from heliograph.fusion.mesh.graph import graph_of
 from heliograph.model.over_time import stack
 from heliograph.numerics.check import fail
-from heliograph.simulation.centres.centre import Apart, ObservationModel, stack_nodes
 from heliograph.simulation.centres.edges import edges_of
 from heliograph.simulation.centres.mesh import Mesh, Rows
+from heliograph.simulation.centres.observation_model import Apart, ObservationModel, stack_nodes
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 

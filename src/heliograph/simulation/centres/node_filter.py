@@ -22,10 +22,10 @@ from heliograph.numerics.check import fail, instance, text
 from heliograph.numerics.float64 import compile_in_float64, in_float64
 from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.types import Array, ArrayLike
-from heliograph.simulation.centres.centre import Apart, stack_nodes
 from heliograph.simulation.centres.edges import Edges
 from heliograph.simulation.centres.mesh import Mesh, MeshState, Rows
 from heliograph.simulation.centres.messages import OnTheWay, quantize_estimate
+from heliograph.simulation.centres.observation_model import Apart, stack_nodes
 from heliograph.simulation.claims import premise_at
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node, ReceivingNode

@@ -21,7 +21,8 @@ from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 from heliograph.simulation.arguments import inputs_of
-from heliograph.simulation.centres.centre import Apart, Centre, ObservationModel, describe_channel
+from heliograph.simulation.centres.centre import Centre
+from heliograph.simulation.centres.observation_model import Apart, ObservationModel, describe_channel
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.runs.side_by_side import StackedFilters

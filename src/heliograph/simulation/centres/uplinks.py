@@ -18,7 +18,7 @@ from heliograph.numerics.check import array, fail
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, ArrayLike, PyTree
 from heliograph.random_affine.moments.second_moments import SecondOrder
-from heliograph.simulation.centres.centre import describe_channel
+from heliograph.simulation.centres.observation_model import describe_channel
 from heliograph.simulation.random_keys import CHANNEL, draw_key
 from heliograph.simulation.transmission.shared_fading import ChannelGroup, channel_groups
 

@@ -33,8 +33,6 @@ from heliograph.simulation.results.labelled import (
     read_units,
     read_uplinks,
     read_values,
-    record_fields,
-    record_frame,
 )
 from heliograph.simulation.results.overloads import Overloads, find_overloads
 from heliograph.simulation.results.plots import (
@@ -49,6 +47,7 @@ from heliograph.simulation.results.plots import (
 )
 from heliograph.simulation.results.record_html import draw_record
 from heliograph.simulation.results.saved import Saved
+from heliograph.simulation.results.wide_table import record_fields, record_frame
 
 if TYPE_CHECKING:  # extras
     import pandas as pd

@@ -18,7 +18,8 @@ from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.runs.side_by_side import StackedFilters
 from heliograph.simulation.stepping import AllFilters
-from heliograph.simulation.transmission.reception import SeparateChannels, make_reception
+from heliograph.simulation.transmission.build_reception import make_reception
+from heliograph.simulation.transmission.reception import SeparateChannels
 from heliograph.simulation.world import World
 
 M = TypeVar("M", bound=Module)

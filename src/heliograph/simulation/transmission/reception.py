@@ -14,28 +14,19 @@ from heliograph.filters.event.stochastic import StochasticEventFilter
 from heliograph.filters.wrappers.fed_back import FedBackFilter
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Estimate
-from heliograph.model.over_time import OverTime, at, first, over_time, stack, structure
+from heliograph.model.over_time import OverTime, at, first, over_time, structure
 from heliograph.model.relays import SENSOR as SENDER
 from heliograph.model.relays import RelayNetwork
-from heliograph.model.sensor import AbstractSensor, AnySensor, without_output_names
+from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.model.trigger import AbstractTrigger, Sender
 from heliograph.model.words.encoder import Reader, Words
-from heliograph.model.words.route import in_bits, reader_of
 from heliograph.numerics.angle import wrap_angles
 from heliograph.numerics.module import Module, unwritten
 from heliograph.numerics.types import PyTree
-from heliograph.random_affine.memory import condition_on_memories, drop_names, memories
-from heliograph.simulation.network import LOCAL, Network
-from heliograph.simulation.node import Node
+from heliograph.random_affine.memory import condition_on_memories
 from heliograph.simulation.random_keys import DITHER, SENSOR, TRIGGER, checksum, draw_key
 from heliograph.simulation.runs.side_by_side import map_all
-from heliograph.simulation.transmission.shared_fading import (
-    deliver,
-    memory_places,
-    move_modes,
-    start,
-    start_modes,
-)
+from heliograph.simulation.transmission.shared_fading import deliver, move_modes, start, start_modes
 
 Measurements = tuple[jax.Array, ...]  # (node, received) of each group
 
@@ -241,7 +232,7 @@ class Slots(AbstractMedium):
         mean = jnp.asarray(at(self.relays.plant, 0).initial_mean)
         hops = {
             name: start(hop, key, checksum(f"{sender} to {listener}"), self.memories[name])
-            for name, (_, listener, sender, hop) in _find_hops_with_memory(self.relays).items()
+            for name, (_, listener, sender, hop) in find_hops_with_memory(self.relays).items()
         }
         return Relayed(jnp.tile(mean, (len(self.estimates_at), 1)), hops)
 
@@ -257,7 +248,7 @@ class Slots(AbstractMedium):
         # Hops without memory by a branch for the slot, then those with memory.
         received = self._sum_without_memory(k, sent, key)
         hops, slot = {}, k % len(self.relays.slots)
-        for name, (number, listener, sender, hop) in _find_hops_with_memory(self.relays).items():
+        for name, (number, listener, sender, hop) in find_hops_with_memory(self.relays).items():
             source = checksum(f"{sender} to {listener}")
             hops[name], z = deliver(hop, state.hops[name], sent[sender], key, k, source, self.memories[name])
             received[listener] = received[listener] + jnp.where(slot == number, z, 0.0)
@@ -303,7 +294,7 @@ class Slots(AbstractMedium):
         return branch
 
 
-def _find_hops_with_memory(relays: RelayNetwork) -> dict[str, tuple[int, str, str, Channel]]:
+def find_hops_with_memory(relays: RelayNetwork) -> dict[str, tuple[int, str, str, Channel]]:
     """Return the slot, listener, sender and hop of the hops with memory, by name."""
     return {
         f"{number} {listener} {sender}": (number, listener, sender, hop)
@@ -325,76 +316,3 @@ def _receive_sum(
     ]
     nobody = jnp.zeros(size) if hops else jnp.full(size, jnp.nan)
     return jnp.sum(jnp.stack(parts), axis=0) if parts else nobody
-
-
-def make_reception(network: Network) -> AbstractMedium:
-    """Build the transmission from the plant to the nodes of a network."""
-    if network.relays is not None:
-        return _make_slots(network, network.relays)
-    if network.common is not None:
-        rows = network.rows
-        received = tuple(np.array([rows[name] for name in names]) for names in network.groups)
-        return CommonChannel(network.common.sensor, network.common.channel, received)
-    # A sensor and a channel for each node, stacked by group.
-    nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
-    memories_of = memory_places({name: (node.sensor, node.channel) for name, node in nodes.items()}, network.plant)
-    groups = [[name for name in names if name in nodes] for names in network.groups]
-    return SeparateChannels(tuple(
-        _stack_group(network, {name: nodes[name] for name in sensing}, memories_of) if sensing else Silent(len(names))
-        for sensing, names in zip(groups, network.groups, strict=True)
-    ))  # fmt: skip
-
-
-def _make_slots(network: Network, relays: RelayNetwork) -> Slots:
-    """Build the transmission through relays that send in slots."""
-    listeners = {name: i for i, name in enumerate(relays.filters)}
-    return Slots(
-        relays=relays,
-        estimates_at=tuple(network.places[name, LOCAL] for name in relays.relays),
-        groups=tuple(tuple(listeners[name] for name in names) for names in network.groups),
-        memories=memory_places({name: hop for name, (_, _, _, hop) in _find_hops_with_memory(relays).items()}),
-    )
-
-
-def _stack_group(network: Network, nodes: Mapping[str, Node], memories_of: Mapping[str, np.ndarray]) -> NodeGroup:
-    """Return the nodes of a group, stacked; `memories_of` each node: places of its sensor's and channel's memories."""
-    first_name, first_node = next(iter(nodes.items()))
-    # Sensor, channel, and where their draws and memories stand.
-    pairs = [(without_output_names(node.sensor), _carrying_channel(node)) for node in nodes.values()]
-    # Memories are told apart by their places: without their names the nodes stack.
-    pairs = [drop_names(pair) if len(memories_of[key]) else pair for pair, key in zip(pairs, nodes, strict=True)]
-    sensor, channel = stack(pairs)
-    rows_of = [_split_places((node.sensor, node.channel), memories_of[key]) for key, node in nodes.items()]
-    of_sensor, memory_rows = (np.stack(parts) for parts in zip(*rows_of, strict=True))
-    # What a sender that decides knows: its filter, its rule.
-    filter_name: str | None = first_node.informed_by or first_node.predictor
-    reference: PyTree = None
-    if filter_name is not None:
-        reference = stack([without_output_names(node.filters[filter_name]) for node in nodes.values()])
-    triggers: PyTree = [node.trigger for node in nodes.values()]
-    encoders: PyTree = [node.encoder for node in nodes.values()]
-    return NodeGroup(
-        sensor=sensor,
-        inputs=network.inputs,
-        channel=channel,
-        checksums=np.array([checksum(key) for key in nodes], dtype=np.uint32),
-        memories=memory_rows,
-        modes=of_sensor,
-        reference_filter=reference,
-        trigger=None if triggers[0] is None else stack(triggers),
-        encoder=None if encoders[0] is None else stack(encoders),
-        informed_at=None if filter_name is None else network.places[first_name, filter_name][:2],
-        reader=None if encoders[0] is None else reader_of(first_node.channel),
-    )
-
-
-def _carrying_channel(node: Node) -> Channel:
-    """Return the channel of the numbers by which a node's signal is carried: its words' bits where it sends words."""
-    return node.channel if node.encoder is None else in_bits(node.encoder, node.channel)
-
-
-def _split_places(observed: tuple[AnySensor, Channel], places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Split the places of the memories of sensor and channel together: return those of the sensor, of the channel."""
-    by_identity = dict(zip(memories(observed), places, strict=True))
-    of_sensor, of_channel = ([by_identity[identity] for identity in memories(part)] for part in observed)
-    return np.array(of_sensor, np.uint32), np.array(of_channel, np.uint32)

@@ -1,0 +1,263 @@
+"""Gaussian filters of plant, sensor and channel: Kalman's, the extended and the cubature filter, and a naive one."""
+
+from heliograph.filters.base import make_sizes
+from heliograph.filters.gaussian.belief import prior_of
+from heliograph.filters.gaussian.diffuse import DiffuseFilter, diffuse_filter, has_unknown_start
+from heliograph.filters.gaussian.gaussian import GaussianFilter, describe_channel_moments, make_perfect_channel
+from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, Linearization
+from heliograph.filters.gaussian.update import AbstractUpdate, Polytope
+from heliograph.filters.wrappers.limited import keeps_limits
+from heliograph.filters.wrappers.sensor_inputs import takes_sensor_inputs
+from heliograph.filters.wrappers.told import takes_told
+from heliograph.model.channel import Channel, check_link, find_received_angles, mean_gain
+from heliograph.model.estimate import lower_by_noise
+from heliograph.model.fading import memory_matters, without_memory
+from heliograph.model.over_time import first, unstack
+from heliograph.model.plant import AnyPlant, check_plant
+from heliograph.model.premises.premise import Premise, believing
+from heliograph.model.sensor import SEVERAL_TAKEN_BY, AnySensor, is_linear
+from heliograph.numerics.check import fail, instance
+from heliograph.numerics.types import ArrayLike, Float
+from heliograph.random_affine.memory import is_modal
+from heliograph.random_affine.moments.second_moments import has_random_gain
+
+MATRICES = ", of matrices kalman_filter(*hg.state_space(F, H, Q, R, mean, covariance))"
+
+
+def _make_gaussian_filter(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel | None,
+    transform: AbstractTransform,
+    update: AbstractUpdate,
+    initial_mean: ArrayLike | None,
+    initial_covariance: ArrayLike | None,
+    trusted: bool,
+) -> GaussianFilter:
+    """Return the Gaussian filter of checked parts, on the channel's second moments without its memory, with its claim.
+
+    `trusted`: whether the channel is the true one, so that more than "nominal" may be claimed.
+    """
+    start = check_plant(plant)
+    instance("update", update, AbstractUpdate, "one such as Polytope()")
+    channel = make_perfect_channel(sensor) if channel is None else channel
+    check_link(first(sensor), first(channel), len(start.states))
+    angles = find_received_angles(plant, sensor, channel)
+    mean, spread, prior_given = prior_of(start, initial_mean, initial_covariance)
+    # Moments of the channel, its memory ignored.
+    premise = Premise(plant, sensor, channel)
+    trusted = trusted and not memory_matters(channel)
+    channel = without_memory(channel)
+    described = describe_channel_moments(channel, update)
+    pairs = zip(unstack(channel), unstack(described), strict=True)
+    # The Kalman filter is exact: linear, no random gain, no angle.
+    on_line = not start.circular and not first(sensor).circular  # an attitude has no linear plant
+    linear = on_line and is_linear(plant, sensor) and not any(has_random_gain(c, s) for c, s in pairs)
+    claim = update.claim(uncertain=False) if linear and trusted and not prior_given else "nominal"
+    claim = lower_by_noise(claim, plant, sensor, channel)
+    filter = GaussianFilter(
+        plant=plant,
+        sensor=sensor,
+        channel=described,
+        transform=transform,
+        rule=update.described(),
+        initial_mean=mean,
+        initial_covariance=spread,
+        linear=linear,
+        observed_angles=angles,
+        **make_sizes(claim, start, first(channel).outputs),
+    )
+    return believing(filter, premise)
+
+
+@keeps_limits
+@takes_sensor_inputs
+@takes_told
+def gaussian_filter(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel | None,
+    transform: "AbstractTransform",
+    update: "AbstractUpdate | None" = None,
+    initial_mean: Float[ArrayLike, " n"] | None = None,
+    initial_covariance: Float[ArrayLike, "n n"] | None = None,
+) -> "GaussianFilter":
+    """Return the Gaussian filter on its channel's second moments with any transform, such as `PolynomialMoments(2)`.
+
+    Args:
+        plant: the plant, n states.
+        sensor: its sensor, m outputs.
+        channel: from the sensor to the filter, None for one that delivers everything as it is. The memory of a
+            channel is ignored: where it matters, the claim is nominal.
+        transform: moments of a nonlinear function; a linear plant or sensor needs none.
+        update: how an uncertain channel is bounded; `Polytope()` by default.
+        initial_mean: mean (n,) of the first state; the plant's by default.
+        initial_covariance: its covariance (n, n); the plant's by default.
+
+    Claim: "nominal"; "exact" where plant and sensor are linear, no gain is random and the initial law is the plant's
+    (then it is the Kalman filter).
+
+    Raises:
+        ValueError: sensor, channel and plant that do not fit, an initial covariance that is none, what is no transform
+            or update.
+
+    Source: cubature fusion under amplify-and-forward relays, Section III.
+    """
+    instance("transform", transform, AbstractTransform, "one such as Cubature()")
+    rule = Polytope() if update is None else instance("update", update, AbstractUpdate, "one such as Polytope()")
+    return _make_gaussian_filter(
+        plant, sensor, channel, transform, rule, initial_mean, initial_covariance, trusted=True
+    )
+
+
+@keeps_limits
+@takes_sensor_inputs
+@takes_told
+def cubature_filter(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel | None = None,
+    update: "AbstractUpdate | None" = None,
+    initial_mean: Float[ArrayLike, " n"] | None = None,
+    initial_covariance: Float[ArrayLike, "n n"] | None = None,
+) -> "GaussianFilter":
+    """Return the cubature Kalman filter on its channel's second moments.
+
+    Args:
+        plant: the plant, n states.
+        sensor: its sensor, m outputs.
+        channel: from the sensor to the filter, by default all arrives as it is. The memory of a channel
+            is ignored: where it matters, the claim is nominal.
+        update: how an uncertain channel is bounded; `Polytope()` by default.
+        initial_mean: mean (n,) of the first state; the plant's by default.
+        initial_covariance: its covariance (n, n); the plant's by default.
+
+    Claim: "nominal"; "exact" where plant and sensor are linear, no gain is random and the initial law is the plant's
+    (then it is the Kalman filter).
+
+    Raises:
+        ValueError: sensor, channel and plant that do not fit, or an initial covariance that is none.
+
+    Source: cubature fusion under amplify-and-forward relays, Section III.
+    """
+    return gaussian_filter(plant, sensor, channel, Cubature(), update, initial_mean, initial_covariance)
+
+
+@keeps_limits
+@takes_sensor_inputs
+@takes_told
+def extended_filter(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel | None = None,
+    update: "AbstractUpdate | None" = None,
+    initial_mean: Float[ArrayLike, " n"] | None = None,
+    initial_covariance: Float[ArrayLike, "n n"] | None = None,
+) -> "GaussianFilter":
+    """Return the extended Kalman filter on its channel's second moments; Jacobians by automatic differentiation.
+
+    Args:
+        plant: the plant, n states.
+        sensor: its sensor, m outputs.
+        channel: from the sensor to the filter; by default all arrives as it is.
+        update: how an uncertain channel is bounded; `Polytope()` by default.
+        initial_mean: mean (n,) of the first state; the plant's by default.
+        initial_covariance: its covariance (n, n); the plant's by default.
+
+    Claim: as `cubature_filter`.
+
+    Raises:
+        ValueError: sensor, channel and plant that do not fit, or an initial covariance that is none.
+
+    Source: cubature fusion under amplify-and-forward relays, Section IV (the filter compared with).
+    """
+    return gaussian_filter(plant, sensor, channel, Linearization(), update, initial_mean, initial_covariance)
+
+
+@keeps_limits
+def mean_gain_filter(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel,
+    initial_mean: Float[ArrayLike, " n"] | None = None,
+    initial_covariance: Float[ArrayLike, "n n"] | None = None,
+) -> GaussianFilter:
+    """Return the cubature filter that takes the mean gain for the gain: the naive filter, as a baseline.
+
+    Args:
+        plant: the plant, n states.
+        sensor: its sensor, m outputs.
+        channel: from the sensor to the filter; only its mean gain is used.
+        initial_mean: mean (n,) of the first state; the plant's by default.
+        initial_covariance: its covariance (n, n); the plant's by default.
+
+    Claim: "nominal", and far too small where gains are random.
+
+    Raises:
+        ValueError: sensor, channel and plant that do not fit, or an initial covariance that is none.
+
+    Source: cubature fusion under amplify-and-forward relays, with every gain replaced by its mean.
+    """
+    believed = mean_gain(without_memory(channel))
+    return _make_gaussian_filter(
+        plant, sensor, believed, Cubature(), Polytope(), initial_mean, initial_covariance, trusted=False
+    )
+
+
+def gaussian_filter_of(
+    name: str, plant: AnyPlant, sensor: AnySensor, channel: Channel, transform: AbstractTransform, rule: AbstractUpdate
+) -> GaussianFilter:
+    """Return the Gaussian filter that another one stands on, refused behind a link of which anything is told.
+
+    Args:
+        name: of the other filter, in the refusal.
+        plant: the plant.
+        sensor: its sensor.
+        channel: from the sensor to the filter.
+        transform: moments of a nonlinear function.
+        rule: how an uncertain channel is bounded.
+    """
+    filter = gaussian_filter(plant, sensor, channel, transform, rule)
+    return instance(f"channel of a {name}", filter, GaussianFilter, "one of which nothing is told")
+
+
+@keeps_limits
+@takes_sensor_inputs
+def kalman_filter(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    initial_mean: Float[ArrayLike, " n"] | None = None,
+    initial_covariance: Float[ArrayLike, "n n"] | None = None,
+) -> GaussianFilter | DiffuseFilter:
+    """Return the Kalman filter of a linear plant whose linear sensor is received directly.
+
+    P- = A P A' + Q, S = C P- C' + R, K = P- C' S^-1, m = m- + K (z - C m- - v), P = P- - K C P-.
+
+    Args:
+        plant: a linear plant, n states.
+        sensor: a linear sensor, m outputs.
+        initial_mean: mean (n,) of the first state; the plant's by default.
+        initial_covariance: its covariance (n, n); the plant's by default.
+
+    From a start that nobody knows (`hg.diffuse` as the plant's initial covariance) it is the limit of ever larger
+    covariances, exactly: infinite variances until enough was measured.
+
+    Claim: "exact" from the plant's initial law, whatever the laws' shapes; "nominal" from another, and with angles.
+
+    Raises:
+        ValueError: a plant or sensor that is not linear, parts that do not fit, an initial covariance that is none.
+
+    Source: Kalman, A new approach to linear filtering and prediction problems (1960).
+    """
+    if not is_linear(plant, sensor):
+        got = f"{type(first(plant)).__name__} and {type(first(sensor)).__name__}"
+        modal = is_modal(first(plant)) or is_modal(first(sensor))
+        instead = f" of one law ({SEVERAL_TAKEN_BY})" if modal else MATRICES
+        raise fail("Kalman filter", f"a LinearPlant and a LinearSensor{instead}", got)
+    if has_unknown_start(plant):
+        if initial_mean is not None or initial_covariance is not None:
+            raise fail("initial law", "none beside a plant whose start is unknown", "one")
+        return diffuse_filter(plant, sensor)
+    return _make_gaussian_filter(
+        plant, sensor, None, Linearization(), Polytope(), initial_mean, initial_covariance, trusted=True
+    )

@@ -1,0 +1,106 @@
+"""One step of a trust-region search, of many lanes at once: the best point of a quadratic model within a radius."""
+
+import numpy as np
+
+from heliograph.numerics.types import Bool, Float
+
+FLAT = 1e-10  # eigenvalue of the scaled information below which a direction is not identified
+SECULAR_STEPS = 20  # Newton steps for the shift s at most; a few are enough
+LONGEST = 5.0  # step of a logarithm or a logit: a factor of 150
+ROUNDING = 1e-14  # of a matrix's eigenvalues, as a share of the largest
+LEAST = 1e-150  # information, of which the square is a number
+LARGEST = 1e12  # curvature in units of standard errors: beyond this a model is taken for rounding
+
+
+def trust_region_step(
+    gradient: np.ndarray,
+    information: np.ndarray,
+    model: np.ndarray,
+    radius: np.ndarray,
+    moving: np.ndarray,
+    free: np.ndarray,
+) -> tuple[Float[np.ndarray, "lanes p"], Float[np.ndarray, " lanes"], Float[np.ndarray, " lanes"]]:
+    """Return the maximiser p of g' p - p' B p / 2 over |D p| <= radius, |D p|, and the gain that B foretells.
+
+    It is (B + s D^2)^-1 g with the least s >= 0 for which B + s D^2 is not indefinite and |D p| <= radius: Newton's
+    method for 1 / |D p| = 1 / radius, from below. All in units u of standard errors, in which B is of order 1 and
+    D = max(1, radius u / LONGEST) where a logarithm moves, else 1: matrices scaled by a diagonal are solved as exactly
+    as without. To B is added v v' for each direction v that is not identified, whose gradient is but rounding.
+
+    Args:
+        gradient: g (lanes, p).
+        information: its diagonal gives the standard errors.
+        model: B, minus the Hessian or near it; it may be indefinite. Where it is not finite, or huge, the information
+            takes its place.
+        radius: of the trust region (lanes,).
+        moving: which coordinates may move (lanes, p).
+        free: which are no logarithms, and so not limited by LONGEST (p,).
+    """
+    unit, flat = find_flat_directions(information, moving)
+    stays = unit == 0
+    d = np.where(free | stays, 1.0, np.maximum(1.0, radius[:, None] * unit / LONGEST))
+    g = np.nan_to_num(gradient) * unit
+    b = _scale_both_sides(model, unit)
+    sane = np.all(np.abs(b) < LARGEST, axis=(1, 2))  # NaN is not
+    b = np.where(sane[:, None, None], b, _scale_both_sides(information, unit))
+    b = (b + b.swapaxes(1, 2)) / 2 + flat @ flat.swapaxes(1, 2) + np.eye(len(free)) * stays[:, :, None]
+    # s: none at first, or what makes the matrix positive.
+    least = np.linalg.eigvalsh(b / d[:, :, None] / d[:, None, :])[:, 0]
+    shift = np.where(least > -ROUNDING, 0.0, -least * (1 + 1e-6))
+    for _ in range(SECULAR_STEPS):
+        step = _solve_shifted(b, shift, d, g)
+        length = np.linalg.norm(d * step, axis=1)
+        beyond = length > 1.01 * radius
+        if not beyond.any():
+            break
+        slope = np.sum(d * d * step * _solve_shifted(b, shift, d, d * d * step), axis=1)  # -|D p| d|D p| / ds
+        newton = length**2 / np.where(beyond, slope, 1.0) * (length - radius) / radius
+        shift = np.where(beyond, shift + newton, shift)
+    inside = np.minimum(1.0, radius / np.where(length > 0, length, 1.0))
+    step, length = step * inside[:, None], length * inside
+    foretold = np.sum(step * (g - multiply_lanes(b, step) / 2), axis=1)
+    return step * unit, length, foretold
+
+
+def _solve_shifted(b: np.ndarray, shift: np.ndarray, d: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Return (B + s D^2)^-1 g of each lane; nothing along directions in which the matrix is singular."""
+    matrix = b + (shift[:, None] * d * d)[:, :, None] * np.eye(b.shape[1])
+    try:
+        return np.asarray(np.linalg.solve(matrix, right[..., None])[..., 0])
+    except np.linalg.LinAlgError:  # a pivot that is exactly 0
+        return multiply_lanes(np.linalg.pinv(matrix, ROUNDING, hermitian=True), right)
+
+
+def expected_gain(
+    gradient: np.ndarray, information: np.ndarray, counting: Bool[np.ndarray, "lanes p"]
+) -> Float[np.ndarray, " lanes"]:
+    """Return g' I^-1 g of the coordinates that count, along directions that are identified: squared standard errors."""
+    unit, _ = find_flat_directions(information, counting)
+    scaled = _scale_both_sides(information, unit)
+    values, vectors = np.linalg.eigh((scaled + scaled.swapaxes(1, 2)) / 2)
+    along = np.einsum("lij,li->lj", vectors, np.nan_to_num(gradient) * unit)
+    return np.asarray(np.sum(np.where(values > FLAT, along**2 / np.where(values > FLAT, values, 1.0), 0.0), axis=1))
+
+
+def find_flat_directions(information: np.ndarray, moving: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the standard error of each coordinate alone (lanes, p), and the directions without information.
+
+    The errors are 0 of coordinates that stay; directions stand in columns (lanes, p, p), the others are zeros.
+    """
+    diagonal = np.diagonal(information, axis1=1, axis2=2)
+    informed = moving & (diagonal > LEAST) & np.isfinite(diagonal)
+    unit = np.where(informed, 1 / np.sqrt(np.where(informed, diagonal, 1.0)), 0.0)
+    scaled = _scale_both_sides(information, unit)
+    values, vectors = np.linalg.eigh((scaled + scaled.swapaxes(1, 2)) / 2)
+    return unit, np.where(((values <= FLAT)[:, None, :]), vectors, 0.0) * informed[:, :, None]
+
+
+def _scale_both_sides(matrix: np.ndarray, unit: np.ndarray) -> np.ndarray:
+    """Return U A U with U = diag(unit); 0 for coordinates that stay, whatever A has there."""
+    stays = (unit == 0)[:, :, None] | (unit == 0)[:, None, :]
+    return np.where(stays, 0.0, matrix * unit[:, :, None] * unit[:, None, :])
+
+
+def multiply_lanes(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """Return A x of each lane."""
+    return np.asarray(np.einsum("lij,lj->li", matrix, vector))
