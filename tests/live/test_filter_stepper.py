@@ -145,7 +145,7 @@ def test_limits_are_counted_by_both_engines(monkeypatch):
         stream = stream_of(item, engine, monkeypatch, (-5.0, 5.0))
         other = stream_of(item, engine, monkeypatch)
         np.testing.assert_array_equal(stream.push([9.0, 1.0], [0.0]).mean, other.push([np.nan, 1.0], [0.0]).mean)
-        assert stream.dropped.tolist() == [1, 0]
+        assert sum(stream.refused.values()).tolist() == [1, 0]
         with pytest.raises(ValueError, match="measurement: expected numbers"):
             stream.push([np.inf, 1.0], [0.0])
 

@@ -69,7 +69,7 @@ def test_a_stream_and_a_timeline_name_it_once_and_go_on(sensor):
         "than once in 1,000,000,000 readings; stuck=10 refuses such"
         for begin in ("stream, step 309: received number 0", "timeline, a: v")
     ]
-    assert line.held == {"a": 1} and stream.held.tolist() == [1] and line.stuck == {"a": 0}
+    assert line.held == {"a": 1} and stream.held.tolist() == [1] and not any(line.refused["a"].values())
     assert line.estimates()["a"]["k"].claim == "exact"
 
 
@@ -78,7 +78,7 @@ def test_who_refuses_what_is_stuck_is_not_watched_and_a_run_is_counted_once():
     line = hg.Timeline(network(DECLARED, stuck=True), window=0.0)
     for k in range(330):
         line.push("a", k, k, [z[k]])
-    assert line.held == {"a": 0} and line.stuck["a"] > 0
+    assert line.held == {"a": 0} and line.refused["a"]["stuck"] > 0
     line = hg.Timeline(network(), window=0.0)
     with pytest.warns(UserWarning, match="a: v is stuck, or has no noise"):
         for k, value in enumerate(np.concatenate([z[:330], z[:100], z[300:330]])):

@@ -77,11 +77,21 @@ def test_values_beyond_limits_count_as_not_arrived():
     timeline = hg.Timeline(network, window=10.0)
     verdicts = [timeline.push("a", k, k, row) for k, row in enumerate(z)]
     assert verdicts == ["used", "used", "implausible", "used", "used"]
-    assert timeline.dropped == {"a": 4} and timeline.counts["a"]["implausible"] == 1
+    assert timeline.refused == {"a": {"limits": 1, "code": 3, "stuck": 0}}
+    assert timeline.counts["a"]["implausible"] == 1
     again = hg.Timeline.restore(network, timeline.save())
-    assert again.dropped == {"a": 4}
-    with pytest.warns(UserWarning, match=r"node 'a': 4 of 10 values count as not arrived; row 2: near 6 is outside -5"):
+    assert again.refused == timeline.refused
+    with pytest.warns(UserWarning, match="node 'a': . of 10 values count as not arrived, by") as said:
         record = hg.run(network, {"a": z})
+    assert [str(warning.message).partition(", by ")[2] for warning in said] == [
+        "limits; row 2: near 6 is outside -5 to 5",
+        "code; row 3: near -999 is a code, far -999 is a code",
+    ]
+    assert [(one.component, one.reason, one.count, one.row) for one in record.refusals] == [
+        (0, "limits", 1, 1),
+        (0, "code", 1, 2),
+        (1, "code", 2, 2),
+    ]
     record_ = hg.run(free, {"a": seen})
     same(record.estimates, record_.estimates)
     np.testing.assert_array_equal(record.measurements["a"], seen)

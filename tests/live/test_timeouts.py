@@ -26,7 +26,7 @@ def test_a_timeline_names_who_is_silent_for_longer_than_its_timeout():
     line.push("b", 2, 6.0, [0.1])
     status = line.senders()["a"]
     assert status.dead and status.last is None and status.silent + status.provisional == 6
-    assert status.reason == "nothing came for 6, and its timeout is 5"
+    assert status.reason == "nothing came for 6 steps, and its timeout is 5 steps"
     line.push("a", 0, 6.0, [0.1])
     assert not line.senders()["a"].dead and line.timeouts == {"a": 1, "b": 0}
     for k in (10, 16):
@@ -64,7 +64,7 @@ def test_a_timeout_changes_no_estimate_and_no_claim_and_is_saved():
         plain.senders()
 
 
-@pytest.mark.parametrize("timeout", [0.0, -1.0, np.nan, np.inf, "soon"])
+@pytest.mark.parametrize("timeout", [0.0, -1.0, np.nan, np.inf, "soon", True])
 def test_a_timeout_is_a_positive_number(timeout):
     with pytest.raises((ValueError, TypeError), match="timeout: expected"):
         network(a=timeout)
@@ -73,12 +73,12 @@ def test_a_timeout_is_a_positive_number(timeout):
 def test_a_recording_names_silences_with_their_rows():
     z = np.full((30, 1), 0.1)
     z[4:8], z[12:25] = np.nan, np.nan
-    with pytest.warns(UserWarning, match=r"node 'a': nothing came for 14, and its timeout is 4: 2 times, the longest "
-                                         r"after row 12$"):  # fmt: skip
+    said = "node 'a': nothing came for 14 steps, and its timeout is 4 steps: 2 times, the longest after row 12$"
+    with pytest.warns(UserWarning, match=said):
         record = hg.run(network(a=4), {"a": z, "b": np.full((30, 1), 0.1)})
     health = examine(network(a=4), record)
     assert [line for line in health.warnings() if "timeout" in line] == [
-        "a: nothing came for 14, and its timeout is 4: 2 times, the longest after row 12"
+        "a: nothing came for 14 steps, and its timeout is 4 steps: 2 times, the longest after row 12"
     ]
 
 

@@ -66,7 +66,7 @@ def test_right_recordings_are_not_stuck():
             for walk in (0.0, 0.01, 0.3, 3.0):
                 for n in (300, 3000, 3000, 20_000):
                     x = np.cumsum(walk * rng.standard_normal(n)) + rng.uniform(-5, 5)
-                    named += limits.screen(np.round((x + draw(rng, n)) / q)[:, None] * q).stuck.any()
+                    named += limits.screen(np.round((x + draw(rng, n)) / q)[:, None] * q).by("stuck").any()
     assert named == 0
 
 
@@ -76,7 +76,7 @@ def test_a_sensor_that_stands_is_refused_after_so_many_readings():
     x = np.cumsum(0.1 * rng.standard_normal((200, 200)), axis=1)
     z = np.round((x + 0.5 * rng.standard_normal(x.shape)) / 0.1) * 0.1
     z[:, 100:] = z[:, [100]]
-    first = [int(np.argmax(limits.screen(row[:, None]).stuck)) - 100 for row in z]
+    first = [int(np.argmax(limits.screen(row[:, None]).by("stuck"))) - 100 for row in z]
     assert max(first) == 9 and min(first) >= 7  # the readings before may have been equal by chance
 
 
@@ -84,8 +84,8 @@ def test_missing_readings_and_codes_end_no_run():
     limits = hg.Node(SENSOR, hg.perfect(), {}, invalid=-1, stuck=3).limits
     z = np.array([5.0, np.nan, 5.0, -1.0, 5.0, 5.0, 6.0, 5.0])[:, None]
     screened = limits.screen(z)
-    np.testing.assert_array_equal(screened.stuck[:, 0], [0, 0, 0, 0, 1, 1, 0, 0])
-    np.testing.assert_array_equal(screened.outside[:, 0], [0, 0, 0, 1, 0, 0, 0, 0])
+    np.testing.assert_array_equal(screened.by("stuck")[:, 0], [0, 0, 0, 0, 1, 1, 0, 0])
+    np.testing.assert_array_equal(screened.by("code")[:, 0], [0, 0, 0, 1, 0, 0, 0, 0])
     # The same in two pieces.
     first = limits.screen(z[:3])
     np.testing.assert_array_equal(limits.screen(z[3:], first.repeats).values, screened.values[3:])
@@ -97,7 +97,10 @@ def test_a_recording_a_stream_and_a_timeline_refuse_the_same():
     item = hg.kalman_filter(PLANT, SENSOR)
     network = hg.Network(PLANT, {"a": hg.Node(SENSOR, hg.perfect(), {"k": item}, stuck=True)})
     assert network.claims()["a"]["k"] == "nominal"
-    with pytest.warns(UserWarning, match="node 'a': 92 of 1000 values .* row 409: v -1.9 is stuck: 10 equal readings"):
+    with pytest.warns(
+        UserWarning,
+        match="node 'a': 92 of 1000 values count as not arrived, by stuck; row 409: v -1.9 is stuck: 10 equal readings",
+    ):
         record = hg.run(network, {"a": z[:, None]})
     stream, timeline = hg.Stream(item, stuck=True), hg.Timeline(network, window=0.0)
     for k in range(450):
@@ -109,7 +112,11 @@ def test_a_recording_a_stream_and_a_timeline_refuse_the_same():
     for k in range(450, 1000):
         estimate = stream.push([z[k]])
         timeline.push("a", k, k, [z[k]])
-    assert stream.stuck.tolist() == [92] and timeline.stuck == {"a": 92} and timeline.counts["a"]["implausible"] == 92
+    assert (
+        stream.refused["stuck"].tolist() == [92]
+        and timeline.refused["a"]["stuck"] == 92
+        and timeline.counts["a"]["implausible"] == 92
+    )
     assert timeline.reasons["a"] == "v -1.9 is stuck: 10 equal readings in a row or more"
     mean = record.estimates["a"]["k"].mean
     np.testing.assert_allclose(estimate.mean, mean[-1], rtol=1e-12)

@@ -83,7 +83,8 @@ def test_limits_hold_here_too_and_it_is_said_once():
     details = [single["detail"] for single in outputs if single["kind"] == "refused"]
     assert details == ["y0 -999 is a code", "y0 6 is outside -5 to 5", "y0 1e+20 is outside -5 to 5"]
     link = service.plants[""].links["a"]
-    assert (link.used, link.implausible, link.dropped, link.lost) == (2, 3, 3, 0)
+    assert (link.used, link.implausible, link.lost) == (2, 3, 0)
+    assert link.refused == {"limits": 2, "code": 1}
     assert len(said) == 1 and said[0].startswith("warning: message 1 of 'a' is implausible: y0 -999 is a code; ")
     hidden = fleet(stepping())  # the identity of a store knows the limits
     assert hidden.program.network is not network

@@ -55,11 +55,10 @@ def filter_plant(
     predicts: bool,
 ) -> FilteredPlant:
     """Filter a plant's rows; forecast as far `ahead`, and predict each row, where that is asked for."""
-    from dataclasses import replace
 
     record, doubts = _filter_rows(network, data.recording, smooth)
     if data.events is not None and data.events.dated and record.origin is not None:
-        record = replace(record, units={"time": "s"} | record.units).with_origin(record.origin)
+        record = record.with_units({"time": "s"} | record.units)
     said = [*_describe_doubted(network, record), *data.summary]
     forecasts: ByFilter = {}
     if ahead is not None:

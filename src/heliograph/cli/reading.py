@@ -197,14 +197,19 @@ def _convert_events(events: "EventTable", plant: str, options: ReadingOptions) -
 
 def describe_unread(path: object, events: "EventTable") -> list[str]:
     """Say how many messages could not be read, and why, of the first of them; and where the reading ended."""
+    from heliograph.model.checks.refusals import describe_counts
+
     lines = [events.broken] if events.broken else []
     if events.refused:
-        lines.append(describe_refused(path, "messages", events.refused, events.reasons))
+        by_node = [f"{node}: {describe_counts(counts)}" for node, counts in events.refusals.items()]
+        lines.append(describe_refused(path, "messages", events.refused, events.reasons, "; ".join(by_node)))
     return lines
 
 
-def describe_refused(path: object, what: str, count: int, reasons: Sequence[str]) -> str:
-    """Say how many rows or messages could not be read, and why, of the first of them."""
+def describe_refused(path: object, what: str, count: int, reasons: Sequence[str], known: str = "") -> str:
+    """Say how many rows or messages could not be read, how many for `known` reasons, and why, of the first of them."""
     more = count - len(reasons)
     others = f"; and {more} more" if more > 0 else ""
-    return f"{path}: {what} that could not be read: {count}; {'; '.join(reasons)}{others}"
+    return (
+        f"{path}: {what} that could not be read: {count}{f' ({known})' if known else ''}; {'; '.join(reasons)}{others}"
+    )

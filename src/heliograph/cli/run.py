@@ -228,7 +228,10 @@ def _write_report(name: str, network: "Network", plants: "Sequence[FilteredPlant
         record, inputs = plant.record, plant.data.recording.inputs
         residuals = heliograph.forecasting.record_residuals(record, inputs) if plant.predicted else {}
         health = examine(network, record, inputs, advance)
-        return replace(health, forecasts=plant.forecasts, predicted=plant.predicted, residuals=residuals)
+        refused = {} if plant.data.events is None else plant.data.events.refusals
+        return replace(
+            health, forecasts=plant.forecasts, predicted=plant.predicted, residuals=residuals, refused_messages=refused
+        )
 
     def examine_plants(advance: "Advance") -> dict[str, Health]:
         """Return the diagnosis of each plant, by name."""

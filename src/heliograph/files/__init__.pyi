@@ -49,7 +49,7 @@ from .recording import (
     read_recording as read_recording,
     write_recording as write_recording,
 )
-from .sources.sources import (
+from .sources.reading import (
     Reading as Reading,
 )
 from .stores.tables import (

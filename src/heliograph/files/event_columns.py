@@ -1,15 +1,17 @@
 """Events of a recording as arrays, and the verdicts on them that a timeline gives to one event after another."""
 
 from array import array
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from heliograph.files.sources.sources import Reading
+from heliograph.files.sources.reading import Unread
 from heliograph.live.event import VERDICTS, Verdict
 from heliograph.live.link_counts import GAP
+from heliograph.model.checks.refusals import Reason, RefusedError
 from heliograph.numerics.check import fail
 from heliograph.numerics.times.row_order import SECOND, YEAR, find_astray
 from heliograph.numerics.types import Bool, Float, Int
@@ -29,6 +31,7 @@ class Columns:
         period: after how many messages the count begins at 0 again; 0 if it does not.
         unread: of the messages that came and are no events, since they could not be read or their stamps were not set:
             moments near which they came, and their counts.
+        refused: how many messages were refused for their flag or counter.
     """
 
     size: int
@@ -39,6 +42,7 @@ class Columns:
     sequence: "array[int]" = field(default_factory=lambda: array("q"))
     values: "array[float]" = field(default_factory=lambda: array("d"))
     unread: list[tuple[float, int]] = field(default_factory=list)
+    refused: "Counter[Reason]" = field(default_factory=Counter)
 
     def __post_init__(self) -> None:
         self.time, self.arrival = (array("d" if self.numbers else "q") for _ in range(2))
@@ -57,8 +61,13 @@ class Columns:
         """Return the values, a row for each event."""
         return np.array(self.values).reshape(len(self.time), self.size)
 
-    def note_unread(self, reading: Reading, arrival: float | None) -> None:
-        """Note a message that came with its count and could not be read, at its time or arrival, else at the newest."""
+    def note_unread(self, unread: Unread, arrival: float | None) -> None:
+        """Note a message that could not be read: its reason, and its count at its time or arrival, else the newest."""
+        if isinstance(unread.error, RefusedError):
+            self.refused[unread.error.reason] += 1
+        reading = unread.counted
+        if reading is None:
+            return
         moments = (reading.time, arrival, self.time[-1] if self.time else None)
         near = next((moment for moment in moments if moment is not None), None)
         if near is not None and reading.sequence is not None:
@@ -315,3 +324,19 @@ def fill_forward(values: Float[np.ndarray, "rows given"]) -> Float[np.ndarray, "
     rows = np.where(np.isnan(values), -1, np.arange(len(values))[:, None])
     last = np.maximum.accumulate(rows, axis=0) if len(values) else rows
     return np.asarray(np.where(last < 0, 0.0, np.take_along_axis(values, np.maximum(last, 0), axis=0)))
+
+
+def lead_to_rows(
+    held: Float[np.ndarray, "rows given"], times: np.ndarray, unit: int, place: int
+) -> Float[np.ndarray, "rows inputs"]:
+    """Return the inputs that lead to each row in continuous time: those of the row before, and the time since it.
+
+    Args:
+        held: inputs as they were set up to each row; before the first they are 0.
+        times: of the rows, in units of which so many are one unit of time.
+        unit: how many.
+        place: of the time since the row before, dt, among the inputs.
+    """
+    before = np.vstack([np.zeros((1, held.shape[1])), held[:-1]])
+    since = np.diff(times, prepend=times[:1]) / unit
+    return np.insert(before, place, since, 1)

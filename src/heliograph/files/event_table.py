@@ -1,5 +1,6 @@
 """Events of a recording in columns: a few numbers each, whatever the messages weighed that they were read from."""
 
+from collections import Counter
 from collections.abc import Iterator
 
 import numpy as np
@@ -12,12 +13,14 @@ from heliograph.files.event_columns import (
     counts_losses,
     fill_forward,
     judge,
+    lead_to_rows,
     number_within,
 )
 from heliograph.files.recording import Recording
-from heliograph.files.sources.sources import Reading
+from heliograph.files.sources.reading import Reading, Unread
 from heliograph.learning.losses.delays import Delays, learn_delays
 from heliograph.live.event import AHEAD, INPUTS, Event, Verdict
+from heliograph.model.checks.refusals import Reason
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail, instance, scalar
 from heliograph.numerics.module import readable
@@ -134,9 +137,19 @@ class EventTable:
         columns.values.frombytes(values.tobytes())
         columns.period = period
 
-    def note_unread(self, reading: Reading, arrival: float | None) -> None:
-        """Note a message of a node that came with its count and could not be read."""
-        self._columns_of(reading.plant)[reading.node].note_unread(reading, arrival)
+    def note_unread(self, unread: Unread, arrival: float | None) -> None:
+        """Note count and reason of a message that could not be read, where its node is known."""
+        if unread.counted is not None:
+            self._columns_of(unread.counted.plant)[unread.counted.node].note_unread(unread, arrival)
+
+    @property
+    def refusals(self) -> dict[str, Counter[Reason]]:
+        """Return by node how many messages were refused for their flag or counter; nodes without any are absent."""
+        counts = dict[str, Counter[Reason]]()
+        for node, columns in ((node, columns) for plant in self._plants.values() for node, columns in plant.items()):
+            if columns.refused:
+                counts.setdefault(node, Counter()).update(columns.refused)
+        return counts
 
     def refuse(self, error: InputError, strict: bool) -> None:
         """Count a message that cannot be read, with the reason.
@@ -335,7 +348,9 @@ class EventTable:
         for n, name in enumerate(self.network.names):
             if counts_losses(self.network, name):
                 self.columns[name].fill_losses(tables[n], row[events.node == n], events.sequence[events.node == n])
-        inputs = self._make_inputs(fill_forward(tables.pop()), times)
+        inputs = fill_forward(tables.pop())
+        if not self.steps:
+            inputs = lead_to_rows(inputs, times, self._unit, self.network.inputs.index(TIME_STEP))
         origin = self.origin
         time = times.astype(np.float64) if self.steps or self.numbers else (times - origin) / SECOND
         measured = np.zeros(len(times), dtype=bool)
@@ -379,15 +394,3 @@ class EventTable:
 
         limits = [limit if limit == np.inf or self._unit == 1 else round(limit * SECOND) for limit in (window, ahead)]
         return events, judge(events, values, self._joint, *limits)
-
-    def _make_inputs(self, held: Float[np.ndarray, "rows given"], times: np.ndarray) -> np.ndarray:
-        """Return the plant's inputs (rows, inputs), from those set up to each row, `held`.
-
-        In continuous time those of the row before lead to a row, 0 at first, with the time dt since that row; where
-        time counts steps, those of the row itself do.
-        """
-        if self.steps:
-            return held
-        before = np.vstack([np.zeros((1, held.shape[1])), held[:-1]])
-        since = np.diff(times, prepend=times[:1]) / self._unit
-        return np.insert(before, self.network.inputs.index(TIME_STEP), since, 1)

@@ -1,10 +1,12 @@
-"""Outputs of rows that are final, held until they are read."""
+"""Outputs of rows that are final, held until they are read, and counts of what filters left out in them."""
 
 from collections import deque
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
 from heliograph.numerics.types import Float
+from heliograph.simulation.rows.columns import FilterColumns
 
 
 class FinalRows:
@@ -27,3 +29,24 @@ class FinalRows:
         self._parts.clear()
         self._count = 0
         return np.concatenate(times), np.concatenate(rows)
+
+
+class GateCounts:
+    """Counts of the values that filters left out of rows, by node and filter that weighs what arrives."""
+
+    def __init__(self, places: Iterable[FilterColumns]):
+        self._columns = {(p.node, p.filter): list(p.weighed.weight) for p in places if p.weighed is not None}
+        self.counts = dict.fromkeys(self._columns, 0)
+
+    def add(self, rows: Float[np.ndarray, "row output"]) -> None:
+        """Count in the outputs of some rows the weights of 0; what did not arrive has none."""
+        for name, columns in self._columns.items():
+            self.counts[name] += int(np.count_nonzero(rows[:, columns] == 0))
+
+    def pack(self) -> list[tuple[str, str, int]]:
+        """Return the counts as node, filter and number."""
+        return [(*name, count) for name, count in self.counts.items()]
+
+    def unpack(self, stored: Sequence[tuple[str, str, int]]) -> None:
+        """Take counts as `pack` returned them, of the filters that are here."""
+        self.counts |= {(node, name): count for node, name, count in stored if (node, name) in self.counts}

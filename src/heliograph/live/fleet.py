@@ -16,9 +16,11 @@ from heliograph.live.plant import PlantState, Withdrawn
 from heliograph.live.pool import Pool, cut_into_legs, group_by_turn
 from heliograph.live.rows import BEFORE, HeldRow, Rows
 from heliograph.live.sender_status import Sender, SenderStatus
+from heliograph.model.checks.refusals import count_by_reason
 from heliograph.model.limits import Limits
 from heliograph.model.over_time import steps_covered
 from heliograph.model.stuck import Repeats
+from heliograph.model.timeouts import name_unit
 from heliograph.numerics.check import TINY, check_count, fail, instance, scalar
 from heliograph.numerics.types import Float
 from heliograph.simulation.node import Node
@@ -237,12 +239,12 @@ class Fleet:
         """Remove an event's values that its node refuses, given the runs of equal readings before it."""
         event, values = taken.event, np.array(taken.event.values)
         screened = limits.screen(values[None], taken.repeats)
-        outside, stuck = screened.outside[0], screened.stuck[0]
-        if not (outside | stuck).any():
+        if not screened.refused.any():
             return ScreenedEvent(event, repeats=screened.repeats)
-        said = limits.why(values, self.network.nodes[node].received_names, stuck)
+        said = limits.why(values, screened.refused[0], self.network.nodes[node].received_names)
         left = event._replace(values=screened.values[0].tolist())
-        return ScreenedEvent(left, int(outside.sum()), int(stuck.sum()), said, screened.repeats)
+        counts = {reason: int(count.sum()) for reason, count in count_by_reason(screened.refused).items()}
+        return ScreenedEvent(left, counts, said, screened.repeats)
 
     def take(
         self, plant: PlantState, event: Known, given: bool = False, wall: float | None = None, clock: str | None = None
@@ -366,7 +368,9 @@ class Fleet:
             last = None if link is None or not link.used else link.latest
             if by_steps and last is not None:
                 last = int(last) if last >= 0 else None
-            statuses[name] = sender.status(last, plant.begun if sender.trigger is None else -1, final, now)
+            status = sender.status(last, plant.begun if sender.trigger is None else -1, final, now)
+            refused = {} if link is None else link.refused
+            statuses[name] = status._replace(refused=refused, unit=name_unit(self.network.inputs))
         return statuses
 
     def count(self, plant: PlantState, node: str, screened: ScreenedEvent, verdict: Verdict) -> None:

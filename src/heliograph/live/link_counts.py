@@ -1,13 +1,15 @@
 """Counts of a node's messages by verdict, of those that its running count says were lost, and of long silences."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from heliograph.live.event import Known, Verdict
 from heliograph.live.leap import Moments
+from heliograph.model.checks.refusals import Reason
 from heliograph.model.stuck import Repeats
 
-NO_REPEATS = Repeats()
+NO_REPEATS, NONE = Repeats(), dict[Reason, int]()
 GAP = 1 << 14  # more messages in a row are not lost: the count began anew (LoRaWAN's MAX_FCNT_GAP)
 
 
@@ -16,15 +18,13 @@ class ScreenedEvent(NamedTuple):
 
     Args:
         event: the event, NaN for these values.
-        dropped: how many are beyond the limits of the node, or codes.
-        stuck: how many repeat for longer than their noise allows.
-        why: which of either, in words.
+        refused: how many the node refuses, by reason that there is.
+        why: which and why, in words.
         repeats: runs of equal readings of the node that end with this event.
     """
 
     event: Known
-    dropped: int = 0
-    stuck: int = 0
+    refused: Mapping[Reason, int] = NONE
     why: str = ""
     repeats: Repeats = NO_REPEATS
 
@@ -47,9 +47,9 @@ class LinkCounts:
         at: time of the measurement with the greatest count.
         lost: gaps in the running count that no message has filled.
         used, duplicate, conflict, late, future, implausible: numbers of messages by verdict.
-        dropped: single values beyond the limits of the node.
+        refused: by reason, single values that the node refuses, and messages for their flag or counter; until version
+            0.4.0 one number, of those beyond limits and codes.
         latest: time of the newest measurement that was used; -1 before the first.
-        stuck: single values that repeated for longer than their noise allows.
         repeats: newest readings, and how many in a row are equal to them, of a node that watches for it.
         timeouts: silences longer than the timeout of the node that a message has ended, in order of arrival.
     """
@@ -64,22 +64,27 @@ class LinkCounts:
     late: int = 0
     future: int = 0
     implausible: int = 0
-    dropped: int = 0
+    refused: "dict[Reason, int]" = field(default_factory=dict)
     latest: float = -1.0
-    stuck: int = 0
     repeats: "Repeats" = field(default_factory=Repeats)
     timeouts: int = 0
 
     def __post_init__(self) -> None:
-        """Take runs of equal readings as they were stored."""
+        """Take runs of equal readings, and what was refused, as they were stored."""
         self.repeats = Repeats.read(self.repeats)
+        if isinstance(self.refused, int):
+            self.refused = {"limits": self.refused} if self.refused else {}
 
     def count_screened(self, screened: ScreenedEvent, verdict: Verdict) -> None:
         """Add the values of an event that count as not arrived; a copy, or one of a wrong time, adds none."""
         if verdict in ("used", "implausible"):
-            self.dropped += screened.dropped
-            self.stuck += screened.stuck
+            for reason, count in screened.refused.items():
+                self.count_refused(reason, count)
             self.repeats = screened.repeats
+
+    def count_refused(self, reason: Reason, count: int = 1) -> None:
+        """Count readings, or messages, that are refused for a reason."""
+        self.refused = {**self.refused, reason: self.refused.get(reason, 0) + count}  # others keep what they copied
 
     @property
     def held(self) -> int:

@@ -1,15 +1,19 @@
 """Silence of senders: what of it is final, what is not, and which senders are dead, and why."""
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 
 from heliograph.model.channel import Channel
+from heliograph.model.checks.refusals import Reason
 from heliograph.model.over_time import first
+from heliograph.model.timeouts import describe_silence
 from heliograph.model.trigger import AbstractTrigger, Periodic
 from heliograph.random_affine.modes import joint_modes
 from heliograph.simulation.node import Node
 
+NONE = dict[Reason, int]()
 DEAD = 1e-3  # probability below which heartbeats are not lost one after another by chance
 
 
@@ -20,8 +24,10 @@ class SenderStatus(NamedTuple):
     then that are final and at which nothing came, or the time. provisional: later ones at which nothing came yet: a
     value may still be under way, and estimates that take it for silence are made anew if one comes. missed: heartbeats
     that were due in the silent steps and did not come; chance: the probability that the link lost them all. timeout:
-    for how long nothing need come, None for any time. A sender is dead where that chance is below 1 in 1,000, or where
-    nothing came for longer than the timeout: its value is unknown, not constant.
+    for how long nothing need come, None for any time. refused: how many of its readings its node refused, by reason,
+    and messages for their flag or counter. unit: of all these times, "" where that of the plant has none. A sender is
+    dead where that chance is below 1 in 1,000, or where nothing came for longer than the timeout: its value is unknown,
+    not constant.
     """
 
     last: float | None
@@ -30,6 +36,8 @@ class SenderStatus(NamedTuple):
     missed: int
     chance: float
     timeout: float | None = None
+    refused: Mapping[Reason, int] = NONE
+    unit: str = "steps"
 
     @property
     def dead(self) -> bool:
@@ -44,7 +52,7 @@ class SenderStatus(NamedTuple):
             return f"{self.missed} heartbeats did not come, {chance}"
         quiet = self.silent + self.provisional
         if self.timeout is not None and quiet > self.timeout:
-            return f"nothing came for {quiet:g}, and its timeout is {self.timeout:g}"
+            return describe_silence(quiet, self.timeout, self.unit)
         return ""
 
 

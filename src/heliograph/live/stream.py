@@ -19,6 +19,7 @@ from heliograph.live.stored.snapshot import Identity, check_same, pack, unpack, 
 from heliograph.model.channel import Channel
 from heliograph.model.checks.faults import find_function_fault
 from heliograph.model.checks.inputs import check_inputs
+from heliograph.model.checks.refusals import SCREENED, Reason, count_by_reason
 from heliograph.model.estimate import JudgedEstimate, lower_unsound_claim, weakest
 from heliograph.model.limits import LimitsLike, Screened, limits_of
 from heliograph.model.origin import Origin
@@ -33,6 +34,7 @@ from heliograph.numerics.trees.static import cast
 from heliograph.numerics.types import ArrayLike, PyTree
 from heliograph.simulation.description.wide_angles import WideAngles
 
+COUNTED: tuple[Reason, ...] = (*SCREENED, "gate")
 BEYOND, RARE = 10, 1e-4  # measurements in a row, each beyond what an honest filter sees so seldom
 SAME = ("precision", "filter", "states", "inputs", "numbers received")  # what the state of a stream means
 
@@ -47,12 +49,13 @@ class Stream:
 
     Args:
         filter: the filter to run.
-        limits: greatest and smallest plausible values, as of a `Node`; numbers beyond them count as not arrived, and
-            `dropped` counts them by component. What is refused then depends on the state: the claim is nominal.
+        limits: greatest and smallest plausible values, as of a `Node`; numbers beyond them count as not arrived. What
+            is refused then depends on the state: the claim is nominal.
         invalid: codes for a missing value, as of a `Node`.
-        stuck: after how many equal readings in a row one counts as not arrived, as of a `Node`; `stuck` of the stream
-            counts them by component.
+        stuck: after how many equal readings in a row one counts as not arrived, as of a `Node`.
 
+    `refused` counts by reason and component what is refused: "limits", "code" and "stuck" before the filter, "gate"
+    by it alone, with a weight of 0.
     A filter that was sure of a wrong start, behind a gate, leaves out all that comes: where BEYOND measurements in a
     row are further off than one in 10,000 should be, a warning says so, and `doubt` until one is not. An angle that is
     known less well than the filter can use is warned of once.
@@ -73,8 +76,8 @@ class Stream:
         self.filter, world = filter, filter.premise
         believed = (None, None) if world is None else (world.sensor, world.channel)
         self.limits = limits_of(filter.received, limits, invalid, stuck, *believed)
-        self.dropped = np.zeros(filter.received, dtype=np.int64)
-        self.stuck, self._repeats = np.zeros(filter.received, dtype=np.int64), Repeats()
+        self.refused = {reason: np.zeros(filter.received, dtype=np.int64) for reason in COUNTED}
+        self._repeats = Repeats()
         refuses = self.limits is not None and self.limits.stuck is not None
         self._watch = None if refuses or _sender_of(filter) else HeldWatch.of(*believed, filter.received)
         # Steps done; step of a sender's newest value; unexpected measurements in a row; remarks made.
@@ -141,6 +144,7 @@ class Stream:
         estimate: JudgedEstimate = compiled.estimate.unflatten([*stepper.estimate, nis, int(arrived)])
         if len(weight := stepper.weight):
             estimate = replace(estimate, weight=weight)
+            self.refused["gate"] += weight == 0
         if self.limits is not None and self.limits.bounded:
             estimate = replace(estimate, claim=weakest([estimate.claim, "nominal"]))
         return estimate if has_nis else lower_unsound_claim(estimate)
@@ -161,8 +165,8 @@ class Stream:
     def _count_readings(self, screened: Screened | None, z: np.ndarray) -> None:
         """Count what was screened; where none is stuck by rule, warn of the first run of each component that is."""
         if screened is not None:
-            self.dropped += screened.outside[0]
-            self.stuck += screened.stuck[0]
+            for reason, more in count_by_reason(screened.refused).items():
+                self.refused[reason] += more
             self._repeats = screened.repeats
         before, watch = self._repeats.found, self._watch
         if watch is None:
@@ -239,8 +243,7 @@ class Stream:
         head = {
             "paths": list(self._compiled.layout),
             "steps": self.steps,
-            "dropped": self.dropped.tolist(),
-            "stuck": self.stuck.tolist(),
+            "refused": {reason: count.tolist() for reason, count in self.refused.items()},
             "repeats": self._repeats,
             "last": self._last,
             "beyond": self._beyond,
@@ -276,8 +279,10 @@ class Stream:
         new, (head, arrays) = cls(filter, limits, invalid, stuck), unpack(data)
         mine, other = new._compiled.identity, head.get("of", {})
         check_same("snapshot", mine, other, SAME, accept_changes)
-        new.steps, new.dropped = int(head["steps"]), np.array(head["dropped"], dtype=np.int64)
-        new.stuck = np.array(head.get("stuck", np.zeros(filter.received)), dtype=np.int64)
+        new.steps = int(head["steps"])
+        # Until version 0.4.0 limits and codes together.
+        counted = head.get("refused") or {"limits": head["dropped"]}
+        new.refused |= {reason: np.array(counts, dtype=np.int64) for reason, counts in counted.items()}
         new._repeats = Repeats(*map(tuple, head.get("repeats", ())))
         new._last, new._beyond = int(head.get("last", -1)), int(head.get("beyond", 0))
         held = head.get("inputs", [None] * len(filter.inputs))

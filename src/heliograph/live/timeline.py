@@ -9,7 +9,7 @@ import numpy as np
 
 from heliograph.filters.plausibility import Judgement
 from heliograph.live.event import INPUTS, VERDICTS, Known, Verdict, check_63_bits, check_moment, check_numbers
-from heliograph.live.final_rows import FinalRows
+from heliograph.live.final_rows import FinalRows, GateCounts
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.fleet_remarks import FleetHeld, FleetRemarks
 from heliograph.live.implausible_events import FleetAngles, Judges
@@ -21,6 +21,7 @@ from heliograph.live.sender_status import SenderStatus
 from heliograph.live.stored.migration import DESCRIPTION, SAME, PlantMigration, describe_network
 from heliograph.live.stored.plant_codec import pack_plant, unpack_plant
 from heliograph.live.stored.snapshot import check_same, pack, unpack
+from heliograph.model.checks.refusals import SCREENED, Reason
 from heliograph.model.estimate import Estimate, JudgedEstimate
 from heliograph.model.origin import Origin
 from heliograph.numerics.check import check_count, fail, instance, scalar, show_value
@@ -52,11 +53,11 @@ class Timeline:
     events of a time form one row, and a second measurement of a node at that time is a conflict; else every event is a
     row.
 
-    `counts` has the number of each verdict; `dropped` the number of single values beyond a node's limits, and `stuck`
-    of those that repeat for too long, which counted as not arrived; `timeouts` that of silences longer than a node's
-    timeout, which `senders` names while they last; `held` that of runs of equal readings that a node without `stuck=`
-    does not refuse; `reasons` says in words, by node, why the last
-    implausible event was one; `forced` is the number of rows that became final early.
+    `counts` has the number of each verdict; `refused` that of single values which count as not arrived, by node and
+    reason, and `gated` of those that a filter alone left out; `timeouts` that of silences longer than a node's timeout,
+    which `senders` names while they last; `held` that of runs of equal readings that a node without `stuck=` does not
+    refuse; `reasons` says in words, by node, why the last implausible event was one; `forced` is the number of rows
+    that became final early.
 
     Args:
         network: the network whose filters run.
@@ -91,6 +92,7 @@ class Timeline:
         self.reasons: dict[str, str] = {}
         self._angles, self._remarks = FleetAngles(self._fleet), FleetRemarks(self._fleet)
         self._held = FleetHeld(self._fleet)
+        self._gates = GateCounts(self._program.places)
         self._finals = FinalRows(2 * self.capacity, self._program.step_rows.outputs.size)
 
     def __getstate__(self) -> dict[str, object]:
@@ -126,14 +128,16 @@ class Timeline:
         }
 
     @property
-    def dropped(self) -> dict[str, int]:
-        """Return the number of single values beyond each node's limits."""
-        return self._counts_of("dropped")
+    def refused(self) -> dict[str, dict[Reason, int]]:
+        """Return by node how many single values it refused, by reason: "limits", "code", "stuck"."""
+        links = self._plant.links
+        refused = {name: links.get(name, LinkCounts()).refused for name in self.network.names}
+        return {name: {reason: counts.get(reason, 0) for reason in SCREENED} for name, counts in refused.items()}
 
     @property
-    def stuck(self) -> dict[str, int]:
-        """Return the number of single values of each node that repeated for longer than its noise allows."""
-        return self._counts_of("stuck")
+    def gated(self) -> dict[tuple[str, str], int]:
+        """Return by node and filter that weighs how many values of final rows it left out, by a weight of 0."""
+        return dict(self._gates.counts)
 
     @property
     def timeouts(self) -> dict[str, int]:
@@ -276,7 +280,7 @@ class Timeline:
         self._finals.add(time, outputs)
         plant = np.frombuffer(pack_plant(self._plant, self._fleet), np.uint8)
         arrays = {"plant": plant, "final.time": time, "final": outputs}
-        return {"options": [self.window, self.ahead, self.capacity]}, arrays
+        return {"options": [self.window, self.ahead, self.capacity], "gated": self._gates.pack()}, arrays
 
     @classmethod
     def restore(cls, network: Network, data: bytes, accept_changes: bool = False) -> "Timeline":
@@ -335,6 +339,7 @@ class Timeline:
         new._fleet.end(new._plant)
         new._plant = unpack_plant("", arrays["plant"].tobytes(), new._fleet)
         new._remarks.note_said(new._plant)
+        new._gates.unpack(head.get("gated", []))  # absent until version 0.4.0
         new._finals.add(arrays["final.time"], arrays["final"])
         return new
 
@@ -356,7 +361,9 @@ class Timeline:
         results = self._fleet.finalise([self._plant])
         read = [row for row in results[0].final if row.has_data()]
         if read:
-            self._finals.add(np.array([row.key[0] for row in read]), self._outputs_after([row.slot for row in read]))
+            outputs = self._outputs_after([row.slot for row in read])
+            self._finals.add(np.array([row.key[0] for row in read]), outputs)
+            self._gates.add(outputs)
         self._fleet.free_slots(results)
 
     def _arrange_judgements(self, outputs: np.ndarray) -> dict[str, dict[str, Estimate]]:

@@ -7,12 +7,13 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.model.channel import Channel
+from heliograph.model.checks.refusals import Reason, number_of
 from heliograph.model.intervals import read_intervals, read_numbers
 from heliograph.model.sensor import AnySensor
 from heliograph.model.stuck import Repeats, StuckLike, count_repeats, stuck_counts
 from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.module import Module
-from heliograph.numerics.types import ArrayLike, Bool, Float
+from heliograph.numerics.types import ArrayLike, Bool, Float, Int
 
 ROUNDING = 4 * float(np.finfo(np.float64).eps)  # of a product and of the factor in it, relative
 
@@ -50,15 +51,17 @@ class Screened(NamedTuple):
 
     Args:
         values: the readings (time, m), NaN where one counts as missing.
-        outside: True for each that is beyond its limits, or a code (time, m).
-        stuck: True for each that repeats for longer than its noise allows (time, m).
+        refused: the number of each one's reason (`model.checks.refusals`), 0 where it is kept (time, m).
         repeats: runs of equal readings that end with the last ones.
     """
 
     values: Float[np.ndarray, "time m"]
-    outside: Bool[np.ndarray, "time m"]
-    stuck: Bool[np.ndarray, "time m"]
+    refused: Int[np.ndarray, "time m"]
     repeats: Repeats
+
+    def by(self, reason: Reason) -> Bool[np.ndarray, "time m"]:
+        """Return True for each that is refused for this reason (time, m)."""
+        return np.asarray(self.refused == number_of(reason))
 
 
 class Limits(Module):
@@ -106,30 +109,39 @@ class Limits(Module):
 
         What is beyond limits or a code is no reading, and ends no run.
         """
-        outside = self.outside(z)
-        values = np.where(outside, np.nan, z)
+        refused = self.judge_values(z)
+        values = np.where(refused > 0, np.nan, z)
         if self.stuck is None:
-            return Screened(values, outside, np.zeros_like(outside), before)
+            return Screened(values, refused, before)
         counts, repeats = count_repeats(values, before)
         stuck = counts >= self.stuck
-        return Screened(np.where(stuck, np.nan, values), outside, stuck, repeats)
+        refused = np.where(stuck, number_of("stuck"), refused)
+        return Screened(np.where(stuck, np.nan, values), refused, repeats)
+
+    def judge_values(self, z: Float[np.ndarray, "... m"]) -> Int[np.ndarray, "... m"]:
+        """Return the number of the reason for which each value by itself counts as missing; 0 where it does not.
+
+        A code is a value of `invalid` that stands for no reading, such as -999, also where it is beyond the limits. NaN
+        is missing already.
+        """
+        beyond = (z < self.low) | (z > self.high)
+        return np.where(is_code(z, self.invalid), number_of("code"), np.where(beyond, number_of("limits"), 0))
 
     def outside(self, z: Float[np.ndarray, "... m"]) -> Bool[np.ndarray, "... m"]:
-        """Return True for each number that counts as missing; NaN is not one of them."""
-        return np.asarray((z < self.low) | (z > self.high) | is_code(z, self.invalid))
+        """Return True for each number that by itself counts as missing; NaN is not one of them."""
+        return np.asarray(self.judge_values(z) > 0)
 
-    def why(self, z: Float[np.ndarray, " m"], names: Sequence[str], stuck: Bool[np.ndarray, " m"] | None = None) -> str:
-        """Describe in words the components of a measurement that count as missing; "" if there are none.
+    def why(self, z: Float[np.ndarray, " m"], refused: Int[np.ndarray, " m"], names: Sequence[str]) -> str:
+        """Describe in words the components of a measurement that are refused; "" if there are none.
 
-        A code is a value of `invalid` that stands for no reading, such as -999.
-
-        `stuck`: which of them have repeated for too long; none by default.
+        `refused`: the number of each one's reason, as `screen` returns it.
         """
-        said, outside = [], self.outside(z)
-        for i in np.flatnonzero(outside if stuck is None else outside | stuck).tolist():
-            code = is_code(z[i], self.invalid)
-            if outside[i]:
-                reason = "is a code" if code else f"is outside {self.low[i]:g} to {self.high[i]:g}"
+        said = []
+        for i in np.flatnonzero(refused).tolist():
+            if refused[i] == number_of("code"):
+                reason = "is a code"
+            elif refused[i] == number_of("limits"):
+                reason = f"is outside {self.low[i]:g} to {self.high[i]:g}"
             else:
                 assert self.stuck is not None
                 reason = f"is stuck: {self.stuck[i]:g} equal readings in a row or more"

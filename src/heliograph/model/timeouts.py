@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.model.plant import TIME_STEP
-from heliograph.numerics.types import Float
+from heliograph.numerics.types import Float, units_in
 
 
 class LongSilences(NamedTuple):
@@ -16,18 +16,30 @@ class LongSilences(NamedTuple):
         timeout: for how long nothing need come, in steps, or in the unit of continuous time.
         rows: row from 0 after which each begins (silences,).
         lengths: from there to the next message, or to the last row (silences,).
+        unit: of both, "steps", or of continuous time; "" where that has none.
     """
 
     timeout: float
     rows: np.ndarray
     lengths: Float[np.ndarray, " silences"]
+    unit: str
 
     def describe(self) -> str:
         """Say how many there are, and where the longest one is."""
         longest = int(np.argmax(self.lengths))
         several = f"{len(self.rows)} times, the longest " if len(self.rows) > 1 else ""
         where = f"{several}after row {self.rows[longest] + 1}"
-        return f"nothing came for {self.lengths[longest]:g}, and its timeout is {self.timeout:g}: {where}"
+        return f"{describe_silence(float(self.lengths[longest]), self.timeout, self.unit)}: {where}"
+
+
+def describe_silence(quiet: float, timeout: float, unit: str) -> str:
+    """Say for how long nothing came, and for how long nothing need come; `unit` of both, "" for none."""
+    return f"nothing came for {quiet:g} {unit}".rstrip() + f", and its timeout is {timeout:g} {unit}".rstrip()
+
+
+def name_unit(inputs: Sequence[str]) -> str:
+    """Return the unit in which timeouts are: "steps", or that of the plant's time; "" where that has none."""
+    return units_in(inputs).get(TIME_STEP, "") if TIME_STEP in inputs else "steps"
 
 
 def find_long_silences(
@@ -58,5 +70,5 @@ def find_long_silences(
         lengths = np.diff(clock[ends])
         long = lengths > timeout
         if long.any():
-            found[node] = LongSilences(timeout, ends[:-1][long], lengths[long])
+            found[node] = LongSilences(timeout, ends[:-1][long], lengths[long], name_unit(names))
     return found

@@ -171,7 +171,9 @@ def _read_numbers(name: str, value: ArrayLike) -> Any:
 
 
 def scalar(name: str, value: ArrayLike, low: float = -np.inf, high: float = np.inf) -> Any:
-    """Return `value` as a finite scalar between `low` and `high`."""
+    """Return `value` as a finite scalar between `low` and `high`; True and False are none."""
+    if isinstance(value, bool | np.bool_):
+        raise fail(name, _describe_range(low, high), show_value(value))
     report_domain(name, value, Domain(low=low, high=high))
     number = array(name, value, ())
     if not is_traced(number) and not low <= number <= high:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.special import ndtri
 
+from heliograph.model.checks.refusals import Reason
 from heliograph.model.plant import TIME_STEP
 from heliograph.model.timeouts import LongSilences, find_long_silences
 from heliograph.numerics.check import array, fail, instance
@@ -84,6 +85,7 @@ class Health:
     apart: ConstantError | None = None  # of one node against the others, which filter by themselves
     possible: tuple[str, ...] = ()  # of estimates where no sensor shows a state any more, or at a limit
     silences: Mapping[str, LongSilences] = field(default_factory=dict)  # by node that was silent past its timeout
+    refused_messages: Mapping[str, Mapping[Reason, int]] = field(default_factory=dict)  # by node: for flag or counter
     time_unit: str = ""  # that times are in another unit than the plant's, which explains what is doubtful
 
     def warnings(self) -> list[str]:

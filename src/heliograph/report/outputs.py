@@ -1,6 +1,6 @@
 """Innovations of a run by output: values down-weighted, bias, which to blame; and errors of its filters."""
 
-from collections import defaultdict, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
@@ -240,11 +240,13 @@ class RecentOutputs:
     def __init__(self, rows: int, names: Mapping[tuple[str, str], Sequence[str]]):
         self.names = names
         self._rows: dict[tuple[str, str], deque[np.ndarray]] = defaultdict(lambda: deque(maxlen=rows))
+        self.left_out = Counter[tuple[str, str]]()  # by node and filter: numbers of weight 0, of all rows so far
 
     def add(self, node: str, name: str, outputs: Mapping[str, Sequence[float | None]]) -> None:
         """Add a row: innovations `value`, their `variance` and the `weight` of each number, None where none arrived."""
         row = [outputs[field] for field in ("value", "variance", "weight")]
         self._rows[node, name].append(np.array(row, dtype=float))
+        self.left_out[node, name] += sum(weight == 0 for weight in outputs["weight"])
 
     def health(self) -> list[OutputHealth]:
         """Summarise each output of each filter over its newest rows."""

@@ -101,11 +101,11 @@ class BatchIntake:
         if isinstance(message, str):
             return None, None, message, ()
         if isinstance(message, UnreadMessage):
-            return self._count_unread(message.read), None, message.why, ()
+            return self._count_unread(message), None, message.why, ()
         try:
             return self._use_message(number, message, wall)
         except InputError as error:  # of another kind than its plant expects
-            return self._count_unread(message), None, str(error), ()
+            return self._count_unread(UnreadMessage(message, str(error))), None, str(error), ()
 
     def _find_implausible_inputs(self, messages: Sequence[Read]) -> dict[tuple[int, bool], str]:
         """Return which inputs lead to no valid prediction from the state before the batch, as `_refused` has them."""
@@ -173,11 +173,12 @@ class BatchIntake:
             inputs = self.fleet.convert_message(INPUTS, message.sequence, at, message.inputs, arrival)
         return TimedEvents(at, arrival, clock, origin, event, inputs)
 
-    def _count_unread(self, message: AnyMessage) -> PlantState | None:
-        """Count a message that came but cannot be used, so that it is not counted as lost.
+    def _count_unread(self, unread: UnreadMessage) -> PlantState | None:
+        """Count a message that came but cannot be used, and what it is refused for; it is not counted as lost.
 
         Returns its plant; None where plant, node or time of the message are none that is known.
         """
+        message = unread.read
         plant, node = self.plants.get(message.plant), message.node
         if plant is None or (node != INPUTS and node not in self.fleet.network.names):
             return None
@@ -186,7 +187,10 @@ class BatchIntake:
         except InputError:  # a time of another kind
             return None
         link = self._note_before(plant, at).link(node)
-        link.count_unread(message.sequence, at, self.fleet.periods.get(node, 0))
+        if unread.counted:
+            link.count_unread(message.sequence, at, self.fleet.periods.get(node, 0))
+        if unread.reason is not None:
+            link.count_refused(unread.reason)
         return plant
 
     def _note_before(self, plant: PlantState, begun: float) -> PlantState:

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, GetPydanticSchema, TypeAdapte
 from pydantic_core.core_schema import no_info_after_validator_function, str_schema
 from typing_extensions import TypeAliasType
 
+from heliograph.model.checks.refusals import Reason
 from heliograph.numerics.check import InputError, fail, instance, show_value
 from heliograph.numerics.times.dates import instant
 
@@ -79,10 +80,19 @@ class NumberedMessage(msgspec.Struct, forbid_unknown_fields=True, gc=False):
 
 
 class UnreadMessage(NamedTuple):
-    """A message that cannot be used although its node, count and time were read, and why it cannot."""
+    """A message that cannot be used although its node, count and time were read, and why it cannot.
 
-    read: Message
+    Args:
+        read: what was read of it.
+        why: why it cannot be used, in words.
+        reason: what it is refused for, of its flag and its counter; None of any other message.
+        counted: whether its sequence is its node's running count.
+    """
+
+    read: "Message | NumberedMessage"
     why: str
+    reason: Reason | None = None
+    counted: bool = True
 
 
 AnyMessage: TypeAlias = Message | NumberedMessage

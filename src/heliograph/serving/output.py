@@ -78,6 +78,8 @@ class SenderOutput(BaseModel):
         missed: heartbeats that were due in the silent steps and did not come.
         chance: probability that the link lost all of these.
         timeout: for how long nothing need come; null for any time.
+        refused: how many of its readings its node refused, by reason, and messages for their flag or counter.
+        unit: of the times, "steps" or that of the plant; empty where that has none.
         dead: true where that chance is below 1 in 1,000, or where nothing came for longer than the timeout: the value
             is unknown then, not constant.
         reason: why it is dead, in words; empty if it is not.
@@ -89,6 +91,8 @@ class SenderOutput(BaseModel):
     missed: int
     chance: float
     timeout: float | None = None
+    refused: dict[str, int] = {}
+    unit: str = "steps"
     dead: bool
     reason: str = ""
 

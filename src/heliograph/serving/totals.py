@@ -5,8 +5,9 @@ from collections.abc import Mapping
 from typing import Protocol
 
 from heliograph.live.event import VERDICTS
+from heliograph.model.checks.refusals import OF_NODES, Reason
 
-COUNTS = (*VERDICTS, "dropped", "stuck", "timeouts", "held")  # which never fall
+COUNTS = (*VERDICTS, *OF_NODES, "timeouts", "held")  # which never fall
 FIELDS = (*COUNTS, "lost")
 
 
@@ -15,21 +16,22 @@ class LinkTotals(Protocol):
 
     Attributes:
         lost: gaps in the node's running count.
-        dropped: single values beyond limits.
-        stuck: single values that repeated for too long.
+        refused: single values that their node refused, by reason, and messages for their flag or counter.
         timeouts: silences longer than the timeout that have ended.
         held: runs of equal readings that were longer than noise allows, and not refused.
         used, duplicate, conflict, late, future, implausible: numbers of messages by verdict.
     """
 
     lost: int
-    dropped: int
-    stuck: int
     timeouts: int
 
     @property
     def held(self) -> int:
         """Return the number of those runs."""
+
+    @property
+    def refused(self) -> Mapping[Reason, int]:
+        """Return how many single values, and messages, were refused by reason."""
 
     used: int
     duplicate: int
@@ -39,11 +41,17 @@ class LinkTotals(Protocol):
     implausible: int
 
 
+def counts_of(link: LinkTotals) -> dict[str, int]:
+    """Return the counts of a node by FIELDS."""
+    refused = {str(reason): count for reason, count in link.refused.items()}
+    return {name: refused.get(name, 0) if name in OF_NODES else getattr(link, name) for name in FIELDS}
+
+
 class Totals:
     """Sums of counts over plants, by node; a plant that leaves the memory takes nothing with it.
 
-    `by_node` has the counts of messages by verdict, of dropped and stuck values, of timeouts, and of
-    lost messages, which may fall.
+    `by_node` has the counts of messages by verdict, of what nodes refused by reason, of timeouts, and
+    of lost messages, which may fall.
     """
 
     def __init__(self) -> None:
@@ -53,7 +61,7 @@ class Totals:
     def add(self, plant: str, links: Mapping[str, LinkTotals]) -> None:
         """Add what has changed in a plant's counts since they were added last."""
         for node, link in links.items():
-            now = tuple(getattr(link, name) for name in FIELDS)
+            now = tuple(counts_of(link).values())
             before = self._seen.get((plant, node), (0,) * len(FIELDS))
             if now != before:
                 self._seen[plant, node] = now

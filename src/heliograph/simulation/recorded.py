@@ -8,12 +8,10 @@ import jax
 import numpy as np
 from typing_extensions import TypeAliasType
 
+from heliograph.model.checks.refusals import number_of
 from heliograph.model.checks.row_times import common_dates, warn_of_unequal_steps
-from heliograph.model.limits import Limits
 from heliograph.model.origin import Origin, last_input, usual_months, usual_spacing
 from heliograph.model.plant import TIME_STEP
-from heliograph.model.stuck import Repeats
-from heliograph.model.timeouts import find_long_silences
 from heliograph.numerics.check import array, check_columns, fail, instance, rank, table
 from heliograph.numerics.float64 import check_process
 from heliograph.numerics.times.row_times import check_times
@@ -25,17 +23,17 @@ from heliograph.simulation.description.possible import doubt_estimates
 from heliograph.simulation.description.remarks import say_remarks
 from heliograph.simulation.description.wide_angles import warn_beyond_a_turn, warn_wide_in_rows
 from heliograph.simulation.network import FUSED, Network
-from heliograph.simulation.node import Node, ReceivingNode
 from heliograph.simulation.plausible_step import (
     Judges,
     any_implausible,
     describe_doubts,
     find_refused_rows,
-    forbidden_rows,
 )
 from heliograph.simulation.recorded_rows import FilteringTask, central_states_before_rows, filter_rows
-from heliograph.simulation.results.record import Record, warn_of_no_numbers
+from heliograph.simulation.results.no_numbers import warn_of_no_numbers
+from heliograph.simulation.results.record import Record
 from heliograph.simulation.results.reducer import trajectories_record
+from heliograph.simulation.screened import screen_recording
 from heliograph.simulation.smoothed import add_truth, make_smoothed_record, select_smoothed_part
 from heliograph.simulation.stepping import AllFilters
 from heliograph.simulation.transmission.shared_dithers import refuse_shared_dithers
@@ -102,16 +100,15 @@ def run(
     warn_of_unequal_steps(network.inputs, times)
     clock = np.arange(steps, dtype=np.float64) if times is None else times
     refuse_shared_dithers(network, z)
-    z, said = _screen_measurements(network, z, u)
+    z, refused, said = screen_recording(network, z, u)
     _warn_of_each((*said, *warn_beyond_a_turn(network, z)))
     # Filters, on what a recording without implausible data has.
     smoothing = None if smooth is None else select_smoothed_part(network, smooth, steps)
     filters = AllFilters(network, None if smoothing is None else smoothing.kinds, judges=True)
     with jax.enable_x64(True):
-        sent = {} if reports is None else table("reports", reports, "reports by fusion")
-        arrivals = _collect_arrivals(filters, sent, steps)
+        arrivals = _collect_arrivals(filters, {} if reports is None else reports, steps)
         smoother = None if smoothing is None else smoothing.smoother(filters)
-        outputs = _filter_plausible(network, z, FilteringTask(filters, smoother, u, arrivals))
+        outputs = _filter_plausible(network, z, refused, FilteringTask(filters, smoother, u, arrivals))
     state = outputs.pop("state")
     if smoothing is None:
         record = trajectories_record(network, {"truth": None, **outputs}, clock)
@@ -124,7 +121,8 @@ def run(
     _warn_of_each((*doubts, *_describe_left_out(network, record), *say_remarks(network, state)))
     # Row numbers are one apart: two of them say so.
     origin = _make_origin(network, record, state, u, usual_spacing(clock if times is not None else clock[:2]))
-    return (record if true is None else add_truth(record, network.plant, true, smooth)).with_origin(origin)
+    record = record if true is None else add_truth(record, network.plant, true, smooth)
+    return record.with_origin(origin).with_refused(refused)
 
 
 def _warn_of_each(lines: Sequence[str]) -> None:
@@ -162,44 +160,6 @@ def _find_times(
     return common_dates({**{f"measurements of node {name!r}": z for name, z in measured.items()}, **others})
 
 
-def _screen_measurements(
-    network: Network, z: dict[str, np.ndarray], u: np.ndarray
-) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Return the measurements without values that are beyond their node's limits, or stuck; and lines that say so.
-
-    A line is said too of values that the rule of their sender forbids, which stay, and of silences that are longer
-    than the node's timeout.
-    """
-    kept, said = dict[str, np.ndarray](), list[str]()
-    for name, node in network.nodes.items():
-        kept[name], lines = (z[name], []) if node.limits is None else _drop_beyond(node.limits, z[name], node)
-        if rows := forbidden_rows(node, kept[name]):
-            lines.append(
-                f"{len(rows)} values came that the rule of their sender forbids; row {rows[0] + 1}: "
-                "within delta of the value before, and no heartbeat due"
-            )
-        said += [f"node {name!r}: {line}" for line in lines]
-    timeouts = {name: node.timeout for name, node in network.nodes.items()}
-    silences = find_long_silences(timeouts, kept, u, network.inputs)
-    said += [f"node {name!r}: {found.describe()}" for name, found in silences.items()]
-    return kept, said
-
-
-def _drop_beyond(
-    limits: Limits, z: Float[np.ndarray, "steps m"], node: Node | ReceivingNode
-) -> tuple[Float[np.ndarray, "steps m"], list[str]]:
-    """Return the values that are neither beyond limits nor stuck, NaN for others; and a line on each of the two."""
-    screened, came = limits.screen(z, Repeats()), int(np.count_nonzero(~np.isnan(z)))
-    none_stuck, lines = np.zeros_like(screened.stuck[0]), list[str]()
-    for dropped, stuck in ((screened.outside, none_stuck), (screened.stuck, screened.stuck)):
-        if dropped.any():
-            row = int(np.argmax(dropped.any(axis=1)))
-            at_row = np.where(dropped[row], z[row], np.nan)
-            why = limits.why(at_row, node.received_names, np.broadcast_to(stuck, dropped.shape)[row])
-            lines.append(f"{int(dropped.sum())} of {came} values count as not arrived; row {row + 1}: {why}")
-    return screened.values, lines
-
-
 def _describe_left_out(network: Network, record: Record) -> Iterator[str]:
     """Yield a line for each output of which a filter that weighs what arrives left out most."""
     for node, filters in record.weighed.items():
@@ -214,6 +174,7 @@ def _describe_left_out(network: Network, record: Record) -> Iterator[str]:
 
 def _collect_arrivals(filters: AllFilters, reports: Reports, steps: int) -> dict[str, PyTree]:
     """Return what arrived of reports and between neighbours, by fusion."""
+    reports = table("reports", reports, "reports by fusion")
     centre_arrivals: dict[str, PyTree] = {
         name: centre.uplinks.recorded(name, centre.nodes, reports.get(name), steps)
         for name, centre in filters.reporting.items()
@@ -224,12 +185,15 @@ def _collect_arrivals(filters: AllFilters, reports: Reports, steps: int) -> dict
     return centre_arrivals | mesh_arrivals
 
 
-def _filter_plausible(network: Network, z: dict[str, np.ndarray], task: FilteringTask) -> PyTree:
+def _filter_plausible(
+    network: Network, z: dict[str, np.ndarray], left_out: dict[str, np.ndarray], task: FilteringTask
+) -> PyTree:
     """Return the results of filtering a recording without implausible data, and warn of these.
 
     If there are any, the recording is first filtered step by step without them to find all rows; then, without those
     that all filters of a node refuse, once again as a recording that never had them. Of what central filters refuse
-    one node is to blame in each row, and the others' values are judged again without it.
+    one node is to blame in each row, and the others' values are judged again without it. What is refused goes from `z`,
+    with its reason into `left_out`.
     """
 
     def group_measurements() -> tuple[np.ndarray, ...]:
@@ -248,6 +212,7 @@ def _filter_plausible(network: Network, z: dict[str, np.ndarray], task: Filterin
             for name, rows in new.items():
                 refused[name] = dict(sorted((refused.get(name, {}) | rows).items()))
                 z[name] = z[name].copy()
+                left_out[name][list(rows)] += ~np.isnan(z[name][list(rows)]) * np.int8(number_of("implausible"))
                 z[name][list(rows)] = np.nan
             again = filter_rows(task, group_measurements(), judged=False)
             outputs = filter_rows(task, group_measurements(), judged=True) if any_implausible(again) else again

@@ -24,7 +24,8 @@ from heliograph.simulation.centres.mesh_building import build_meshes
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.plan import has_plan, plan
-from heliograph.simulation.results.record import Record, warn_of_no_numbers
+from heliograph.simulation.results.no_numbers import warn_of_no_numbers
+from heliograph.simulation.results.record import Record
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Result, Trajectories
 from heliograph.simulation.results.statistics import BATCHES
 from heliograph.simulation.runs.by_run import each_run, read_by, simulate_trajectories

@@ -14,7 +14,8 @@ import numpy as np
 from heliograph.files.bags.mcap_chunks import read_messages_in_order
 from heliograph.files.bags.message_layout import Decoder, RawMessage
 from heliograph.files.event_table import EventTable
-from heliograph.files.sources.sources import Sources, Unread
+from heliograph.files.sources.reading import Unread
+from heliograph.files.sources.sources import Sources
 from heliograph.numerics.check import InputError, fail, show_error
 
 if TYPE_CHECKING:
@@ -221,8 +222,7 @@ def _append_messages(
             if isinstance(reading, Unread):
                 where = f"{path}, message {number}, logged at {moment(logged)}"
                 table.refuse(InputError(f"{where}, {reading.error}"), strict)
-                if reading.counted is not None:
-                    table.note_unread(reading.counted, logged)
+                table.note_unread(reading, logged)
             else:
                 table.add(reading, logged)
 

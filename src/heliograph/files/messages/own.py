@@ -10,7 +10,7 @@ from heliograph.files.event_columns import counts_losses
 from heliograph.files.event_table import EventTable
 from heliograph.files.messages.in_files import FileMessage, read_parquet_names
 from heliograph.files.sources.fields import convert_name
-from heliograph.files.sources.sources import Reading, Unread
+from heliograph.files.sources.reading import Reading, Unread
 from heliograph.files.text.csv_text import read_csv_header
 from heliograph.files.text.dialects import NO_VALUE
 from heliograph.files.text.text_file import CutOffError, kind_of
@@ -101,8 +101,7 @@ class OwnMessages:
             self._table = EventTable(self._reader.network, numbers=bool(self._reader.numbers))
         for reading, arrival in found:
             if isinstance(reading, Unread):
-                assert reading.counted is not None
-                self._table.note_unread(reading.counted, arrival)
+                self._table.note_unread(reading, arrival)
                 raise reading.error
             self._table.add(reading, arrival)
 

@@ -20,7 +20,8 @@ from heliograph.files.messages.in_files import (
 )
 from heliograph.files.messages.own import NODE, SEQUENCE, OwnMessages, holds_events, is_own, is_table
 from heliograph.files.sources.fields import parse_arrival
-from heliograph.files.sources.sources import Sources, Unread
+from heliograph.files.sources.reading import Unread
+from heliograph.files.sources.sources import Sources
 from heliograph.files.stores.address import is_store, parse_store
 from heliograph.files.stores.tables import StoreTable, ask_store
 from heliograph.files.text.text_file import CutOffError, kind_of
@@ -218,8 +219,7 @@ def _append_message(
         for reading in sources.read(topic, content, message.where):
             if isinstance(reading, Unread):
                 events.refuse(reading.error, strict)
-                if reading.counted is not None:
-                    events.note_unread(reading.counted, came)
+                events.note_unread(reading, came)
                 continue
             arrival = reading.time if came is None else came
             if arrival is None:

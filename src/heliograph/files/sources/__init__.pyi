@@ -14,7 +14,7 @@ from .fields import parse_arrival as parse_arrival
 from .fields import parse_number as parse_number
 from .fields import parse_start as parse_start
 from .json_field import Source as Source
-from .sources import Reading as Reading
+from .reading import Reading as Reading
 from .sources import SECOND as SECOND
 from .sources import Sources as Sources
-from .sources import Unread as Unread
+from .reading import Unread as Unread

@@ -11,6 +11,7 @@ from typing_extensions import TypeAliasType
 from heliograph.files.availability import Available
 from heliograph.files.sources.derived import Computed, Covariance, PlaneCovariance, ZeroIfAbsent
 from heliograph.files.sources.fields import TimeUnit, convert_name, convert_time, field_at, parse_start
+from heliograph.model.checks.refusals import RefusedError
 from heliograph.numerics.check import TINY, fail, flag, scalar, show_value
 from heliograph.numerics.module import readable
 from heliograph.numerics.times.dates import looks_like_date
@@ -120,7 +121,8 @@ class Count:
     def check(self, number: int, name: str) -> int:
         """Return a count of a message; refuse one of another modulus."""
         if self.period and number >= self.period:
-            raise fail(name, f"a count below {self.period}", f"{number}: of another modulus than bits={self.bits}")
+            got = f"{number}: of another modulus than bits={self.bits}"
+            raise RefusedError("counter", fail(name, f"a count below {self.period}", got))
         return number
 
 
@@ -198,9 +200,8 @@ class Source:
             value = field_at(message, field, where)
             if value not in allowed:
                 expected = "true or 1" if allowed == (True, 1) else f"one of {show_value(allowed)}"
-                raise fail(
-                    f"{where}, field {field!r}", f"{expected}, of a message that can be trusted", show_value(value)
-                )
+                said = f"{expected}, of a message that can be trusted"
+                raise RefusedError("flag", fail(f"{where}, field {field!r}", said, show_value(value)))
 
 
 def json_field(

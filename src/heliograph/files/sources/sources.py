@@ -18,50 +18,17 @@ from heliograph.files.sources.fields import (
     match_topic,
 )
 from heliograph.files.sources.json_field import Field, Source
+from heliograph.files.sources.reading import Reading, Unread
 from heliograph.files.sources.several_senders import SeveralSenders
 from heliograph.live.event import INPUTS
+from heliograph.model.checks.refusals import RefusedError
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail, show_value
-from heliograph.numerics.module import readable
-from heliograph.numerics.types import Float
 from heliograph.simulation.network import Network
 
 SECOND = 10**9  # nanoseconds
 LISTED = 8  # topics in one line
 COPY = 10 * SECOND  # a message that comes again so soon, with its count and values, is a copy
-
-
-@readable
-class Reading(NamedTuple):
-    """What one message says of one node.
-
-    Attributes:
-        plant: name of the plant, "" for a single one.
-        node: name of the node, or "inputs".
-        sequence: the node's running count; None if the message has none.
-        time: nanoseconds since 1970, or a step; None for the moment of arrival.
-        values: all values of the node, NaN for those that this message has not. Shape (size,).
-        period: after how many messages the count begins at 0 again; 0 if it does not.
-    """
-
-    plant: str
-    node: str
-    sequence: int | None
-    time: int | None
-    values: Float[np.ndarray, " size"]
-    period: int = 0
-
-
-class Unread(NamedTuple):
-    """Why a source could not read a message.
-
-    Attributes:
-        error: the reason.
-        counted: plant, node, count and time of the message where these were read; else None.
-    """
-
-    error: InputError
-    counted: Reading | None
 
 
 class Mapped(NamedTuple):
@@ -206,7 +173,7 @@ class Sources:
             try:
                 reading = self._read(mapped, topic, message, where)
             except InputError as error:
-                results.append(Unread(error, self._read_count(mapped, topic, message, where)))
+                results.append(Unread(error, self._read_count(mapped, topic, message, where, error)))
             else:
                 results += [] if reading is None else [reading]
         return results
@@ -272,14 +239,18 @@ class Sources:
         period = 0 if source.sequence is None else source.sequence.period
         return Reading(plant, node, sequence, _read_time(source, message, where), values, period)
 
-    def _read_count(self, mapped: Mapped, topic: str, message: object, where: str) -> Reading | None:
-        """Return plant, node, count and time of a message whose values cannot be read; None if these cannot either."""
+    def _read_count(self, mapped: Mapped, topic: str, message: object, where: str, error: InputError) -> Reading | None:
+        """Return plant, node, count and time of a message with this error; None if these cannot be read either."""
+        sequence, missing = None, False
         try:
             plant, node = _read_names(mapped, topic, message, where)
             sequence, missing = self._read_message_count(mapped.source, mapped.pattern, message, where)
+        except RefusedError:  # by its count: its names are read
+            pass
         except InputError:
             return None
-        if sequence is None or missing or node not in mapped.places:
+        sequence = None if missing else sequence
+        if node not in mapped.places or (sequence is None and not isinstance(error, RefusedError)):
             return None
         try:
             time = _read_time(mapped.source, message, where)

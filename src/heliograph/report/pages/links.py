@@ -7,12 +7,14 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from heliograph.disk.quoting import quote_for_figure, visible
+from heliograph.model.checks.refusals import WORDS
 from heliograph.report.arrivals import Arrivals
 from heliograph.report.figures import BLUE, VERMILION, WIDTH
 from heliograph.report.health import Health
 from heliograph.report.innovations import LOOK, MOST, label_time_axis, say_not_drawn
 from heliograph.report.outputs import round_to
 from heliograph.report.pages.page import Picture, Table, Text
+from heliograph.simulation.network import Network
 
 
 @matplotlib.rc_context(LOOK)
@@ -66,8 +68,29 @@ def make_links_blocks(health: Health, drawings: Mapping[str, bytes]) -> list[Tab
         Table(headers, rows, slower if any(link.due_in != "each row" for link in health.links) else ""),
         *picture,
         *missing,
+        *_list_refused(health),
         *describe_shared(health.shared),
     ]
+
+
+def _list_refused(health: Health) -> list[Table]:
+    """Return a table of what came and was refused, by reason; nothing where nothing was."""
+    rows = []
+    names = {
+        node: [link.component for link in health.links if link.node == node] for node in health.record.measurements
+    }
+    names[Network.FUSED] = [f"{link.node}: {link.component}" for link in health.links]
+    for refusal in health.record.refusals:
+        component = names[refusal.node][refusal.component]
+        name = component if refusal.node == Network.FUSED else f"{refusal.node}: {component}"
+        by = f"{refusal.node}/{refusal.filter}" if refusal.filter else refusal.node
+        rows.append([visible(name), visible(by), WORDS[refusal.reason], f"{refusal.count:,}", f"{refusal.row + 1:,}"])
+    for node, counts in health.refused_messages.items():
+        said = [(WORDS[reason].removeprefix("of "), count) for reason, count in counts.items()]
+        rows += [[visible(node), visible(node), words, f"{count:,}", "–"] for words, count in said]
+    headers = ["refused", "by", "reason", "how many", "first in row"]
+    caption = "What came and was not used: single readings, and messages as a whole, which are none of the rows."
+    return [Table(headers, rows, caption, wordy=True)] if rows else []
 
 
 def _caption_deliveries(health: Health) -> str:

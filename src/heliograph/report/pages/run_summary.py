@@ -38,12 +38,23 @@ def run_summary(health: Health) -> dict[str, Json]:
         "outputs": outputs,
         "errors": _error_numbers(health.record),
         "links": links,
+        "refused": _list_refused(health),
         "overloads": {
             node: {name: _overload_numbers(*overload) for name, overload in by_filter.items()}
             for node, by_filter in health.record.overloads.items()
         },
         "shared": {name: list(nodes) for name, nodes in health.shared.items()},
     }
+
+
+def _list_refused(health: Health) -> list[Json]:
+    """Return how many readings were refused by node, filter, place among what is received and reason; and messages."""
+    readings: list[Json] = [dict(vars(refusal)) for refusal in health.record.refusals]
+    return readings + [
+        {"node": node, "reason": reason, "count": count}
+        for node, counts in health.refused_messages.items()
+        for reason, count in counts.items()
+    ]
 
 
 def _filter_numbers(tested: FilterHealth) -> dict[str, Json]:

@@ -10,7 +10,7 @@ import numpy as np
 from heliograph.files.messages.in_files import PAYLOAD, TOPIC, convert_row, typed_cells
 from heliograph.files.messages.own import NODE, OWN, SEQUENCE, OwnReader
 from heliograph.files.recording import RowReader
-from heliograph.files.sources.sources import Reading, Unread
+from heliograph.files.sources.reading import Reading, Unread
 from heliograph.files.table import CsvColumns
 from heliograph.files.table_rows import Cells, join_cells
 from heliograph.files.text.csv_text import ANNOTATIONS, CsvRow, CsvText

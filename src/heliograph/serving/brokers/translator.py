@@ -7,7 +7,9 @@ from pathlib import Path
 
 from heliograph.files.messages.in_files import FileMessage, message_name
 from heliograph.files.sources.fields import decode_json, parse_arrival
-from heliograph.files.sources.sources import Reading, Sources, Unread
+from heliograph.files.sources.reading import Reading, Unread
+from heliograph.files.sources.sources import Sources
+from heliograph.model.checks.refusals import RefusedError
 from heliograph.numerics.check import InputError, fail, instance, show_value
 from heliograph.numerics.times.row_order import YEAR
 from heliograph.serving.brokers.transport import LOG
@@ -167,7 +169,9 @@ class Translator:
         if unread.counted is None:
             return why
         try:
-            return UnreadMessage(self._make_message(topic, unread.counted, known, repeatable), why)
+            message = self._make_message(topic, unread.counted, known, repeatable)
+            reason = unread.error.reason if isinstance(unread.error, RefusedError) else None
+            return UnreadMessage(message, why, reason, unread.counted.sequence is not None)
         except InputError:
             return why
 

@@ -8,6 +8,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.registry import Collector
 
 from heliograph.live.event import VERDICTS
+from heliograph.model.checks.refusals import OF_NODES
 from heliograph.report.outputs import summarise_output
 from heliograph.serving.observation.last_answers import LastAnswers
 from heliograph.serving.observation.watch import Watch
@@ -80,13 +81,11 @@ def _collect_crossings(watch: Watch) -> Metric:
 
 
 def _collect_links(watch: Watch) -> Iterable[Metric]:
-    """Return the metrics of the nodes' messages: by verdict, lost, values beyond limits or stuck, and timeouts."""
+    """Return the metrics of the nodes' messages: by verdict, lost, what was refused by reason, and timeouts."""
     messages = CounterMetricFamily("heliograph_messages", "Messages by node and verdict.", labels=["node", "verdict"])
     lost = GaugeMetricFamily("heliograph_lost", "Gaps in a node's sequence numbers, now.", labels=["node"])
-    what = "Values beyond a node's limits, or codes, which count as not arrived."
-    dropped = CounterMetricFamily("heliograph_dropped", what, labels=["node"])
-    why = "Values that repeat for longer than their noise allows, which count as not arrived."
-    stuck = CounterMetricFamily("heliograph_stuck", why, labels=["node"])
+    what = "Values that count as not arrived, by reason; of flag and counter messages. A gate is of a filter."
+    refused = CounterMetricFamily("heliograph_refused", what, labels=["node", "filter", "reason"])
     quiet = "Silences longer than a node's timeout that have ended; heliograph_dead_senders has those that last."
     timeouts = CounterMetricFamily("heliograph_timeouts", quiet, labels=["node"])
     said = "Runs of equal readings longer than noise allows, of a node that does not refuse them (stuck=)."
@@ -96,11 +95,13 @@ def _collect_links(watch: Watch) -> Iterable[Metric]:
             messages.add_metric([node, verdict], tally[verdict] or 0)
         if tally["lost"] is not None:
             lost.add_metric([node], tally["lost"])
-        dropped.add_metric([node], tally["dropped"] or 0)
-        stuck.add_metric([node], tally["stuck"] or 0)
+        for reason in OF_NODES:
+            refused.add_metric([node, "", reason], tally[reason] or 0)
         timeouts.add_metric([node], tally["timeouts"] or 0)
         held.add_metric([node], tally["held"] or 0)
-    return messages, lost, dropped, stuck, timeouts, held
+    for (node, filter), count in watch.outputs.left_out.items():
+        refused.add_metric([node, filter, "gate"], count)
+    return messages, lost, refused, timeouts, held
 
 
 def _collect_dead_senders(watch: Watch) -> Metric:

@@ -13,6 +13,7 @@ from pydantic_core import from_json
 
 from heliograph.disk.quoting import join_names
 from heliograph.fusion.network_fusion import Fusion
+from heliograph.model.checks.refusals import OF_NODES, WORDS
 from heliograph.model.estimate import Claim
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.types import unit_of, units_in
@@ -22,7 +23,7 @@ from heliograph.serving.observation.overview import Overview, Wrong
 from heliograph.serving.observation.running_nis import MEMORY, RunningNis, read_nis
 from heliograph.serving.observed_service import BatchTimes, ObservedService, WatchableService, WatchedPlant
 from heliograph.serving.output import Output
-from heliograph.serving.totals import FIELDS, Totals
+from heliograph.serving.totals import FIELDS, Totals, counts_of
 from heliograph.simulation.network import Network
 
 T = TypeVar("T")
@@ -34,12 +35,11 @@ WARNINGS = 50  # lines
 APART = 3  # nodes that have a warning each; more of the same kind have one together
 REFUSED = "late", "future", "implausible", "conflict"
 LAGS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3600.0, 86400.0)  # s, edges of the histogram
-COUNTED = {  # of a node's messages
+COUNTED: dict[str, str] = {  # of a node's messages
     "late": "came too late to be used; a longer --window would hold what they change",
     "future": "of a time that is not yet, refused; its clock is wrong",
     "implausible": "implausible and refused; the refused lines say why",
-    "dropped": "beyond its limits, or codes, counted as not arrived",
-    "stuck": "equal for longer than its noise allows, counted as not arrived: it is stuck",
+    **{reason: f"refused, {WORDS[reason]}" for reason in OF_NODES},
     "held": "runs of equal readings longer than its noise allows: it is stuck, or has no noise",
     "timeouts": "silences that were longer than its timeout, and ended",
     "conflict": "came again with other values; the first stayed",
@@ -215,7 +215,7 @@ class Watch:
             yield from ((name, service.plants[name]) for name in names if name in service.plants)
 
     def links(self) -> dict[str, dict[str, int | None]]:
-        """Sum the counts over all plants, by node: messages by verdict, lost ones, and values beyond limits.
+        """Sum the counts over all plants, by node: messages by verdict, lost ones, and what was refused.
 
         Also of plants that have left the memory.
         """
@@ -371,8 +371,8 @@ def _add_counts(plants: Sequence[WatchedPlant]) -> dict[str, dict[str, int]]:
     for plant in plants:
         for node, link in plant.links.items():
             tally = results.setdefault(node, dict.fromkeys(FIELDS, 0))
-            for name in tally:
-                tally[name] += getattr(link, name)
+            for name, count in counts_of(link).items():
+                tally[name] += count
     return results
 
 

@@ -1,7 +1,6 @@
 """Record of runs: trajectories of the truth, the measurements, and the estimates with their claims."""
 
-import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
@@ -15,7 +14,6 @@ from heliograph.filters.innovation import InnovationSummary, Weighed
 from heliograph.model.estimate import Estimate, is_sound
 from heliograph.model.origin import KeptOrigin, Origin
 from heliograph.numerics.check import check_count, fail
-from heliograph.numerics.linalg import find_lost
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import units_in
 from heliograph.simulation.centres.uplinks import SentReports, Uplink
@@ -46,6 +44,7 @@ from heliograph.simulation.results.plots import (
     state_places,
 )
 from heliograph.simulation.results.record_html import draw_record
+from heliograph.simulation.results.refusals import Refusal, list_refusals
 from heliograph.simulation.results.saved import Saved
 from heliograph.simulation.results.wide_table import record_fields, record_frame
 
@@ -82,6 +81,8 @@ class Record(Saved):
         reports: by fusion and node, of each fusion that uses reports.
         transmissions: by simulated node with a trigger, (run, time, m): the `model.SendReason` for which a component
             was sent, negative where it was lost, 0 where it was not sent.
+        refused: of a recording, by node that refused any, the number of the reason for which a reading that came counts
+            as missing (`model.checks.refusals`), 0 where it does not, (time, received); `refusals` counts them.
         weighed: of a recording, by node and filter that weighs what arrives: `value` and `variance` of its innovations
             and their `weight` in the update, (time, received) each; `outputs` summarises them.
         origin: of what `hg.run` returns, the filters' last states, from which `hg.forecast` predicts; not saved.
@@ -98,6 +99,7 @@ class Record(Saved):
     reports: Reports = field(default_factory=dict)
     transmissions: ByNode = field(default_factory=dict)
     weighed: Weights = field(default_factory=dict)
+    refused: ByNode = field(default_factory=dict, init=False, compare=False, repr=False)
     origin: KeptOrigin = field(default=None, init=False, compare=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -206,6 +208,20 @@ class Record(Saved):
             raise fail("node and filter", f"one that weighs, of a recording: {weighing}", f"{node}/{name}")
         return self.weighed[node][name].summarise()
 
+    def with_refused(self, refused: ByNode) -> "Record":
+        """Return the same record with the reasons for which readings were refused, by node (time, received).
+
+        Nodes that refused nothing are left out.
+        """
+        changed = copy(self)
+        vars(changed)["refused"] = {node: reasons for node, reasons in refused.items() if reasons.any()}
+        return changed
+
+    @property
+    def refusals(self) -> tuple[Refusal, ...]:
+        """How many readings of a recording were refused, by reason, of each node's component and by each filter."""
+        return list_refusals(self.refused, self.weighed)
+
     def to_xarray(self) -> "xr.Dataset":
         """Return the labelled arrays: dimensions run, time, node, filter, state, and `other`, which is a state too.
 
@@ -284,7 +300,9 @@ class Record(Saved):
 
     def apart(self) -> list[str]:
         """Return the names of the parts that are saved separately."""
-        return super().apart() + [name for name in ("reports", "transmissions", "weighed") if getattr(self, name)]
+        return super().apart() + [
+            name for name in ("reports", "transmissions", "weighed", "refused") if getattr(self, name)
+        ]
 
     def plot(
         self,
@@ -352,7 +370,7 @@ class Record(Saved):
         for node, filters in self.estimates.items():
             for name, estimate in filters.items():
                 what = "mean" if estimate.claim == "none" else "covariance"
-                lines += [f"{node}/{name}: no valid {what} {when}" for when in _describe_when(~is_sound(estimate))]
+                lines += [f"{node}/{name}: no valid {what} {when}" for when in describe_when(~is_sound(estimate))]
         # Quantizers that saturated.
         for name, uplink in self.uplinks.items():
             for i, node in enumerate(uplink.nodes):
@@ -363,33 +381,7 @@ class Record(Saved):
         return lines
 
 
-def warn_of_no_numbers(record: Record, complete: Iterable[str] = (), stacklevel: int = 3) -> None:
-    """Warn of estimates, and of what was simulated, that are no finite numbers from some step on, a line each.
-
-    Covariances are not judged here, which of many runs takes long; `Record.failures` does.
-
-    Args:
-        record: the record.
-        complete: names of simulated nodes at which nothing is ever lost, so that a NaN is the sensor's.
-        stacklevel: as of `warnings.warn`, of the caller.
-    """
-    simulated = {} if record.truth is None else {"the true state, which the plant makes": record.truth}
-    for name in complete:
-        simulated[f"measurements of node {name!r}, where nothing is lost"] = record.measurements[name]
-    for what, values in simulated.items():
-        for when in _describe_when(~np.isfinite(values).all(axis=-1)):
-            warnings.warn(f"{what}: no finite number {when}", stacklevel=stacklevel + 1)
-    for node, filters in record.estimates.items():
-        for name, estimate in filters.items():
-            bad = find_lost(np.asarray(estimate.mean), 1)
-            if estimate.claim != "none" and node != FUSED:  # there a quantizer may say that it knows no bound
-                bad |= find_lost(np.asarray(estimate.covariance), 2)
-            what = "mean" if estimate.claim == "none" else "covariance"
-            for when in _describe_when(bad):
-                warnings.warn(f"{node}/{name}: no valid {what} {when}", stacklevel=stacklevel + 1)
-
-
-def _describe_when(bad: np.ndarray) -> list[str]:
+def describe_when(bad: np.ndarray) -> list[str]:
     """Say from which step on, and in how many runs, something (..., time) is bad; nothing where it never is."""
     if not np.any(bad):
         return []

@@ -97,6 +97,8 @@ function show(view) {
   outputs(view);
 }
 
+const REASONS = ["limits", "code", "stuck", "flag", "counter"];
+
 function counted(number) {  // messages without a count of their own say nothing of lost ones
   return number === null ? "not counted" : number.toLocaleString("en");
 }
@@ -269,8 +271,13 @@ function links(view) {
     const doubted = checks.some((test) => test.doubt);
     const judged = made("td", checks.length ? (doubted ? "doubtful" : "not refuted") : "", doubted ? "doubt" : "fine");
     const counts = [link.used, link.lost, link.late, link.duplicate];
-    return row(node, [...counts.map(counted), judged, ...(deciding ? [status_of(view.senders[node])] : [])]);
+    return row(node, [...counts.map(counted), refused(link), judged, ...(deciding ? [status_of(view.senders[node])] : [])]);
   }));
+}
+
+function refused(link) {  // values by reason, such as "3 limits, 1 stuck"; messages by flag and counter
+  const counts = REASONS.filter((reason) => link[reason]).map((reason) => counted(link[reason]) + " " + reason);
+  return counts.length ? counts.join(", ") : counted(0);
 }
 
 function tests(view) {
