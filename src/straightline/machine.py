@@ -129,6 +129,9 @@ class Tiers:
 
     def machine(self, blocks: float) -> Machine:
         """Return code that is about to be executed for so many blocks of the most runs; hold it while it runs."""
+        made = self._machine
+        if made is not None and made.level:  # nothing better is to come
+            return made
         with self._lock:
             executions = self._of(blocks)
             self._executions += executions
