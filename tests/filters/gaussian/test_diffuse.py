@@ -25,6 +25,44 @@ def test_the_niles_log_likelihood_is_that_of_kfas_and_of_statsmodels_by_the_form
     np.testing.assert_allclose(likelihood - log(2 * pi) / 2, -633.464564, atol=1e-6)  # statsmodels, q = 1
 
 
+TREND, SEASON = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[-1.0, -1.0, -1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+MEMORY, HUNDREDS = np.array([[1.0, 0.5, 0.0], [0.0, 1.0, 0.3], [0.0, 0.0, 0.6]]), NILE / 100
+GAPS, PAIRS = HUNDREDS[:12, None].copy(), np.stack([HUNDREDS[:10], HUNDREDS[10:20]], axis=1)
+GAPS[[0, 3, 4]] = PAIRS[2] = PAIRS[1, 0] = PAIRS[5, 1] = np.nan
+LEVEL_AND_SEASON = np.block([[TREND, np.zeros((2, 3))], [np.zeros((3, 2)), SEASON]])
+OF_STATSMODELS = {  # F, H, Q, R, how many states nobody knows, the variance of one more, data: its number
+    "trend": (TREND, [[1, 0]], np.diag([0.5, 0.1]), [[2]], 2, [], GAPS, -19.765399308678962),
+    "damped trend": (
+        [[1, 1], [0, 0.8]], [[1, 0]], [[0.5, 0.1], [0.1, 0.1]], [[2]], 2, [], HUNDREDS[:15, None], -29.15691805198216,
+    ),
+    "level and season": (
+        LEVEL_AND_SEASON, [[1, 0, 1, 0, 0]], np.diag([0.5, 0.01, 0.2, 0, 0]), [[1]], 5, [], HUNDREDS[:20, None],
+        -37.14821707919782,
+    ),
+    "beside a known state": (
+        MEMORY, [[1, 0, 1]], np.diag([0.1, 0.2, 0.5]), [[1.5]], 2, [0.5 / 0.64], HUNDREDS[:15, None],
+        -28.987700633236262,
+    ),
+    "two outputs": (
+        MEMORY, [[1, 0, 1], [0.5, 1, 0]], np.diag([0.1, 0.2, 0.5]), [[1.5, 0.4], [0.4, 1]], 2, [0.5 / 0.64], PAIRS,
+        -58.671572136724606,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", OF_STATSMODELS)
+def test_the_log_likelihood_is_that_of_statsmodels_by_the_formula(name):
+    """Less half of log 2 pi for each of q states, and one step later: by |det F| of what is unknown, dx_1 for dx_0."""
+    F, H, Q, R, unknown, known, z, number = OF_STATSMODELS[name]
+    names = [f"s{i}" for i in range(len(F))]
+    start = hg.diffuse(names[:unknown], np.diag([0.0] * unknown + known))
+    plant = hg.LinearPlant(F, Q, np.zeros(len(F)), start, states=names)
+    ours = hg.kalman_filter(plant, hg.LinearSensor(H, R)).run(z).log_likelihood
+    scale = log(abs(np.linalg.det(np.array(F)[:unknown, :unknown])))
+    # statsmodels 0.15.0 with an exact diffuse start of x_1: both round to 1e-14.
+    np.testing.assert_allclose(ours - unknown / 2 * log(2 * pi) + scale, number, atol=1e-8)
+
+
 def exact(values):
     return np.array([[Fraction(v).limit_denominator(1000) for v in row] for row in np.atleast_2d(values)], dtype=object)
 
