@@ -46,12 +46,19 @@ class Expected(NamedTuple):
         return both.ravel(), apart.reshape(-1, len(self.z))
 
     def innovation(self, first: FirstSums, second: jax.Array, density: jax.Array) -> Innovation:
-        """Return mean and covariance of the innovation, by the sums of what is apart from the base, and log p(z)."""
-        present = ~jnp.isnan(self.z)
+        """Return mean and covariance of the innovation, and log p(z).
+
+        Args:
+            first: first sums of what is apart from the base.
+            second: second sums of it (m, m), about the base.
+            density: log p(z), where something arrived.
+        """
+        mean, present = first.mean(()), ~jnp.isnan(self.z)
         within = jnp.einsum("a,aij->ij", jnp.asarray(self.atoms.weight), jnp.asarray(self.atoms.noise))
         within = jnp.where(present[:, None] & present, within, jnp.nan)
-        value, nothing = self.base + first.mean(()), ~jnp.any(present)  # of nothing the density is 1, to rounding
-        return Innovation(value, within + second / first.weight, jnp.where(nothing, 0.0, density))
+        spread = second / first.weight - jnp.outer(mean, mean)
+        nothing = ~jnp.any(present)  # of nothing the density is 1, to rounding
+        return Innovation(self.base + mean, within + spread, jnp.where(nothing, 0.0, density))
 
 
 def find_reference(weight: Number, predicted: Number) -> Number:

@@ -50,7 +50,7 @@ class Particles(NamedTuple):
 
 
 class Sums(NamedTuple):
-    """Sums over the particles of a row, as vectors: of weights, positions and innovations, and of their squares.
+    """Sums over the particles of a row: `first` as `_pack` makes it, `second` ones of the states (n, n).
 
     `reference` is h(x) of the particle from which innovations are counted, `density` log p(z | earlier rows).
     """
@@ -130,8 +130,8 @@ def _prepare(filter: Any, z: np.ndarray, u: np.ndarray) -> _Programs | None:
     groups = Particles(*(part.reshape(-1, GROUP, *part.shape[1:]) for part in particles))
     shared = memory.row, memory.reference
     of_first = _hold(_sum_first, filter, (*shared, groups), (False, False, True), len(groups.weight))
-    arguments = *shared, memory.first, groups
-    second = _hold(_sum_second, filter, arguments, (False, False, False, True), len(groups.weight))
+    arguments = memory.first, groups.weight, groups.position
+    second = _hold(_sum_second, filter, arguments, (False, True, True), len(groups.weight))
     return None if of_first is None or second is None else _Programs(memory, advance, of_first, second)
 
 
@@ -168,31 +168,26 @@ def _advance(
 
 
 def _sum_first(filter: Any, row: Row, reference: Array, group: Particles) -> jax.Array:
-    """Return the first sums of a group of particles, and of what their innovations are apart from the reference's."""
+    """Return the first sums of a group of particles, and both of what their innovations are apart from the base."""
     angles = filter.angles_used().states
     sums = first_sums(jnp.asarray(group.weight), jnp.asarray(group.position), angles)
     both, apart = filter.expected(reference, row.z, row.k).apart(group.prior, group.predicted)
-    return _pack(sums, first_sums(both, apart, ()))
+    return _pack(sums, first_sums(both, apart, ()), second_sums(both, apart))
 
 
-def _sum_second(filter: Any, row: Row, reference: Array, sums: Array, group: Particles) -> jax.Array:
-    """Return the second sums of a group of particles about the means of all."""
+def _sum_second(filter: Any, sums: Array, weight: Array, position: Array) -> jax.Array:
+    """Return the second sums of the states of a group of particles, about the means of all."""
     angles = filter.angles_used().states
-    state, received = _unpack(filter, sums)
-    of_state = wrap_angles(jnp.asarray(group.position) - state.mean(angles), angles)
-    both, apart = filter.expected(reference, row.z, row.k).apart(group.prior, group.predicted)
-    return _pack(second_sums(jnp.asarray(group.weight), of_state), second_sums(both, apart - received.mean(())))
+    apart = wrap_angles(jnp.asarray(position) - _unpack(filter, sums).state.mean(angles), angles)
+    return second_sums(jnp.asarray(weight), apart)
 
 
 def _tell_row(filter: Any, row: Row, sums: Sums) -> tuple[Any, ...]:
     """Return what is told of a row, by its sums."""
-    n, m = len(filter.states), filter.received
-    state, received = _unpack(filter, sums.first)
-    covariance = sums.second[: n * n].reshape(n, n) / state.weight
-    apart = sums.second[n * n :].reshape(m, m)
-    innovation = filter.expected(sums.reference, row.z, row.k).innovation(received, apart, sums.density)
+    state, received, spread = _unpack(filter, sums.first)
+    innovation = filter.expected(sums.reference, row.z, row.k).innovation(received, spread, sums.density)
     count = state.weight**2 / state.square
-    return state.mean(filter.angles_used().states), covariance, innovation, count
+    return state.mean(filter.angles_used().states), sums.second / state.weight, innovation, count
 
 
 def _pack(*sums: Any) -> jax.Array:
@@ -201,20 +196,28 @@ def _pack(*sums: Any) -> jax.Array:
 
 
 def _sizes(filter: Any) -> tuple[int, ...]:
-    """Return the lengths of the first sums of states, and of those of innovations."""
-    angles = len(filter.angles_used().states)
-    return 1, 1, len(filter.states), angles, angles, 1, 1, filter.received, 0, 0
+    """Return the lengths of the first sums of states, and of both sums of innovations."""
+    angles, m = len(filter.angles_used().states), filter.received
+    return 1, 1, len(filter.states), angles, angles, 1, 1, m, 0, 0, m * m
 
 
-def _unpack(filter: Any, vector: Array) -> tuple[FirstSums, FirstSums]:
-    """Return the first sums that `_pack` made one vector of."""
+class _OfAll(NamedTuple):
+    """First sums of states and of innovations, and second ones (m, m) of innovations about the base."""
+
+    state: FirstSums
+    received: FirstSums
+    spread: jax.Array
+
+
+def _unpack(filter: Any, vector: Array) -> _OfAll:
+    """Return the sums that `_pack` made one vector of."""
     parts = iter(jnp.split(jnp.asarray(vector), np.cumsum(_sizes(filter))[:-1].tolist()))
 
     def take() -> FirstSums:
         weight, square, *rest = (next(parts) for _ in range(5))
         return FirstSums(weight[0], square[0], *rest)
 
-    return take(), take()
+    return _OfAll(take(), take(), next(parts).reshape(filter.received, filter.received))
 
 
 def _filter_rows(filter: Any, z: np.ndarray, u: np.ndarray, state: PyTree | None, begin: int) -> Pass | None:
@@ -296,9 +299,9 @@ class _Loop:
         # First sums of all, then second sums about their means.
         memory.reference[...] = self._find_reference()
         programs.first()
-        first = np.add.reduce(programs.first.outputs[0], axis=0, out=memory.first)
+        first = np.einsum("ij->j", programs.first.outputs[0], out=memory.first)  # in half of the time of add.reduce
         programs.second()
-        second = np.add.reduce(programs.second.outputs[0], axis=0)
+        second = np.einsum("ijk->jk", programs.second.outputs[0])
         before, self.sum, self.square = self.sum, float(first[0]), float(first[1])
         density = -np.inf if excluded else math.log(self.sum) + largest - math.log(before)
         return Sums(first.copy(), second, memory.reference.copy(), np.asarray(density))

@@ -33,5 +33,5 @@ def first_sums(weight: jax.Array, x: jax.Array, angles: Angles) -> FirstSums:
 
 
 def second_sums(weight: jax.Array, apart: jax.Array) -> jax.Array:
-    """Return the sum of w d d' (n, n) of differences d (N, n) from a mean, by weights (N,)."""
+    """Return the sum of w d d' (n, n) of differences d (N, n) from one place, by weights (N,)."""
     return (apart * weight[:, None]).T @ apart

@@ -21,15 +21,15 @@ def resample_systematically(weight: jax.Array, start: jax.Array) -> jax.Array:
 def resample_known(weight: np.ndarray, start: float) -> np.ndarray:
     """Resample known weights (N,) of any sum like `resample_systematically`, in a time that does not grow by log N.
 
-    Particle i is drawn for the j with N C_(i-1) < start + j <= N C_i, C the distribution function.
+    Particle i is drawn for the j with N C_(i-1) < start + j <= N C_i, C the distribution function; and of a j the
+    index is the count of those drawn for lower ones alone.
     """
     count, ends = len(weight), np.cumsum(weight)
     ends *= count / ends[-1]
     ends += 1 - start
     places = np.minimum(ends.astype(np.int64), count)
     places[-1] = count  # whatever rounding says
-    places[1:] -= places[:-1].copy()
-    return np.repeat(np.arange(count), places)
+    return np.cumsum(np.bincount(places)[:count])
 
 
 def draw_normals(key: jax.Array, numbers: jax.Array | None, size: int, particles: int) -> jax.Array:

@@ -198,8 +198,7 @@ class StateParticleFilter(AbstractStateParticleFilter):
         reference = find_reference(weight, predicted)
         received = self.expected(reference, z, k)
         both, apart = received.apart(weight, predicted)
-        first = first_sums(both, apart, ())
-        return received.innovation(first, second_sums(both, apart - first.mean(())), density)
+        return received.innovation(first_sums(both, apart, ()), second_sums(both, apart), density)
 
     @estimates
     def estimate(self, state: StateParticles) -> Estimate:
