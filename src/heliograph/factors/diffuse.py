@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.factors.columns import Columns, below_diagonal, decorrelate, reciprocal_or_zero, unit_lower
-from heliograph.factors.gaussian import LOG_TURN, BackwardGain, Gaussian
+from heliograph.factors.gaussian import BackwardGain, Gaussian
 from heliograph.factors.repeated import triangularise_noise
+from heliograph.numerics.density import LOG_TURN
 from heliograph.numerics.types import Float
 
 FALLEN = 1e-12  # of what a row had in infinite columns: less is rounding

@@ -33,12 +33,11 @@ from heliograph.factors.repeated import (
     triangularise_noise,
 )
 from heliograph.factors.scalar_update import measure_parts, measure_product, measure_row, measure_rows, revise_columns
+from heliograph.numerics.density import LOG_TURN
 from heliograph.numerics.linalg import OFF_SUPPORT, OFF_VALUE, PIVOT_TOLERANCE, rounding, symmetric
 from heliograph.numerics.short_programs import writes_short_programs
 from heliograph.numerics.traced import is_traced, library
 from heliograph.numerics.types import Array, Float
-
-LOG_TURN = float(np.log(2 * np.pi))
 
 
 class Gaussian(NamedTuple):

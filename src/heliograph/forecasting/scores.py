@@ -5,8 +5,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtr
 
+from heliograph.numerics.density import LOG_TURN
+
 LEVELS = (0.5, 0.8, 0.95)  # probabilities of the central intervals whose coverage is counted
-LOG_TURN = float(np.log(2 * np.pi))
 BANDWIDTH = 1.3  # times the root of the number of rows
 
 
@@ -24,7 +25,7 @@ class Law(NamedTuple):
 
 
 def below(law: Law, values: np.ndarray) -> np.ndarray:
-    """Return probability that each lies below what came (rows,): uniform between 0 and 1 where the laws are right."""
+    """Return the probability that each lies below what came (rows,): uniform on (0, 1) where the laws are right."""
     return np.asarray(np.sum(law.weights * ndtr((values[:, None] - law.means) / np.sqrt(law.variances)), axis=1))
 
 

@@ -13,7 +13,7 @@ from heliograph.model.intervals import StateLimits, StateLimitsLike, read_state_
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.turns import check_turns
 from heliograph.model.unknown_start import DiffuseStart
-from heliograph.numerics.angle import Angles, angles_at, angles_named
+from heliograph.numerics.angle import Angles, angles_at, read_angles
 from heliograph.numerics.check import array, covariance, fail, function, instance, items, name_list, names, show_error
 from heliograph.numerics.linalg import cholesky
 from heliograph.numerics.manifold import Manifold
@@ -159,8 +159,13 @@ class AbstractPlant(Module):
         return drawn
 
 
+def split_inputs(u: Array, places: Sequence[Sequence[int]]) -> list[jax.Array]:
+    """Return the inputs of each part of a model, from those of all (inputs,) and each part's places among these."""
+    return [jnp.asarray(u)[np.array(own, int)] for own in places]
+
+
 class JointNoise(Module):
-    """Independent noises of two plants, one above the other, of which one depends on inputs: a covariance of the input.
+    """Independent noises of several plants, one above the other, of which some depend on inputs: a function of these.
 
     Args:
         plants: the plants.
@@ -170,13 +175,10 @@ class JointNoise(Module):
     plants: tuple[AbstractPlant, ...]
     places: tuple[tuple[int, ...], ...] = eqx.field(static=True)
 
-    def _each(self, u: jax.Array) -> list[tuple[AbstractPlant, jax.Array]]:
-        """Return each plant with its own inputs."""
-        return [(plant, jnp.asarray(u)[np.array(at, int)]) for plant, at in zip(self.plants, self.places, strict=True)]
-
     def __call__(self, u: jax.Array) -> jax.Array:
         """Return the covariance under the input u."""
-        return jnp.asarray(jax.scipy.linalg.block_diag(*(plant.noise_covariance(own) for plant, own in self._each(u))))
+        pairs = zip(self.plants, split_inputs(u, self.places), strict=True)
+        return jnp.asarray(jax.scipy.linalg.block_diag(*(plant.noise_covariance(own) for plant, own in pairs)))
 
     @property
     def mean(self) -> jax.Array:
@@ -185,8 +187,8 @@ class JointNoise(Module):
 
     def sample(self, key: jax.Array, u: jax.Array) -> jax.Array:
         """Draw each plant's."""
-        keys = jax.random.split(key, len(self.plants))
-        return jnp.concatenate([p.sample_noise(k, own) for (p, own), k in zip(self._each(u), keys, strict=True)])
+        parts = zip(self.plants, jax.random.split(key, len(self.plants)), split_inputs(u, self.places), strict=True)
+        return jnp.concatenate([plant.sample_noise(k, own) for plant, k, own in parts])
 
 
 class Plant(AbstractPlant):
@@ -243,7 +245,7 @@ class Plant(AbstractPlant):
             self.noise = noise
         else:
             self.noise = as_noise("process noise", noise, n)
-        self.circular = _circular(self.states, circular)
+        self.circular = read_angles("circular states", circular, self.states)
         self.attitude = _read_attitude(self.states, attitude, self.circular)
         if limits and attitude:
             raise fail("limits of states", "none beside attitudes", list(self.attitude))
@@ -313,7 +315,7 @@ class LinearPlant(AbstractPlant):
         if callable(noise):
             check_shape("process noise covariance(u)", noise, (np.zeros(len(self.inputs)),), (n, n))
         self.noise = noise if callable(noise) else as_noise("process noise", noise, n)
-        self.circular = _circular(self.states, circular)
+        self.circular = read_angles("circular states", circular, self.states)
         self.limits = read_state_limits(limits, self.states, self.circular, self.initial_mean)
         u = np.zeros(len(self.inputs))
         check_turns("plant", self.transition, self.initial_mean, self.manifold, self.manifold, u)
@@ -336,10 +338,6 @@ class LinearPlant(AbstractPlant):
     def transition(self, x: jax.Array, u: jax.Array) -> jax.Array:
         """Return A x + B u."""
         return self.transition_matrix(u) @ x + matrix_of(self.input_matrix, u) @ u
-
-
-def _circular(states: tuple[str, ...], circular: Sequence[str]) -> tuple[str, ...]:
-    return tuple(states[i] for i in angles_named("circular states", circular, states))
 
 
 def _read_attitude(states: tuple[str, ...], attitude: Sequence[str], circular: tuple[str, ...]) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from typing_extensions import TypeAliasType
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import AnyPlant, LinearPlant, MatrixFunction, NoiseFunction, OfInputs
 from heliograph.model.sensor_inputs import GivenInputs, NoiseOfInputs, count_rows, name_inputs, read_noise_of_inputs
-from heliograph.numerics.angle import Angles, angles_at, angles_named
+from heliograph.numerics.angle import Angles, angles_at, read_angles
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import (
     array,
@@ -140,7 +140,7 @@ class Sensor(AbstractSensor):
         if self.inputs:
             self.function = function("measure of a sensor", measure, "(x, u)")
             self.outputs, self.noise = read_noise_of_inputs(noise, outputs, None, self.inputs)
-            self.circular = _select_circular(self.outputs, circular)
+            self.circular = read_angles("circular outputs", circular, self.outputs)
             self.noise = _round_to(self.noise, resolution, self.circular)
             return
         self.function, law = _take_state_alone(measure), _constant("sensor noise", noise)
@@ -152,7 +152,7 @@ class Sensor(AbstractSensor):
         if shape != (1,):
             expected = "one output, as a variance without names means (outputs=[...] names more)"
             raise fail("measure of a sensor", expected, f"shape {shape}")
-        self.circular = _select_circular(self.outputs, circular)
+        self.circular = read_angles("circular outputs", circular, self.outputs)
         self.noise = _round_to(self.noise, resolution, self.circular)
 
     def measure(self, x: jax.Array) -> jax.Array:
@@ -201,13 +201,13 @@ class LinearSensor(AbstractSensor):
             self.outputs, self.noise = read_noise_of_inputs(noise, outputs, rows, self.inputs)
             named: Any = OfInputs(matrix, "sensor matrix", self.inputs) if callable(matrix) else matrix
             self.matrix = named if callable(matrix) else array("sensor matrix", named, ("outputs", "states"))
-            self.circular = _select_circular(self.outputs, circular)
+            self.circular = read_angles("circular outputs", circular, self.outputs)
             self.noise = _round_to(self.noise, resolution, self.circular)
             return
         self.matrix = array("sensor matrix", _constant("sensor matrix", matrix), ("outputs", "states"))
         self.noise = as_noise("sensor noise", _constant("sensor noise", noise), self.matrix.shape[-2])
         self.outputs = names("sensor outputs", outputs, self.matrix.shape[-2], "y")
-        self.circular = _select_circular(self.outputs, circular)
+        self.circular = read_angles("circular outputs", circular, self.outputs)
         self.noise = _round_to(self.noise, resolution, self.circular)
 
     def measure(self, x: jax.Array) -> jax.Array:
@@ -318,10 +318,6 @@ def _drop_names(model: Any) -> Any:
     object.__setattr__(bare, "outputs", names("sensor outputs", None, len(model.outputs), "y"))
     object.__setattr__(bare, "circular", tuple(f"y{i}" for i in model.angles))
     return bare
-
-
-def _select_circular(outputs: tuple[str, ...], circular: Sequence[str]) -> tuple[str, ...]:
-    return tuple(outputs[i] for i in angles_named("circular outputs", circular, outputs))
 
 
 AnySensor = TypeAliasType("AnySensor", AbstractSensor | OverTime)  # an OverTime holds one sensor per step

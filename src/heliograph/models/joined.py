@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.model.plant import AbstractPlant, JointNoise, LinearPlant, OfInputs, Plant, matrix_of
+from heliograph.model.plant import AbstractPlant, JointNoise, LinearPlant, OfInputs, Plant, matrix_of, split_inputs
 from heliograph.model.sensor import LinearSensor
 from heliograph.model.unknown_start import DiffuseStart, UnknownStart
 from heliograph.models.series import Component
@@ -34,14 +34,10 @@ class SideBySide(Module):
     def __call__(self, x: jax.Array, u: jax.Array) -> jax.Array:
         """Return the state after a step."""
         parts, start = [], 0
-        for plant, own in self.each(u):
+        for plant, own in zip(self.plants, split_inputs(u, self.places), strict=True):
             parts.append(plant.transition(x[start : start + len(plant.states)], own))
             start += len(plant.states)
         return jnp.concatenate(parts)
-
-    def each(self, u: jax.Array) -> list[tuple[Any, jax.Array]]:
-        """Return each plant with the inputs that are its own."""
-        return [(p, jnp.asarray(u)[np.array(at, int)]) for p, at in zip(self.plants, self.places, strict=True)]
 
 
 class MatrixSideBySide(SideBySide):
@@ -49,7 +45,9 @@ class MatrixSideBySide(SideBySide):
 
     def __call__(self, u: jax.Array) -> jax.Array:  # type: ignore[override]
         """Return A (n, n)."""
-        return jnp.asarray(block_diagonal([jnp.asarray(p.transition_matrix(own)) for p, own in self.each(u)]))
+        plants: list[Any] = list(self.plants)  # linear ones
+        pairs = zip(plants, split_inputs(u, self.places), strict=True)
+        return jnp.asarray(block_diagonal([jnp.asarray(plant.transition_matrix(own)) for plant, own in pairs]))
 
 
 class InputsSideBySide(SideBySide):
@@ -57,8 +55,8 @@ class InputsSideBySide(SideBySide):
 
     def __call__(self, u: jax.Array) -> jax.Array:  # type: ignore[override]
         """Return B (n, inputs)."""
-        rows = []
-        for (plant, own), at in zip(self.each(u), self.places, strict=True):
+        rows, plants = [], list[Any](self.plants)  # linear ones
+        for plant, own, at in zip(plants, split_inputs(u, self.places), self.places, strict=True):
             matrix = jnp.asarray(matrix_of(plant.input_matrix, own))
             rows.append(jnp.zeros((len(plant.states), len(u))).at[:, np.array(at, int)].set(matrix))
         return jnp.concatenate(rows)

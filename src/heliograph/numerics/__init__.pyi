@@ -3,9 +3,9 @@
 from .angle import Angles as Angles
 from .angle import TURN as TURN
 from .angle import angles_at as angles_at
-from .angle import angles_named as angles_named
 from .angle import continue_angles as continue_angles
 from .angle import nearest as nearest
+from .angle import read_angles as read_angles
 from .angle import wrap_angles as wrap_angles
 from .caching import cache_arrays as cache_arrays
 from .caching import cache_by_object as cache_by_object

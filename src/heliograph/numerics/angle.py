@@ -16,8 +16,8 @@ A = TypeVar("A", jax.Array, np.ndarray)
 Angles = tuple[int, ...]  # which components are angles
 
 
-def angles_named(name: str, circular: Sequence[str], names: Sequence[str]) -> Angles:
-    """Return the indices of those `names` that are listed in `circular`.
+def read_angles(name: str, circular: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
+    """Return those of a model's `names`, in their order, that a user listed as `circular`, checked.
 
     Args:
         name: what an error calls the list.
@@ -28,7 +28,7 @@ def angles_named(name: str, circular: Sequence[str], names: Sequence[str]) -> An
     unknown = [angle for angle in given if angle not in names]
     if unknown or len(set(given)) < len(given):
         raise fail(name, f"some of {list(names)}, each once", given)
-    return tuple(i for i, single in enumerate(names) if single in given)
+    return tuple(single for single in names if single in given)
 
 
 def angles_at(angles: object, size: int) -> Angles:

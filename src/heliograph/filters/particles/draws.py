@@ -4,13 +4,11 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from heliograph.factors.columns import decorrelate, square_root
 from heliograph.factors.gaussian import Gaussian
 from heliograph.factors.repeated import rounding_of_products
-
-LOG_TURN = float(np.log(2 * np.pi))
+from heliograph.numerics.density import LOG_TURN
 
 
 def slopes_given(function: Callable[[jax.Array], jax.Array], x: Gaussian, drawn: int) -> tuple[jax.Array, jax.Array]:

@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from heliograph.factors.columns import Columns, columns_of
 from heliograph.filters.particles.received_density import Atoms
@@ -19,7 +18,6 @@ from heliograph.numerics.angle import Angles, nearest
 from heliograph.random_affine.noise import AbstractNoise
 
 PRIOR_SHARE = 0.1  # of the proposal: weights are then bounded, where h saturates too
-LOG_TURN = float(np.log(2 * np.pi))
 
 
 class Moved(NamedTuple):

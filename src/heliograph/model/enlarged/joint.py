@@ -6,10 +6,10 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from heliograph.model.channel import Channel, parallel
 from heliograph.model.over_time import at_each_step
+from heliograph.model.plant import split_inputs
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor, Sensor
 from heliograph.model.sensor_inputs import NoiseOfInputs
 from heliograph.numerics.check import fail, instance, names, table
@@ -76,7 +76,7 @@ class SensorsUnderInputs(Module):
 
     def given(self, u: jax.Array) -> list[Any]:
         """Return the sensors of known inputs."""
-        return [p.given(jnp.asarray(u)[np.array(at, int)]) for p, at in zip(self.parts, self.places, strict=True)]
+        return [part.given(own) for part, own in zip(self.parts, split_inputs(u, self.places), strict=True)]
 
 
 class JointMatrix(SensorsUnderInputs):
