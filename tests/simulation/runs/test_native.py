@@ -1,6 +1,7 @@
 """Networks simulated by native code: what XLA gives, whoever else is simulated and however runs are dealt."""
 
 import gc
+import weakref
 
 import jax
 import jax.numpy as jnp
@@ -206,6 +207,20 @@ def test_many_nodes_are_what_each_is_alone(monkeypatch):
             of_record = hg.simulation.error_statistics(alone, name, f)
             np.testing.assert_allclose(sums[name][f].rmse(), of_record.rmse(), rtol=1e-13)
             assert (sums[name][f].claim, whole.estimates[name][f].claim) == (of_record.claim, of_record.claim)
+
+
+def test_what_is_kept_of_a_network_goes_with_it():
+    """Its world is built once for all simulations, in parts where nodes are many."""
+    fused, channel = linear(), hg.hop(hg.Rayleigh(0.8), 0.02)
+    filters = {"linear": hg.linear_filter(LINEAR, POSITION, channel)}
+    many = hg.Network(LINEAR, {f"n{i}": hg.Node(POSITION, channel, filters) for i in range(6)})
+    held = []
+    for network in (fused, many):
+        hg.monte_carlo(network, 3, 8, 0)
+        held.append(weakref.ref(network))
+    del fused, many, network
+    gc.collect()
+    assert [one() for one in held] == [None, None]
 
 
 def test_networks_of_one_structure_share_a_program():

@@ -5,8 +5,9 @@ Their zeros and ones are known when the program is made, to save operations.
 """
 
 import os
+from collections.abc import Iterator
 from functools import lru_cache, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,6 +16,7 @@ import numpy as np
 
 from heliograph.engine.choice import try_native
 from heliograph.engine.limits import BLOCK
+from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.arguments import Precision
 from heliograph.simulation.network import Network
@@ -25,7 +27,6 @@ from heliograph.simulation.runs.memory import Needed, check_memory
 from heliograph.simulation.runs.native_lanes import Native, NativeLanes
 from heliograph.simulation.runs.node_parts import NODES, build_world, count_parts, is_apart, split_nodes
 from heliograph.simulation.smoothed import Recorded, SmoothedPart, Smoother, finish, reduce_run
-from heliograph.simulation.stepping import AllFilters
 from heliograph.simulation.world import World
 from straightline import Unsupported, accumulate
 
@@ -55,16 +56,10 @@ def compile_runs(
     """
     if str(key.dtype) != "key<fry>":
         raise Unsupported(f"keys of type {key.dtype}")
-    # Arrays are arguments; everything else is part of the program.
-    leaves, tree = jax.tree.flatten((world, later, inputs, reducer))
-    is_fixed = tuple(not eqx.is_array(leaf) for leaf in leaves)
-    fixed = tuple(leaf if f else None for leaf, f in zip(leaves, is_fixed, strict=True))
-    arrays = [np.asarray(leaf) for leaf, f in zip(leaves, is_fixed, strict=True) if not f]
-    # One program for networks of one structure.
+    # One program for networks of one structure: arrays are its arguments.
+    (of_world, arrays), (of_rest, others) = _describe_world(world), _describe((later, inputs, reducer))
     try:
-        compiled = _find_program(
-            tree, is_fixed, fixed, tuple(map(_Known.of, arrays)), bool(jax.threefry_partitionable.value), precision
-        )
+        compiled = _find_program(of_world, of_rest, bool(jax.threefry_partitionable.value), precision)
     except TypeError as error:
         if "unhashable" not in str(error):
             raise
@@ -76,7 +71,7 @@ def compile_runs(
     collected, sums, variables = program.memory(runs, lanes, min(lanes, os.cpu_count() or 1))
     collected *= 2 if precision == "float32" else 1  # results are handed back in double precision
     check_memory(Needed(parts * collected, sums, variables), runs, len(inputs))
-    return Native(program.begin([key, *arrays], runs), form)
+    return Native(program.begin([key, *arrays, *others], runs), form)
 
 
 class _Known:
@@ -123,31 +118,56 @@ def _is_given(array: np.ndarray) -> bool:
     return array.dtype.kind == "f" or array.dtype == np.uint32
 
 
+class _Structure(NamedTuple):
+    """All of a tree but the numbers of its arrays: `fixed` leaves, such as a user's functions, None in place of arrays.
+
+    `known`: what is known of each array when a program is made.
+    """
+
+    tree: Any
+    fixed: tuple[Any, ...]
+    is_fixed: tuple[bool, ...]
+    known: tuple[_Known, ...]
+
+    def restore(self, arrays: Iterator[Any]) -> PyTree:
+        """Return the tree with the next arrays in their places."""
+        leaves = [leaf if f else next(arrays) for leaf, f in zip(self.fixed, self.is_fixed, strict=True)]
+        return jax.tree.unflatten(self.tree, leaves)
+
+
+def _describe(tree: PyTree) -> tuple[_Structure, tuple[np.ndarray, ...]]:
+    """Take a tree apart into its structure and its arrays."""
+    leaves, structure = jax.tree.flatten(tree)
+    is_fixed = tuple(not eqx.is_array(leaf) for leaf in leaves)
+    fixed = tuple(leaf if f else None for leaf, f in zip(leaves, is_fixed, strict=True))
+    arrays = tuple(np.asarray(leaf) for leaf, f in zip(leaves, is_fixed, strict=True) if not f)
+    return _Structure(structure, fixed, is_fixed, tuple(map(_Known.of, arrays))), arrays
+
+
+@cache_by_object
+def _describe_world(world: World) -> tuple[_Structure, tuple[np.ndarray, ...]]:
+    """Take a world apart, once for all simulations of it."""
+    return _describe(world)
+
+
 @lru_cache(PROGRAMS)
 def _find_program(
-    tree: Any,
-    is_fixed: tuple[bool, ...],
-    fixed: tuple[Any, ...],
-    known: tuple[_Known, ...],
-    counting: bool,
-    precision: Precision,
+    world: _Structure, rest: _Structure, counting: bool, precision: Precision
 ) -> tuple[Any, Any] | Unsupported:
     """Return what `_compile_program` does, cached; returned and not raised, so cached too, is why there is none.
 
     `counting` is only part of the cache's key: what is traced depends on JAX's way of counting draws.
     """
     try:
-        return _compile_program(tree, is_fixed, fixed, known, precision)
+        return _compile_program(world, rest, precision)
     except Unsupported as error:
         return Unsupported(error.operation, error.where)  # without its traceback, which holds the program
 
 
-def _compile_program(
-    tree: Any, is_fixed: tuple[bool, ...], fixed: tuple[Any, ...], known: tuple[_Known, ...], precision: Precision
-) -> tuple[Any, Any]:
-    """Compile the code of networks of one structure; also return the structure of what is collected of a run.
+def _compile_program(of_world: _Structure, of_rest: _Structure, precision: Precision) -> tuple[Any, Any]:
+    """Compile the code of worlds of one structure; also return the structure of what is collected of a run.
 
-    `is_fixed`: which leaves of the tree are no arrays, such as a user's functions; `fixed`: these, None for arrays.
+    `of_rest`: of the smoother that follows, the inputs and the reducer.
     """
     form: list[Any] = []  # filled when `run` is traced
 
@@ -155,8 +175,7 @@ def _compile_program(
         """Simulate one run from the program's arrays and the run's number; return what is summed, and what is kept."""
         *arrays, number = leaves
         items = iter(arrays)
-        leaves_of_tree = [value if f else next(items) for value, f in zip(fixed, is_fixed, strict=True)]
-        world, later, inputs, reducer = jax.tree.unflatten(tree, leaves_of_tree)
+        world, (later, inputs, reducer) = of_world.restore(items), of_rest.restore(items)
         run_key, u = jax.random.fold_in(key, number), jnp.asarray(inputs)
         if later is None:
             reduced = _run(world, u, reducer, run_key)
@@ -167,7 +186,7 @@ def _compile_program(
         return summed, reduced.collected
 
     # Sums over runs by batch; the rest is collected.
-    key = jax.eval_shape(lambda: jax.random.key(0))
+    key, known = jax.eval_shape(lambda: jax.random.key(0)), of_world.known + of_rest.known
     masks = {n: k.mask for n, k in enumerate(known, start=1) if k.mask.any()}
     single = precision == "float32"
     program = accumulate(run, key, *(k.example for k in known), batches=BATCHES, known=masks, single=single)
@@ -257,9 +276,9 @@ def code_of_network(
     precision: Precision = "float64",
 ) -> Native:
     """Make the native code of a network's runs, as `compile_runs` of its world; a part of it may be smoothed."""
-    filters = AllFilters(network, None if smoothing is None else smoothing.kinds)
-    later = None if smoothing is None else smoothing.smoother(filters)
-    return compile_runs(build_world(network, filters), inputs, key, reducer, runs, later, precision=precision)
+    world = build_world(network, None if smoothing is None else smoothing.kinds)
+    later = None if smoothing is None else smoothing.smoother(world.filters)
+    return compile_runs(world, inputs, key, reducer, runs, later, precision=precision)
 
 
 def _run_chunks(

@@ -1,6 +1,5 @@
 """Networks of many nodes that share nothing but the plant, simulated a few nodes at a time."""
 
-from collections.abc import Iterator
 from dataclasses import fields
 from typing import TypeVar
 
@@ -9,6 +8,7 @@ import jax
 import numpy as np
 
 from heliograph.model.over_time import first
+from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.frozen import FrozenMapping
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
@@ -34,9 +34,10 @@ def is_apart(network: Network) -> bool:
     return len(nodes) == len(network.nodes) and not fused and not any(first(n.channel).remembers for n in nodes)
 
 
-def build_world(network: Network, filters: AllFilters) -> World:
-    """Build the world of a network with these filters, with its numbers as they are when it is simulated."""
-    return World(drop_identities(network.plant), make_reception(network), filters)
+@cache_by_object
+def build_world(network: Network, smoothed_groups: tuple[int, ...] | None = None) -> World:
+    """Build the world of a network, once for all simulations of it; `smoothed_groups` as of `AllFilters`."""
+    return World(drop_identities(network.plant), make_reception(network), AllFilters(network, smoothed_groups))
 
 
 def count_parts(network: Network) -> int:
@@ -44,18 +45,21 @@ def count_parts(network: Network) -> int:
     return sum(-(-len(names) // NODES) for names in network.groups)
 
 
-def split_nodes(network: Network) -> Iterator[tuple[Network, World]]:
-    """Split a network whose nodes are apart: yield networks of a few nodes each, of one structure, and their worlds.
+@cache_by_object
+def split_nodes(network: Network) -> tuple[tuple[Network, World], ...]:
+    """Split a network whose nodes are apart: return networks of a few nodes each, of one structure, and their worlds.
 
     The nodes of a structure are stacked once, and a part takes its rows: to stack those of each part would take longer
-    than to simulate three hundred runs.
+    than to simulate three hundred runs, and so would to split the network again for each simulation of it.
     """
+    parts = []
     for names in network.groups:
         alike = _select_nodes(network, names)
-        world = jax.tree.map(_on_host, build_world(alike, AllFilters(alike)))
+        world = jax.tree.map(_on_host, build_world(alike))
         for start in range(0, len(names), NODES):
             some = slice(start, start + NODES)
-            yield _select_nodes(network, names[some]), _select_rows(world, some)
+            parts.append((_select_nodes(network, names[some]), _select_rows(world, some)))
+    return tuple(parts)
 
 
 def _on_host(leaf: PyTree) -> PyTree:
