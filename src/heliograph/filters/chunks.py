@@ -94,7 +94,7 @@ def filter_in_chunks(
         state: before the first row; that before any unless given.
         begin: number of the first row.
     """
-    start = linear_start(filter)
+    start = linear_start(filter) if is_long(len(z)) else None
     if start is None:
         return None
     rows = FilterRows(filter, output, np.asarray(begin))

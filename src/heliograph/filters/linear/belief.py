@@ -11,6 +11,7 @@ from heliograph.factors.gaussian import Gaussian, from_covariance, predict_affin
 from heliograph.filters.gaussian.belief import process_noise
 from heliograph.model.plant import AbstractPlant, LinearPlant
 from heliograph.numerics.linalg import symmetric
+from heliograph.numerics.traced import library
 from heliograph.numerics.types import Float
 
 
@@ -48,7 +49,8 @@ class LinearBelief(NamedTuple):
 
 def prior_belief(start: AbstractPlant) -> LinearBelief:
     """Return the prior, both as estimate and as the state's moments before data."""
-    mean, covariance = jnp.asarray(start.initial_mean), jnp.asarray(start.initial_covariance)
+    xp = library(start.initial_mean, start.initial_covariance)
+    mean, covariance = xp.asarray(start.initial_mean), xp.asarray(start.initial_covariance)
     return LinearBelief(from_covariance(start.initial_mean, start.initial_covariance), mean, covariance)
 
 
