@@ -28,6 +28,7 @@ from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.density import log_density
 from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 from heliograph.random_affine.base import check_forgets, check_maps
 from heliograph.random_affine.moments.monomials import count_monomials, evaluate_monomials, position
@@ -123,7 +124,9 @@ class PolynomialFilter(AbstractSizedFilter):
 
 def _initial_mean(centre: MeanBeforeData | None, n: int) -> jax.Array:
     """Return the mean of the state at the start (n,), zeros where nothing is subtracted."""
-    return jnp.zeros(n) if centre is None else jnp.asarray(centre.start)
+    start = np.zeros(n) if centre is None else centre.start
+    mean: jax.Array = library(start).asarray(start)
+    return mean
 
 
 def _predict_mean(centre: MeanBeforeData | None, mean: Array, k: Step) -> Array:
