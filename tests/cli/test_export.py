@@ -52,11 +52,22 @@ def test_without_a_compiler_it_says_so(folder, capsys, monkeypatch):
         ({"filter": "awake"}, "filter: expected one of the network's filters ['aware', 'trusting'], got 'awake'"),
         ({"out": "step.txt"}, "step.txt: expected a name that ends in .c"),
         ({"out": "no/step.c"}, "output folder no: expected an existing folder"),
+        ({"out": "step.c", "window": "0"}, "window: expected a positive whole number, got 0"),
         ({"out": "1.c"}, "expected a name that C takes for its functions, such as step.c, got '1'"),
     ],
 )
 def test_refusals(folder, capsys, more, words):
-    refused(folder, capsys, arguments(**more), words)
+    options = [f"--{name}={value}" for name, value in more.items() if name == "window"]
+    refused(folder, capsys, arguments(*options, **{k: v for k, v in more.items() if k != "window"}), words)
+
+
+@pytest.mark.filterwarnings("default:window")
+def test_a_window_is_part_of_what_it_costs(folder, capsys):
+    """Eight rows of a state of 72 bytes, one number and two inputs; the state; four counters. Its noise is per step."""
+    assert cli.main(arguments("--window", "6")) == 0
+    said = capsys.readouterr()
+    assert "state 856 bytes" in said.out and "window: predictions depend on what comes late: noise over 0" in said.err
+    assert "step_window_late(step_window *window, double age" in (folder / "step.h").read_text()
 
 
 def test_a_node_where_several_have_the_filter(folder, capsys):

@@ -21,11 +21,21 @@ class Device:
     """One filter as it runs on a device; `state` is its memory."""
 
     def __init__(
-        self, filter_, folder: Path, name="step", precision="double", of=None, node=None, apart=False, size=False
+        self,
+        filter_,
+        folder: Path,
+        name="step",
+        precision="double",
+        of=None,
+        node=None,
+        apart=False,
+        size=False,
+        window=None,
+        compiler=COMPILER,
     ):
-        self.exported = export_c(filter_, folder / f"{name}.c", precision, of, node, apart, size)
+        self.exported = export_c(filter_, folder / f"{name}.c", precision, of, node, apart, size, window)
         library = folder / f"{name}_{precision}.so"
-        command = [COMPILER, *FLAGS, "-shared", "-fPIC", self.exported.source.name, "-o", library.name, "-lm"]
+        command = [compiler, *FLAGS, "-shared", "-fPIC", self.exported.source.name, "-o", library.name, "-lm"]
         subprocess.run(command, cwd=folder, check=True)
         self.library, self.name = ctypes.CDLL(str(library)), name
         self.real = ctypes.c_double if precision == "double" else ctypes.c_float
@@ -33,7 +43,7 @@ class Device:
         self.size = len(filter_.states)
         for part in ("mean", "covariance"):
             self._function(part).restype = ctypes.POINTER(self.real)
-        self._function("start")(self._pointer(self.state))
+        self._function("start" if window is None else "window_start")(self._pointer(self.state))
 
     def step(self, z, u=()) -> int:
         """Advance; 0 unless refused."""

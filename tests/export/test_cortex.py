@@ -2,6 +2,7 @@
 
 import shutil
 import subprocess
+import warnings
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +12,7 @@ import heliograph as hg
 from tests.export.device import FLAGS
 from tests.export.test_apart import MAKERS, SENSOR, VEHICLE
 from tests.export.test_far_origin import CAR
+from tests.export.test_window import ANGLES, TURN
 
 CAR_SENSOR = hg.Sensor(lambda x: jnp.stack([x[0], x[1], x[2], x[4]]), np.diag([1.0, 1.0, 0.01, 1e-4]))
 CROSS = "arm-none-eabi"
@@ -25,7 +27,9 @@ needs_cross_compiler = pytest.mark.skipif(
 @pytest.mark.parametrize("name", ["extended", "gate"])
 def test_single_precision_stays_single_on_a_device(name, tmp_path):
     """No warning, no number made double, and no call of the library that emulates doubles; no heap."""
-    hg.export_c(MAKERS[name](VEHICLE, SENSOR), tmp_path / "step.c", "float", apart=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # noise for each step is not divided
+        hg.export_c(MAKERS[name](VEHICLE, SENSOR), tmp_path / "step.c", "float", apart=True, window=20)
     flags = [*FLAGS[:-1], *CORTEX, "-Wdouble-promotion"]
     subprocess.run([f"{CROSS}-gcc", *flags, "-c", "step.c", "-o", "step.o"], cwd=tmp_path, check=True)
     listed = subprocess.run([f"{CROSS}-nm", "-u", "step.o"], cwd=tmp_path, capture_output=True, text=True, check=True)
@@ -35,12 +39,27 @@ def test_single_precision_stays_single_on_a_device(name, tmp_path):
 
 @pytest.mark.slow
 @needs_cross_compiler
+@pytest.mark.filterwarnings("ignore:window")
+def test_late_measurements_take_little_code(tmp_path):
+    """Beside the step, which is there once: functions that hold rows and run them again."""
+    for filter_, most in ((hg.extended_filter(TURN, ANGLES), 800), (MAKERS["extended"](VEHICLE, SENSOR), 1200)):
+        sizes = [measure_code(tmp_path, filter_, window=window)[0] for window in (None, 20)]
+        assert 0 < sizes[1] - sizes[0] < most
+
+
+def measure_code(folder, filter_, **options):
+    """Bytes of code and constants at -Os, and of the state."""
+    written = hg.export_c(filter_, folder / "step.c", "float", size=True, **options)
+    subprocess.run([f"{CROSS}-gcc", *FLAGS[:-1], *CORTEX, "-c", "step.c", "-o", "step.o"], cwd=folder, check=True)
+    listed = subprocess.run([f"{CROSS}-size", "step.o"], cwd=folder, capture_output=True, text=True, check=True)
+    code, data = listed.stdout.split()[6:8]
+    return int(code) + int(data), written.state_bytes
+
+
+@pytest.mark.slow
+@needs_cross_compiler
 @pytest.mark.parametrize(("name", "most"), [("extended", 10_500), ("cubature", 20_000)])
 def test_a_car_fits(name, most, tmp_path):
     """Bytes of code and constants of one step of five states and four outputs, at -Os (31,000 unrolled)."""
-    written = hg.export_c(MAKERS[name](CAR, CAR_SENSOR), tmp_path / "step.c", "float", size=True)
-    subprocess.run([f"{CROSS}-gcc", *FLAGS[:-1], *CORTEX, "-c", "step.c", "-o", "step.o"], cwd=tmp_path, check=True)
-    command = [f"{CROSS}-size", "step.o"]
-    listed = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
-    code, data = listed.stdout.split()[6:8]
-    assert int(code) + int(data) < most and written.state_bytes < 300
+    code, state = measure_code(tmp_path, MAKERS[name](CAR, CAR_SENSOR))
+    assert code < most and state < 300

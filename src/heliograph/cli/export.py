@@ -23,6 +23,9 @@ def export(
     precision: Annotated[str, Parameter(help="double, or float: single precision.")] = "double",
     apart: Annotated[bool, Parameter(help="Prediction, correction and a start as functions of their own too.")] = False,
     size: Annotated[bool, Parameter(help="Small rather than fast: points one after another, in loops.")] = False,
+    window: Annotated[
+        int | None, Parameter(help="How many steps late a measurement may be; none is late unless given.")
+    ] = None,
 ) -> None:
     """Write one step of a filter of your own network as C99, for a device: no heap, no library but libm.
 
@@ -44,7 +47,7 @@ def export(
     check_place(out)
     named = find_filter_by_name(load_network(network), filter, node)
     # Write the files, then compile and time them.
-    written = write_filter(named.filter, named.received, out, precision, apart, size)
+    written = write_filter(named.filter, named.received, out, precision, apart, size, window)
     exported, real = named.filter, PRECISIONS[precision]
     measured = measure_cost(written.header, written.source, exported.received, len(exported.inputs), real)
     claim = claim_of(exported, real)

@@ -14,6 +14,7 @@ from jax.tree_util import keystr, tree_flatten_with_path
 from heliograph.disk.whole_file import check_output, whole_files
 from heliograph.export.program import RESERVED, Real, write_step_program
 from heliograph.export.text import CText, Form, write_c_text
+from heliograph.export.window import check_window
 from heliograph.factors.columns import use_precision
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.scheduled import ScheduledFilter
@@ -47,6 +48,7 @@ def export_c(
     node: str | None = None,
     apart: bool = False,
     size: bool = False,
+    window: int | None = None,
 ) -> Exported:
     """Write one step of a filter as C99, for a device: `step.h` and `step.c` where `path` is "step.c".
 
@@ -69,25 +71,29 @@ def export_c(
             when it comes, and the innovation is told; False by default.
         size: whether the code is to be small rather than fast: points are taken one after another in loops, where
             that is shorter; False by default.
+        window: how many steps late a measurement may be, with `step_window` around the state and functions of it: what
+            comes late is filled into its step, of a plant with an input "dt" at its time, and the steps from there on
+            are run again. None by default: none is late.
 
     Returns:
-        The two files, the number of each operation in a step, and the bytes of the state.
+        The two files, the number of each operation in a step, and the bytes of the state, or of the window around it.
 
     Raises:
         ValueError: no filter; no filter of that name, or a fusion of finished estimates; a path that does not end in
             .c, is no name in C or cannot be written; random numbers, or operations that C does not have, with the line
-            they come from; single precision of another filter. Then nothing is written.
+            they come from; single precision of another filter; a window of continuous time where parts go by steps.
+            Then nothing is written.
 
     Source: Bierman, Factorization methods for discrete sequential estimation (1977).
     """
     if isinstance(filter, Network):
         named = find_filter_by_name(filter, "" if name is None else name, node)
-        return write_filter(named.filter, named.received, path, precision, apart, size)
+        return write_filter(named.filter, named.received, path, precision, apart, size, window)
     if name is not None or node is not None:
         raise fail("export by name", "a network", show_value(filter))
     what = "a filter, or a network and the name of its filter or fusion"
     checked: AbstractFilter = instance("export", filter, AbstractFilter, what)
-    return write_filter(checked, _name_received(checked), path, precision, apart, size)
+    return write_filter(checked, _name_received(checked), path, precision, apart, size, window)
 
 
 def _name_received(filter: AbstractFilter) -> tuple[str, ...]:
@@ -103,12 +109,14 @@ def write_filter(
     precision: str,
     apart: bool = False,
     size: bool = False,
+    window: int | None = None,
 ) -> Exported:
     """Write as `export_c`, with names for the components of z."""
     source = check_place(path)
     if precision not in PRECISIONS:
         raise fail("precision", " or ".join(PRECISIONS), show_value(precision))
-    text = make_text(filter, received, source.stem, PRECISIONS[precision], apart, size)
+    late = None if window is None else check_window(filter, window)
+    text = make_text(filter, received, source.stem, PRECISIONS[precision], apart, size, late)
     header = source.with_suffix(".h")
     with whole_files([header, source]) as partials:
         for partial, content in zip(partials, (text.header, text.source), strict=True):
@@ -134,7 +142,13 @@ def check_place(path: str | Path) -> Path:
 
 
 def make_text(
-    filter: AbstractFilter, received: Sequence[str], prefix: str, real: Real, apart: bool = False, size: bool = False
+    filter: AbstractFilter,
+    received: Sequence[str],
+    prefix: str,
+    real: Real,
+    apart: bool = False,
+    size: bool = False,
+    late: int | None = None,
 ) -> CText:
     """Return the text of both files of a filter; for `size` the shorter of two forms, in loops and written out."""
     kind = f"a {type(filter).__name__} in {'double' if real == 'double' else 'single'} precision"
@@ -142,7 +156,7 @@ def make_text(
         expected = "a filter that carries its covariance as factors L D L', or a schedule of gains"
         raise fail("single precision", expected, type(filter).__name__)
     exported = filter if real == "double" else filter.for_single_precision()
-    form = Form(prefix, real, received, kind)
+    form = Form(prefix, real, received, kind, late)
     texts = list[CText]()
     try:
         for short in (True, False) if size else (False,):

@@ -6,7 +6,9 @@ from typing import Any, NamedTuple
 import heliograph
 from heliograph.disk.quoting import visible
 from heliograph.export.functions import declare_innovation, explain_parts, list_heads, write_functions
+from heliograph.export.layout import lay_out_array, lay_out_struct
 from heliograph.export.program import Real, StepProgram
+from heliograph.export.window import WindowText, write_window
 from heliograph.filters.base import AbstractFilter
 from heliograph.model.estimate import Claim
 from heliograph.model.over_time import first
@@ -19,9 +21,6 @@ MEANING: dict[Claim, str] = {
 }
 
 
-SIZES = {"double": 8, "float": 4, "unsigned char": 1, "int32_t": 4, "uint32_t": 4, "int64_t": 8, "uint64_t": 8}
-
-
 class Form(NamedTuple):
     """Options of the text.
 
@@ -30,16 +29,18 @@ class Form(NamedTuple):
         real: type of numbers.
         received: names of z's components.
         kind: description of the filter and the precision.
+        late: how many steps late a measurement may be; None of a step that takes none.
     """
 
     prefix: str
     real: Real
     received: Sequence[str]
     kind: str
+    late: int | None = None
 
 
 class CText(NamedTuple):
-    """Header and source; the number of each operation in a step; bytes of the state."""
+    """Header and source; the number of each operation in a step; bytes of the state, or of the window around it."""
 
     header: str
     source: str
@@ -52,32 +53,34 @@ def write_c_text(program: StepProgram, form: Form) -> CText:
     prefix, real = form.prefix, form.real
     # The C type of each member: that of the result "next_<member>".
     types = {x.name.removeprefix("next_"): x.type for x in program.computes[0].results}
+    fields = [(types[m.name], m.name, max(m.start.size, 1)) for m in program.members]
+    counter = [lay_out_array("int64_t", 1)] if program.counts else []
+    state = lay_out_struct([*(lay_out_array(kind, count) for kind, _, count in fields), *counter])
+    window = None if form.late is None else write_window(program, form.late, state, prefix, real)
     starts = [program.initial] if program.at is None else [program.initial, program.at]
     text = _SOURCE.format(
         prefix=prefix,
         comment=f"{prefix}.c: one step of {form.kind}; {prefix}.h says how to use it.",
         functions="\n\n".join(_write_static(code) for code in (*starts, *program.computes)),
         start=_write_start(program),
-        step="\n\n".join(write_functions(program, prefix, real)),
+        step="\n\n".join([*write_functions(program, prefix, real), *([] if window is None else window.functions)]),
         mean=program.mean,
         covariance=program.covariance,
         real=real,
     )
     # The header declares the state and explains the functions.
-    fields = [(types[m.name], m.name, max(m.start.size, 1)) for m in program.members]
+    heads = [*list_heads(program, prefix, real), *([] if window is None else window.heads)]
     header = _HEADER.format(
         prefix=prefix,
         guard=f"{prefix.upper()}_H",
-        comment=_write_comment(program, form),
+        comment=_write_comment(program, form, window),
         members="\n".join([f"    {kind} {name}[{count}];" for kind, name, count in fields] + _declare_counter(program)),
         innovation=declare_innovation(program, prefix, real),
-        functions="".join(f"{head};\n" for head in list_heads(program, prefix, real)),
+        window="" if window is None else window.types,
+        functions="".join(f"{head};\n" for head in heads),
         real=real,
     )
-    sizes = [(SIZES[kind], count) for kind, _, count in fields]
-    if program.counts:
-        sizes.append((SIZES["int64_t"], 1))  # the step counter
-    return CText(header, text, program.operations, _measure_state(sizes))
+    return CText(header, text, program.operations, state.size if window is None else window.size)
 
 
 def _write_static(code: Any) -> str:
@@ -91,22 +94,6 @@ def _declare_counter(program: StepProgram) -> list[str]:
     return ["    int64_t step;"] if program.counts else []
 
 
-def _measure_state(fields: Sequence[tuple[int, int]]) -> int:
-    """Return the bytes of a C struct of arrays of (bytes of a number, count): each is aligned to its number's size.
-
-    The struct itself is filled up to a multiple of its largest number.
-    """
-
-    def round_up(total: int, size: int) -> int:
-        """Return the next multiple of `size`."""
-        return -(-total // size) * size
-
-    total = 0
-    for size, count in fields:
-        total = round_up(total, size) + size * count
-    return round_up(total, max(size for size, _ in fields))
-
-
 def _write_start(program: StepProgram) -> str:
     """Return the statements that set the state before the first step."""
     members = ", ".join(f"state->{m.name}" for m in program.members)
@@ -118,7 +105,7 @@ def claim_of(filter: AbstractFilter, real: Real) -> Claim:
     return filter.claim if real == "double" or filter.claim == "none" else "nominal"
 
 
-def _write_comment(program: StepProgram, form: Form) -> str:
+def _write_comment(program: StepProgram, form: Form, window: WindowText | None) -> str:
     """Return the comment at the head of the header: how to call the functions, and what the arrays hold."""
     filter, prefix, claim = program.filter, form.prefix, claim_of(program.filter, form.real)
     # States that are angles or attitudes say so.
@@ -138,6 +125,7 @@ def _write_comment(program: StepProgram, form: Form) -> str:
         "6 the inputs are none: dt is negative, beyond 2^53 units or the wrapped difference of unsigned counters of 32",
         "bits, or a function of the inputs returned no finite numbers, or no covariance.",
         *(explain_parts(program, prefix) if len(program.parts) > 1 else []),
+        *([] if window is None else window.comment),
         "",
         *_explain_entries("z", form.received, [""] * len(form.received)),
         *_explain_entries("u", filter.inputs, [""] * len(filter.inputs)),
@@ -174,7 +162,7 @@ typedef struct {{
 {members}
 }} {prefix}_state;
 
-{innovation}void {prefix}_start({prefix}_state *state);
+{innovation}{window}void {prefix}_start({prefix}_state *state);
 {functions}const {real} *{prefix}_mean(const {prefix}_state *state);
 const {real} *{prefix}_covariance(const {prefix}_state *state);
 

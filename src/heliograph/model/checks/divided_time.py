@@ -1,0 +1,94 @@
+"""Intervals of continuous time, divided by a row in between: what of a model goes by steps, and what is uneven."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.engine.choice import compile_on_call
+from heliograph.model.channel import Channel
+from heliograph.model.over_time import first
+from heliograph.model.plant import AbstractPlant, AnyPlant
+from heliograph.model.sensor import AnySensor
+from heliograph.model.trigger import AbstractTrigger
+from heliograph.numerics.types import Array, Float
+from heliograph.random_affine.memory import memories
+
+CUTS = ((0.0, 1.0), (0.25, 0.75), (1.0, 0.0))  # of an interval of length one, in the plant's own unit
+TOLERANCE = 1e-9  # relative: a few products lose 1e-15
+
+
+def find_part_by_steps(
+    plant: AnyPlant | None,
+    sensor: AnySensor | None = None,
+    channel: Channel | None = None,
+    trigger: AbstractTrigger | None = None,
+) -> str:
+    """Return which part has a law that a row in between would change, as one that goes from step to step; "" if none.
+
+    Args:
+        plant: the plant; each of these may be None, where it is not asked about.
+        sensor: its sensor.
+        channel: what brings its signal.
+        trigger: rule of the sender.
+    """
+    if plant is not None and memories(plant):
+        return "a plant with modes, whose law a row that is inserted would change"
+    if sensor is not None and memories(sensor):
+        return "a sensor with modes"
+    if channel is not None and first(channel).remembers:
+        return "a channel that remembers"
+    return "" if trigger is None else "a sender with a trigger"
+
+
+def explain_unevenness(plant: AbstractPlant, dt: int) -> str:
+    """Explain how a plant's prediction over an interval differs from that over its parts; "" if it does not.
+
+    f(f(x, s), t) = f(x, s + t), A(s + t) = A(t) A(s), Q(s + t) = A(t) Q(s) A(t)' + Q(t), with A the Jacobian of f. We
+    test these around the initial mean, with all other inputs 1; s = 0 and t = 0 are among the divisions.
+
+    Args:
+        plant: the plant, whose time step is an input.
+        dt: index of this input.
+    """
+    mean, spread = np.asarray(plant.initial_mean), np.sqrt(np.diag(np.asarray(plant.initial_covariance)))
+    cuts = np.array(CUTS)
+    # At the initial mean, and one standard deviation from it.
+    for x in (mean, mean + spread):
+        whole = _integrate_parts(plant, dt, x, cuts.sum(axis=1, keepdims=True))
+        parts = _integrate_parts(plant, dt, x, cuts)
+        for i, (s, t) in enumerate(CUTS):
+            for what, at_once, in_two in zip(("transition", "Jacobian", "noise"), whole, parts, strict=True):
+                gap = float(np.abs(at_once[i] - in_two[i]).max())
+                if not gap <= TOLERANCE * max(1.0, float(np.abs(at_once[i]).max())):
+                    return (
+                        f"{what} over {s:g} and then {t:g} differs by {gap:.3g} from that over {s + t:g}; give the "
+                        "plant a function, and a noise, of dt that agree over the parts of an interval"
+                    )
+    return ""
+
+
+@compile_on_call
+def _integrate_parts(
+    plant: AbstractPlant, dt: int, x: Float[Array, " n"], intervals: Float[Array, "cut part"]
+) -> tuple[Float[Array, "cut n"], Float[Array, "cut n n"], Float[Array, "cut n n"]]:
+    """Return for each cut the mean, transition matrix and noise covariance after its intervals, passed one by one.
+
+    intervals (cut, part): lengths, in the plant's unit of time; the mean starts at x.
+    """
+
+    def integrate(parts: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Return mean, transition matrix and noise covariance after intervals of these lengths."""
+        n = len(x)
+        state, matrix, spread = jnp.asarray(x), jnp.eye(n), jnp.zeros((n, n))
+        for interval in parts:
+            u = jnp.where(np.arange(len(plant.inputs)) == dt, interval, 1.0)
+            a, moved = jax.jacfwd(plant.moves(u, state))(state), plant.transition(state, u)
+            state, matrix, spread = (
+                plant.manifold.settle(moved, moved + plant.noise_mean()),
+                a @ matrix,
+                a @ spread @ a.T + plant.noise_covariance(u),
+            )
+        return state, matrix, spread
+
+    moved: tuple[jax.Array, jax.Array, jax.Array] = jax.vmap(integrate)(jnp.asarray(intervals))
+    return moved
