@@ -161,7 +161,7 @@ def run_over_data(filter: SteppedFilter, z: ArrayLike, u: ArrayLike | None, afte
     months = 0 if clock is None else usual_months(clock)
     origin = Origin(filter, state, end, last_input(np.asarray(rows_u)), last, spacing, months=months)
     if counts is not None:
-        _warn_of_few_particles(counts)
+        _warn_of_particles(counts, innovation.log_likelihood, begin)
     return Filtered(
         means=mean,
         covariances=covariance,
@@ -199,12 +199,16 @@ def _check_later(before: Origin, clock: np.ndarray) -> None:
         raise fail("measurements", f"rows behind {before.time}, the last one before them", str(clock[0]))
 
 
-def _warn_of_few_particles(counts: Array) -> None:
-    """Warn where the effective number of particles (steps,) is below FEW."""
-    few = np.flatnonzero(np.asarray(counts) < FEW)
+def _warn_of_particles(counts: Array, log_likelihoods: Array, begin: int) -> None:
+    """Warn of rows that no particle explains, and of effective numbers below FEW (steps,); `begin` rows were before."""
+    unused = begin + 1 + np.flatnonzero(np.isneginf(np.asarray(log_likelihoods)))
+    few = begin + 1 + np.flatnonzero(np.asarray(counts) < FEW)
+    if len(unused):
+        said = f"particle_filter: {len(unused)} of the rows are not used, first row {unused[0]}"
+        warnings.warn(f"{said}: no particle explains what arrived, and the state stays as it was", stacklevel=4)
     if len(few):
         least = float(np.min(np.asarray(counts)))
-        said = f"particle_filter: fewer than {FEW} particles count after {len(few)} of the rows, first row {few[0] + 1}"
+        said = f"particle_filter: fewer than {FEW} particles count after {len(few)} of the rows, first row {few[0]}"
         warnings.warn(f"{said} ({least:.2g} at least); take more of them", stacklevel=4)
 
 

@@ -270,8 +270,11 @@ def markov_plant(
                            f"another {what.replace('_', ' ')}")  # fmt: skip
     if rates is None:
         return ModalPlant(_chain_of(transition, initial, name, modes, len(plants)), plants)
-    if transition is not None or modes is not None or initial is None:
-        raise fail("rates of the modes", "an initial law beside them, and no transition", "another")
+    if initial is None:
+        raise fail("rates of the modes", "initial=, the law of the mode of the first row, beside them", "none")
+    if transition is not None or modes is not None:
+        given = "transition=" if modes is None else "modes="
+        raise fail("rates of the modes", "no transition= and no modes= beside them", given)
     if TIME_STEP not in plants[0].inputs:
         raise fail("rates of the modes", f"plants with the input {TIME_STEP!r}", list(plants[0].inputs))
     moving = SwitchingRates(rates)

@@ -62,6 +62,8 @@ def test_weights_that_collapse_are_warned_of():
     assert result.effective_numbers[0] == pytest.approx(100)
     assert max(result.effective_numbers[1:]) < 10
     assert hg.kalman_filter(PLANT, sensor).run([[0.3]]).effective_numbers is None
+    with pytest.warns(UserWarning, match="first row 4"):
+        filter.run([[0.3]], after=result)
 
 
 def on_grid(z, noise_density):
@@ -156,6 +158,8 @@ def test_a_row_that_no_particle_explains_is_not_used_and_named():
     np.testing.assert_array_equal(after.position, state.position)
     np.testing.assert_array_equal(after.weight, state.weight)
     assert innovation.log_likelihood == -np.inf
+    with pytest.warns(UserWarning, match="1 of the rows are not used, first row 2: no particle explains"):
+        filter.run([[np.nan], [1.0]])
     network = hg.Network(plant, {"node": hg.Node(sensor, hg.perfect(), {"particles": filter})})
     with pytest.warns(UserWarning, match="excludes"):
         record = hg.run(network, {"node": [[1.0], [np.nan]]})
