@@ -28,9 +28,9 @@ class Compiled:
     """Code for blocks of runs, one for each number of a vector; of `width` runs, or of as many as suit the processor.
 
     `differs` says of each argument, leaf by leaf, whether each run has its own, along a leading axis, or all runs share
-    it. Results have the same bits whatever the width and the number of cores. `operations` are those of a run,
-    `divisions` those of them that divide or take roots. `common` says which results, leaf by leaf, are the same of all
-    runs: they follow from shared arguments alone.
+    it; if they share all, there is one run. Results have the same bits whatever the width and the number of cores.
+    `operations` are those of a run, `divisions` those of them that divide or take roots. `common` says which results,
+    leaf by leaf, are the same of several runs: they follow from shared arguments alone.
     """
 
     def __init__(self, program: Program, differs: Sequence[bool], width: int | None = None):
@@ -38,7 +38,8 @@ class Compiled:
         self.types = [DTYPES[b.type] for b in program.inputs]
         self.shapes = [b.shape for b in program.inputs]
         self.tree = program.tree
-        self.code: Code = write_module(program, self.differs, width, features()[2])
+        # If runs share all arguments, they are one, whose results are computed in the arrays that are returned.
+        self.code: Code = write_module(program, self.differs, width, features()[2], alone=not any(self.differs))
         self.width, self.common = self.code.width, self.code.common
         self.operations, self.divisions = self.code.operations, self.code.divisions
         # Code for blocks of runs, for what all runs share, and for one run alone.
@@ -187,6 +188,8 @@ class InPlace:
         fresh = [np.zeros(s, t) for s, t in zip(shapes, compiled.types[given:], strict=True)]
         self.inputs = [inputs.get(n, x) for n, x in enumerate(fresh)]
         compiled._check_shapes(self.inputs, given, runs)
+        if runs != 1 and compiled._by_run is None:
+            raise ValueError(f"runs: expected one, since they share all arguments, got {runs}")
         for n, (x, new) in enumerate(zip(self.inputs, fresh, strict=True)):
             if x.dtype != new.dtype or not x.flags.c_contiguous:
                 raise ValueError(f"array {n} read in place: expected contiguous numbers of type {new.dtype}")

@@ -103,7 +103,7 @@ def filter_in_chunks(
 
 def sum_filtered_in_chunks(filter: Any, z: Array, u: Array, output: Callable[..., PyTree]) -> PyTree | None:
     """Filter rows as `filter_in_chunks` does; return sums over all rows of what is kept of each, or None."""
-    start = linear_start(filter)
+    start = linear_start(filter) if is_long(len(z)) else None
     if start is None:
         return None
     whole = sum_in_chunks(FilterRows(filter, output), start, (np.asarray(z), np.asarray(u)))

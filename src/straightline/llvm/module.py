@@ -9,6 +9,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from straightline.cycles import keep_cycles
 from straightline.folding import DTYPES
 from straightline.limits import LONGEST, TABLE
 from straightline.llvm.lanes import WIDTH, gather, lane_numbers, types, write_flush
@@ -156,7 +157,7 @@ def write_module(
     """
     outputs = output_buffers(program, last)
     lanes = [b for b, d in zip(program.inputs, differing, strict=True) if d or alone]
-    items = sort_items(list_needed(outputs))
+    items = sort_items(keep_cycles(program.graph, outputs) if alone else list_needed(outputs))
     counts = _count_operations(items)
     # What differs between runs, what the function of blocks needs for it, and where all of it lies.
     differs = {*items, *program.inputs} if alone else find_differing(items, lanes)
