@@ -36,6 +36,7 @@ ORDER = [
         "filters.plausibility",
         "filters.states",
         "filters.recursion",
+        "filters.windows",
         "filters.settled",
         "filters.chunks",
         "filters.filter_data",

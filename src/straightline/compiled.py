@@ -116,27 +116,42 @@ class Compiled:
             arguments: trees like the examples; arrays of which each run has its own have a leading axis of runs.
             cores: threads that compute; those of the machine by default.
         """
-        arrays, first = self._convert_arguments(arguments), len(self._first)
-        runs, code = self._count_runs(arrays), self.code
-        # Memory, and its addresses in the order that the code expects: inputs, tables, outputs, what runs share.
+        return self.join([arguments], cores)
+
+    def join(self, calls: Sequence[Sequence[PyTree]], cores: int | None = None) -> PyTree:
+        """Return the results of the runs of several calls, one after another, in the same arrays.
+
+        Args:
+            calls: the arguments of each, which differ by those of which each run has its own.
+            cores: threads that compute; those of the machine by default.
+        """
+        arrays = [self._convert_arguments(arguments) for arguments in calls]
+        counts, code = [self._count_runs(some) for some in arrays], self.code
+        runs = sum(counts)
         outputs = [in_lines((runs, *b.shape), DTYPES[b.type]) for b in code.outputs]
         shared = aligned(code.shared) if self._shared is None else self._shared
-        last = addresses([*outputs, shared])
-        pointers = np.array([*self._addresses, *addresses(arrays[first:]), *self._tables, *last], dtype=np.uint64)
         # What all runs share: held for later calls unless it follows from arguments that these change.
         if self.once is not None:
             if self._shared is None:
-                once = self.once.machine(1)
-                once.run(pointers.ctypes.data, 0, 0, 1, 1)
-                self._shared = shared if all(self.differs[first:]) else None
+                pointers = self._point_to(arrays[0], outputs, shared)
+                self.once.machine(1).run(pointers.ctypes.data, 0, 0, 1, 1)
+                self._shared = shared if all(self.differs[len(self._first) :]) else None
             self._copy_common(outputs, shared)
         # What differs, block by block.
         if not all(code.common):
             tiers, width = self._choose_tiers(runs)
-            memory = (arrays, code.tables, outputs, shared)
-            call = Call(machine=tiers.machine(-(-runs // width)), pointers=pointers, memory=memory, runs=runs)
-            self._compute_blocks(call, cores)
+            machine, begin = tiers.machine(-(-runs // width)), 0
+            for some, count in zip(arrays, counts, strict=True):
+                own = [x[begin : begin + count] for x in outputs]
+                pointers, memory = self._point_to(some, own, shared), (some, code.tables, own, shared)
+                self._compute_blocks(Call(machine=machine, pointers=pointers, memory=memory, runs=count), cores)
+                begin += count
         return jax.tree.unflatten(self.tree, outputs)
+
+    def _point_to(self, arrays: list[np.ndarray], outputs: list[np.ndarray], shared: np.ndarray) -> np.ndarray:
+        """Return addresses in the order that the code expects: inputs, tables, outputs, what runs share."""
+        own = addresses(arrays[len(self._first) :])
+        return np.array([*self._addresses, *own, *self._tables, *addresses([*outputs, shared])], dtype=np.uint64)
 
     def _compute_blocks(self, call: "Call", cores: int | None) -> None:
         """Compute all blocks of runs of a call: here if that is little work, else shared among threads."""

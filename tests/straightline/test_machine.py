@@ -230,3 +230,12 @@ def test_one_run_has_the_bits_of_many_in_memory_of_its_own():
         loose.for_runs(9, {1: x.astype(np.float32)})
     with pytest.raises(ValueError, match="array 1 of the arguments: expected shape"):
         loose.for_runs(8, {1: x})
+
+
+@pytest.mark.parametrize("place", [1, 8, 40, 49])
+def test_runs_of_several_arrays_are_those_of_one(place):
+    x, matrix = np.random.default_rng(4).normal(size=(50, 3)), np.arange(9.0).reshape(3, 3)
+    code = compile(lambda x, matrix: (matrix @ jnp.sin(x), matrix.T), x[0], matrix, shared=[1])
+    joined = code.join([(x[:place], matrix), (x[place:], matrix)])
+    for a, b in zip(joined, code(x, matrix), strict=True):
+        np.testing.assert_array_equal(a, b)

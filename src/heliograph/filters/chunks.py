@@ -33,13 +33,12 @@ from heliograph.filters.settled import (
     sum_settled,
 )
 from heliograph.filters.states import agree, beside_gaussians, means_of, with_gaussians
+from heliograph.filters.windows import Which, join_results, take, take_windows, take_windows_in_parts
 from heliograph.numerics.types import Array, Bool, Int, PyTree
 
 CHUNKS = 16  # at least: two cores with eight lanes each
 PROBES = 8  # joints at which forgetting is tried before all rows are filtered
 BLOCKS = 64  # places in a pass without data
-
-Which = slice | np.ndarray  # some of the chunks, by their numbers
 
 
 class Lengths(NamedTuple):
@@ -283,22 +282,25 @@ def _scan_all(recursion: Recursion, start: PyTree, rows: PyTree, programs: Progr
     begun = begin_chunks(recursion, start, rows)
     if begun is None:
         return None
-    total, chunks = len(jax.tree.leaves(rows)[0]), take_windows(rows, begun.first, begun.lengths.chunk)
+    length, total = begun.lengths.chunk, np.asarray(len(jax.tree.leaves(rows)[0]))
 
     def scan(states: PyTree, which: Which) -> PyTree:
-        """Return the results of some chunks from these states, (chunk, ...); flags say what differs between chunks."""
-        arguments = recursion, states, take(chunks, which), begun.first[which], np.asarray(total)
-        choice = choose_code(programs.full, arguments, [False, True, True, True, False])
-        return None if choice.code is None else choice.results()
+        """Return the results of some chunks from these states, (chunk, ...)."""
+        parts = [
+            (recursion, take(states, part), windows, first, total)
+            for part, first, windows in take_windows_in_parts(rows, begun.first[which], length)
+        ]
+        return join_results(programs.full, parts, [False, True, True, True, False])
 
     def scan_means(settled: Settled) -> PyTree:
         """Return the results of all chunks, as if they were settled but for the means."""
-        arguments = recursion, settled, means_of(begun.states), chunks, begun.first, np.asarray(total)
-        choice = choose_code(programs.settled, arguments, [False, False, True, True, True, False])
-        if choice.code is None:
-            return None
-        means, kept = choice.results()
-        return settled.repeated(means), programs.complete(settled, kept)
+        means = means_of(begun.states)
+        parts = [
+            (recursion, settled, take(means, part), windows, first, total)
+            for part, first, windows in take_windows_in_parts(rows, begun.first, length)
+        ]
+        joined = join_results(programs.settled, parts, [False, False, True, True, True, False])
+        return None if joined is None else (settled.repeated(joined[0]), programs.complete(settled, joined[1]))
 
     results = scan_chunks(begun, scan, scan_means)
     if results is None:
@@ -353,33 +355,3 @@ def replace_chunk(results: PyTree, which: Which, new_results: PyTree) -> None:
     """Overwrite the results of some chunks with new ones, in place."""
     for held, new in zip(jax.tree.leaves(results), jax.tree.leaves(new_results), strict=True):
         held[which] = new
-
-
-def take_windows(rows: PyTree, begin: Int[np.ndarray, " n"], length: int) -> PyTree:
-    """Return windows of rows (n, length, ...), the last row repeated behind the end of the data."""
-    total = len(jax.tree.leaves(rows)[0])
-    one_by_one = np.array_equal(begin, np.arange(len(begin)) * length)
-    within = not np.any(begin % length) and bool(np.all(begin + length <= total))
-
-    def take_from(leaf: np.ndarray) -> np.ndarray:
-        """Return the windows of one array: views of it where they follow one another."""
-        if one_by_one:
-            missing = np.repeat(leaf[-1:], max(len(begin) * length - total, 0), axis=0)
-            joined = np.concatenate([leaf, missing]) if len(missing) else leaf[: len(begin) * length]
-            return joined.reshape(len(begin), length, *leaf.shape[1:])
-        if within:
-            blocks = leaf[: total // length * length].reshape(total // length, length, *leaf.shape[1:])
-            return np.asarray(blocks[begin // length])
-        windows: np.ndarray = np.empty((len(begin), length, *leaf.shape[1:]), leaf.dtype)
-        for window, place in zip(windows, begin, strict=True):
-            part = leaf[place : place + length]
-            window[: len(part)] = part
-            window[len(part) :] = leaf[-1]
-        return windows
-
-    return jax.tree.map(take_from, rows)
-
-
-def take(states: PyTree, which: Which) -> PyTree:
-    """Return some entries, along the leading axis of every array."""
-    return jax.tree.map(lambda leaf: leaf[which], states)

@@ -20,6 +20,7 @@ import numpy as np
 from heliograph.engine.choice import choose_code
 from heliograph.filters.recursion import Recursion, number_rows, sum_rows
 from heliograph.filters.states import ROUNDING, agree, means_of, select_state, with_means
+from heliograph.filters.windows import take
 from heliograph.numerics.process.equal_rows import repeat_row
 from heliograph.numerics.types import Array, Bool, Int, PyTree
 from straightline import present
@@ -65,7 +66,15 @@ class Settled(NamedTuple):
 
     def covers(self, states: PyTree) -> Bool[np.ndarray, " n"]:
         """Test which states (n, ...) are this one but for the means."""
-        return agree(states, self.repeated(means_of(states)))
+        means = means_of(states)
+        beside, own = (jax.tree.leaves(with_means(x, [()] * len(means))) for x in (states, self.state))
+        # Most have the same numbers; of the others what these stand for is compared.
+        same = [(x == y).reshape(len(x), -1).all(axis=1) for x, y in zip(beside, own, strict=True)]
+        covered: np.ndarray = np.all(same, axis=0)
+        others = np.flatnonzero(~covered)
+        if len(others):
+            covered[others] = agree(take(states, others), self.repeated([mean[others] for mean in means]))
+        return covered
 
 
 def find_settled(recursion: Recursion, start: PyTree, rows: PyTree, ahead: int) -> Settled | None:

@@ -40,22 +40,22 @@ def agree(
     pairs = [(a, b, np.zeros(())) for a, b in zip(*map(_leaves_beside, (states, others)), strict=True)]
     sizes = _size_slopes(others if among is None else among)
     for x, y in zip(*map(_moving_parts, (states, others)), strict=True):
+        p, q = np.asarray(x.covariance), np.asarray(y.covariance)
         if isinstance(y, Gaussian):
-            deviation, outer = _deviations(y)
+            deviation, outer = _deviations(q)
             ratio = np.abs(y.mean) / np.where(deviation > 0, deviation, np.inf)
             # Largest mean in its deviations.
             far = np.max(ratio, axis=-1, keepdims=True, initial=0.0)
         size = 1.0 if isinstance(y, Gaussian) else next(sizes)
-        p, q = np.asarray(x.covariance), np.asarray(y.covariance)
         pairs += [(x.mean, y.mean, size * (tolerance + ROUNDING * far) * deviation), (p, q, size * tolerance * outer)]
     near = [_are_near(*pair).reshape(len(pair[0]), -1).all(axis=1) for pair in pairs]
     result: np.ndarray = np.all(near, axis=0)
     return result
 
 
-def _deviations(gaussian: Gaussian) -> tuple[np.ndarray, np.ndarray]:
-    """Return the deviations of Gaussians (n, k), and the products of each two of them (n, k, k)."""
-    deviation = np.sqrt(np.diagonal(np.asarray(gaussian.covariance), axis1=-2, axis2=-1))
+def _deviations(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the deviations (n, k) of covariances (n, k, k), and the products of each two of them (n, k, k)."""
+    deviation = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
     return deviation, deviation[..., :, None] * deviation[..., None, :]
 
 
@@ -63,8 +63,9 @@ def _size_slopes(states: PyTree) -> Iterator[float]:
     """Return of the derivatives in each number the largest among states (n, ...), in deviations of their Gaussian."""
     for part in _moving_parts(states):
         if isinstance(part, Gaussian):
-            units = _deviations(part)
+            gaussian = part
             continue
+        units = _deviations(np.asarray(gaussian.covariance))
         with np.errstate(invalid="ignore", divide="ignore"):
             shares = [np.where(unit > 0, np.abs(slope) / unit, 0.0) for slope, unit in zip(part, units, strict=True)]
         yield max(float(np.max(share, initial=0.0, where=np.isfinite(share))) for share in shares)

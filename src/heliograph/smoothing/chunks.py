@@ -14,20 +14,12 @@ import numpy as np
 
 from heliograph.engine.choice import choose_code
 from heliograph.factors.gaussian import Gaussian
-from heliograph.filters.chunks import (
-    Begun,
-    Which,
-    begin_chunks,
-    mend_chunks,
-    replace_chunk,
-    scan_chunks,
-    take,
-    take_windows,
-)
+from heliograph.filters.chunks import Begun, begin_chunks, mend_chunks, replace_chunk, scan_chunks
 from heliograph.filters.recursion import linear_start, scan_chunk
 from heliograph.filters.settled import Settled
 from heliograph.filters.smoother_step import SmootherStep, gaussian_of
 from heliograph.filters.states import agree, select_state
+from heliograph.filters.windows import Which, take, take_windows
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.types import Array, Float, PyTree
 from heliograph.smoothing.fixed_interval_lag_point import sum_blocks

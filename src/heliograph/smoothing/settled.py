@@ -14,11 +14,12 @@ import numpy as np
 
 from heliograph.engine.choice import choose_code
 from heliograph.factors.gaussian import Gaussian
-from heliograph.filters.chunks import Begun, take
+from heliograph.filters.chunks import Begun
 from heliograph.filters.recursion import Recursion
 from heliograph.filters.settled import Settled, find_settled, scan_settled, step_settled
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, gaussian_of, make_smoother_step
 from heliograph.filters.states import means_of, with_means
+from heliograph.filters.windows import take
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.types import Array, PyTree
 

@@ -1,7 +1,7 @@
 """Arrays of equal rows in the memory of a few of them, which the system shows again and again until they are written.
 
 A filter's covariances stand still over most rows of a long recording: a million matrices of four states are 128 MB,
-which take 25 ms to write and 1.3 to map. The array is NumPy's as any other: contiguous, to be read and written; the
+which take 25 ms to write and 0.8 to map. The array is NumPy's as any other: contiguous, to be read and written; the
 system copies a page of it, for it alone, when it is first written to, and what is written is seen nowhere else.
 """
 
