@@ -1,5 +1,6 @@
 """`heliograph check`: the diagram, the doubts, and an exit status for scripts."""
 
+import numpy as np
 import pytest
 
 import heliograph as hg
@@ -52,6 +53,8 @@ import heliograph as h
 plant = h.LinearPlant([[1.0, 0.5], [0.0, 0.9]], np.diag([0.01, 0.05]), [0, 0], 1.0, states=["way", "speed"])
 sensors = {"gnss": h.LinearSensor([[1.0, 0.0]], 4.0), "wheel": h.LinearSensor([[0.0, 1.0]], 0.1)}
 network = h.Network(plant, {name: h.Node(sensor, h.perfect(1), {}) for name, sensor in sensors.items()})
+mast = h.Node(h.LinearSensor([[1.0, 0.0]], 2.0), h.perfect(1), {})
+places = {f"mast {noise}": h.Node(h.LinearSensor([[1.0, 0.0]], noise), h.perfect(1), {}) for noise in (0.5, 1.0)}
 """
 
 
@@ -68,9 +71,39 @@ def test_what_sensors_are_worth_is_a_table_of_the_function(folder, capsys):
         assert line.startswith(case.name) and " ".join(line.split()).endswith(" ".join(cells))
 
 
+def test_places_for_one_more_are_compared_and_drawn(folder, capsys):
+    (folder / "pair.py").write_text(PAIR)
+    asked = ["check", "pair.py", "--without", "wheel", "--with", "mast", "--with", "places"]
+    for name in ("worth.svg", "worth.png"):
+        assert cli.main([*asked, "--figure", name]) == 0
+    said = capsys.readouterr().out.splitlines()
+    scope = {}
+    exec(PAIR, scope)
+    nodes = {"mast": scope["mast"], **scope["places"]}
+    found = hg.planning.worth_of_sensors(scope["network"], 200, ["wheel"], additions=nodes)
+    best = found.best_addition
+    assert best.name == "with mast 0.5" and best.mean_increase == pytest.approx(float(np.sqrt(np.prod(best.increase))))
+    times = f"{best.mean_increase:.3g}"
+    assert said[-1] == f"best addition: with mast 0.5, {times} times the error (geometric mean over states)"
+    assert [line.partition("  ")[0] for line in said[-5:-1]] == ["without wheel", *(f"with {name}" for name in nodes)]
+    assert (folder / "worth.svg").read_text().startswith("<?xml") and (folder / "worth.png").stat().st_size > 10_000
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [
+        (
+            ["--with", "masts"],
+            "--with masts: expected a heliograph.Node of the network's file, or a dictionary of nodes, "
+            "got no such name (closest: 'mast')",
+        ),
+        (["--with", "sensors"], "--with sensors: expected a heliograph.Node of the network's file, or a dictionary of"),
+        (["--with", "mast", "--with", "mast"], "--with: expected nodes of different names, got 'mast' twice"),
+        (
+            ["--figure", "a.svg"],
+            "--figure: expected what sensors are worth (--without, --outage or --with), got none of",
+        ),
+        (["--with", "mast", "--figure", "a.pdf"], "a.pdf: expected a name that ends in .svg or .png, got '.pdf'"),
         (["--without", "radar"], "sensor: expected one of the nodes gnss, wheel, got 'radar'"),
         (["--outage", "gnss:300"], "outage of 'gnss': expected at most the 200 steps of the run, got 300"),
         (["--outage", "gnss"], "--outage: expected NODE:STEPS, such as gnss:60, got 'gnss'"),

@@ -38,6 +38,12 @@ class ErrorWithout:
     uncertainty: Float[np.ndarray, " n"]
     increase: Float[np.ndarray, " n"]
 
+    @property
+    def mean_increase(self) -> float:
+        """Return the geometric mean of the increase over states, which has no unit; NaN where one is not known."""
+        with np.errstate(divide="ignore"):
+            return float(np.exp(np.mean(np.log(self.increase))))
+
 
 @readable
 @dataclass(frozen=True)
@@ -49,12 +55,28 @@ class SensorWorth:
         complete: with all nodes of the network.
         cases: each node left out, each outage, each addition, in the order asked for.
         exact: whether errors are covariances of an exact filter, and not squares of errors that were drawn.
+        added: names of the nodes that were tried, whose cases are the last.
     """
 
     states: tuple[str, ...]
     complete: ErrorWithout
     cases: tuple[ErrorWithout, ...]
     exact: bool
+    added: tuple[str, ...] = ()
+
+    @property
+    def best_addition(self) -> ErrorWithout | None:
+        """The case of the addition with the least `mean_increase`; None of fewer than two."""
+        cases = self.cases[len(self.cases) - len(self.added) :]
+        return min(cases, key=lambda case: case.mean_increase) if len(cases) > 1 else None
+
+    def describe_method(self, runs: int) -> str:
+        """Say how errors were found: by the covariance of an exact filter, or as those of so many runs.
+
+        Args:
+            runs: number of runs.
+        """
+        return "by the covariance" if self.exact else f"root mean square of {runs} runs"
 
 
 class _Case(NamedTuple):
@@ -122,7 +144,7 @@ def worth_of_sensors(
         of_all = errors[0].error if errors else error
         increase = np.divide(error, of_all, out=np.full_like(error, np.nan), where=of_all > 0)
         errors.append(ErrorWithout(name=case.name, error=error, uncertainty=uncertainty, increase=increase))
-    return SensorWorth(states=network.states, complete=errors[0], cases=tuple(errors[1:]), exact=exact)
+    return SensorWorth(network.states, complete=errors[0], cases=tuple(errors[1:]), exact=exact, added=tuple(added))
 
 
 def _plain_nodes(network: Network) -> dict[str, Node]:

@@ -1,0 +1,68 @@
+"""Figure of what sensors are worth: how many times the error is, of each state, in each case."""
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from heliograph.disk.quoting import label_with_unit, quote_for_figure
+from heliograph.numerics.types import units_in
+from heliograph.planning.sensors import SensorWorth
+from heliograph.report.figures import BLUE, GREEN, INK, STYLE, VERMILION, stacked_panels
+
+BAR = 0.6  # height of a bar
+SPARE, ROOM = 0.05, 0.2  # share of the axis left free before all bars, and behind them for numbers
+
+
+@matplotlib.rc_context(STYLE)
+def draw_worth(worth: SensorWorth, title: str) -> Figure:
+    """Draw a panel for each state with a bar for each case: its error over that of all nodes, on a logarithmic axis.
+
+    A bar to the right of 1 is of a larger error, as without a node; one to the left of a smaller one, as with one more.
+
+    Args:
+        worth: errors with all nodes and in each case, at least one.
+        title: how errors were found, in words.
+    """
+    rows = len(worth.cases)
+    figure, panels = stacked_panels(len(worth.states), 0.55 + 0.26 * rows, 0.5)
+    figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    units, limits = units_in(worth.states), _find_limits(worth)
+    for panel, i in zip(panels, range(len(worth.states)), strict=True):
+        _draw_state(panel, worth, i, limits)
+        state = label_with_unit(str(worth.states[i]), units)
+        panel.set_title(f"{state}: with all nodes {worth.complete.error[i]:.3g}")
+    panels[-1].set_xlabel("times the error with all nodes")
+    return figure
+
+
+def _draw_state(axes: Axes, worth: SensorWorth, i: int, limits: tuple[float, float]) -> None:
+    """Draw the bars of one state, the first case above, each with its number and, of runs, its standard error."""
+    increase = np.array([case.increase[i] for case in worth.cases])
+    known = np.where(np.isfinite(increase) & (increase > 0), increase, 1.0)
+    places = np.arange(len(known))
+    axes.barh(places, known - 1.0, left=1.0, height=BAR, color=[VERMILION if x > 1 else GREEN for x in known])
+    if not worth.exact:
+        errors = np.array([case.uncertainty[i] for case in worth.cases]) / worth.complete.error[i]
+        axes.errorbar(known, places, xerr=errors, fmt="none", ecolor=INK, elinewidth=1.0)
+    for place, times in enumerate(increase):  # a column of numbers at the end of the rows
+        words = f"{times:.3g}" if np.isfinite(times) else "not known"
+        axes.text(limits[1], place, words, va="center", ha="right", fontsize=9, color=INK)
+    axes.axvline(1.0, color=BLUE, linewidth=1.0)
+    axes.set_yticks(places, [quote_for_figure(case.name) for case in worth.cases])
+    axes.set_ylim(len(known) - 0.5, -0.5)
+    axes.grid(visible=False, axis="y")
+    axes.set_xscale("log")
+    axes.set_xlim(*limits)
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda times, _: f"{times:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+
+
+def _find_limits(worth: SensorWorth) -> tuple[float, float]:
+    """Return the ends of the axis of all panels: a little beyond all bars, with room for their numbers."""
+    increase = np.array([case.increase for case in worth.cases])
+    known = np.append(increase[np.isfinite(increase) & (increase > 0)], 1.0)
+    span = max(float(np.log(known.max() / known.min())), np.log(2.0))
+    return float(known.min() * np.exp(-SPARE * span)), float(known.max() * np.exp(ROOM * span))
