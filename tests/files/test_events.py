@@ -1,6 +1,7 @@
 """Files of events: whatever their order, dates or format, the estimates are those of the events in order."""
 
 import csv
+import re
 
 import numpy as np
 import pyarrow as pa
@@ -203,3 +204,15 @@ def test_an_arrival_of_steps_may_be_no_step_whatever_the_file_is_called(tmp_path
         path = written(tmp_path / name, ["node", "sequence", "time", "arrival", "y"], rows)
         events = hg.files.read_messages(path, hg.Network(plant, {"a": node}), strict=True)
         assert [event.arrival for event in events.sort_events()] == [0.5, 1.25]
+
+
+@pytest.mark.parametrize(("first", "said"), [(1_700_000_000_000_000_003, "counted from 17"), (0, "from 17.* rounded")])
+def test_whole_numbers_beyond_doubles_are_counted_from_the_first_or_said_to_be_rounded(tmp_path, network, first, said):
+    """Of 2^60 doubles are 256 apart; counted from a large first time the times keep every digit."""
+    times = [first, 1_700_000_000_000_000_005, 1_700_000_000_000_000_009]
+    rows = [("cart", k, time, time, "1.0", "", "") for k, time in enumerate(times)]
+    events = hg.files.read_messages(written(tmp_path / "late.csv", HEADER, rows), network)
+    (note,) = [note for note in events.notes if "times" in note]
+    assert re.search(said, note)
+    found = [event.time for event in events.sort_events()]
+    assert (found == [0.0, 2.0, 6.0]) is bool(first)

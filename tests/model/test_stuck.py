@@ -5,17 +5,10 @@ import pytest
 from scipy.stats import norm
 
 import heliograph as hg
+from tests.laws import LAWS
 
 PLANT = hg.LinearPlant([[1.0]], 0.01, [0.0], 1.0)
 SENSOR = hg.LinearSensor([[1.0]], 0.25, outputs=["v"], resolution=0.1)
-LAWS = {
-    "Gaussian": (hg.Gaussian([[1.0]]), lambda rng, n: rng.standard_normal(n)),
-    "Student": (hg.StudentT(1.0, 3.0), lambda rng, n: rng.standard_t(3, n)),
-    "contaminated": (
-        hg.Contaminated(1.0, 0.05, 100.0),
-        lambda rng, n: np.where(rng.random(n) < 0.05, 10.0, 1.0) * rng.standard_normal(n),
-    ),
-}
 
 
 def limits_of(sensor, stuck, link=None):

@@ -16,7 +16,7 @@ from heliograph.model.over_time import at, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.angle import wrap_angles
-from heliograph.numerics.check import check_count, check_seed, fail
+from heliograph.numerics.check import check_count, check_seed, fail, scalar
 from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.manifold import Manifold
 from heliograph.numerics.module import readable
@@ -45,6 +45,27 @@ class Paths(NamedTuple):
     outputs: tuple[str, ...]
     x: np.ndarray
     y: np.ndarray
+
+    def is_beyond(self, name: str, level: float, above: bool = True) -> Bool[np.ndarray, "draws times"]:
+        """Return whether a state or an output is beyond a level, at each time of each path (draws, times).
+
+        Args:
+            name: of the state or output.
+            level: the level.
+            above: whether beyond is above the level (default) or below it.
+
+        Raises:
+            ValueError: no such state or output, a level that is no number.
+        """
+        limit = float(scalar("level", level))
+        if name in self.states:
+            values = self.x[:, :, self.states.index(name)]
+        elif name in self.outputs:
+            values = self.y[:, :, self.outputs.index(name)]
+        else:
+            known = dict.fromkeys(self.states + self.outputs)
+            raise fail("threshold", f"a state or output: {', '.join(known)}", repr(name))
+        return np.asarray(values > limit if above else values < limit)
 
 
 def draw_paths(

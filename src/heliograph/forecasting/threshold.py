@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from heliograph.forecasting.horizons import Horizons, Inputs
-from heliograph.forecasting.paths import DRAWS, Paths, draw_paths
+from heliograph.forecasting.paths import DRAWS, draw_paths
 from heliograph.model.origin import HasOrigin
-from heliograph.numerics.check import fail, scalar
+from heliograph.numerics.check import scalar
 from heliograph.numerics.module import readable
 
 
@@ -98,17 +98,7 @@ def crossing(
     """
     limit = float(scalar("level", level))
     paths = draw_paths(source, horizons, inputs, draws, seed, node, filter)
-    values = _select_number(paths, name)
-    beyond = values > limit if above else values < limit
+    beyond = paths.is_beyond(name, limit, above)
     shares = beyond.mean(axis=0), np.logical_or.accumulate(beyond, axis=1).mean(axis=0)
     (now, now_error), (ever, ever_error) = ((p, np.sqrt(p * (1 - p) / draws)) for p in shares)
     return Crossing(name, limit, above, paths.steps, paths.time, now, now_error, ever, ever_error, draws)
-
-
-def _select_number(paths: Paths, name: str) -> np.ndarray:
-    """Return the values of a state or an output along all paths (draws, times)."""
-    if name in paths.states:
-        return paths.x[:, :, paths.states.index(name)]
-    if name in paths.outputs:
-        return paths.y[:, :, paths.outputs.index(name)]
-    raise fail("threshold", f"a state or output: {', '.join(dict.fromkeys(paths.states + paths.outputs))}", repr(name))

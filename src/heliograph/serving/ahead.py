@@ -142,11 +142,8 @@ class ForecastPublisher:
         """Return {threshold: probabilities that it is crossed, by horizon}, for the states and outputs of a filter."""
         outputs = () if forecast.outputs is None else forecast.outputs.names
         known = () if forecast.states.claim == "none" else (*forecast.states.names, *outputs)
-        return {
-            str(threshold): find_crossings(start, place, threshold, self.horizons, not self._continuous)
-            for threshold in self._thresholds
-            if threshold.name in known
-        }
+        passed = tuple(threshold for threshold in self._thresholds if threshold.name in known)
+        return find_crossings(start, place, passed, self.horizons, not self._continuous) if passed else {}
 
 
 def _write_forecasts(forecast: "heliograph.forecasting.Forecast") -> Bodies:

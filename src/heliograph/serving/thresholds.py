@@ -3,6 +3,7 @@
 import re
 from typing import NamedTuple
 
+import numpy as np
 from typing_extensions import TypeAliasType
 
 import heliograph
@@ -71,22 +72,28 @@ def check_names(network: Network, thresholds: Thresholds) -> None:
 
 
 def find_crossings(
-    source: HasOrigin, place: tuple[str, str], threshold: Threshold, horizons: list[float], whole: bool
-) -> list[dict[str, float]]:
-    """Return for each horizon the probabilities that a threshold is crossed then, and by then, as they are published.
+    source: HasOrigin, place: tuple[str, str], thresholds: Thresholds, horizons: list[float], whole: bool
+) -> dict[str, list[dict[str, float]]]:
+    """Return by threshold the probabilities that it is crossed at each horizon, and by then, as they are published.
+
+    All are of the same paths.
 
     Args:
         source: where the forecast starts.
         place: node and filter.
-        threshold: the level.
+        thresholds: the levels, at least one.
         horizons: how far ahead, in steps or in the unit of dt.
         whole: whether horizons are steps; every step up to the last is then looked at, else the horizons alone.
     """
     ahead = int(horizons[-1]) if whole else horizons
-    found = heliograph.forecasting.crossing(
-        source, *threshold[:2], ahead, threshold.above, "held", DRAWS, node=place[0], filter=place[1]
-    )
+    paths = heliograph.forecasting.draw_paths(source, ahead, "held", DRAWS, node=place[0], filter=place[1])
     rows = [int(horizon) - 1 for horizon in horizons] if whole else range(len(horizons))
-    return [
-        {"then": float(found.beyond[i]), "by": float(found.by[i]), "by_error": float(found.by_error[i])} for i in rows
-    ]
+    found = dict[str, list[dict[str, float]]]()
+    for threshold in thresholds:
+        beyond = paths.is_beyond(*threshold)
+        then, by = beyond.mean(axis=0), np.logical_or.accumulate(beyond, axis=1).mean(axis=0)
+        error = np.sqrt(by * (1 - by) / DRAWS)
+        found[str(threshold)] = [
+            {"then": float(then[i]), "by": float(by[i]), "by_error": float(error[i])} for i in rows
+        ]
+    return found

@@ -159,3 +159,20 @@ def test_a_real_server_gives_back_what_it_was_given():
         np.testing.assert_array_equal(written[state], expected.mean[:, 0])
         np.testing.assert_array_equal(written[f"{state}.sd"], np.sqrt(expected.covariance[:, 0, 0]))
         np.testing.assert_array_equal(written["valid"], [1, 1, 1])
+
+
+@pytest.mark.parametrize(("value", "refused"), [("a", False), ("b", True)])
+def test_a_tag_of_a_columns_name_is_no_column(value, refused):
+    """One of the two would be lost; where both say the same nothing is."""
+    parts = [
+        {"name": "t", "tags": {"gate": "a"}, "columns": ["time", "gate", "level"], "values": [[10**9, value, 1.0]]}
+    ]
+    network = hg.Network(SCALAR[0], {"tank": hg.Node(SCALAR[1], hg.perfect(), {})})
+    sources = {"t": hg.files.json_field("level", node="tank", time="time", step=1)}
+    with Answering(parts) as server:
+        address = f"{server.url}?table=t"
+        if refused:
+            with pytest.raises(ValueError, match=r"tags and columns of different names .*, got 'gate' for both"):
+                hg.files.read_messages(address, network, sources)
+        else:
+            assert len(hg.files.read_messages(address, network, sources)) == 1

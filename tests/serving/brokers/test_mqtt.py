@@ -1,12 +1,18 @@
 """Publishing to an MQTT server that acknowledges when it is asked to, and not before."""
 
 import asyncio
+import contextlib
+import socket
+import subprocess
+import time
 from collections.abc import Callable, Coroutine
+from shutil import which
 
 import pytest
 
 pytest.importorskip("paho")
 
+from heliograph import cli
 from heliograph.serving import Output, Transport, make_transport, parse_address
 
 CONNECT, PUBLISH, DISCONNECT = 1, 3, 14  # kinds of packets of MQTT 3.1.1
@@ -98,3 +104,24 @@ def test_what_was_not_acknowledged_is_published_again_after_the_connection_ended
         assert [body for body in broker.bodies if body != b"now"] == [b"0", b"1", b"2", b"1", b"2"]
 
     serve(work)
+
+
+@pytest.mark.skipif(which("mosquitto") is None, reason="no mosquitto here")
+def test_a_refused_login_is_told_as_one(tmp_path, capsys):
+    """A broker that takes no anonymous client, and knows nobody."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    settings = tmp_path / "mosquitto.conf"
+    settings.write_text(f"listener {port} 127.0.0.1\nallow_anonymous false\n")
+    broker = subprocess.Popen(["mosquitto", "-c", str(settings)], stdout=-3, stderr=-3)
+    try:
+        for _ in range(100):
+            with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), 1):
+                break
+            time.sleep(0.05)
+        assert cli.main(["inspect", f"mqtt://127.0.0.1:{port}", "--seconds", "0.1"]) == 2
+        assert "expected a connection, got a refusal: Not authori" in capsys.readouterr().err
+    finally:
+        broker.terminate()
+        broker.wait()

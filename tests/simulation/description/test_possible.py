@@ -46,10 +46,16 @@ def test_one_that_sensors_show_is_not():
         filtered(battery({"soc": (0, 1)}), voltages(0.95))
 
 
-def test_a_filter_that_averages_over_points_is_not_judged_at_its_mean():
+@pytest.mark.parametrize("make", [hg.cubature_filter, hg.unscented_filter])
+def test_a_filter_that_averages_over_points_is_judged_by_these(make):
+    """At .05 both jump below -.2, where all their points are beyond the end; at .6 they come near."""
+    with pytest.warns(UserWarning, match="m/f: 'soc' ends at -.*, where no sensor shows it"):
+        _, record = filtered(battery(), voltages(0.05), make)
+    assert record.estimates["m"]["f"].mean[-1, 0] < -0.2
     with warnings.catch_warnings():
-        warnings.filterwarnings("error", message=".*no sensor shows it")
-        filtered(battery(), voltages(0.95), hg.cubature_filter)
+        warnings.simplefilter("error")
+        filtered(battery(), voltages(0.6), make)
+        filtered(battery({"soc": (0, 1)}), voltages(0.05), make)
 
 
 def test_an_estimate_held_at_its_limit_is_noted():

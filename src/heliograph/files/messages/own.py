@@ -91,6 +91,9 @@ class OwnMessages:
             raise InputError(self.reasons[0]) if self.reasons else fail(str(self.source), "at least one row", "none")
         if self._reader.zero:
             self._table.notes.append(f"{self.source}: times are counted from {self._reader.zero}")
+        if self._reader.rounded is not None:
+            digits = f"from {self._reader.rounded} on times are rounded to the nearest double"
+            self._table.notes.append(f"{self.source}: {digits}, as the first, counted from, is far from them")
         self._table.refused, self._table.reasons, self._table.broken = self.refused, self.reasons, self.broken
         return self._table
 
@@ -123,6 +126,7 @@ class OwnReader:
     Attributes:
         numbers: whether times are numbers, and not dates; None before the first.
         zero: what whole numbers are counted from that doubles could not tell apart; 0 or None for others.
+        rounded: the first whole number that doubles do not hold, where the first of all was small; None of none.
     """
 
     def __init__(self, network: Network, source: str, ignore_unknown: bool, table: bool):
@@ -133,6 +137,7 @@ class OwnReader:
         self._numbered = [name for name in network.names if counts_losses(network, name)]
         self.numbers: bool | None = None
         self.zero: int | None = None
+        self.rounded: int | None = None
         self._zoned: bool | None = None
         self._columns: Set[str] = frozenset()
 
@@ -210,6 +215,8 @@ class OwnReader:
             if self.zero is None:
                 self.zero = cell if abs(cell) >= EXACT else 0
             number = float(cell - self.zero)
+            if self.rounded is None and int(number) != cell - self.zero:
+                self.rounded = cell
         if is_step and not (number >= 0 and number.is_integer()):
             raise fail(name, "a step, a whole number from 0", f"{cell} ({OF_STEPS})")
         return number

@@ -32,7 +32,7 @@ def read_influxql(address: StoreAddress, answer: bytes) -> Answer:
     if any(part.get("partial") for part in (*results, *series)):
         raise fail(str(address), "all rows of the query", "a part of them, as the server limits their number")
     rows = [
-        {**part.get("tags", {}), **dict(zip(part["columns"], values, strict=True))}
+        _join_tags(address, part.get("tags", {}), dict(zip(part["columns"], values, strict=True)))
         for part in series
         for values in part["values"]
     ]
@@ -84,7 +84,8 @@ def read_flux(address: StoreAddress, answer: bytes) -> Answer:
                 continue
             name, value = str(row.pop("_field")), row.pop("_value")
             # What is left are the time and the tags, which all fields of one row share.
-            joined.setdefault((measurement_of_row, *sorted(row.items())), row.copy())[name] = value
+            fields = joined.setdefault((measurement_of_row, *sorted(row.items())), row.copy())
+            fields |= _join_tags(address, row, {name: value})
     except InputError:
         raise
     except (ValueError, KeyError, csv.Error):
@@ -92,6 +93,21 @@ def read_flux(address: StoreAddress, answer: bytes) -> Answer:
     rows = list(joined.values())
     names = [name for row in rows for name in row]
     return measurement or address.database, _make_columns(address, names, rows, _read_moment, True)
+
+
+def _join_tags(address: StoreAddress, tags: Row, columns: Row) -> dict[str, Any]:
+    """Return the columns of a row with its tags.
+
+    Raises:
+        ValueError: a tag of a column's name, with another value: one of the two would be lost.
+    """
+    both = [name for name in tags if name in columns and tags[name] != columns[name]]
+    if both:
+        remedy = (
+            f"tags and columns of different names (AS in the query, or rename() of Flux, gives {both[0]!r} another)"
+        )
+        raise fail(str(address), remedy, f"{both[0]!r} for both")
+    return {**tags, **columns}
 
 
 def _yield_flux_rows(text: str) -> Iterable[dict[str, Any]]:

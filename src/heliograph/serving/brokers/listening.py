@@ -43,13 +43,15 @@ def _listen_mqtt(address: Address, seconds: float, topics: dict[str, Topic]) -> 
     from paho.mqtt.properties import Properties
     from paho.mqtt.reasoncodes import ReasonCode
 
-    ready = threading.Event()
+    ready, refused = threading.Event(), list[str]()
 
     def subscribe(client: Client, data: object, flags: ConnectFlags, code: ReasonCode, more: Properties | None) -> None:
-        """Ask for all topics once connected, and say that it is ready; a refused connection says so by its silence."""
-        if not code.is_failure:
+        """Ask for all topics once connected, or note why the broker refuses; say that it has answered."""
+        if code.is_failure:
+            refused.append(str(code))
+        else:
             client.subscribe("#", 0)
-            ready.set()
+        ready.set()
 
     def note_message(client: Client, data: object, message: MQTTMessage) -> None:
         """Note a message under its topic, with the time of its arrival."""
@@ -68,6 +70,8 @@ def _listen_mqtt(address: Address, seconds: float, topics: dict[str, Topic]) -> 
     try:
         if not ready.wait(WAIT):
             raise fail(f"broker {address}", "a connection", f"none within {WAIT:g} s")
+        if refused:
+            raise fail(f"broker {address}", "a connection", f"a refusal: {refused[0]}")
         time.sleep(seconds)
     finally:
         client.disconnect()

@@ -26,15 +26,22 @@ def make_observability_matrix(
     plant: AbstractPlant, sensors: Sequence[AbstractSensor], state: Float[np.ndarray, " n"], steps: int
 ) -> Float[np.ndarray, "rows n"]:
     """Return d(y_1, ..., y_steps)/dx_0 at a state, all sensors stacked, with inputs of 1."""
-    u = jnp.ones(len(plant.inputs))
-
-    def compute_outputs(x: jax.Array) -> jax.Array:
-        """Return y_1, ..., y_steps of all sensors from x_0, without noise."""
-        results = []
-        for _ in range(steps):
-            x = plant.transition(x, u)
-            results += [sensor.under(plant.inputs, u).measure(x) for sensor in sensors]
-        return jnp.concatenate(results)
-
     with jax.enable_x64(True):
-        return np.asarray(jax.jacfwd(compute_outputs)(jnp.asarray(state)))
+        return np.asarray(jax.jacfwd(lambda x: _measure_steps(plant, sensors, x, steps))(jnp.asarray(state)))
+
+
+def measure_from(
+    plant: AbstractPlant, sensors: Sequence[AbstractSensor], states: Float[np.ndarray, "states n"], steps: int
+) -> Float[np.ndarray, "states rows"]:
+    """Return y_1, ..., y_steps of all sensors from each of some states, without noise, with inputs of 1."""
+    with jax.enable_x64(True):
+        return np.asarray(jax.vmap(lambda x: _measure_steps(plant, sensors, x, steps))(jnp.asarray(states)))
+
+
+def _measure_steps(plant: AbstractPlant, sensors: Sequence[AbstractSensor], x: jax.Array, steps: int) -> jax.Array:
+    """Return y_1, ..., y_steps of all sensors from the state x, stacked."""
+    u, results = jnp.ones(len(plant.inputs)), list[jax.Array]()
+    for _ in range(steps):
+        x = plant.transition(x, u)
+        results += [sensor.under(plant.inputs, u).measure(x) for sensor in sensors]
+    return jnp.concatenate(results)

@@ -1,18 +1,19 @@
 """Doubts about estimates at the edge of what is possible: where no sensor shows a state any more, or at its limit."""
 
 from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.gaussian.transform import Linearization
+from heliograph.filters.gaussian.transform import AbstractTransform, Linearization
 from heliograph.filters.wrappers.limited import LimitedFilter
 from heliograph.model.over_time import first
 from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor, is_linear
 from heliograph.numerics.check import instance
-from heliograph.numerics.types import Float
-from heliograph.simulation.description.observability import list_sensors, make_observability_matrix
+from heliograph.numerics.types import Bool, Float
+from heliograph.simulation.description.observability import list_sensors, make_observability_matrix, measure_from
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.results.record import Record
@@ -40,37 +41,41 @@ def doubt_estimates(network: Network, record: Record) -> tuple[str, ...]:
 
 
 def _warn_unseen_at_end(network: Network, record: Record) -> Iterator[str]:
-    """Yield a line for each extended filter that ends where no sensor shows a state that one showed at the start.
+    """Yield a line for each filter that ends where no sensor shows a state that one showed at the start.
 
-    A state is shown where an output within n steps depends on it: its column of the observability matrix is not zero.
-    Where it is exactly zero, as beyond the end of a table, the gain of the state is by its correlations alone: what
-    arrives says nothing of where it is. Not judged: states with limits, which bring an estimate back; filters that
-    average over points; models that vary over time; estimates that are no numbers.
+    A state is shown where an output within n steps depends on it, as far as the filter looks (`_Look`). Where none
+    does, as beyond the end of a table, the gain of the state is by its correlations alone: what arrives says nothing of
+    where it is. Not judged: states with limits, which bring an estimate back; particles and mixtures; models that vary
+    over time; estimates that are no numbers.
     """
     plant = network.plant
     if not isinstance(plant, AbstractPlant):
         return
     limited = {name for name, _ in plant.limits}
     for node, label, filter, sensors in _find_filters(network):
-        if not isinstance(getattr(filter, "transform", None), Linearization):
+        transform = getattr(filter, "transform", None)
+        if not isinstance(transform, AbstractTransform):
             continue
         varies = any(first(sensor) is not sensor for sensor in sensors)
         if varies or all(is_linear(plant, sensor) for sensor in sensors):
             continue
-        means = np.asarray(record.estimates[node][label].mean)
+        estimate = record.estimates[node][label]
+        means, covariances = (np.asarray(part) for part in (estimate.mean, estimate.covariance))
         if len(means) <= LAST or not np.all(np.isfinite(means[[-1 - LAST, -1]])):
             continue
+        looks = _Look(plant, [first(sensor) for sensor in sensors], isinstance(transform, Linearization))
+        start = np.asarray(plant.initial_mean), np.asarray(plant.initial_covariance)
+        end, before = (means[-1], covariances[-1]), (means[-1 - LAST], covariances[-1 - LAST])
         # Over one step first, which is cheap: hardly any recording ends so.
-        constant, start, end = [first(sensor) for sensor in sensors], np.asarray(plant.initial_mean), means[-1]
-        if not np.any(_find_shown(plant, constant, start, 1) & ~_find_shown(plant, constant, end, 1)):
+        if not np.any(looks.find_shown(*start, 1) & ~looks.find_shown(*end, 1)):
             continue
-        unseen = _find_shown(plant, constant, start) & ~_find_shown(plant, constant, end)
-        unseen &= ~_find_shown(plant, constant, means[-1 - LAST])
+        steps = len(plant.states)
+        unseen = looks.find_shown(*start, steps) & ~looks.find_shown(*end, steps) & ~looks.find_shown(*before, steps)
         for i in np.flatnonzero(unseen):
             name = network.states[i]
             if name not in limited:
                 yield (
-                    f"{node}/{label}: {name!r} ends at {means[-1, i]:.4g}, where no sensor shows it, as beyond the end "
+                    f"{node}/{label}: {name!r} ends at {end[0][i]:.4g}, where no sensor shows it, as beyond the end "
                     "of a table: what arrives does not move it. If it cannot be there, limits= of the plant say so"
                 )
 
@@ -111,9 +116,32 @@ def _find_filters(network: Network) -> Iterator[tuple[str, str, AbstractFilter, 
             yield FUSED, label, fusion, every
 
 
-def _find_shown(
-    plant: AbstractPlant, sensors: Sequence[AbstractSensor], state: Float[np.ndarray, " n"], steps: int | None = None
-) -> np.ndarray:
-    """Return which states (n,) change an output within some steps, n by default."""
-    matrix = make_observability_matrix(plant, sensors, state, steps or len(plant.states))
-    return np.asarray(np.any(matrix != 0, axis=0))
+class _Look(NamedTuple):
+    """How far a filter looks for a state: at the tangent of the sensors, or at their outputs beside its mean.
+
+    Args:
+        plant: the plant.
+        sensors: the sensors that the filter hears, which do not vary.
+        tangent: whether it takes the tangent at its mean.
+    """
+
+    plant: AbstractPlant
+    sensors: Sequence[AbstractSensor]
+    tangent: bool
+
+    def find_shown(
+        self, mean: Float[np.ndarray, " n"], covariance: Float[np.ndarray, "n n"], steps: int
+    ) -> Bool[np.ndarray, " n"]:
+        """Return which states change an output within some steps.
+
+        Of a tangent those whose column of the observability matrix is not zero. Of points also those for which outputs
+        differ at mean +- sqrt(n) deviations, where `Cubature` has its points if states are not correlated.
+        """
+        by_tangent = np.any(make_observability_matrix(self.plant, self.sensors, mean, steps) != 0, axis=0)
+        if self.tangent or np.all(by_tangent):
+            return np.asarray(by_tangent)
+        spread = np.sqrt(len(mean) * np.maximum(np.diagonal(covariance), 0.0))
+        ahead, behind = (
+            measure_from(self.plant, self.sensors, mean + sign * np.diag(spread), steps) for sign in (1.0, -1.0)
+        )
+        return np.asarray(by_tangent | np.any(ahead != behind, axis=1))

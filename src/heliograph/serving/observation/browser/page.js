@@ -227,9 +227,11 @@ const two = (value) => value !== 0 && (Math.abs(value) < 0.1 || Math.abs(value) 
 
 function status_of(sender) {
   if (!sender) return made("td", "");
-  if (sender.dead) return made("td", "dead: " + (sender.missed ? sender.missed + " heartbeats missed" : "silent for " + short(sender.silent + sender.provisional)), "doubt");
+  const unit = (value) => (sender.unit === "steps" && value === 1 ? " step" : sender.unit && " " + sender.unit);
+  const quiet = sender.silent + sender.provisional;
+  if (sender.dead) return made("td", "dead: " + (sender.missed ? sender.missed + " heartbeats missed" : "silent for " + short(quiet) + unit(quiet)), "doubt");
   if (sender.last === null) return made("td", "nothing yet");
-  return made("td", sender.silent ? "silent for " + short(sender.silent) + (sender.timeout ? "" : sender.silent === 1 ? " step" : " steps") : "sends", "fine");
+  return made("td", sender.silent ? "silent for " + short(sender.silent) + unit(sender.silent) : "sends", "fine");
 }
 
 // How far ahead, in words: of messages with dates in seconds, else in the unit of their time.
