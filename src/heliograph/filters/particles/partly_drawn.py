@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.engine.choice import compile_on_call
 from heliograph.factors.columns import Columns, columns_of_each, join_columns
 from heliograph.factors.gaussian import (
     Gaussian,
@@ -102,7 +103,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
     order: tuple[int, ...] = eqx.field(static=True)  # places of the states, drawn ones first
     drawn: int = eqx.field(static=True)  # how many are drawn
 
-    @in_float64
+    @compile_on_call
     def init(self) -> PartlyDrawn:
         """Return the law of x_0 in every particle; its drawn states are drawn unless a linear plant moves them."""
         start, n, modes = models_of(at(self.plant, 0))[0], self.particles, len(self.initial)

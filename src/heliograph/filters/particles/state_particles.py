@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.engine.choice import compile_on_call
 from heliograph.factors.columns import Columns, columns_of, join_columns, square_root, triangularise
 from heliograph.filters.base import Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.chunks import Pass
@@ -85,7 +86,7 @@ class StateParticleFilter(AbstractStateParticleFilter):
         """Filter rows with a lane for each particle where these are enough."""
         return filter_particles(self, z, u, state, begin) if self.particles >= ENOUGH else None
 
-    @in_float64
+    @compile_on_call
     def init(self) -> StateParticles:
         """Draw the particles from the law of x_0."""
         key, own = self.start_keys()
