@@ -7,7 +7,7 @@ from importlib import import_module
 from pathlib import Path
 
 import heliograph
-from tests.test_structure import PUBLIC, SOURCE
+from tests.test_structure import PUBLIC, SOURCE, import_graph
 
 ROOT = Path(__file__).parents[1]
 GLOSSARY = ROOT / "docs" / "notation.md"
@@ -76,3 +76,25 @@ def test_the_files_that_a_newcomer_is_led_to_are_there():
         for function in re.findall(r"`(\w+)` (?:of|in) ", row):
             text = (SOURCE / re.findall(r"`([\w/]+\.py)`", row)[0]).read_text()
             assert re.search(rf"^ *(def {function}\(|{function}[:,])|[(,] ?{function}: ", text, re.M), row
+
+
+def test_each_file_of_a_walk_imports_an_earlier_one_or_is_imported_by_it():
+    """Directly or through others: else the walk through the library leads where its calls do not go."""
+    graph = import_graph()
+    walks = re.split(r"\n\d\. ", (SOURCE / "README.md").read_text().split("\nThree walks")[1].split("\n<!--")[0])[1:]
+    assert len(walks) == 3
+    for walk in walks:
+        files = [f"heliograph.{name}".replace("/", ".") for name in re.findall(r"`([\w/]+)\.py`", walk)]
+        reached = {name: reachable(graph, name) for name in files}
+        for i, name in enumerate(files[1:], start=1):
+            assert any(name in reached[other] or other in reached[name] for other in files[:i]), name
+
+
+def reachable(graph: dict[str, set[str]], start: str) -> set[str]:
+    """Return all that `start` leads to, itself too."""
+    found, left = {start}, [start]
+    while left:
+        new = graph[left.pop()] - found
+        found |= new
+        left += new
+    return found
