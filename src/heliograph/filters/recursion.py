@@ -73,6 +73,7 @@ def sum_rows(
     """Step over rows from number `first` on, before row `count`: the last state, and the sums of what steps return."""
 
     def body(now: tuple[PyTree, PyTree], row: tuple[PyTree, Array]) -> tuple[tuple[PyTree, PyTree], None]:
+        """Step over one row and add its output; from row `count` on nothing changes."""
         (state, sums), (data, k) = now, row
         after, output = step(state, data, k)
         return select_state(k < count, (after, jax.tree.map(jnp.add, sums, output)), now), None

@@ -146,6 +146,8 @@ def describe_outlier_noise(
 def _find_noisy_outputs(squares: Array, covariance: Array, plain: SecondOrder) -> np.ndarray:
     """Return the sensor's output whose noise each received component brings, (m,).
 
+    `squares` (m, p): E[G_ia^2] of the gain of output a in component i; `covariance` (p, p): of the sensor's noise.
+
     Raises:
         ValueError: one that brings the noise of several.
     """

@@ -68,6 +68,7 @@ def truncate_to_limits(x: Gaussian, limits: PlacedLimits) -> tuple[jax.Array, Ga
     """
     total = jnp.zeros(len(x.mean))
     for place, low, high in limits:
+        # A limit from above alone is one from below of -x, as `truncate_gaussians` needs it.
         sign = 1.0 if np.isfinite(low) else -1.0
         centre, row = sign * x.mean[:, place], sign * x.root[:, place]
         ends = sorted(sign * end for end in (low, high) if np.isfinite(end))

@@ -12,6 +12,8 @@ import jax
 import numpy as np
 from jax.extend import core
 
+from heliograph.numerics.traced import called_program
+
 Numbers = np.ndarray
 Contraction = tuple[tuple[Sequence[int], Sequence[int]], tuple[Sequence[int], Sequence[int]]]  # contracted, batch
 ULPS = 4  # units in the last place: a library's sine or exponential is off by less than one, the arithmetic by a half
@@ -19,7 +21,6 @@ MOVES = (
     "reshape", "broadcast_in_dim", "transpose", "squeeze", "slice", "concatenate", "rev", "copy", "expand_dims",
     "dynamic_slice", "gather", "pad", "split", "stack", "unstack", "stop_gradient",
 )  # fmt: skip
-CALLS = {"pjit": "jaxpr", "jit": "jaxpr", "closed_call": "call_jaxpr", "custom_jvp_call": "call_jaxpr"}
 
 
 class UnknownError(Exception):
@@ -52,9 +53,8 @@ def evaluate(jaxpr: core.ClosedJaxpr, arguments: Sequence[Interval], continuous:
     for equation in jaxpr.jaxpr.eqns:
         inputs = [read(atom) for atom in equation.invars]
         name = equation.primitive.name
-        if name in CALLS:
-            inner = equation.params[CALLS[name]]
-            results = evaluate(inner, inputs, continuous)
+        if (called := called_program(equation)) is not None:
+            results = evaluate(called, inputs, continuous)
         elif name == "mul" and equation.invars[0] is equation.invars[1]:
             results = [_square(inputs[0])]
         elif name == "stop_gradient" and continuous and not np.array_equal(*inputs[0]):

@@ -147,6 +147,7 @@ from .traced import DOUBLE as DOUBLE
 from .traced import EQUAL as EQUAL
 from .traced import as_real as as_real
 from .traced import block_diagonal as block_diagonal
+from .traced import called_program as called_program
 from .traced import constants as constants
 from .traced import describe_rounded as describe_rounded
 from .traced import equal_to_rounding as equal_to_rounding

@@ -18,12 +18,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var
+from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var
 
-CALLS = frozenset((
-    "jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr",
-    "checkpoint", "remat", "remat2",
-))  # fmt: skip
+from heliograph.numerics.traced import called_program
 
 
 class Compensated(NamedTuple):
@@ -77,11 +74,10 @@ class _Evaluation:
             "reduce_sum": self._sum, "cumsum": self._accumulate, "dot_general": self._contract,
         }  # fmt: skip
 
-    def inline(self, program: ClosedJaxpr | Jaxpr, inputs: Sequence[Compensated]) -> list[Compensated]:
+    def inline(self, program: ClosedJaxpr, inputs: Sequence[Compensated]) -> list[Compensated]:
         """Return the results of a traced program."""
-        jaxpr: Any = program.jaxpr if isinstance(program, ClosedJaxpr) else program
-        consts = program.consts if isinstance(program, ClosedJaxpr) else []
-        values: dict[Var, Compensated] = dict(zip(jaxpr.constvars, map(self._divide_known, consts), strict=True))
+        jaxpr, known = program.jaxpr, map(self._divide_known, program.consts)
+        values: dict[Var, Compensated] = dict(zip(jaxpr.constvars, known, strict=True))
         values |= zip(jaxpr.invars, inputs, strict=True)
 
         def read(v: Any) -> Compensated:
@@ -104,9 +100,8 @@ class _Evaluation:
     def _apply(self, equation: JaxprEqn, inputs: list[Compensated]) -> list[Compensated]:
         """Return the results of one operation."""
         name, params = equation.primitive.name, equation.params
-        if name in CALLS:
-            inner = next(params[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in params)
-            return self.inline(inner, inputs)
+        if (program := called_program(equation)) is not None:
+            return self.inline(program, inputs)
         if name == "cond":
             return self._branch(inputs, params["branches"])
         if name in self.rules and all(jnp.issubdtype(jnp.result_type(x.high), jnp.floating) for x in inputs):

@@ -15,6 +15,7 @@ import jax.scipy.linalg
 import jax.scipy.special
 import numpy as np
 import scipy
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn
 
 
 def is_traced(*values: object) -> bool:
@@ -108,6 +109,24 @@ def library(*values: object) -> Any:
 def scipy_for(*values: object) -> Any:
     """Return scipy, or jax.scipy where a number is traced."""
     return jax.scipy if is_traced(*values) else scipy
+
+
+CALLS = frozenset((
+    "jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr",
+    "checkpoint", "remat", "remat2",
+))  # fmt: skip
+
+
+def called_program(operation: JaxprEqn) -> ClosedJaxpr | None:
+    """Return the program that an operation of a traced function calls on its operands; None if it calls none.
+
+    A jitted function within another is such a call, and one with a derivative of its own.
+    """
+    if operation.primitive.name not in CALLS:
+        return None
+    params = operation.params
+    program = next(params[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in params)
+    return ClosedJaxpr(program, ()) if isinstance(program, Jaxpr) else program
 
 
 def plain(value: Any) -> float | jax.Array:

@@ -15,6 +15,6 @@ from .fields import parse_number as parse_number
 from .fields import parse_start as parse_start
 from .json_field import Source as Source
 from .reading import Reading as Reading
+from .reading import Unread as Unread
 from .sources import SECOND as SECOND
 from .sources import Sources as Sources
-from .reading import Unread as Unread

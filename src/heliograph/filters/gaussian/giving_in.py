@@ -166,6 +166,7 @@ class GivingInFilter(AbstractSizedFilter):
         needs_room = left_out & (e**2 > rule.c * total) & (of_state > 0)
         # delta of each number that is to be used, (n, m); each state by itself.
         change = _most_probable_change(predicted, jnp.where(needs_room, e, 0.0), of_state)
+        # P + n diag(delta^2) / min(c, 1), summed over these numbers.
         n = len(self.states)
         wider = Columns(jnp.eye(n), n / jnp.minimum(rule.c, 1.0) * jnp.sum(change**2, axis=1))
         return from_columns(predicted.prior.mean, join_columns(predicted.prior.columns, wider))

@@ -157,15 +157,16 @@ def expected_squared_residuals(
 def branch_precision(
     before: PredictedMeasurement, e: jax.Array, scale: jax.Array, law: NoiseBranches
 ) -> tuple[jax.Array, jax.Array]:
-    """Return the expected precision sum q_j r / r_j (m,) of each component's noise, in units of r, and its mean.
+    """Return the expected precision sum q_j r / r_j of each component's noise, and the noise's mean by it; (m,) each.
 
-    q_j is the probability of branch j given the component alone.
+    q_j is the probability of branch j given the component alone, r_j its variance (`least`), r the unit (`scale`); the
+    mean is sum q_j m_j / r_j over sum q_j / r_j.
     """
     log_share, mean, variance, least = law
     total = jnp.maximum(before.columns.diagonal[:, None] + variance, least)
     difference = e[:, None] - mean
     logs = log_share - (difference**2 / total + jnp.log(total)) / 2
-    q = jnp.exp(logs - jnp.max(logs, axis=1, keepdims=True))
+    q = jnp.exp(logs - jnp.max(logs, axis=1, keepdims=True))  # relative to the largest
     precision = q * scale[:, None] / least
     sum_of_precisions = jnp.sum(precision, axis=1)
     return sum_of_precisions / jnp.sum(q, axis=1), jnp.sum(precision * mean, axis=1) / sum_of_precisions

@@ -238,7 +238,7 @@ def _second_moments_of_steps(system: LinearSystem) -> tuple[np.ndarray, np.ndarr
     start at zero do not stay there; limited to numbers whose squares are finite.
     """
     s, mean, covariance = system.steps, system.mean, system.covariance
-    largest = float(np.finfo(float).max) ** 0.5
+    largest = float(np.finfo(float).max) ** 0.5  # of a second moment; of a mean its root
     of_states, of_received = [], []
     for k in range(len(s.transition)):
         reach = np.sqrt(mean**2 + np.diagonal(covariance))

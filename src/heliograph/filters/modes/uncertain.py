@@ -175,7 +175,7 @@ def _bound_diagonal(low: jax.Array, high: jax.Array) -> jax.Array:
     """
     modes, (middle, reach) = len(low), _find_middle_law(low, high)
     centred, total = jnp.eye(modes) - 1 / modes, jnp.sum(reach)
-    share = total / modes / 2
+    share = total / modes / 2  # e; d d' <= diag(reach) sum reach / M, by Cauchy and Schwarz
     safe = jnp.where(share > 0, share, 1.0)
     across = centred @ jnp.diag(reach * total) @ centred / (safe * modes)
     within = centred @ jnp.diag(reach) @ centred if modes > 2 else jnp.zeros((modes, modes))

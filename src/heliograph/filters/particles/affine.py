@@ -13,12 +13,12 @@ import numpy as np
 from jax.extend import core
 
 from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.traced import called_program
 
 KNOWN, GIVEN, AFFINE, OTHER = -1, 0, 1, 2  # degrees, in their order
 MOVES = ("reshape", "broadcast_in_dim", "transpose", "squeeze", "slice", "concatenate", "rev", "copy", "expand_dims",
          "split", "stack", "unstack")  # fmt: skip
 LOOKUPS = ("gather", "dynamic_slice")  # the first operand is moved, by indices
-CALLS = {"pjit": "jaxpr", "jit": "jaxpr", "closed_call": "call_jaxpr", "custom_jvp_call": "call_jaxpr"}
 
 
 class _Traced(NamedTuple):
@@ -79,8 +79,8 @@ def _degrees_of_operation(equation: Any, x: list[_Traced]) -> list[_Traced]:
         results = equation.primitive.bind(*(jnp.asarray(array) for array in arrays), **params)
         return list(results) if equation.primitive.multiple_results else [results]
 
-    if name in CALLS:
-        return _trace_degrees(params[CALLS[name]], x)
+    if (called := called_program(equation)) is not None:
+        return _trace_degrees(called, x)
     # Known operands give known results, given ones given results.
     if all(operand.value is not None for operand in x):
         return [_constant(value) for value in compute([operand.value for operand in x])]

@@ -33,7 +33,7 @@ def resample_known(weight: np.ndarray, start: float) -> np.ndarray:
 
 
 def draw_normals(key: jax.Array, numbers: jax.Array | None, size: int, particles: int) -> jax.Array:
-    """Draw standard normal numbers (B, size) for the particles of these numbers (B,), None: for all, of so many.
+    """Draw standard normal numbers (B, size) for the particles that `numbers` (B,) lists; for all `particles` if None.
 
     Word w of a particle is the hash of its place among all words, so that particles draw the same side by side or one
     by one. Of MANY numbers in all on they are of single precision, two from each 64 bits: those have 2^23 values, at

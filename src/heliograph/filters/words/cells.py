@@ -150,7 +150,7 @@ def change_by_cell(index: jax.Array, grid: Grid, prior: Prior, dither: str) -> C
 
 
 def _cut_to_cell(index: jax.Array, grid: Grid, prior: Prior) -> Change:
-    """Return what it does to y to lie in a cell: by its ends, or its centre where their difference would lose digits.
+    """Return what knowing its cell does to y: by the cell's ends, or its centre where their difference loses digits.
 
     The end cells of words of so many `bits` reach to infinity; bits 0: words without end.
     """

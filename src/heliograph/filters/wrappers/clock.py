@@ -154,6 +154,7 @@ class ClockFilter(AbstractWrapper):
         def add_derivative(
             carry: tuple[jax.Array, jax.Array], _: None
         ) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
+            """Move one step on; the output is one step's part of O'O."""
             x, from_present = carry  # the state at a later step, and its derivatives by the present state
             rows = jax.jacfwd(observe)(x) @ from_present
             step = jax.jacfwd(lambda x: plant.transition(x, state.inputs))(x)

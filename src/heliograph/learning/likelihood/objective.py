@@ -165,7 +165,7 @@ def filter_of(network: Network, form: Form) -> AbstractFilter:
 
 
 def find_sole_filter(network: Network) -> AbstractFilter:
-    """Only filter of a network, of all that arrives and of all states.
+    """Return the only filter of a network, which is of all that arrives and of all states.
 
     Raises:
         ValueError: none, several, one of a part of the states, or one that claims no covariance.
