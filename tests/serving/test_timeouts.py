@@ -75,7 +75,7 @@ def test_silence_of_all_is_told_once_by_the_clock_and_commits_nothing(program, c
     for second in range(1, 20):
         clock.seconds = float(second)
         told += service.take([])
-    assert dead(told) == ["nothing came for 6, and its timeout is 5"]
+    assert dead(told) == ["nothing came for 6 s, and its timeout is 5 s"]
     assert json.loads(told[0].body)["time"] == (BEGUN + timedelta(seconds=6)).isoformat()
     assert service.dead_senders() == {"a": 1} and service.dead_by_plant() == {"p": ["a"]}
     # Nothing was committed, and no time has passed: what was measured before is not late.
@@ -88,7 +88,7 @@ def test_silence_of_one_is_told_with_what_the_other_sends(program, clock, tmp_pa
     service = begun(program, tmp_path / "a.db")
     send(service, 0.0, "a", 0)
     assert dead(send(service, 4.0, "b", 0)) == [""]
-    assert dead(send(service, 5.5, "b", 1)) == ["nothing came for 5.5, and its timeout is 5"]
+    assert dead(send(service, 5.5, "b", 1)) == ["nothing came for 5.5 s, and its timeout is 5 s"]
 
 
 def test_a_silent_plant_is_told_while_others_send_unless_messages_wait(program, clock, tmp_path, monkeypatch):
@@ -112,9 +112,9 @@ def test_after_a_restart_it_is_told_again_and_the_page_and_metrics_know(program,
     clock.seconds = 30.0
     assert watched.take([]) == []  # messages that waited come first
     monkeypatch.setattr("heliograph.serving.silence.GRACE", -1.0)
-    assert dead(watched.take([])) == ["nothing came for 30, and its timeout is 5"]
-    assert watch.view("p")["warnings"] == ["a: its sender is dead: nothing came for 30, and its timeout is 5"]
+    assert dead(watched.take([])) == ["nothing came for 30 s, and its timeout is 5 s"]
+    assert watch.view("p")["warnings"] == ["a: its sender is dead: nothing came for 30 s, and its timeout is 5 s"]
     assert [wrong.dead for wrong in watch.worst()] == [("a",)] and watch.dead_senders()["a"] == 1
     send(watched, 40.0, "a", 2)
     assert watch.links()["a"]["timeouts"] == 1
-    assert watch.view("p")["warnings"] == ["a: 1 silences that were longer than its timeout, and ended"]
+    assert watch.view("p")["warnings"] == ["a: 1 times silent for longer than its timeout, and back"]

@@ -68,12 +68,12 @@ def _collect_topics(recording: str, seconds: float, dbc: Path | None) -> "tuple[
         if path.is_file() and kind_of(path) in (*LINES, ".csv", ".parquet"):
             advance(f"reading {recording}")
             return inspect_file(path)
-        if is_folder(path):
-            advance(f"reading {recording}")
-            return inspect_folder(path)
         if is_log(path):
             advance(f"reading {recording}")
             return inspect_log(path, dbc)
+        if is_folder(path):
+            advance(f"reading {recording}")
+            return inspect_folder(path)
         return inspect_bag(path, lambda done, total: advance(f"reading {recording}", done, total))
 
 

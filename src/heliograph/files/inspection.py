@@ -15,7 +15,7 @@ from heliograph.files.bags.bag import OFTEN, Progress, list_fields, open_bag, pa
 from heliograph.files.bags.mcap_chunks import read_messages_in_order as bag_messages
 from heliograph.files.bags.mcap_json import holds_json, read_json_messages
 from heliograph.files.logs.log_sources import LogSources
-from heliograph.files.logs.reading import open_log
+from heliograph.files.logs.reading import open_logs
 from heliograph.files.messages.folder import list_files
 from heliograph.files.messages.in_files import (
     decode_payload,
@@ -281,13 +281,13 @@ def inspect_log(path: Path, dbc: Path | None) -> tuple[dict[str, Topic], str]:
     """Return the messages of a vehicle's log, and the first reason why some cannot be read, "" if all can be.
 
     Args:
-        path: the log.
+        path: the log, or a folder with several.
         dbc: database of its bus; None where it needs none, or for the identifiers alone.
 
     Raises:
         ValueError: no such file, one that cannot be opened, a database that does not fit; one line.
     """
-    log = open_log(path, LogSources({}, dbc=dbc), lambda name: True)
+    log = open_logs(path, LogSources({}, dbc=dbc), lambda name: True)
     topics, broken = dict[str, Topic](), ""
     for message in log.messages:
         if isinstance(message, InputError):

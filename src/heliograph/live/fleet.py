@@ -362,7 +362,8 @@ class Fleet:
         by_steps, watermark = self.program.dt is None, plant.confirmed - self.options.window
         final = ceil(max(watermark, -1.0)) - 1 if by_steps else max(watermark, plant.begun)
         now = floor(min(now, self.end_step)) if by_steps else now
-        statuses = {}
+        statuses, dated = {}, "" if plant.origin is None else "s"  # dates are seconds apart
+        unit = name_unit(self.network.inputs) or dated
         for name, sender in self.watched.items():
             link = plant.links.get(name)
             last = None if link is None or not link.used else link.latest
@@ -370,7 +371,7 @@ class Fleet:
                 last = int(last) if last >= 0 else None
             status = sender.status(last, plant.begun if sender.trigger is None else -1, final, now)
             refused = {} if link is None else link.refused
-            statuses[name] = status._replace(refused=refused, unit=name_unit(self.network.inputs))
+            statuses[name] = status._replace(refused=refused, unit=unit)
         return statuses
 
     def count(self, plant: PlantState, node: str, screened: ScreenedEvent, verdict: Verdict) -> None:

@@ -69,19 +69,20 @@ def find_begin(path):
         return file.start_time.timestamp()
 
 
-def write_mdf(path, invalid=()):
+def write_mdf(path, invalid=(), rows=slice(None)):
     asammdf = pytest.importorskip("asammdf", reason="the extra `mdf`")
     bits = np.isin(np.arange(COUNT), invalid)
     file = asammdf.MDF(version="4.10")
     file.start_time = datetime.datetime.fromtimestamp(START, datetime.UTC)
-    speed = asammdf.Signal(SPEED, TIME, name="FrontLeft", unit="km/h", invalidation_bits=bits if len(invalid) else None)
+    marks = bits[rows] if len(invalid) else None
+    speed = asammdf.Signal(SPEED[rows], TIME[rows], name="FrontLeft", unit="km/h", invalidation_bits=marks)
     file.append([speed], acq_name="WheelSpeeds")
     file.append([asammdf.Signal(np.arange(5.0), np.arange(5) / 2, name="YawRate", unit="deg/s")])
     file.save(path, overwrite=True)
     return path
 
 
-def write_ulog(path, date=True, boot=7_000_000):
+def write_ulog(path, date=True, boot=7_000_000, rows=slice(None)):
     """Write the topics by the description of the format; `boot` is in microseconds since the device began to run."""
     pytest.importorskip("pyulog", reason="the extra `ulog`")
 
@@ -93,7 +94,7 @@ def write_ulog(path, date=True, boot=7_000_000):
     parts.append(record("F", b"vehicle_gps_position:uint64_t timestamp;uint64_t time_utc_usec;"))
     parts.append(record("A", struct.pack("<BH", 0, 0) + b"WheelSpeeds"))
     parts.append(record("A", struct.pack("<BH", 0, 1) + b"vehicle_gps_position"))
-    for k in range(COUNT):
+    for k in range(COUNT)[rows]:
         parts.append(record("D", struct.pack("<HQf", 0, boot + k * 100_000, SPEED[k])))
     if date:
         parts.append(record("D", struct.pack("<HQQ", 1, boot + 500_000, START * 10**6 + 500_000)))

@@ -226,3 +226,30 @@ BO_ 2566834709 Wheel: 8 ECU
     sources = hg.files.LogSources({"Wheel": logs.wheel("Speed")}, dbc=logs.database(tmp_path, text))
     _, _, values = recorded(path, sources)
     assert np.allclose(values[::2], 10.0) and np.isnan(values[1::2]).all()
+
+
+@pytest.mark.parametrize("kind", [".blf", "signals.mf4", ".ulg"])
+def test_several_logs_in_a_folder_are_one_recording(tmp_path, kind, capsys):
+    """The drive in two files gives what one file gives."""
+    dbc, folder = logs.database(tmp_path), tmp_path / "drives"
+    folder.mkdir()
+
+    def write(path, rows):
+        if kind == ".blf":
+            return logs.write_frames(path, [logs.frame(k) for k in range(logs.COUNT)[rows]])
+        return (logs.write_mdf if kind == "signals.mf4" else logs.write_ulog)(path, rows=rows)
+
+    sources = hg.files.LogSources({"WheelSpeeds": logs.wheel()}, dbc=dbc if kind == ".blf" else None)
+    whole, *_ = recorded(write(tmp_path / f"all{kind[-4:]}", slice(None)), sources)
+    for name, rows in (("1", slice(0, 15)), ("2", slice(15, None))):
+        write(folder / f"{name}{kind[-4:]}", rows)
+    (folder / "notes.txt").write_text("rain")
+    events = hg.files.read_messages(folder, logs.car(), sources)
+    ours, theirs = events.recording(), whole.recording()
+    np.testing.assert_array_equal(ours.measurements["wheel"], theirs.measurements["wheel"])
+    np.testing.assert_allclose(ours.inputs, theirs.inputs, rtol=0, atol=2e-6)
+    assert f"{folder}: not read beside logs: notes.txt" in events.notes
+    assert cli.main(["inspect", str(folder), *(["--dbc", str(dbc)] if kind == ".blf" else [])]) == 0
+    assert "WheelSpeeds" in capsys.readouterr().out
+    with pytest.raises(ValueError, match="expected a message 'Yaw' of the sources"):
+        hg.files.read_messages(folder, logs.car(), hg.files.LogSources({"Yaw": logs.wheel()}, dbc=sources.dbc))

@@ -45,8 +45,15 @@ class Series(NamedTuple):
 
 
 def is_log(path: Path) -> bool:
-    """Return whether a path is that of a vehicle's log, by its name."""
-    return path.suffix.lower() in LOGS
+    """Return whether a path is that of a vehicle's log, by its name, or of a folder with logs."""
+    return bool(list_logs(path))
+
+
+def list_logs(path: Path) -> list[Path]:
+    """Return the logs at a path: itself, by its name, or those in a folder, by name; none where there are none."""
+    if path.is_dir():
+        return sorted(part for part in path.iterdir() if part.is_file() and part.suffix.lower() in LOGS)
+    return [path] if path.suffix.lower() in LOGS else []
 
 
 def merge_series(path: Path, begin: float, series: Mapping[str, Series]) -> Iterator[FileMessage]:

@@ -5,7 +5,7 @@ from difflib import get_close_matches
 from pathlib import Path
 
 from heliograph.files.logs.can_frames import open_frames
-from heliograph.files.logs.log import MDF, ULOG, Log, Wanted
+from heliograph.files.logs.log import MDF, ULOG, Log, Wanted, list_logs
 from heliograph.files.logs.log_sources import STAMP, LogSources
 from heliograph.files.logs.mdf import open_mdf
 from heliograph.files.logs.ulog import open_ulog
@@ -14,6 +14,34 @@ from heliograph.files.sources.sources import Sources
 from heliograph.numerics.check import InputError, fail
 
 LISTED = 8  # names in one line
+
+
+def open_logs(path: Path, sources: LogSources, wanted: Wanted) -> Log:
+    """Open a vehicle's log, or those in a folder as one, file by file; only messages that are wanted are decoded.
+
+    Raises:
+        ValueError: what `open_log` refuses.
+        ModuleNotFoundError: what reads one is not installed.
+    """
+    logs = [open_log(part, sources, wanted) for part in list_logs(path) or [path]]
+    if len(logs) == 1:
+        return logs[0]
+    notes = list[str]()
+
+    def read_one_after_another() -> Iterator[FileMessage | InputError]:
+        """Yield the messages of all logs, and collect their notes."""
+        for log in logs:
+            yield from log.messages
+            notes.extend(log.notes)
+
+    units, bits = dict[str, dict[str, str]](), dict[str, dict[str, int]]()
+    for log in logs:
+        for topic, signals in log.units.items():
+            units[topic] = {**units.get(topic, {}), **signals}
+        for topic, widths in log.bits.items():
+            bits[topic] = {**bits.get(topic, {}), **widths}
+    kinds = {topic: kind for log in logs for topic, kind in log.kinds.items()}
+    return Log(units, kinds, read_one_after_another(), notes, bits)
 
 
 def open_log(path: Path, sources: LogSources, wanted: Wanted) -> Log:
@@ -36,8 +64,10 @@ def open_log(path: Path, sources: LogSources, wanted: Wanted) -> Log:
 def read_log(path: Path, table: object, sources: Sources, notes: list[str]) -> Iterator[FileMessage | InputError]:
     """Yield the messages of a log that sources ask for, in order of time, or why one cannot be read.
 
+    Of several logs in a folder those of one file after another; each message has to be in one of them.
+
     Args:
-        path: the log.
+        path: the log, or the folder.
         table: the sources as the network's file has them, a `LogSources` or a dictionary.
         sources: the same, checked against the network.
         notes: lines on units and on what was left out, which are appended.
@@ -46,11 +76,14 @@ def read_log(path: Path, table: object, sources: Sources, notes: list[str]) -> I
         ValueError: no such log, no database, a message or a signal that is not there; one line with the remedy.
     """
     given = table if isinstance(table, LogSources) else LogSources({})
-    log = open_log(path, given, lambda name: bool(sources.of(name)))
+    log = open_logs(path, given, lambda name: bool(sources.of(name)))
     place = str(path) if given.dbc is None else f"{path} by {given.dbc}"
     used = _check_signals(place, path, log, sources)
     yield from log.messages
     notes += log.notes
+    if path.is_dir():
+        rest = [part.name for part in sorted(path.iterdir()) if part not in list_logs(path) and part != given.dbc]
+        notes += [f"{path}: not read beside logs: {', '.join(rest[:LISTED])}"] if rest else []
     if used:
         notes.append(f"{place}: in the file's units, before scale= and offset=: {', '.join(used)}")
 

@@ -245,7 +245,7 @@ def _note_left_out(path: Path | StoreTable, sources: Sources, events: EventTable
     if said := sources.describe_absent_field():
         raise InputError(said)
     from_zero = sources.clocks.check(str(path))
-    if isinstance(path, Path) and is_folder(path):
+    if isinstance(path, Path) and is_folder(path) and not is_log(path):
         events.notes += list_left_files(path, sources)
         if len(from_zero) > 1:
             remedy = "start= or offset= of hg.files.Stamp says if they are not"

@@ -40,8 +40,8 @@ COUNTED: dict[str, str] = {  # of a node's messages
     "future": "of a time that is not yet, refused; its clock is wrong",
     "implausible": "implausible and refused; the refused lines say why",
     **{reason: f"refused, {WORDS[reason]}" for reason in OF_NODES},
-    "held": "runs of equal readings longer than its noise allows: it is stuck, or has no noise",
-    "timeouts": "silences that were longer than its timeout, and ended",
+    "held": "times equal for longer than its noise allows: it is stuck, or has no noise",
+    "timeouts": "times silent for longer than its timeout, and back",
     "conflict": "came again with other values; the first stayed",
 }
 

@@ -273,7 +273,7 @@ function links(view) {
     const doubted = checks.some((test) => test.doubt);
     const judged = made("td", checks.length ? (doubted ? "doubtful" : "not refuted") : "", doubted ? "doubt" : "fine");
     const counts = [link.used, link.lost, link.late, link.duplicate];
-    return row(node, [...counts.map(counted), refused(link), judged, ...(deciding ? [status_of(view.senders[node])] : [])]);
+    return row(node, [...counts.map(counted), judged, ...(deciding ? [status_of(view.senders[node])] : []), refused(link)]);
   }));
 }
 
