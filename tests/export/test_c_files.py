@@ -319,6 +319,10 @@ def of_inputs(noise, name="dt"):
     return hg.kalman_filter(plant, hg.LinearSensor([[1.0, 0.0]], 0.04))
 
 
+# One and a hundred counts back, in counts and in seconds of a counter of milliseconds or microseconds.
+WRAPS = [(2.0**32 - back) * unit for back in (1, 100) for unit in (1.0, 1e-3, 1e-6)]
+
+
 @needs_compiler
 @pytest.mark.parametrize("precision", ["double", "float"])
 def test_a_time_step_that_is_none_is_refused_as_elsewhere(precision, tmp_path):
@@ -328,7 +332,7 @@ def test_a_time_step_that_is_none_is_refused_as_elsewhere(precision, tmp_path):
     for dt in (1.0, 0.3, 7.7, 0.0, 1e-3):
         assert device.step([1.0], [dt]) == clean.step([1.0], [dt]) == 0
         before = device.state.copy()
-        for none in (-1.0, -1e-9, 2.0**32 - 2.0**20, 1e30, 2.0**60):
+        for none in (-1.0, -1e-9, 2.0**32 - 2.0**20, 1e30, 2.0**60, *WRAPS):
             assert device.step([1.0], [none]) == 6
         np.testing.assert_array_equal(device.state, before)
     np.testing.assert_array_equal(device.mean(), clean.mean())

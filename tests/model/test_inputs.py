@@ -1,5 +1,7 @@
 """A time step that goes backwards and a function that returns what it must not are refused where they come in."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -46,6 +48,15 @@ def test_a_time_step_that_is_none_is_refused(door, dt, said):
     with pytest.raises(ValueError, match="input 'dt', row 3: expected a time step") as raised:
         doors(network_of(walk), [1.0, 1.0, dt, 1.0])[door]()
     assert said in str(raised.value)
+
+
+@pytest.mark.parametrize(("unit", "said"), [(1.0, "-3 as"), (1e-3, "-3 / 1000 as"), (1e-6, "-3 / 1e+06 as")])
+def test_a_counter_that_wrapped_is_named_in_its_own_counts(unit, said):
+    """Of milliseconds and microseconds that were made seconds too; hours and months beside them are time steps."""
+    filter, z = network_of(walk).nodes["a"].filters["k"], np.ones((2, 1))
+    with pytest.raises(ValueError, match=f"row 2: expected a time step, got 4.*: {re.escape(said)} a difference of"):
+        filter.run(z, [[1.0], [(2.0**32 - 3) * unit]])
+    filter.run(z, [[(2.0**32 - 2.0**25) * unit], [(2.0**32 + 2.0**11) * unit]])
 
 
 @pytest.mark.parametrize("door", DOORS)

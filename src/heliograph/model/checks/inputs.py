@@ -20,7 +20,9 @@ from heliograph.random_affine.noise import AbstractNoise
 
 LONGEST = 2.0**53  # units of a time step; a double counts no time beyond it
 WRAPPED = 2.0**32  # a difference of unsigned counters of 32 bits that is -d reads 2^32 - d
-NEAR = 2.0**24  # how far below 2^32 a whole number is taken for such a difference
+NEAR = 2.0**24  # how far below 2^32 a whole number of units is taken for such a difference
+SMALLER = (1e3, 1e6)  # counts in a unit of dt, of a counter of milliseconds or microseconds in seconds
+CLOSE = 2.0**10  # how far below 2^32 a number of such counts is: few steps are of 49.7 days so exactly
 ROWS = 4096  # of inputs for which functions are computed at once
 MOST_SHOWN = 100  # characters of a matrix
 LOOSE = 100.0  # times the tolerances of eigenvalues: elimination rounds by more than they do
@@ -47,8 +49,10 @@ def find_time_step_fault(dt: Float[np.ndarray, " steps"]) -> Fault | None:
         return Fault(row, "a time step that does not go backwards", got)
     if dt[row] > LONGEST:
         return Fault(row, "a time step of at most 2^53 units, as far as a double counts", got)
-    wrapped = f"{dt[row] - WRAPPED:.10g} as a difference of unsigned counters of 32 bits"
-    return Fault(row, "a time step", f"{got}: {wrapped}")
+    # In counts of the unit that it is nearest to 2^32 in.
+    counts = min((1.0, *SMALLER), key=lambda counts: abs(dt[row] * counts - WRAPPED))
+    below = f"{round(dt[row] * counts - WRAPPED)}" + (f" / {counts:g}" if counts > 1 else "")
+    return Fault(row, "a time step", f"{got}: {below} as a difference of unsigned counters of 32 bits")
 
 
 def check_time_step(names: Sequence[str], u: Float[np.ndarray, "... inputs"]) -> None:
@@ -66,10 +70,21 @@ def check_time_step(names: Sequence[str], u: Float[np.ndarray, "... inputs"]) ->
         raise fail(where, fault.expected, fault.came)
 
 
-def _is_time_step(dt: Array) -> Array:
-    """Return whether each number is from 0 to 2^53, and no difference of unsigned counters below zero."""
-    wrapped = (dt >= WRAPPED - NEAR) & (dt < WRAPPED) & (dt.round() == dt)
+def _is_time_step(dt: Array, precision: type = np.float64) -> Array:
+    """Return whether each number is from 0 to 2^53, and no difference of unsigned counters below zero.
+
+    `precision`: of the numbers.
+    """
+    wrapped = _is_near_wrap(dt, 1.0, NEAR, precision) & (dt.round() == dt)
+    for counts in SMALLER:
+        wrapped = wrapped | _is_near_wrap(dt, counts, CLOSE, precision)
     return (dt >= 0) & (dt <= LONGEST) & ~wrapped
+
+
+def _is_near_wrap(dt: Array, counts: float, near: float, precision: type) -> Array:
+    """Return whether each time step is so many counts below 2^32, rounded as the precision has them."""
+    ends = [float(precision((WRAPPED - below) / counts)) for below in (near, 0.5)]
+    return (dt >= ends[0]) & (dt <= ends[1])
 
 
 def check_inputs(
@@ -230,7 +245,7 @@ def do_inputs_spoil(
     """
     spoilt = jnp.asarray(False)
     if TIME_STEP in names:
-        spoilt = ~jnp.asarray(_is_time_step(u[list(names).index(TIME_STEP)]))
+        spoilt = ~jnp.asarray(_is_time_step(u[list(names).index(TIME_STEP)], precision or np.float64))
     for varying in plants_in(model):
         plant = at(varying, k)
         if not names or plant.inputs != tuple(names):
