@@ -223,7 +223,7 @@ class AbstractFilter(Module):
         raise fail("smoothing", "a filter that keeps its covariance and says how its state moves", type(self).__name__)
 
     def after_step(self, state: PyTree, k: Step) -> Estimate:
-        """`estimate(state)` after the correction of step k, for a filter that looks its covariance up by the step."""
+        """Return the estimate after step k: `estimate(state)`, but of a filter that looks its covariance up by k."""
         return self.estimate(state)
 
     def filter_rows(self, z: Array, u: Array, state: PyTree | None = None, begin: Array | int = 0) -> Pass | None:

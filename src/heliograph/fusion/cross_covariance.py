@@ -129,7 +129,7 @@ class ErrorMoments(NamedTuple):
 def initial_errors(
     mean: Float[Array, " n"], covariance: Float[Array, "n n"], starts: Float[Array, "node n"]
 ) -> ErrorMoments:
-    """Moments before the first step: every filter starts at a known mean, so all errors are x_0 up to a constant."""
+    """Return the moments before the first step, when filters start at known means: errors are x_0 up to a constant."""
     mean, starts = jnp.asarray(mean), jnp.asarray(starts)
     return ErrorMoments(jnp.concatenate([mean[None], mean - starts]), jnp.tile(covariance, (1 + len(starts),) * 2))
 
@@ -180,7 +180,7 @@ class ErrorSources(NamedTuple):
     independent: Float[Array, "node n n"]
 
     def covariances(self) -> Float[Array, "node n n"]:
-        """Return Cov e_i of each."""
+        """Return Cov e_i of each node, by its sources and its own part."""
         return self.shared @ self.shared.swapaxes(-1, -2) + self.independent
 
     def joint(self) -> Float[Array, "node n node n"]:

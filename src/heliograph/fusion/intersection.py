@@ -193,7 +193,7 @@ def restore_exact_components(
     means: Float[jax.Array, "count n"],
     inputs: Float[jax.Array, "count n n"],
 ) -> tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]:
-    """Where an input has variance 0, give the fused estimate that input's mean, and variance 0.
+    """Give the fused estimate an input's mean, and variance 0, where that input has variance 0.
 
     In `invert_covariances` a small number stands for no variance, of which the mean would keep 1e-8 of what the
     others say.

@@ -181,7 +181,7 @@ class UniformQuantizer(AbstractQuantizer):
         check_range("amplitude times scale", self.amplitude, self.scale, self.levels)
 
     def init(self, n: int) -> tuple[()]:
-        """Return the empty state."""
+        """Return the empty state: a fixed amplitude remembers nothing."""
         return ()
 
     @in_float64

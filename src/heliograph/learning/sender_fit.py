@@ -73,7 +73,7 @@ class SenderFit:
         return {"conditional": self.total}
 
     def rows(self) -> tuple[Row, ...]:
-        """Return the table."""
+        """Return the rows of the table of estimates, one for each number."""
         return self.table
 
     @property

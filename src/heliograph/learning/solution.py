@@ -101,7 +101,7 @@ class Solution:
     _tables: dict[tuple[Method, float], tuple[Row, ...]] = field(default_factory=dict, repr=False, compare=False)
 
     def __repr__(self) -> str:
-        """Form, log-likelihood, whether this is a maximum, and the numbers; no data."""
+        """Return form, log-likelihood, whether this is a maximum, and the numbers; no data."""
         numbers = dict(zip([entry.name for entry in self.parameters.entries],
                            self.parameters.entries_at(self.x).tolist(), strict=True))  # fmt: skip
         state = "converged" if self.converged else "not converged"

@@ -135,7 +135,7 @@ def lower_by_noise(claim: Claim, *models: PyTree) -> Claim:
 
 
 def is_sound(estimate: Estimate) -> np.ndarray:
-    """Mask of the means that are finite and, where a covariance is claimed, positive semidefinite (to rounding)."""
+    """Return which means are finite and, where a covariance is claimed, positive semidefinite (to rounding)."""
     finite = ~find_lost(np.asarray(estimate.mean), 1)
     if estimate.claim == "none":
         return finite
@@ -143,7 +143,7 @@ def is_sound(estimate: Estimate) -> np.ndarray:
 
 
 def _are_covariances(bound: np.ndarray) -> np.ndarray:
-    """Mask of the matrices (..., n, n) that are finite and positive semidefinite to rounding."""
+    """Return which matrices (..., n, n) are finite and positive semidefinite to rounding."""
     # Of a long recording most are the matrix of the row before, and judged with it.
     if bound.ndim == 3 and len(bound) > 2 and np.array_equal(bound[-1], bound[len(bound) // 2]):
         rows = bound.reshape(len(bound), -1)

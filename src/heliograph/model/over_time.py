@@ -130,7 +130,7 @@ def steps_covered(tree: object) -> int | None:
 
 
 def unstack(model: object) -> list[PyTree]:
-    """The objects of each step, as they were given to `over_time`; the object itself alone where it does not vary."""
+    """Return the object of each step, as `over_time` was given it; of one that does not vary this alone."""
     return [at(model, i) for i in range(model.steps)] if isinstance(model, OverTime) else [model]
 
 

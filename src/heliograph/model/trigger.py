@@ -260,7 +260,7 @@ class StochasticTrigger(AbstractTrigger):
         return jnp.full(len(error), jax.random.uniform(key, dtype=float) > silent)
 
     def known_losses(self, sender: Sender, reason: jax.Array, arrived: jax.Array) -> jax.Array:
-        """State of the link, 1 where it is down, whether or not anything is sent: so that silence stays Gaussian."""
+        """Return the link's state, 1 where it is down, whether anything is sent or not: so silence stays Gaussian."""
         return (~arrived).astype(float)[: self.side_information(len(arrived))]
 
     def check_outputs(self, outputs: int) -> None:

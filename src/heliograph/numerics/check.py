@@ -222,7 +222,7 @@ def instance(name: str, value: object, kind: type[T], what: str) -> T:
 
 
 def function(name: str, value: object, of: str) -> Any:
-    """Return what can be called."""
+    """Return a value that can be called, or raise: expected a function of `of`."""
     if not callable(value):
         raise fail(name, f"a function of {of}", show_value(value))
     return value
@@ -235,7 +235,7 @@ def check_progress(value: object, of: str) -> None:
 
 
 def file_path(name: str, value: object) -> Path:
-    """Return the path of a file or folder."""
+    """Return a value as the path of a file or folder, or raise."""
     if not isinstance(value, str | os.PathLike) or "\0" in os.fspath(value):
         raise fail(name, "a path", show_value(value))
     return Path(value)
@@ -250,14 +250,14 @@ def rank(name: str, value: object) -> int:
 
 
 def flag(name: str, value: object) -> bool:
-    """Return True or False."""
+    """Return a value that is True or False, or raise."""
     if not isinstance(value, bool | np.bool_):
         raise fail(name, "True or False", show_value(value))
     return bool(value)
 
 
 def text(name: str, value: object) -> str:
-    """Return a text."""
+    """Return a value that is a text, or raise."""
     return instance(name, value, str, "a text")
 
 

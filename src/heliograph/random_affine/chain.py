@@ -78,7 +78,7 @@ class AbstractMemory(Module):
         raise unwritten(self, "move")
 
     def nodes(self, degree: int) -> Nodes:
-        """The memory as finitely many states, exact for laws whose mean is a polynomial of `degree` in the state."""
+        """Return the memory as finitely many states, exact for a mean that is a polynomial of `degree` in the state."""
         raise unwritten(self, "nodes")
 
     @property
@@ -180,7 +180,7 @@ class MarkovChain(AbstractMemory):
         return draw_index(jnp.asarray(self.transition)[state], key)
 
     def nodes(self, degree: int) -> Nodes:
-        """Return the modes."""
+        """Return the modes, with the chain's initial law and transition: exact whatever the degree."""
         return Nodes(np.arange(self.modes), self.initial, self.transition, self.radius)
 
     def state_from_number(self, number: jax.Array) -> jax.Array:
@@ -257,7 +257,7 @@ class Autoregression(AbstractMemory):
         return Nodes(x, w, (hermite * powers) @ hermite.T * w)
 
     def state_from_number(self, number: jax.Array) -> jax.Array:
-        """Return the number."""
+        """Return the number itself: the state is a real number."""
         return number
 
     def next_state_quadrature(self, state: jax.Array | None, degree: int) -> tuple[jax.Array | np.ndarray, Law]:

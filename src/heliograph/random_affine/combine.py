@@ -53,7 +53,7 @@ class AbstractCombination(AbstractComposite):
         return self.maps[0].inputs
 
     def _init(self, key: jax.Array) -> PyTree[jax.Array]:
-        """Return the maps' states."""
+        """Return the first states of the maps, one for each; none of maps that forget."""
         keys = jax.random.split(key, len(self.maps))
         return tuple(m.init(k) for m, k in zip(self.maps, keys, strict=True)) if self.remembers else ()
 
@@ -106,7 +106,7 @@ class Series(AbstractCombination):
         return self.maps[-1].outputs
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
-        """Draw each map and multiply."""
+        """Draw each map, and multiply, the first map's matrix rightmost; rows of lost outputs are NaN."""
         state, drawn = self._draw_each(state, jax.random.split(key, len(self.maps)))
         then = _compose_draws if self.erases else jnp.matmul
         return state, reduce(lambda h, matrix: then(matrix, h), drawn)

@@ -82,7 +82,7 @@ class OwnMessages:
             self.reasons += [str(error)] if len(self.reasons) < 3 else []
 
     def events(self) -> EventTable:
-        """Return the events.
+        """Return the events that were read, with notes on their times and on what was refused.
 
         Raises:
             ValueError: none could be read; why the first could not.

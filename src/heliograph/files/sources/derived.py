@@ -98,7 +98,7 @@ class ZeroIfAbsent:
 
     @staticmethod
     def of(value: Any) -> Any:
-        """Return the number."""
+        """Return the number itself, of which nothing is derived."""
         return value
 
 

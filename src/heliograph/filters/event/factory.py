@@ -148,7 +148,7 @@ def _gain_and_noise_spread(channel: SideInformation) -> np.ndarray:
 
 
 def _has_gaussian_noise(*models: PyTree) -> bool:
-    """True if all noise in these models is Gaussian, so that silence of probability exp(-e' W e / 2) leaves it so."""
+    """Return whether all noise of these models is Gaussian: silence of probability exp(-e' W e / 2) leaves it so."""
     leaves = jax.tree.leaves(models, is_leaf=lambda leaf: isinstance(leaf, AbstractNoise))
     return all(isinstance(leaf, Gaussian) for leaf in leaves if isinstance(leaf, AbstractNoise))
 

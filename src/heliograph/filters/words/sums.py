@@ -17,7 +17,7 @@ class Sums(NamedTuple):
     second: jax.Array
 
     def plus(self, other: "Sums") -> "Sums":
-        """Add those of other words."""
+        """Return the sums over these words and others."""
         return Sums(self.mass + other.mass, self.first + other.first, self.second + other.second)
 
 

@@ -114,7 +114,7 @@ class FedBackFilter(AbstractWrapper):
         return state.gaussian
 
     def reference(self, known: Float[Array, " n"], u: Float[Array, " inputs"], k: Step) -> Float[jax.Array, " m"]:
-        """Reference r subtracted from y at step k, from the estimate after step k - 1 and the input over step k."""
+        """Return the reference r that is subtracted from y at step k, from the estimate before and the input over k."""
         return predict_signal(at(self.base.plant, k), at(self.base.sensor, k), known, u)
 
     @in_float64

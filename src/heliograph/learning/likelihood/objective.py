@@ -101,7 +101,7 @@ class Objective:
         return innovations
 
     def errors(self, x: Array, z: Array, u: Array, truth: Array) -> tuple[jax.Array, jax.Array]:
-        """Errors of the estimates (steps, n), NaN where the truth is not known, and what is claimed (steps, n, n)."""
+        """Return the estimates' errors (steps, n), NaN where no truth is known, and what is claimed (steps, n, n)."""
         filter, angles = self.filter(x), first(self.description.start.plant).angles
 
         def claimed(state: PyTree, innovation: Innovation, k: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -113,7 +113,7 @@ class Objective:
 
 
 def _identity_of(build: Build) -> tuple[object, ...]:
-    """What makes a function the same as another: its code and all that it closes over; of another callable itself."""
+    """Return what makes functions the same: their code and all that they close over; of another callable itself."""
     if not isinstance(build, FunctionType):
         return (build,)
     cells = [cell.cell_contents for cell in build.__closure__ or ()]

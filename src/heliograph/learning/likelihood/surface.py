@@ -47,7 +47,7 @@ class Surface:
         return Domains(low, high, single & (low | high))
 
     def evaluations(self, x: Float[np.ndarray, "points p"]) -> Evaluation:
-        """Return the evaluation at points."""
+        """Return value, score and information at each point; those of the last points are kept."""
         if not (self._last and np.array_equal(self._last[0][0], x)):
             self._last[:] = [(np.array(x), evaluate_at_points(self.objective, np.asarray(x), self.data))]
         return self._last[0][1]

@@ -45,7 +45,7 @@ class Domains(NamedTuple):
 
     @staticmethod
     def unbounded(count: int) -> "Domains":
-        """Return plain real numbers."""
+        """Return the domains of so many real numbers, without ends."""
         none = np.zeros(count, dtype=bool)
         return Domains(none, none, none)
 

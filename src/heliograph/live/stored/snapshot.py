@@ -78,7 +78,7 @@ def pack(head: Mapping[str, object], arrays: Mapping[str, np.ndarray]) -> bytes:
 
 
 def unpack(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Read a head and arrays."""
+    """Return the head and the arrays, by name, of what `pack` wrote."""
     try:
         with np.load(BytesIO(data), allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}

@@ -71,7 +71,7 @@ def list_differences(believed: Premise, own: Premise) -> tuple[str, ...]:
 
 
 def _enlarge_own(believed: Premise, own: Premise) -> Premise:
-    """The world with its past signals as states, where the filter was made for these: of them it tells the first."""
+    """Return the world with past signals as states, where the filter was made for these: of them it tells the first."""
     if own.sensor is None or own.channel is None or not first(own.channel).past:
         return own
     if len(first(believed.plant).states) <= len(first(own.plant).states):

@@ -38,11 +38,11 @@ class PathProblem(NamedTuple):
     scale: float
 
     def covariances(self, powers: Powers) -> Float[np.ndarray, "time n n"]:
-        """Return P after each step."""
+        """Return the error covariance P after each step."""
         return error_covariances(self.paths, self.information(powers).information)
 
     def exact(self, powers: Powers) -> float:
-        """Return the error itself."""
+        """Return the error at these powers, without smoothing of an eigenvalue."""
         return self.criterion.exact(self.covariances(powers))
 
     def sensitivity(self, powers: Powers) -> tuple[float, Powers, Powers]:

@@ -38,7 +38,7 @@ class Rayleigh(AbstractLaw):
         return jnp.log(g) - jnp.square(g / self.scale) / 2
 
     def bulk(self) -> tuple[Scalar | float, Scalar | float]:
-        """Interval that holds nearly all of the law: from 0 to 9 scales."""
+        """Return the interval that holds nearly all of the law: from 0 to 9 scales."""
         return 0.0, 9 * self.scale
 
 
@@ -74,7 +74,7 @@ class Rician(AbstractLaw):
         return jnp.log(g) - jnp.square((g - sight) / scale) / 2 + jnp.log(bessel)
 
     def bulk(self) -> tuple[Scalar | float, Scalar | float]:
-        """Interval that holds nearly all of the law: within 9 scales of the line of sight."""
+        """Return the interval that holds nearly all of the law: within 9 scales of the line of sight."""
         return library(self.sight, self.scale).maximum(self.sight - 9 * self.scale, 0.0), self.sight + 9 * self.scale
 
 
@@ -129,7 +129,10 @@ class Nakagami(AbstractLaw):
         return (2 * m - 1) * jnp.log(g) - m * jnp.square(g) / self.power
 
     def bulk(self) -> tuple[Scalar | float, Scalar | float]:
-        """From 0 to the power of a gamma variable of shape m that is above its mean by 36 nats."""
+        """Return the interval that holds nearly all of the law: from 0 to a gain above which it is by less than e^-36.
+
+        A gamma variable of shape m is above m + sqrt(2 m t) + t with at most the probability e^-t; t = NATS.
+        """
         xp = library(self.shape, self.power)
         largest = self.shape + xp.sqrt(2 * NATS * self.shape) + NATS
         return 0.0, xp.sqrt(self.power * largest / self.shape)
@@ -168,6 +171,6 @@ class LogNormal(AbstractLaw):
         return -jnp.log(g) - jnp.square((jnp.log(g) - self.log_mean) / self.log_deviation) / 2
 
     def bulk(self) -> tuple[Scalar | float, Scalar | float]:
-        """Interval that holds nearly all of the law: within 9 deviations of its logarithm."""
+        """Return the interval that holds nearly all of the law: within 9 deviations of its logarithm."""
         xp = library(self.log_mean, self.log_deviation)
         return xp.exp(self.log_mean - 9 * self.log_deviation), xp.exp(self.log_mean + 9 * self.log_deviation)

@@ -274,7 +274,7 @@ class Store:
         return outputs
 
     def number(self, name: str) -> int:
-        """Return a stored count."""
+        """Return the stored count of this name; 0 where none was stored."""
         with self._name_store_in_errors("a database that can be read"), self._engine.connect() as connection:
             row = connection.execute(select(NUMBERS).where(NUMBERS.c.name == name)).first()
         return 0 if row is None else self._count_written(*row)

@@ -68,7 +68,10 @@ class CrossCovariances:
         return np.asarray(self.state @ self.state.T)
 
     def matrix_weights(self) -> tuple[Float[np.ndarray, "n node n"], Float[np.ndarray, "n n"]]:
-        """Best unbiased weights W and the covariance W P W' of their error; linear in nodes where P allows it."""
+        """Return the best unbiased weights W and the covariance W P W' of their error.
+
+        The time that it takes is linear in the number of nodes where P allows it.
+        """
         weights = _choose_weights(self._sources)
         shared, independent = self._sources.weigh(weights)
         return weights, np.asarray(shared @ shared.T + independent)
@@ -78,7 +81,7 @@ class CrossCovariances:
         return ErrorSources(self.shared, self.independent)
 
     def fused(self, relays: Mapping[str, Sequence[str]]) -> "CrossCovariances":
-        """Moments at relays that forward the matrix-weighted estimate of their nodes, as the nodes of the next level.
+        """Return the moments at relays that forward the matrix-weighted estimate of their nodes.
 
         An error W e is a linear map of the nodes' errors, so its sources are W shared, and the rest has covariance
         W independent W' as long as no two relays receive the same node. Known means of the errors are subtracted. Apply

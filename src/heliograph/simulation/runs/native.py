@@ -89,7 +89,7 @@ class _Known:
 
     @classmethod
     def of(cls, array: np.ndarray) -> "_Known":
-        """Describe an array."""
+        """Describe an array: shape, type, which of its entries are known to a program, and their values."""
         known = _is_plain(array) if array.dtype.kind == "f" else np.full(array.shape, not _is_given(array))
         if array.size > FEW and _is_given(array):
             known[...] = False
@@ -108,7 +108,7 @@ class _Known:
 
 
 def _is_plain(array: np.ndarray) -> np.ndarray:
-    """Return which entries are PLAIN."""
+    """Return which entries are numbers that a program knows, those of PLAIN."""
     plain: np.ndarray = np.logical_or.reduce([array == number for number in PLAIN])
     return plain
 
