@@ -13,7 +13,7 @@ import numpy as np
 
 from heliograph.files.bags.bag import OFTEN, Progress, list_fields, open_bag, parts_of
 from heliograph.files.bags.mcap_chunks import read_messages_in_order as bag_messages
-from heliograph.files.bags.mcap_json import holds_json, read_json_messages
+from heliograph.files.bags.mcap_messages import holds_messages, read_mcap_messages
 from heliograph.files.logs.log_sources import LogSources
 from heliograph.files.logs.reading import open_logs
 from heliograph.files.messages.folder import list_files
@@ -141,7 +141,7 @@ def inspect_bag(path: Path, progress: Progress | None = None) -> tuple[dict[str,
     """
     topics, broken = dict[str, Topic](), ""
     for part in parts_of(path) or [path]:
-        ended = _inspect_json(part, topics) if holds_json(part) else _inspect_part(part, topics, progress)
+        ended = _inspect_mcap(part, topics) if holds_messages(part) else _inspect_part(part, topics, progress)
         broken = broken or ended
     return topics, broken
 
@@ -170,12 +170,16 @@ def _inspect_part(path: Path, topics: dict[str, Topic], progress: Progress | Non
         return cut
 
 
-def _inspect_json(path: Path, topics: dict[str, Topic]) -> str:
-    """Add the topics of an MCAP file with messages in JSON, and return where and why reading it ended early."""
-    for message in read_json_messages(path):
+def _inspect_mcap(path: Path, topics: dict[str, Topic]) -> str:
+    """Add the topics of an MCAP file without ROS, and return where and why reading it ended early."""
+    for message in read_mcap_messages(path):
         if isinstance(message, InputError):
             return str(message)
-        note(topics, str(message.topic), message.content or "", parse_arrival(message.arrival, message.where))
+        arrival = parse_arrival(message.arrival, message.where)
+        if isinstance(message.content, dict):
+            _note_message(topics, str(message.topic), message.content, "Protobuf", arrival)
+        else:
+            note(topics, str(message.topic), str(message.content or ""), arrival)
     return ""
 
 

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from heliograph.files.bags.bag import Progress, is_bag, parts_of, read_bag
-from heliograph.files.bags.mcap_json import holds_json, read_json_messages
+from heliograph.files.bags.mcap_messages import holds_messages, read_mcap_messages
 from heliograph.files.event_table import EventTable
 from heliograph.files.logs.log import is_log
 from heliograph.files.logs.reading import read_log
@@ -112,8 +112,8 @@ def _read_bags(path: Path, sources: Sources, progress: Progress | None, strict: 
     """Return the events of a bag, or of the bags in a folder, with messages of ROS or in JSON."""
     events = EventTable(sources.network, sources.step)
     for part in parts_of(path) or [path]:
-        if holds_json(part):
-            found = _append_all(part, read_json_messages(part, sources), sources, events, strict)
+        if holds_messages(part):
+            found = _append_all(part, read_mcap_messages(part, sources), sources, events, strict)
             missing = [topic for topic in sources.topics if not set("+#") & set(topic) and topic not in found]
             events.notes += [f"{part}: not in the bag: {', '.join(missing)}"] if missing else []
         else:

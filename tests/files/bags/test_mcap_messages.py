@@ -1,4 +1,4 @@
-"""MCAP files with messages in JSON: their events, what `inspect` lists, and what is damaged or refused."""
+"""MCAP files with messages in JSON or Protobuf: their events, what `inspect` lists, what is damaged or refused."""
 
 import json
 
@@ -123,8 +123,10 @@ def test_other_encodings_are_refused(folder, capsys):
         "log.mcap: not in the bag: /cellar" in run(folder, capsys, f'{SOURCE} | {{"/cellar": field("t", node="a")}}')[0]
     )
     _, err, _ = run(folder, capsys, '{"/picture": field("t", node="a"), "/attic": field("air.t", node="a")}')
-    assert "log.mcap, /picture: expected messages in JSON, as others of this file are, got protobuf" in err
+    expected = "messages in JSON or Protobuf with its schema, as others of this file are"
+    assert f"log.mcap, /picture: expected {expected}, got protobuf" in err
     write(folder / "log.mcap", encoding="protobuf")
     _, err, _ = run(folder, capsys)
-    assert err == "heliograph: log.mcap: expected messages of ROS or in JSON, got protobuf\n"
+    expected = "messages of ROS, in JSON, or in Protobuf with its schema"
+    assert err == f"heliograph: log.mcap: expected {expected}, got protobuf without its schema\n"
     assert cli.main(["inspect", "log.mcap"]) == 2 and "got protobuf" in capsys.readouterr().err

@@ -1,39 +1,50 @@
-"""Messages of JSON in MCAP files, as viewers and loggers without ROS write them."""
+"""Messages in JSON or Protocol Buffers in MCAP files, as viewers and loggers without ROS write them."""
 
 import os
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from io import BytesIO
+from itertools import takewhile
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
 from heliograph.files.bags.bag import DATA_END, FOOTER, MAGIC, DamageError
+from heliograph.files.bags.protobuf import Schema
 from heliograph.files.messages.in_files import FileMessage
 from heliograph.files.sources.sources import Sources
 from heliograph.files.text.text_file import CutOffError
 from heliograph.numerics.check import InputError, fail, show_error
 
-CHANNEL, MESSAGE, CHUNK = 0x04, 0x05, 0x06  # kinds of records
+SCHEMA, CHANNEL, MESSAGE, CHUNK = 0x03, 0x04, 0x05, 0x06  # kinds of records
 RECORD = struct.Struct("<BQ")  # kind and length of a record
 HEADER = struct.Struct("<HIQQ")  # of a message: channel, count, times of logging and publishing
 PART = struct.Struct("<QQQI")  # of a chunk: first and last time, size and checksum of its content
 LENGTH, SIZE, NUMBER = struct.Struct("<I"), struct.Struct("<Q"), struct.Struct("<H")
 END = struct.Struct("<BQQQI")  # a footer: kind, length, where the summary begins, where its offsets do, checksum
-JSON = "json"
-OTHERS = {"protobuf", "flatbuffer", "cbor", "msgpack"}  # encodings of MCAP's registry that nothing here reads
+JSON, PROTOBUF = "json", "protobuf"
+BARE = "protobuf without its schema"
+OTHERS = {BARE, "flatbuffer", "cbor", "msgpack"}  # encodings of MCAP's registry that nothing here reads
 
 
 class Channel(NamedTuple):
-    """A channel of an MCAP file: its topic, and how its messages are encoded."""
+    """A channel of an MCAP file: its topic, how its messages are encoded, and the number of their schema."""
 
     topic: str
     encoding: str
+    schema: int
 
 
-def holds_json(path: Path) -> bool:
-    """Return whether a file is MCAP with messages of JSON.
+class Types(NamedTuple):
+    """Types of a file's messages of Protocol Buffers: the name of one, and the schema that describes it."""
+
+    name: str
+    schema: Schema
+
+
+def holds_messages(path: Path) -> bool:
+    """Return whether a file is MCAP with messages in JSON or Protocol Buffers.
 
     Raises:
         ValueError: MCAP whose messages are all of an encoding that is not read.
@@ -47,41 +58,47 @@ def holds_json(path: Path) -> bool:
         return False
     encodings = {channel.encoding for channel in channels}
     if encodings and encodings <= OTHERS:
-        raise fail(str(path), "messages of ROS or in JSON", ", ".join(sorted(encodings)))
-    return JSON in encodings
+        raise fail(str(path), "messages of ROS, in JSON, or in Protobuf with its schema", ", ".join(sorted(encodings)))
+    return bool(encodings & {JSON, PROTOBUF})
 
 
-def read_json_messages(path: Path, sources: Sources | None = None) -> Iterator[FileMessage | InputError]:
+def read_mcap_messages(path: Path, sources: Sources | None = None) -> Iterator[FileMessage | InputError]:
     """Yield the messages of an MCAP file in its order, each with the moment when it was logged.
 
-    Messages that are not in JSON have no content.
+    Messages in other encodings have no content; one that its schema does not fit is an error.
 
     Where the file is damaged or cut off the last is a `CutOffError`.
 
     Args:
         path: the file.
-        sources: sources, whose topics are in JSON; None for no such check.
+        sources: sources, whose topics are in JSON or Protocol Buffers; None for all topics.
 
     Raises:
         ValueError: a topic of the sources that is in another encoding; one line.
     """
-    channels, count = dict[int, Channel](), 0
+    channels, types, count = dict[int, Channel](), dict[int, Types](), 0
     with path.open("rb") as file:
         file.seek(len(MAGIC))
         try:
             for kind, content in _read_records(file):
-                if kind == CHANNEL:
-                    number, channel = _read_channel(content)
+                if kind == SCHEMA:
+                    types |= _read_schema(content)
+                elif kind == CHANNEL:
+                    number, channel = _read_channel(content, types)
                     channels[number] = channel
-                    if channel.encoding != JSON and sources is not None and sources.of(channel.topic):
-                        expected = "messages in JSON, as others of this file are"
+                    if channel.encoding not in (JSON, PROTOBUF) and sources is not None and sources.of(channel.topic):
+                        expected = "messages in JSON or Protobuf with its schema, as others of this file are"
                         raise fail(f"{path}, {channel.topic}", expected, channel.encoding or "no encoding")
                 elif kind == MESSAGE:
                     count += 1
                     number, _, logged, _ = HEADER.unpack_from(content)
-                    topic, encoding = channels[number]
-                    text = content[HEADER.size :].decode(errors="replace") if encoding == JSON else None
-                    yield FileMessage(f"{path}, message {count}", topic, text, np.datetime64(logged, "ns"))
+                    channel, where = channels[number], f"{path}, message {count}"
+                    wanted = sources is None or bool(sources.of(channel.topic))
+                    payload = _decode(where, channel, types, content[HEADER.size :]) if wanted else None
+                    if isinstance(payload, InputError):
+                        yield payload
+                    else:
+                        yield FileMessage(where, channel.topic, payload, np.datetime64(logged, "ns"))
         except InputError as error:
             if not isinstance(error, DamageError):
                 raise
@@ -93,6 +110,31 @@ def read_json_messages(path: Path, sources: Sources | None = None) -> Iterator[F
             )
 
 
+def _decode(where: str, channel: Channel, types: dict[int, Types], data: bytes) -> object:
+    """Return a message: in JSON its text, in Protocol Buffers its fields, in others None; or why it is none."""
+    if channel.encoding == JSON:
+        return data.decode(errors="replace")
+    if channel.encoding != PROTOBUF:
+        return None
+    name, schema = types[channel.schema]
+    try:
+        return schema.decode(data, name)
+    except (ValueError, IndexError, struct.error) as error:
+        return fail(f"{where}, {channel.topic}", f"a message of {name}", error)
+
+
+def _read_schema(content: bytes) -> dict[int, Types]:
+    """Return the number of a schema of Protocol Buffers with its types; nothing of another, or of one that is none."""
+    name, at = _read_text(content, NUMBER.size)
+    encoding, at = _read_text(content, at)
+    if encoding != PROTOBUF:
+        return {}
+    try:
+        return {NUMBER.unpack_from(content)[0]: Types(name, Schema.of(content[at + LENGTH.size :]))}
+    except (ValueError, KeyError):
+        return {}
+
+
 def _find_channels(file: BinaryIO) -> list[Channel]:
     """Return the channels of the summary of an MCAP file; without one, those that stand before the first message."""
     # The footer says where the summary begins.
@@ -100,16 +142,20 @@ def _find_channels(file: BinaryIO) -> list[Channel]:
     kind, _, summary, _, _ = END.unpack(file.read(END.size))
     if kind == FOOTER and summary and file.read() == MAGIC:
         file.seek(summary)
-        found = [_read_channel(content)[1] for kind, content in _read_records(file) if kind == CHANNEL]
-        if found:
+        if found := _list_channels(_read_records(file)):
             return found
     # Without it channels stand where they are first used.
-    channels = list[Channel]()
     file.seek(len(MAGIC))
-    for kind, content in _read_records(file):
-        if kind == MESSAGE:
-            break
-        channels += [_read_channel(content)[1]] if kind == CHANNEL else []
+    return _list_channels(takewhile(lambda record: record[0] != MESSAGE, _read_records(file)))
+
+
+def _list_channels(records: Iterable[tuple[int, bytes]]) -> list[Channel]:
+    """Return the channels among records, each behind its schema."""
+    channels, types = list[Channel](), dict[int, Types]()
+    for kind, content in records:
+        if kind == SCHEMA:
+            types |= _read_schema(content)
+        channels += [_read_channel(content, types)[1]] if kind == CHANNEL else []
     return channels
 
 
@@ -139,11 +185,13 @@ def _read_records(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
         yield from _read_records(BytesIO(decompress(data, compression, whole, checksum)))
 
 
-def _read_channel(content: bytes) -> tuple[int, Channel]:
-    """Return the number of a channel, and its topic and encoding."""
+def _read_channel(content: bytes, types: Mapping[int, Types]) -> tuple[int, Channel]:
+    """Return the number of a channel, and its topic, encoding and schema, of which the types are known."""
     topic, at = _read_text(content, 2 * NUMBER.size)
     encoding, _ = _read_text(content, at)
-    return NUMBER.unpack_from(content)[0], Channel(topic, encoding)
+    (schema,) = NUMBER.unpack_from(content, NUMBER.size)
+    encoding = BARE if encoding == PROTOBUF and schema not in types else encoding
+    return NUMBER.unpack_from(content)[0], Channel(topic, encoding, schema)
 
 
 def _read_text(content: bytes, at: int) -> tuple[str, int]:

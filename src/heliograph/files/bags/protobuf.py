@@ -1,0 +1,245 @@
+"""Messages of Protocol Buffers, by the description of their types that a file holds: dictionaries, as JSON has them."""
+
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+# How a number stands in a message: its wire type.
+VARINT, FIXED64, SIZED, FIXED32 = 0, 1, 2, 5
+STAMP = "google.protobuf.Timestamp"
+MESSAGE, ENUM, TEXT, BYTES, GROUP = 11, 14, 9, 12, 10  # types of fields, by FieldDescriptorProto
+REPEATED = 3  # a label
+DEEPEST = 64  # messages within messages
+
+Wire = bytes | int
+
+
+def _zigzag(number: int) -> int:
+    """Return the signed number that a varint stands for, of types sint32 and sint64."""
+    return (number >> 1) ^ -(number & 1)
+
+
+def _signed(number: int) -> int:
+    """Return the signed number of 64 bits in two's complement."""
+    return number - (1 << 64) if number >> 63 else number
+
+
+class Scalar(NamedTuple):
+    """How a type of number is read: its wire type, and what makes the number of it."""
+
+    wire: int
+    read: Callable[[Any], Any]
+
+
+def _fixed(layout: str) -> Callable[[bytes], Any]:
+    """Return what reads a number of fixed length."""
+    return lambda data: struct.unpack(layout, data)[0]
+
+
+SCALARS = {  # by type of FieldDescriptorProto
+    1: Scalar(FIXED64, _fixed("<d")),
+    2: Scalar(FIXED32, _fixed("<f")),
+    3: Scalar(VARINT, _signed),
+    4: Scalar(VARINT, int),
+    5: Scalar(VARINT, _signed),
+    6: Scalar(FIXED64, _fixed("<Q")),
+    7: Scalar(FIXED32, _fixed("<I")),
+    8: Scalar(VARINT, bool),
+    13: Scalar(VARINT, int),
+    15: Scalar(FIXED32, _fixed("<i")),
+    16: Scalar(FIXED64, _fixed("<q")),
+    17: Scalar(VARINT, _zigzag),
+    18: Scalar(VARINT, _zigzag),
+}
+LENGTHS = {FIXED64: 8, FIXED32: 4}
+
+
+class Field(NamedTuple):
+    """A field of a message.
+
+    Args:
+        name: as the schema writes it.
+        kind: its type's number.
+        of: full name of its message or enumeration, "" for others.
+        repeated: whether it is a list.
+        implicit: whether it is 0, false or "" where it is absent.
+    """
+
+    name: str
+    kind: int
+    of: str
+    repeated: bool
+    implicit: bool
+
+
+@dataclass(frozen=True)
+class Schema:
+    """Types that a file describes.
+
+    Args:
+        messages: fields of each message by their numbers, by the message's full name.
+        enums: names of the values of each enumeration, by its full name.
+    """
+
+    messages: dict[str, dict[int, Field]]
+    enums: dict[str, dict[int, str]]
+
+    @staticmethod
+    def of(data: bytes) -> "Schema":
+        """Read a FileDescriptorSet; raise ValueError at what is none."""
+        schema = Schema({}, {})
+        for file in _of_number(data, 1):
+            syntax = _text(file, 12)
+            package = _text(file, 2)
+            for number, add in ((4, schema._add_message), (5, schema._add_enum)):
+                for content in _of_number(file, number):
+                    add(content, f"{package}." if package else "", syntax == "proto3")
+        return schema
+
+    def _add_message(self, data: bytes, prefix: str, implicit: bool) -> None:
+        """Add a type of messages, and those within it."""
+        name, fields = prefix + _text(data, 1), dict[int, Field]()
+        for content in _of_number(data, 2):
+            found = {number: value for number, _, value in read_fields(content)}
+            # Of a oneof, or declared optional, nothing is said by an absent field; nor of a message.
+            has_presence = 9 in found or found.get(17) == 1 or found[5] == MESSAGE
+            fields[int(found[3])] = Field(
+                _as_text(found[1]),
+                int(found[5]),
+                _as_text(found.get(6, b"")).removeprefix("."),
+                repeated=found.get(4) == REPEATED,
+                implicit=implicit and not has_presence,
+            )
+        self.messages[name] = fields
+        for number, add in ((3, self._add_message), (4, self._add_enum)):
+            for content in _of_number(data, number):
+                add(content, f"{name}.", implicit)
+
+    def _add_enum(self, data: bytes, prefix: str, implicit: bool) -> None:
+        """Add an enumeration."""
+        values = [{number: value for number, _, value in read_fields(content)} for content in _of_number(data, 2)]
+        names = {_signed(int(found.get(2, 0))): _as_text(found[1]) for found in values}
+        self.enums[prefix + _text(data, 1)] = names
+
+    def decode(self, data: bytes, name: str, depth: int = 0) -> dict[str, Any]:
+        """Return a message as a dictionary by the names of its fields.
+
+        Enumerations are names; a `Timestamp` is its `sec` and `nsec`; bytes are None. What is absent has its default
+        where the schema knows no other meaning of that.
+
+        Args:
+            data: the message.
+            name: full name of its type.
+            depth: how many messages it stands in.
+
+        Raises:
+            ValueError: no such message, or no such type in the schema.
+        """
+        if name not in self.messages or depth > DEEPEST:
+            raise ValueError(f"no type {name!r} in the schema" if depth <= DEEPEST else "messages nested too deeply")
+        fields = self.messages[name]
+        content: dict[str, Any] = {f.name: [] if f.repeated else self._default(f) for f in fields.values()
+                                   if f.repeated or f.implicit}  # fmt: skip
+        for number, wire, value in read_fields(data):
+            field = fields.get(number)
+            if field is None:  # of a newer schema
+                continue
+            values = [self._read_value(field, each, depth) for each in _unpack(field, wire, value)]
+            if field.repeated:
+                content[field.name] += values
+            elif values:
+                content[field.name] = values[-1]
+        return {"sec": content["seconds"], "nsec": content["nanos"]} if name == STAMP else content
+
+    def _read_value(self, field: Field, value: Any, depth: int) -> Any:
+        """Return a value of a field as JSON has it."""
+        if field.kind == MESSAGE:
+            return self.decode(value, field.of, depth + 1)
+        if field.kind == ENUM:
+            return self.enums.get(field.of, {}).get(_signed(value), _signed(value))
+        if field.kind == TEXT:
+            return _as_text(value)
+        return None if field.kind == BYTES else SCALARS[field.kind].read(value)
+
+    def _default(self, field: Field) -> Any:
+        """Return what an absent field stands for."""
+        if field.kind == ENUM:
+            return self.enums.get(field.of, {}).get(0, 0)
+        if field.kind in (TEXT, BYTES):
+            return "" if field.kind == TEXT else None
+        return {1: 0.0, 2: 0.0, 8: False}.get(field.kind, 0)
+
+
+def read_fields(data: bytes) -> Iterator[tuple[int, int, Wire]]:
+    """Yield number, wire type and raw value of each field of a message.
+
+    Raises:
+        ValueError: what is no message.
+    """
+    at = 0
+    while at < len(data):
+        key, at = _read_varint(data, at)
+        number, wire = key >> 3, key & 7
+        value: Wire
+        if wire == VARINT:
+            value, at = _read_varint(data, at)
+        else:
+            size = LENGTHS.get(wire, -1)
+            if wire == SIZED:
+                size, at = _read_varint(data, at)
+            if size < 0 or at + size > len(data) or not number:
+                raise ValueError("no message of Protocol Buffers, or one that was cut off")
+            value, at = data[at : at + size], at + size
+        yield number, wire, value
+
+
+def _read_varint(data: bytes, at: int) -> tuple[int, int]:
+    """Return the whole number at a place, seven bits in each byte, and the place where it ends."""
+    number = shift = 0
+    while at < len(data) and shift < 70:
+        byte = data[at]
+        number, at, shift = number | (byte & 127) << shift, at + 1, shift + 7
+        if byte < 128:
+            return number & (1 << 64) - 1, at
+    raise ValueError("no message of Protocol Buffers, or one that was cut off")
+
+
+def _unpack(field: Field, wire: int, value: Wire) -> list[Wire]:
+    """Return the values of a field as they stand: of a packed list several."""
+    expected = SIZED if field.kind in (TEXT, BYTES, MESSAGE) else VARINT if field.kind == ENUM else None
+    if expected is None:
+        if field.kind not in SCALARS:
+            raise ValueError(f"field {field.name!r} is of a type that is not read")
+        expected = SCALARS[field.kind].wire
+    if wire == expected:
+        return [value]
+    if not (field.repeated and wire == SIZED and isinstance(value, bytes)):
+        raise ValueError(f"field {field.name!r} is of another type than the schema's")
+    values, at = list[Wire](), 0
+    while at < len(value):
+        if expected == VARINT:
+            number, at = _read_varint(value, at)
+            values.append(number)
+        else:
+            size = LENGTHS[expected]
+            values.append(value[at : at + size])
+            at += size
+    return values
+
+
+def _of_number(data: bytes, wanted: int) -> list[bytes]:
+    """Return the messages or texts in the fields of a number."""
+    return [value for number, _, value in read_fields(data) if number == wanted and isinstance(value, bytes)]
+
+
+def _text(data: bytes, number: int) -> str:
+    """Return the text in the last field of a number; "" where there is none."""
+    return _as_text((_of_number(data, number) or [b""])[-1])
+
+
+def _as_text(value: Any) -> str:
+    """Return a text; raise ValueError at what is none."""
+    if not isinstance(value, bytes):
+        raise ValueError("a number where a text is expected")
+    return value.decode()
