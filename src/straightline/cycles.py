@@ -78,7 +78,9 @@ def _find_recurring(loop: Loop, needed: Collection[Any]) -> Recurring:
     _leave_fused_products(needed, found)
     used = {a for n in found for a in n.args} | {loop.following[k] for k in carried}
     own = [n for n in rows if n in tests and n in used]
-    return Recurring(found, carried, own, _list_sources(rows, own))
+    # What a test is computed of is computed in each turn, also where it follows from other tests.
+    sources = _list_sources(rows, own)
+    return Recurring({n: None for n in found if n not in sources}, carried, own, sources)
 
 
 def _is_known(node: Node, body: Block, *sets: Container[Any]) -> bool:

@@ -3,8 +3,6 @@
 That is the same function with runs side by side, in whose loops nothing is kept.
 """
 
-import time
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -66,6 +64,21 @@ def turned(rows, noise):
     return jax.lax.scan(step, jnp.float64(0.0), rows)
 
 
+def judged(rows, noise):
+    """A variance that grows where a number is missing; a second test is of a number that follows from the first."""
+
+    def step(variance, z):
+        weight = jnp.where(jnp.isnan(z[0]), 0.0, 1.0)
+        counts = jnp.abs(weight) <= noise[0] + 0.5
+        for k in range(40):
+            variance = (
+                variance - weight * variance**2 / (variance + 1.0) / 40 + jnp.where(counts, 0.1, noise[1]) / (k + 1)
+            )
+        return variance, (variance, weight * z[1])
+
+    return jax.lax.scan(step, jnp.float64(1.0), rows)
+
+
 def nested(rows, noise):
     """Filters of parts of the rows in a loop that carries what grows, as a variance does."""
 
@@ -98,6 +111,8 @@ OUTAGES[1000:1100] = OUTAGES[1110:1111] = OUTAGES[2000:2400, 1] = np.nan
         (counted(32), COMPLETE),
         (counted(33), COMPLETE),
         (turned, COMPLETE),
+        (judged, COMPLETE),
+        (judged, OUTAGES),
         (nested, OUTAGES),
     ],
 )
@@ -107,14 +122,3 @@ def test_the_bits_are_those_of_computing_all(function, rows):
         anew = compile(function, rows, NOISE)(np.stack([rows, rows]), np.stack([NOISE, NOISE]))
     for a, b in zip(jax.tree.leaves(kept), jax.tree.leaves(anew), strict=True):
         np.testing.assert_array_equal(a[0].view(np.int64), b[1].view(np.int64))
-
-
-def test_it_saves_most_of_the_time():
-    code, took = compile(filtered, COMPLETE, NOISE, shared=[0, 1]), []
-    for rows in (COMPLETE, pattern(4), missing(0.5)):
-        code(rows, NOISE)
-        began = time.process_time()
-        for _ in range(20):
-            code(rows, NOISE)
-        took.append(time.process_time() - began)
-    assert max(took[:2]) < 0.6 * took[2]  # 0.4 measured
