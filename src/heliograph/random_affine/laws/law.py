@@ -25,6 +25,7 @@ Vector = Float[jax.Array | np.ndarray, " n"]
 
 DRAWS = 2**14  # of a law that nobody knows but by its samples
 NATS = 36.0  # e^-36 is a rounding error of 1
+BEYOND = 1e-12  # by which a corner's last probability may lie beyond its ends, for the rounding of the others' sum
 CORNER_LIMIT = 12  # atoms whose corners are listed; above, moments are bounded one by one
 
 
@@ -223,7 +224,7 @@ class Discrete(AbstractLaw):
                 corner[others] = ends
                 corner[slack] = 0.0
                 corner[slack] = 1.0 - corner.sum()
-                if low[slack] - 1e-12 <= corner[slack] <= high[slack] + 1e-12:
+                if low[slack] - BEYOND <= corner[slack] <= high[slack] + BEYOND:
                     corners.add(tuple(np.round(np.clip(corner, 0.0, 1.0), 15)))
         return np.array([np.array(c) / sum(c) for c in sorted(corners)])
 
