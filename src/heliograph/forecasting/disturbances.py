@@ -19,6 +19,7 @@ from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.noise import Gaussian
 
 FALSE = 0.01  # probability of any false shock, of all tests together
+EQUAL = 1e-10  # relative: means and covariances of what is measured and of what arrives that are the same
 ROUNDING = 1e-12  # of a variance, below which nothing is known of a noise
 
 
@@ -155,14 +156,14 @@ def _find_model(filter: AbstractFilter) -> tuple[LinearPlant, LinearSensor]:
 
 
 def _hands_on(predicted: Forecast) -> bool:
-    """Ask whether what arrives is what is measured."""
+    """Return whether what arrives is what is measured."""
     sent, came = predicted.outputs, predicted.received
     return (
         sent is not None
         and came is not None
         and sent.mean.shape == came.mean.shape
-        and np.allclose(sent.covariance, came.covariance, rtol=1e-10, atol=0)
-        and np.allclose(sent.mean, came.mean, rtol=1e-10, atol=1e-300)
+        and np.allclose(sent.covariance, came.covariance, rtol=EQUAL, atol=0)
+        and np.allclose(sent.mean, came.mean, rtol=EQUAL, atol=1e-300)
     )
 
 

@@ -11,6 +11,7 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.types import Float
 
 CONVERGED = 0.1  # more of each error's variance: what the gain of the step before may cost to be searched near again
+RANK = 1e-12  # share of the largest correlation of received numbers below which a combination is taken for none
 SMALLEST = 1e-6  # of what an error's size was before a measurement: as small as one measurement can make it
 
 
@@ -161,7 +162,7 @@ def _propagate(
     # The best gain Cov(e+, received) Cov(received)^-1, in units of what is received.
     cross = step.error @ eta @ step.received.T
     unit = np.sqrt(np.maximum(np.diagonal(received), np.finfo(float).tiny))
-    best = cross / unit @ np.linalg.pinv(received / np.outer(unit, unit), rcond=1e-12, hermitian=True) / unit
+    best = cross / unit @ np.linalg.pinv(received / np.outer(unit, unit), rcond=RANK, hermitian=True) / unit
     gain = best if given is None else given
     # e+ after the correction, and at least SMALLEST of what it was before.
     before, left = step.error @ eta @ step.error.T, step.error - gain @ step.received

@@ -8,6 +8,7 @@ from scipy.sparse.csgraph import connected_components
 from heliograph.learning.parameters import Parameters
 from heliograph.numerics.types import Float
 
+SPANNED = 1e-12  # share of the largest singular value above which a direction is spanned
 NOTHING, WEAK = 1e-8, 1e-4  # eigenvalues of the information in units of each coordinate's own
 SAME = 1e-5  # of a direction at several points
 WHOLE = 1e-4  # how far an exponent may be from a whole number
@@ -92,7 +93,7 @@ def _differentiate_coordinates(parameters: Parameters, x: Float[np.ndarray, " p"
 def _orthonormalise(vectors: np.ndarray) -> np.ndarray:
     """Return an orthonormal basis, in columns, of what the columns of `vectors` span."""
     left, size, _ = np.linalg.svd(vectors, full_matrices=False)
-    return np.asarray(left[:, size > 1e-12 * max(size.max(initial=0.0), 1e-300)])
+    return np.asarray(left[:, size > SPANNED * max(size.max(initial=0.0), 1e-300)])
 
 
 def _group_connected(bases: list[np.ndarray]) -> list[tuple[int, ...]]:

@@ -19,6 +19,7 @@ BELOW_ONE = 1 - 1e-9  # below this a spectral radius is below 1, whatever roundi
 CONVERGED = 1e-13  # relative change of the gains from step to step
 ITERATIONS, POLISHING = 100, 50  # of the covariance recursion in search of gains, and of what follows it
 NEGLIGIBLE = 1e12  # how far covariances outgrow the noises before these are left out
+WEIGHT = 1e-9  # probability of a mode below which it has none
 SEEN = 1e-6  # share that a mode counts with in the search for gains, if it is left for good sooner or later
 SIZE_LIMIT = 1024  # rows of the operator that acts on all entries of all covariances
 
@@ -89,7 +90,7 @@ def find_gains(system: KnownLossSystem) -> KindGains:
 
     Source: Sinopoli et al. (2004), Theorem 3 (the modified algebraic Riccati equation); by mode for chains.
     """
-    system = system._replace(law=np.where(system.law > 1e-9, system.law, SEEN))  # a mode of no weight has a gain too
+    system = system._replace(law=np.where(system.law > WEIGHT, system.law, SEEN))  # a mode of no weight has a gain too
     size = float(np.trace(system.process)) or 1.0  # what starts at rest is searched as if it did not
     parts: Parts = system.law[:, None, None] * (system.process + size * np.eye(len(system.transition)))
     # Value iteration, renormalised where covariances grow.

@@ -211,9 +211,8 @@ def gain_over_linear(
 def skewness(square: LinearSystem, states: int, outputs: int) -> float:
     """Return the largest |E (a - Ea)(b - Eb)(c - Ec)| / (sd a sd b sd c) over a, b, c among x_k and z_k.
 
-    All comes from the system of degree 2.
-
-    k3(a, b, c) = Cov(a b, c) - E a Cov(b, c) - E b Cov(a, c), with a b a monomial of the square.
+    All comes from the system of degree 2: k3(a, b, c) = Cov(a b, c) - E a Cov(b, c) - E b Cov(a, c), with a b one of
+    its monomials.
     """
     x, z = _place_products(states), _place_products(outputs)
     before = state_moments(square)
@@ -229,7 +228,7 @@ def skewness(square: LinearSystem, states: int, outputs: int) -> float:
         for places, start in ((x, 0), (z, len(spread))):
             for (a, b), row in ((key, p) for key, p in places.items() if len(key) == 2):
                 i, j = start + places[(a,)], start + places[(b,)]
-                # k3(a, b, c) = Cov(a b, c) - E a Cov(b, c) - E b Cov(a, c).
+                # k3 of a, b and each c.
                 third = joint[start + row, linear] - mean[i] * joint[j, linear] - mean[j] * joint[i, linear]
                 size = deviation[i] * deviation[j] * deviation[linear]
                 ratio = np.divide(np.abs(third), size, out=np.zeros_like(third), where=size > 0)

@@ -26,6 +26,9 @@ POINTS = 200  # of half a grid: a step of its law is 64 million products
 PRODUCTS = 2e10  # of an iteration: seconds
 RAREST = 1e-6  # rate of messages that a grid holds
 LONGEST = 100  # deviations of a step from 0, beyond which there are too many nodes
+HELD = 5.5  # deviations of what is measured over which the grid reaches on either side
+MOST_CELLS = 1e9  # that are counted: more are refused anyway
+GRID_ACCURACY = 1e-3  # relative, of a rate by a grid
 REACH = 12.0  # deviations at which a density ends
 
 
@@ -217,10 +220,10 @@ def _choose_cells(system: _Scalar, delta: float, share: float) -> tuple[int, int
     """
     a, q, r = system.a, system.q, system.r
     # Cells of at most `share` deviations of either noise; delta is the edge of a cell, so h = delta / (cells + 1/2).
-    cells = int(np.ceil(min(delta / (share * np.sqrt(min(q, r))), 1e9) - 0.5))
+    cells = int(np.ceil(min(delta / (share * np.sqrt(min(q, r))), MOST_CELLS) - 0.5))
     h = delta / (cells + 0.5)
-    # As many as reach over 5.5 deviations of what is measured.
-    n = int(np.ceil(min(5.5 * np.sqrt(q / (1 - a * a) + r) / h, 1e9)))
+    # As many as reach over HELD deviations of what is measured.
+    n = int(np.ceil(min(HELD * np.sqrt(q / (1 - a * a) + r) / h, MOST_CELLS)))
     if n > POINTS:
         raise fail(
             "plant, sensor and delta",
@@ -295,7 +298,7 @@ def delta_for_rate(plant: AnyPlant, sensor: AnySensor, rate: float) -> float:
         ValueError: as `send_on_delta_rate`; a rate that is not between 0 and 1.
     """
     system = _check_scalar(plant, sensor)
-    return _find_threshold(rate, lambda delta: _send_on_delta_rate(system, delta), system, 1e-3)
+    return _find_threshold(rate, lambda delta: _send_on_delta_rate(system, delta), system, GRID_ACCURACY)
 
 
 def _find_threshold(rate: float, rate_at: Callable[[float], float], system: _Scalar, accuracy: float = 1e-10) -> float:

@@ -23,6 +23,7 @@ FEASIBLE = 1e-7  # relative excess over a limit that counts as none
 ACTIVE = 1e-7  # relative: how near a limit is one that is reached
 SHIFT = 1e-5  # relative, of the differences of gradients that make a Hessian
 ROUNDING = 1e-14  # relative
+LEAST_SIZE = 1e-12  # unit of a value that is less, or 0, at the start
 
 
 class Evaluation(NamedTuple):
@@ -75,7 +76,7 @@ class Programme:
         self._last: tuple[bytes, Evaluation | None] = (b"", None)
         self.size = 1.0
         value = self.value(start / problem.unit)[0]
-        self.size = max(value, 1e-12) if np.isfinite(value) else 1.0
+        self.size = max(value, LEAST_SIZE) if np.isfinite(value) else 1.0
 
     def at(self, z: Vector) -> Evaluation | None:
         """Return the evaluation at a point, None where it does not exist; the last one is cached."""
@@ -203,7 +204,7 @@ class Programme:
         right = np.concatenate([-gradient, -room[active]])
         if not np.all(np.isfinite(system)):
             return None
-        solution = np.linalg.lstsq(system, right, rcond=1e-14)[0]
+        solution = np.linalg.lstsq(system, right, rcond=ROUNDING)[0]
         step = np.zeros_like(z)
         step[index] = scale * solution[: len(index)]
         return step, solution[len(index) :], active

@@ -10,8 +10,10 @@ from heliograph.numerics.types import Float
 Function = Callable[[np.ndarray], tuple[float, np.ndarray]]
 
 DECREASE = 1e-4  # Armijo: least part of the predicted decrease that a step must give
-SHORTEN = 0.3
-SHORTEST = 1e-14
+SHORTEN = 0.3  # factor of a step that does not decrease the value enough
+SHORTEST = 1e-14  # share of a step: where a shorter one would be needed, none decreases the value
+FIRST = 1e-2  # length of a step of steepest descent, of which nothing is known yet
+CURVED, CURVED_OF_MANY = 1e-14, 1e-12  # s'y / |s| |y| above which an update is a curvature: dense, and L-BFGS
 PATIENCE = 5  # steps in a row that gain nothing
 
 
@@ -56,7 +58,7 @@ class _DenseInverseHessian:
     def times(self, vector: np.ndarray) -> np.ndarray:
         """Return H v; steepest descent where -H v is no direction of descent."""
         if (self.matrix @ vector) @ vector <= 0:
-            self.matrix = np.eye(len(vector)) * 1e-2 / np.linalg.norm(vector)
+            self.matrix = np.eye(len(vector)) * FIRST / np.linalg.norm(vector)
         return np.asarray(self.matrix @ vector)
 
     def update(self, s: np.ndarray, y: np.ndarray) -> None:
@@ -66,7 +68,7 @@ class _DenseInverseHessian:
         """
         curvature, first = float(s @ y), self.first
         self.first = False
-        if curvature <= 1e-14 * np.linalg.norm(s) * np.linalg.norm(y):
+        if curvature <= CURVED * np.linalg.norm(s) * np.linalg.norm(y):
             return
         if first:
             self.matrix = np.eye(len(s)) * curvature / float(y @ y)
@@ -98,7 +100,7 @@ class _LimitedInverseHessian:
 
     def update(self, s: np.ndarray, y: np.ndarray) -> None:
         """Remember an update whose curvature s'y is positive."""
-        if s @ y > 1e-12 * np.linalg.norm(s) * np.linalg.norm(y):
+        if s @ y > CURVED_OF_MANY * np.linalg.norm(s) * np.linalg.norm(y):
             self.updates.append((s, y))
 
 

@@ -169,6 +169,7 @@ def relay_schedules(network: RelayNetwork, design: RelayDesign) -> dict[str, Sch
 
 def _check_start(network: RelayNetwork, design: RelayDesign) -> None:
     """Raise ValueError for a design with other moments at k = 0 than the network's, as a periodic one has."""
+    # Equal to the rounding of both; of a periodic design first and last to what its iteration ends at.
     expected, start = start_moments(network), design.moments[0]
     if start.shape != expected.shape or not np.allclose(start, expected, rtol=1e-9, atol=0.0):
         periodic = len(design.moments) == len(network.slots) + 1 and np.allclose(start, design.moments[-1], rtol=1e-6)

@@ -19,6 +19,8 @@ WIDER, NARROWER = 3.0, 0.25  # factors of the radius after a step that the model
 CLOSE = 1e-15  # g' H^-1 g: twice the log-likelihood that a full step gains, 3e-8 standard errors away
 NEAR = 1e-8  # the same where rounding lets nothing better be found: 1e-4 standard errors
 NOISE = 1e-13  # rounding of a log-likelihood, as a share of its size
+TAKEN = 1e-4  # share of the foretold gain that a step has to bring to be taken
+DEFINED = 1e-8  # r' p / |r| |p| below which it is rounding
 AT_LIMIT = 1e-6  # nats that remain to be gained on the way to the end of a domain
 SMALLEST_RADIUS = 1e-12
 JOINED = 0.1  # standard errors between two lanes that climb to one top, and of either from it
@@ -206,7 +208,7 @@ def _step_lanes(evaluate: Evaluate, state: _State, moving: np.ndarray, domains: 
     far = length > 0.9 * state.radius
     hidden = foretold < NOISE * np.abs(state.total)
     fell = expected_gain(gradient, information, counting) < expected_gain(state.gradient, state.information, counting)
-    taken = sound & np.where(hidden, (fell | far) & (gain >= -NOISE * np.abs(total)), gain > 1e-4 * foretold)
+    taken = sound & np.where(hidden, (fell | far) & (gain >= -NOISE * np.abs(total)), gain > TAKEN * foretold)
     # The radius by how well the gain was foretold.
     well = taken & ((gain > 0.75 * foretold) | hidden)
     badly = going & ~(sound & ((gain > 0.25 * foretold) | (hidden & taken)))
@@ -293,7 +295,7 @@ def _update_hessian(
     unit, _ = find_flat_directions(state.information, step != 0)
     size = np.sqrt(np.sum((residual * unit) ** 2, axis=1) * np.sum((step / np.where(unit > 0, unit, 1.0)) ** 2, axis=1))
     # r' p must be more than rounding of |r| |p|, both in standard errors.
-    is_defined = sound & (np.abs(along) > 1e-8 * size)
+    is_defined = sound & (np.abs(along) > DEFINED * size)
     update = residual[:, :, None] * residual[:, None, :] / np.where(is_defined, along, 1.0)[:, None, None]
     secant = base + np.where(is_defined[:, None, None], update, 0.0)
     # Of the two the one that would have foretold this gain.

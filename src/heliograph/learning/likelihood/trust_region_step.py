@@ -8,6 +8,7 @@ FLAT = 1e-10  # eigenvalue of the scaled information below which a direction is 
 SECULAR_STEPS = 20  # Newton steps for the shift s at most; a few are enough
 LONGEST = 5.0  # step of a logarithm or a logit: a factor of 150
 ROUNDING = 1e-14  # of a matrix's eigenvalues, as a share of the largest
+PAST = 1e-6  # relative: how far beyond the least shift that makes a matrix positive the search begins
 LEAST = 1e-150  # information, of which the square is a number
 LARGEST = 1e12  # curvature in units of standard errors: beyond this a model is taken for rounding
 
@@ -46,7 +47,7 @@ def trust_region_step(
     b = (b + b.swapaxes(1, 2)) / 2 + flat @ flat.swapaxes(1, 2) + np.eye(len(free)) * stays[:, :, None]
     # s: none at first, or what makes the matrix positive.
     least = np.linalg.eigvalsh(b / d[:, :, None] / d[:, None, :])[:, 0]
-    shift = np.where(least > -ROUNDING, 0.0, -least * (1 + 1e-6))
+    shift = np.where(least > -ROUNDING, 0.0, -least * (1 + PAST))
     for _ in range(SECULAR_STEPS):
         step = _solve_shifted(b, shift, d, g)
         length = np.linalg.norm(d * step, axis=1)

@@ -224,8 +224,9 @@ def _condition_on_ends(counts: np.ndarray, spans: np.ndarray, intervals: bool) -
     top, value = maximise_shares(likelihood, [logits(0.1, 0.5), logits(0.3, 0.3), logits(0.02, 0.9)])
     shares = 1 / (1 + np.exp(-top))
     # Variances of the logits, 1 / (n p (1 - p)) of n packets alone, from differences of the score.
-    steps = 1e-4 * np.eye(2)
-    hessian = np.stack([likelihood(top - step)[1] - likelihood(top + step)[1] for step in steps]) / 2e-4
+    width = 1e-4  # of a logit: what a difference leaves out is 1e-8 of it, and its rounding 1e-12
+    steps = width * np.eye(2)
+    hessian = np.stack([likelihood(top - step)[1] - likelihood(top + step)[1] for step in steps]) / (2 * width)
     variances = np.diag(np.linalg.pinv((hessian + hessian.T) / 2))
     size = np.clip(1 / np.maximum(variances * shares * (1 - shares), 1e-300), 0.0, counts.sum(axis=1))
     fails, recovers = shares

@@ -277,6 +277,6 @@ def _sum_log_probabilities(
 ) -> tuple[float, np.ndarray]:
     """Return the log-likelihood of the trials under predictions (P(lost), its derivatives), and its gradient (3,)."""
     p, slope = predictions
-    p = np.clip(p, 1e-300, 1 - 1e-16)
+    p = np.clip(p, 1e-300, 1 - 1e-16)  # so that both logarithms are numbers
     logs, score = np.where(lost == 1, np.log(p), np.log1p(-p)), (lost - p) / (p * (1 - p))
     return float(np.sum(logs[trials])), slope @ np.where(trials, score, 0.0)

@@ -15,6 +15,7 @@ from heliograph.numerics.types import ArrayLike, Float
 
 Dither = Literal["none", "triangular", "subtracted", "stochastic"]
 MOST_BITS = 24  # of a word
+ROUNDING = 1e-9  # of a step: what a span of words may lack to its end
 
 
 @readable
@@ -65,7 +66,7 @@ class Words(Module):
         if resolution is not None:
             step = float(scalar("resolution", resolution, np.finfo(float).tiny))
             spans = (self.high - self.low) / step
-            bits = max(1, int(np.ceil(np.log2(np.max(spans) - 1e-9 + 1))))
+            bits = max(1, int(np.ceil(np.log2(np.max(spans) - ROUNDING + 1))))
             self.high = self.low + step * (2.0**bits - 1)
         self.bits = check_count("bits of a word", bits)
         if self.bits > MOST_BITS:

@@ -48,7 +48,10 @@ class Number(NamedTuple):
 
 
 def young_scalars(steps: int) -> Number:
-    """Return the scalar of Young's inequality for each step, or a single one of the steady bound."""
+    """Return the scalar of Young's inequality for each step, or a single one of the steady bound.
+
+    From 0.1, between 1e-6 and 1e3: beyond these one of the bound's factors 1 + b and 1 + 1 / b is a thousand or more.
+    """
     shape = () if steps == 1 else (steps,)
     return Number(start=np.full(shape, 0.1), low=np.full(shape, 1e-6), high=np.full(shape, 1e3))
 
@@ -153,6 +156,7 @@ def _mark_powers(description: Description, **values: object) -> Network:
 
 UNTRACEABLE = jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError
 PROGRAMS = 16  # networks whose programs are cached
+LEAST_UNIT = 1e-12  # of a number whose range and start are less
 INSIDE = 1e-9  # of the way from an end to the start
 
 
@@ -316,7 +320,7 @@ class NumberProblem:
     def descent_problem(self) -> Problem:
         """Return the problem of a descent, in units of the numbers' ranges, or of their starts where they have none."""
         low, high = self.numbers.low, self.numbers.high
-        unit = np.maximum(np.where(np.isfinite(high - low), high - low, np.abs(self.numbers.start)), 1e-12)
+        unit = np.maximum(np.where(np.isfinite(high - low), high - low, np.abs(self.numbers.start)), LEAST_UNIT)
         return Problem(
             low=low,
             high=high,

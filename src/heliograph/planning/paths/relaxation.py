@@ -17,7 +17,9 @@ from heliograph.numerics.types import ArrayLike, Bool, Float
 from heliograph.planning.paths.model import Paths, PathValues, Powers, fading, require_at_least, share_of_signal
 
 NEWTON_STEPS = 60  # of the root in l, on a logarithmic scale on which Newton's steps cannot leave it
-BISECTIONS = 120
+BISECTIONS = 120  # of log l between ends: 2^-120 of their distance, 138, is far below its rounding
+ENDS = 1e-30, 1e30  # of l, times the largest alpha
+SETTLED = 1e-15  # relative change of log l at which Newton's steps end
 DEAD = 1e150  # noise of a path in which a hop that is not free sends nothing
 LARGEST = 1e100  # powers and noises, whose squares doubles hold
 
@@ -108,7 +110,7 @@ def split_power_over_hops(whole: SplitPaths, total: PathValues) -> Split:
         excess = np.log(np.divide(reached, power, out=np.ones_like(power), where=reached > 0))
         step = np.divide(excess * reached, falls, out=np.zeros_like(falls), where=falls > 0)
         log_l = log_l + step
-        if np.all(np.abs(step) <= 1e-15 * (1 + np.abs(log_l))):
+        if np.all(np.abs(step) <= SETTLED * (1 + np.abs(log_l))):
             break
     # The powers, of exactly this sum.
     p = _split_at_multiplier(alpha, log_l)[0]
@@ -163,7 +165,7 @@ def compute_envelope(whole: SplitPaths, cap: PathValues) -> Envelope:
     """
     alpha, hops = whole.alpha, (whole.alpha > 0).sum(axis=-1)
     largest = np.where(hops > 0, alpha.max(axis=-1), 1.0)
-    low, high = np.log(1e-30 / largest), np.log(1e30 / largest)
+    low, high = (np.log(end / largest) for end in ENDS)
     for _ in range(BISECTIONS):
         middle = (low + high) / 2
         p = _split_at_multiplier(alpha, middle[..., None])[0]
