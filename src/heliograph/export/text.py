@@ -8,6 +8,7 @@ from heliograph.disk.quoting import visible
 from heliograph.export.functions import declare_innovation, explain_parts, list_heads, write_functions
 from heliograph.export.layout import lay_out_array, lay_out_struct
 from heliograph.export.program import Real, StepProgram
+from heliograph.export.single_precision import explain_ranges, explain_rounding
 from heliograph.export.window import WindowText, write_window
 from heliograph.filters.base import AbstractFilter
 from heliograph.model.estimate import Claim
@@ -113,6 +114,8 @@ def _write_comment(program: StepProgram, form: Form, window: WindowText | None) 
     notes = {filter.states.index(name): " (radians, from -pi to pi)" for name in circular}
     notes |= dict.fromkeys(filter.attitude, " (of a rotation vector, radians; its errors are turns in the body's axes)")
     units = [notes.get(i, "") for i in range(len(filter.states))]
+    ranges = explain_ranges(filter) if form.real == "float" else [""] * filter.received
+    rounding = explain_rounding(filter, any(ranges)) if form.real == "float" else []
     lines = [
         f"{prefix}.h: one step of {form.kind}.",
         f"Made by heliograph {heliograph.__version__}; do not edit.",
@@ -128,11 +131,12 @@ def _write_comment(program: StepProgram, form: Form, window: WindowText | None) 
         *(explain_parts(program, prefix) if len(program.parts) > 1 else []),
         *([] if window is None else window.comment),
         "",
-        *_explain_entries("z", form.received, [""] * len(form.received)),
+        *_explain_entries("z", form.received, ranges),
         *_explain_entries("u", filter.inputs, [""] * len(filter.inputs)),
         *_explain_entries("mean", filter.states, units),
         f"covariance[{len(filter.states)} * i + j] is that of the errors of mean[i] and mean[j].",
         "All numbers are in the units in which the plant and the sensor were described.",
+        *rounding,
         f"Claim: {claim}, {MEANING[claim]}.",
     ]
     if filter.horizon is not None:
