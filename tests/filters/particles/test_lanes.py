@@ -1,5 +1,6 @@
 """Particles of one run, a lane each: the numbers of the same filter by XLA, which takes all of them at once."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -27,6 +28,9 @@ STEPPING = hg.LinearPlant([[0.9]], hg.random_affine.FiniteSupport([[-1.0], [1.0]
 EDGE = hg.Sensor(lambda x: jnp.sqrt(x), 0.1)  # no number for half of the particles
 LOSSY = hg.erasure(hg.hop(hg.Discrete([0.5, 1.0], [0.3, 0.7]), 0.05), 0.8)
 WALK = hg.Plant(lambda x, u: 0.9 * x + jnp.sin(x), 0.25, [0.0], [[1.0]])
+MODES = hg.markov_plant([PLANT, hg.LinearPlant([[1.0, 0.1], [0.0, 0.5]], np.diag([0.1, 1.0]), [0.0, 1.0], np.eye(2))],
+                        [[0.9, 0.1], [0.3, 0.7]])  # fmt: skip
+FADING = hg.erasure(hg.gilbert_elliott(hg.perfect(1), hg.hop(1.0, 4.0), 0.1, 0.2), 0.8)
 ROWS = np.array([[0.3, 1.0], [0.2, 0.9], [np.nan, np.nan], [0.5, np.nan], [0.7, 1.1], [0.9, 1.3]])
 
 CASES = {
@@ -36,6 +40,10 @@ CASES = {
     "two values": (STEPPING, hg.LinearSensor([[1.0]], 1.0), hg.perfect(), ROWS[:, :1], {"proposal": "prior"}),
     "no number": (WALK, EDGE, hg.perfect(), ROWS[:, 1:], {}),
     "atoms": (WALK, hg.Sensor(lambda x: x**2 / 3, 0.1), LOSSY, ROWS[:, 1:], {}),
+    "an angle drawn": (TURNING, COMPASS, hg.perfect(2), ROWS[:, ::-1] + [2.5, 0.0], {"drawn": ["heading"]}),
+    "modes": (MODES, SENSOR, hg.perfect(2), ROWS, {"drawn": []}),
+    "modes and a state": (MODES, SENSOR, hg.perfect(2), ROWS, {"drawn": ["x0"], "proposal": "prior"}),
+    "modes of a link": (WALK, hg.Sensor(lambda x: x**2 / 3, 0.1), FADING, ROWS[:, 1:], {"drawn": ["x0"]}),
 }  # fmt: skip
 
 
@@ -52,10 +60,14 @@ def assert_equal(got, right):
     for name in ("means", "covariances", "innovations", "innovation_covariances", "log_likelihoods"):
         np.testing.assert_allclose(getattr(got, name), getattr(right, name), rtol=1e-9, atol=1e-11, err_msg=name)
     np.testing.assert_allclose(got.effective_numbers, right.effective_numbers, rtol=1e-9)
+    assert (got.modes is None) == (right.modes is None)
+    if right.modes is not None:
+        np.testing.assert_allclose(got.modes, right.modes, rtol=1e-9)
     states = got.origin.state, right.origin.state
-    for name in ("position", "weight"):
-        one, other = (np.asarray(getattr(state, name)) for state in states)
-        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-11, err_msg=name)
+    for name in ("position", "gaussian", "log_mode", "weight"):
+        parts = zip(*(jax.tree.leaves(getattr(state, name, ())) for state in states), strict=True)
+        for one, other in parts:
+            np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-11, err_msg=name)
     np.testing.assert_array_equal(np.asarray(states[0].key), np.asarray(states[1].key))
 
 

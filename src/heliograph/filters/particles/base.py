@@ -1,21 +1,28 @@
 """What particle filters of the state share: their fields, the resampling at the start of a step, and used rows."""
 
+from abc import abstractmethod
 from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from heliograph.filters.base import AbstractSizedFilter, FilterAngles
+from heliograph.filters.base import AbstractSizedFilter, FilterAngles, Step
+from heliograph.filters.chunks import Pass
+from heliograph.filters.particles.expected import find_reference
+from heliograph.filters.particles.lanes import filter_particles
+from heliograph.filters.particles.moments import StateSums
 from heliograph.filters.particles.received_density import ReceivedDensity
 from heliograph.filters.particles.resampling import effective_number, resample_systematically
+from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.modes_of_motion import models_of
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.angle import Angles
-from heliograph.numerics.types import Array, Int
+from heliograph.numerics.types import Array, Int, PyTree
 
+ENOUGH = 200  # particles; of 100 a row takes 80 us in lanes and half of it otherwise, of 300 90 and three times that
 State = TypeVar("State", bound=tuple[Any, ...])
 
 
@@ -24,6 +31,20 @@ class Resampled(NamedTuple):
 
     which: jax.Array
     log_weight: jax.Array
+
+
+class Weighed(NamedTuple):
+    """Particles that were weighed by z.
+
+    Args:
+        particles: what each is with z, (B, ...).
+        log_likelihood: log p(z | particle), less what the proposal adds (B,).
+        predicted: what each expected before z was known, arrays (B, ...).
+    """
+
+    particles: PyTree
+    log_likelihood: jax.Array
+    predicted: tuple[jax.Array, ...]
 
 
 class AbstractStateParticleFilter(AbstractSizedFilter):
@@ -47,6 +68,55 @@ class AbstractStateParticleFilter(AbstractSizedFilter):
     def angles_used(self) -> FilterAngles:
         """Return the angles of its plant, and those that its channel delivers."""
         return FilterAngles(models_of(first(self.plant))[0].angles, self.observed_angles)
+
+    def filter_rows(self, z: Array, u: Array, state: PyTree | None = None, begin: Array | int = 0) -> Pass | None:
+        """Filter rows with a lane for each particle where these are enough."""
+        return filter_particles(self, z, u, state, begin) if self.particles >= ENOUGH else None
+
+    @abstractmethod
+    def make_room(self, count: int) -> Any:
+        """Return arrays of so many particles, a tree of what each is, to be filled."""
+
+    @abstractmethod
+    def particles_of(self, state: Any) -> Any:
+        """Return what the particles (N, ...) of a state are."""
+
+    @abstractmethod
+    def sum_states(self, weight: jax.Array, particles: Any) -> StateSums:
+        """Return the first sums of particles (B,) by weights of any sum."""
+
+    @abstractmethod
+    def sum_apart(self, weight: jax.Array, particles: Any, sums: StateSums) -> jax.Array:
+        """Return the second sums (n, n) of particles (B,) about the mean that first sums of all have."""
+
+    @abstractmethod
+    def estimate_of(self, sums: StateSums, second: jax.Array) -> Estimate:
+        """Return the estimate that both sums over all particles say."""
+
+    @abstractmethod
+    def sum_received(
+        self, reference: tuple[Any, ...], weight: jax.Array, predicted: tuple[Any, ...], z: jax.Array, k: Step
+    ) -> Any:
+        """Return sums of what particles (B,) expect of z, counted from what one of reference expects."""
+
+    @abstractmethod
+    def innovation_of(self, received: Any, reference: tuple[Any, ...], z: Any, k: Step, density: Any) -> Innovation:
+        """Return the innovation that these sums over all particles say; `density`: log p(z)."""
+
+    def compute_estimate(self, state: Any) -> Estimate:
+        """Return the mean and covariance of all particles, by sums over them."""
+        weight, particles = jax.tree.map(jnp.asarray, (state.weight, self.particles_of(state)))
+        sums = self.sum_states(weight, particles)
+        return self.estimate_of(sums, self.sum_apart(weight, particles, sums))
+
+    def compute_innovation(
+        self, weight: jax.Array, predicted: tuple[jax.Array, ...], z: jax.Array, k: Step, density: jax.Array
+    ) -> Innovation:
+        """Return z less its mean, its covariance and the log-likelihood, by sums over what particles (N,) expect."""
+        number = find_reference(weight, predicted)
+        reference = tuple(part[number] for part in predicted)
+        received = self.sum_received(reference, weight, predicted, z, k)
+        return self.innovation_of(received, reference, z, k, density)
 
     @property
     def of_atoms(self) -> bool:

@@ -1,22 +1,21 @@
 """What particles expect of a measurement: the moments of its innovation over those where h(x) is a number."""
 
-from typing import NamedTuple, TypeVar
+import functools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from heliograph.filters.particles.moments import FirstSums
 from heliograph.filters.particles.received_density import Atoms
 from heliograph.model.estimate import Innovation
 from heliograph.numerics.angle import Angles, nearest
 from heliograph.numerics.traced import library
-
-Number = TypeVar("Number", jax.Array, np.ndarray)
+from heliograph.numerics.types import Array
 
 
 class Expected(NamedTuple):
-    """The atoms of z (m,) given h(x), and h(x) of a particle of reference (p,), which is no number if all are none.
+    """The atoms of z (m,) given h(x), and h(x) of a particle of reference (p,), which is no number if none is.
 
     Innovations are summed as differences from that of the reference's first atom: of angles within half a turn of it.
     """
@@ -61,10 +60,10 @@ class Expected(NamedTuple):
         return Innovation(self.base + mean, within + spread, jnp.where(nothing, 0.0, density))
 
 
-def find_reference(weight: Number, predicted: Number) -> Number:
-    """Return h(x) of the heaviest particle where it is a number; of particles (N,), (N, p) without any, no number."""
+def find_reference(weight: Array, predicted: tuple[Array, ...]) -> Array:
+    """Return the number of the heaviest of particles (N,) whose expectations are numbers; of all if none has any."""
     xp = library(weight, predicted)
-    counts = xp.all(xp.isfinite(predicted), axis=1) & (weight > 0)
-    best = predicted[xp.argmax(xp.where(counts, weight, 0.0))]
-    reference: Number = xp.where(xp.any(counts), best, xp.nan)
-    return reference
+    finite = [xp.all(xp.isfinite(xp.reshape(part, (len(part), -1))), axis=1) for part in predicted]
+    counts = functools.reduce(xp.logical_and, finite) & (weight > 0)
+    number: Array = xp.argmax(xp.where(counts | ~xp.any(counts), weight, 0.0))
+    return number

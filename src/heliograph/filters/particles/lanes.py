@@ -16,9 +16,7 @@ import numpy as np
 from heliograph.engine.choice import choose_code, compute_once
 from heliograph.filters.chunks import Pass
 from heliograph.filters.particles.expected import find_reference
-from heliograph.filters.particles.moments import FirstSums, first_sums, second_sums
 from heliograph.filters.particles.resampling import resample_known
-from heliograph.numerics.angle import wrap_angles
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.types import Array, PyTree
 
@@ -40,24 +38,25 @@ class Row(NamedTuple):
     moved: Array
 
 
-class Particles(NamedTuple):
-    """Particles of a row: positions (N, n), weights (N,) before and with z, and h(x) before z was known (N, p)."""
+class Group(NamedTuple):
+    """Particles of a row with a leading axis: weights before and with z, what each is, and what it expects of z."""
 
-    position: np.ndarray
-    prior: np.ndarray
-    weight: np.ndarray
-    predicted: np.ndarray
+    prior: Array
+    weight: Array
+    particles: PyTree
+    predicted: tuple[Array, ...]
 
 
 class Sums(NamedTuple):
-    """Sums over the particles of a row: `first` as `_pack` makes it, `second` ones of the states (n, n).
+    """Sums over the particles of a row: of states and of what is received as `_pack` makes them, `second` (n, n).
 
-    `reference` is h(x) of the particle from which innovations are counted, `density` log p(z | earlier rows).
+    `reference` is what the particle expects from which innovations are counted, `density` log p(z | earlier rows).
     """
 
-    first: np.ndarray
+    states: np.ndarray
+    received: np.ndarray
     second: np.ndarray
-    reference: np.ndarray
+    reference: tuple[np.ndarray, ...]
     density: np.ndarray
 
 
@@ -85,54 +84,66 @@ def filter_particles(
 class _Memory(NamedTuple):
     """Arrays that the programs of a row read in place: the row, particles, and sums over them.
 
-    `x` are positions and `log_weight` log weights before the row, the largest 0; `prior` are the weights that these
-    are the logarithms of, and `weight` those with z, the largest 1. Behind the last particle others of weight 0 fill
-    the last group, at the place of the first.
+    `particles` are those before the row, a tree, and `log_weight` their log weights, the largest 0; `prior` are the
+    weights that these are the logarithms of, and `weight` those with z, the largest 1. Behind the last particle others
+    of weight 0 fill the last group, at the place of the first.
     """
 
     row: Row
     used: np.ndarray
-    x: np.ndarray
+    particles: PyTree
     log_weight: np.ndarray
     numbers: np.ndarray
     prior: np.ndarray
     weight: np.ndarray
-    reference: np.ndarray
-    first: np.ndarray
+    reference: tuple[np.ndarray, ...]
+    states: np.ndarray
 
 
 class _Programs(NamedTuple):
-    """Code of what is done with particles, with the filter's own arrays: calls in memory of their own."""
+    """Code of what is done with particles, with the filter's own arrays: calls in memory of their own.
+
+    `now` are the particles behind the last row, and `log_weight` their log weights; `predicted` what each expected.
+    """
 
     memory: _Memory
+    now: PyTree
+    log_weight: np.ndarray
+    predicted: tuple[np.ndarray, ...]
     advance: Any
     first: Any
     second: Any
 
 
-def _prepare(filter: Any, z: np.ndarray, u: np.ndarray) -> _Programs | None:
-    """Return the code for a filter and rows like these; None if there is none."""
+def _prepare(filter: Any, z: np.ndarray, u: np.ndarray, keys: tuple[np.ndarray, np.ndarray]) -> _Programs | None:
+    """Return the code for a filter, for rows like these and their keys; None if there is none."""
     length = -(-filter.particles // GROUP) * GROUP
     numbers = np.arange(length, dtype=np.uint32)
     # Programs share what of a row and of particles more than one reads.
-    own, proposing = np.zeros((2, 2), np.uint32)
+    own, proposing = (np.zeros_like(part[0]) for part in keys)
     row = Row(np.zeros((), int), np.zeros_like(z[0]), np.zeros_like(u[0]), own, proposing, np.ones((), bool))
-    x, *weights = np.zeros((length, len(filter.states))), *np.zeros((3, length))
-    log_weight, prior, weight = weights
-    first = np.zeros(sum(_sizes(filter)))
-    memory = _Memory(row, np.ones((), bool), x, log_weight, numbers, prior, weight, np.zeros(0), first)
-    advance = _hold(_advance, filter, memory[:5], (False, False, True, True, True), length)
+    log_weight, prior, weight = np.zeros((3, length))
+    before = row, np.ones((), bool), filter.make_room(length), log_weight, numbers
+    advance = _hold(_advance, filter, before, (False, False, True, True, True), length)
     if advance is None:
         return None
-    position, _, predicted = advance.outputs
-    memory = memory._replace(reference=np.zeros(predicted.shape[1]))
-    particles = Particles(position, memory.prior, memory.weight, predicted)
-    groups = Particles(*(part.reshape(-1, GROUP, *part.shape[1:]) for part in particles))
-    shared = memory.row, memory.reference
-    of_first = _hold(_sum_first, filter, (*shared, groups), (False, False, True), len(groups.weight))
-    arguments = memory.first, groups.weight, groups.position
-    second = _hold(_sum_second, filter, arguments, (False, True, True), len(groups.weight))
-    return None if of_first is None or second is None else _Programs(memory, advance, of_first, second)
+    leaves, form = jax.tree.flatten(before[2])
+    held, predicted = advance.outputs[: len(leaves)], tuple(advance.outputs[len(leaves) + 1 :])
+    now = jax.tree.unflatten(form, held)
+    # Sums, a lane for each group.
+    reference = tuple(np.zeros(part.shape[1:]) for part in predicted)
+    group: Group = jax.tree.map(
+        lambda part: part.reshape(length // GROUP, GROUP, *part.shape[1:]), Group(prior, weight, now, predicted)
+    )
+    first = _hold(_sum_first, filter, (row, reference, group), (False, False, True), len(group.weight))
+    if first is None:
+        return None
+    states = np.zeros(first.outputs[0].shape[1])
+    arguments = states, group.weight, group.particles
+    second = _hold(_sum_second, filter, arguments, (False, True, True), len(group.weight))
+    memory = _Memory(*before, prior, weight, reference, states)
+    made = _Programs(memory, now, advance.outputs[len(leaves)], predicted, advance, first, second)
+    return None if second is None else made
 
 
 def _hold(function: Call, filter: Any, arguments: tuple[Any, ...], differs: tuple[bool, ...], runs: int) -> Any:
@@ -149,75 +160,66 @@ def _bind(function: Call, filter: Any, arguments: tuple[Any, ...], differs: tupl
     return choice.code.with_first(*choice.arrays[: len(choice.arrays) - len(jax.tree.leaves(arguments))])
 
 
-def _draw_start(filter: Any, key: Array, number: Array) -> jax.Array:
-    """Draw x_0 (n,) of a particle."""
-    drawn: jax.Array = filter.draw_start(key, number[None])[0]
-    return drawn
+def _draw_start(filter: Any, key: Array, number: Array) -> PyTree:
+    """Draw what a particle is before any row."""
+    return _take_first(filter.draw_start(key, number[None]))
+
+
+def _take_first(tree: PyTree) -> PyTree:
+    """Return the first of arrays along their leading axis."""
+    return jax.tree.map(lambda leaf: leaf[0], tree)
 
 
 def _advance(
-    filter: Any, row: Row, used: Array, x: Array, log_weight: Array, number: Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Move a particle x (n,) and weigh it by z where the row is used; return it, its log weight, and h(x) before."""
+    filter: Any, row: Row, used: Array, particle: PyTree, log_weight: Array, number: Array
+) -> tuple[PyTree, jax.Array, tuple[jax.Array, ...]]:
+    """Move a particle and weigh it by z where the row is used; return it, its log weight, and what it expected."""
     numbers = jnp.asarray(number)[None]
-    position, law = filter.move(jnp.asarray(x)[None], numbers, row.own, row.u, row.k, row.moved)
-    weighed = filter.weigh(position, law, numbers, row.proposing, row.z, row.k)
+    one = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], particle)
+    moved, law = filter.move(one, numbers, row.own, row.u, row.k, row.moved)
+    weighed = filter.weigh(moved, law, numbers, row.proposing, row.z, row.k)
     likelihood = jnp.where(used, weighed.log_likelihood[0], 0.0)
-    told: jax.Array = jnp.where(used, weighed.position[0], position[0])
-    return told, jnp.asarray(log_weight) + likelihood, weighed.predicted[0]
+    told = jax.tree.map(lambda new, old: jnp.where(used, new, old), weighed.particles, moved)
+    return _take_first(told), jnp.asarray(log_weight) + likelihood, _take_first(weighed.predicted)
 
 
-def _sum_first(filter: Any, row: Row, reference: Array, group: Particles) -> jax.Array:
-    """Return the first sums of a group of particles, and both of what their innovations are apart from the base."""
-    angles = filter.angles_used().states
-    sums = first_sums(jnp.asarray(group.weight), jnp.asarray(group.position), angles)
-    both, apart = filter.expected(reference, row.z, row.k).apart(group.prior, group.predicted)
-    return _pack(sums, first_sums(both, apart, ()), second_sums(both, apart))
+def _sum_first(filter: Any, row: Row, reference: tuple[Array, ...], group: Group) -> tuple[jax.Array, jax.Array]:
+    """Return the first sums of the states of a group of particles, and the sums of what they expect of z."""
+    group = jax.tree.map(jnp.asarray, group)
+    received = filter.sum_received(reference, group.prior, group.predicted, row.z, row.k)
+    return _pack(filter.sum_states(group.weight, group.particles)), _pack(received)
 
 
-def _sum_second(filter: Any, sums: Array, weight: Array, position: Array) -> jax.Array:
+def _sum_second(filter: Any, states: Array, weight: Array, particles: PyTree) -> jax.Array:
     """Return the second sums of the states of a group of particles, about the means of all."""
-    angles = filter.angles_used().states
-    apart = wrap_angles(jnp.asarray(position) - _unpack(filter, sums).state.mean(angles), angles)
-    return second_sums(jnp.asarray(weight), apart)
+    weight, particles = jax.tree.map(jnp.asarray, (weight, particles))
+    second: jax.Array = filter.sum_apart(weight, particles, _unpack(states, filter.sum_states, weight, particles))
+    return second
 
 
 def _tell_row(filter: Any, row: Row, sums: Sums) -> tuple[Any, ...]:
     """Return what is told of a row, by its sums."""
-    state, received, spread = _unpack(filter, sums.first)
-    innovation = filter.expected(sums.reference, row.z, row.k).innovation(received, spread, sums.density)
-    count = state.weight**2 / state.square
-    return state.mean(filter.angles_used().states), sums.second / state.weight, innovation, count
+    one, weight = jax.tree.map(jnp.asarray, filter.make_room(1)), jnp.ones(1)
+    states = _unpack(sums.states, filter.sum_states, weight, one)
+    predicted = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], sums.reference)
+    received = _unpack(sums.received, filter.sum_received, sums.reference, weight, predicted, row.z, row.k)
+    estimate = filter.estimate_of(states, sums.second)
+    innovation = filter.innovation_of(received, sums.reference, row.z, row.k, sums.density)
+    count = states.first.weight**2 / states.first.square
+    return estimate.mean, estimate.covariance, innovation, estimate.modes, count
 
 
-def _pack(*sums: Any) -> jax.Array:
+def _pack(sums: PyTree) -> jax.Array:
     """Return sums as one vector."""
     return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(sums)])
 
 
-def _sizes(filter: Any) -> tuple[int, ...]:
-    """Return the lengths of the first sums of states, and of both sums of innovations."""
-    angles, m = len(filter.angles_used().states), filter.received
-    return 1, 1, len(filter.states), angles, angles, 1, 1, m, 0, 0, m * m
-
-
-class _OfAll(NamedTuple):
-    """First sums of states and of innovations, and second ones (m, m) of innovations about the base."""
-
-    state: FirstSums
-    received: FirstSums
-    spread: jax.Array
-
-
-def _unpack(filter: Any, vector: Array) -> _OfAll:
-    """Return the sums that `_pack` made one vector of."""
-    parts = iter(jnp.split(jnp.asarray(vector), np.cumsum(_sizes(filter))[:-1].tolist()))
-
-    def take() -> FirstSums:
-        weight, square, *rest = (next(parts) for _ in range(5))
-        return FirstSums(weight[0], square[0], *rest)
-
-    return _OfAll(take(), take(), next(parts).reshape(filter.received, filter.received))
+def _unpack(vector: Array, function: Call, *arguments: Any) -> Any:
+    """Return the sums that `_pack` made one vector of, like those of a function of these arguments."""
+    leaves, form = jax.tree.flatten(jax.eval_shape(function, *arguments))
+    ends = np.cumsum([math.prod(leaf.shape) for leaf in leaves])[:-1].tolist()
+    parts = zip(jnp.split(jnp.asarray(vector), ends), leaves, strict=True)
+    return jax.tree.unflatten(form, [part.reshape(leaf.shape) for part, leaf in parts])
 
 
 def _filter_rows(filter: Any, z: np.ndarray, u: np.ndarray, state: PyTree | None, begin: int) -> Pass | None:
@@ -226,7 +228,7 @@ def _filter_rows(filter: Any, z: np.ndarray, u: np.ndarray, state: PyTree | None
     of_start, start, last, own, proposing = compute_once(_draw_keys, _draw_keys_by_xla, (filter, z, key))
     k = begin + np.arange(len(z))
     moved = (np.arange(len(z)) > 0) | (state is not None and bool(state.moved))
-    rows, programs = Row(k, z, u, own, proposing, moved), _prepare(filter, z, u)
+    rows, programs = Row(k, z, u, own, proposing, moved), _prepare(filter, z, u, (own, proposing))
     if programs is None:
         return None
     loop = _Loop(filter, programs)
@@ -237,14 +239,13 @@ def _filter_rows(filter: Any, z: np.ndarray, u: np.ndarray, state: PyTree | None
             return None
         loop.begin(draw(of_start, numbers), np.zeros(filter.particles))
     else:
-        loop.begin(np.asarray(state.position), np.asarray(state.log_weight))
+        loop.begin(jax.tree.map(np.asarray, filter.particles_of(state)), np.asarray(state.log_weight))
     steps = [loop.step(Row(*row), choice) for row, choice in zip(zip(*rows, strict=True), start.tolist(), strict=True)]
-    sums = Sums(*(np.array(part) for part in zip(*steps, strict=True)))
+    sums: Sums = jax.tree.map(lambda *parts: np.stack(parts), *steps)
     told = choose_code(_tell_row, (filter, rows, sums), [False, True, True])
     if told.code is None:
         return None
-    mean, covariance, innovation, counts = told.results()
-    return Pass(loop.last_state(last), (mean, covariance, innovation, None, counts))
+    return Pass(loop.last_state(last), told.results())
 
 
 def _draw_keys(filter: Any, z: Array, key: Array | None) -> tuple[jax.Array, ...]:
@@ -272,12 +273,15 @@ class _Loop:
     def __init__(self, filter: Any, programs: _Programs):
         self.filter, self.programs, self.memory, self.count = filter, programs, programs.memory, filter.particles
         self.resample, self.sum, self.square = float(filter.resample), 0.0, 0.0
-        self.position, self.log_weight, self.predicted = programs.advance.outputs
+        self.now, self.log_weight, self.predicted = programs.now, programs.log_weight, programs.predicted
+        self.held = jax.tree.leaves(self.now)
+        self.pairs = list(zip(self.held, jax.tree.leaves(self.memory.particles), strict=True))
 
-    def begin(self, x: np.ndarray, log_weight: np.ndarray) -> None:
-        """Take particles (N, n) with these log weights, the largest 0."""
+    def begin(self, particles: PyTree, log_weight: np.ndarray) -> None:
+        """Take particles (N, ...) with these log weights, the largest 0."""
         memory, count = self.memory, self.count
-        self.position[:count], self.position[count:] = x, x[0]
+        for held, new in zip(self.held, jax.tree.leaves(particles), strict=True):
+            held[:count], held[count:] = new, new[0]
         memory.log_weight[:count], memory.log_weight[count:] = log_weight, -np.inf
         np.exp(memory.log_weight, out=memory.weight)
         self.sum, self.square = float(memory.weight.sum()), float(memory.weight @ memory.weight)
@@ -289,7 +293,7 @@ class _Loop:
             held[...] = new
         self._choose(start)
         # A row that no particle explains is not used.
-        used = not np.isnan(row.z).all()
+        used = self.filter.always_used or not np.isnan(row.z).all()
         largest = self._advance(used)
         excluded = used and not largest > -np.inf
         if excluded:
@@ -297,41 +301,47 @@ class _Loop:
         np.subtract(self.log_weight, largest, out=memory.log_weight)
         np.exp(memory.log_weight, out=memory.weight)
         # First sums of all, then second sums about their means.
-        memory.reference[...] = self._find_reference()
+        self._find_reference()
         programs.first()
-        first = np.einsum("ij->j", programs.first.outputs[0], out=memory.first)  # in half of the time of add.reduce
+        states = np.einsum("ij->j", programs.first.outputs[0], out=memory.states)  # in half of the time of add.reduce
+        received = np.einsum("ij->j", programs.first.outputs[1])
         programs.second()
         second = np.einsum("ijk->jk", programs.second.outputs[0])
-        before, self.sum, self.square = self.sum, float(first[0]), float(first[1])
+        before, self.sum, self.square = self.sum, float(states[0]), float(states[1])
         density = -np.inf if excluded else math.log(self.sum) + largest - math.log(before)
-        return Sums(first.copy(), second, memory.reference.copy(), np.asarray(density))
+        reference = tuple(part.copy() for part in memory.reference)
+        return Sums(states.copy(), received, second, reference, np.asarray(density))
 
     def _choose(self, start: float) -> None:
         """Let particles go on as they are, or resampled where the effective number is too small."""
         memory, count = self.memory, self.count
         if not self.sum**2 / self.square < self.resample * count:
-            memory.x[...], memory.prior[...] = self.position, memory.weight
+            for held, new in self.pairs:
+                new[...] = held
+            memory.prior[...] = memory.weight
             return
         which = resample_known(memory.weight[:count], start)
-        np.take(self.position, which, axis=0, out=memory.x[:count], mode="clip")
+        for held, new in self.pairs:
+            np.take(held, which, axis=0, out=new[:count], mode="clip")
         memory.log_weight[:count], memory.prior[:count], self.sum = 0.0, 1.0, float(count)
 
     def _advance(self, used: bool) -> float:
         """Move particles, and weigh them by z if the row is used; return the largest log weight."""
         self.memory.used[...] = used
         self.programs.advance()
-        for held in (self.position, self.predicted):
+        for held in (*self.held, *self.predicted):
             held[self.count :] = held[0]
         return float(self.log_weight.max())
 
-    def _find_reference(self) -> np.ndarray:
-        """Return h(x) of the heaviest particle before z was known, of which it is a number."""
-        heaviest: np.ndarray = self.predicted[np.argmax(self.memory.prior)]
-        if np.isfinite(heaviest).all():
-            return heaviest
-        return find_reference(self.memory.prior[: self.count], self.predicted[: self.count])
+    def _find_reference(self) -> None:
+        """Keep what the heaviest particle before z was known expects, of those where it is a number."""
+        best: Any = np.argmax(self.memory.prior)
+        if not all(np.isfinite(part[best]).all() for part in self.predicted):
+            best = find_reference(self.memory.prior[: self.count], tuple(part[: self.count] for part in self.predicted))
+        for held, new in zip(self.memory.reference, self.predicted, strict=True):
+            held[...] = new[best]
 
     def last_state(self, key: np.ndarray) -> Any:
         """Return the state of the filter after the last row, given the key of what follows."""
-        held = self.position[: self.count], self.memory.log_weight[: self.count]
-        return self.filter.state_of(*(np.array(part) for part in held), key)
+        particles = jax.tree.map(lambda leaf: np.array(leaf[: self.count]), self.now)
+        return self.filter.state_of(particles, np.array(self.memory.log_weight[: self.count]), key)

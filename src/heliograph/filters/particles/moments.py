@@ -25,6 +25,13 @@ class FirstSums(NamedTuple):
         return mean
 
 
+class StateSums(NamedTuple):
+    """First sums of the states of particles, and of the weights of modes (modes,), without any where there is one."""
+
+    first: FirstSums
+    modes: jax.Array | None
+
+
 def first_sums(weight: jax.Array, x: jax.Array, angles: Angles) -> FirstSums:
     """Return the first sums of numbers x (N, n) by weights (N,), which need not sum to 1."""
     of_angles = x[:, list(angles)]

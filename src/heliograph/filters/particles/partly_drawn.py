@@ -15,16 +15,10 @@ import numpy as np
 
 from heliograph.engine.choice import compile_on_call
 from heliograph.factors.columns import Columns, columns_of_each, join_columns
-from heliograph.factors.gaussian import (
-    Gaussian,
-    condition_on_observation,
-    from_columns,
-    from_covariance,
-    moments_of_mixture,
-)
+from heliograph.factors.gaussian import Gaussian, condition_on_observation, from_columns, from_covariance
 from heliograph.filters.base import Step, corrects, estimates, predicts
-from heliograph.filters.innovation import mixed_innovation
-from heliograph.filters.particles.base import AbstractStateParticleFilter, keep_unused, relative_to_largest
+from heliograph.filters.particles.base import AbstractStateParticleFilter, Weighed, keep_unused, relative_to_largest
+from heliograph.filters.particles.cloud import Cloud, PartlyDrawn, repeat_for_modes, sum_clouds, sum_clouds_apart
 from heliograph.filters.particles.draws import (
     condition_on_draw,
     condition_on_leading,
@@ -32,51 +26,24 @@ from heliograph.filters.particles.draws import (
     find_certain,
     slopes_given,
 )
+from heliograph.filters.particles.expected_mixture import (
+    ExpectedMixture,
+    ReceivedSums,
+    find_base,
+    sum_mixtures,
+    tell_innovation,
+)
+from heliograph.filters.particles.moments import StateSums
 from heliograph.filters.particles.proposal import PRIOR_SHARE, noise_columns
 from heliograph.filters.particles.received_density import Atoms
-from heliograph.filters.particles.resampling import draw_normals, effective_number, fold_in_bits
+from heliograph.filters.particles.resampling import draw_normals, draw_uniforms, fold_in_bits
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.modes_of_motion import models_of
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AbstractPlant, LinearPlant
 from heliograph.model.sensor import AbstractSensor, LinearSensor
 from heliograph.numerics.angle import Angles, nearest, wrap_angles
-from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.types import Array, Bool, Float, Int
-
-
-class PartlyDrawn(NamedTuple):
-    """N particles: of each the Gaussian of x in every mode, drawn states first, with log probabilities of the modes.
-
-    Where mode and drawn states are drawn, one mode has probability 1, and the drawn states have variance 0 in it.
-    `moved` is true from the first prediction on.
-
-    Shapes: the Gaussians (N, M, n), log_mode (N, M), log_weight (N,), the largest 0, key (2,).
-    """
-
-    gaussian: Gaussian
-    log_mode: Float[jax.Array, "N M"]
-    log_weight: Float[jax.Array, " N"]
-    key: Int[jax.Array, " 2"]
-    moved: Bool[jax.Array, ""]
-
-    @property
-    @in_float64
-    def weight(self) -> jax.Array:
-        """Weights (N,), which sum to 1."""
-        return jax.nn.softmax(self.log_weight)
-
-    @property
-    @in_float64
-    def effective_number(self) -> jax.Array:
-        """1 / sum of the squared weights: how many particles of equal weight would say as much."""
-        return effective_number(self.weight)
-
-    @property
-    @in_float64
-    def mode_weights(self) -> jax.Array:
-        """Probabilities (N, M) of particle and mode."""
-        return self.weight[:, None] * jax.nn.softmax(self.log_mode, axis=1)
+from heliograph.numerics.types import Array, Float
 
 
 class Received(NamedTuple):
@@ -103,46 +70,86 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
     order: tuple[int, ...] = eqx.field(static=True)  # places of the states, drawn ones first
     drawn: int = eqx.field(static=True)  # how many are drawn
 
+    @property
+    def always_used(self) -> bool:
+        """Return whether a row in which nothing arrived says something, of the modes."""
+        return len(self.initial) > 1
+
     @compile_on_call
     def init(self) -> PartlyDrawn:
         """Return the law of x_0 in every particle; its drawn states are drawn unless a linear plant moves them."""
-        start, n, modes = models_of(at(self.plant, 0))[0], self.particles, len(self.initial)
-        key, key_of_states = jax.random.split(jax.random.PRNGKey(self.seed))
-        order = np.array(self.order)
+        key, own = self.start_keys()
+        particles = self.draw_start(own, jnp.arange(self.particles))
+        return self.state_of(particles, jnp.zeros(self.particles), key)._replace(moved=jnp.asarray(False))
+
+    def make_room(self, count: int) -> Any:
+        """Return arrays of so many particles, to be filled."""
+        modes, n = len(self.initial), len(self.order)
+        each: Any = (np.zeros((count, modes, *size)) for size in ((n,), (n * (n - 1) // 2,), (n,), ()))
+        mean, lower, variances, log_mode = each
+        return Cloud(Gaussian(mean, lower, variances), log_mode)
+
+    def particles_of(self, state: PartlyDrawn) -> Cloud:
+        """Return the Gaussian of each particle in each mode, and log probabilities of the modes."""
+        return Cloud(state.gaussian, state.log_mode)
+
+    def state_of(self, particles: Cloud, log_weight: jax.Array, key: jax.Array) -> PartlyDrawn:
+        """Return the state of particles with these log weights."""
+        return PartlyDrawn(particles.gaussian, particles.log_mode, log_weight, key, jnp.asarray(True))
+
+    def start_keys(self) -> tuple[jax.Array, jax.Array]:
+        """Return the key of the first step, and that of the draws of x_0."""
+        key, own = jax.random.split(jax.random.PRNGKey(self.seed))
+        return key, own
+
+    def draw_start(self, key: jax.Array, numbers: jax.Array) -> Cloud:
+        """Return the law of x_0 for the particles of these numbers (B,)."""
+        start, count, order = models_of(at(self.plant, 0))[0], len(numbers), np.array(self.order)
         x = from_covariance(start.initial_mean[order], start.initial_covariance[order][:, order])
-        x = jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf)[None], n, axis=0), x)
+        x = jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf)[None], count, axis=0), x)
         if not self._is_linear(models_of(at(self.plant, 0))):
-            x = self._draw_states(x, key_of_states)
-        log_mode = jnp.tile(jnp.log(jnp.asarray(self.initial)), (n, 1))
-        return PartlyDrawn(_repeat_for_modes(x, modes), log_mode, jnp.zeros(n), key, jnp.asarray(False))
+            x = self._draw_states(x, key, numbers)
+        log_mode = jnp.tile(jnp.log(jnp.asarray(self.initial)), (count, 1))
+        return Cloud(repeat_for_modes(x, len(self.initial)), log_mode)
 
     @predicts
     def predict(self, state: PartlyDrawn, u: Any = (), k: Step = 0) -> PartlyDrawn:
         """Resample where the effective number is too small, then move each particle's Gaussian by every mode's law."""
-        plants, u = models_of(at(self.plant, k)), jnp.asarray(u)
-        key, key_of_choice, key_of_states, key_of_mode = jax.random.split(jax.random.fold_in(state.key, 0), 4)
+        key, choice, own = self.keys_of_prediction(state.key)
+        which, log_weight = self.resampled(state.log_weight, choice)
+        particles = jax.tree.map(lambda leaf: leaf[which], self.particles_of(state))
+        moved, _ = self.move(particles, None, own, jnp.asarray(u), k, state.moved)
+        return self.state_of(moved, log_weight, key)
+
+    def keys_of_prediction(self, key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Return keys of what follows, of the choice of particles, and of their states and modes (2, 2)."""
+        keys = jax.random.split(jax.random.fold_in(key, 0), 4)
+        return keys[0], keys[1], keys[2:]
+
+    def move(
+        self, particles: Cloud, numbers: jax.Array | None, key: jax.Array, u: jax.Array, k: Step, moved: jax.Array
+    ) -> tuple[Cloud, None]:
+        """Move the Gaussians of particles (B,) by the law of every mode that may follow."""
+        plants, (gaussian, log_mode) = models_of(at(self.plant, k)), particles
         # What no measurement has drawn is drawn now; at the first step of a linear plant the start stays a Gaussian.
-        mode = draw_index(state.log_mode, jax.random.uniform(key_of_mode, (self.particles,), dtype=float))
-        in_mode: Gaussian = jax.tree.map(lambda leaf: leaf[jnp.arange(self.particles), mode], state.gaussian)
-        x = self._draw_states(in_mode, key_of_states)
+        mode = draw_index(log_mode, draw_uniforms(key[1], numbers, 1, self.particles)[:, 0])
+        in_mode: Gaussian = jax.tree.map(lambda leaf: leaf[jnp.arange(len(mode)), mode], gaussian)
+        x = self._draw_states(in_mode, key[0], numbers)
         if self._is_linear(plants):
-            x = jax.tree.map(lambda new, old: jnp.where(state.moved, new, old), x, in_mode)
-        which, log_weight = self.resampled(state.log_weight, key_of_choice)
-        x, mode = jax.tree.map(lambda leaf: leaf[which], (x, mode))
+            x = jax.tree.map(lambda new, old: jnp.where(moved, new, old), x, in_mode)
         # The law after the step in each mode that may follow.
         by_model = [jax.vmap(lambda particle, plant=plant: self._move(plant, particle, u))(x) for plant in plants]
-        moved: Gaussian = jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=1)[:, self.plant_modes, ...], *by_model)
-        chance = jnp.where(state.moved, jnp.asarray(self.transition)[mode], jnp.asarray(self.initial))
-        return PartlyDrawn(moved, jnp.log(chance), log_weight, key, jnp.asarray(True))
+        after: Gaussian = jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=1)[:, self.plant_modes, ...], *by_model)
+        chance = jnp.where(moved, jnp.asarray(self.transition)[mode], jnp.asarray(self.initial))
+        return Cloud(after, jnp.log(chance)), None
 
     def _is_linear(self, plants: Sequence[AbstractPlant]) -> bool:
         """Return whether the plant is linear in the drawn states too, so that they need not be drawn to be moved."""
         return all(isinstance(plant, LinearPlant) and not plant.circular for plant in plants)
 
-    def _draw_states(self, x: Gaussian, key: jax.Array) -> Gaussian:
-        """Return Gaussians (N, n) given their drawn states, which are drawn here."""
-        draws = draw_normals(key, None, self.drawn, self.particles)
-        return jax.vmap(condition_on_draw)(x, draws)
+    def _draw_states(self, x: Gaussian, key: jax.Array, numbers: jax.Array | None) -> Gaussian:
+        """Return Gaussians (B, n) given their drawn states, which are drawn here."""
+        return jax.vmap(condition_on_draw)(x, draw_normals(key, numbers, self.drawn, self.particles))
 
     def _move(self, plant: AbstractPlant, x: Gaussian, u: jax.Array) -> Gaussian:
         """Return the law of f(x) + w of one particle; f is affine in what of x has a variance."""
@@ -167,31 +174,40 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
     @corrects
     def correct(self, state: PartlyDrawn, z: Any, k: Step = 0) -> tuple[PartlyDrawn, Innovation]:
         """Draw mode and drawn states with z, weight each particle by p(z) p / q, and condition the rest on z."""
-        z, sensors, density = jnp.asarray(z), models_of(at(self.sensor, k)), at(self.density, k)
-        atoms, chance = density.given_arrivals(z)
+        z = jnp.asarray(z)
+        key, proposing = self.keys_of_correction(state.key, z)
+        weighed = self.weigh(self.particles_of(state), None, None, proposing, z, k)
+        density = jax.nn.logsumexp(jax.nn.log_softmax(state.log_weight) + weighed.log_likelihood)
+        # All weights zero: the row is not used.
+        log_weight = relative_to_largest(state.log_weight + weighed.log_likelihood)
+        updated = self.state_of(weighed.particles, log_weight, key)._replace(moved=state.moved)
+        used = (self.always_used | ~jnp.all(jnp.isnan(z))) & (density > -jnp.inf)
+        after = keep_unused(used, updated, state._replace(key=key))
+        return after, self.compute_innovation(state.weight, weighed.predicted, z, k, density)
+
+    def keys_of_correction(self, key: jax.Array, z: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return keys of what follows, and of the drawn states and of the choices (2, 2)."""
+        key = fold_in_bits(key, z)
+        return key, jax.random.split(jax.random.fold_in(key, 2))
+
+    def weigh(
+        self, particles: Cloud, law: None, numbers: jax.Array | None, key: jax.Array, z: jax.Array, k: Step
+    ) -> Weighed:
+        """Draw mode and drawn states of particles (B,) with z, and weigh them by p(z) p / q."""
+        sensors, (gaussian, log_mode) = models_of(at(self.sensor, k)), particles
+        atoms, chance = at(self.density, k).given_arrivals(z)
         received = self._describe_received(z, atoms)
         # That nothing or only a part arrived says something of the mode.
-        log_mode = state.log_mode + jnp.log(chance)
-        before = jax.nn.logsumexp(jax.nn.log_softmax(state.log_weight)[:, None] + log_mode)
-        key = fold_in_bits(state.key, z)
-        key_of_states, key_of_choice = jax.random.split(jax.random.fold_in(key, 2))
-        draws = draw_normals(key_of_states, None, self.drawn, self.particles)
-        uniform = jax.random.uniform(key_of_choice, (self.particles, 3), dtype=float)
+        log_mode = log_mode + jnp.log(chance)
+        draws = draw_normals(key[0], numbers, self.drawn, self.particles)
+        uniform = draw_uniforms(key[1], numbers, 3, self.particles)
         draw_and_weigh = jax.vmap(partial(self._draw_and_weigh, sensors, received))
-        x, mode, log_ratio = draw_and_weigh(state.gaussian, log_mode, draws, uniform)
-        log_weight = state.log_weight + log_ratio
-        density_of_z = jax.nn.logsumexp(jax.nn.log_softmax(state.log_weight) + log_ratio) - before
-        # All weights zero: the row is not used.
-        plant = models_of(at(self.plant, k))[0]
-        log_weight = relative_to_largest(log_weight)
+        x, mode, log_ratio = draw_and_weigh(gaussian, log_mode, draws, uniform)
+        plant, modes = models_of(at(self.plant, k))[0], len(self.initial)
         x = x._replace(mean=wrap_angles(x.mean, self._angles_in_order(plant)))
-        modes = len(self.initial)
         certain = jnp.where(jnp.arange(modes) == mode[:, None], 0.0, -jnp.inf)
-        updated = PartlyDrawn(_repeat_for_modes(x, modes), certain, log_weight, key, state.moved)
-        used = (modes > 1) | ~jnp.all(jnp.isnan(z))
-        used = used & (density_of_z > -jnp.inf)
-        after = keep_unused(used, updated, state._replace(key=key))
-        return after, self._innovation(sensors, received, state.gaussian, state.weight, log_mode, density_of_z)
+        predicted = jax.vmap(partial(self._expect, sensors, received))(gaussian, log_mode)
+        return Weighed(Cloud(repeat_for_modes(x, modes), certain), log_ratio, tuple(predicted))
 
     def _describe_received(self, z: jax.Array, atoms: Atoms) -> Received:
         """Return what arrived, with the atoms of each mode, and with one Gaussian in their place."""
@@ -302,64 +318,56 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         atom = draw_index(densities[None], uniform[None])[0]
         return jax.tree.map(lambda leaf: leaf[atom], after), jax.nn.logsumexp(densities)
 
-    def _innovation(
-        self,
-        sensors: Sequence[AbstractSensor],
-        received: Received,
-        x: Gaussian,
-        weight: jax.Array,
-        log_mode: jax.Array,
-        density: jax.Array,
-    ) -> Innovation:
-        """Return z less its mean over particles, modes and atoms, to first order in h, its covariance, and log p(z)."""
-        present = ~jnp.isnan(received.z)
+    def _expect(
+        self, sensors: Sequence[AbstractSensor], received: Received, x: Gaussian, log_mode: jax.Array
+    ) -> ExpectedMixture:
+        """Return what a particle expects of z in each mode and atom, to first order in h."""
 
-        def predict_in_mode(mode: jax.Array, x: Gaussian) -> tuple[jax.Array, jax.Array]:
-            """Return innovations (atoms, m) and their covariances of one particle in one mode."""
+        def expect_in_mode(mode: jax.Array, x: Gaussian) -> tuple[jax.Array, jax.Array]:
+            """Return means (atoms, m) of z and their covariances."""
             y, slopes = slopes_given(partial(self._measure, sensors, mode), x, drawn=0)
             gain = received.gain[mode]
-            value = nearest(
-                received.z - gain @ y - received.offset[mode], jnp.zeros(len(present)), self.observed_angles
-            )
             spread = jax.vmap(lambda g: Columns(g @ slopes, x.variances).covariance)(gain)
             noise = jax.vmap(lambda matrix, weights: Columns(matrix, weights).covariance)(
                 *jax.tree.map(lambda leaf: leaf[mode], received.noise)
             )
-            return value, jnp.where(present[:, None] & present, spread + noise, jnp.nan)
+            return gain @ y + received.offset[mode], spread + noise
 
-        value, total = jax.vmap(jax.vmap(predict_in_mode), in_axes=(None, 0))(jnp.arange(len(self.initial)), x)
-        share = weight[:, None, None] * jax.nn.softmax(log_mode, axis=1)[:, :, None] * received.weight
-        # Particles where h(x) is no number count not at all.
-        valid = jnp.all(jnp.isfinite(value) | ~present, axis=-1)
-        share = jnp.where(valid, share, 0.0).ravel()
-        share = share / jnp.where(jnp.sum(share) > 0, jnp.sum(share), 1.0)
-        value = jnp.where(valid[..., None], value, jnp.where(present, 0.0, jnp.nan)).reshape(-1, len(present))
-        value = nearest(value, value[jnp.argmax(share)], self.observed_angles)
-        return mixed_innovation(share, value, total.reshape(-1, *total.shape[-2:]), density)
+        expected, total = jax.vmap(expect_in_mode)(jnp.arange(len(self.initial)), x)
+        share = jax.nn.softmax(log_mode)[:, None] * received.weight
+        m = len(received.z)
+        chance = jnp.sum(jnp.exp(log_mode))
+        return ExpectedMixture(share.ravel(), expected.reshape(-1, m), total.reshape(-1, m, m), chance)
+
+    def sum_received(
+        self, reference: tuple[Any, ...], weight: jax.Array, predicted: tuple[Any, ...], z: jax.Array, k: Step
+    ) -> ReceivedSums:
+        """Return sums of how far innovations of particles (B,), modes and atoms are from that of a reference."""
+        base = find_base(ExpectedMixture(*reference), z, self.observed_angles)
+        return sum_mixtures(base, weight, ExpectedMixture(*predicted), z, self.observed_angles)
+
+    def innovation_of(
+        self, received: ReceivedSums, reference: tuple[Any, ...], z: jax.Array, k: Step, density: jax.Array
+    ) -> Innovation:
+        """Return z less its mean over particles, modes and atoms, its covariance, and log p(z)."""
+        return tell_innovation(received, find_base(ExpectedMixture(*reference), z, self.observed_angles), z, density)
+
+    def sum_states(self, weight: jax.Array, particles: Cloud) -> StateSums:
+        """Return the first sums of particles (B,), drawn states first."""
+        return sum_clouds(weight, particles, self._angles_in_order(models_of(first(self.plant))[0]))
+
+    def sum_apart(self, weight: jax.Array, particles: Cloud, sums: StateSums) -> jax.Array:
+        """Return the second sums (n, n) of particles (B,) about the mean of all, drawn states first."""
+        return sum_clouds_apart(weight, particles, sums, self._angles_in_order(models_of(first(self.plant))[0]))
+
+    def estimate_of(self, sums: StateSums, second: jax.Array) -> Estimate:
+        """Return mean and covariance over particles and modes; of an angle the mean direction, and moments about it."""
+        back, weight = np.argsort(self.order), sums.first.weight
+        mean = sums.first.mean(self._angles_in_order(models_of(first(self.plant))[0]))
+        modes = None if sums.modes is None else jnp.asarray(sums.modes) / weight
+        return Estimate(mean[back], (second / weight)[back][:, back], self.claim, modes)
 
     @estimates
     def estimate(self, state: PartlyDrawn) -> Estimate:
         """Return mean and covariance over particles and modes; of an angle the mean direction, and moments about it."""
-        plant, weight = models_of(first(self.plant))[0], jnp.asarray(state.mode_weights)
-        x, n = state.gaussian, len(self.order)
-        places, flat = self._angles_in_order(plant), jnp.asarray(x.mean).reshape(-1, n)
-        share = weight.ravel()
-        # The mean direction is that of E exp(i angle), and an angle's Gaussian has exp(i m - variance / 2).
-        covariances = jnp.asarray(x.covariance).reshape(-1, n, n)
-        mean = share @ flat
-        for i in places:
-            size = share * jnp.exp(-covariances[:, i, i] / 2)
-            mean = mean.at[i].set(jnp.arctan2(size @ jnp.sin(flat[:, i]), size @ jnp.cos(flat[:, i])))
-        difference = wrap_angles(flat - mean, places)
-        # Second moments about this mean.
-        center, covariance = moments_of_mixture(difference, covariances, share)
-        covariance = covariance + jnp.outer(center, center)
-        plants_order = np.argsort(self.order)
-        modes = jnp.sum(weight, axis=0) if len(self.initial) > 1 else None
-        return Estimate(mean[plants_order], covariance[plants_order][:, plants_order], self.claim, modes)
-
-
-def _repeat_for_modes(x: Gaussian, modes: int) -> Gaussian:
-    """Return Gaussians (N, n) as those of every mode (N, M, n)."""
-    repeated: Gaussian = jax.tree.map(lambda leaf: jnp.repeat(leaf[:, None], modes, axis=1), x)
-    return repeated
+        return self.compute_estimate(state)

@@ -1,6 +1,6 @@
 """Particle filter of the state: weighted points for any plant, and any sensor and link whose noise has a density."""
 
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,11 +9,9 @@ import numpy as np
 from heliograph.engine.choice import compile_on_call
 from heliograph.factors.columns import Columns, columns_of, join_columns, square_root, triangularise
 from heliograph.filters.base import Step, corrects, estimates, make_sizes, predicts
-from heliograph.filters.chunks import Pass
-from heliograph.filters.particles.base import AbstractStateParticleFilter, keep_unused, relative_to_largest
-from heliograph.filters.particles.expected import Expected, find_reference
-from heliograph.filters.particles.lanes import filter_particles
-from heliograph.filters.particles.moments import first_sums, second_sums
+from heliograph.filters.particles.base import AbstractStateParticleFilter, Weighed, keep_unused, relative_to_largest
+from heliograph.filters.particles.expected import Expected
+from heliograph.filters.particles.moments import FirstSums, StateSums, first_sums, second_sums
 from heliograph.filters.particles.proposal import Moved, noise_columns, propose
 from heliograph.filters.particles.received_density import Atoms, find_received_density
 from heliograph.filters.particles.resampling import draw_normals, effective_number, fold_in_bits
@@ -25,13 +23,12 @@ from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.numerics.angle import wrap_angles
 from heliograph.numerics.check import check_count, fail, instance, scalar
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int, PyTree
+from heliograph.numerics.types import ArrayLike, Bool, Float, Int
 from heliograph.random_affine.noise import AbstractNoise, Gaussian
 
 Proposal = Literal["optimal", "prior"]
 PROPOSALS: tuple[Proposal, ...] = ("optimal", "prior")
 MANY = 1000
-ENOUGH = 200  # particles; of 100 a row takes 80 us in lanes and half of it otherwise, of 300 90 and three times that
 
 
 class StateParticles(NamedTuple):
@@ -62,29 +59,21 @@ class StateParticles(NamedTuple):
         return effective_number(self.weight)
 
 
-class Weighed(NamedTuple):
-    """Particles that were weighed by z.
-
-    Args:
-        position: x (B, n), drawn with z.
-        log_likelihood: log p(z | x), less what the proposal adds (B,).
-        predicted: h(x) before z was known (B, p).
-    """
-
-    position: jax.Array
-    log_likelihood: jax.Array
-    predicted: jax.Array
-
-
 class StateParticleFilter(AbstractStateParticleFilter):
     """Weighted particles of the whole state, which are drawn from the prior or with z. Built by `particle_filter`.
 
     What is done with particles takes any of them side by side, by their numbers: all at once (None), or a lane each.
     """
 
-    def filter_rows(self, z: Array, u: Array, state: PyTree | None = None, begin: Array | int = 0) -> Pass | None:
-        """Filter rows with a lane for each particle where these are enough."""
-        return filter_particles(self, z, u, state, begin) if self.particles >= ENOUGH else None
+    always_used = False
+
+    def make_room(self, count: int) -> np.ndarray:
+        """Return an array of so many positions."""
+        return np.zeros((count, len(self.states)))
+
+    def particles_of(self, state: StateParticles) -> jax.Array:
+        """Return the positions (N, n) of a state."""
+        return state.position
 
     @compile_on_call
     def init(self) -> StateParticles:
@@ -160,9 +149,9 @@ class StateParticleFilter(AbstractStateParticleFilter):
         density = jax.nn.logsumexp(jax.nn.log_softmax(state.log_weight) + weighed.log_likelihood)
         log_weight = relative_to_largest(state.log_weight + weighed.log_likelihood)
         used = ~jnp.all(jnp.isnan(z)) & (density > -jnp.inf)
-        updated = self.state_of(weighed.position, log_weight, key)._replace(moved=state.moved)
+        updated = self.state_of(weighed.particles, log_weight, key)._replace(moved=state.moved)
         after = keep_unused(used, updated, state._replace(key=key))
-        return after, self._innovation(state.weight, weighed.predicted, z, k, density)
+        return after, self.compute_innovation(state.weight, weighed.predicted, z, k, density)
 
     def keys_of_correction(self, key: jax.Array, z: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return keys of what follows, and of the choice of those drawn from the prior."""
@@ -172,7 +161,10 @@ class StateParticleFilter(AbstractStateParticleFilter):
     def weigh(
         self, position: jax.Array, law: Moved | None, numbers: jax.Array | None, key: jax.Array, z: jax.Array, k: Step
     ) -> Weighed:
-        """Weigh particles (B, n) by z, after they are drawn anew with it where the law of their move is given."""
+        """Weigh particles (B, n) by z, after they are drawn anew with it where the law of their move is given.
+
+        They expected h(x) before z was known (B, p).
+        """
         sensor, atoms = at(self.sensor, k), self.atoms_of(z, k)
         predicted = received = jax.vmap(sensor.measure)(position)
         correction = jnp.zeros(len(position))
@@ -181,32 +173,48 @@ class StateParticleFilter(AbstractStateParticleFilter):
             position, correction = wrap_angles(drawn.position, at(self.plant, k).angles), drawn.correction
             received = jax.vmap(sensor.measure)(position)
         likelihood = atoms.log_densities(received, z, self.observed_angles) + correction
-        return Weighed(position, likelihood, predicted)
+        return Weighed(position, likelihood, (predicted,))
 
     def atoms_of(self, z: jax.Array, k: Step) -> Atoms:
         """Return the atoms of what is received given h(x)."""
         atoms: Atoms = jax.tree.map(lambda leaf: leaf[0], at(self.density, k).given_arrivals(z)[0])
         return atoms
 
-    def expected(self, reference: jax.Array, z: jax.Array, k: Step) -> Expected:
-        """Return what is expected of z, about what a particle of reference expects (p,)."""
-        return Expected(self.atoms_of(z, k), z, reference, self.observed_angles)
+    def sum_received(
+        self, reference: tuple[Any, ...], weight: jax.Array, predicted: tuple[Any, ...], z: jax.Array, k: Step
+    ) -> tuple[FirstSums, jax.Array]:
+        """Return both sums of how far innovations of particles (B,) and atoms are from that of a reference."""
+        both, apart = Expected(self.atoms_of(z, k), z, reference[0], self.observed_angles).apart(weight, *predicted)
+        return first_sums(both, apart, ()), second_sums(both, apart)
 
-    def _innovation(
-        self, weight: jax.Array, predicted: jax.Array, z: jax.Array, k: Step, density: jax.Array
+    def innovation_of(
+        self,
+        received: tuple[FirstSums, jax.Array],
+        reference: tuple[Any, ...],
+        z: jax.Array,
+        k: Step,
+        density: jax.Array,
     ) -> Innovation:
         """Return z less its mean over particles and atoms, the covariance of these, and the log-likelihood."""
-        reference = find_reference(weight, predicted)
-        received = self.expected(reference, z, k)
-        both, apart = received.apart(weight, predicted)
-        return received.innovation(first_sums(both, apart, ()), second_sums(both, apart), density)
+        return Expected(self.atoms_of(z, k), z, reference[0], self.observed_angles).innovation(*received, density)
+
+    def sum_states(self, weight: jax.Array, position: jax.Array) -> StateSums:
+        """Return the first sums of positions (B, n)."""
+        return StateSums(first_sums(weight, position, first(self.plant).angles), None)
+
+    def sum_apart(self, weight: jax.Array, position: jax.Array, sums: StateSums) -> jax.Array:
+        """Return the second sums (n, n) of positions (B, n) about the mean of all."""
+        angles = first(self.plant).angles
+        return second_sums(weight, wrap_angles(position - sums.first.mean(angles), angles))
+
+    def estimate_of(self, sums: StateSums, second: jax.Array) -> Estimate:
+        """Return the weighted mean and covariance; of an angle its mean direction, and second moments about it."""
+        return Estimate(sums.first.mean(first(self.plant).angles), second / sums.first.weight, self.claim)
 
     @estimates
     def estimate(self, state: StateParticles) -> Estimate:
         """Return the weighted mean and covariance; of an angle its mean direction, and second moments about it."""
-        angles, weight, x = first(self.plant).angles, jnp.asarray(state.weight), jnp.asarray(state.position)
-        mean = first_sums(weight, x, angles).mean(angles)
-        return Estimate(mean, second_sums(weight, wrap_angles(x - mean, angles)), self.claim)
+        return self.compute_estimate(state)
 
 
 def _root_of(columns: Columns) -> jax.Array:
