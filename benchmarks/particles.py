@@ -19,7 +19,7 @@ from heliograph.filters.filter_data import Filtered
 ROWS, ROUNDS = 100, 5
 PARTICLES = 1_000, 10_000, 100_000
 FEW, APART = 10_000, 0.1
-AT_MOST = {"10,000, prior, native": 70.0, "10,000, optimal, native": 80.0}
+AT_MOST = {"10,000, prior, native": 40.0, "10,000, optimal, native": 50.0}
 
 
 def recording() -> tuple[hg.LinearPlant, hg.LinearSensor, np.ndarray]:

@@ -94,6 +94,11 @@ COMPARISONS = {
         Program("modes_heliograph", "heliograph"),
         (Program("modes_filterpy", "FilterPy, a loop", "filterpy", target=200),),
     ),
+    "motion": Comparison(
+        problems.motion,
+        Program("motion_heliograph", "heliograph"),
+        (Program("motion_filterpy", "FilterPy, a loop", "filterpy", target=200),),
+    ),
     "cubature": Comparison(
         problems.cubature,
         Program("cubature_heliograph", "heliograph"),
