@@ -62,8 +62,10 @@ def test_limits_act_as_in_a_stream(folder, capsys):
     (folder / "data.csv").write_text("time,push,pos\n0,0,0.5\n0.5,1,-999\n0.5,0,0.7\n2,0.5,6\n2.5,0,0.2\n")
     assert cli.main(run_arguments()) == 0
     said = capsys.readouterr().err
-    assert said.count("\n") == 1 and "node 'remote': 2 of 5 values count as not arrived" in said
-    assert "row 2: pos -999 is a code" in said
+    assert (
+        said.count("\n") == 2 and "node 'remote': 1 of 5 values count as not arrived, by limits; row 4: pos 6" in said
+    )
+    assert "by code; row 2: pos -999 is a code" in said
     table, net = read_table("out.csv"), load_network("net.py")
     item = net.nodes["remote"].filters["aware"]
     recording = read_recording("data.csv", net)

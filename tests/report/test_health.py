@@ -216,6 +216,6 @@ def test_what_a_node_refuses_as_stuck_is_said_to_be_refused_and_not_to_be_lost()
     z = np.round(np.cumsum(0.1 * rng.standard_normal(STEPS)) + rng.standard_normal(STEPS), 2)[:, None]
     z[700:1100] = z[700]
     node = hg.Node(sensor, hg.perfect(), {"k": hg.kalman_filter(PLANT, sensor)}, stuck=True)
-    with pytest.warns(UserWarning, match="396 of 1500 values count as not arrived; row 705: y"):
+    with pytest.warns(UserWarning, match="396 of 1500 values count as not arrived, by stuck; row 705: y"):
         (line,) = health_of(hg.Network(PLANT, {"a": node}), {"a": z}).warnings()
     assert line.startswith("a: y is stuck") and line.endswith("what repeated for longer was refused")

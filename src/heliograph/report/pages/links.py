@@ -84,11 +84,11 @@ def _list_refused(health: Health) -> list[Table]:
         component = names[refusal.node][refusal.component]
         name = component if refusal.node == Network.FUSED else f"{refusal.node}: {component}"
         by = f"{refusal.node}/{refusal.filter}" if refusal.filter else refusal.node
-        rows.append([visible(name), visible(by), WORDS[refusal.reason], f"{refusal.count:,}", f"{refusal.row + 1:,}"])
+        rows.append([visible(name), f"{refusal.count:,}", WORDS[refusal.reason], visible(by), f"{refusal.row + 1:,}"])
     for node, counts in health.refused_messages.items():
         said = [(WORDS[reason].removeprefix("of "), count) for reason, count in counts.items()]
-        rows += [[visible(node), visible(node), words, f"{count:,}", "–"] for words, count in said]
-    headers = ["refused", "by", "reason", "how many", "first in row"]
+        rows += [[visible(node), f"{count:,}", words, visible(node), "–"] for words, count in said]
+    headers = ["refused", "how many", "reason", "by", "first in row"]
     caption = "What came and was not used: single readings, and messages as a whole, which are none of the rows."
     return [Table(headers, rows, caption, wordy=True)] if rows else []
 

@@ -8,6 +8,7 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.transform import AbstractTransform, Linearization
 from heliograph.filters.wrappers.limited import LimitedFilter
+from heliograph.model.modes_of_motion import ModalPlant, ModalSensor
 from heliograph.model.over_time import first
 from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor, is_linear
@@ -46,17 +47,17 @@ def _warn_unseen_at_end(network: Network, record: Record) -> Iterator[str]:
     A state is shown where an output within n steps depends on it, as far as the filter looks (`_Look`). Where none
     does, as beyond the end of a table, the gain of the state is by its correlations alone: what arrives says nothing of
     where it is. Not judged: states with limits, which bring an estimate back; particles and mixtures; models that vary
-    over time; estimates that are no numbers.
+    over time or have modes; estimates that are no numbers.
     """
     plant = network.plant
-    if not isinstance(plant, AbstractPlant):
+    if not isinstance(plant, AbstractPlant) or isinstance(plant, ModalPlant):
         return
     limited = {name for name, _ in plant.limits}
     for node, label, filter, sensors in _find_filters(network):
         transform = getattr(filter, "transform", None)
         if not isinstance(transform, AbstractTransform):
             continue
-        varies = any(first(sensor) is not sensor for sensor in sensors)
+        varies = any(first(sensor) is not sensor or isinstance(sensor, ModalSensor) for sensor in sensors)
         if varies or all(is_linear(plant, sensor) for sensor in sensors):
             continue
         estimate = record.estimates[node][label]
