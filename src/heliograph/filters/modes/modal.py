@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.engine.choice import compile_on_call
 from heliograph.factors.columns import (
     Columns,
     below_diagonal,
@@ -48,7 +49,6 @@ from heliograph.model.modes_of_motion import models_of
 from heliograph.model.over_time import OverTime, at, first, restack, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor
-from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import outer
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import stack_parts
@@ -163,7 +163,7 @@ class ModalFilter(AbstractJointModalFilter):
     plant_modes: tuple[int, ...] = eqx.field(static=True)  # which of the plant's models each mode has
     sensor_modes: tuple[int, ...] = eqx.field(static=True)
 
-    @in_float64
+    @compile_on_call
     def init(self) -> ModalBelief:
         """Return the prior, independent of the mode."""
         law, (prior, second) = jnp.asarray(self.initial), compute_initial_moments(at(self.plant, 0), self.initial)

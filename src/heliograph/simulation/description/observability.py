@@ -1,6 +1,7 @@
 """Which outputs within n steps depend on which state: the observability matrix of a network at one state."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +10,8 @@ import numpy as np
 from heliograph.model.over_time import first
 from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor
-from heliograph.numerics.types import Float
+from heliograph.numerics.float64 import compile_in_float64
+from heliograph.numerics.types import Array, Float, Int
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
@@ -26,22 +28,45 @@ def make_observability_matrix(
     plant: AbstractPlant, sensors: Sequence[AbstractSensor], state: Float[np.ndarray, " n"], steps: int
 ) -> Float[np.ndarray, "rows n"]:
     """Return d(y_1, ..., y_steps)/dx_0 at a state, all sensors stacked, with inputs of 1."""
-    with jax.enable_x64(True):
-        return np.asarray(jax.jacfwd(lambda x: _measure_steps(plant, sensors, x, steps))(jnp.asarray(state)))
+    return _differentiate_outputs(plant, tuple(sensors), state, np.arange(steps))
 
 
 def measure_from(
     plant: AbstractPlant, sensors: Sequence[AbstractSensor], states: Float[np.ndarray, "states n"], steps: int
 ) -> Float[np.ndarray, "states rows"]:
     """Return y_1, ..., y_steps of all sensors from each of some states, without noise, with inputs of 1."""
-    with jax.enable_x64(True):
-        return np.asarray(jax.vmap(lambda x: _measure_steps(plant, sensors, x, steps))(jnp.asarray(states)))
+    return _measure_from_states(plant, tuple(sensors), states, np.arange(steps))
 
 
-def _measure_steps(plant: AbstractPlant, sensors: Sequence[AbstractSensor], x: jax.Array, steps: int) -> jax.Array:
-    """Return y_1, ..., y_steps of all sensors from the state x, stacked."""
-    u, results = jnp.ones(len(plant.inputs)), list[jax.Array]()
-    for _ in range(steps):
+@compile_in_float64
+def _differentiate_outputs(
+    plant: AbstractPlant, sensors: tuple[AbstractSensor, ...], state: Float[Array, " n"], rows: Int[Array, " steps"]
+) -> Any:
+    """Return d(outputs of all rows)/dx_0 (rows, n)."""
+    return jax.jacfwd(lambda x: _measure_rows(plant, sensors, x, rows))(state)
+
+
+@compile_in_float64
+def _measure_from_states(
+    plant: AbstractPlant,
+    sensors: tuple[AbstractSensor, ...],
+    states: Float[Array, "states n"],
+    rows: Int[Array, " steps"],
+) -> Any:
+    """Return the outputs of all rows from each state (states, rows)."""
+    return jax.vmap(lambda x: _measure_rows(plant, sensors, x, rows))(states)
+
+
+def _measure_rows(
+    plant: AbstractPlant, sensors: tuple[AbstractSensor, ...], x: jax.Array, rows: Int[Array, " steps"]
+) -> jax.Array:
+    """Return y_1, ..., y_steps of all sensors from the state x, one after another, a step for each row."""
+    u = jnp.ones(len(plant.inputs))
+
+    def step(x: jax.Array, _: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Move the state, and measure it by all sensors."""
         x = plant.transition(x, u)
-        results += [sensor.under(plant.inputs, u).measure(x) for sensor in sensors]
-    return jnp.concatenate(results)
+        return x, jnp.concatenate([sensor.under(plant.inputs, u).measure(x) for sensor in sensors])
+
+    _, outputs = jax.lax.scan(step, x, rows)
+    return outputs.reshape(-1)
