@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.engine.choice import compile_on_call
 from heliograph.factors.columns import Columns
 from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.base import (
@@ -36,7 +37,6 @@ from heliograph.model.sensor import AbstractSensor
 from heliograph.numerics.angle import nearest
 from heliograph.numerics.check import TINY, fail, scalar
 from heliograph.numerics.density import log_density
-from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.moments.second_moments import SecondOrder
 
@@ -83,7 +83,7 @@ class AdaptiveFilter(AbstractWrapper):
         """Return the belief of the plant's state."""
         return state.gaussian
 
-    @in_float64
+    @compile_on_call
     def init(self) -> AdaptiveBelief:
         """Return the filter's prior, and the variances' with as much weight as forgetting leaves them."""
         shape = jnp.full(self.received, PRIOR_SHAPE)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.engine.choice import compile_on_call
 from heliograph.factors.columns import Columns, join_columns
 from heliograph.factors.gaussian import Gaussian, from_columns
 from heliograph.filters.base import (
@@ -26,7 +27,6 @@ from heliograph.model.over_time import at
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.angle import nearest
 from heliograph.numerics.check import fail
-from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import ArrayLike, Float
 
 CONTRADICTED = float(np.log(1000.0))  # the other numbers speak for the gated state 1000 to 1
@@ -90,7 +90,7 @@ class GivingInFilter(AbstractSizedFilter):
         """Return the angles of the gate."""
         return self.base.angles_used()
 
-    @in_float64
+    @compile_on_call
     def init(self) -> WatchedBelief:
         """Return the belief before any data."""
         start, zero = self.base.init(), jnp.zeros(())

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import block_diag
 
+from heliograph.engine.choice import compile_on_call
 from heliograph.factors.columns import Columns, join_columns, rounding_of, side_by_side, triangularise
 from heliograph.factors.gaussian import Gaussian, from_columns, from_covariance
 from heliograph.filters.base import Step, corrects, make_sizes, predicts
@@ -41,7 +42,6 @@ from heliograph.model.estimate import Claim, Innovation
 from heliograph.model.over_time import OverTime, at, first, restack, unstack
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
-from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import outer
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 from heliograph.random_affine.superposed import terms_without_common_memory
@@ -78,7 +78,7 @@ class AdditiveModalFilter(AbstractModalFilter):
     terms: Terms
     initial: tuple[Array, ...]
 
-    @in_float64
+    @compile_on_call
     def init(self) -> AdditiveBelief:
         """Return the prior, independent of the modes: Cov(zeta) = Gamma x E[x~ x~'], less E[x~] E[x~]' of x~ itself."""
         start = at(self.plant, 0)

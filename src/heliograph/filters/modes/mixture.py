@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.engine.choice import compile_on_call
 from heliograph.factors.columns import Columns, columns_of_each, join_columns, rounding_of, square_root
 from heliograph.factors.gaussian import (
     Gaussian,
@@ -37,7 +38,6 @@ from heliograph.model.premises.premise import believes
 from heliograph.model.sensor import AnySensor, LinearSensor, is_linear
 from heliograph.numerics.angle import Angles, nearest, wrap_angles
 from heliograph.numerics.check import fail, scalar
-from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import is_traced, stack_parts
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
@@ -102,7 +102,7 @@ class MixtureFilter(AbstractSizedFilter):
         """True: it is a mixture over atoms."""
         return True
 
-    @in_float64
+    @compile_on_call
     def init(self) -> MixtureBelief:
         """Return the prior, and the initial law of the modes."""
         start = at(self.plant, 0)

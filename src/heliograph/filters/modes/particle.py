@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
+from heliograph.engine.choice import compile_on_call
 from heliograph.factors.gaussian import Gaussian, from_covariance, moments_of_mixture
 from heliograph.filters.base import (
     AbstractSizedFilter,
@@ -47,7 +48,6 @@ from heliograph.model.premises.premise import believes
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.angle import Angles, wrap_angles
 from heliograph.numerics.check import check_count
-from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
 from heliograph.random_affine.memory import memories
 
@@ -95,7 +95,7 @@ class ParticleFilter(AbstractSizedFilter):
         """Return the angles of its plant, and those that its channel delivers."""
         return FilterAngles(first(self.plant).angles, self.observed_angles)
 
-    @in_float64
+    @compile_on_call
     def init(self) -> Particles:
         """Return the prior in every particle, with modes in proportion to their initial law."""
         start, n = at(self.plant, 0), self.particles

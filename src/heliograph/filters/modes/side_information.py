@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.engine.choice import compile_on_call
 from heliograph.factors.columns import (
     Columns,
     below_diagonal,
@@ -42,7 +43,6 @@ from heliograph.model.premises.premise import Premise, believing
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import array, probabilities
-from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import outer
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 from heliograph.random_affine.memory import memories
@@ -102,7 +102,7 @@ class SideInformationFilter(AbstractSizedFilter):
     initial: Float[Array, " M"]
     flagged: bool = eqx.field(static=True)
 
-    @in_float64
+    @compile_on_call
     def init(self) -> SideInformationBelief:
         """Return the prior, independent of the mode."""
         start, law = at(self.plant, 0), jnp.asarray(self.initial)

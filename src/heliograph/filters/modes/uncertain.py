@@ -10,6 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from heliograph.engine.choice import compile_on_call
 from heliograph.factors.columns import Columns, join_columns, triangularise
 from heliograph.factors.gaussian import Gaussian, from_columns
 from heliograph.filters.base import Step, corrects, predicts
@@ -35,7 +36,6 @@ from heliograph.model.estimate import Claim, Innovation
 from heliograph.model.over_time import at
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
-from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.lapack import eigh
 from heliograph.numerics.types import ArrayLike, Bool, Float
 
@@ -63,7 +63,7 @@ class UncertainModalFilter(AbstractJointModalFilter):
     Source: the filter of Costa (1994) with Young's inequality for the uncertain part of the chain.
     """
 
-    @in_float64
+    @compile_on_call
     def init(self) -> UncertainBelief:
         """Return the prior, independent of the mode, whose initial law is known."""
         law, (prior, second) = jnp.asarray(self.initial), compute_initial_moments(at(self.plant, 0), self.initial)

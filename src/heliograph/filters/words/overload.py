@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 
+from heliograph.engine.choice import compile_on_call
 from heliograph.linear.recursion import lmmse
 from heliograph.linear.system import LinearSystem, Steps
 from heliograph.model.channel import Channel
@@ -15,9 +16,8 @@ from heliograph.model.sensor import AnySensor, LinearSensor
 from heliograph.model.words.encoder import Words
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import fail
-from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import readable
-from heliograph.numerics.types import Float
+from heliograph.numerics.types import Array, Float
 from heliograph.random_affine.moments.second_moments import SecondOrder, second_order
 from heliograph.random_affine.words.rounded import Rounded
 
@@ -127,12 +127,17 @@ def _read_step(
 
 
 @cache_by_object
-@in_float64
 def _motion(plant: LinearPlant) -> Motion:
     """Return A, b and Cov w with inputs zero."""
+    a, b, q = _evaluate_motion(plant)
+    return np.asarray(a), np.asarray(b), np.asarray(q)
+
+
+@compile_on_call
+def _evaluate_motion(plant: LinearPlant) -> tuple[Array, Array, Array]:
+    """Return A, b and Cov w with inputs zero, by one program."""
     u = jnp.zeros(len(plant.inputs))
-    parts = plant.transition_matrix(u), plant.shift(u), plant.noise_covariance(u)
-    return np.asarray(parts[0]), np.asarray(parts[1]), np.asarray(parts[2])
+    return plant.transition_matrix(u), plant.shift(u), plant.noise_covariance(u)
 
 
 @cache_by_object

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from heliograph.engine.choice import compile_on_call
 from heliograph.factors.columns import join_columns, rounding_of
 from heliograph.factors.gaussian import (
     Gaussian,
@@ -23,7 +24,6 @@ from heliograph.filters.words.word_filter import Received, WordFilter
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import at, first
 from heliograph.numerics.angle import wrap_angles
-from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import ArrayLike, Float
 
 LEADING = 3  # bits; two leave one lock-in in 20,000 runs at 5 % of bits flipped, one leaves half of all
@@ -61,7 +61,7 @@ class TwoHypothesesFilter(AbstractSizedFilter):
         """Always True: a number that is no word is excluded."""
         return True
 
-    @in_float64
+    @compile_on_call
     def init(self) -> Hypotheses:
         """Return the prior twice, the first with all of the probability."""
         start = self.base.init()

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from heliograph.engine.choice import compile_on_call
 from heliograph.factors.gaussian import Gaussian, correct_by_gain
 from heliograph.filters.base import Step, corrects, make_sizes, predicts
 from heliograph.filters.gaussian.belief import second_moments_at_start
@@ -25,7 +26,6 @@ from heliograph.model.premises.premise import believes
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.angle import nearest
 from heliograph.numerics.check import fail, items
-from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.lapack import eigh
 from heliograph.numerics.types import ArrayLike, Bool, Float, Int
 from heliograph.random_affine.moments.second_moments import SecondOrder
@@ -79,7 +79,7 @@ class ClockFilter(AbstractWrapper):
         """Return the belief of plant and clocks."""
         return state.gaussian
 
-    @in_float64
+    @compile_on_call
     def init(self) -> ClockBelief:
         """Return the belief before any data."""
         start = self.base.init()

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.engine.choice import compile_on_call
 from heliograph.factors.columns import Columns
 from heliograph.filters.base import (
     AbstractFilter,
@@ -33,7 +34,6 @@ from heliograph.model.plant import AnyPlant, LinearPlant, Plant
 from heliograph.model.premises.premise import believes, believing
 from heliograph.model.sensor import AnySensor, LinearSensor
 from heliograph.numerics.check import check_count, fail, instance
-from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, check_maps
 from heliograph.random_affine.combine import Series
@@ -201,7 +201,7 @@ class LateFilter(AbstractWrapper):
         self.base, self.delay, self.claim, self.states = base, delay, base.claim, base.states
         self.inputs, self.received = base.inputs, base.received
 
-    @in_float64
+    @compile_on_call
     def init(self) -> LateState:
         """Return the state before any signal was sent."""
         start = jax.tree.map(jnp.asarray, self.base.init())

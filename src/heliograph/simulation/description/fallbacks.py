@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 import jax
-import jax.numpy as jnp
+import numpy as np
 
 from heliograph.disk.quoting import join_names
 from heliograph.engine.choice import explain_refusal
@@ -42,9 +42,8 @@ def _find_refused_filters(network: Network) -> Iterator[tuple[str, str]]:
     """Yield each filter whose step is refused, with the reason."""
     for who, named in _list_filters(network):
         filter = without_output_names(named)  # so that filters of one structure are compiled once
-        z, u = jnp.zeros(filter.received), jnp.zeros(len(filter.inputs))
-        state = jax.tree.map(jnp.asarray, filter.init())
-        if why := explain_refusal(_step, filter, state, z, u, jnp.asarray(0)):
+        z, u = np.zeros(filter.received), np.zeros(len(filter.inputs))
+        if why := explain_refusal(_step, filter, filter.init(), z, u, np.asarray(0)):
             yield who, why
 
 

@@ -1,7 +1,6 @@
 """Which outputs within n steps depend on which state: the observability matrix of a network at one state."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -28,22 +27,23 @@ def make_observability_matrix(
     plant: AbstractPlant, sensors: Sequence[AbstractSensor], state: Float[np.ndarray, " n"], steps: int
 ) -> Float[np.ndarray, "rows n"]:
     """Return d(y_1, ..., y_steps)/dx_0 at a state, all sensors stacked, with inputs of 1."""
-    return _differentiate_outputs(plant, tuple(sensors), state, np.arange(steps))
+    return np.asarray(_differentiate_outputs(plant, tuple(sensors), state, np.arange(steps)))
 
 
 def measure_from(
     plant: AbstractPlant, sensors: Sequence[AbstractSensor], states: Float[np.ndarray, "states n"], steps: int
 ) -> Float[np.ndarray, "states rows"]:
     """Return y_1, ..., y_steps of all sensors from each of some states, without noise, with inputs of 1."""
-    return _measure_from_states(plant, tuple(sensors), states, np.arange(steps))
+    return np.asarray(_measure_from_states(plant, tuple(sensors), states, np.arange(steps)))
 
 
 @compile_in_float64
 def _differentiate_outputs(
     plant: AbstractPlant, sensors: tuple[AbstractSensor, ...], state: Float[Array, " n"], rows: Int[Array, " steps"]
-) -> Any:
+) -> jax.Array:
     """Return d(outputs of all rows)/dx_0 (rows, n)."""
-    return jax.jacfwd(lambda x: _measure_rows(plant, sensors, x, rows))(state)
+    jacobian: jax.Array = jax.jacfwd(lambda x: _measure_rows(plant, sensors, x, rows))(state)
+    return jacobian
 
 
 @compile_in_float64
@@ -52,7 +52,7 @@ def _measure_from_states(
     sensors: tuple[AbstractSensor, ...],
     states: Float[Array, "states n"],
     rows: Int[Array, " steps"],
-) -> Any:
+) -> jax.Array:
     """Return the outputs of all rows from each state (states, rows)."""
     return jax.vmap(lambda x: _measure_rows(plant, sensors, x, rows))(states)
 
@@ -63,7 +63,7 @@ def _measure_rows(
     """Return y_1, ..., y_steps of all sensors from the state x, one after another, a step for each row."""
     u = jnp.ones(len(plant.inputs))
 
-    def step(x: jax.Array, _: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def step(x: jax.Array, _: object) -> tuple[jax.Array, jax.Array]:
         """Move the state, and measure it by all sensors."""
         x = plant.transition(x, u)
         return x, jnp.concatenate([sensor.under(plant.inputs, u).measure(x) for sensor in sensors])
