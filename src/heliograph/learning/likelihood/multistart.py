@@ -20,6 +20,7 @@ ROUNDS = 6  # of climbs, ends of domains, and proofs
 INWARDS = np.linspace(0.0, 40.0, 41)  # from the end of a domain
 EXACTLY = 20.0  # logarithm of the size of data over that of their innovations: two in a thousand million
 SEEN = 2.0  # nats by which a likelihood has fallen where a number is seen
+AT_ONE_POINT = 1e-3  # standard errors between starts that the first rows of a recording lead to one point
 SADDLE = -1e-3  # curvature in units of standard errors below which a point is no maximum
 
 Watch = Callable[[Maximum], None]
@@ -74,19 +75,21 @@ class Search:
     def run(self, starts: Float[np.ndarray, "starts p"], seed: int) -> Top:
         """Return the highest point that climbs reach, proved to be a maximum.
 
-        Climbs begin at all starts, then at as many points around the best, then near each end of the domains.
+        Climbs begin at all starts, then at as many points around the best, then near each end of the domains. In a long
+        recording its first rows say where most of them begin; the maximum is one of all rows.
 
         Args:
             starts: where to begin (starts, p); from a single one there is a single climb.
             seed: seed of the second round.
         """
         no_ends = np.zeros(starts.shape[1])
-        climbed = self._climb(starts, no_ends)
+        climbed = self._climb_by_first_rows(starts, no_ends, 0)
         top = self._prove_maximum(climbed)
         self.best, ends = top._replace(converged=False, reason=""), climbed.total
         if len(starts) > 1:
             around = self._draw_around(top, len(starts) - 1, seed)
-            climbed = self._climb(np.concatenate([around, top.x[None]]), no_ends)  # what climbs to the top joins it
+            # What climbs to the top joins it.
+            climbed = self._climb_by_first_rows(np.concatenate([around, top.x[None]]), no_ends, len(around))
             ends = np.concatenate([ends, climbed.total[:-1]])
             if climbed.total.max() > top.total + SAME:
                 top = self._prove_maximum(climbed)
@@ -128,7 +131,28 @@ class Search:
             centre[index] -= top.ends[index] * INWARDS[np.flatnonzero(rise > -SEEN)[-1]]
         points = centre + drawn * spread
         points[count + np.arange(len(lowered)), lowered] -= LOWERED
-        return self.surface.possible(points, top.x)
+        return (self.surface.of_first_rows() or self.surface).possible(points, top.x)
+
+    def _climb_by_first_rows(self, starts: np.ndarray, ends: np.ndarray, own: int) -> Maximum:
+        """Maximise from each start as `_climb` does, of long recordings from where their first rows lead.
+
+        Start number `own` climbs by all rows from where it is, since the first ones may know nothing of what comes
+        later; those that the first rows lead to one point climb together from there.
+        """
+        short = self.surface.of_first_rows() if len(starts) > 1 else None
+        if short is None:
+            return self._climb(starts, ends)
+        others, x = np.arange(len(starts)) != own, starts.copy()
+        moving = np.repeat((ends == 0)[None], len(starts) - 1, axis=0)
+        led = maximise(short.evaluate, starts[others], moving, None, self.surface.domains, joining=True)
+        x[others] = led.x
+        # Of each start the first one that is at the same point.
+        error = short.standard_errors(led.x[led.order[0]])
+        within = AT_ONE_POINT * np.where(np.isfinite(error), error, 0.0)
+        same = np.all(np.abs(x[:, None] - x[None]) <= within, axis=2)
+        lanes, places = np.unique(np.argmax(same, axis=1), return_inverse=True)
+        climbed = self._climb(self.surface.possible(x[lanes], starts[own]), ends)
+        return Maximum(*(leaf[places] for leaf in climbed[:-1]), climbed.steps)
 
     def _climb(self, starts: np.ndarray, ends: np.ndarray) -> Maximum:
         """Maximise from each start, coordinates at an end held there, and keep the best point seen so far."""

@@ -19,6 +19,8 @@ CUTS = 40  # of a profile at most
 EXACT = 1e-3  # of the root of a fall
 ENOUGH = 1e-6  # nats that may remain to be gained on a profile
 HALVINGS = 8  # of the way to a possible point
+FIRST = 1 << 14  # rows of a long recording that say where climbs from drawn starts begin
+LONG = 1 << 17  # rows
 TINY = 1e-300
 
 
@@ -45,6 +47,15 @@ class Surface:
         low, high = (np.concatenate(column) for column in zip(*map(_find_ends_at_infinity, every), strict=True))
         single = np.concatenate([np.full(number.size, number.domain.kind == "interval") for number in every])
         return Domains(low, high, single & (low | high))
+
+    def of_first_rows(self) -> "Surface | None":
+        """Return the likelihood of the first rows of long recordings alone; None where they are not long."""
+        data = self.data
+        if data.measurements.shape[1] < LONG:
+            return None
+        truth = None if data.truth is None else data.truth[:, :FIRST]
+        lengths = tuple(min(length, FIRST) for length in data.lengths)
+        return Surface(self.objective, Data(data.measurements[:, :FIRST], data.inputs[:, :FIRST], lengths, truth))
 
     def evaluations(self, x: Float[np.ndarray, "points p"]) -> Evaluation:
         """Return value, score and information at each point; those of the last points are kept."""
