@@ -2,13 +2,15 @@
 
 Run: python benchmarks/one_series.py [--without-peers], or within benchmarks/run.py. Positions and speeds in a plane, of
 which positions are measured: four states, two outputs, complete rows. Each is timed when warm, the least of three
-calls by the clock; slow peers take fewer rows. Means must agree to 1e-6, likelihoods to 1e-9 of their size.
+calls by the clock; slow peers take fewer rows. Means must agree to 1e-6, likelihoods to 1e-9 of their size. The
+gradient is that of the log-likelihood in two variances, with its information, as a fit takes it.
 """
 
 import json
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,10 @@ from peers.environments import python_of
 from peers.series import least
 
 import heliograph as hg
+from heliograph.learning.description import describe
+from heliograph.learning.likelihood.data import gather_data
+from heliograph.learning.likelihood.evaluation import evaluate_at_points
+from heliograph.learning.likelihood.objective import make_objectives
 
 ROWS = 1_000_000
 FEW = 30_000  # rows that are not divided into chunks
@@ -34,6 +40,7 @@ AT_MOST = {
     "heliograph, filter, row by row": 70.0,
     "heliograph, smoother": 60.0,
     "heliograph, likelihood": 20.0,
+    "heliograph, gradient": 80.0,
 }
 
 
@@ -50,6 +57,20 @@ def problem() -> dict[str, np.ndarray]:
     return {"A": a, "C": c, "Q": q, "R": r, "mean": np.zeros(4), "covariance": np.eye(4), "z": z}
 
 
+def score(p: dict[str, np.ndarray]) -> Callable[[], np.ndarray]:
+    """Return what computes the gradient of the log-likelihood in the sizes of the noise of plant and sensor, at 1."""
+
+    def build() -> hg.Network:
+        plant = hg.LinearPlant(p["A"], hg.free(1.0, "q", "positive") * p["Q"], p["mean"], p["covariance"])
+        sensor = hg.LinearSensor(p["C"], hg.free(1.0, "r", "positive") * p["R"])
+        return hg.Network(plant, {"node": hg.Node(sensor, hg.perfect(2), {})})
+
+    described = describe(build)
+    data = gather_data(described.start, {"node": p["z"]}, None, described.parameters.size)
+    objective, start = make_objectives(described)[0], described.parameters.start[None]
+    return lambda: evaluate_at_points(objective, start, data).gradient
+
+
 def ours(p: dict[str, np.ndarray]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Nanoseconds a row of each task, and its means or likelihood."""
     plant, sensor = hg.LinearPlant(p["A"], p["Q"], p["mean"], p["covariance"]), hg.LinearSensor(p["C"], p["R"])
@@ -61,7 +82,7 @@ def ours(p: dict[str, np.ndarray]) -> tuple[dict[str, Any], dict[str, np.ndarray
         "likelihood": lambda: hg.log_likelihood(item, z),
         "hg.run": lambda: hg.run(network, {"node": z}).estimates["node"]["Kalman"].mean,
     }
-    times = {name: least(task, len(z), 9) for name, task in tasks.items()}
+    times = {name: least(task, len(z), 9) for name, task in (tasks | {"gradient": score(p)}).items()}
     times["filter, row by row"] = least(lambda: item.run(z[:FEW]), FEW, 9)
     return times, {name: np.asarray(task()) for name, task in tasks.items()}
 
