@@ -152,7 +152,7 @@ class Search:
         same = np.all(np.abs(x[:, None] - x[None]) <= within, axis=2)
         lanes, places = np.unique(np.argmax(same, axis=1), return_inverse=True)
         climbed = self._climb(self.surface.possible(x[lanes], starts[own]), ends)
-        return Maximum(*(leaf[places] for leaf in climbed[:-1]), climbed.steps)
+        return Maximum(**{name: leaf if name == "steps" else leaf[places] for name, leaf in climbed._asdict().items()})
 
     def _climb(self, starts: np.ndarray, ends: np.ndarray) -> Maximum:
         """Maximise from each start, coordinates at an end held there, and keep the best point seen so far."""
