@@ -182,15 +182,9 @@ def _origin_of(filter: SteppedFilter, after: Filtered) -> Origin:
     origin = instance("after", after, Filtered, expected).origin
     if origin is None:
         raise fail("after", expected, "a result without the state after its last row")
-    if not isinstance(origin.model, type(filter)) or _shapes_of(origin.state) != _shapes_of(filter.init()):
+    if not isinstance(origin.model, type(filter)) or not origin.has_form_of(filter.init()):
         raise fail("after", expected, f"one of another filter, {type(origin.model).__name__}")
     return origin
-
-
-def _shapes_of(state: PyTree) -> tuple[object, list[tuple[int, ...]]]:
-    """Return the form of a filter's state, and the shapes of its arrays."""
-    leaves, form = jax.tree.flatten(state)
-    return form, [np.shape(leaf) for leaf in leaves]
 
 
 def _check_later(before: Origin, clock: np.ndarray) -> None:

@@ -4,10 +4,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Protocol, TypeAlias
 
+import jax
 import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.model.estimate import Estimate
+from heliograph.model.stuck import Repeats
 from heliograph.numerics.times.dates import seconds_between
 from heliograph.numerics.types import PyTree
 
@@ -27,6 +29,7 @@ class Origin:
         spacing: usual time between steps, of dates in seconds; NaN where it is not known.
         estimates: of a network, the last ones by node and filter.
         months: of the calendar between steps, of dates that are firsts of months; 0 of all others.
+        repeats: of a network, the runs of equal readings with which rows ended, by node with limits.
         several: whether these are the states of several plants side by side: then the leaves of `state`, `step`,
             `inputs`, `time` and the estimates have a leading axis of plants.
     """
@@ -39,7 +42,14 @@ class Origin:
     spacing: float = float("nan")
     estimates: Mapping[str, Mapping[str, Estimate]] = field(default_factory=dict)
     months: int = 0
+    repeats: Mapping[str, Repeats] = field(default_factory=dict)
     several: bool = False
+
+    def has_form_of(self, state: PyTree) -> bool:
+        """Return whether the state has the form of another one, and arrays of its shapes."""
+        own, other = ((str(form), [np.shape(leaf) for leaf in leaves])
+                      for leaves, form in map(jax.tree.flatten, (self.state, state)))  # fmt: skip
+        return own == other
 
 
 KeptOrigin = TypeAliasType("KeptOrigin", Origin | None)  # None where no state was kept

@@ -15,7 +15,7 @@ from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import array, check_columns, fail, instance, rank, table
 from heliograph.numerics.float64 import check_process
 from heliograph.numerics.times.row_times import check_times
-from heliograph.numerics.types import ArrayLike, Float, PyTree, units_in
+from heliograph.numerics.types import ArrayLike, PyTree, units_in
 from heliograph.simulation.arguments import inputs_of, measurement_of
 from heliograph.simulation.centres.blame import refuse_centrally
 from heliograph.simulation.centres.uplinks import SentReports
@@ -29,12 +29,19 @@ from heliograph.simulation.plausible_step import (
     describe_doubts,
     find_refused_rows,
 )
-from heliograph.simulation.recorded_rows import FilteringTask, central_states_before_rows, filter_rows
+from heliograph.simulation.recorded_rows import (
+    Begin,
+    FilteringTask,
+    central_states_before_rows,
+    check_behind,
+    filter_rows,
+    origin_behind,
+)
 from heliograph.simulation.results.no_numbers import warn_of_no_numbers
 from heliograph.simulation.results.record import Record
 from heliograph.simulation.results.reducer import trajectories_record
 from heliograph.simulation.screened import screen_recording
-from heliograph.simulation.smoothed import add_truth, make_smoothed_record, select_smoothed_part
+from heliograph.simulation.smoothed import SmoothedPart, add_truth, make_smoothed_record, select_smoothed_part
 from heliograph.simulation.stepping import AllFilters
 from heliograph.simulation.transmission.shared_dithers import refuse_shared_dithers
 from heliograph.smoothing.fixed_interval_lag_point import AbstractSmoothing
@@ -45,11 +52,12 @@ Reports = TypeAliasType("Reports", Mapping[str, Mapping[str, SentReports | Array
 def run(
     network: "Network",
     measurements: "Mapping[str, ArrayLike]",
-    inputs: "Float[ArrayLike, 'steps inputs'] | None" = None,
+    inputs: "ArrayLike | None" = None,
     time: "ArrayLike | None" = None,
-    truth: "Float[ArrayLike, 'steps n'] | None" = None,
+    truth: "ArrayLike | None" = None,
     smooth: "AbstractSmoothing | None" = None,
     reports: "Reports | None" = None,
+    after: "Record | None" = None,
 ) -> "Record":
     """Run every filter of the network over recorded measurements.
 
@@ -75,6 +83,8 @@ def run(
             at each step, (steps, received), NaN where it never arrived; `SentReports` where delays differ. For each
             fusion between neighbours and each of its nodes, (steps, rounds times neighbours), NaN where a neighbour's
             message did not arrive. They may be left out where the links are deterministic (default none).
+        after: what this returned for the rows before these, from which the filters go on: so a recording too long to be
+            held is run in blocks. Warnings count rows from the first of these. None (default): nothing is before them.
 
     Returns:
         The record, with the truth that was given: `record.rmse(node, filter)`, `record.nees(node, filter)`.
@@ -82,47 +92,61 @@ def run(
     Raises:
         ValueError: a node without measurements or the reverse, shapes that do not fit, times that go backwards, dates
             of rows that differ between nodes, two senders of words with the same dithers, a filter or fusion that
-            cannot be smoothed.
+            cannot be smoothed; `after` of another network or of later rows, or with what needs rows of both: smoothing,
+            a fusion whose messages may be late.
     """
     check_process()
     instance("network", network, Network, "a Network")
-    name = next(iter(network.nodes))
-    measured = table("measurements", measurements, f"arrays of nodes, such as {{{name!r}: z}},")
+    example = f"arrays of nodes, such as {{{next(iter(network.nodes))!r}: z}},"
+    measured = table("measurements", measurements, example)
     network = network.restricted_to(measured)
     steps = _count_rows(next(iter(measured.values())))
     # Measurements, inputs and times of one length.
     z = {name: measurement_of(name, measurements[name], steps, node) for name, node in network.nodes.items()}
-    network.check_horizon(steps)
+    smoothing = None if smooth is None else select_smoothed_part(network, smooth, steps)
+    filters = AllFilters(network, None if smoothing is None else smoothing.kinds, judges=True)
+    before = None if after is None else origin_behind(filters, after, smooths=smooth is not None)
+    first = 0 if before is None else int(before.step)
+    network.check_horizon(first + steps)
     u = inputs_of(network, inputs, steps)
     check_columns("truth", truth, network.states)
     true = None if truth is None else array("truth", truth, (steps, len(network.states)), missing=True)
     times = _find_times(measured, {"inputs": inputs, "truth": truth}, time, steps)
     warn_of_unequal_steps(network.inputs, times)
-    clock = np.arange(steps, dtype=np.float64) if times is None else times
+    clock = first + np.arange(steps, dtype=np.float64) if times is None else times
+    check_behind(before, clock)
     refuse_shared_dithers(network, z)
-    z, refused, said = screen_recording(network, z, u)
+    z, refused, said, repeats = screen_recording(network, z, u, {} if before is None else before.repeats)
     _warn_of_each((*said, *warn_beyond_a_turn(network, z)))
     # Filters, on what a recording without implausible data has.
-    smoothing = None if smooth is None else select_smoothed_part(network, smooth, steps)
-    filters = AllFilters(network, None if smoothing is None else smoothing.kinds, judges=True)
+    begin = None if before is None else Begin(before.state, np.asarray(first))
     with jax.enable_x64(True):
         arrivals = _collect_arrivals(filters, {} if reports is None else reports, steps)
         smoother = None if smoothing is None else smoothing.smoother(filters)
-        outputs = _filter_plausible(network, z, refused, FilteringTask(filters, smoother, u, arrivals))
+        outputs = _filter_plausible(network, z, refused, FilteringTask(filters, smoother, u, arrivals, begin))
     state = outputs.pop("state")
-    if smoothing is None:
-        record = trajectories_record(network, {"truth": None, **outputs}, clock)
-    else:
-        record = make_smoothed_record(network, smoothing, outputs, clock)
+    record = _make_record(network, smoothing, outputs, clock)
     if time is not None and (unit := units_in(network.inputs).get(TIME_STEP)):
         record = replace(record, units=record.units | {"time": unit})
-    warn_of_no_numbers(record)
-    doubts = *warn_wide_in_rows(network, record), *doubt_estimates(network, record)
-    _warn_of_each((*doubts, *_describe_left_out(network, record), *say_remarks(network, state)))
+    _warn_of_record(network, record, state)
     # Row numbers are one apart: two of them say so.
     origin = _make_origin(network, record, state, u, usual_spacing(clock if times is not None else clock[:2]))
     record = record if true is None else add_truth(record, network.plant, true, smooth)
-    return record.with_origin(origin).with_refused(refused)
+    return record.with_origin(replace(origin, step=first + steps, repeats=repeats)).with_refused(refused)
+
+
+def _warn_of_record(network: Network, record: Record, state: PyTree) -> None:
+    """Warn of what a record shows: no numbers, wide angles, impossible estimates, what filters left out or remark."""
+    warn_of_no_numbers(record)
+    doubts = *warn_wide_in_rows(network, record), *doubt_estimates(network, record)
+    _warn_of_each((*doubts, *_describe_left_out(network, record), *say_remarks(network, state)))
+
+
+def _make_record(network: Network, smoothing: SmoothedPart | None, outputs: PyTree, clock: np.ndarray) -> Record:
+    """Return the record of what all filters made of the rows, with its smoothed part where there is one."""
+    if smoothing is None:
+        return trajectories_record(network, {"truth": None, **outputs}, clock)
+    return make_smoothed_record(network, smoothing, outputs, clock)
 
 
 def _warn_of_each(lines: Sequence[str]) -> None:

@@ -9,26 +9,78 @@ import numpy as np
 from heliograph.engine.choice import compute_once
 from heliograph.filters.chunks import scan_in_chunks
 from heliograph.filters.recursion import Recursion
+from heliograph.model.origin import Origin
+from heliograph.numerics.check import fail, instance
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.types import Array, PyTree
-from heliograph.simulation.centres.uplinks import Drawn
 from heliograph.simulation.plausible_step import step_plausibly
+from heliograph.simulation.results.record import Record
 from heliograph.simulation.smoothed import Smoother
 from heliograph.simulation.stepping import AllFilters, initial_states
 
+EXPECTED = "what hg.run of this network returned for the rows before"
 ROWS = 128  # of a recording with fusions between neighbours, whose weights are in memory at a time
+
+
+class Begin(NamedTuple):
+    """Where rows begin that go on behind others: the filters' states there, and the number of the first row."""
+
+    states: PyTree
+    step: np.ndarray
 
 
 class FilteringTask(NamedTuple):
     """All that a recording is filtered with but its measurements: filters, smoother, inputs (steps, inputs), arrivals.
 
     `arrivals`: which reports arrived of each fusion by reports, and which messages of one between neighbours, by name.
+    `begin`: of rows behind others; None of the first ones.
     """
 
     filters: AllFilters
     smoother: Smoother | None
     u: np.ndarray
     arrivals: dict[str, PyTree]
+    begin: Begin | None = None
+
+    def first_states(self) -> PyTree:
+        """Return the states before the first of these rows."""
+        return self.filters.init() if self.begin is None else jax.tree.map(jnp.asarray, self.begin.states)
+
+    def rows(self, z: tuple[np.ndarray, ...]) -> tuple[PyTree, ...]:
+        """Return the rows: their numbers, inputs, measurements, and what arrived."""
+        numbers = jnp.arange(len(self.u))
+        return numbers if self.begin is None else self.begin.step + numbers, self.u, z, self.arrivals
+
+
+def origin_behind(filters: AllFilters, after: Record, smooths: bool) -> Origin:
+    """Return the states behind earlier rows, of these filters.
+
+    Raises:
+        ValueError: no such record; smoothing, which needs all rows; a fusion whose messages may come rows later.
+    """
+    origin = instance("after", after, Record, EXPECTED).origin
+    if origin is None:
+        raise fail("after", EXPECTED, "a record without the last states of its filters")
+    if smooths:
+        raise fail("after", "no smoothing, which needs all rows at once", "smooth")
+    if late := [*filters.reporting, *filters.meshes]:
+        raise fail("after", "no fusion by reports or between neighbours, which may come rows later", late)
+    if not origin.has_form_of(jax.eval_shape(filters.init)):
+        raise fail("after", EXPECTED, "one of another network")
+    return origin
+
+
+def check_behind(origin: Origin | None, clock: np.ndarray) -> None:
+    """Check that rows are not before the last one before them.
+
+    Raises:
+        ValueError: their first time is, or is a date where that is a number, or the reverse.
+    """
+    if origin is None:  # nothing is before them
+        return
+    last, first = np.asarray(origin.time), clock[0]
+    if last.dtype.kind != clock.dtype.kind or first < last:
+        raise fail("time", f"rows behind {origin.time}, the last one before them", str(first))
 
 
 def filter_rows(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool) -> PyTree:
@@ -50,11 +102,12 @@ class NetworkRows(Recursion):
     """Recursion of all filters of a network over rows; each row's output is all that they estimate and judge."""
 
     filters: AllFilters
+    begin: Array
 
     def step(self, state: PyTree, row: tuple[PyTree, Array], k: Array) -> tuple[PyTree, PyTree]:
         """Step all filters over one row; return their states and what is recorded of them."""
         z, u = row
-        return self.filters.step(state, z, jnp.asarray(u), jnp.asarray(k), {})
+        return self.filters.step(state, z, jnp.asarray(u), jnp.asarray(self.begin + k), {})
 
 
 def _filter_in_chunks(task: FilteringTask, z: tuple[np.ndarray, ...]) -> PyTree | None:
@@ -64,13 +117,14 @@ def _filter_in_chunks(task: FilteringTask, z: tuple[np.ndarray, ...]) -> PyTree 
     """
     if task.smoother is not None or not task.filters.are_linear:
         return None
-    filtered = scan_in_chunks(NetworkRows(task.filters), to_numpy(initial_states(task.filters)), (z, task.u))
+    begin = task.begin or Begin(initial_states(task.filters), np.asarray(0))
+    filtered = scan_in_chunks(NetworkRows(task.filters, begin.step), to_numpy(begin.states), (z, task.u))
     return None if filtered is None else _collect_results(None, z, *filtered)
 
 
 def _scan_in_parts(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool) -> PyTree:
     """Return what `filter_rows` does, by XLA, some rows at a time, whose weights between neighbours come ahead."""
-    filters, smoother, u, arrivals = task
+    filters, smoother, u, arrivals, _ = task  # rows of such a network are behind no others
     # As few parts of at most ROWS rows as there can be, of one size, so that they share a program.
     count = -(-len(u) // ROWS)
     size = -(-len(u) // count)
@@ -89,8 +143,7 @@ def _scan_in_parts(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool)
 
 def _run_filters(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool) -> PyTree:
     """Return what `filter_rows` does, of all rows in one scan."""
-    filters, smoother, u, arrivals = task
-    return _collect_results(smoother, z, *_scan(filters, filters.init(), (jnp.arange(len(u)), u, z, arrivals), judged))
+    return _collect_results(task.smoother, z, *_scan(task.filters, task.first_states(), task.rows(z), judged))
 
 
 def _scan(
@@ -121,20 +174,18 @@ def _collect_results(
 
 def central_states_before_rows(task: FilteringTask, z: tuple[np.ndarray, ...]) -> PyTree:
     """Return the states of the central filters before each row, by name; z as of `filter_rows`."""
-    return compute_once(_collect_central_states, _central_states_by_xla, (task.filters, task.u, task.arrivals, z))
+    return compute_once(_collect_central_states, _central_states_by_xla, (task._replace(smoother=None), z))
 
 
-def _collect_central_states(
-    filters: AllFilters, u: np.ndarray, arrivals: dict[str, Drawn], z: tuple[np.ndarray, ...]
-) -> PyTree:
+def _collect_central_states(task: FilteringTask, z: tuple[np.ndarray, ...]) -> PyTree:
     """Return the states of the central filters before each row."""
 
     def step(states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
         """Step all filters; the central ones' states before the step are the output."""
         k, u_k, z_k, drawn = row
-        return step_plausibly(filters, states, z_k, u_k, k, drawn)[0], states[1]
+        return step_plausibly(task.filters, states, z_k, u_k, k, drawn)[0], states[1]
 
-    before: PyTree = jax.lax.scan(step, filters.init(), (jnp.arange(len(u)), u, z, arrivals))[1]
+    before: PyTree = jax.lax.scan(step, task.first_states(), task.rows(z))[1]
     return before
 
 

@@ -1,5 +1,6 @@
 """Measurements of a recording without readings that their nodes refuse, and what is said of these and of silences."""
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -22,26 +23,33 @@ class ScreenedRecording(NamedTuple):
         refused: by node the number of the reason of each reading, 0 where it is kept, (steps, received).
         said: what is said of that, of values that the rule of their sender forbids, which stay, and of silences that
             are longer than a node's timeout; a line each.
+        repeats: the runs of equal readings with which rows end, by node with limits.
     """
 
     measurements: dict[str, np.ndarray]
     refused: dict[str, np.ndarray]
     said: list[str]
+    repeats: dict[str, Repeats]
 
 
-def screen_recording(network: Network, z: dict[str, np.ndarray], u: np.ndarray) -> ScreenedRecording:
+def screen_recording(
+    network: Network, z: dict[str, np.ndarray], u: np.ndarray, before: Mapping[str, Repeats]
+) -> ScreenedRecording:
     """Return the measurements without readings that their nodes refuse, with the reason of each.
 
     Args:
         network: the network.
         z: by node, (steps, received), NaN where nothing arrived.
         u: inputs (steps, inputs).
+        before: the runs of equal readings with which the rows before these ended, by node; {} before the first ones.
     """
     kept, refused, said = dict[str, np.ndarray](), dict[str, np.ndarray](), list[str]()
+    repeats = dict[str, Repeats]()
     for name, node in network.nodes.items():
         kept[name], refused[name], lines = z[name], np.zeros(z[name].shape, dtype=np.int8), list[str]()
         if node.limits is not None:
-            screened = node.limits.screen(z[name], Repeats())
+            screened = node.limits.screen(z[name], before.get(name, Repeats()))
+            repeats[name] = screened.repeats
             kept[name], refused[name] = screened.values, screened.refused.astype(np.int8)
             lines = [
                 _describe_refused(reason, node.limits, z[name], refused[name], node)
@@ -56,7 +64,7 @@ def screen_recording(network: Network, z: dict[str, np.ndarray], u: np.ndarray) 
     timeouts = {name: node.timeout for name, node in network.nodes.items()}
     silences = find_long_silences(timeouts, kept, u, network.inputs)
     said += [f"node {name!r}: {found.describe()}" for name, found in silences.items()]
-    return ScreenedRecording(kept, refused, said)
+    return ScreenedRecording(kept, refused, said, repeats)
 
 
 def _describe_refused(
