@@ -21,7 +21,7 @@ import numpy as np
 import heliograph as hg
 from heliograph.engine.choice import choose_code
 from heliograph.learning.description import Build, describe
-from heliograph.learning.intervals import Method, long_run, quantile, sandwich
+from heliograph.learning.intervals import Method, estimate_long_run_covariance, quantile, sandwich
 from heliograph.learning.likelihood.evaluation import Evaluation, evaluate_recording
 from heliograph.learning.likelihood.objective import Form, Objective, make_objectives
 from heliograph.learning.likelihood.surface import DIFFERENCE
@@ -141,7 +141,7 @@ class Fits:
         """Ends of 95 % intervals (runs, p), as `Fit.rows` makes them; NaN where a number has run to a limit."""
         reach = np.full(self.x.shape, np.nan)
         for i in np.flatnonzero(self.inside):
-            result = long_run(method, [self.scores[i]], self.hessian[i])
+            result = estimate_long_run_covariance(method, [self.scores[i]], self.hessian[i])
             spread = np.diag(sandwich(self.hessian[i], result.covariance))
             reach[i] = quantile(result.freedom) * np.sqrt(np.maximum(spread, 0.0))
         return self._back(self.x - reach), self._back(self.x + reach)

@@ -15,7 +15,7 @@ import numpy as np
 
 import heliograph as hg
 from heliograph.simulation.arguments import key_of
-from heliograph.simulation.runs.native import code_of_network
+from heliograph.simulation.runs.native import compile_network_runs
 
 HERE = Path(__file__).resolve().parent
 PAGE = HERE.parent / "docs" / "operations.md"
@@ -75,7 +75,7 @@ def of_networks() -> list[Row]:
 
 def _of_node(network: hg.Network) -> int:
     """Count the operations that differ between runs and that these share, of a step and node."""
-    code = code_of_network(network, np.zeros((STEPS, 0)), key_of(0), hg.Statistics(), 64).begun.program.code
+    code = compile_network_runs(network, np.zeros((STEPS, 0)), key_of(0), hg.Statistics(), 64).begun.program.code
     work: float = code.blocks.work + (0 if code.once is None else code.once.work)
     return round(work / STEPS / len(network.names))
 

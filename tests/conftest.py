@@ -131,9 +131,9 @@ def keep_contexts():
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_protocol(item, nextitem):
     """Tests trace from deep within pytest: they have room on the interpreter's stack."""
-    from heliograph.numerics import make_room
+    from heliograph.numerics import reserve_stack
 
-    return make_room(item.config.pluginmanager.getplugin("runner").pytest_runtest_protocol)(item, nextitem)
+    return reserve_stack(item.config.pluginmanager.getplugin("runner").pytest_runtest_protocol)(item, nextitem)
 
 
 @pytest.fixture(scope="session")

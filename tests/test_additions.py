@@ -39,7 +39,7 @@ FILTER = {
 
 import jax.numpy as jnp
 
-from heliograph.factors.columns import Columns, columns_of, join_columns
+from heliograph.factors.columns import WeightedColumns, columns_of, join_columns
 from heliograph.factors.gaussian import from_columns, from_covariance, predict_affine
 from heliograph.filters.base import AbstractSizedFilter, corrects, make_sizes, predicts
 from heliograph.filters.innovation import gaussian_innovation
@@ -69,8 +69,8 @@ class FixedGainFilter(AbstractSizedFilter):
         z, c, noise = jnp.asarray(z), jnp.asarray(self.sensor.matrix), self.sensor.noise.columns
         gain, expected = jnp.where(jnp.isnan(z), 0.0, self.gain), c @ state.mean
         mean = state.mean + gain @ jnp.where(jnp.isnan(z), 0.0, z - expected)
-        kept = Columns(state.root - gain @ c @ state.root, state.variances)
-        total = join_columns(Columns(c @ state.root, state.variances), noise).covariance
+        kept = WeightedColumns(state.root - gain @ c @ state.root, state.variances)
+        total = join_columns(WeightedColumns(c @ state.root, state.variances), noise).covariance
         after = from_columns(mean, join_columns(kept, noise.through(gain)))
         return after, gaussian_innovation(z, expected, total)
 
@@ -94,7 +94,7 @@ import numpy as np
 
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.hop import known
-from heliograph.random_affine.moments.monomials import Moments
+from heliograph.random_affine.moments.monomials import JointMoments
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(40)
 
@@ -119,7 +119,7 @@ class Turned(AbstractRandomAffine):
     def moments(self, order):
         turns = [known([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]) for a in NODES * self.widest]
         matrices = np.array([turn.moments(order).matrix for turn in turns])
-        return Moments(np.tensordot(WEIGHTS / 2, matrices, axes=1), 2, 2, order)
+        return JointMoments(np.tensordot(WEIGHTS / 2, matrices, axes=1), 2, 2, order)
 
     def mean_gain(self):
         return known(np.sinc(self.widest / np.pi) * np.eye(2))

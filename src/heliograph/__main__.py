@@ -27,10 +27,10 @@ def command() -> None:
             signal.signal(number, lambda number, _: os._exit(128 + number))  # while it is imported nothing is to undo
     gc.set_threshold(*RARELY)
     from heliograph.cli import SIGNALLED, main
-    from heliograph.numerics.process.stack import make_room
+    from heliograph.numerics.process.stack import reserve_stack
 
     try:
-        code = make_room(main)()
+        code = reserve_stack(main)()
     except BaseException as error:
         code = _find_exit_code(error)
     for number in (signal.SIGINT, signal.SIGTERM):  # all is done

@@ -12,27 +12,27 @@ from straightline.compiled import addresses, aligned, memory_of, threads
 from straightline.folding import DTYPES
 from straightline.llvm.module import write_module
 from straightline.lowering import like
-from straightline.machine import Tiers, features, narrow
-from straightline.program import Program, Summed, fold_rows, lower, row_length
+from straightline.machine import TieredCode, features, narrow
+from straightline.program import Program, SummedOutputs, fold_rows, lower_function, row_length
 
 PARTS = 64  # sums of their own, which computers of any number of cores share out
 
 
-class Accumulated:
+class AccumulatedProgram:
     """Code of a program with one argument that differs between runs, the number of the run.
 
     `common` says of each result, leaf by leaf, whether all runs share it, and `summed` whether it is summed.
     """
 
-    def __init__(self, program: Program, summed: Summed):
+    def __init__(self, program: Program, summed: SummedOutputs):
         differs = [n == summed.number for n in range(len(program.inputs))]
         self.summed, self.tree = summed, program.tree
         self.types = [DTYPES[b.type] for n, b in enumerate(program.inputs) if n != summed.number]
         self.code = write_module(program, differs, None, features()[2], summed=summed)
         self.common, self.operations = self.code.common, self.code.operations
         self.width = self.code.width
-        self.blocks = Tiers(self.code.blocks, (narrow(self.width), self.width))
-        self.once = None if self.code.once is None else Tiers(self.code.once, (1, 1))
+        self.blocks = TieredCode(self.code.blocks, (narrow(self.width), self.width))
+        self.once = None if self.code.once is None else TieredCode(self.code.once, (1, 1))
 
     def memory(self, runs: int, lanes: int, in_flight: int) -> tuple[float, float, float]:
         """Return bytes of what is collected of `runs`, of `lanes` sums kept apart, and of the variables of all runs.
@@ -50,12 +50,12 @@ class Accumulated:
                 collected += float(buffer.size) * np.dtype(DTYPES[buffer.type]).itemsize
         return runs * collected, lanes * sums, float(self.code.shared) + in_flight * float(self.code.scratch)
 
-    def begin(self, arguments: Sequence[Any], runs: int) -> "Begun":
+    def begin(self, arguments: Sequence[Any], runs: int) -> "BegunProgram":
         """Return the program with its arguments (all but the run's number), and what all runs share, computed.
 
         The code is made for as many runs as will follow.
         """
-        return Begun(self, arguments, runs)
+        return BegunProgram(self, arguments, runs)
 
     def __call__(self, *arguments: PyTree, runs: int, first: int = 0) -> PyTree:
         """Compute runs on all cores; return sums, (..., batch), and what is collected, (run, ...).
@@ -90,10 +90,10 @@ class Accumulated:
         return jax.tree.unflatten(self.tree, leaves)
 
 
-class Begun:
+class BegunProgram:
     """A program with its arguments; `shared` has the results that all runs share, None for all others."""
 
-    def __init__(self, program: Accumulated, arguments: Sequence[Any], runs: int):
+    def __init__(self, program: AccumulatedProgram, arguments: Sequence[Any], runs: int):
         self.program, self.summed = program, program.summed.outputs
         self.arguments = [memory_of(x, t) for x, t in zip(arguments, program.types, strict=True)]
         self.memory = aligned(program.code.shared)
@@ -176,7 +176,7 @@ def accumulate(
     batches: int = 1,
     known: Mapping[int, np.ndarray] = MappingProxyType({}),
     single: bool = False,
-) -> Accumulated:
+) -> AccumulatedProgram:
     """Compile a JAX function of the number of a run, whose results are summed over runs or collected.
 
     Such is a Monte Carlo simulation: the run's number makes its key. What is summed takes no more memory for more runs.
@@ -199,7 +199,7 @@ def accumulate(
     features()  # refuses a processor that LLVM does not know
     leaves = jax.tree.leaves(examples)
     numbers = {n: (np.asarray(mask), np.asarray(leaves[n])) for n, mask in known.items()}
-    program = lower(function, *examples, like((), np.uint32), known=numbers, single=single)
+    program = lower_function(function, *examples, like((), np.uint32), known=numbers, single=single)
     # The results are a pair: leaves of its first part are summed.
     pair, data = program.tree.children(), program.tree.node_data()
     if data is None or data[0] is not tuple or len(pair) != 2:
@@ -207,7 +207,7 @@ def accumulate(
         raise ValueError(f"function of a run: expected {expected}, got {program.tree}")
     count = pair[0].num_leaves
     summed = tuple(n < count for n in range(len(program.outputs)))
-    return Accumulated(program, Summed(outputs=summed, batches=batches, number=len(leaves)))
+    return AccumulatedProgram(program, SummedOutputs(outputs=summed, batches=batches, number=len(leaves)))
 
 
 def _add_in_order(sums: Sequence[np.ndarray]) -> np.ndarray:

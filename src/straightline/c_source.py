@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from straightline.nodes import REAL, Block, Buffer, Check, Guard, Loop, Node, Store, Type, Unsupported
+from straightline.nodes import REAL, Block, Buffer, Guard, Loop, LoopExit, Node, Store, Type, Unsupported
 from straightline.program import list_needed
 
 Real = Literal["double", "float"]
@@ -60,7 +60,7 @@ def c_type(type: Type, real: Real) -> str:
     return {"bool": "int", "i32": "int32_t", "i64": "int64_t", "u32": "uint32_t", "u64": "uint64_t"}[type]
 
 
-def literal(value: float | int | bool, type: Type, real: Real) -> str:
+def write_literal(value: float | int | bool, type: Type, real: Real) -> str:
     """Return a known number as a literal with every digit that its type has.
 
     Raises:
@@ -89,7 +89,7 @@ def literal(value: float | int | bool, type: Type, real: Real) -> str:
     return f"({text})" if text.startswith("-") else text
 
 
-def expression(node: Node, arguments: Sequence[str], real: Real) -> str:
+def write_expression(node: Node, arguments: Sequence[str], real: Real) -> str:
     """Return the C expression of a node's operation on arguments, which are names and literals.
 
     Raises:
@@ -189,14 +189,14 @@ class CSource:
 
     def name(self, node: Node) -> str:
         """Return the variable or literal of a number."""
-        return literal(node.value, node.type, self.real) if node.op == "constant" else self.names[node]
+        return write_literal(node.value, node.type, self.real) if node.op == "constant" else self.names[node]
 
     def _clip_to_range(self, node: Node) -> str:
         """Return a number as the end of a range: the largest of the precision in place of one beyond it."""
         if node.op != "constant" or self.real != "float" or not math.isfinite(node.value):
             return self.name(node)
         largest = float(np.finfo(np.float32).max)
-        return literal(
+        return write_literal(
             min(max(node.value, -largest), largest) if node.type == "f64" else node.value, node.type, self.real
         )
 
@@ -205,7 +205,7 @@ class CSource:
         lines: list[str] = []
         for statement in block.items:
             # Only what is needed; the end of a loop always is.
-            if statement not in self.needed and not isinstance(statement, Check):
+            if statement not in self.needed and not isinstance(statement, LoopExit):
                 continue
             if isinstance(statement, Node):
                 lines += self._write_node(statement, indent)
@@ -245,7 +245,7 @@ class CSource:
             text = self._write_entry(buffer, offset, strides, node.args)
         else:
             named = self._clip_to_range if node.op in ("min", "max") else self.name
-            text = expression(node, [named(a) for a in node.args], self.real)
+            text = write_expression(node, [named(a) for a in node.args], self.real)
             self.operations[node.op] = self.operations.get(node.op, 0) + 1
         self.names[node] = self._new_name()
         return [f"{indent}const {c_type(node.type, self.real)} {self.names[node]} = {text};"]
@@ -272,7 +272,7 @@ class CSource:
         key = (buffer.type, values.tobytes())
         if key not in self.tables:
             name = f"{self.prefix}_table_{len(self.tables)}"
-            numbers = [literal(x, buffer.type, self.real) for x in values.ravel().tolist()]
+            numbers = [write_literal(x, buffer.type, self.real) for x in values.ravel().tolist()]
             head = f"static const {c_type(buffer.type, self.real)} {name}[{len(numbers)}] = {{"
             self.tables[key] = name, "\n".join([head, *_wrap_numbers(numbers), "};"])
         return self.tables[key][0]

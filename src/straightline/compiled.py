@@ -15,10 +15,10 @@ from jaxtyping import PyTree
 from straightline.folding import DTYPES
 from straightline.limits import ALONE, LITTLE, LONGEST
 from straightline.llvm.layout import LINE
-from straightline.llvm.module import Code, write_module
-from straightline.machine import Machine, Tiers, features, generate, narrow
+from straightline.llvm.module import ModuleText, write_module
+from straightline.machine import Machine, TieredCode, features, generate, narrow
 from straightline.nodes import Unsupported
-from straightline.program import Program, lower
+from straightline.program import Program, lower_function
 from straightline.result_memory import from_line, in_lines
 
 SHARES = 4  # parts of the work for each core, so that one that is held up holds up little
@@ -39,13 +39,13 @@ class Compiled:
         self.shapes = [b.shape for b in program.inputs]
         self.tree = program.tree
         # If runs share all arguments, they are one, whose results are computed in the arrays that are returned.
-        self.code: Code = write_module(program, self.differs, width, features()[2], alone=not any(self.differs))
+        self.code: ModuleText = write_module(program, self.differs, width, features()[2], alone=not any(self.differs))
         self.width, self.common = self.code.width, self.code.common
         self.operations, self.divisions = self.code.operations, self.code.divisions
         # Code for blocks of runs, for what all runs share, and for one run alone.
-        self.blocks = Tiers(self.code.blocks, (width or narrow(self.width), self.width))
-        self.once = None if self.code.once is None else Tiers(self.code.once, (1, 1))
-        self.single = Tiers(self.code.blocks, (1, 1))
+        self.blocks = TieredCode(self.code.blocks, (width or narrow(self.width), self.width))
+        self.once = None if self.code.once is None else TieredCode(self.code.once, (1, 1))
+        self.single = TieredCode(self.code.blocks, (1, 1))
         self._refusal: str | None = None  # why LLVM makes no code, "" if it does, None until it was tried
         self._first: list[np.ndarray] = []  # the first arguments, which calls leave out, and their addresses
         self._addresses, self._tables = list[int](), addresses(self.code.tables)
@@ -60,7 +60,7 @@ class Compiled:
         new._addresses, new._shared = addresses(new._first), None
         return new
 
-    def for_runs(self, runs: int, inputs: Mapping[int, np.ndarray] = MappingProxyType({})) -> "InPlace":
+    def for_runs(self, runs: int, inputs: Mapping[int, np.ndarray] = MappingProxyType({})) -> "InPlaceCode":
         """Return the same code for so many runs at a time, with memory of its own: no call of it makes an array.
 
         Args:
@@ -68,7 +68,7 @@ class Compiled:
             inputs: arrays that are read in place, by the numbers of the arguments that calls do not leave out; others
                 are made.
         """
-        return InPlace(self, runs, inputs)
+        return InPlaceCode(self, runs, inputs)
 
     def prepare(self, arrays: Sequence[Any] = ()) -> str:
         """Generate what a first call of these arrays, or of one run, takes; return "", or why LLVM makes no code."""
@@ -84,7 +84,7 @@ class Compiled:
                 self._refusal = str(error)
         return self._refusal
 
-    def _choose_tiers(self, runs: int) -> tuple[Tiers, int]:
+    def _choose_tiers(self, runs: int) -> tuple[TieredCode, int]:
         """Return the code for so many runs, and the most runs of its vectors: one run fills no lanes."""
         return (self.single, 1) if runs == 1 else (self.blocks, self.width)
 
@@ -144,7 +144,7 @@ class Compiled:
             for some, count in zip(arrays, counts, strict=True):
                 own = [x[begin : begin + count] for x in outputs]
                 pointers, memory = self._point_to(some, own, shared), (some, code.tables, own, shared)
-                self._compute_blocks(Call(machine=machine, pointers=pointers, memory=memory, runs=count), cores)
+                self._compute_blocks(CallMemory(machine=machine, pointers=pointers, memory=memory, runs=count), cores)
                 begin += count
         return jax.tree.unflatten(self.tree, outputs)
 
@@ -153,7 +153,7 @@ class Compiled:
         own = addresses(arrays[len(self._first) :])
         return np.array([*self._addresses, *own, *self._tables, *addresses([*outputs, shared])], dtype=np.uint64)
 
-    def _compute_blocks(self, call: "Call", cores: int | None) -> None:
+    def _compute_blocks(self, call: "CallMemory", cores: int | None) -> None:
         """Compute all blocks of runs of a call: here if that is little work, else shared among threads."""
         blocks, scratch, work = -(-call.runs // call.machine.width), self.code.scratch, self.code.blocks.work
         share = max(-(-blocks // ((cores or cpu_count()) * SHARES)), -(-LITTLE // max(work, 1)))
@@ -172,7 +172,7 @@ class Compiled:
                 array[...] = shared[offset : offset + size].view(array.dtype).reshape(buffer.shape)
 
 
-class Call(NamedTuple):
+class CallMemory(NamedTuple):
     """Code and all the memory of one call, held by each thread that computes a part of it.
 
     Who waits for the parts may stop waiting, at a Ctrl-C for example: the threads go on to write.
@@ -189,7 +189,7 @@ class Call(NamedTuple):
         self.machine.run(self.pointers.ctypes.data, memory.ctypes.data, begin, end, self.runs)
 
 
-class InPlace:
+class InPlaceCode:
     """Code of a `Compiled` for so many runs, in arrays of its own: a call computes `outputs` from `inputs`.
 
     What all runs share, but the first arguments, which calls leave out, is computed in every call. Bits are those of
@@ -230,15 +230,15 @@ class InPlace:
         if self._is_little:
             machine.run(*self._at, 0, -(-self.runs // machine.width), self.runs)
         else:
-            self._compiled._compute_blocks(Call(machine, self._pointers, self._memory, self.runs), None)
+            self._compiled._compute_blocks(CallMemory(machine, self._pointers, self._memory, self.runs), None)
 
-    def _compute_shared(self, once: Tiers) -> None:
+    def _compute_shared(self, once: TieredCode) -> None:
         """Compute what all runs share."""
         once.machine(1).run(self._at[0], 0, 0, 1, 1)
         self._compiled._copy_common(self.outputs, self._memory[-1])
 
 
-class Alone:
+class SingleRunCode:
     """Code for one run with its own memory of arguments and results, which a call reads and writes in place.
 
     `in_place` says which results, leaf by leaf, are written over which arguments, such as a filter's state.
@@ -251,7 +251,7 @@ class Alone:
         self._arguments = [(b.shape, DTYPES[b.type]) for b in program.inputs]
         self._allocate([])
 
-    def again(self, first: Sequence[np.ndarray]) -> "Alone":
+    def again(self, first: Sequence[np.ndarray]) -> "SingleRunCode":
         """Return the same code with new memory; the first arguments are these arrays, which a call only reads."""
         new = copy(self)
         new._allocate(first)
@@ -302,7 +302,7 @@ def compile(
     """
     features()  # refuses a processor that LLVM does not know
     differs = [n not in shared for n, example in enumerate(examples) for _ in jax.tree.leaves(example)]
-    return Compiled(lower(function, *examples, most=most or 2 * LONGEST, single=single), differs)
+    return Compiled(lower_function(function, *examples, most=most or 2 * LONGEST, single=single), differs)
 
 
 def compile_one(
@@ -310,7 +310,7 @@ def compile_one(
     *examples: PyTree,
     in_place: Mapping[int, int] = MappingProxyType({}),
     single: bool = False,
-) -> Alone:
+) -> SingleRunCode:
     """Compile a JAX function for one run that is computed again and again, such as a step of a controller.
 
     The result has memory of its own: arrays `inputs` and `outputs`, leaf by leaf, and a call, which takes no arguments
@@ -328,8 +328,8 @@ def compile_one(
         Unsupported: an operation that native code does not take, with the line that it comes from.
     """
     features()  # refuses a processor that LLVM does not know
-    program = lower(function, *examples, single=single)
-    return Alone(program, {n % len(program.outputs): argument for n, argument in in_place.items()})
+    program = lower_function(function, *examples, single=single)
+    return SingleRunCode(program, {n % len(program.outputs): argument for n, argument in in_place.items()})
 
 
 def explain(

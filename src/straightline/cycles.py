@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 from straightline.graph import Graph
 from straightline.limits import DEAR
 from straightline.nodes import REAL, Block, Buffer, Guard, Loop, Node, Store, Type
-from straightline.program import REFERRING, list_needed, uses
+from straightline.program import REFERRING, list_needed, list_used_nodes
 from straightline.rules.elementwise import select
 
 RING = 32  # rows: of a longer cycle every turn is computed
@@ -113,7 +113,7 @@ def _leave_fused_products(needed: Iterable[Any], found: dict[Node, None]) -> Non
     """Leave out the products that are fused with a sum elsewhere: apart from it they would be rounded."""
     users: defaultdict[Node, list[Any]] = defaultdict(list)
     for x in needed:
-        for used in uses(x):
+        for used in list_used_nodes(x):
             users[used].append(x)
     for n in [n for n in found if n.op == "mul" and n.type in REAL and len(users[n]) == 1]:
         user = users[n][0]
@@ -123,7 +123,7 @@ def _leave_fused_products(needed: Iterable[Any], found: dict[Node, None]) -> Non
 
 def _list_needed_elsewhere(items: Iterable[Any], found: Recurring) -> list[Node]:
     """Return the numbers of S that something else needs, in order."""
-    used = {a for x in items if x not in found.nodes for a in uses(x)}
+    used = {a for x in items if x not in found.nodes for a in list_used_nodes(x)}
     return [n for n in found.nodes if n in used]
 
 

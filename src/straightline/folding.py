@@ -25,7 +25,7 @@ DTYPES: dict[str, Any] = {
 }
 
 
-class Graph(Protocol):
+class NodeMaker(Protocol):
     """A program that makes nodes; `never_nan` are those that are known not to be NaN."""
 
     never_nan: set[Node]
@@ -135,7 +135,7 @@ EVALUATED: dict[str, Callable[..., Any]] = {
 }  # fmt: skip
 
 
-def folded(graph: Graph, op: str, type: Type, args: tuple[Node, ...]) -> Node | None:
+def folded(graph: NodeMaker, op: str, type: Type, args: tuple[Node, ...]) -> Node | None:
     """Return an existing or simpler node of the same value; None if there is none."""
     for a in args:
         if a.op != "constant":
@@ -150,7 +150,7 @@ OF_DOUBLES: dict[str, Callable[[float, float], float]] = {
 }  # fmt: skip
 
 
-def _evaluate(graph: Graph, op: str, type: Type, args: tuple[Node, ...]) -> Node | None:
+def _evaluate(graph: NodeMaker, op: str, type: Type, args: tuple[Node, ...]) -> Node | None:
     """Return the constant that an operation on constants gives, or None for one that is not folded."""
     if type == "f64" and op in OF_DOUBLES:
         return graph.constant(OF_DOUBLES[op](float(args[0].value), float(args[1].value)), type)
@@ -183,7 +183,7 @@ def is_finite(node: Node) -> bool:
     return node.op == "select" and all(is_finite(a) for a in node.args[1:])
 
 
-def _fold_add(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+def _fold_add(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
     """Simplify a + b: x + 0 = x, a + (-x) = a - x; None where nothing is simpler."""
     if a.op == "constant" and a.value == 0:
         return b
@@ -196,7 +196,7 @@ def _fold_add(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
     return None
 
 
-def _fold_sub(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+def _fold_sub(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
     """Simplify a - b: x - 0 = x, -0 - x = -x, a - (-x) = a + x; None where nothing is simpler."""
     if _is(b, 0):
         return a
@@ -207,7 +207,7 @@ def _fold_sub(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
     return None
 
 
-def _fold_mul(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+def _fold_mul(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
     """Simplify a b: 1 x = x, 0 x = 0 of a finite x, -1 x = -x, (x + x) / 2 = x; None where nothing is simpler."""
     if b.op == "constant":
         a, b = b, a
@@ -227,7 +227,7 @@ def _fold_mul(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
     return graph.node("mul", type, graph.constant(-a.value, type), b.args[0])
 
 
-def _fold_div(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+def _fold_div(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
     """Replace a division by a power of two by the product with its reciprocal, which is exact."""
     if type not in REAL or b.op != "constant" or not b.value or not math.isfinite(b.value):
         return None
@@ -238,12 +238,12 @@ def _fold_div(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
     return graph.node("mul", type, a, graph.constant(1 / b.value, type))
 
 
-def _fold_neg(graph: Graph, type: Type, a: Node) -> Node | None:
+def _fold_neg(graph: NodeMaker, type: Type, a: Node) -> Node | None:
     """Simplify -(-x) to x."""
     return a.args[0] if a.op == "neg" else None
 
 
-def _fold_and(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+def _fold_and(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
     """Simplify a & b where one is a constant flag or both are the same; None where nothing is simpler."""
     if b.op == "constant":
         a, b = b, a
@@ -252,7 +252,7 @@ def _fold_and(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
     return a if a is b else None
 
 
-def _fold_or(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+def _fold_or(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
     """Simplify a | b where one is a constant or both are the same; None where nothing is simpler."""
     if b.op == "constant":
         a, b = b, a
@@ -263,7 +263,7 @@ def _fold_or(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
     return a if a is b else None
 
 
-def _fold_xor(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+def _fold_xor(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
     """Simplify a ^ b where one is zero, or a constant flag; None where nothing is simpler."""
     if b.op == "constant":
         a, b = b, a
@@ -272,22 +272,22 @@ def _fold_xor(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
     return graph.node("not", type, b) if a.op == "constant" and type == "bool" else None
 
 
-def _fold_not(graph: Graph, type: Type, a: Node) -> Node | None:
+def _fold_not(graph: NodeMaker, type: Type, a: Node) -> Node | None:
     """Simplify not not x to x."""
     return a.args[0] if a.op == "not" else None
 
 
-def _fold_shift(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+def _fold_shift(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
     """Simplify a shift by no bits."""
     return a if _is(b, 0) else None
 
 
-def _fold_extremum(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+def _fold_extremum(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
     """Simplify max(x, x) and min(x, x) to x."""
     return a if a is b else None
 
 
-def _fold_select(graph: Graph, type: Type, condition: Node, a: Node, b: Node) -> Node | None:
+def _fold_select(graph: NodeMaker, type: Type, condition: Node, a: Node, b: Node) -> Node | None:
     """Simplify a choice by a condition known, negated, or that of an inner choice; None where nothing is simpler."""
     if a is b:
         return a
@@ -307,7 +307,7 @@ def _fold_select(graph: Graph, type: Type, condition: Node, a: Node, b: Node) ->
 def _fold_comparison(op: str) -> Callable[..., Node | None]:
     """Return the rule that simplifies == or !=."""
 
-    def rule(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+    def fold_flag_comparison(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
         """Simplify a comparison of a flag with a constant to the flag, and one of a number with itself."""
         if a is b and (a.type not in REAL or a in graph.never_nan or is_finite(a)):
             return graph.constant(op == "eq", "bool")
@@ -320,13 +320,13 @@ def _fold_comparison(op: str) -> Callable[..., Node | None]:
             return None
         return flag if bool(b.value) == (op == "eq") else graph.node("not", "bool", flag)
 
-    return rule
+    return fold_flag_comparison
 
 
 def _fold_order(strict: bool, turned: bool) -> Callable[..., Node | None]:
     """Return the rule that writes an order of flags as logic."""
 
-    def rule(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+    def rule(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
         """Write the order of two flags, false before true, as logic: LLVM has no such comparison of vectors of them."""
         if a.type != "bool":
             return None
@@ -336,7 +336,7 @@ def _fold_order(strict: bool, turned: bool) -> Callable[..., Node | None]:
     return rule
 
 
-def _fold_convert(graph: Graph, type: Type, a: Node) -> Node | None:
+def _fold_convert(graph: NodeMaker, type: Type, a: Node) -> Node | None:
     """Simplify a conversion: of the same type, there and back, or to a flag (x != 0); None where nothing is simpler."""
     if a.type == type:
         return a

@@ -14,7 +14,7 @@ from jaxtyping import PyTree
 
 from straightline.folding import DTYPES
 from straightline.memory import InMemory
-from straightline.nodes import Block, Buffer, Check, Guard, Loop, Node, Store, Unsupported
+from straightline.nodes import Block, Buffer, Guard, Loop, LoopExit, Node, Store, Unsupported
 from straightline.program import Program, list_needed
 from straightline.rules.random_bits import hash_words
 
@@ -31,10 +31,10 @@ Memory = dict[Buffer, jax.Array]  # numbers of one run
 
 def function_of(program: Program) -> Callable[..., PyTree]:
     """Return the function of one run's arrays that a program computes, for JAX to trace, map and differentiate."""
-    return lambda *arrays: jax.tree.unflatten(program.tree, _Evaluation(program).results(arrays))
+    return lambda *arrays: jax.tree.unflatten(program.tree, _JaxEvaluation(program).results(arrays))
 
 
-class _Evaluation:
+class _JaxEvaluation:
     """Values of nodes and numbers in memory while JAX traces the function."""
 
     def __init__(self, program: Program):
@@ -135,7 +135,7 @@ class _Evaluation:
         def goes_on(carry: PyTree) -> jax.Array:
             """Return the loop's condition, after the part of the body before its check."""
             begin_turn(carry, 0)
-            check = next(i for i, x in enumerate(loop.body.items) if isinstance(x, Check))
+            check = next(i for i, x in enumerate(loop.body.items) if isinstance(x, LoopExit))
             self.block(loop.body.items[:check])
             assert loop.condition is not None
             return self.value(loop.condition)

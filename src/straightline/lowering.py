@@ -21,7 +21,7 @@ from jaxtyping import PyTree
 from straightline.graph import Graph
 from straightline.limits import LONGEST, TABLE, WRITTEN_OUT
 from straightline.memory import InMemory
-from straightline.nodes import TYPES, Buffer, Key, Node, Type, Unsupported
+from straightline.nodes import TYPES, Buffer, Node, RandomKey, Type, Unsupported
 
 Value = Any  # a NumPy array of nodes or keys, or an array in memory
 Rule = Callable[["Lowering", JaxprEqn, list[Value]], Sequence[Value]]
@@ -133,7 +133,7 @@ def failed(operation: str, error: Exception, where: str) -> Unsupported:
 
 
 @contextmanager
-def refusing(what: str) -> Iterator[None]:
+def refuse_failures(what: str) -> Iterator[None]:
     """Turn a failure of what makes native code into a refusal."""
     try:
         yield
@@ -160,13 +160,13 @@ def array_of(nodes: Iterable[Any], shape: tuple[int, ...]) -> np.ndarray:
 def keys_of(words: np.ndarray) -> np.ndarray:
     """Return keys (...) from their words (..., 2)."""
     flat = words.reshape(-1, 2)
-    return array_of((Key(*pair) for pair in flat), words.shape[:-1])
+    return array_of((RandomKey(*pair) for pair in flat), words.shape[:-1])
 
 
 def scalars(value: np.ndarray) -> list[Node]:
     """Return the nodes of an array in row-major order, a key as its two words."""
     flat: list[Any] = value.ravel().tolist()
-    return [n for x in flat for n in ((x.first, x.second) if isinstance(x, Key) else (x,))]
+    return [n for x in flat for n in ((x.first, x.second) if isinstance(x, RandomKey) else (x,))]
 
 
 def type_of(value: Any) -> Type:
@@ -213,13 +213,13 @@ def code_line(equation: JaxprEqn) -> str:
     return f"{outside[0].file_name}:{outside[0].line_num}" if outside else ""
 
 
-class _Held(NamedTuple):
+class _NonArrayPart(NamedTuple):
     """A part of a result that is no array, such as a function: it is put back as it is when the result is restored."""
 
     value: Any
 
 
-jax.tree_util.register_pytree_node(_Held, lambda held: ((), held.value), lambda value, _: value)
+jax.tree_util.register_pytree_node(_NonArrayPart, lambda held: ((), held.value), lambda value, _: value)
 ARRAYS = (jax.Array, np.ndarray, np.generic, bool, int, float, complex)
 
 
@@ -241,7 +241,9 @@ def trace_function(function: Callable[..., PyTree], *examples: PyTree, single: b
 
     def call(*leaves: Any) -> list[Any]:
         returned = function(*jax.tree.unflatten(tree, leaves))
-        arrays, form = jax.tree.flatten(jax.tree.map(lambda x: x if isinstance(x, ARRAYS) else _Held(x), returned))
+        arrays, form = jax.tree.flatten(
+            jax.tree.map(lambda x: x if isinstance(x, ARRAYS) else _NonArrayPart(x), returned)
+        )
         structure[:] = [form]
         return arrays
 

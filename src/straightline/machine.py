@@ -10,8 +10,8 @@ import jax
 import llvmlite.binding as llvm
 
 from straightline.limits import OFTEN
-from straightline.llvm.module import Source
-from straightline.lowering import refusing, say
+from straightline.llvm.module import FunctionSource
+from straightline.lowering import refuse_failures, say
 from straightline.nodes import Unsupported
 
 Function = Callable[[int, int, int, int, int], None]
@@ -19,7 +19,7 @@ SIGNATURE = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_in
 
 
 @cache
-def target() -> llvm.Target:
+def find_llvm_target() -> llvm.Target:
     """Return the LLVM target of this machine.
 
     Raises:
@@ -38,7 +38,7 @@ def target() -> llvm.Target:
 def features() -> tuple[str, str, bool]:
     """Return this processor's name and features for LLVM, and whether it has fused multiply-add."""
     flags = llvm.get_host_cpu_features()
-    arm = "aarch64" in target().triple or "arm64" in target().triple
+    arm = "aarch64" in find_llvm_target().triple or "arm64" in find_llvm_target().triple
     return llvm.get_host_cpu_name(), flags.flatten(), bool(flags.get("fma")) or arm
 
 
@@ -50,10 +50,10 @@ class Machine:
     a vector. Results have the same bits whatever both are.
     """
 
-    def __init__(self, source: Source, level: int, width: int):
+    def __init__(self, source: FunctionSource, level: int, width: int):
         self.level, self.width = level, width
         cpu, flags, *_ = features()
-        machine = target().create_target_machine(cpu=cpu, features=flags, opt=level)
+        machine = find_llvm_target().create_target_machine(cpu=cpu, features=flags, opt=level)
         module = llvm.parse_assembly(source.text(width))
         module.verify()
         code = llvm.ObjectFileRef.from_data(machine.emit_object(module))
@@ -85,8 +85,8 @@ def _hasty() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(1)
 
 
-@refusing("a program")
-def generate(source: Source, level: int, width: int) -> Machine:
+@refuse_failures("a program")
+def generate(source: FunctionSource, level: int, width: int) -> Machine:
     """Generate code outside of the main thread, and wait for it.
 
     Python raises what a signal asks for in the main thread, between any two of its operations: an object of LLVM made
@@ -100,7 +100,7 @@ def generate(source: Source, level: int, width: int) -> Machine:
     return _hasty().submit(Machine, source, level, width).result()
 
 
-def _with_care(source: Source, width: int, hasty: Machine) -> Machine:
+def _with_care(source: FunctionSource, width: int, hasty: Machine) -> Machine:
     """Generate code with care; if that fails, that in haste goes on, and it is said once."""
     try:
         return Machine(source, 1, width)
@@ -109,7 +109,7 @@ def _with_care(source: Source, width: int, hasty: Machine) -> Machine:
         return hasty
 
 
-class Tiers:
+class TieredCode:
     """Code of one text, generated again with care when its executions have cost as much as that.
 
     A call that executes a program `often` waits for care; any other goes on in haste until care is done in the
@@ -117,7 +117,7 @@ class Tiers:
     the runs of a vector in haste and with care.
     """
 
-    def __init__(self, source: Source, widths: tuple[int, int]):
+    def __init__(self, source: FunctionSource, widths: tuple[int, int]):
         self._source, self._widths, self._executions, self._lock = source, widths, 0.0, Lock()
         self._machine: Machine | None = None
         self._careful: Future[Machine] | None = None

@@ -46,7 +46,7 @@ class Node:
         return f"%{self.serial}={self.op}({', '.join(f'%{a.serial}' for a in self.args)})"
 
 
-class Key:
+class RandomKey:
     """A key of random numbers: its two words, of type u32."""
 
     __slots__ = ("first", "second")
@@ -68,7 +68,7 @@ class Block:
         self.parent, self.pinned = parent, pinned
         self.owner: Loop | Guard | None = None
         self.depth: int = 0 if parent is None else parent.depth + 1
-        self.items: list[Node | Loop | Guard | Store | Check] = []
+        self.items: list[Node | Loop | Guard | Store | LoopExit] = []
         self.seen: dict[Any, Node] = {}
 
     def let_go(self) -> None:
@@ -163,7 +163,7 @@ class Loop:
         self.counter: Node | None = None
 
 
-class Check:
+class LoopExit:
     """Exit of a loop, at this place of its body, unless some run's condition holds."""
 
     __slots__ = ("loop",)

@@ -55,7 +55,7 @@ class Program(NamedTuple):
 Known = Mapping[int, tuple[np.ndarray, np.ndarray]]  # number of a leaf -> which entries are known, and these numbers
 
 
-def lower(
+def lower_function(
     function: Callable[..., PyTree],
     *examples: PyTree,
     most: int = 2 * LONGEST,
@@ -77,7 +77,7 @@ def lower_traced(
     known: Known = MappingProxyType({}),
     single: bool = False,
 ) -> Program:
-    """Lower a program that is traced already, in single precision or in double; other arguments as of `lower`."""
+    """Lower a program that is traced already, in single precision or in double; the rest as of `lower_function`."""
     lowering = Lowering(most)
     avals: list[Any] = [v.aval for v in traced.jaxpr.invars]
     inputs, values = [], []
@@ -167,14 +167,14 @@ def fusable(node: Node, products: set[Node]) -> Node | None:
     return None
 
 
-def products_of(items: Iterable[Any]) -> set[Node]:
+def find_fusable_products(items: Iterable[Any]) -> set[Node]:
     """Return products that are fused with their user, the one sum or difference that uses them, noted as `value`.
 
     Of two products of one user the later one is taken.
     """
     users: dict[Node, Any] = {}  # None of products that are used twice
     for statement in items:
-        for used in uses(statement):
+        for used in list_used_nodes(statement):
             if used.op == "mul" and used.type in REAL:
                 users[used] = None if used in users else statement
     results: set[Node] = set()
@@ -189,7 +189,7 @@ def products_of(items: Iterable[Any]) -> set[Node]:
     return results
 
 
-def uses(node: Any) -> Sequence[Node]:
+def list_used_nodes(node: Any) -> Sequence[Node]:
     """Return the nodes that an item of a program uses directly."""
     if isinstance(node, Node):
         return node.args
@@ -250,7 +250,7 @@ def find_differing(items: list[Any], inputs: Iterable[Buffer]) -> set[Any]:
     """
     spread = find_varying(items, inputs)
     carried = {x for x in items if isinstance(x, Buffer) and x.kind == "carried"}
-    while within := (carried and _read_within(crossing(items, spread)) & carried - spread):
+    while within := (carried and _read_within(find_crossing_items(items, spread)) & carried - spread):
         spread = find_varying(items, [*inputs, *within, *(carried & spread)])
     return spread
 
@@ -262,7 +262,7 @@ def _read_within(items: Iterable[Any]) -> set[Buffer]:
     return {part.owner[0] for part in parts if part.block is not part.owner[0].block}
 
 
-def crossing(items: Iterable[Any], spread: set[Any]) -> set[Any]:
+def find_crossing_items(items: Iterable[Any], spread: set[Any]) -> set[Any]:
     """Return which of the items are needed to compute those that differ between runs: these, and statements."""
     results = {x for x in items if x in spread or (isinstance(x, Store) and x.buffer.owner[0] in spread)}
     left = list(results)
@@ -300,7 +300,7 @@ def _list_sources(node: Any, around: Callable[[Block], list[Any]]) -> list[Any]:
     return [*node.args, *around(node.block)]
 
 
-class Summed(NamedTuple):
+class SummedOutputs(NamedTuple):
     """Outputs that are summed, leaf by leaf; into how many batches; which input is the run's number (u32)."""
 
     outputs: tuple[bool, ...]

@@ -61,11 +61,11 @@ def _keep(memory: np.ndarray) -> None:
     """Keep bytes for later results, and give back what was kept first beyond MOST and ARRAYS."""
     if len(memory) <= MOST:
         _kept[id(memory)] = memory
-    for key in _surplus():
+    for key in _list_surplus():
         _kept.pop(key, None)
 
 
-def _surplus() -> Iterator[int]:
+def _list_surplus() -> Iterator[int]:
     """Return the keys of what is to be given back, so that at most MOST bytes and ARRAYS are kept."""
     kept = tuple(_kept.items())
     size, count = sum(len(memory) for _, memory in kept), len(kept)

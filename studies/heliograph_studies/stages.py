@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from heliograph.disk.whole_file import whole_file
-from heliograph.numerics.check import InputError, fail, show_error
+from heliograph.numerics.check import InputError, error_text, fail
 from heliograph.report.progress import Advance
 
 T = TypeVar("T")
@@ -58,7 +58,7 @@ class Stages:
         except Exception as error:
             stored = self.folder is not None and self.folder.is_dir()
             where = f"; what was done before is kept in {self.folder}" if stored else ""
-            raise fail(f"{self.study}, {self.stage}", "to be worked out", f"{show_error(error)}{where}") from error
+            raise fail(f"{self.study}, {self.stage}", "to be worked out", f"{error_text(error)}{where}") from error
 
     def progress(self, done: int, total: int) -> None:
         """Show how much of the present stage is done."""

@@ -10,7 +10,7 @@ import pytest
 
 from heliograph import cli
 from heliograph.campaign import explore, load_campaign, open_results
-from heliograph.campaign.explore import Detail, list_details
+from heliograph.campaign.explore import StateScore, list_state_scores
 from heliograph.campaign.run import run_campaign
 from heliograph.campaign.summary import Score, read_summary
 from tests.campaign.example import CAMPAIGN, NETWORK, write
@@ -35,20 +35,22 @@ def hostile(campaign, scores):
     there = [
         score for single in scores for score in (single, replace(single, node=HOSTILE, nees_per_dimension=float("nan")))
     ]
-    return explore.explore_page(campaign, there)
+    return explore.write_explore_page(campaign, there)
 
 
 @pytest.fixture(scope="module")
 def explored(campaign, scores):
     """The page of two nodes and of four steps of two states."""
     results = [
-        Detail(s.setting, node, s.filter, s.claim, state, step, 1.0 / (step + 1), 0.1, 1.0, 1.0, 0.1, 100)
+        StateScore(s.setting, node, s.filter, s.claim, state, step, 1.0 / (step + 1), 0.1, 1.0, 1.0, 0.1, 100)
         for s in scores for node in ("near", HOSTILE) for state in ("x", "y") for step in range(5)
     ]  # fmt: skip
     there = [
         score for single in scores for score in (single, replace(single, node=HOSTILE, nees_per_dimension=float("nan")))
     ]
-    return explore.explore_page(campaign, there, lambda settings, steps: [d for d in results if d.setting in settings])
+    return explore.write_explore_page(
+        campaign, there, lambda settings, steps: [d for d in results if d.setting in settings]
+    )
 
 
 def data(html):
@@ -98,7 +100,7 @@ def test_the_fixed_pictures_and_the_table_are_there_for_print(hostile):
 @pytest.mark.slow
 def test_a_big_campaign_says_what_is_shown(campaign, scores, monkeypatch):
     monkeypatch.setattr(explore, "ROWS", 4)
-    html = explore.explore_page(campaign, scores)
+    html = explore.write_explore_page(campaign, scores)
     assert len(data(html)[0]["columns"]["rmse"]) == 4
     assert "the first 4 of 6 settings are on this page, 4 of 6 rows" in html
 
@@ -107,9 +109,9 @@ def test_a_campaign_without_numbers_is_drawn_by_setting(campaign):
     named = replace(campaign, settings=[{"kind": ["a", 1]}, {"kind": ["b"]}])
     alike = replace(campaign, settings=[{"kind": "a"}])
     item = [Score(0, "near", "f", "none", 1.0, 0.1, 2.0, 0.1, 3, 3)]
-    (table,) = data(explore.explore_page(named, [*item, replace(item[0], setting=1)]))
+    (table,) = data(explore.write_explore_page(named, [*item, replace(item[0], setting=1)]))
     assert table["x"] == "kind" and table["columns"]["kind"] == ['["a", 1]', '["b"]']
-    assert data(explore.explore_page(alike, item))[0]["x"] == "setting"
+    assert data(explore.write_explore_page(alike, item))[0]["x"] == "setting"
 
 
 @pytest.mark.slow
@@ -120,7 +122,7 @@ def test_single_states_add_up_to_the_scores(tmp_path):
         "LinearSensor([[1.0]]", "LinearSensor([[1.0, 0.0]]"))  # fmt: skip
     run_campaign(plan, tmp_path / "out", workers=0)
     scores, results = read_summary(tmp_path / "out" / "summary.csv"), open_results(tmp_path / "out")
-    result = list_details(tmp_path / "out" / "results.zarr", plan, [0, 1], [1, 3, 6])
+    result = list_state_scores(tmp_path / "out" / "results.zarr", plan, [0, 1], [1, 3, 6])
     for score in scores:
         whole = [item for item in result if item.setting == score.setting and not item.step]
         assert sum(item.rmse**2 for item in whole) == pytest.approx(score.rmse**2, rel=1e-12)

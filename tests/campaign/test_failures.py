@@ -25,7 +25,7 @@ def trouble(tmp_path, monkeypatch):
 
 def fail_chunk(monkeypatch, times: int) -> list[tuple[int, int]]:
     """Make chunk 1 of setting 4 fail so many times; returns what was tried."""
-    tried, compute = [], work.compute
+    tried, compute = [], work.compute_chunk
 
     def failing(campaign, network, chunk, store):
         tried.append((chunk.setting, chunk.number))
@@ -33,7 +33,7 @@ def fail_chunk(monkeypatch, times: int) -> list[tuple[int, int]]:
             raise RuntimeError("bad luck\nin two lines")
         compute(campaign, network, chunk, store)
 
-    monkeypatch.setattr(work, "compute", failing)
+    monkeypatch.setattr(work, "compute_chunk", failing)
     return tried
 
 

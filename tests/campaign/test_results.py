@@ -4,7 +4,7 @@ import pytest
 import heliograph as hg
 from heliograph.campaign.run import run_campaign
 from heliograph.campaign.summary import _make_score, open_results, read_summary
-from heliograph.campaign.work import Errors
+from heliograph.campaign.work import ErrorReducer
 from tests.campaign.example import CAMPAIGN, CHUNKS, NETWORK, chunk_files, contents, write
 
 
@@ -76,7 +76,7 @@ def test_different_nodes_and_filters_and_the_world(tmp_path):
     assert list(results.kind.values) == ["", "two"] and list(results.noise.values) == ["", "[[0.2]]"]
     np.testing.assert_array_equal(np.isfinite(results.measurement).all(("run", "time", "received")), [[1, 0], [1, 1]])
     network = campaign.function()(**campaign.settings[1])
-    recorded = hg.monte_carlo(network, 4, 64, campaign.key(1), Errors(world=True))
+    recorded = hg.monte_carlo(network, 4, 64, campaign.key(1), ErrorReducer(world=True))
     assert np.array_equal(results.truth[1, :64], recorded["truth"])  # the very same program
     assert np.array_equal(results.measurement[1, :64, :, 1], recorded["measurements"]["far"])
     assert np.array_equal(results.error[1, :64, :, 1, 1], recorded["estimates"]["far"]["other"]["error"])

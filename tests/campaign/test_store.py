@@ -17,7 +17,7 @@ from heliograph.campaign import engines
 from heliograph.campaign.engines import run_in_processes
 from heliograph.campaign.run import run_campaign
 from heliograph.campaign.work import Job
-from heliograph.disk import only_here
+from heliograph.disk import lock_folder
 from heliograph.disk.whole_file import try_lock
 from tests.campaign.example import CAMPAIGN, CHUNKS, NETWORK, contents, write
 
@@ -25,8 +25,8 @@ LOCK = ".lock"
 HOLD = """
 import sys, time
 from pathlib import Path
-from heliograph.disk.whole_file import only_here
-with only_here(Path(sys.argv[1])) as alone:
+from heliograph.disk.whole_file import lock_folder
+with lock_folder(Path(sys.argv[1])) as alone:
     print(alone, flush=True)
     time.sleep(60)
 """
@@ -53,10 +53,10 @@ def test_one_campaign_a_folder_and_a_killed_one_holds_nothing(tmp_path, expected
 
 
 def test_a_folder_made_for_the_lock_alone_goes_with_it(tmp_path):
-    with only_here(tmp_path / "a" / "b") as alone, only_here(tmp_path / "a" / "b") as again:
+    with lock_folder(tmp_path / "a" / "b") as alone, lock_folder(tmp_path / "a" / "b") as again:
         assert alone and not again
     assert not (tmp_path / "a").exists()
-    with only_here(tmp_path / "a") as alone:
+    with lock_folder(tmp_path / "a") as alone:
         assert alone
         (tmp_path / "a" / "results").touch()
     assert [path.name for path in (tmp_path / "a").iterdir()] == ["results"]
@@ -72,7 +72,7 @@ def test_a_lock_whose_file_was_removed_by_its_last_holder_is_taken_on_a_new_one(
         lock(handle, how)
 
     monkeypatch.setattr(fcntl, "flock", flock)
-    with only_here(tmp_path) as alone:
+    with lock_folder(tmp_path) as alone:
         assert alone and len(real) == 2
         with try_lock(tmp_path / LOCK) as ours:
             assert not ours

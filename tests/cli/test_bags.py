@@ -89,13 +89,15 @@ def test_inspect_lists_topics_and_suggests_sources(folder, capsys):
 
 def test_a_pose_takes_states_by_name():
     """A heading of 90 degrees turns about z; states that nobody names leave their axis at 0."""
-    from heliograph.files.bags.output import _convert_angles
+    from heliograph.files.bags.output import _convert_angles_to_quaternion
 
     assert pose_of(("x", "theta", "vyaw")).places(("x", "theta", "vyaw")) == (
         [0, None, None, None, None, None],
         [None, None, None, None, None, 2],
     )
-    np.testing.assert_allclose(_convert_angles(0.0, 0.0, np.pi / 2), [0, 0, np.sqrt(0.5), np.sqrt(0.5)], atol=1e-15)
+    np.testing.assert_allclose(
+        _convert_angles_to_quaternion(0.0, 0.0, np.pi / 2), [0, 0, np.sqrt(0.5), np.sqrt(0.5)], atol=1e-15
+    )
     with pytest.raises(ValueError, match="pose: expected names of the states p, v, got 'x'"):
         Pose(x="x").places(("p", "v"))
 

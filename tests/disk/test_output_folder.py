@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from heliograph.disk import check_replaceable, clear_left, whole_folder
+from heliograph.disk import check_replaceable, remove_leftover_folders, whole_folder
 
 
 def test_new_folder_appears_at_the_end(tmp_path: Path) -> None:
@@ -45,7 +45,7 @@ def test_what_a_killed_process_left_is_cleared_and_what_it_put_aside_put_back(tm
         (left / part).mkdir(parents=True)
         (left / part / part).touch()
     (tmp_path / ".out-of_mine").mkdir()  # not named as ours are
-    clear_left(target)
+    remove_leftover_folders(target)
     assert sorted(p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*")) == [".out-of_mine", "out", "out/old"]
 
 

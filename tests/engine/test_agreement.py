@@ -8,9 +8,9 @@ import pytest
 import heliograph as hg
 from heliograph.engine.choice import engine_of
 from straightline import machine
-from straightline.compiled import Alone, Compiled, compile
+from straightline.compiled import Compiled, SingleRunCode, compile
 from straightline.jax_function import function_of
-from straightline.program import lower
+from straightline.program import lower_function
 
 RANDOM = np.random.default_rng(4)
 PLANT = hg.LinearPlant([[0.9, 0.1], [0.0, 0.8]], np.diag([0.1, 0.2]), [1.0, 0.0], np.eye(2))
@@ -67,7 +67,7 @@ def test_every_filter_gives_what_xla_gives(name):
     """Of LLVM's code and of JAX's operation by operation, to 1e-12 of the claimed deviation; missing data among it."""
     item = FILTERS[name]()
     single, z = over_recording(item), measurements(item, 5, 30)
-    program = lower(single, z[0])
+    program = lower_function(single, z[0])
     with jax.enable_x64(True):
         expected = [np.asarray(x) for x in jax.jit(jax.vmap(single))(z)]
         by_jax = jax.jit(jax.vmap(function_of(program)))(z)
@@ -96,12 +96,12 @@ def test_bits_depend_on_no_width_and_no_neighbour(name):
     """Of one run alone, of 13 in blocks of 8, 4 and 16, by one core and by several."""
     item = FILTERS[name]()
     single, z = over_recording(item), measurements(item, 13, 20)
-    program = lower(single, z[0])
+    program = lower_function(single, z[0])
     whole = Compiled(program, [True], 8)(z, cores=3)
     for width in (4, 16):
-        for a, b in zip(whole, Compiled(lower(single, z[0]), [True], width)(z, cores=1), strict=True):
+        for a, b in zip(whole, Compiled(lower_function(single, z[0]), [True], width)(z, cores=1), strict=True):
             np.testing.assert_array_equal(a, b)
-    alone = Alone(lower(single, z[0]))
+    alone = SingleRunCode(lower_function(single, z[0]))
     for run in (0, 12):
         alone.inputs[0][...] = z[run]
         alone()
@@ -119,7 +119,7 @@ def test_a_state_stays_in_its_place_from_call_to_call():
         state, estimate = item.step(jax.tree.unflatten(tree, leaves), z)
         return *jax.tree.leaves(state), estimate.mean
 
-    alone = Alone(lower(step, z[0], *map(np.asarray, leaves)), {k: k + 1 for k in range(len(leaves))})
+    alone = SingleRunCode(lower_function(step, z[0], *map(np.asarray, leaves)), {k: k + 1 for k in range(len(leaves))})
     for place, leaf in zip(alone.inputs[1:], leaves, strict=True):
         place[...] = leaf
     expected = compile(over_recording(item), z)(z[None])[0][0]
@@ -162,7 +162,7 @@ def test_loops_end_for_each_run_at_its_turn():
     y, turns = compile(root, x[0])(x)
     with jax.enable_x64(True):
         expected = jax.vmap(root)(x)
-        by_jax = jax.vmap(function_of(lower(root, x[0])))(x)
+        by_jax = jax.vmap(function_of(lower_function(root, x[0])))(x)
     np.testing.assert_allclose(y, np.sqrt(x), rtol=1e-15)
     np.testing.assert_array_equal(turns, expected[1])
     np.testing.assert_array_equal(by_jax[1], expected[1])
@@ -240,7 +240,7 @@ def test_random_draws_are_those_of_jax():
     uniform, normal = compile(draw, numbers[0])(numbers)
     with jax.enable_x64(True):
         expected = jax.vmap(draw)(numbers)
-        by_jax = jax.vmap(function_of(lower(draw, numbers[0])))(numbers)
+        by_jax = jax.vmap(function_of(lower_function(draw, numbers[0])))(numbers)
     np.testing.assert_array_equal(uniform, expected[0])
     np.testing.assert_allclose(normal, expected[1], rtol=1e-14)
     np.testing.assert_array_equal(by_jax[0], expected[0])
@@ -252,7 +252,8 @@ def test_derivatives_of_the_graph_are_those_of_the_function():
     single, z = over_recording(item), RANDOM.normal(size=(15, item.received))
     with jax.enable_x64(True):
         by_graph, by_jax = (
-            jax.jit(jax.grad(lambda z, f=f: jnp.sum(f(z)[0] ** 2)))(z) for f in (function_of(lower(single, z)), single)
+            jax.jit(jax.grad(lambda z, f=f: jnp.sum(f(z)[0] ** 2)))(z)
+            for f in (function_of(lower_function(single, z)), single)
         )
     np.testing.assert_allclose(by_graph, by_jax, rtol=1e-11, atol=1e-12)
 
@@ -372,7 +373,7 @@ def test_a_machine_without_native_code_says_so_once_and_computes_by_xla(monkeypa
 
     x = RANDOM.normal(size=(3, 2, 2))
     monkeypatch.setattr(machine.llvm.Target, "from_default_triple", unknown)
-    for cached in (machine.target, machine.features):
+    for cached in (machine.find_llvm_target, machine.features):
         cached.cache_clear()
     with pytest.warns(RuntimeWarning, match="no native code: expected a processor that LLVM knows, got no target"):
         assert engine_of(lambda x: x @ x, x) == "xla: LLVM does not know this processor"

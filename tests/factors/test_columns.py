@@ -7,7 +7,7 @@ import pytest
 
 import straightline
 from heliograph.factors import (
-    Columns,
+    WeightedColumns,
     columns_of,
     decorrelate,
     eliminate,
@@ -34,7 +34,7 @@ def double():
 
 def columns(n, count, seed=0):
     rng = np.random.default_rng(seed)
-    return Columns(rng.normal(size=(n, count)), rng.uniform(0.1, 2.0, count))
+    return WeightedColumns(rng.normal(size=(n, count)), rng.uniform(0.1, 2.0, count))
 
 
 def product(c):
@@ -73,7 +73,7 @@ def test_a_pivot_is_at_least_its_share():
 def test_derivatives_exist_where_variances_are_zero():
     """Of d_2 of W diag(w) W' by the weight of a column that alone carries the second row: its square."""
     matrix = np.array([[1.0, 0.0], [0.5, 3.0]])
-    of_weight = jax.grad(lambda w: triangularise(Columns(matrix, jnp.stack([0.0 * w, w]))).weights[1])
+    of_weight = jax.grad(lambda w: triangularise(WeightedColumns(matrix, jnp.stack([0.0 * w, w]))).weights[1])
     of_pivot = jax.grad(lambda v: eliminate(jnp.diag(jnp.stack([v, 2 * v]))).weights[1])
     assert of_weight(0.0) == pytest.approx(9.0) and of_pivot(0.0) == pytest.approx(2.0)
 
@@ -151,7 +151,9 @@ def test_natively_the_noise_of_many_outputs_on_their_own_costs_what_that_of_each
     """
 
     def noise(w):
-        factors = triangularise(Columns(jnp.concatenate([jnp.diag(w[:n]), jnp.diag(w[n:])], axis=1), jnp.ones(2 * n)))
+        factors = triangularise(
+            WeightedColumns(jnp.concatenate([jnp.diag(w[:n]), jnp.diag(w[n:])], axis=1), jnp.ones(2 * n))
+        )
         return factors.matrix, factors.weights, eliminate(jnp.diag(w[:n])).weights
 
     w = np.random.default_rng(2).uniform(0.5, 2.0, size=(3, 2 * n))

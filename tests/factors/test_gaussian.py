@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from heliograph.factors import (
-    Columns,
+    WeightedColumns,
     add_noise_to_image,
     append_rows,
     columns_of,
@@ -108,7 +108,7 @@ def test_columns_added_in_a_loop_give_the_sum(n, known):
     slopes, weights = rng.normal(size=(n, n + 3)), rng.uniform(0.1, 2.0, n + 3)
     noise = triangularise(columns_of(covariance(rng, n))).times(known)
     total = added_in_a_loop(slopes, weights, noise)
-    right = (slopes * weights) @ slopes.T + Columns(*noise).covariance
+    right = (slopes * weights) @ slopes.T + WeightedColumns(*noise).covariance
     np.testing.assert_allclose(total.covariance, right, **EXACT)
 
 
@@ -116,7 +116,7 @@ def test_columns_added_in_a_loop_keep_what_their_squares_would_lose():
     """Of weights 1e-24 to 1e24: each root of d to 4 eps of its row, against fractions."""
     rng = np.random.default_rng(0)
     slopes, weights = rng.normal(size=(4, 7)), 10.0 ** rng.uniform(-24, 24, 7)
-    got = added_in_a_loop(slopes, weights, Columns(jnp.eye(4), jnp.zeros(4)))
+    got = added_in_a_loop(slopes, weights, WeightedColumns(jnp.eye(4), jnp.zeros(4)))
     rows, parts = exactly(slopes), exactly([weights])[0]
     left = [[sum(a * b * w for a, b, w in zip(x, y, parts, strict=True)) for y in rows] for x in rows]
     size, right = np.sqrt([float(left[i][i]) for i in range(4)]), []
@@ -137,7 +137,7 @@ def test_measured_in_a_loop_it_is_the_same(missing):
 
     def condition(short):
         with write_short_programs(short):
-            noise = Columns(jnp.asarray(root), np.ones(4))
+            noise = WeightedColumns(jnp.asarray(root), np.ones(4))
             return jax.jit(lambda *given: condition_on_observation.__wrapped__(*given))(
                 x, h @ x.root, jnp.asarray(innovation), noise
             )
@@ -273,8 +273,10 @@ def test_derivatives_pass_a_known_state_and_a_noise_free_output():
 
     def variance(start, noise):
         x = Gaussian(jnp.zeros(1), jnp.zeros(0), jnp.asarray(start)[None])
-        x = predict_affine(x, jnp.eye(1), jnp.zeros(1), Columns(jnp.eye(1), jnp.full(1, q)))
-        return condition_on_observation(x, x.root, jnp.zeros(1), Columns(jnp.eye(1), noise[None]))[0].variances[0]
+        x = predict_affine(x, jnp.eye(1), jnp.zeros(1), WeightedColumns(jnp.eye(1), jnp.full(1, q)))
+        return condition_on_observation(x, x.root, jnp.zeros(1), WeightedColumns(jnp.eye(1), noise[None]))[0].variances[
+            0
+        ]
 
     slopes = jax.jit(jax.grad(variance, (0, 1)))
     of_noise, of_start = slopes(0.0, 0.0)[1], slopes(0.0, 0.3)[0]
@@ -347,7 +349,7 @@ def test_rows_below_a_gaussian_are_the_joint_law_and_its_first_components_the_sa
 def test_squares_below_the_normal_numbers_count_as_zero(size):
     """1 / 1e-310 is no number: the column stays as it is, and nothing is learned of what it hides in."""
     x = Gaussian(np.zeros(2), np.array([0.5]), np.array([1.0, 2.0]))
-    both = from_columns(np.zeros(2), Columns(np.array([[size, 0.0], [size, 1.0]]), np.ones(2)))
+    both = from_columns(np.zeros(2), WeightedColumns(np.array([[size, 0.0], [size, 1.0]]), np.ones(2)))
     np.testing.assert_allclose(both.covariance, [[0.0, 0.0], [0.0, 1.0]], atol=1e-300)
     after, _ = condition_on_observation(x, np.array([[size, 0.0]]), np.zeros(1), zero_covariance(1))
     revised = impose_moments_of_combination(x, np.array([size, 0.0]), 0.0, 0.5)

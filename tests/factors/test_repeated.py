@@ -8,7 +8,7 @@ import pytest
 import straightline
 from heliograph import LinearPlant, LinearSensor, Stream, linear_filter
 from heliograph.factors import (
-    Columns,
+    WeightedColumns,
     columns_of,
     condition_on_observation,
     from_covariance,
@@ -112,7 +112,7 @@ def test_natively_noises_of_many_outputs_on_their_own_cost_what_each_costs():
     n = 40
 
     def noise(w):
-        factors = triangularise_noise(Columns(jnp.diag(w), jnp.ones(n)))
+        factors = triangularise_noise(WeightedColumns(jnp.diag(w), jnp.ones(n)))
         return factors.matrix, factors.weights
 
     w = np.random.default_rng(2).uniform(0.5, 2.0, size=(3, n))

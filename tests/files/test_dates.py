@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import heliograph as hg
 from heliograph.files.table import read_table, write_table
-from heliograph.numerics import dates, format_dates
+from heliograph.numerics import format_dates, parse_dates
 from heliograph.serving import Message
 
 PLANT = hg.Plant(lambda x, u: x + u[0], 0.1, [0.0], [[1.0]], states=["p"], inputs=["dt"])
@@ -27,26 +27,29 @@ ZONES = st.integers(-23 * 60, 23 * 60).map(lambda minutes: timezone(timedelta(mi
 def test_a_date_is_the_instant_that_python_says(moment, zone, space):
     aware = moment.replace(tzinfo=zone)
     text = aware.isoformat(sep=" " if space else "T")
-    (result,) = dates([text], "time")
+    (result,) = parse_dates([text], "time")
     expected = np.datetime64(aware.astimezone(UTC).replace(tzinfo=None), "ns")
-    assert result == expected and dates([aware], "time")[0] == expected
-    assert dates(format_dates(np.array([result])), "time")[0] == result
+    assert result == expected and parse_dates([aware], "time")[0] == expected
+    assert parse_dates(format_dates(np.array([result])), "time")[0] == result
 
 
 def test_what_else_is_a_date_and_what_is_none():
-    result = dates(["2026-11-21T23:25:00.123456789Z", "2026-11-21 23:25:00.5UTC", "2026-11-22T01:25+02"], "time")
+    result = parse_dates(["2026-11-21T23:25:00.123456789Z", "2026-11-21 23:25:00.5UTC", "2026-11-22T01:25+02"], "time")
     assert [str(t) for t in result] == [
         "2026-11-21T23:25:00.123456789",
         "2026-11-21T23:25:00.500000000",
         "2026-11-21T23:25:00.000000000",
     ]
-    assert dates(["2026-11-21"], "time")[0] == np.datetime64("2026-11-21") and np.isnat(dates(["", None], "time")).all()
-    assert dates(["1969-12-31T23:59:59.999999999"], "time").astype(int)[0] == -1
+    assert (
+        parse_dates(["2026-11-21"], "time")[0] == np.datetime64("2026-11-21")
+        and np.isnat(parse_dates(["", None], "time")).all()
+    )
+    assert parse_dates(["1969-12-31T23:59:59.999999999"], "time").astype(int)[0] == -1
     for wrong in ("2026-13-01", "2026-11-21T25:00", "1600-01-01", "21.11.2026", "2026-11-21T23:25+99:00", "today"):
         with pytest.raises(ValueError, match=r"time, row 1: expected a date as 2026-11-21T23:25:00\+01:00, .* got"):
-            dates([wrong], "time")
+            parse_dates([wrong], "time")
     with pytest.raises(ValueError, match="row 2: expected a zone with every date or with none"):
-        dates(["2026-11-21T00:00Z", "2026-11-21T01:00"], "time")
+        parse_dates(["2026-11-21T00:00Z", "2026-11-21T01:00"], "time")
 
 
 def test_seconds_between_dates_lose_nothing():
@@ -195,7 +198,7 @@ def test_no_other_text_is_an_instant(text):
     ],
 )
 def test_basic_dates_and_leap_seconds_are_read(text, same):
-    assert dates([text], "time") == dates([same], "time")
+    assert parse_dates([text], "time") == parse_dates([same], "time")
     if text[-5:] != "T1000":  # without a zone it is no instant
         first, second = (Message(node="a", sequence=0, time=moment).time for moment in (text, same))
         assert first == second
@@ -204,7 +207,7 @@ def test_basic_dates_and_leap_seconds_are_read(text, same):
 @pytest.mark.parametrize("text", ["2016-12-31T22:59:60Z", "2016-12-30T23:59:60Z", "2016-12-31T23:59:60.1234567891Z"])
 def test_other_sixtieth_seconds_and_finer_than_nanoseconds_are_refused(text):
     with pytest.raises(ValueError, match=r"^time, row 1: expected a date as .*, from 1678 to 2261, to the nanosecond"):
-        dates([text], "time")
+        parse_dates([text], "time")
 
 
 def test_text_among_numbers_is_no_number():

@@ -11,7 +11,7 @@ import pytest
 import heliograph as hg
 from heliograph import cli
 from heliograph.live.event import Event
-from heliograph.live.recorded import play
+from heliograph.live.recorded import replay_events
 
 NETWORK = """
 import jax.numpy as jnp
@@ -159,7 +159,7 @@ def test_columns_that_nobody_knows_or_that_lack_are_named(tmp_path, network):
 def test_playing_gives_final_and_lagged_estimates(network):
     """Final ones are those of the rows in order; of each moment then what was received a lag later."""
     events = [Event(*row[:3], [float(cell or "nan") for cell in received(row)], row[3]) for row in ROWS]
-    result = play(network, events, 5.0, 1.0)
+    result = replay_events(network, events, 5.0, 1.0)
     assert {name: {v: n for v, n in count.items() if n} for name, count in result.counts.items()} == {
         "cart": {"used": 4, "duplicate": 1, "late": 1}, "inputs": {"used": 1},
     }  # fmt: skip

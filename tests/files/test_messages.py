@@ -12,7 +12,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import heliograph as hg
-from heliograph.live.recorded import play
+from heliograph.live.recorded import replay_events
 from tests.files import bags
 from tests.files.module import load_module
 
@@ -46,7 +46,7 @@ def test_rows_are_what_a_timeline_puts_in_order(world):
     """With a window that nothing misses, the final estimates are those of the rows in the order of measuring."""
     network, sources, _, path = world
     table = hg.files.read_messages(path, network, sources)
-    final = play(network, table.sort_events(), 10.0).final
+    final = replay_events(network, table.sort_events(), 10.0).final
     rows = hg.run(network, *table.recording())
     estimate, other = final.estimates["gps"]["filter"], rows.estimates["gps"]["filter"]
     measured = ~np.isnan(table.recording().measurements["gps"][:, 0])

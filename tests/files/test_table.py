@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import heliograph.files.table
-from heliograph.disk import check_output, check_output_folder, naming
+from heliograph.disk import check_folder_writable, check_writable, name_path_in_errors
 from heliograph.files.table import read_table, write_table
 
 COLUMNS = {
@@ -169,15 +169,15 @@ def test_permissions_are_those_of_any_new_file(tmp_path):
 
 def test_places_that_cannot_be_written(tmp_path):
     (tmp_path / "file").touch()
-    refused(lambda: check_output(tmp_path / "file" / "out.csv"), "output folder", "file", "a folder")
-    refused(lambda: check_output(tmp_path / "no" / "out.csv"), "existing folder", "nothing of that name")
+    refused(lambda: check_writable(tmp_path / "file" / "out.csv"), "output folder", "file", "a folder")
+    refused(lambda: check_writable(tmp_path / "no" / "out.csv"), "existing folder", "nothing of that name")
     (tmp_path / "out.csv").mkdir()
-    refused(lambda: check_output(tmp_path / "out.csv"), "output file", "a folder")
-    refused(lambda: check_output_folder(tmp_path / "file"), "output folder", "a file")
-    refused(lambda: check_output_folder(tmp_path / "file" / "new"), "output folder", "on its path")
-    check_output_folder(tmp_path / "new" / "newer")
+    refused(lambda: check_writable(tmp_path / "out.csv"), "output file", "a folder")
+    refused(lambda: check_folder_writable(tmp_path / "file"), "output folder", "a file")
+    refused(lambda: check_folder_writable(tmp_path / "file" / "new"), "output folder", "on its path")
+    check_folder_writable(tmp_path / "new" / "newer")
     assert not (tmp_path / "new").exists()
-    check_output(tmp_path / "fine.parquet")
+    check_writable(tmp_path / "fine.parquet")
     assert not (tmp_path / "fine.parquet").exists()
 
 
@@ -186,7 +186,7 @@ def test_a_folder_without_permission(tmp_path, monkeypatch):
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr("tempfile.TemporaryFile", deny)
-    refused(lambda: check_output(tmp_path / "out.csv"), str(tmp_path), "can be written", "Permission denied")
+    refused(lambda: check_writable(tmp_path / "out.csv"), str(tmp_path), "can be written", "Permission denied")
 
 
 def test_estimates_are_readable_by_others(tmp_path):
@@ -211,7 +211,7 @@ def test_a_disk_that_is_really_full(tmp_path):
     columns = {"a": np.arange(1e5)}
     with pytest.raises(OSError, match="No space left on device") as caught:
         (tmp_path / ".out.csv.partial").symlink_to("/dev/full")
-        with naming(tmp_path / "out.csv"), (tmp_path / ".out.csv.partial").open("w") as file:
+        with name_path_in_errors(tmp_path / "out.csv"), (tmp_path / ".out.csv.partial").open("w") as file:
             file.writelines(f"{v}\n" for v in columns["a"])
     assert caught.value.filename == str(tmp_path / "out.csv")
 

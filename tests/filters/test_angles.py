@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.numerics import nearest, wrap_angles
+from heliograph.numerics import wrap_angles, wrap_near
 
 STEPS = 30
 CHAIN = hg.random_affine.MarkovChain([[0.9, 0.1], [0.3, 0.7]])
@@ -182,7 +182,7 @@ def test_a_compass_on_the_circle_is_one_on_a_line_that_was_wound_up(name):
     (line, expected, _), (circle, likelihood, item) = results
     mean = np.asarray(circle.mean)
     assert np.all(np.abs(mean[:, 0]) <= np.pi + 1e-12)
-    np.testing.assert_allclose(nearest(mean, np.asarray(line.mean), (0,)), line.mean, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(wrap_near(mean, np.asarray(line.mean), (0,)), line.mean, rtol=0, atol=1e-10)
     np.testing.assert_allclose(circle.covariance, line.covariance, rtol=1e-10, atol=1e-12)
     assert likelihood == pytest.approx(expected, rel=1e-10)
     assert item.claim == "nominal"  # a circle is no line: P grows beyond it
@@ -195,7 +195,7 @@ def test_an_unknown_heading_is_no_smaller_than_known():
     estimate = wide.estimate(wide.correct(wide.init(), [-3.0])[0])
     expected = 30.0 * 0.03 / (30.0 + 0.03)  # P R / (P + R), R = .25 .75 .4^2
     assert estimate.covariance[0, 0] == pytest.approx(expected, rel=1e-10)
-    assert abs(nearest(np.asarray(estimate.mean), np.array([-3.0, 0.0]), (0,))[0] + 3.0) < 0.01
+    assert abs(wrap_near(np.asarray(estimate.mean), np.array([-3.0, 0.0]), (0,))[0] + 3.0) < 0.01
 
 
 def test_fused_estimates_are_between_two_on_either_side_of_the_cut():

@@ -116,9 +116,9 @@ def test_means_far_from_zero_are_as_near_as_their_rounding():
 def test_means_alone_move_where_rows_are_complete():
     """Of 20 chunks the first, the three that lack rows, and the last, which is not full."""
     item, u = hg.kalman_filter(WALK, PLACES), np.zeros((ROWS, 0))
-    rows = chunks.FilterRows(item, lambda filter, state, innovation, k: innovation.log_likelihood)
+    rows = chunks.FilterRecursion(item, lambda filter, state, innovation, k: innovation.log_likelihood)
     with jax.enable_x64(True):
-        begun = chunks.begin_chunks(rows, chunks.linear_start(item), (FEW_HOLES, u))
+        begun = chunks.find_chunk_starts(rows, chunks.linear_start(item), (FEW_HOLES, u))
     assert np.flatnonzero(~begun.covered).tolist() == [0, 3, 4, 9, 19]
 
 

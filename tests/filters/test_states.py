@@ -12,7 +12,7 @@ PRIOR = Gaussian(np.array([[1.0]]), np.zeros((1, 0)), np.array([[DEVIATION**2]])
 
 def sensitive(mean, covariance, unit):
     """A state and its derivatives in a number of which this is the unit."""
-    return PRIOR, states.Slopes(unit * np.array([[mean]]), unit * np.array([[[covariance]]]))
+    return PRIOR, states.MomentSlopes(unit * np.array([[mean]]), unit * np.array([[[covariance]]]))
 
 
 @pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
@@ -24,11 +24,11 @@ def test_derivatives_are_the_same_to_a_share_of_the_largest_whatever_the_unit(un
         sensitive((3 + apart) * DEVIATION, 0.0, unit),
         sensitive(3 * DEVIATION, apart * DEVIATION**2, unit),
     ):
-        assert states.agree(other, one).tolist() == [same]
+        assert states.find_equal_states(other, one).tolist() == [same]
 
 
 def test_derivatives_that_are_nothing_beside_those_of_the_start_are_the_same():
     """In a number of the start alone: what is left of it differs from nothing by all of itself."""
     start, left, nothing = (sensitive(mean, 0.0, 1.0) for mean in (1.0, 1e-30, 0.0))
-    assert not states.agree(left, nothing)[0]
-    assert states.agree(left, nothing, among=start)[0]
+    assert not states.find_equal_states(left, nothing)[0]
+    assert states.find_equal_states(left, nothing, among=start)[0]

@@ -8,7 +8,7 @@ from scipy.integrate import quad
 from scipy.special import ndtr
 
 import heliograph as hg
-from heliograph.forecasting.scores import Law, crps, log_score, overlapping_mean
+from heliograph.forecasting.scores import MixtureLaws, average_overlapping, crps, log_score
 
 
 def world(loss=1.0):
@@ -51,7 +51,7 @@ def test_an_honest_filter_covers_ahead_and_a_wrong_one_does_not():
 
 
 def test_scores_of_a_mixture_are_their_integrals():
-    law = Law(np.array([[0.3, 0.7]]), np.array([[-1.0, 2.0]]), np.array([[0.25, 1.5]]))
+    law = MixtureLaws(np.array([[0.3, 0.7]]), np.array([[-1.0, 2.0]]), np.array([[0.25, 1.5]]))
 
     def below(x):
         return 0.3 * ndtr((x + 1) / 0.5) + 0.7 * ndtr((x - 2) / np.sqrt(1.5))
@@ -69,7 +69,7 @@ def test_standard_errors_know_the_overlap():
     generator = np.random.default_rng(0)
     noise = generator.normal(size=(400, 1007))
     series = np.stack([np.convolve(row, np.ones(8), "valid") for row in noise])
-    said = np.mean([overlapping_mean(row, 8).error for row in series])
+    said = np.mean([average_overlapping(row, 8).error for row in series])
     true = series.mean(axis=1).std()
     assert said == pytest.approx(true, rel=0.15)  # of which Bartlett's weights take a tenth
     assert series.std() / np.sqrt(1000) < true / 2.5

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.learning.likelihood import Surface, gather_data
+from heliograph.learning.likelihood import LikelihoodSurface, gather_data
 from heliograph.learning.likelihood.trust_region import maximise
 from tests.oracles.learning_links import likelihood
 
@@ -135,7 +135,7 @@ def test_several_recordings_are_one_likelihood(result, recording):
     surface = solution.surface
     parts = gather_data(result.description.start, [z, z[:150]], [INPUTS, INPUTS[:150]], 4)
     assert parts.lengths == (STEPS, 150) and parts.measurements.shape == (2, STEPS, 2)
-    whole = Surface(surface.objective, parts).evaluations(solution.x[None]).total
+    whole = LikelihoodSurface(surface.objective, parts).evaluations(solution.x[None]).total
     values = result.description.parameters.known(solution.x)
     short = oracle(values, z[:150], solution.form, INPUTS[:150])
     assert whole == pytest.approx(surface.evaluations(solution.x[None]).total + short, rel=1e-12)
@@ -154,14 +154,14 @@ def test_who_interrupts_keeps_the_best_so_far(recording):
 
 def test_who_interrupts_as_the_second_form_begins_keeps_the_first(recording, monkeypatch):
     """Before the second form's first point there is none of it: the first form's maximum is the best so far."""
-    evaluations = Surface.evaluations
+    evaluations = LikelihoodSurface.evaluations
 
     def stopping(surface, x):
         if surface.objective.form == "conditional" and len(x) == 1:
             raise KeyboardInterrupt
         return evaluations(surface, x)
 
-    monkeypatch.setattr(Surface, "evaluations", stopping)
+    monkeypatch.setattr(LikelihoodSurface, "evaluations", stopping)
     fitted = hg.fit(network, recording, INPUTS, starts=1)
     assert fitted.stopped and [solution.form for solution in fitted.solutions] == ["linear"]
     assert fitted.best.converged and np.isfinite(fitted.best.total)

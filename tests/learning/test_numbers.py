@@ -6,15 +6,15 @@ from scipy import optimize
 
 import heliograph as hg
 from heliograph.learning.intervals import (
-    bartlett,
-    cosines,
     covariance_by_model,
     draw_block_sums,
-    find_told_by_few,
+    estimate_by_bartlett,
+    estimate_by_cosines,
+    find_numbers_told_by_few,
     white,
 )
 from heliograph.learning.likelihood.trust_region import maximise
-from heliograph.learning.unidentified import find_confounded, product_text, rank_of, sum_text
+from heliograph.learning.unidentified import find_confounded, format_sum, product_text, rank_of_information
 
 RNG = np.random.default_rng(0)
 
@@ -61,13 +61,15 @@ def test_long_run_covariances_of_an_autoregression():
         scores.append(s[:, None])
     whole = runs * steps
     spread = 4 * 4 * np.sqrt(2 / (runs * 0.4 * steps ** (2 / 3)))  # four standard errors
-    assert cosines(scores).covariance[0, 0] / whole == pytest.approx(4.0, abs=spread)
+    assert estimate_by_cosines(scores).covariance[0, 0] / whole == pytest.approx(4.0, abs=spread)
     assert white(scores).covariance[0, 0] / whole == pytest.approx(4 / 3, rel=0.05)
-    assert 3.2 < bartlett(scores).covariance[0, 0] / whole < 4.2  # its weights take off lag / (L + 1), L = 13
+    assert (
+        3.2 < estimate_by_bartlett(scores).covariance[0, 0] / whole < 4.2
+    )  # its weights take off lag / (L + 1), L = 13
     drawn = draw_block_sums(scores, 2000, 0)
     assert np.var(drawn) / whole == pytest.approx(4.0, rel=0.2)
-    assert cosines(scores[:1]).freedom == int(0.4 * steps ** (2 / 3))
-    assert cosines(scores).freedom == pytest.approx(3 * int(0.4 * steps ** (2 / 3)))
+    assert estimate_by_cosines(scores[:1]).freedom == int(0.4 * steps ** (2 / 3))
+    assert estimate_by_cosines(scores).freedom == pytest.approx(3 * int(0.4 * steps ** (2 / 3)))
 
 
 def parameters(*kinds):
@@ -89,7 +91,7 @@ def informed(known, parameters, points):
         values, turned = parameters.entries_at(x), parameters.jacobian(x)
         step = 1e-6 * np.eye(len(values))
         rows = np.stack([(known(values + h) - known(values - h)) / 2e-6 for h in step], axis=1) @ turned
-        ranks.append(rank_of(rows.T @ rows + 0.0))
+        ranks.append(rank_of_information(rows.T @ rows + 0.0))
     return ranks
 
 
@@ -111,7 +113,7 @@ def test_a_power_and_a_sum():
     assert product_text(["a", "b"], group.exponents[0]) == "a^2 * b"
     (group,) = groups_of(lambda v: np.array([0.5 * v[0] + v[1]]), "positive", "positive")
     assert not len(group.exponents)
-    assert sum_text(["a", "b"], group.weights[0]) == "a + 2 b"
+    assert format_sum(["a", "b"], group.weights[0]) == "a + 2 b"
 
 
 def test_two_ridges_apart_one_that_is_neither_and_nothing_at_all():
@@ -129,8 +131,8 @@ def test_a_step_is_told_of_by_few_rows_and_a_mean_by_all():
     """Of 100 rows: all at one, all alike, as a chi-square tells, and in the second half."""
     step, half = (np.arange(100) == 50).astype(float), (np.arange(100) >= 50).astype(float)
     columns = [step, np.ones(100), np.random.default_rng(0).normal(size=100) ** 2, half]
-    assert find_told_by_few([np.stack(columns, axis=1)]).tolist() == [True, False, False, False]
-    assert not find_told_by_few([np.ones((40, 1)), np.ones((60, 1))]).any()
+    assert find_numbers_told_by_few([np.stack(columns, axis=1)]).tolist() == [True, False, False, False]
+    assert not find_numbers_told_by_few([np.ones((40, 1)), np.ones((60, 1))]).any()
 
 
 def test_of_a_true_model_the_parts_of_scores_add_up_to_its_information():

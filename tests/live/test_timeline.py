@@ -9,7 +9,7 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 import heliograph as hg
-from heliograph.live.stored import unpack
+from heliograph.live.stored import unpack_snapshot
 from heliograph.live.stored.plant_codec import HEAD
 from tests.live import worlds
 
@@ -94,13 +94,13 @@ def test_whatever_comes_its_bits_are_those_of_what_it_accepted(world, seed, mixi
     item, accepted, counted = timeline(network), [], 0
     stop = generator.integers(len(pushes))
     for i, event in enumerate(pushes):
-        before = unpack(item.save()) if generator.random() < 0.2 else None
+        before = unpack_snapshot(item.save()) if generator.random() < 0.2 else None
         verdict = item.push(*event)
         counted += 1
         if verdict == "used":
             accepted.append(event)
         elif before is not None:
-            assert_unchanged(before, unpack(item.save()))
+            assert_unchanged(before, unpack_snapshot(item.save()))
         held = [row.key[0] for row in item._plant.rows.held[1:]]
         assert all(time >= item.now - WINDOW for time in held) and len(held) <= CAPACITY
         if i == stop:

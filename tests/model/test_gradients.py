@@ -11,7 +11,7 @@ from scipy import special
 
 import heliograph as hg
 from heliograph.engine.choice import compute_once
-from heliograph.factors import Columns
+from heliograph.factors import WeightedColumns
 from heliograph.random_affine.moments import push_moments
 
 STEPS = 6
@@ -203,7 +203,7 @@ def test_a_channel_with_an_uncertain_law_keeps_its_bound_under_a_trace():
     known = [hg.random_affine.second_order(channel) for channel in make(p)]
     # Columns of a known noise are a root, of a traced one L and d: their covariance is the same.
     for ours, theirs in zip(traced, known, strict=True):
-        pair = [(replace(x, noise=Columns(0.0, 0.0)), *map(np.asarray, x.noise)) for x in (ours, theirs)]
+        pair = [(replace(x, noise=WeightedColumns(0.0, 0.0)), *map(np.asarray, x.noise)) for x in (ours, theirs)]
         spreads = [(matrix * weights) @ matrix.T for _, matrix, weights in pair]
         np.testing.assert_allclose(*spreads, rtol=1e-12, atol=1e-14)
         for a, b in zip(*(jax.tree.leaves(x) for x, *_ in pair), strict=True):

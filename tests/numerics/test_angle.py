@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 import heliograph as hg
 from heliograph.filters.gaussian.transform import Cubature, Linearization, PolynomialMoments
-from heliograph.numerics import continue_angles, nearest, wrap_angles
+from heliograph.numerics import continue_angles, wrap_angles, wrap_near
 
 TURN = 2 * np.pi
 ANGLE = st.floats(-1e3, 1e3)
@@ -15,7 +15,7 @@ ANGLE = st.floats(-1e3, 1e3)
 
 @given(ANGLE, ANGLE)
 def test_the_same_angle_within_half_a_turn(value, reference):
-    result = nearest(np.array([value, value]), np.array([reference, reference]), (1,))
+    result = wrap_near(np.array([value, value]), np.array([reference, reference]), (1,))
     assert result[0] == value  # no angle, no change
     assert abs(result[1] - reference) <= TURN / 2 * (1 + 1e-9)
     turns = (result[1] - value) / TURN
@@ -25,7 +25,7 @@ def test_the_same_angle_within_half_a_turn(value, reference):
 def test_what_is_in_range_keeps_every_bit_and_what_is_missing_stays_missing():
     x = np.array([3.14, -3.14, np.nan, 0.1])
     np.testing.assert_array_equal(wrap_angles(x, (0, 1, 2, 3)), x)
-    np.testing.assert_array_equal(nearest(np.array([7.0]), np.array([np.nan]), (0,)), [7.0])
+    np.testing.assert_array_equal(wrap_near(np.array([7.0]), np.array([np.nan]), (0,)), [7.0])
 
 
 def test_names_are_checked():
@@ -54,7 +54,7 @@ def test_an_angle_that_follows_another_has_exact_moments_however_wide(rule, devi
     with jax.enable_x64(True):
         mean = jnp.array([0.2, 0.3])
         result = rule.apply(continue_angles(heading, mean, (0,), (0,)), mean, jnp.asarray(covariance))
-    near = nearest(np.asarray(result.mean), np.array([3.23, 0.3]), (0,))
+    near = wrap_near(np.asarray(result.mean), np.array([3.23, 0.3]), (0,))
     np.testing.assert_allclose(near, [3.23, 0.3], rtol=0, atol=1e-10)
     # 1e-9: points at 1e2 radians, of which turns are taken off
     np.testing.assert_allclose(result.covariance, slope @ covariance @ slope.T, rtol=1e-9, atol=1e-9)

@@ -6,7 +6,7 @@ import pytest
 import heliograph as hg
 from heliograph.random_affine.base import AbstractRandomAffine, inner_maps, replace_inner_maps
 from heliograph.random_affine.combine import Series
-from heliograph.random_affine.moments import Position, Signal
+from heliograph.random_affine.moments import ChannelPosition, SignalMoment
 
 HOP = hg.hop(hg.Rayleigh(0.8), 0.1)
 RELAYED = hg.amplify_and_forward([HOP, hg.erasure(hg.hop(1.0, 0.2), 0.9)])
@@ -37,13 +37,13 @@ def test_a_map_that_says_no_more_has_an_answer_or_refuses_in_one_line():
     assert not halved.has_known_gain and not halved.is_silent and halved.detach_outliers() == (halved, None)
     low, high = halved.moment_interval(2)
     np.testing.assert_array_equal(low, high)
-    behind = halved.carry_signal(Signal(np.array([[5.0, 2.0], [2.0, 1.0]]), 0.5))
+    behind = halved.carry_signal(SignalMoment(np.array([[5.0, 2.0], [2.0, 1.0]]), 0.5))
     np.testing.assert_array_equal(behind.second, [[1.25, 1.0], [1.0, 1.0]])
     for ask in (
         lambda: halved.carry_angles((0,)),
         lambda: halved.list_atoms(),
         lambda: halved.disturb_gain(),
-        lambda: halved.visit_hops(lambda name, hop, signal: hop, Position("", 0, None)),
+        lambda: halved.visit_hops(lambda name, hop, signal: hop, ChannelPosition("", 0, None)),
     ):
         with pytest.raises(ValueError, match=r"^[a-z ]+: expected .*, got Halved$"):
             ask()
@@ -52,7 +52,7 @@ def test_a_map_that_says_no_more_has_an_answer_or_refuses_in_one_line():
 def test_a_map_in_others_is_asked_for_what_they_are_asked():
     chain = Series([Halved(), hg.erasure(Halved(), 0.5)])
     assert chain.in_words() == "Halved → Halved, 50% lost" and len(chain.list_outcomes()) == 2
-    assert chain.carry_signal(Signal(np.eye(2), 1.0)).arrives == 0.5
+    assert chain.carry_signal(SignalMoment(np.eye(2), 1.0)).arrives == 0.5
     assert isinstance(chain.condition_on_arrival(), Series) and not chain.condition_on_arrival().erases
 
 

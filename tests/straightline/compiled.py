@@ -7,7 +7,7 @@ import llvmlite.binding as llvm
 import numpy as np
 
 from straightline.llvm.lanes import types
-from straightline.vectors.elementary import functions
+from straightline.vectors.elementary import write_functions
 
 WIDTH = 8
 
@@ -18,7 +18,7 @@ class Compiled:
     def __init__(self, names: Iterable[str], single: bool = False):
         self.single = single
         names = [f"{name}f" if single else name for name in names]
-        self.engine = engine_of(functions(names, WIDTH) + "".join(_loop(name, single) for name in names))
+        self.engine = engine_of(write_functions(names, WIDTH) + "".join(_loop(name, single) for name in names))
 
     def __call__(self, name: str, *arguments: np.ndarray) -> np.ndarray:
         """The function's results."""

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from straightline import present
-from straightline.accumulated import Accumulated
+from straightline.accumulated import AccumulatedProgram
 from straightline.lowering import scalars
 from straightline.machine import Machine
-from straightline.program import Summed, fold_rows, lower, row_length
+from straightline.program import SummedOutputs, fold_rows, lower_function, row_length
 
 BATCHES, STEPS = 50, 4
 
@@ -28,8 +28,8 @@ def walk(start, number):
 @pytest.fixture(scope="module")
 def begun():
     with jax.enable_x64(True):
-        program = lower(walk, np.float64(0), np.uint32(0))
-    return Accumulated(program, Summed((True, False, False), BATCHES, 1)).begin([np.float64(2.0)], 40)
+        program = lower_function(walk, np.float64(0), np.uint32(0))
+    return AccumulatedProgram(program, SummedOutputs((True, False, False), BATCHES, 1)).begin([np.float64(2.0)], 40)
 
 
 def expected(runs):
@@ -66,8 +66,8 @@ def test_sums_have_the_same_bits_whatever_the_number_of_runs_in_a_vector():
         return (jnp.exp(jnp.sin(start + 0.1 * number)),)
 
     with jax.enable_x64(True):
-        program = lower(uneven, np.float64(0), np.uint32(0))
-    code = Accumulated(program, Summed((True,), BATCHES, 1)).begin([np.float64(2.0)], 40)
+        program = lower_function(uneven, np.float64(0), np.uint32(0))
+    code = AccumulatedProgram(program, SummedOutputs((True,), BATCHES, 1)).begin([np.float64(2.0)], 40)
     results = []
     for width in (1, 2, 4, 8):
         code._machine, sums = Machine(code.program.code.blocks, 0, width), code.zeros()
@@ -92,8 +92,11 @@ def test_a_sum_of_what_is_used_again():
         return squares, jax.lax.scan(lambda total, x: (total + x, total), 0.0, squares)[1]
 
     with jax.enable_x64(True):
-        program = lower(twice, np.float64(0), np.uint32(0))
-    code, runs = Accumulated(program, Summed((True, False), BATCHES, 1)).begin([np.float64(2.0)], 40), np.arange(40)
+        program = lower_function(twice, np.float64(0), np.uint32(0))
+    code, runs = (
+        AccumulatedProgram(program, SummedOutputs((True, False), BATCHES, 1)).begin([np.float64(2.0)], 40),
+        np.arange(40),
+    )
     sums = code.zeros()
     squares, positions = expected(runs)
     before = np.cumsum(positions**2, axis=1) - positions**2
@@ -105,7 +108,7 @@ def test_what_has_arrived_is_never_requested():
     def filled(x):
         return jnp.where(jnp.isnan(x), 0.0, 2 * x), jnp.where(jnp.isnan(present(x)), 0.0, 3 * x)
 
-    program = lower(filled, np.zeros(2))
+    program = lower_function(filled, np.zeros(2))
     asking, plain = ([node.op for node in scalars(output)] for output in program.outputs)
     assert asking == ["select", "select"] and plain == ["mul", "mul"]
     np.testing.assert_array_equal(jax.jit(jax.vmap(present))(np.array([1.0, np.nan])), [1.0, np.nan])

@@ -8,7 +8,7 @@ import pytest
 from straightline.graph import Graph
 from straightline.lowering import Lowering, scalars, trace_function
 from straightline.nodes import Unsupported
-from straightline.program import list_needed, lower
+from straightline.program import list_needed, lower_function
 from tests.straightline.over_runs import over_runs
 
 
@@ -76,7 +76,7 @@ def test_factors_and_triangular_systems():
 
 
 def test_equal_expressions_are_one_node_and_what_nothing_needs_is_dropped():
-    program = lower(lambda x: (x[0] * x[1] + x[1] * x[0], jnp.sin(x[2]))[0], np.zeros(3))
+    program = lower_function(lambda x: (x[0] * x[1] + x[1] * x[0], jnp.sin(x[2]))[0], np.zeros(3))
     nodes = list_needed(scalars(program.outputs[0]))
     assert sorted(n.op for n in nodes if hasattr(n, "op")) == ["add", "load", "load", "mul"]
 
@@ -92,7 +92,7 @@ def test_a_product_with_zero_is_zero_only_of_finite_numbers():
 
 def test_what_is_not_lowered_is_refused_with_its_operation_and_place():
     with pytest.raises(Unsupported, match=r"svd.* at .*test_lowering\.py:\d+"):
-        lower(lambda x: jnp.linalg.svd(x)[1], X)
+        lower_function(lambda x: jnp.linalg.svd(x)[1], X)
 
 
 def test_a_loop_over_an_axis_ends_for_each_entry_when_its_condition_fails():

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 from straightline import compiled
-from straightline.compiled import Alone, compile
+from straightline.compiled import SingleRunCode, compile
 from straightline.limits import OFTEN
 from straightline.machine import background
 from straightline.nodes import Node
-from straightline.program import lower
+from straightline.program import lower_function
 
 STEPS = 500
 STARTS = np.random.default_rng(7).normal(size=(16, 2))
@@ -109,9 +109,9 @@ def test_no_code_is_generated_with_care_without_optimizations(code):
 
 
 def test_a_long_step_in_live_use_is_generated_in_haste(monkeypatch):
-    careful = Alone(lower(rotated, STARTS[0]))
+    careful = SingleRunCode(lower_function(rotated, STARTS[0]))
     monkeypatch.setattr(compiled, "ALONE", careful.code.operations - 1)
-    hasty = Alone(lower(rotated, STARTS[0]))
+    hasty = SingleRunCode(lower_function(rotated, STARTS[0]))
     assert (careful.machine.level, hasty.machine.level) == (1, 0)
     for step in (careful, hasty):
         step.inputs[0][...] = STARTS[0]

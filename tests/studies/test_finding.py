@@ -74,7 +74,7 @@ def test_every_study_says_what_it_shows(capsys):
     known = listed(capsys, "example") | listed(capsys, "reproduce")
     assert "demo" in known and "quadratic-bias" in known and "hello" not in known
     with pytest.raises(ValueError, match=r"example: expected one of .*demo, .*, got 'nothing'"):
-        cli.studies.run(["nothing"], None, {}, "example")
+        cli.studies.run_studies(["nothing"], None, {}, "example")
 
 
 def test_what_is_a_page_now_is_named(capsys):

@@ -20,7 +20,7 @@ from pathlib import Path
 from threading import Event, Thread, Timer
 from typing import Any
 
-from heliograph.campaign.work import Job, Reply, perform
+from heliograph.campaign.work import Job, Reply, perform_job
 from heliograph.numerics.check import fail
 
 Engine = Callable[[Iterable[Job]], Iterator[tuple[Job, Reply]]]
@@ -45,7 +45,7 @@ def start_engine(
 @contextmanager
 def run_in_this_process(campaign: str, store: Path) -> Iterator[Engine]:
     """Do one job after another in this process."""
-    yield lambda jobs: ((job, perform(campaign, str(store), job.setting, job.chunk)) for job in jobs)
+    yield lambda jobs: ((job, perform_job(campaign, str(store), job.setting, job.chunk)) for job in jobs)
 
 
 @contextmanager
@@ -64,7 +64,7 @@ def _share_jobs(crew: list["_Worker"], waiting: deque[Job]) -> Iterator[tuple[Jo
     finished: queue.SimpleQueue[tuple[Job, Reply]] = queue.SimpleQueue()
     count = len(waiting)
 
-    def serve(worker: _Worker) -> None:
+    def take_jobs(worker: _Worker) -> None:
         """Take jobs and do them, until none waits or the worker is stopped."""
         while not worker.stopped:
             try:
@@ -74,7 +74,7 @@ def _share_jobs(crew: list["_Worker"], waiting: deque[Job]) -> Iterator[tuple[Jo
             finished.put((job, worker.ask(job)))
 
     for worker in crew:
-        Thread(target=serve, args=(worker,), daemon=True).start()
+        Thread(target=take_jobs, args=(worker,), daemon=True).start()
     for _ in range(count):
         yield finished.get()
 
@@ -211,7 +211,7 @@ def _submit_jobs(
         room = max(LOOK_AHEAD * sum(_ask_cluster(client.nthreads).values()), 1) - len(jobs)
         for _ in range(min(room, len(waiting))):
             job = waiting.popleft()
-            future = client.submit(perform, campaign, store, job.setting, job.chunk, pure=False)
+            future = client.submit(perform_job, campaign, store, job.setting, job.chunk, pure=False)
             jobs[future] = job
             flying.add(future)
         # Wait for any job; without one for too long, give all up.

@@ -11,12 +11,12 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 import zarr
 
-from heliograph.campaign.page import draw_pictures, make_score_table, summarise_best
+from heliograph.campaign.page import describe_best_filter, draw_pictures, make_score_table
 from heliograph.campaign.plan import BITWISE, Campaign
 from heliograph.campaign.store import (
     CLAIM,
     STORE,
-    Labels,
+    AxisLabels,
     done_chunks,
     parameter_values,
     read_labels,
@@ -24,12 +24,12 @@ from heliograph.campaign.store import (
 )
 from heliograph.campaign.summary import SUMMARY, Score, read_summary
 from heliograph.numerics.check import fail, file_path
-from heliograph.report.pages.explore import STATIC, Explored, Quantity, Value, explore_html
+from heliograph.report.pages.explore import STATIC, ExploredTable, PlotColumn, Value, explore_html
 from heliograph.report.pages.page import Page, Points, Section
 
 
 @dataclass(frozen=True)
-class Detail:
+class StateScore:
     """Scores of one state of one filter over the finite runs, at a step counted from 1, or over all steps (`step` 0).
 
     `claimed` is the root of the mean claimed variance, `nees_per_dimension` the mean of the squared error over the
@@ -51,17 +51,19 @@ class Detail:
     finite_runs: int
 
 
-def list_details(store: Path, campaign: Campaign, settings: Sequence[int], steps: Sequence[int]) -> list[Detail]:
+def list_state_scores(
+    store: Path, campaign: Campaign, settings: Sequence[int], steps: Sequence[int]
+) -> list[StateScore]:
     """Return the scores of every state of every filter in these settings: over all steps, then at each given step."""
     group, labels = zarr.open_group(store, mode="r"), read_labels(store)
     claims, done = np.asarray(group[CLAIM]), done_chunks(store, campaign)
-    results: list[Detail] = []
+    results: list[StateScore] = []
     for setting in settings:
         chunks = [chunk for chunk in campaign.chunks(setting) if (setting, chunk.number) in done]
         parts = [_sum_errors(group, setting, slice(c.start, c.stop), claims[setting], steps) for c in chunks]
         if parts:
             sums = ErrorSums(*(np.sum(totals, axis=0) for totals in zip(*parts, strict=True)))
-            results += _compute_details(setting, labels, claims[setting], [0, *steps], sums)
+            results += _compute_state_scores(setting, labels, claims[setting], [0, *steps], sums)
     return results
 
 
@@ -100,9 +102,9 @@ def _sum_errors(group: zarr.Group, setting: int, runs: slice, claims: np.ndarray
     return ErrorSums(counted.sum(axis=0), kept.sum(axis=1), (kept**2).sum(axis=1))
 
 
-def _compute_details(
-    setting: int, labels: Labels, claims: np.ndarray, steps: Sequence[int], sums: ErrorSums
-) -> list[Detail]:
+def _compute_state_scores(
+    setting: int, labels: AxisLabels, claims: np.ndarray, steps: Sequence[int], sums: ErrorSums
+) -> list[StateScore]:
     """Return RMSE, claimed deviation and NEES with standard errors, by node, filter, state and step of one setting.
 
     Args:
@@ -122,7 +124,7 @@ def _compute_details(
         rmse, claimed = np.sqrt(squared_error), np.sqrt(claimed_variance)
         rmse_error = np.where(rmse > 0, squared_error_error / (2 * rmse), 0.0)  # of a root, to first order
     return [
-        Detail(
+        StateScore(
             setting,
             node,
             name,
@@ -152,11 +154,11 @@ ALL = "all together"  # states
 NAMES = ("node", "filter", "state")
 SCORED = ("claim", "rmse", "rmse_error", "nees_per_dimension", "nees_error", "finite_runs")
 OVER_TIME = ("claim", "rmse", "rmse_error", "claimed", "nees_per_dimension", "nees_error", "finite_runs")
-RMSE = Quantity("rmse", "RMSE", "rmse_error")
-CLAIMED = Quantity("claimed", "claimed standard deviation")
-NEES = Quantity("nees_per_dimension", "NEES / dim", "nees_error", 1.0)
+RMSE = PlotColumn("rmse", "RMSE", "rmse_error")
+CLAIMED = PlotColumn("claimed", "claimed standard deviation")
+NEES = PlotColumn("nees_per_dimension", "NEES / dim", "nees_error", 1.0)
 
-Look: TypeAlias = Callable[[Sequence[int], Sequence[int]], list[Detail]]  # into the store: settings, steps
+Look: TypeAlias = Callable[[Sequence[int], Sequence[int]], list[StateScore]]  # into the store: settings, steps
 
 
 def explore_results(results: str | Path, out: str | Path) -> Path:
@@ -176,22 +178,23 @@ def explore_results(results: str | Path, out: str | Path) -> Path:
     campaign, scores = restore_campaign(folder / STORE), read_summary(folder / SUMMARY)
     if not scores:
         raise fail(f"results folder {folder}", "at least one score", "none yet")
-    text = explore_page(campaign, scores, partial(list_details, folder / STORE, campaign))
+    text = write_explore_page(campaign, scores, partial(list_state_scores, folder / STORE, campaign))
     target.mkdir(parents=True, exist_ok=True)
     path = target / EXPLORE
     path.write_text(text, encoding="utf-8")
     return path
 
 
-def explore_page(campaign: Campaign, scores: Sequence[Score], look: Look | None = None) -> str:
+def write_explore_page(campaign: Campaign, scores: Sequence[Score], look: Look | None = None) -> str:
     """Return the page as HTML. It has the first settings, as many as have at most ROWS rows in each table."""
     shown = _keep_first_settings(scores)
     settings = len({score.setting for score in shown})
     page = Page(
         kicker="Explore a campaign",
-        title=summarise_best(scores),
+        title=describe_best_filter(scores),
         lead=f"{Path(campaign.path).name}: {len(campaign.settings)} settings, {campaign.runs} runs each of "
-        f"{campaign.horizon} steps; {_describe_cut(settings, campaign, shown, scores)} A case is a node in a setting.",
+        f"{campaign.horizon} steps; {_describe_shown_part(settings, campaign, shown, scores)} "
+        "A case is a node in a setting.",
         sections=[
             Section("Results", draw_pictures(campaign, scores), STATIC),
             Section("All scores", [make_score_table(campaign, scores)], STATIC),
@@ -213,7 +216,7 @@ MEANING = (
 )
 
 
-def _describe_cut(settings: int, campaign: Campaign, shown: Sequence[Score], scores: Sequence[Score]) -> str:
+def _describe_shown_part(settings: int, campaign: Campaign, shown: Sequence[Score], scores: Sequence[Score]) -> str:
     """Say how many of the settings and rows are on the page, and where all are."""
     if len(shown) == len(scores):
         return f"{len(shown)} rows, one for each setting, node and filter."
@@ -234,13 +237,13 @@ def _keep_first_settings(scores: Sequence[Score]) -> list[Score]:
     return shown
 
 
-def _make_tables(campaign: Campaign, scores: Sequence[Score], look: Look | None) -> list[Explored]:
+def _make_tables(campaign: Campaign, scores: Sequence[Score], look: Look | None) -> list[ExploredTable]:
     """Return the tables of the page: scores over all steps, of all states and of each of several; then over time.
 
     Details of single states take time to read: of as many settings as have some ROWS rows, by those of the first.
     """
     scored = [
-        Detail(s.setting, s.node, s.filter, s.claim, ALL, 0, s.rmse, s.rmse_error, math.nan, s.nees_per_dimension,
+        StateScore(s.setting, s.node, s.filter, s.claim, ALL, 0, s.rmse, s.rmse_error, math.nan, s.nees_per_dimension,
                s.nees_error, s.finite_runs)
         for s in scores
     ]  # fmt: skip
@@ -256,13 +259,13 @@ def _make_tables(campaign: Campaign, scores: Sequence[Score], look: Look | None)
     return [_make_scores_table(campaign, scored), _make_steps_table(campaign, at_steps)]
 
 
-def _make_scores_table(campaign: Campaign, rows: Sequence[Detail]) -> Explored:
+def _make_scores_table(campaign: Campaign, rows: Sequence[StateScore]) -> ExploredTable:
     """Return the table of each filter's scores over all steps, and how it is drawn at first."""
     columns, parameters = _make_columns(campaign, rows, SCORED), list(campaign.parameters)
     x = _choose_axis(columns, parameters)
     panel = next((name for name in ("node", *parameters) if name != x and len(set(columns[name])) > 1), "")
     whole = {"setting", "node", "filter", x, panel, *(parameters if x == "setting" else ())} - {""}
-    return Explored(
+    return ExploredTable(
         "all steps together",
         columns,
         dimensions=["setting", *parameters, *NAMES],
@@ -275,10 +278,10 @@ def _make_scores_table(campaign: Campaign, rows: Sequence[Detail]) -> Explored:
     )
 
 
-def _make_steps_table(campaign: Campaign, rows: Sequence[Detail]) -> Explored:
+def _make_steps_table(campaign: Campaign, rows: Sequence[StateScore]) -> ExploredTable:
     """Return the table of scores step by step, and how it is drawn at first."""
     steps: dict[str, list[Value]] = {"time": [row.step for row in rows]}
-    return Explored(
+    return ExploredTable(
         "step by step",
         columns=steps | _make_columns(campaign, rows, OVER_TIME),
         dimensions=["time", "setting", *campaign.parameters, *NAMES],
@@ -291,7 +294,7 @@ def _make_steps_table(campaign: Campaign, rows: Sequence[Detail]) -> Explored:
     )
 
 
-def _make_columns(campaign: Campaign, rows: Sequence[Detail], fields: Sequence[str]) -> dict[str, list[Value]]:
+def _make_columns(campaign: Campaign, rows: Sequence[StateScore], fields: Sequence[str]) -> dict[str, list[Value]]:
     """Return columns of the settings' numbers, parameters and names, and of these quantities, row by row."""
     parameters = {name: parameter_values(campaign, name).tolist() for name in campaign.parameters}
     return {

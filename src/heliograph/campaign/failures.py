@@ -7,7 +7,7 @@ from pathlib import Path
 
 from heliograph.campaign.plan import Campaign, Setting
 from heliograph.campaign.work import Job, Reply
-from heliograph.disk.whole_file import naming, replace
+from heliograph.disk.whole_file import name_path_in_errors, replace
 
 FAILURES = "failures.json"
 
@@ -71,7 +71,7 @@ def write_failures(out: Path, failures: list[Failure], tried: list[Job]) -> None
         path.unlink(missing_ok=True)
         partial.unlink(missing_ok=True)  # of a process that was killed
         return
-    with naming(path):
+    with name_path_in_errors(path):
         partial.write_text(json.dumps(entries, indent=2) + "\n", encoding="utf-8")
     replace(partial, path)
 

@@ -42,7 +42,7 @@ def write_campaign_page(campaign: Campaign, scores: Sequence[Score], failures: S
     # Failures first, so that nobody reads the results without them.
     return Page(
         kicker="Heliograph campaign",
-        title=summarise_best(scores),
+        title=describe_best_filter(scores),
         lead=f"{name}: {len(campaign.settings)} settings, {campaign.runs} runs each of {campaign.horizon} steps; "
         f"{computed} of {len(campaign.settings) * campaign.runs} runs are there. {_describe_failures(failures)} A case "
         "is a node in a setting.",
@@ -50,14 +50,14 @@ def write_campaign_page(campaign: Campaign, scores: Sequence[Score], failures: S
             *([_list_failures(failures)] if failures else []),
             Section("Results", draw_pictures(campaign, scores)),
             Section("All scores", [make_score_table(campaign, scores)]),
-            _explain_reading(campaign),
+            _explain_opening_in_python(campaign),
             Section("The campaign", [Code(campaign.text.strip())]),
         ],
         footer=", ".join(f"{package} {campaign.versions[package]}" for package in BITWISE),
     )
 
 
-def summarise_best(scores: Sequence[Score]) -> str:
+def describe_best_filter(scores: Sequence[Score]) -> str:
     """Return which filter has the least error in most cases, in words; of a single filter the range of errors.
 
     A case is a node in a setting.
@@ -114,7 +114,7 @@ def make_score_table(campaign: Campaign, scores: Sequence[Score]) -> Table:
     return Table(["setting", *score_headers(campaign)], rows, caption)
 
 
-def _explain_reading(campaign: Campaign) -> Section:
+def _explain_opening_in_python(campaign: Campaign) -> Section:
     """Return the section that shows how to open the errors of all runs in Python."""
     lines = [
         "import heliograph as hg",
@@ -127,7 +127,7 @@ def _explain_reading(campaign: Campaign) -> Section:
 
 
 @dataclass(frozen=True)
-class Quantity:
+class ScoreColumn:
     """A column of scores, `value`, and that of its standard error, `error`, by their names in `Score`."""
 
     label: str
@@ -135,8 +135,8 @@ class Quantity:
     error: str
 
 
-RMSE = Quantity("RMSE", "rmse", "rmse_error")
-NEES = Quantity("NEES per dimension", "nees_per_dimension", "nees_error")
+RMSE = ScoreColumn("RMSE", "rmse", "rmse_error")
+NEES = ScoreColumn("NEES per dimension", "nees_per_dimension", "nees_error")
 
 
 def draw_campaign_figures(campaign: Campaign, scores: Sequence[Score]) -> dict[str, Figure]:
@@ -166,7 +166,7 @@ def _drop_parameter(setting: Setting, name: str) -> Setting:
 
 
 @matplotlib.rc_context(STYLE)
-def plot_by_parameter(campaign: Campaign, scores: Sequence[Score], parameter: str, quantity: Quantity) -> Figure:
+def plot_by_parameter(campaign: Campaign, scores: Sequence[Score], parameter: str, quantity: ScoreColumn) -> Figure:
     """Plot a quantity against a parameter, a curve for each filter with error bars of two standard errors.
 
     There is one panel for each node and each choice of the other parameters.
@@ -199,7 +199,7 @@ def plot_by_parameter(campaign: Campaign, scores: Sequence[Score], parameter: st
 
 
 @matplotlib.rc_context(STYLE)
-def plot_by_setting(campaign: Campaign, scores: Sequence[Score], quantity: Quantity) -> Figure:
+def plot_by_setting(campaign: Campaign, scores: Sequence[Score], quantity: ScoreColumn) -> Figure:
     """Plot a quantity by setting, a point for each filter with two standard errors; one panel for each node."""
     nodes = list(dict.fromkeys(score.node for score in scores))[:PANELS]
     settings = list(dict.fromkeys(score.setting for score in scores))[:SETTINGS]
@@ -249,14 +249,14 @@ def _assign_colours(scores: Sequence[Score]) -> dict[str, str]:
     return {name: COLOURS[i % len(COLOURS)] for i, name in enumerate(names)}
 
 
-def _list_values(scores: Sequence[Score], quantity: Quantity) -> tuple[np.ndarray, np.ndarray]:
+def _list_values(scores: Sequence[Score], quantity: ScoreColumn) -> tuple[np.ndarray, np.ndarray]:
     """Return a quantity of each score and its standard error, 0 where that is not known."""
     values = np.array([getattr(score, quantity.value) for score in scores])
     return values, np.nan_to_num(np.array([getattr(score, quantity.error) for score in scores]))
 
 
 def _finish_figure(
-    figure: Figure, grid: list[Axes], drawn: Sequence[Score], quantity: Quantity, colours: Mapping[str, str]
+    figure: Figure, grid: list[Axes], drawn: Sequence[Score], quantity: ScoreColumn, colours: Mapping[str, str]
 ) -> None:
     """Add what all panels share: the line NEES = 1, the scale, the quantity's name and the legend."""
     if quantity is NEES:

@@ -12,10 +12,10 @@ from heliograph.campaign.failures import Failure, describe_failure, write_failur
 from heliograph.campaign.plan import Campaign
 from heliograph.campaign.store import (
     STORE,
-    Description,
-    check_same,
+    NetworkDescription,
+    check_same_campaign,
     check_within,
-    create,
+    create_store,
     done_chunks,
     find_described,
     labels_from,
@@ -27,13 +27,13 @@ from heliograph.campaign.store import (
 )
 from heliograph.campaign.summary import SUMMARY, write_summary
 from heliograph.campaign.work import Job, Reply
-from heliograph.disk.whole_file import check_output_folder, check_replaceable, clear_left, only_here
+from heliograph.disk.whole_file import check_folder_writable, check_replaceable, lock_folder, remove_leftover_folders
 from heliograph.numerics.check import check_count, check_progress, fail, file_path, instance
 from heliograph.numerics.module import readable
 
 TRIES = 3  # a job that fails is tried again after the others, in case its worker was to blame
 Progress = TypeAliasType("Progress", Callable[[str, int, int], None])
-Accept = Callable[[Job, Description | None, int], None]  # a job, what it gave, and how many are done
+Accept = Callable[[Job, NetworkDescription | None, int], None]  # a job, what it gave, and how many are done
 
 
 @readable
@@ -88,8 +88,8 @@ def run_campaign(
     instance("campaign", campaign, Campaign, "one from load_campaign")
     check_progress(progress, "(what, done, total)")
     out, progress = file_path("results folder", out), progress or (lambda what, done, total: None)
-    check_output_folder(out)
-    with only_here(out) as alone:
+    check_folder_writable(out)
+    with lock_folder(out) as alone:
         if not alone:
             raise fail(f"results folder {out}", "no other campaign at work in it", "one that is")
         return _compute_missing(campaign, out, workers, scheduler, only, progress)
@@ -108,14 +108,14 @@ def _compute_missing(
     Arguments are those of `run_campaign`.
     """
     store = (out / STORE).absolute()
-    clear_left(store)
+    remove_leftover_folders(store)
     check_replaceable(out, f"{STORE}/zarr.json")
     expected = _list_jobs(campaign, only)
     # A store that exists must be of this campaign; damaged and partial files are removed first.
     done: set[tuple[int, ...]] = set()
     damaged: list[Path] = []
     if store.is_dir():
-        check_same(store, campaign)
+        check_same_campaign(store, campaign)
         damaged = remove_damaged(store, campaign)
         remove_partial(store)
         done = done_chunks(store, campaign)
@@ -147,7 +147,7 @@ def _compute_settings(
     progress: Progress,
 ) -> dict[Job, Reply]:
     """Describe new settings, then compute the chunks of those that can be built; return failures, in order."""
-    failed = _make_store(engine, campaign, store, {job.setting for job in missing}, progress)
+    failed = _prepare_store(engine, campaign, store, {job.setting for job in missing}, progress)
     possible = [job for job in missing if Job(job.setting) not in failed]
     total = already + len(missing)
     progress("simulating", already, total)
@@ -176,7 +176,7 @@ def _count_workers(workers: int | None, jobs: int) -> int:
     return min(check_count("workers", workers, 0), jobs)
 
 
-def _make_store(
+def _prepare_store(
     engine: Engine, campaign: Campaign, store: Path, settings: set[int], progress: Progress
 ) -> dict[Job, Reply]:
     """Make the store if needed, and write missing claims; return the jobs of settings that cannot be built."""
@@ -188,9 +188,9 @@ def _make_store(
         begun = {setting for setting, _ in done_chunks(store, campaign)}
         lacking = sorted((settings | begun) - {setting for (setting,) in find_described(store)})
     jobs = [Job(setting) for setting in lacking]
-    results: dict[int, Description] = {}
+    results: dict[int, NetworkDescription] = {}
 
-    def accept(job: Job, value: Description | None, done: int) -> None:
+    def accept(job: Job, value: NetworkDescription | None, done: int) -> None:
         """Keep the description of a setting."""
         assert value is not None  # these jobs only describe
         results[job.setting] = value
@@ -203,7 +203,7 @@ def _make_store(
     # The axes of a new store are the union of all settings; later settings must fit into them.
     labels = {setting: labels_from(results[setting]["labels"]) for setting in sorted(results)}
     if new:
-        create(store, campaign, unite_labels(labels))
+        create_store(store, campaign, unite_labels(labels))
     for setting, label in labels.items():
         check_within(label, read_labels(store), setting)
         write_claims(store, setting, results[setting]["claims"])
@@ -211,7 +211,7 @@ def _make_store(
 
 
 def _try_jobs(
-    engine: Engine, jobs: Iterable[Job], accept: Callable[[Job, Description | None, int], None]
+    engine: Engine, jobs: Iterable[Job], accept: Callable[[Job, NetworkDescription | None, int], None]
 ) -> dict[Job, Reply]:
     """Do jobs, repeat failed ones, call accept(job, value, number done) for the others; return the last failures."""
     done, left = 0, {job: Reply() for job in jobs}

@@ -28,7 +28,7 @@ Claims = dict[str, dict[str, str]]
 
 
 @dataclass(frozen=True)
-class Labels:
+class AxisLabels:
     """Names along the axes of a campaign's store, and the size of the largest measurement."""
 
     states: tuple[str, ...]
@@ -37,7 +37,7 @@ class Labels:
     received: int
 
 
-class Table(TypedDict):
+class LabelsAsJson(TypedDict):
     """Labels in a form that JSON can represent."""
 
     states: Sequence[str]
@@ -46,17 +46,17 @@ class Table(TypedDict):
     received: int
 
 
-class Description(TypedDict):
+class NetworkDescription(TypedDict):
     """Labels of one network and its claims by node and filter, in a form that JSON can represent."""
 
-    labels: Table
+    labels: LabelsAsJson
     claims: Claims
 
 
-def describe(network: Network) -> Description:
+def describe_network(network: Network) -> NetworkDescription:
     """Return labels and claims of one network."""
     claims: Claims = {node: dict(filters) for node, filters in network.claims().items()}
-    labels = Table(
+    labels = LabelsAsJson(
         states=network.states,
         nodes=tuple(claims),
         filters=tuple(dict.fromkeys(name for filters in claims.values() for name in filters)),
@@ -65,18 +65,18 @@ def describe(network: Network) -> Description:
     return {"labels": labels, "claims": claims}
 
 
-def labels_from(table: Table) -> Labels:
-    """Restore labels from the form that `describe` returns."""
-    return Labels(tuple(table["states"]), tuple(table["nodes"]), tuple(table["filters"]), table["received"])
+def labels_from(table: LabelsAsJson) -> AxisLabels:
+    """Restore labels from the form that `describe_network` returns."""
+    return AxisLabels(tuple(table["states"]), tuple(table["nodes"]), tuple(table["filters"]), table["received"])
 
 
-def unite_labels(parts: Mapping[int, Labels]) -> Labels:
+def unite_labels(parts: Mapping[int, AxisLabels]) -> AxisLabels:
     """Return the union of the labels of all settings, in order of first appearance."""
     first, labels = next(iter(parts.items()))
     for setting, other in parts.items():
         if other.states != labels.states:
             raise fail(f"setting {setting}", f"the states of setting {first}, {labels.states}", other.states)
-    return Labels(
+    return AxisLabels(
         states=labels.states,
         nodes=_unite_names([part.nodes for part in parts.values()]),
         filters=_unite_names([part.filters for part in parts.values()]),
@@ -84,7 +84,7 @@ def unite_labels(parts: Mapping[int, Labels]) -> Labels:
     )
 
 
-def check_within(labels: Labels, known: Labels, setting: int) -> None:
+def check_within(labels: AxisLabels, known: AxisLabels, setting: int) -> None:
     """Raise ValueError if a setting has a name, or a longer measurement, that the store was not made for."""
     lacking = [name for name in (*labels.nodes, *labels.filters) if name not in (*known.nodes, *known.filters)]
     if labels.states != known.states or labels.received > known.received or lacking:
@@ -114,7 +114,7 @@ def variables(campaign: Campaign) -> dict[str, tuple[tuple[str, ...], str]]:
     return ERRORS | (WORLD if campaign.keep == "trajectories" else {})
 
 
-def create(path: Path, campaign: Campaign, labels: Labels) -> None:
+def create_store(path: Path, campaign: Campaign, labels: AxisLabels) -> None:
     """Create the store, complete except for the claims and the chunks of runs."""
     with whole_folder(path) as folder:
         attributes = {
@@ -145,7 +145,7 @@ def create(path: Path, campaign: Campaign, labels: Labels) -> None:
             zarr.consolidate_metadata(folder)
 
 
-def _make_coordinates(campaign: Campaign, labels: Labels) -> dict[str, np.ndarray]:
+def _make_coordinates(campaign: Campaign, labels: AxisLabels) -> dict[str, np.ndarray]:
     """Return the store's coordinates by name: one for each axis, and each parameter along the settings."""
     steps = {
         "setting": np.arange(len(campaign.settings)),
@@ -240,18 +240,18 @@ def _sync(folder: Path, start: str) -> None:
 
 def done_chunks(path: Path, campaign: Campaign) -> set[tuple[int, ...]]:
     """Return (setting, chunk) of the chunks whose files all exist."""
-    return set.intersection(*(set(_find_chunks(path / name, 2)) for name in variables(campaign)))
+    return set.intersection(*(set(_find_chunk_files(path / name, 2)) for name in variables(campaign)))
 
 
 def find_described(path: Path) -> set[tuple[int, ...]]:
     """Return (setting,) of the settings whose claims are written."""
-    return set(_find_chunks(path / CLAIM, 1))
+    return set(_find_chunk_files(path / CLAIM, 1))
 
 
 def remove_damaged(path: Path, campaign: Campaign) -> list[Path]:
     """Remove the files of chunks that do not agree with their checksums; return these files."""
-    files = [file for name in variables(campaign) for file in _find_chunks(path / name, 2).values()]
-    damaged = [file for file in (*files, *_find_chunks(path / CLAIM, 1).values()) if not _is_whole(file)]
+    files = [file for name in variables(campaign) for file in _find_chunk_files(path / name, 2).values()]
+    damaged = [file for file in (*files, *_find_chunk_files(path / CLAIM, 1).values()) if not _is_whole(file)]
     for file in damaged:
         file.unlink()
     return damaged
@@ -263,7 +263,7 @@ def _is_whole(file: Path) -> bool:
     return len(data) > 4 and google_crc32c.value(data[:-4]) == int.from_bytes(data[-4:], "little")
 
 
-def _find_chunks(folder: Path, indices: int) -> dict[tuple[int, ...], Path]:
+def _find_chunk_files(folder: Path, indices: int) -> dict[tuple[int, ...], Path]:
     """Return the files of chunks, named "c.0.3.0", by so many of the first indices of the chunk, here (0, 3)."""
     found = {}
     for name in os.listdir(folder):
@@ -281,7 +281,7 @@ def remove_partial(path: Path) -> None:
                 file.unlink(missing_ok=True)
 
 
-def read_labels(path: Path) -> Labels:
+def read_labels(path: Path) -> AxisLabels:
     """Return the labels that the store was created with."""
     stored: Any = zarr.open_group(path, mode="r").attrs["labels"]
     return labels_from(stored)
@@ -294,7 +294,7 @@ def restore_campaign(path: Path) -> Campaign:
     return replace(stored, versions=attributes["versions"])
 
 
-def check_same(path: Path, campaign: Campaign) -> None:
+def check_same_campaign(path: Path, campaign: Campaign) -> None:
     """Raise ValueError, naming the difference, unless the store was created with this campaign."""
     attributes: Any = _read_attributes(path)
     stored_versions = dict(attributes["versions"])

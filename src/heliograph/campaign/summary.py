@@ -12,7 +12,7 @@ import zarr
 from heliograph.campaign.plan import Campaign
 from heliograph.campaign.store import CLAIM, STORE, done_chunks, read_labels
 from heliograph.disk.quoting import quote_for_cell, unquote_cell
-from heliograph.disk.whole_file import naming, replace
+from heliograph.disk.whole_file import name_path_in_errors, replace
 from heliograph.numerics.check import fail, file_path
 
 if TYPE_CHECKING:
@@ -186,7 +186,7 @@ def _format_number(value: float, digits: int) -> str:
 def write_summary(store: Path, campaign: Campaign, path: Path) -> None:
     """Write the scores with the parameters of their settings as CSV."""
     partial = path.with_name(f".{path.name}.partial")
-    with naming(path), partial.open("w", newline="", encoding="utf-8") as file:
+    with name_path_in_errors(path), partial.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(["setting", *campaign.parameters, *(field.name for field in fields(Score)[1:])])
         for score in summarize(store, campaign):

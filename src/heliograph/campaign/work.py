@@ -13,10 +13,10 @@ import numpy as np
 
 from heliograph.campaign.plan import Campaign, Chunk, parse_campaign, versions
 from heliograph.campaign.store import (
-    Description,
-    Labels,
+    AxisLabels,
+    NetworkDescription,
     check_within,
-    describe,
+    describe_network,
     labels_from,
     read_labels,
     write_chunk,
@@ -48,28 +48,28 @@ class Reply:
     `late`: the job was given up, since it took longer than the campaign allows.
     """
 
-    value: Description | None = None
+    value: NetworkDescription | None = None
     error: str = ""
     traceback: str = ""
     late: bool = False
 
 
-def perform(campaign: str, store: str, setting: int, chunk: int | None) -> Reply:
+def perform_job(campaign: str, store: str, setting: int, chunk: int | None) -> Reply:
     """Do one job of a campaign given as JSON; an error becomes a reply."""
     try:
         plan = parse_campaign(campaign)
         _check_versions(plan)
         network = _build_network(campaign, setting)
         if chunk is None:
-            return Reply(describe(network))
-        compute(plan, network, plan.chunks(setting)[chunk], Path(store))
+            return Reply(describe_network(network))
+        compute_chunk(plan, network, plan.chunks(setting)[chunk], Path(store))
         return Reply()
     except Exception as error:
         message = " ".join(str(error).split())
         return Reply(error=f"{type(error).__name__}: {message}", traceback=traceback.format_exc())
 
 
-def compute(campaign: Campaign, network: Network, chunk: Chunk, store: Path) -> None:
+def compute_chunk(campaign: Campaign, network: Network, chunk: Chunk, store: Path) -> None:
     """Simulate a chunk of runs and write it.
 
     Every chunk is simulated at full width, so that the last one of a setting needs no compilation of its own.
@@ -77,15 +77,15 @@ def compute(campaign: Campaign, network: Network, chunk: Chunk, store: Path) -> 
     if not store.is_dir():
         raise fail("results folder", f"a folder {store} that this machine sees", "nothing of that name")
     labels = read_labels(store)
-    check_within(labels_from(describe(network)["labels"]), labels, chunk.setting)
+    check_within(labels_from(describe_network(network)["labels"]), labels, chunk.setting)
     # Full width, whatever the chunk has; only its own runs are written.
     recorded = monte_carlo(
         network,
         campaign.horizon,
         campaign.chunk,
         campaign.key(chunk.setting),
-        Errors(world=campaign.keep == "trajectories"),
-        inputs(campaign, network),
+        ErrorReducer(world=campaign.keep == "trajectories"),
+        make_network_inputs(campaign, network),
         campaign.chunk,
         first_run=chunk.start,
     )
@@ -93,7 +93,7 @@ def compute(campaign: Campaign, network: Network, chunk: Chunk, store: Path) -> 
     write_chunk(store, chunk, {name: values[: chunk.stop - chunk.start] for name, values in arrays.items()})
 
 
-def inputs(campaign: Campaign, network: Network) -> np.ndarray | None:
+def make_network_inputs(campaign: Campaign, network: Network) -> np.ndarray | None:
     """Return the network's inputs over the campaign's steps, (horizon, inputs)."""
     if sorted(campaign.inputs) != sorted(network.inputs):
         raise fail("inputs", f"values of {list(network.inputs)}", list(campaign.inputs))
@@ -116,15 +116,15 @@ def _build_network(campaign: str, setting: int) -> Network:
     plan = parse_campaign(campaign)
     network = plan.function()(**plan.settings[setting])
     network.check_horizon(plan.horizon)
-    inputs(plan, network)
-    _bound_memory(network)
+    make_network_inputs(plan, network)
+    _drop_old_programs(network)
     return network
 
 
 _seen: list[Network] = []
 
 
-def _bound_memory(network: Network) -> None:
+def _drop_old_programs(network: Network) -> None:
     """Drop all compiled programs once networks of `COMPILED` other structures have been seen before this one."""
     if any(alike(network, other) for other in _seen):
         return
@@ -134,7 +134,7 @@ def _bound_memory(network: Network) -> None:
     _seen.append(network)
 
 
-def _arrange_results(recorded: PyTree, labels: Labels) -> dict[str, np.ndarray]:
+def _arrange_results(recorded: PyTree, labels: AxisLabels) -> dict[str, np.ndarray]:
     """Arrange the reducer's results on the axes of the store, (run, time, ...); NaN where a node lacks a filter."""
     estimates = recorded["estimates"]
     # Shapes are those of any filter; all have the same states.
@@ -159,7 +159,7 @@ def _arrange_results(recorded: PyTree, labels: Labels) -> dict[str, np.ndarray]:
     return arrays
 
 
-class Errors(AbstractReducer[dict[str, PyTree]]):
+class ErrorReducer(AbstractReducer[dict[str, PyTree]]):
     """Reducer to each run's errors, claimed variances and NEES per dimension; with `world` also truth and measurements.
 
     The result is a dictionary: "estimates" by node and filter, each with error and variance (run, time, n) and

@@ -20,12 +20,12 @@ def main() -> None:
     nothing = os.open(os.devnull, os.O_RDONLY)
     os.dup2(nothing, 0)  # nor may it read a job: it finds the end of its input
     os.close(nothing)
-    from heliograph.campaign.work import perform
+    from heliograph.campaign.work import perform_job
 
     # One answer for each job, in order.
     campaign, store = json.loads(requested.readline())
     for line in requested:
-        answer = json.dumps(asdict(perform(campaign, store, *json.loads(line))))
+        answer = json.dumps(asdict(perform_job(campaign, store, *json.loads(line))))
         try:
             print(answer, file=answers, flush=True)
         except BrokenPipeError:

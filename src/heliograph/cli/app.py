@@ -51,18 +51,18 @@ def estimates_option() -> Parameter:
     )
 
 
-def folder(command: str, out: Path | None, name: str) -> Path:
+def choose_results_folder(command: str, out: Path | None, name: str) -> Path:
     """Return the folder in which a results folder of this name is made: `--out`, or its parent if `--out` is that one.
 
     Raises:
         ValueError: no `--out`, or a folder that cannot be written.
     """
-    from heliograph.disk.whole_file import check_output_folder
+    from heliograph.disk.whole_file import check_folder_writable
     from heliograph.numerics.check import fail
 
     if out is None:
         raise fail(command, "a folder for the results (--out DIR)", "none")
-    check_output_folder(out)
+    check_folder_writable(out)
     return out.parent if out.name == name else out
 
 

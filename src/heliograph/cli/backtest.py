@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 import heliograph
-from heliograph.cli.app import folder, measured_option, number, path_option
+from heliograph.cli.app import choose_results_folder, measured_option, number, path_option
 from heliograph.cli.reading import ReadingOptions, read_measured
 from heliograph.files.stores.address import StoreAddress
 
@@ -51,7 +51,7 @@ def backtest(
     from heliograph.report.results import write_results
 
     # Check the options before anything is computed.
-    target, asked = folder("backtest", out, NAME) / NAME, horizons_in(horizons)
+    target, asked = choose_results_folder("backtest", out, NAME) / NAME, horizons_in(horizons)
     listed = [asked] if isinstance(asked, int) else asked
     ahead = [horizon for horizon in listed if isinstance(horizon, int)]
     if len(ahead) < len(listed):

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from heliograph.cli.app import folder, path_option
+from heliograph.cli.app import choose_results_folder, path_option
 
 if TYPE_CHECKING:
     from heliograph.files.design_file import DesignFile
@@ -32,7 +32,7 @@ def design(
     from heliograph.report.results import write_results
 
     # Read and check everything before the computation starts.
-    target = folder("design", out, NAME) / NAME
+    target = choose_results_folder("design", out, NAME) / NAME
     file = read_design(task)
 
     def results_of(designed: "DesignResults") -> "Results":

@@ -38,13 +38,13 @@ def export(
         holds several. The name may be that of a function that returns one.
     """
     from heliograph.disk.quoting import visible
-    from heliograph.export.c_files import PRECISIONS, check_place, measure_cost, write_filter
+    from heliograph.export.c_files import PRECISIONS, check_source_path, measure_cost, write_filter
     from heliograph.export.text import claim_of
     from heliograph.files.network_file import load_network
     from heliograph.simulation.centres.named_filter import find_filter_by_name
 
     # Refuse a bad path before the network is loaded.
-    check_place(out)
+    check_source_path(out)
     named = find_filter_by_name(load_network(network), filter, node)
     # Write the files, then compile and time them.
     written = write_filter(named.filter, named.received, out, precision, apart, size, window)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from urllib.parse import quote
 
 import heliograph
-from heliograph.cli.reading import Measured, ReadingOptions
+from heliograph.cli.reading import MeasuredPlant, ReadingOptions
 from heliograph.files.stores.address import StoreAddress
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ class FilteredPlant(NamedTuple):
         said: lines for the summary.
     """
 
-    data: Measured
+    data: MeasuredPlant
     record: "Record"
     written: "Record"
     forecasts: "ByFilter"
@@ -49,7 +49,7 @@ class FilteredPlant(NamedTuple):
 
 def filter_plant(
     network: "Network",
-    data: Measured,
+    data: MeasuredPlant,
     smooth: "FixedInterval | FixedLag | None",
     ahead: "Horizons | None",
     predicts: bool,
@@ -75,7 +75,7 @@ def filter_plant(
     )
 
 
-def write_plant(
+def write_plant_estimates(
     plant: FilteredPlant,
     place: Path | StoreAddress,
     network: "Network",
@@ -86,8 +86,8 @@ def write_plant(
     """Write a plant's estimates, and beside them those of a lag later where there is one; return lines on these."""
     write = _choose_writer(plant.data, module)
     predicted = _select_rows_of_predicted(plant.predicted, plant.data.rows)
-    _write_rows(write, plant.written, plant.forecasts, predicted, place, plant.data)
-    return _write_lagged(network, plant.data, lag, options, place, write)
+    _write_estimates(write, plant.written, plant.forecasts, predicted, place, plant.data)
+    return _write_lagged_estimates(network, plant.data, lag, options, place, write)
 
 
 def place_of_plant(out: Path | StoreAddress, plant: str, several: bool) -> Path | StoreAddress:
@@ -173,13 +173,13 @@ def _select_rows_of_predicted(predicted: "ByFilter", rows: "np.ndarray | None") 
     return selected
 
 
-def _write_rows(
+def _write_estimates(
     write: "Write",
     record: "Record",
     forecasts: "ByFilter",
     predicted: "ByFilter",
     place: Path | StoreAddress,
-    data: "Measured",
+    data: "MeasuredPlant",
 ) -> None:
     """Write estimates, with rows of forecasts below them and columns of what was predicted where there are any."""
     if not forecasts and not predicted:
@@ -197,9 +197,9 @@ def _write_rows(
         write_columns(place, columns, data.plant, _find_origin(data))
 
 
-def _write_lagged(
+def _write_lagged_estimates(
     network: "Network",
-    data: "Measured",
+    data: "MeasuredPlant",
     lag: float | None,
     options: ReadingOptions,
     place: Path | StoreAddress,
@@ -208,13 +208,13 @@ def _write_lagged(
     """Write the estimates of a lag later beside the others, and return a line on it; none without a lag."""
     if lag is None or data.events is None:
         return []
-    from heliograph.live.recorded import play
+    from heliograph.live.recorded import replay_events
     from heliograph.model.plant import TIME_STEP
 
     window, ahead = options.limits
     start = float(data.recording.time[0]) if TIME_STEP in network.inputs else 0.0  # the initial law is of that moment
     capacity = max(1000, len(data.events))
-    played = play(network, data.events.sort_events(), window, lag, start, ahead, capacity).lagged
+    played = replay_events(network, data.events.sort_events(), window, lag, start, ahead, capacity).lagged
     if played is None:
         return []
     beside: Path | StoreAddress
@@ -226,7 +226,7 @@ def _write_lagged(
     return [f"{beside}: {len(played.time)} rows, each given what came {lag:g} later"]
 
 
-def _choose_writer(data: "Measured", module: "Mapping[str, object]") -> "Write":
+def _choose_writer(data: "MeasuredPlant", module: "Mapping[str, object]") -> "Write":
     """Return a function that writes estimates to a store, a table, or MCAP with the pose that `module` names."""
     from heliograph.files.bags.output import write_bag
     from heliograph.files.estimates.table import estimate_columns, write_estimates
@@ -246,7 +246,7 @@ def _choose_writer(data: "Measured", module: "Mapping[str, object]") -> "Write":
     return write
 
 
-def _find_origin(data: "Measured") -> "np.datetime64 | None":
+def _find_origin(data: "MeasuredPlant") -> "np.datetime64 | None":
     """Return the date of time 0, of messages whose times are dates."""
     messages = data.events
     return None if messages is None or messages.steps or messages.numbers else messages.date

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from heliograph.cli.app import measured_option, number, path_option
-from heliograph.cli.reading import Measured, ReadingOptions, read_measured, take_only_plant
+from heliograph.cli.reading import MeasuredPlant, ReadingOptions, read_measured, take_only_plant
 from heliograph.cli.stopping import GentleStop
 from heliograph.files.stores.address import StoreAddress
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from heliograph.learning.held_out import Change, Uniformity
     from heliograph.learning.losses.fates import Fates
     from heliograph.learning.losses.losses import Losses
-    from heliograph.report.pages.fit import Learned
+    from heliograph.report.pages.fit import FitResults
     from heliograph.report.progress import Advance
     from heliograph.report.results import Json, Results
     from heliograph.simulation.network import Network
@@ -62,11 +62,11 @@ def fit(
 
     with GentleStop() as stop:
 
-        def work(advance: "Advance") -> "Learned":
+        def work(advance: "Advance") -> "FitResults":
             """Learn with the options of the command."""
             return learn(network, measurements, starts, seed, share, advance, truth, reading or ReadingOptions(), stop)
 
-        learned = write_results(out, 6, work, lambda learning: list_results(learning, out, network))
+        learned = write_results(out, 6, work, lambda learning: collect_results_files(learning, out, network))
         print(learned.fit)
     for name in ("report.html", "fitted_network.py"):
         print(out / name)
@@ -85,7 +85,7 @@ def learn(
     truth: bool,
     reading: ReadingOptions,
     stop: GentleStop,
-) -> "Learned":
+) -> "FitResults":
     """Fit the free numbers to the earlier rows, and judge the filters on the later ones."""
     advance("starting")
     from dataclasses import replace
@@ -94,7 +94,7 @@ def learn(
     from heliograph.learning.held_out import compare_filters, transform_held_out
     from heliograph.learning.sender_fit import has_deciding_sender
     from heliograph.numerics.check import fail
-    from heliograph.report.pages.fit import Learned
+    from heliograph.report.pages.fit import FitResults
 
     # The network as it starts, and the data.
     build = NetworkAgain(network)
@@ -120,19 +120,19 @@ def learn(
         uniform = stop.unless_stopped(lambda: transform_held_out(fitted.network, changes, z, u, cut)) or []
     advance("looking at losses")
     losses = stop.unless_stopped(lambda: _learn_lossy(start, recording)) or {}
-    return Learned(network, str(measurements), fitted, cut, rows - cut, changes, uniform, losses)
+    return FitResults(network, str(measurements), fitted, cut, rows - cut, changes, uniform, losses)
 
 
 def _learn_lossy(network: "Network", recording: "Recording") -> "dict[str, Losses]":
     """Return the statistics of losses of the nodes of which some messages arrived and some did not."""
     from heliograph.learning.losses.losses import learn_losses
 
-    fates = _find_fates(network, recording)
+    fates = _find_message_fates(network, recording)
     lossy = {name for name, sequences in fates.items() if any(0 < sequence.mean() < 1 for sequence in sequences)}
     return {name: learn_losses(fates[name]) for name in fates if name in lossy}
 
 
-def _find_fates(network: "Network", recording: "Recording") -> "dict[str, Fates]":
+def _find_message_fates(network: "Network", recording: "Recording") -> "dict[str, Fates]":
     """Return which messages of each node arrived, of all that were due, by node or "node.component".
 
     Left out are nodes of which nobody knows when a message is due: where rows are messages of any node, those without a
@@ -160,7 +160,7 @@ def _read_data(
     advance: "Advance",
     truth: bool,
     reading: ReadingOptions,
-) -> Measured:
+) -> MeasuredPlant:
     """Read rows of a table, or messages, which are rows in the order of measuring; say what was left out."""
     from heliograph.disk.quoting import visible
     from heliograph.files.network_file import load_module
@@ -212,7 +212,7 @@ def _fit_with_progress(
     return fitted
 
 
-def list_results(learned: "Learned", out: Path, network: str) -> "Results":
+def collect_results_files(learned: "FitResults", out: Path, network: str) -> "Results":
     """Return the content of the results folder."""
     from heliograph.files.fitted import as_json, write_fitted
     from heliograph.report.pages.fit import draw_fit_figures, pages
@@ -224,11 +224,11 @@ def list_results(learned: "Learned", out: Path, network: str) -> "Results":
         """Write the learned numbers and the network with them."""
         write_fitted(content, network, learned.measurements, folder, out)
 
-    summary = {**content, "held_out_rows": learned.held_out, **_convert_comparison(learned)}
+    summary = {**content, "held_out_rows": learned.held_out, **_convert_comparison_to_json(learned)}
     return Results(draw_fit_figures(learned), pages(learned), summary, write)
 
 
-def _convert_comparison(learned: "Learned") -> "dict[str, Json]":
+def _convert_comparison_to_json(learned: "FitResults") -> "dict[str, Json]":
     """Return filters before and after, and losses, for JSON."""
     # Each filter: gain of the log-likelihood per row, size and whiteness of its innovations.
     filters: list[Json] = [

@@ -12,10 +12,10 @@ TEMPLATE = "my_network.py.txt"  # no module of ours
 def new(file: Annotated[Path, path_option("Python file to write; it must not be there yet.")], /) -> None:
     """Write a commented network to begin with: a file that runs, and simulates data for itself."""
     from heliograph.disk.quoting import visible
-    from heliograph.disk.whole_file import check_output, whole_file
+    from heliograph.disk.whole_file import check_writable, whole_file
     from heliograph.numerics.check import fail
 
-    check_output(file, (".py",))
+    check_writable(file, (".py",))
     if file.exists():
         raise fail(f"file {file}", "a new name", "a file that is there")
     text = files("heliograph.cli").joinpath(TEMPLATE).read_text(encoding="utf-8")

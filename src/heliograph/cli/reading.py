@@ -55,7 +55,7 @@ class ReadingOptions:
 
 
 @dataclass(frozen=True)
-class Measured:
+class MeasuredPlant:
     """Measured data of one plant.
 
     Attributes:
@@ -82,7 +82,7 @@ def read_measured(
     module: Mapping[str, object],
     options: ReadingOptions,
     advance: "Advance",
-) -> list[Measured]:
+) -> list[MeasuredPlant]:
     """Return the measured data of each plant, from a table, messages or a store.
 
     Args:
@@ -105,7 +105,7 @@ def read_measured(
             raise fail("--window, --ahead, --lag and --plant", "messages or events", f"rows of time in {path}")
         return [read_rows(path, network, options)]
     wanted = events.plants if options.plant is None else [options.plant]
-    measured = [_convert_events(events.of(plant), plant, options) for plant in wanted]
+    measured = [_make_rows_of_events(events.of(plant), plant, options) for plant in wanted]
     # What is said of the whole reading is said with one plant: warnings with the first, notes with the last.
     measured[0].warnings.extend(describe_unread(path, events))
     measured[-1].summary.extend(events.notes)
@@ -121,7 +121,7 @@ def open_measured(location: "Path | StoreAddress") -> "Path | StoreTable":
     return ask_store(location)
 
 
-def take_only_plant(path: object, measured: list[Measured]) -> Measured:
+def take_only_plant(path: object, measured: list[MeasuredPlant]) -> MeasuredPlant:
     """Return the measured data of the only plant.
 
     Raises:
@@ -147,12 +147,12 @@ def read_events(
     from heliograph.files.bags.bag import is_bag
     from heliograph.files.logs.log import is_log
     from heliograph.files.messages.folder import is_folder
-    from heliograph.files.messages.to_events import is_mapped
+    from heliograph.files.messages.to_events import is_of_messages
     from heliograph.files.messages.to_events import read_events as read_mapped
     from heliograph.numerics.check import fail
 
     sources = module.get("sources")
-    if not is_mapped(path, sources):
+    if not is_of_messages(path, sources):
         return None
     if sources is None and isinstance(path, Path) and (is_bag(path) or is_log(path) or is_folder(path)):
         hint = f"heliograph inspect {path} --network {reference} suggests them"
@@ -164,7 +164,7 @@ def read_events(
     return read_mapped(path, network, sources, progress, options.strict, options.ignore_unknown)
 
 
-def read_rows(path: "Path | StoreTable", network: "Network", options: ReadingOptions) -> Measured:
+def read_rows(path: "Path | StoreTable", network: "Network", options: ReadingOptions) -> MeasuredPlant:
     """Return the rows of time of a table, with warnings on those that could not be read."""
     from heliograph.files.recording import read_recording_rows
 
@@ -172,10 +172,10 @@ def read_rows(path: "Path | StoreTable", network: "Network", options: ReadingOpt
         warnings.simplefilter("always", UserWarning)
         recording, refused, notes = read_recording_rows(path, network, options.strict, options.ignore_unknown)
     lines = [describe_refused(path, "rows", len(refused), refused[:REASONS])] if refused else []
-    return Measured("", recording, warnings=[*lines, *notes, *(str(doubt.message) for doubt in doubts)])
+    return MeasuredPlant("", recording, warnings=[*lines, *notes, *(str(doubt.message) for doubt in doubts)])
 
 
-def _convert_events(events: "EventTable", plant: str, options: ReadingOptions) -> Measured:
+def _make_rows_of_events(events: "EventTable", plant: str, options: ReadingOptions) -> MeasuredPlant:
     """Return the rows of a plant from its events, with a line by node on how many events were used, late or lost."""
     import numpy as np
 
@@ -192,7 +192,7 @@ def _convert_events(events: "EventTable", plant: str, options: ReadingOptions) -
     recording, rows = events.rows(window, ahead)
     if events.dated:
         lines.append(f"times in seconds since {np.datetime_as_string(events.date, timezone='UTC')}")
-    return Measured(plant, recording, rows, events, summary=lines)
+    return MeasuredPlant(plant, recording, rows, events, summary=lines)
 
 
 def describe_unread(path: object, events: "EventTable") -> list[str]:

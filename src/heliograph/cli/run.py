@@ -9,7 +9,7 @@ from cyclopts import Parameter
 
 import heliograph
 from heliograph.cli.app import estimates_option, measured_option, path_option
-from heliograph.cli.filtered_plant import FilteredPlant, filter_plant, place_of_plant, write_plant
+from heliograph.cli.filtered_plant import FilteredPlant, filter_plant, place_of_plant, write_plant_estimates
 from heliograph.cli.reading import ReadingOptions, read_measured
 from heliograph.files.stores.address import StoreAddress
 
@@ -75,7 +75,7 @@ def run(
         loaded, module = load_module(network)
         if not any(loaded.claims().values()):
             raise fail(f"network {network}", "at least one filter to run", "none")
-        _check_kept(measurements, out, loaded, module.get("sources"))
+        _refuse_replacing_inputs(measurements, out, loaded, module.get("sources"))
         measured = read_measured(measurements, network, loaded, module, options, advance)
         if lag is not None and measured[0].events is None:
             raise fail("--lag", "messages or events", f"rows of time in {measurements}")
@@ -87,7 +87,7 @@ def run(
             place = out and place_of_plant(out, data.plant, len(measured) > 1)
             if place is not None:
                 advance(f"writing {place}")
-                plant.said.extend(write_plant(plant, place, loaded, module, lag, options))
+                plant.said.extend(write_plant_estimates(plant, place, loaded, module, lag, options))
             done.append((plant, place))
     # Report, then warnings and a summary.
     if report is not None:
@@ -141,7 +141,7 @@ def _check_options(
             raise fail("lag", f"a number from 0 to the window, {window:g}", lag)
         if out is None:
             raise fail("--lag", "a file for the estimates (--out FILE)", "none")
-    _check_places(measurements, out, report)
+    _check_output_places(measurements, out, report)
 
 
 def _describe_results(record: "Record", out: Path | StoreAddress | None, report: Path | None) -> list[str]:
@@ -175,9 +175,11 @@ def _describe_claim(estimate: "Estimate") -> str:
     return f"{estimate.claim}, none of {without} rows"
 
 
-def _check_places(measurements: Path | StoreAddress, out: Path | StoreAddress | None, report: Path | None) -> None:
+def _check_output_places(
+    measurements: Path | StoreAddress, out: Path | StoreAddress | None, report: Path | None
+) -> None:
     """Check before the work starts that packages for these files are installed, and that they can be written."""
-    from heliograph.disk.whole_file import FORMATS, check_output
+    from heliograph.disk.whole_file import FORMATS, check_writable
     from heliograph.files.logs.log import PACKAGES
     from heliograph.numerics.check import fail
     from heliograph.numerics.process.extras import check_installed
@@ -192,7 +194,7 @@ def _check_places(measurements: Path | StoreAddress, out: Path | StoreAddress | 
 
         check_store(out)
     elif out is not None:
-        check_output(out, (*FORMATS, ".mcap"))
+        check_writable(out, (*FORMATS, ".mcap"))
         if isinstance(measurements, Path) and out.resolve() == measurements.resolve():
             raise fail(f"output file {out}", "another file than the measurements", "the same")
     if report is not None:
@@ -202,7 +204,7 @@ def _check_places(measurements: Path | StoreAddress, out: Path | StoreAddress | 
         check_replaceable(report, SUMMARY)
 
 
-def _check_kept(
+def _refuse_replacing_inputs(
     measurements: Path | StoreAddress, out: Path | StoreAddress | None, network: "Network", sources: object
 ) -> None:
     """Raise ValueError if estimates would replace one of the files that are read from a folder of measurements."""

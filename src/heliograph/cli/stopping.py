@@ -9,7 +9,7 @@ from threading import Timer
 from types import FrameType, TracebackType
 from typing import NoReturn, TypeVar
 
-from heliograph.numerics.process.signals import STOPPING, handlers
+from heliograph.numerics.process.signals import STOPPING, handle_stop_signals
 
 SIGNALLED = 128  # plus the signal's number: the exit code of what a signal ended
 INTERRUPTED, TERMINATED = SIGNALLED + signal.SIGINT, SIGNALLED + signal.SIGTERM
@@ -44,7 +44,7 @@ def stoppable(stopped: list[int]) -> Iterator[None]:
     timers: list[Timer] = []
     report_before, sys.unraisablehook = sys.unraisablehook, interrupt_later
     try:
-        with handlers(interrupt):
+        with handle_stop_signals(interrupt):
             yield
     finally:
         for timer in timers:
@@ -97,7 +97,7 @@ class GentleStop:
         if self._number:
             return None
         try:
-            with handlers(self._interrupt):
+            with handle_stop_signals(self._interrupt):
                 return work()
         except KeyboardInterrupt:
             if not self._number:

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Protocol
 
 from cyclopts import Parameter
 
-from heliograph.cli.app import folder, number, path_option
+from heliograph.cli.app import choose_results_folder, number, path_option
 
 GROUP = "heliograph.studies"
 PAGES = {  # what is a page of the documentation, with blocks that run, by the name of the example that it was
@@ -51,7 +51,7 @@ def demo(
     changes: Changes | None = None,
 ) -> None:
     """Filter a recorded radio-ranging drive whose ranges arrive through simulated relays, and report."""
-    run(["demo"], out, collect_changes(changes, seed=seed, recording=recording), "example")
+    run_studies(["demo"], out, collect_changes(changes, seed=seed, recording=recording), "example")
 
 
 def example(
@@ -67,7 +67,7 @@ def example(
     """Run an example and report, or list them."""
     if name is None:
         return print_list("example")
-    run([name], out, collect_changes(changes, seed=seed, trace=trace, recording=recording), "example")
+    run_studies([name], out, collect_changes(changes, seed=seed, trace=trace, recording=recording), "example")
 
 
 def reproduce(
@@ -88,10 +88,10 @@ def reproduce(
         raise fail("--set", "one publication, whose settings these are", "all")
     names = list(list_studies("publication")) if method == "all" else [method]
     own_folder = "" if method == "all" else method
-    run(names, out, collect_changes(changes, runs=runs, seed=seed), "publication", own_folder)
+    run_studies(names, out, collect_changes(changes, runs=runs, seed=seed), "publication", own_folder)
 
 
-def run(
+def run_studies(
     names: Sequence[str], out: Path | None, values: Mapping[str, str], kind: str, own_folder: str | None = None
 ) -> None:
     """Run studies of a kind one after another, each into its own folder in `out`.
@@ -111,8 +111,10 @@ def run(
 
     known = list_studies(kind)
     _check_names(names, known, kind)
-    check_installed([package for name in names for package in (*NEEDS, *read_needs(known[name].module))])
-    target = folder("reproduce" if kind == "publication" else kind, out, names[0] if own_folder is None else own_folder)
+    check_installed([package for name in names for package in (*NEEDS, *read_needed_packages(known[name].module))])
+    target = choose_results_folder(
+        "reproduce" if kind == "publication" else kind, out, names[0] if own_folder is None else own_folder
+    )
     studies = {name: load(known[name]) for name in names}
     # All settings are checked before any work.
     settings = {name: change_settings(name, study, values, kind) for name, study in studies.items()}
@@ -145,12 +147,12 @@ def change_settings(name: str, study: Study, values: Mapping[str, str], kind: st
 
     published = study.settings({})
     for option, value in values.items():
-        if isinstance(value, Option) and is_dataclass(published) and not hasattr(published, option):
+        if isinstance(value, OptionValue) and is_dataclass(published) and not hasattr(published, option):
             raise fail(f"--{option}", f"{'an' if kind == 'example' else 'a'} {kind} that takes it", repr(name))
     return study.settings(values)
 
 
-class Option(str):
+class OptionValue(str):
     """A value that was given by an option of its own, not by `--set`."""
 
     __slots__ = ()
@@ -168,7 +170,7 @@ def collect_changes(changes: Sequence[str] | None, **options: object) -> dict[st
     # Options of the command, checked as numbers.
     for name, value in options.items():
         if value is not None:
-            values[name] = Option(value)
+            values[name] = OptionValue(value)
             if name == "seed":
                 check_seed("--seed", value)
             elif name == "runs":
@@ -215,7 +217,7 @@ def first_line(module: str) -> str:
     return (ast.get_docstring(parse(module)) or "").partition("\n")[0]
 
 
-def read_needs(module: str) -> Sequence[str]:
+def read_needed_packages(module: str) -> Sequence[str]:
     """Return the packages of extras that a study's module lists as `NEEDS`, without running it: it may need them."""
     for statement in parse(module).body:
         match statement:

@@ -39,8 +39,8 @@ def explore(
 ) -> None:
     """Make one page of a campaign's results, to choose axes, settings, nodes and filters in; it works offline."""
     from heliograph.campaign.explore import explore_results
-    from heliograph.disk.whole_file import check_output_folder
+    from heliograph.disk.whole_file import check_folder_writable
 
-    check_output_folder(out)
+    check_folder_writable(out)
     page = explore_results(results, out)
     rich.console.Console().print(f"Page: {page}", soft_wrap=True, highlight=False, markup=False)

@@ -81,11 +81,11 @@ def compute_worth(network: "Network", module: Mapping[str, object], options: Wor
 
 def _check_figure(figure: Path) -> None:
     """Raise the error that writing the figure would raise."""
-    from heliograph.disk.whole_file import check_output
+    from heliograph.disk.whole_file import check_writable
     from heliograph.numerics.process.extras import check_installed
 
     check_installed(["matplotlib"])
-    check_output(figure, FIGURES)
+    check_writable(figure, FIGURES)
 
 
 def _find_nodes(module: Mapping[str, object], names: Sequence[str]) -> dict[str, "Node"]:

@@ -35,7 +35,7 @@ def try_lock(path: Path) -> Iterator[bool]:
 
 
 @contextmanager
-def only_here(folder: Path) -> Iterator[bool]:
+def lock_folder(folder: Path) -> Iterator[bool]:
     """Lock a folder by a lock file in it; yields whether the lock was obtained.
 
     The lock file is removed with the lock, and so are folders that were made for it and stayed empty. A killed process
@@ -111,7 +111,7 @@ def replace(partial: Path, path: Path) -> None:
 
 
 @contextmanager
-def naming(path: Path | str) -> Iterator[None]:
+def name_path_in_errors(path: Path | str) -> Iterator[None]:
     """Within this context, add the path to errors of the system that lack one, such as that of a full disk."""
     try:
         yield
@@ -136,13 +136,13 @@ def whole_files(paths: Sequence[Path]) -> Iterator[list[Path]]:
         _clear_partial(path)
     replaced: list[tuple[Path, bytes | None]] = []
     try:
-        with naming(paths[0]):
+        with name_path_in_errors(paths[0]):
             yield partials
         # Replace one by one, with the earlier contents of all but the last.
         with hold_signals():
             for partial, path in zip(partials, paths, strict=True):
                 before = path.read_bytes() if path != paths[-1] and path.exists() else None
-                with naming(path):
+                with name_path_in_errors(path):
                     replace(partial, path)
                 replaced.append((path, before))
     except BaseException:
@@ -177,7 +177,7 @@ def _is_running(process: str) -> bool:
 FORMATS = (".csv", ".parquet")
 
 
-def check_output(path: str | Path, formats: Sequence[str] = FORMATS) -> None:
+def check_writable(path: str | Path, formats: Sequence[str] = FORMATS) -> None:
     """Raise the error that writing the file would raise, before the work starts.
 
     Args:
@@ -191,10 +191,10 @@ def check_output(path: str | Path, formats: Sequence[str] = FORMATS) -> None:
         raise fail(f"output file {path}", "a file", "a folder")
     if not path.parent.exists():
         raise fail(f"output folder {path.parent}", "an existing folder", "nothing of that name")
-    check_output_folder(path.parent)
+    check_folder_writable(path.parent)
 
 
-def check_output_folder(folder: str | Path) -> None:
+def check_folder_writable(folder: str | Path) -> None:
     """Raise ValueError unless files can be written in the folder, or it can be made."""
     folder = Path(folder)
     existing = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
@@ -217,8 +217,8 @@ def format_of(path: Path, formats: Sequence[str] = FORMATS) -> str:
 
 def check_replaceable(target: Path, mark: str) -> None:
     """Raise ValueError unless `target` can be written and is new, empty, or holds a file `mark`: earlier results."""
-    check_output_folder(target)
-    clear_left(target)
+    check_folder_writable(target)
+    remove_leftover_folders(target)
     if target.is_dir() and {p.name for p in target.iterdir()} - {LOCK} and not (target / mark).is_file():
         raise fail(f"output folder {target}", f"a new or empty folder, or one with {mark} to replace", "other files")
 
@@ -230,7 +230,7 @@ def whole_folder(target: Path) -> Iterator[Path]:
     Remains of killed processes that wrote the same folder are cleared first, and earlier results that one had moved
     aside are restored.
     """
-    clear_left(target)
+    remove_leftover_folders(target)
     made = [folder for folder in target.parents if not folder.exists()]
     partial, lock = target.parent, ExitStack()  # the parent until there is a temporary folder
     try:
@@ -240,7 +240,7 @@ def whole_folder(target: Path) -> Iterator[Path]:
             partial = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
             (partial / "new").mkdir()
             lock.enter_context(try_lock(partial))
-        with lock, naming(target):
+        with lock, name_path_in_errors(target):
             yield partial / "new"
             sync_tree(partial / "new")
         with hold_signals():
@@ -268,7 +268,7 @@ def _replace_folder(partial: Path, target: Path) -> None:
     shutil.rmtree(partial)
 
 
-def clear_left(target: Path) -> None:
+def remove_leftover_folders(target: Path) -> None:
     """Remove the temporary folders next to `target` that killed processes left, none that a running process uses.
 
     A folder with something else in it is nobody's of ours. Earlier results that were moved aside are put back.

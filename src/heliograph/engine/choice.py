@@ -15,8 +15,8 @@ import numpy as np
 from heliograph.engine.limits import SHORT
 from heliograph.numerics import float64
 from heliograph.numerics.check import fail, show_value
-from heliograph.numerics.process.collector import no_collector
-from heliograph.numerics.process.stack import make_room
+from heliograph.numerics.process.collector import pause_collector
+from heliograph.numerics.process.stack import reserve_stack
 from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import PyTree
 from straightline import Unsupported, compile
@@ -144,7 +144,7 @@ def compile_on_call(function: Callable[P, R]) -> Callable[P, R]:
         """Compute the function by native code or XLA."""
         if kwargs or is_traced(*args):
             return by_xla(*args, **kwargs)
-        float64.check_process()
+        float64.refuse_forked_process()
         returned: R = compute_once(function, by_xla, jax.tree.map(float64.as_array, args), SHORT)
         return returned
 
@@ -165,8 +165,8 @@ def try_native(make: Callable[[], Code]) -> Code | None:
     if engine == "xla":
         return None
     try:
-        with no_collector():
-            return make_room(make)()
+        with pause_collector():
+            return reserve_stack(make)()
     except Unsupported as error:
         if engine == "native":
             raise fail("native code", "a program of operations that it takes", str(error)) from None
@@ -210,8 +210,8 @@ class _ArrayOfRun(NamedTuple):
 
 
 @lru_cache(COMPILED)
-@make_room
-@no_collector()
+@reserve_stack
+@pause_collector()
 def _compile_structure(structure: Any, leaves: tuple[Any, ...], most: int | None) -> tuple[Any, str]:
     """Return the code of a function in a tree (function, *arguments) with these leaves, or None and why there is none.
 

@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from jax.tree_util import keystr, tree_flatten_with_path
 
-from heliograph.disk.whole_file import check_output, whole_files
+from heliograph.disk.whole_file import check_writable, whole_files
 from heliograph.export.program import RESERVED, Real, write_step_program
-from heliograph.export.text import CText, Form, write_c_text
+from heliograph.export.text import CText, TextOptions, write_c_text
 from heliograph.export.window import check_window
 from heliograph.factors.columns import use_precision
 from heliograph.filters.base import AbstractFilter
@@ -112,7 +112,7 @@ def write_filter(
     window: int | None = None,
 ) -> Exported:
     """Write as `export_c`, with names for the components of z."""
-    source = check_place(path)
+    source = check_source_path(path)
     if precision not in PRECISIONS:
         raise fail("precision", " or ".join(PRECISIONS), show_value(precision))
     late = None if window is None else check_window(filter, window)
@@ -124,7 +124,7 @@ def write_filter(
     return Exported(header, source, text.operations, text.state_bytes)
 
 
-def check_place(path: str | Path) -> Path:
+def check_source_path(path: str | Path) -> Path:
     """Return the path of the source, checked: its name is the prefix of the names in it.
 
     Raises:
@@ -133,8 +133,8 @@ def check_place(path: str | Path) -> Path:
     if not isinstance(path, str | Path):
         raise fail("path of the source", "a file that ends in .c", show_value(path))
     source = Path(path)
-    check_output(source, (".c",))
-    check_output(source.with_suffix(".h"), (".h",))
+    check_writable(source, (".c",))
+    check_writable(source.with_suffix(".h"), (".h",))
     stem = source.stem
     if not (stem.isascii() and stem.isidentifier()) or stem in RESERVED or stem.startswith("_"):
         raise fail(f"output file {source}", "a name that C takes for its functions, such as step.c", repr(stem))
@@ -156,7 +156,7 @@ def make_text(
         expected = "a filter that carries its covariance as factors L D L', or a schedule of gains"
         raise fail("single precision", expected, type(filter).__name__)
     exported = filter if real == "double" else filter.for_single_precision()
-    form = Form(prefix, real, received, kind, late)
+    form = TextOptions(prefix, real, received, kind, late)
     texts = list[CText]()
     try:
         for short in (True, False) if size else (False,):

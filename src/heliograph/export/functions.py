@@ -1,10 +1,10 @@
 """Text of the functions of an exported step: whole, or its prediction, its correction and a start apart."""
 
-from heliograph.export.parts import Part
+from heliograph.export.parts import PartOfStep
 from heliograph.export.program import Real, StepProgram
 
 
-def list_heads(program: StepProgram, prefix: str, real: Real) -> list[str]:
+def list_signatures(program: StepProgram, prefix: str, real: Real) -> list[str]:
     """Return the heads of the functions that move the state: of the step, or also of its parts, the step last."""
     state = f"{prefix}_state *state"
     step = f"int {prefix}_step({state}, const {real} z[], const {real} u[])"
@@ -28,7 +28,7 @@ def declare_innovation(program: StepProgram, prefix: str, real: Real) -> str:
     )
 
 
-def explain_parts(program: StepProgram, prefix: str) -> list[str]:
+def explain_separate_functions(program: StepProgram, prefix: str) -> list[str]:
     """Return lines for the header on the functions that are apart."""
     lines = [
         "",
@@ -50,21 +50,21 @@ def explain_parts(program: StepProgram, prefix: str) -> list[str]:
 
 
 def write_functions(program: StepProgram, prefix: str, real: Real) -> list[str]:
-    """Return the text of the functions that move the state, in the order of `list_heads`.
+    """Return the text of the functions that move the state, in the order of `list_signatures`.
 
     Each writes the state only where nothing is refused.
     """
-    heads = list_heads(program, prefix, real)
+    heads = list_signatures(program, prefix, real)
     if len(program.parts) == 1:
         body = [
             *_check_measurement(program),
             *_check_inputs(program),
-            *_compute(program, 0, prefix),
+            *_write_part_statements(program, 0, prefix),
             "    return 0;",
         ]
         return [_join_function(heads[0], body)]
-    predict = [*_check_inputs(program), *_compute(program, 0, prefix), "    return 0;"]
-    correct = [*_check_measurement(program), *_compute(program, 1, prefix), "    return 0;"]
+    predict = [*_check_inputs(program), *_write_part_statements(program, 0, prefix), "    return 0;"]
+    correct = [*_check_measurement(program), *_write_part_statements(program, 1, prefix), "    return 0;"]
     step = [
         f"    {prefix}_state after = *state;",
         f"    int refused = {prefix}_predict(&after, u);",
@@ -74,7 +74,7 @@ def write_functions(program: StepProgram, prefix: str, real: Real) -> list[str]:
         "    *state = after;",
         "    return 0;",
     ]
-    start = [] if program.at is None else [_write_start(program, prefix)]
+    start = [] if program.at is None else [_write_start_statements(program, prefix)]
     return [_join_function(head, body) for head, body in zip(heads, [*start, predict, correct, step], strict=True)]
 
 
@@ -96,7 +96,7 @@ def _check_inputs(program: StepProgram) -> list[str]:
     return lines
 
 
-def _compute(program: StepProgram, number: int, prefix: str) -> list[str]:
+def _write_part_statements(program: StepProgram, number: int, prefix: str) -> list[str]:
     """Return the statements that compute a part, refuse an implausible one, and then write all that changed."""
     part, code = program.parts[number], program.computes[number]
     read = [f"state->{m.name}" + ("" if m.start.ndim else "[0]") for m in program.read]
@@ -129,7 +129,7 @@ def _place_beside(name: str) -> str:
     return f"&news.{name}" if name in ("nis", "arrived") else f"news.{name}"
 
 
-def _write_step_number(program: StepProgram, part: Part) -> str:
+def _write_step_number(program: StepProgram, part: PartOfStep) -> str:
     """Return the C expression for the number of the step that a part belongs to.
 
     A prediction counts the step: a correction's is one less than the state's count.
@@ -139,7 +139,7 @@ def _write_step_number(program: StepProgram, part: Part) -> str:
     return "state->step > 0 ? state->step - 1 : 0" if part.name == "correct" else "state->step"
 
 
-def _write_start(program: StepProgram, prefix: str) -> list[str]:
+def _write_start_statements(program: StepProgram, prefix: str) -> list[str]:
     """Return the statements of a start from a given mean and covariance."""
     members = ", ".join(f"after.{m.name}" for m in program.members)
     return [

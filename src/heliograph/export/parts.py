@@ -17,7 +17,7 @@ ROUNDING = {"double": 1e-9, "float": 1e-4}  # of an expectation after many steps
 PRECISION = {"double": np.float64, "float": np.float32}
 
 
-class Part(NamedTuple):
+class PartOfStep(NamedTuple):
     """A function of arrays that becomes one of C: the step, its prediction or its correction.
 
     Args:
@@ -37,7 +37,7 @@ class Part(NamedTuple):
     beside: tuple[str, ...]
 
 
-def parts_of_step(filter: AbstractFilter, real: str, apart: bool) -> list[Part]:
+def make_parts_of_step(filter: AbstractFilter, real: str, apart: bool) -> list[PartOfStep]:
     """Return the step, or apart its prediction and its correction, for numbers of type `real`.
 
     A measurement that differs from what was expected by less than `ROUNDING` of itself is used, however small its
@@ -46,12 +46,14 @@ def parts_of_step(filter: AbstractFilter, real: str, apart: bool) -> list[Part]:
     leaves, tree = jax.tree.flatten(filter.init())
     z, u, k = np.zeros(filter.received), np.zeros(len(filter.inputs)), np.asarray(0)
     if not apart:
-        return [Part("step", ("z", "u"), _make_step(filter, tree, real), (leaves, z, u, k), ("implausible", "spoilt"))]
+        return [
+            PartOfStep("step", ("z", "u"), _make_step(filter, tree, real), (leaves, z, u, k), ("implausible", "spoilt"))
+        ]
     weighs = filter.correct(filter.predict(filter.init(), u, 0), z, 0)[1].weight is not None
     beside = ("implausible", "value", "nis", "arrived", *(("weight",) if weighs else ()))
     return [
-        Part("predict", ("u",), _make_prediction(filter, tree, real), (leaves, u, k), ("implausible", "spoilt")),
-        Part("correct", ("z",), _make_correction(filter, tree, real), (leaves, z, k), beside),
+        PartOfStep("predict", ("u",), _make_prediction(filter, tree, real), (leaves, u, k), ("implausible", "spoilt")),
+        PartOfStep("correct", ("z",), _make_correction(filter, tree, real), (leaves, z, k), beside),
     ]
 
 
@@ -62,7 +64,7 @@ def _make_step(filter: AbstractFilter, tree: PyTree, real: str) -> Callable[...,
     def step(arrays: list[jax.Array], z: jax.Array, u: jax.Array, k: jax.Array) -> list[jax.Array]:
         """Return state, estimate and two flags after a step."""
         after, estimate, judgement, innovation = filter.judge_step(jax.tree.unflatten(tree, arrays), z, u, k)
-        implausible = find_implausible(innovation, z, ROUNDING[real]) | (judgement.input > 0)
+        implausible = is_implausible(innovation, z, ROUNDING[real]) | (judgement.input > 0)
         spoilt = do_inputs_spoil(filter, filter.inputs, u, k, PRECISION[real])
         return [*jax.tree.leaves(after), estimate.mean, estimate.covariance, implausible, spoilt]
 
@@ -97,7 +99,7 @@ def _make_correction(filter: AbstractFilter, tree: PyTree, real: str) -> Callabl
         judgement = Judgement.judge_correction(
             filter.claim, (prior, after), (expected, estimate), innovation, z, filter.of_atoms
         )
-        implausible = find_implausible(innovation, z, ROUNDING[real])
+        implausible = is_implausible(innovation, z, ROUNDING[real])
         beside = [implausible, innovation.value, judgement.distance, judgement.arrived]
         weight = [] if innovation.weight is None else [innovation.weight]
         return [*jax.tree.leaves(after), estimate.mean, estimate.covariance, *beside, *weight]
@@ -105,7 +107,7 @@ def _make_correction(filter: AbstractFilter, tree: PyTree, real: str) -> Callabl
     return correct
 
 
-def find_implausible(innovation: Innovation, z: jax.Array, rounding: float) -> jax.Array:
+def is_implausible(innovation: Innovation, z: jax.Array, rounding: float) -> jax.Array:
     """Return whether some component is larger than expected, and too many of its own deviations away from that.
 
     The deviation of one component is cheap, where those of all together are not. Where the innovation is of a part of

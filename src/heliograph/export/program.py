@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.export.parts import Part, parts_of_step
-from heliograph.factors.centred import CentredGaussian, centred_from_covariance
+from heliograph.export.parts import PartOfStep, make_parts_of_step
+from heliograph.factors.centred import SplitMeanGaussian, centred_from_covariance
 from heliograph.factors.gaussian import Gaussian, from_covariance
 from heliograph.filters.base import AbstractFilter
 from heliograph.numerics.check import InputError, fail
@@ -25,7 +25,7 @@ ADDED = frozenset(("step", "estimate_mean", "estimate_covariance", "z", "u"))  #
 SAME = 1e-6  # deviations to which a covariance's factors give it back
 
 
-class Member(NamedTuple):
+class StateMember(NamedTuple):
     """An array in the state of the step: its name, and its numbers before the first step."""
 
     name: str
@@ -50,9 +50,9 @@ class StepProgram(NamedTuple):
     """
 
     filter: AbstractFilter
-    members: list[Member]
-    read: list[Member]
-    parts: list[Part]
+    members: list[StateMember]
+    read: list[StateMember]
+    parts: list[PartOfStep]
     computes: list[Any]
     initial: Any
     at: Any
@@ -79,12 +79,12 @@ def write_step_program(
     """
     state = filter.init()
     leaves = jax.tree.leaves(state)
-    named = [Member(name, np.asarray(leaf)) for name, leaf in zip(name_arrays(state), leaves, strict=True)]
-    read, estimate, parts = list(named), filter.estimate(state), parts_of_step(filter, real, apart)
-    named += [Member("estimate_mean", np.asarray(estimate.mean))]
-    named += [Member("estimate_covariance", np.asarray(estimate.covariance))]
+    named = [StateMember(name, np.asarray(leaf)) for name, leaf in zip(name_state_arrays(state), leaves, strict=True)]
+    read, estimate, parts = list(named), filter.estimate(state), make_parts_of_step(filter, real, apart)
+    named += [StateMember("estimate_mean", np.asarray(estimate.mean))]
+    named += [StateMember("estimate_covariance", np.asarray(estimate.covariance))]
     try:
-        symmetric = _find_symmetric(parts)
+        symmetric = _find_symmetric_arrays(parts)
         wholes = [_write_part(part, symmetric, prefix, real, size) for part in parts]
         # Mean and covariance of the estimate are members of their own only if they are no arrays of the state.
         places = [max(_find_same_result(n, whole, named) for whole in wholes) for n in (len(leaves), len(leaves) + 1)]
@@ -93,8 +93,8 @@ def write_step_program(
         computes = [_write_part(part, symmetric, prefix, real, size, kept, (read, members)) for part in parts]
         names, starts = [m.name for m in members], [m.start for m in members]
         initial = to_c(lambda: starts, name=f"{prefix}_initial", single=real == "float", names=((), names))
-        set_anew = isinstance(state, Gaussian | CentredGaussian) and apart
-        at = _write_start(filter, kept, names, prefix, real) if set_anew else None
+        set_anew = isinstance(state, Gaussian | SplitMeanGaussian) and apart
+        at = _write_start_function(filter, kept, names, prefix, real) if set_anew else None
     except Unsupported as error:
         raise no_c(error.operation, error.where) from None
     mean, covariance = (named[n].name for n in places)
@@ -102,7 +102,7 @@ def write_step_program(
     return StepProgram(filter, members, read, parts, computes, initial, at, mean, covariance, counts)
 
 
-def _find_same_result(number: int, code: Any, named: Sequence[Member]) -> int:
+def _find_same_result(number: int, code: Any, named: Sequence[StateMember]) -> int:
     """Return the first result that is always equal to this one, before the first step too; itself where none is."""
     same = [n for n in range(number) if code.results[n].same == code.results[number].same]
     start = named[number].start
@@ -110,13 +110,13 @@ def _find_same_result(number: int, code: Any, named: Sequence[Member]) -> int:
 
 
 def _write_part(
-    part: Part,
+    part: PartOfStep,
     symmetric: set[int],
     prefix: str,
     real: Real,
     size: bool = False,
     kept: Sequence[int] | None = None,
-    names: tuple[Sequence[Member], Sequence[Member]] = ((), ()),
+    names: tuple[Sequence[StateMember], Sequence[StateMember]] = ((), ()),
 ) -> Any:
     """Return a part of a step as a function of C; all its arguments but the measurement are finite.
 
@@ -153,7 +153,7 @@ def _write_part(
     )
 
 
-def _write_start(filter: AbstractFilter, kept: list[int], names: list[str], prefix: str, real: Real) -> Any:
+def _write_start_function(filter: AbstractFilter, kept: list[int], names: list[str], prefix: str, real: Real) -> Any:
     """Return the function of C from mean and covariance to the members, and a flag `none`: these are no such law.
 
     A covariance whose factors do not give it back is none: elimination keeps each pivot at zero or above.
@@ -165,10 +165,10 @@ def _write_start(filter: AbstractFilter, kept: list[int], names: list[str], pref
         prefix: of the function's name.
         real: type of its numbers.
     """
-    make = centred_from_covariance if isinstance(filter.init(), CentredGaussian) else from_covariance
+    make = centred_from_covariance if isinstance(filter.init(), SplitMeanGaussian) else from_covariance
 
     @jax.jit
-    def begin(mean: jax.Array, covariance: jax.Array) -> list[jax.Array]:
+    def start_from_moments(mean: jax.Array, covariance: jax.Array) -> list[jax.Array]:
         """Return the members of the state of a mean and covariance, and whether these are none."""
         state = make(mean, covariance)
         estimate = filter.estimate(state)
@@ -181,7 +181,7 @@ def _write_start(filter: AbstractFilter, kept: list[int], names: list[str], pref
 
     n = len(filter.states)
     return to_c(
-        begin,
+        start_from_moments,
         np.zeros(n),
         np.eye(n),
         name=f"{prefix}_compute_start",
@@ -190,7 +190,7 @@ def _write_start(filter: AbstractFilter, kept: list[int], names: list[str], pref
     )
 
 
-def _find_symmetric(parts: Sequence[Part]) -> set[int]:
+def _find_symmetric_arrays(parts: Sequence[PartOfStep]) -> set[int]:
     """Return which arrays of the state are always symmetric, of which one triangle is read.
 
     By induction: symmetric at the start, and after each part from symmetric ones. Assume all, drop those that are not.
@@ -211,7 +211,7 @@ def no_c(operation: str, where: str) -> InputError:
     return fail("export", "operations that C has", f"{operation} at {where}")
 
 
-def name_arrays(state: PyTree) -> list[str]:
+def name_state_arrays(state: PyTree) -> list[str]:
     """Return names in C for the arrays of a state, from their field names; the Gaussian that it holds has no name."""
     names: list[str] = []
     for path, _ in jax.tree_util.tree_flatten_with_path(state)[0]:

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from heliograph.factors.centred import CentredGaussian
+from heliograph.factors.centred import SplitMeanGaussian
 from heliograph.filters.base import AbstractFilter
 from heliograph.model.over_time import first
 from heliograph.random_affine.base import AbstractRandomAffine
@@ -33,7 +33,7 @@ def explain_rounding(filter: AbstractFilter, ranged: bool) -> list[str]:
         "mean is rounded to single precision. What that leaves out of mean[i] is state->low[i]: take an origin off",
         "mean[i] first, and then add it.",
     ]
-    return [*(lines if ranged else []), *(apart if isinstance(filter.init(), CentredGaussian) else [])]
+    return [*(lines if ranged else []), *(apart if isinstance(filter.init(), SplitMeanGaussian) else [])]
 
 
 def _find_deviations(filter: AbstractFilter) -> np.ndarray | None:

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import heliograph
 from heliograph.disk.quoting import visible
-from heliograph.export.functions import declare_innovation, explain_parts, list_heads, write_functions
+from heliograph.export.functions import declare_innovation, explain_separate_functions, list_signatures, write_functions
 from heliograph.export.layout import lay_out_array, lay_out_struct
 from heliograph.export.program import Real, StepProgram
 from heliograph.export.single_precision import explain_ranges, explain_rounding
@@ -22,7 +22,7 @@ MEANING: dict[Claim, str] = {
 }
 
 
-class Form(NamedTuple):
+class TextOptions(NamedTuple):
     """Options of the text.
 
     Args:
@@ -49,7 +49,7 @@ class CText(NamedTuple):
     state_bytes: int
 
 
-def write_c_text(program: StepProgram, form: Form) -> CText:
+def write_c_text(program: StepProgram, form: TextOptions) -> CText:
     """Return header and source of a step."""
     prefix, real = form.prefix, form.real
     # The C type of each member: that of the result "next_<member>".
@@ -70,7 +70,7 @@ def write_c_text(program: StepProgram, form: Form) -> CText:
         real=real,
     )
     # The header declares the state and explains the functions.
-    heads = [*list_heads(program, prefix, real), *([] if window is None else window.heads)]
+    heads = [*list_signatures(program, prefix, real), *([] if window is None else window.heads)]
     header = _HEADER.format(
         prefix=prefix,
         guard=f"{prefix.upper()}_H",
@@ -106,7 +106,7 @@ def claim_of(filter: AbstractFilter, real: Real) -> Claim:
     return filter.claim if real == "double" or filter.claim == "none" else "nominal"
 
 
-def _write_comment(program: StepProgram, form: Form, window: WindowText | None) -> str:
+def _write_comment(program: StepProgram, form: TextOptions, window: WindowText | None) -> str:
     """Return the comment at the head of the header: how to call the functions, and what the arrays hold."""
     filter, prefix, claim = program.filter, form.prefix, claim_of(program.filter, form.real)
     # States that are angles or attitudes say so.
@@ -128,7 +128,7 @@ def _write_comment(program: StepProgram, form: Form, window: WindowText | None) 
         "6 the inputs are none: dt is negative, beyond 2^53 units or the wrapped difference of unsigned counters of 32",
         "bits (of its unit, a thousandth or a millionth), or a function of the inputs returned no finite numbers, or",
         "no covariance.",
-        *(explain_parts(program, prefix) if len(program.parts) > 1 else []),
+        *(explain_separate_functions(program, prefix) if len(program.parts) > 1 else []),
         *([] if window is None else window.comment),
         "",
         *_explain_entries("z", form.received, ranges),

@@ -1,17 +1,17 @@
 """Names that other folders take; the package loads them when first used."""
 
-from .centred import CentredGaussian as CentredGaussian
+from .centred import SplitMeanGaussian as SplitMeanGaussian
 from .centred import center_gaussian as center_gaussian
 from .centred import center_known as center_known
 from .centred import centred_from_covariance as centred_from_covariance
 from .changes import settle as settle
 from .changes import unsettle as unsettle
-from .columns import Columns as Columns
+from .columns import WeightedColumns as WeightedColumns
 from .columns import below_diagonal as below_diagonal
 from .columns import columns_of as columns_of
-from .columns import columns_of_each as columns_of_each
 from .columns import decorrelate as decorrelate
 from .columns import eliminate as eliminate
+from .columns import factor_covariances as factor_covariances
 from .columns import join_columns as join_columns
 from .columns import noise_beside_repeated as noise_beside_repeated
 from .columns import reciprocal_or_zero as reciprocal_or_zero

@@ -11,7 +11,7 @@ from heliograph.numerics.compensated import split_sum
 from heliograph.numerics.types import Array, Float
 
 
-class CentredGaussian(NamedTuple):
+class SplitMeanGaussian(NamedTuple):
     """Mean high + low, where high is the mean as it is rounded, and covariance L diag(d) L'.
 
     Shapes: high and low (n,), lower (n (n - 1) / 2,) of L, variances d (n,).
@@ -28,20 +28,20 @@ class CentredGaussian(NamedTuple):
         return Gaussian(self.low, self.lower, self.variances)
 
 
-def center_gaussian(center: jax.Array, x: Gaussian) -> CentredGaussian:
+def center_gaussian(center: jax.Array, x: Gaussian) -> SplitMeanGaussian:
     """Return the law of center + x."""
     mean = split_sum(center, x.mean)
-    return CentredGaussian(mean.high, jnp.asarray(mean.low), x.lower, x.variances)
+    return SplitMeanGaussian(mean.high, jnp.asarray(mean.low), x.lower, x.variances)
 
 
-def center_known(x: Gaussian) -> CentredGaussian:
+def center_known(x: Gaussian) -> SplitMeanGaussian:
     """Return a law of known numbers about its mean as single precision has it."""
     mean = np.asarray(x.mean, np.float64)
     high = mean.astype(np.float32).astype(np.float64)
-    return CentredGaussian(jnp.asarray(high), jnp.asarray(mean - high), x.lower, x.variances)
+    return SplitMeanGaussian(jnp.asarray(high), jnp.asarray(mean - high), x.lower, x.variances)
 
 
-def centred_from_covariance(mean: Array, covariance: Array) -> CentredGaussian:
+def centred_from_covariance(mean: Array, covariance: Array) -> SplitMeanGaussian:
     """Return the law of a mean that the precision has, and of a covariance matrix."""
     x = from_covariance(mean, covariance)
-    return CentredGaussian(jnp.asarray(mean), jnp.zeros_like(x.mean), x.lower, x.variances)
+    return SplitMeanGaussian(jnp.asarray(mean), jnp.zeros_like(x.mean), x.lower, x.variances)

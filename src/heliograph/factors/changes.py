@@ -7,7 +7,7 @@ its mean beside the center; here it becomes a mean on the group, and its covaria
 import jax
 import jax.numpy as jnp
 
-from heliograph.factors.columns import Columns
+from heliograph.factors.columns import WeightedColumns
 from heliograph.factors.gaussian import Gaussian, from_columns
 from heliograph.numerics.manifold import Manifold
 
@@ -23,7 +23,7 @@ def settle(manifold: Manifold, center: jax.Array, x: Gaussian) -> Gaussian:
     reset = manifold.reset(x.mean - center) if manifold.rotations else None
     if reset is None:
         return x
-    return from_columns(manifold.settle(center, x.mean), Columns(reset @ x.root, x.variances))
+    return from_columns(manifold.settle(center, x.mean), WeightedColumns(reset @ x.root, x.variances))
 
 
 def unsettle(manifold: Manifold, center: jax.Array, x: Gaussian) -> Gaussian:
@@ -36,4 +36,4 @@ def unsettle(manifold: Manifold, center: jax.Array, x: Gaussian) -> Gaussian:
     mean = manifold.unsettle(center, x.mean)
     reset = manifold.reset(mean - center)
     assert reset is not None
-    return from_columns(mean, Columns(jnp.linalg.inv(reset) @ x.root, x.variances))
+    return from_columns(mean, WeightedColumns(jnp.linalg.inv(reset) @ x.root, x.variances))

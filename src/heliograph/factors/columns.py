@@ -29,7 +29,7 @@ LARGEST = 1e30  # variance by rounding: beyond it numbers are absurd, and their 
 RANK = 1e-12  # of a component's variance: less of a pivot of a known covariance is none
 
 
-class Columns(NamedTuple):
+class WeightedColumns(NamedTuple):
     """A covariance W diag(w) W'.  Shapes: matrix W (n, columns), weights w (columns,)."""
 
     matrix: Any  # Float[Array, "n columns"], NumPy's or JAX's
@@ -47,31 +47,31 @@ class Columns(NamedTuple):
         variances: jax.Array = jnp.asarray(self.matrix) ** 2 @ self.weights
         return variances
 
-    def through(self, matrix: Array) -> "Columns":
+    def through(self, matrix: Array) -> "WeightedColumns":
         """Return the covariance of A v for a v with this one."""
-        return Columns(matrix @ self.matrix, self.weights)
+        return WeightedColumns(matrix @ self.matrix, self.weights)
 
-    def times(self, factor: Array) -> "Columns":
+    def times(self, factor: Array) -> "WeightedColumns":
         """Return the covariance times a number."""
-        return Columns(self.matrix, self.weights * factor)
+        return WeightedColumns(self.matrix, self.weights * factor)
 
 
-def join_columns(*parts: Columns) -> Columns:
+def join_columns(*parts: WeightedColumns) -> WeightedColumns:
     """Add covariances: their columns side by side."""
     matrix = jnp.concatenate([jnp.asarray(part.matrix) for part in parts], axis=1)
-    return Columns(matrix, jnp.concatenate([jnp.asarray(part.weights) for part in parts]))
+    return WeightedColumns(matrix, jnp.concatenate([jnp.asarray(part.weights) for part in parts]))
 
 
-def side_by_side(parts: Columns, weights: Array) -> Columns:
+def side_by_side(parts: WeightedColumns, weights: Array) -> WeightedColumns:
     """Add covariances P_i with weights, sum_i w_i P_i; `parts` have a leading axis."""
     matrix = jnp.asarray(parts.matrix)
     columns = jnp.moveaxis(matrix, 0, 1).reshape(matrix.shape[1], -1)
-    return Columns(columns, (jnp.asarray(weights)[:, None] * parts.weights).reshape(-1))
+    return WeightedColumns(columns, (jnp.asarray(weights)[:, None] * parts.weights).reshape(-1))
 
 
-def zero_covariance(n: int) -> Columns:
+def zero_covariance(n: int) -> WeightedColumns:
     """Return the covariance of zero of n components: no columns."""
-    return Columns(np.zeros((n, 0)), np.zeros(0))
+    return WeightedColumns(np.zeros((n, 0)), np.zeros(0))
 
 
 def unit_lower(entries: Array) -> Any:
@@ -122,7 +122,7 @@ def square_root(x: jax.Array) -> jax.Array:
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
 
 
-def triangularise(columns: Columns) -> Columns:
+def triangularise(columns: WeightedColumns) -> WeightedColumns:
     """Find L and d with L diag(d) L' = W diag(w) W', by making the rows of W orthogonal from the first one down.
 
     d_j = |row j|^2 in the weights, L_ij = (row i, row j) / d_j, and row i loses L_ij row j. c n (n + 1) products for c
@@ -131,11 +131,11 @@ def triangularise(columns: Columns) -> Columns:
     Source: Thornton, Triangular covariance factorizations for Kalman filtering (1976), modified weighted Gram-Schmidt.
     """
     if len(columns.matrix) > WRITTEN:
-        return _triangularise_many(columns)
+        return _triangularise_by_loop(columns)
     return _triangularise_row_by_row(columns)
 
 
-def _triangularise_row_by_row(columns: Columns) -> Columns:
+def _triangularise_row_by_row(columns: WeightedColumns) -> WeightedColumns:
     """Return L and d with L diag(d) L' = A diag(w) A', by weighted Gram-Schmidt, one row of A after another."""
     rows, weights = jnp.asarray(columns.matrix), jnp.asarray(columns.weights)
     n, lower, variances = len(rows), [], []
@@ -151,7 +151,7 @@ def _triangularise_row_by_row(columns: Columns) -> Columns:
     return assemble_factors(lower, variances, rows.dtype)
 
 
-def absorb_columns(factors: Columns, columns: Columns) -> Columns:
+def absorb_columns(factors: WeightedColumns, columns: WeightedColumns) -> WeightedColumns:
     """Find L and d of L diag(d) L' + W diag(w) W', W's columns one after another in a loop: short rather than fast.
 
     A column c of weight w goes from row to row j: with d_j' = d_j + w c_j^2, s = d_j / d_j' and g = w c_j / d_j',
@@ -181,20 +181,20 @@ def absorb_columns(factors: Columns, columns: Columns) -> Columns:
 
     start = below_diagonal(jnp.asarray(factors.matrix)).astype(dtype), jnp.asarray(factors.weights).astype(dtype)
     (lower, variances), _ = lax.scan(absorb, start, (jnp.asarray(columns.matrix).T, jnp.asarray(columns.weights)))
-    return Columns(unit_lower(lower), variances)
+    return WeightedColumns(unit_lower(lower), variances)
 
 
-def eliminate(covariance: jax.Array, least: float = 0.0) -> Columns:
+def eliminate(covariance: jax.Array, least: float = 0.0) -> WeightedColumns:
     """Factor P = L diag(d) L' by elimination: n^3 / 6 products, n reciprocals.
 
     A pivot is known to eps of its own variance, of which rounding may leave less than nothing, as it may of a variance
     of zero: it is at least `least` times the variance's size.
     """
     pivots = least * jnp.abs(jnp.diagonal(covariance))
-    return (_eliminate_many if len(covariance) > WRITTEN else _eliminate_column_by_column)(covariance, pivots)
+    return (_eliminate_by_loop if len(covariance) > WRITTEN else _eliminate_column_by_column)(covariance, pivots)
 
 
-def _eliminate_column_by_column(covariance: jax.Array, least: jax.Array) -> Columns:
+def _eliminate_column_by_column(covariance: jax.Array, least: jax.Array) -> WeightedColumns:
     """Return L and d with L diag(d) L' = P, by elimination without square roots; no d is below `least`."""
     n, rest, lower, variances = len(covariance), covariance, [], []
     for j in range(n):
@@ -245,21 +245,21 @@ def factor_constant(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return lower[np.tril_indices(n, -1)], variances
 
 
-def columns_of(covariance: Array) -> Columns:
+def columns_of(covariance: Array) -> WeightedColumns:
     """Return the columns of a covariance: as many as its rank where its numbers are known, else n by elimination."""
     if isinstance(covariance, np.ndarray):
         root = root_of(covariance)
-        return Columns(root, np.ones(root.shape[1]))
+        return WeightedColumns(root, np.ones(root.shape[1]))
     return eliminate(jnp.asarray(covariance))
 
 
-def columns_of_each(covariances: Array) -> Columns:
+def factor_covariances(covariances: Array) -> WeightedColumns:
     """Return the columns (count, n, n) of covariances (count, n, n), one after another.
 
     Of covariances that are known they are roots, padded by columns of zeros; of others they come by elimination.
     """
     if not isinstance(covariances, np.ndarray):
-        eliminated: Columns = jax.vmap(eliminate)(covariances)
+        eliminated: WeightedColumns = jax.vmap(eliminate)(covariances)
         return eliminated
     n = covariances.shape[-1]
     each = list(covariances.reshape(-1, n, n))
@@ -268,17 +268,17 @@ def columns_of_each(covariances: Array) -> Columns:
     roots = {numbers: root_of(covariance) for numbers, covariance in different.items()}
     padded = {numbers: np.pad(root, ((0, 0), (0, n - root.shape[1]))) for numbers, root in roots.items()}
     matrices = [padded[covariance.tobytes()] for covariance in each]
-    return Columns(np.reshape(matrices, covariances.shape), np.ones(covariances.shape[:-1]))
+    return WeightedColumns(np.reshape(matrices, covariances.shape), np.ones(covariances.shape[:-1]))
 
 
-def rounding_of(seconds: Array) -> Columns:
+def rounding_of(seconds: Array) -> WeightedColumns:
     """Return the rounding of numbers of second moments E[s_i^2] (n,), as noise of (ROUNDING_UNITS eps)^2 E[s_i^2].
 
     It is put where a model is made: of the state beside Q, of a measurement beside R; as columns, since added to a
     variance it would be lost.
     """
     variances = (ROUNDING_UNITS * unit_of(seconds)) ** 2 * seconds
-    return Columns(np.eye(len(seconds)), library(seconds).minimum(variances, LARGEST))
+    return WeightedColumns(np.eye(len(seconds)), library(seconds).minimum(variances, LARGEST))
 
 
 def rounding_of_pivots(covariance: Array) -> float:
@@ -334,17 +334,19 @@ def column_below_diagonal(j: int, column: jax.Array) -> jax.Array:
     return lax.select(np.arange(n) > j, lax.reshape(column, (n,)), jnp.zeros(n, column.dtype))
 
 
-def assemble_factors(lower: list[jax.Array], variances: list[jax.Array], dtype: np.dtype[Any]) -> Columns:
+def assemble_factors(lower: list[jax.Array], variances: list[jax.Array], dtype: np.dtype[Any]) -> WeightedColumns:
     """Put L and d together from the columns below the diagonal and the entries of d."""
     n = len(variances)
     if not n:
-        return Columns(jnp.zeros((0, 0), dtype), jnp.zeros(0, dtype))
+        return WeightedColumns(jnp.zeros((0, 0), dtype), jnp.zeros(0, dtype))
     below = lax.concatenate([lax.expand_dims(column, (1,)) for column in lower], 1)
-    return Columns(below + np.eye(n, dtype=dtype), lax.concatenate([lax.reshape(d, (1,)) for d in variances], 0))
+    return WeightedColumns(
+        below + np.eye(n, dtype=dtype), lax.concatenate([lax.reshape(d, (1,)) for d in variances], 0)
+    )
 
 
 @operation(_triangularise_row_by_row)
-def _triangularise_many(columns: Columns) -> Columns:
+def _triangularise_by_loop(columns: WeightedColumns) -> WeightedColumns:
     """Compute `triangularise` as a loop over the rows; natively row by row where known zeros leave little to compute.
 
     The noises of sixty links are their own columns each: of 12,000 numbers of W all but two hundred are known zeros.
@@ -362,12 +364,12 @@ def _triangularise_many(columns: Columns) -> Columns:
 
     start = rows, jnp.eye(n, dtype=rows.dtype), jnp.zeros(n, rows.dtype)
     _, lower, variances = lax.fori_loop(0, n, body, start)
-    return Columns(lower, variances)
+    return WeightedColumns(lower, variances)
 
 
 @operation(_eliminate_column_by_column)
-def _eliminate_many(covariance: jax.Array, least: jax.Array) -> Columns:
-    """Compute `eliminate` as a loop over the columns, natively as `_triangularise_many`."""
+def _eliminate_by_loop(covariance: jax.Array, least: jax.Array) -> WeightedColumns:
+    """Compute `eliminate` as a loop over the columns, natively as `_triangularise_by_loop`."""
     n = len(covariance)
 
     def body(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
@@ -379,7 +381,7 @@ def _eliminate_many(covariance: jax.Array, least: jax.Array) -> Columns:
 
     start = covariance, jnp.eye(n, dtype=covariance.dtype), jnp.zeros(n, covariance.dtype)
     _, lower, variances = lax.fori_loop(0, n, body, start)
-    return Columns(lower, variances)
+    return WeightedColumns(lower, variances)
 
 
 def insert_column(

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import Columns, below_diagonal, decorrelate, reciprocal_or_zero, unit_lower
+from heliograph.factors.columns import WeightedColumns, below_diagonal, decorrelate, reciprocal_or_zero, unit_lower
 from heliograph.factors.gaussian import BackwardGain, Gaussian
 from heliograph.factors.repeated import triangularise_noise
 from heliograph.numerics.density import LOG_TURN
@@ -61,7 +61,7 @@ def project_diffuse(x: Diffuse, matrix: jax.Array) -> tuple[jax.Array, jax.Array
     return (slopes * x.variances) @ slopes.T, unknown
 
 
-class Levels(NamedTuple):
+class LevelWeights(NamedTuple):
     """Weights of columns (c,): finite ones, and infinite ones."""
 
     finite: jax.Array
@@ -69,8 +69,8 @@ class Levels(NamedTuple):
 
 
 def triangularise_levels(
-    rows: jax.Array, weights: Levels, count: int, whole: jax.Array | None = None
-) -> tuple[jax.Array, Levels, jax.Array]:
+    rows: jax.Array, weights: LevelWeights, count: int, whole: jax.Array | None = None
+) -> tuple[jax.Array, LevelWeights, jax.Array]:
     """Make the first `count` rows (c columns) orthogonal in the weights, from the first down.
 
     Row j has s = sum of w a^2 over infinite columns: where more than rounding is left of it, L_ij by them alone and
@@ -99,14 +99,14 @@ def triangularise_levels(
         finite.append(jnp.where(is_far, 0.0, near))
         infinite.append(jnp.where(is_far, far, 0.0))
         rows = jnp.where((np.arange(len(rows)) > j)[:, None], rows - share[:, None] * row, rows)
-    return jnp.stack(columns, axis=1), Levels(jnp.stack(finite), jnp.stack(infinite)), rows
+    return jnp.stack(columns, axis=1), LevelWeights(jnp.stack(finite), jnp.stack(infinite)), rows
 
 
-def start_diffuse(mean: jax.Array, known: Columns, unknown: np.ndarray) -> Diffuse:
+def start_diffuse(mean: jax.Array, known: WeightedColumns, unknown: np.ndarray) -> Diffuse:
     """Return the law of a state of which some components (n,) are unknown, the others known by columns."""
     n = len(mean)
     rows = jnp.concatenate([jnp.eye(n), jnp.asarray(known.matrix)], axis=1)
-    weights = Levels(
+    weights = LevelWeights(
         jnp.concatenate([jnp.zeros(n), jnp.asarray(known.weights)]),
         jnp.concatenate([jnp.asarray(unknown, float), jnp.zeros(known.matrix.shape[1])]),
     )
@@ -114,54 +114,56 @@ def start_diffuse(mean: jax.Array, known: Columns, unknown: np.ndarray) -> Diffu
     return Diffuse(jnp.asarray(mean), below_diagonal(lower), *levels)
 
 
-def predict_diffuse(x: Diffuse, matrix: jax.Array, shift: jax.Array, noise: Columns) -> Diffuse:
+def predict_diffuse(x: Diffuse, matrix: jax.Array, shift: jax.Array, noise: WeightedColumns) -> Diffuse:
     """Predict x over x+ = F x + b + w."""
     rows, weights = _append_noise(matrix @ x.root, x, noise)
     lower, levels, _ = triangularise_levels(rows, weights, len(x.mean))
     return Diffuse(matrix @ x.mean + shift, below_diagonal(lower), *levels)
 
 
-def _append_noise(slopes: jax.Array, x: Diffuse, noise: Columns) -> tuple[jax.Array, Levels]:
+def _append_noise(slopes: jax.Array, x: Diffuse, noise: WeightedColumns) -> tuple[jax.Array, LevelWeights]:
     """Return the rows [slopes | N] of x+ = m+ + slopes xi + N omega, with the weights of their columns.
 
     x gives the weights of xi, finite and infinite ones; those of omega are finite.
     """
     rows = jnp.concatenate([slopes, jnp.asarray(noise.matrix)], axis=1)
     own = jnp.asarray(noise.weights)
-    return rows, Levels(jnp.concatenate([x.variances, own]), jnp.concatenate([x.infinite, jnp.zeros(len(own))]))
+    return rows, LevelWeights(jnp.concatenate([x.variances, own]), jnp.concatenate([x.infinite, jnp.zeros(len(own))]))
 
 
-class Heard(NamedTuple):
+class DiffuseEvidence(NamedTuple):
     """What a measurement's components said: log-likelihood (), and which heard an unknown direction (m,)."""
 
     log_likelihood: jax.Array
     unknown: jax.Array
 
 
-def observe_diffuse(x: Diffuse, matrix: jax.Array, innovation: jax.Array, noise: Columns) -> tuple[Diffuse, Heard]:
+def observe_diffuse(
+    x: Diffuse, matrix: jax.Array, innovation: jax.Array, noise: WeightedColumns
+) -> tuple[Diffuse, DiffuseEvidence]:
     """Condition x on z = H x + v, given z - H m - E v; NaN where a component did not arrive.
 
     A component that hears an unknown direction adds -1/2 log s_inf to the log-likelihood, the others log N: their sum
     is the log of the integral of p(z | delta) over the unknown delta.
     """
     present = ~jnp.isnan(innovation)
-    fresh = triangularise_noise(Columns(jnp.where(present[:, None], noise.matrix, 0.0), noise.weights))
+    fresh = triangularise_noise(WeightedColumns(jnp.where(present[:, None], noise.matrix, 0.0), noise.weights))
     rows = jnp.concatenate([matrix, jnp.where(present, innovation, 0.0)[:, None]], axis=1)
     rows = decorrelate(fresh.matrix, jnp.where(present[:, None], rows, 0.0))
     shift, density, unknown = jnp.zeros_like(x.mean), jnp.asarray(0.0), []
     state = x
     for i in range(len(innovation)):
         h, noise_i = rows[i, :-1], jnp.where(present[i], fresh.weights[i], 1.0)
-        state, gain, s, heard = _hear(state, h, noise_i)
+        state, gain, s, heard = _observe_scalar(state, h, noise_i)
         e = rows[i, -1] - h @ shift
         shift = shift + gain * e
         log = jnp.where(heard, -jnp.log(s) / 2, -(e**2 / s + jnp.log(s) + LOG_TURN) / 2)
         density = density + jnp.where(present[i], log, 0.0)
         unknown.append(heard & present[i])
-    return state._replace(mean=x.mean + shift), Heard(density, jnp.stack(unknown))
+    return state._replace(mean=x.mean + shift), DiffuseEvidence(density, jnp.stack(unknown))
 
 
-def _hear(x: Diffuse, h: jax.Array, noise: jax.Array) -> tuple[Diffuse, jax.Array, jax.Array, jax.Array]:
+def _observe_scalar(x: Diffuse, h: jax.Array, noise: jax.Array) -> tuple[Diffuse, jax.Array, jax.Array, jax.Array]:
     """Condition x on one number h'x + v, column by column of L from the last.
 
     Returns:
@@ -198,7 +200,7 @@ def _hear(x: Diffuse, h: jax.Array, noise: jax.Array) -> tuple[Diffuse, jax.Arra
     return Diffuse(x.mean, lower, jnp.stack(d), jnp.stack(d_inf)), k * reciprocal_or_zero(total), total, far > 0
 
 
-def condition_on_next_diffuse(x: Diffuse, matrix: jax.Array, ahead: jax.Array, noise: Columns) -> BackwardGain:
+def condition_on_next_diffuse(x: Diffuse, matrix: jax.Array, ahead: jax.Array, noise: WeightedColumns) -> BackwardGain:
     """Return the regression of x on the next state x+ = F x + b + w, of what both levels know.
 
     What of x stays unknown given x+ has a variance that is no number, and so have the estimates that rest on it.

@@ -13,7 +13,7 @@ import numpy as np
 from jax import lax
 
 from heliograph.factors.columns import (
-    Columns,
+    WeightedColumns,
     absorb_columns,
     below_diagonal,
     decorrelate,
@@ -32,7 +32,13 @@ from heliograph.factors.repeated import (
     rounding_of_slopes,
     triangularise_noise,
 )
-from heliograph.factors.scalar_update import measure_parts, measure_product, measure_row, measure_rows, revise_columns
+from heliograph.factors.scalar_update import (
+    measure_parts,
+    measure_row,
+    measure_rows,
+    measure_scalar_given_products,
+    update_columns,
+)
 from heliograph.numerics.density import LOG_TURN
 from heliograph.numerics.linalg import OFF_SUPPORT, OFF_VALUE, PIVOT_TOLERANCE, rounding, symmetric
 from heliograph.numerics.short_programs import writes_short_programs
@@ -57,9 +63,9 @@ class Gaussian(NamedTuple):
         return unit_lower(self.lower)
 
     @property
-    def columns(self) -> Columns:
+    def columns(self) -> WeightedColumns:
         """Covariance as the columns of L with weights d."""
-        return Columns(self.root, self.variances)
+        return WeightedColumns(self.root, self.variances)
 
     @property
     def covariance(self) -> Any:
@@ -71,13 +77,13 @@ class Gaussian(NamedTuple):
         return xp.where(upper, product, xp.swapaxes(product, -1, -2))
 
 
-def from_columns(mean: jax.Array, columns: Columns) -> Gaussian:
+def from_columns(mean: jax.Array, columns: WeightedColumns) -> Gaussian:
     """Return the Gaussian of a covariance that is a sum of squares W diag(w) W', by orthogonal rows: exact to eps^2."""
     factors = triangularise(columns)
     return Gaussian(mean, below_diagonal(factors.matrix), factors.weights)
 
 
-def from_summed_covariance(mean: jax.Array, *parts: Columns) -> Gaussian:
+def from_summed_covariance(mean: jax.Array, *parts: WeightedColumns) -> Gaussian:
     """Return the Gaussian of Cov = sum of the parts, by elimination of the summed matrix: faster, less exact."""
     total = parts[0].covariance
     for part in parts[1:]:
@@ -100,10 +106,10 @@ def from_covariance(mean: Array, covariance: Array) -> Gaussian:
     return Gaussian(jnp.asarray(mean), below_diagonal(columns.matrix), columns.weights)
 
 
-def predict_affine(x: Gaussian, matrix: Any, shift: Array, noise: Columns) -> Gaussian:
+def predict_affine(x: Gaussian, matrix: Any, shift: Array, noise: WeightedColumns) -> Gaussian:
     """Predict x over x+ = F x + b + w: mean F m + b, covariance F L diag(d) (F L)' + Cov w."""
     return from_columns(
-        jnp.asarray(matrix @ x.mean + shift), join_columns(Columns(matrix @ x.root, x.variances), noise)
+        jnp.asarray(matrix @ x.mean + shift), join_columns(WeightedColumns(matrix @ x.root, x.variances), noise)
     )
 
 
@@ -117,9 +123,9 @@ class Image(NamedTuple):
     """
 
     mean: Float[jax.Array, " p"]
-    explained: Columns
+    explained: WeightedColumns
     unit: Float[Array, " n"]
-    curvature: Columns
+    curvature: WeightedColumns
 
     @property
     def slopes(self) -> jax.Array:
@@ -127,18 +133,18 @@ class Image(NamedTuple):
         return jnp.asarray(self.explained.matrix * reciprocal_or_zero(jnp.asarray(self.unit)))
 
     @property
-    def columns(self) -> Columns:
+    def columns(self) -> WeightedColumns:
         """Covariance of f(x), as columns with their weights."""
         return join_columns(self.explained, self.curvature)
 
 
-def image_by_slopes(mean: jax.Array, slopes: jax.Array, x: Gaussian, curvature: Columns | None = None) -> Image:
+def image_by_slopes(mean: jax.Array, slopes: jax.Array, x: Gaussian, curvature: WeightedColumns | None = None) -> Image:
     """Return the image of an f of which the slopes in xi are computed, affine where it has no curvature."""
     rest = zero_covariance(len(mean)) if curvature is None else curvature
-    return Image(mean, Columns(slopes, x.variances), np.ones(len(x.mean)), rest)
+    return Image(mean, WeightedColumns(slopes, x.variances), np.ones(len(x.mean)), rest)
 
 
-def append_rows(x: Gaussian, mean: jax.Array, slopes: jax.Array, noise: Columns) -> Gaussian:
+def append_rows(x: Gaussian, mean: jax.Array, slopes: jax.Array, noise: WeightedColumns) -> Gaussian:
     """Return the law of (x, t) with t = mean + slopes xi + v: its factors are [[L, 0], [slopes, N]] and (d, r).
 
     `noise` holds the factors N diag(r) N' of Cov v. Shapes: mean (m,), slopes (m, n), noise (m, m).
@@ -153,12 +159,12 @@ def take_leading(x: Gaussian, n: int) -> Gaussian:
     return Gaussian(x.mean[..., :n], x.lower[..., : n * (n - 1) // 2], x.variances[..., :n])
 
 
-def sum_unexplained(image: Image, noise: Columns) -> Columns:
+def sum_unexplained(image: Image, noise: WeightedColumns) -> WeightedColumns:
     """Return n columns of Cov (f(x) + w) beside its slopes: curvature + Cov w, `noise` as of `triangularise`."""
     return from_summed_covariance(image.mean, image.curvature, noise).columns if len(image.curvature.weights) else noise
 
 
-def add_noise_to_image(image: Image, noise: Columns) -> Gaussian:
+def add_noise_to_image(image: Image, noise: WeightedColumns) -> Gaussian:
     """Return the Gaussian of f(x) + w: mean of f(x), covariance slopes diag(d) slopes' + curvature + Cov w.
 
     `noise` holds factors of Cov w, L unit lower.
@@ -200,7 +206,7 @@ class Innovations(NamedTuple):
 
 
 def condition_on_observation(
-    x: Gaussian, slopes: jax.Array, innovation: jax.Array, noise: Columns, present: jax.Array | None = None
+    x: Gaussian, slopes: jax.Array, innovation: jax.Array, noise: WeightedColumns, present: jax.Array | None = None
 ) -> tuple[Gaussian, Innovations]:
     """Condition x = m + L xi on z = E z + slopes xi + v, given z - E z.
 
@@ -211,7 +217,7 @@ def condition_on_observation(
     n = len(x.mean)
     present = ~jnp.isnan(innovation) if present is None else present
     # Rows (slopes, innovation) of what arrived, with uncorrelated noises.
-    fresh = triangularise_noise(Columns(jnp.where(present[:, None], noise.matrix, 0.0), noise.weights))
+    fresh = triangularise_noise(WeightedColumns(jnp.where(present[:, None], noise.matrix, 0.0), noise.weights))
     rows = jnp.concatenate([slopes, jnp.where(present, innovation, 0.0)[:, None]], axis=1)
     rows = jnp.where(present[:, None], rows, 0.0)
     whole = rows[:, :n] ** 2 @ x.variances + fresh.matrix**2 @ fresh.weights
@@ -223,7 +229,7 @@ def condition_on_observation(
     return Gaussian(news[:n], below_diagonal(root[:n]), d), Innovations(values, totals, whole)
 
 
-def gain_of(x: Gaussian, slopes: jax.Array, noise: Columns) -> jax.Array:
+def gain_of(x: Gaussian, slopes: jax.Array, noise: WeightedColumns) -> jax.Array:
     """Return Kalman's gain (n, m) of z = E z + slopes xi + v, of the factors N diag(r) N' of Cov v, N unit lower.
 
     With V the unit triangle by which a component's innovation, given those before it, enters those to come, these
@@ -244,12 +250,14 @@ def gain_of(x: Gaussian, slopes: jax.Array, noise: Columns) -> jax.Array:
     return gains[:n] @ decorrelate(entering, decorrelate(noise.matrix, jnp.eye(len(rows))))
 
 
-def correct_by_gain(x: Gaussian, slopes: jax.Array, noise: Columns, gain: jax.Array, innovation: jax.Array) -> Gaussian:
+def correct_by_gain(
+    x: Gaussian, slopes: jax.Array, noise: WeightedColumns, gain: jax.Array, innovation: jax.Array
+) -> Gaussian:
     """Correct x = m + L xi by any gain K of e = slopes xi + v: mean m + K e, error (L - K slopes) xi - K v.
 
     Joseph's form, sums of squares; with Kalman's gain it is `condition_on_observation`.
     """
-    left = Columns(x.root - gain @ slopes, x.variances)
+    left = WeightedColumns(x.root - gain @ slopes, x.variances)
     return from_columns(x.mean + gain @ innovation, join_columns(left, noise.through(gain)))
 
 
@@ -271,7 +279,7 @@ def impose_moments_of_combination(x: Gaussian, row: jax.Array, shift: jax.Array,
     power = row * product
     before = jnp.append(0.0, lax.cumsum(power))
     s = ratio * before + jnp.append(lax.cumsum(power, reverse=True), 0.0)
-    root, variances, w = revise_columns(x.root, x.variances, product, (1 - ratio) * row, s)
+    root, variances, w = update_columns(x.root, x.variances, product, (1 - ratio) * row, s)
     return Gaussian(x.mean + w * (reciprocal_or_one(s[0]) * shift), below_diagonal(root), variances)
 
 
@@ -285,7 +293,7 @@ def moments_of_mixture(
     about = means - means[0]
     shift = weights @ about
     within = jnp.reshape(weights @ covariances.reshape(len(weights), -1), covariances.shape[1:])
-    return means[0] + shift, symmetric(within + Columns((about - shift).T, weights).covariance)
+    return means[0] + shift, symmetric(within + WeightedColumns((about - shift).T, weights).covariance)
 
 
 def merge_mixture(parts: Gaussian, weights: Float[jax.Array, " parts"]) -> Gaussian:
@@ -317,7 +325,7 @@ class BackwardGain(NamedTuple):
         return decorrelate(unit_lower(self.lower), rows)
 
 
-def condition_on_next_state(x: Gaussian, slopes: jax.Array, ahead: jax.Array, noise: Columns) -> BackwardGain:
+def condition_on_next_state(x: Gaussian, slopes: jax.Array, ahead: jax.Array, noise: WeightedColumns) -> BackwardGain:
     """Return the regression of x = m + L_x xi on x+ = ahead + slopes xi + N omega, measuring x+ part by part.
 
     (x, x+) has the factors [[L_x, 0], [slopes, N]] and (d, r). Each part of x+, without a noise but omega, is measured:
@@ -342,7 +350,9 @@ def condition_on_next_state(x: Gaussian, slopes: jax.Array, ahead: jax.Array, no
         says = jnp.sum(power) > rounding
         products = jnp.append(jnp.where(says, product, 0.0), r), jnp.append(jnp.where(says, power, 0.0), r)
         rows = jnp.concatenate([root, own[:, None]], axis=1)
-        rows, d, gain, _ = measure_product(rows, jnp.append(d, r), jnp.append(f, 1.0), products, jnp.zeros_like(r))
+        rows, d, gain, _ = measure_scalar_given_products(
+            rows, jnp.append(d, r), jnp.append(f, 1.0), products, jnp.zeros_like(r)
+        )
         return rows[:, :n], d[:n], gain
 
     root, d, gains = measure_parts(measure_part, root, x.variances, least)
@@ -355,5 +365,5 @@ def rts_step(back: BackwardGain, later: Gaussian) -> Gaussian:
 
     Source: Rauch, Tung and Striebel, Maximum likelihood estimates of linear dynamic systems (1965).
     """
-    carried = Columns(back.gain @ back.apply_inverse_factor(later.root), later.variances)
+    carried = WeightedColumns(back.gain @ back.apply_inverse_factor(later.root), later.variances)
     return from_columns(back.mean_given(later.mean), join_columns(carried, back.left.columns))

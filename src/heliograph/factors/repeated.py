@@ -13,7 +13,7 @@ from jax import lax
 from heliograph.factors.columns import (
     RANK,
     ROUNDING_UNITS,
-    Columns,
+    WeightedColumns,
     assemble_factors,
     column_below_diagonal,
     insert_column,
@@ -25,7 +25,7 @@ from heliograph.numerics.linalg import WRITTEN, outer, scale
 from straightline import operation
 
 
-def triangularise_noise(noise: Columns) -> Columns:
+def triangularise_noise(noise: WeightedColumns) -> WeightedColumns:
     """Triangularise the noises of m components, of which those that repeat others keep nothing but their own.
 
     With w_i = W_i - sum_j L_ij w_j: an entry |w_ik| <= RANK (|W_ik| + sum_j |L_ij| |w_jk|) is zero, where components
@@ -66,7 +66,7 @@ def _clear(numbers: jax.Array, least: jax.Array) -> jax.Array:
     return jnp.where(jnp.abs(numbers) <= least, 0.0, numbers)
 
 
-def _triangularise_row_by_row(rows: jax.Array, weights: jax.Array) -> Columns:
+def _triangularise_row_by_row(rows: jax.Array, weights: jax.Array) -> WeightedColumns:
     """Write Gram-Schmidt out row by row: L and d with L diag(d) L' = A W A', A's `rows` and W's `weights`."""
     m, share, size = len(rows), max(ROUNDING_UNITS * rows.shape[1] * unit_of(rows), RANK), jnp.abs(rows)
     lower, variances = list[jax.Array](), list[jax.Array]()
@@ -84,11 +84,11 @@ def _triangularise_row_by_row(rows: jax.Array, weights: jax.Array) -> Columns:
 
 
 @operation(_triangularise_row_by_row)
-def _triangularise_in_loop(rows: jax.Array, weights: jax.Array) -> Columns:
+def _triangularise_in_loop(rows: jax.Array, weights: jax.Array) -> WeightedColumns:
     """Compute `_triangularise_row_by_row` in a loop, for so many rows that a long program would be slow."""
     m, share = len(rows), max(ROUNDING_UNITS * rows.shape[1] * unit_of(rows), RANK)
 
-    def body(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+    def eliminate_row(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         """Take row j, its rounding cleared, off the rows below it, and put it into L and d."""
         rows, size, lower, variances = carry
         row = _clear(rows[j], share * size[j])
@@ -99,5 +99,5 @@ def _triangularise_in_loop(rows: jax.Array, weights: jax.Array) -> Columns:
         return rows, size, *insert_column(j, lower, below, variances, d)
 
     start = rows, jnp.abs(rows), jnp.eye(m, dtype=rows.dtype), jnp.zeros(m, rows.dtype)
-    _, _, lower, variances = lax.fori_loop(0, m, body, start)
-    return Columns(lower, variances)
+    _, _, lower, variances = lax.fori_loop(0, m, eliminate_row, start)
+    return WeightedColumns(lower, variances)

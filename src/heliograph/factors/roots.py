@@ -8,7 +8,7 @@ from heliograph.factors.columns import RANK
 from heliograph.numerics.types import Bool, Float
 
 
-class Observed(NamedTuple):
+class ObservedRoot(NamedTuple):
     """Gain K (..., n, m), and a root (..., n, columns) of the covariance after a measurement: W+ W+' = P - K S K'."""
 
     gain: Float[np.ndarray, "*items n m"]
@@ -43,7 +43,7 @@ def observe_root(
     root: Float[np.ndarray, "*items n c"],
     output: Float[np.ndarray, "*items m n"],
     noise: Float[np.ndarray, "*items m d"],
-) -> Observed:
+) -> ObservedRoot:
     """Condition x of covariance W W' on z = C x + v, Cov v = N N'.
 
     [[N, C W], [0, W]] = [[V, 0], [K V, W+]] U with an orthogonal U and V V' = C P C' + N N': sums of squares alone,
@@ -61,7 +61,7 @@ def observe_root(
     rows[..., :m, noise.shape[-1] : columns] = through
     rows[..., m:, noise.shape[-1] : columns] = root
     # Those that add something first, of most models all of them as they are.
-    says = _find_rows_that_add(rows[..., :m, :columns])
+    says = _find_independent_rows(rows[..., :m, :columns])
     order = None if says.all() else np.argsort(~says, axis=-1, kind="stable")
     if order is not None:
         says = np.take_along_axis(says, order, axis=-1)
@@ -77,12 +77,12 @@ def observe_root(
     unused = np.where(says[..., None, :], 0.0, moved)
     if order is not None:
         gain = np.take_along_axis(gain, np.argsort(order, axis=-1)[..., None, :], axis=-1)
-    return Observed(np.ascontiguousarray(gain), np.concatenate([lower[..., m:, m:], unused], axis=-1))
+    return ObservedRoot(np.ascontiguousarray(gain), np.concatenate([lower[..., m:, m:], unused], axis=-1))
 
 
 def observe_information(
     root: Float[np.ndarray, "*items n c"], information: Float[np.ndarray, "*items n n"]
-) -> Observed:
+) -> ObservedRoot:
     """Condition x of covariance W W' on measurements of information J = C' Cov(v)^-1 C: P+ = (P^-1 + J)^-1.
 
     With J = U U' they say as much as U' x + v, Cov v = I; P may be singular.
@@ -91,7 +91,7 @@ def observe_information(
     return observe_root(root, rows, np.eye(rows.shape[-1]))
 
 
-def _find_rows_that_add(rows: Float[np.ndarray, "*items m c"]) -> Bool[np.ndarray, "*items m"]:
+def _find_independent_rows(rows: Float[np.ndarray, "*items m c"]) -> Bool[np.ndarray, "*items m"]:
     """Find which rows have more than RANK of their square left beside those before them that have, by Gram-Schmidt."""
     rest, adds = rows, np.zeros(rows.shape[:-1], bool)
     for j in range(rows.shape[-2]):

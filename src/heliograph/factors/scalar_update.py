@@ -27,20 +27,20 @@ def measure_scalar(
     since L is lower.
     """
     product = d * f
-    return measure_product(root, d, f, (product, f * product), noise)
+    return measure_scalar_given_products(root, d, f, (product, f * product), noise)
 
 
-def measure_product(
+def measure_scalar_given_products(
     root: jax.Array, d: jax.Array, f: jax.Array, products: tuple[jax.Array, jax.Array], noise: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """Measure f' xi + v as `measure_scalar`, given diag(d) f and f_j^2 d_j: both are zero of what says nothing."""
     product, power = products
     s = lax.rev(lax.cumsum(lax.concatenate([lax.reshape(noise, (1,)), lax.rev(power, (0,))], 0)), (0,))
-    after, kept, w = revise_columns(root, d, product, f, s)
+    after, kept, w = update_columns(root, d, product, f, s)
     return after, kept, w * reciprocal_or_one(s[0]), s[0]
 
 
-def revise_columns(
+def update_columns(
     root: jax.Array, d: jax.Array, product: jax.Array, f: jax.Array, s: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return V_j - (f_j / s_{j+1}) w_{j+1}, d_j s_{j+1} / s_j and w_0, with w_j = sum_{k >= j} product_k V_k."""
@@ -110,10 +110,10 @@ def measure_row(
     product = d * f
     power = f * product
     if least is None:
-        return measure_product(root, d, f, (product, power), noise)
+        return measure_scalar_given_products(root, d, f, (product, power), noise)
     nothing = jnp.sum(power) <= least
     beside = jnp.where(nothing, noise + noise_beside_rounding(len(d), least), noise)
-    root, d, gain, total = measure_product(root, d, f, (product, power), beside)
+    root, d, gain, total = measure_scalar_given_products(root, d, f, (product, power), beside)
     return root, d, gain, jnp.where(nothing, noise, total)
 
 

@@ -74,7 +74,7 @@ class Available:
         return word in self.offline
 
 
-class LastWords:
+class DeviceStatuses:
     """Keeps the last word, online or offline, of each device that a condition is about.
 
     Args:

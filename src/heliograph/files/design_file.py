@@ -64,7 +64,7 @@ def read_design(path: Path) -> DesignFile:
         if isinstance(table.get(key), dict):
             _check_keys(f"{path.name}, {key}", table[key], known)
     # Network and problem.
-    file, name = _find_function(path, table.get("network"), "network")
+    file, name = _find_python_file(path, table.get("network"), "network")
     free = table.get("free")
     if free is not None and (not isinstance(free, list) or not all(isinstance(name, str) for name in free)):
         raise fail(f"{path.name}, free", "a list of names", repr(free))
@@ -107,7 +107,7 @@ def _read_budget(path: Path, table: Mapping[str, Any]) -> Budget | None:
 def _read_map(path: Path, table: Mapping[str, object]) -> MapPlaces:
     """Return the places of the map that a design file asks for: the network's function of x and y, and the grid."""
     values = _read_table(path, table, "map")
-    file, name = _find_function(path, values.get("network"), "map.network")
+    file, name = _find_python_file(path, values.get("network"), "map.network")
     if not name:
         raise fail(f"{path.name}, map.network", 'a file and a function of x and y, as "my_network.py:at"', file.name)
     points = check_count(f"{path.name}, map.points", values.get("points", 11), 2)
@@ -117,7 +117,7 @@ def _read_map(path: Path, table: Mapping[str, object]) -> MapPlaces:
     return MapPlaces(build, x, y)
 
 
-def _find_function(path: Path, value: object, key: str) -> tuple[Path, str]:
+def _find_python_file(path: Path, value: object, key: str) -> tuple[Path, str]:
     """Return the Python file beside the design file that a value names, as FILE or FILE:NAME, and NAME or ""."""
     if not isinstance(value, str):
         raise fail(f"{path.name}, {key}", 'a Python file, as "my_network.py" or "my_network.py:name"', repr(value))

@@ -13,7 +13,7 @@ from heliograph.live.event import VERDICTS, Verdict
 from heliograph.live.link_counts import GAP
 from heliograph.model.checks.refusals import Reason, RefusedError
 from heliograph.numerics.check import fail
-from heliograph.numerics.times.row_order import SECOND, YEAR, find_astray
+from heliograph.numerics.times.row_order import SECOND, YEAR, find_unset_stamps
 from heliograph.numerics.types import Bool, Float, Int
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
@@ -22,7 +22,7 @@ USED, DUPLICATE, CONFLICT, LATE, FUTURE = map(VERDICTS.index, ("used", "duplicat
 
 
 @dataclass
-class Columns:
+class NodeEvents:
     """Events of one node: times and arrivals in nanoseconds, steps or numbers, counts (-1: none), `size` values each.
 
     Attributes:
@@ -144,7 +144,7 @@ class Columns:
             return f"{name}: stamps and arrivals are of two clocks: each event arrives when it was measured", "", 0
         known = bool(late.any())
         near = "that of arrival" if known else "the others in order"
-        unset = late > year if known else find_astray(time, year)
+        unset = late > year if known else find_unset_stamps(time, year)
         count = int(np.count_nonzero(unset))
         if not count:
             return "", "", 0
@@ -160,7 +160,7 @@ class Columns:
         return "", str(fail(name, f"a time that was set, near {near}", got)), count
 
 
-class Events(NamedTuple):
+class ArrivedEvents(NamedTuple):
     """Events in order of arrival: node (-1: inputs), time, arrival, count, and index among those of the node.
 
     Shapes: all (events,).
@@ -172,13 +172,13 @@ class Events(NamedTuple):
     sequence: np.ndarray
     place: np.ndarray
 
-    def of(self, which: np.ndarray) -> "Events":
+    def of(self, which: np.ndarray) -> "ArrivedEvents":
         """Return some of the events, by number or by mask."""
-        return Events(*(column[which] for column in self))
+        return ArrivedEvents(*(column[which] for column in self))
 
 
-def judge(
-    events: Events,
+def judge_events(
+    events: ArrivedEvents,
     values: Callable[[int], np.ndarray],
     joint: bool,
     window: float,
@@ -274,7 +274,7 @@ def count_gaps(time: np.ndarray, sequence: Int[np.ndarray, " events"], period: i
     return int(np.sum(np.maximum(gaps - 1, 0)))
 
 
-def number_within(*columns: np.ndarray) -> Int[np.ndarray, " events"]:
+def number_equal_rows(*columns: np.ndarray) -> Int[np.ndarray, " events"]:
     """Return the number of each row among those that are equal to it, in their order, from 0."""
     ranks = _rank_rows(*columns)
     order = np.argsort(ranks, kind="stable")
@@ -295,7 +295,9 @@ def _rank_rows(*columns: np.ndarray) -> Int[np.ndarray, " events"]:
     return ranks
 
 
-def _find_newest_final(events: Events, rank: Int[np.ndarray, " events"], window: float) -> Int[np.ndarray, " events"]:
+def _find_newest_final(
+    events: ArrivedEvents, rank: Int[np.ndarray, " events"], window: float
+) -> Int[np.ndarray, " events"]:
     """Return the rank of the newest row that is final when each event comes, -1 for none.
 
     An event of time t is final for the events that come after it at more than t + window.

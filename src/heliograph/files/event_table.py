@@ -7,14 +7,14 @@ import numpy as np
 
 from heliograph.files.event_columns import (
     USED,
-    Columns,
-    Events,
+    ArrivedEvents,
+    NodeEvents,
     count_verdicts,
     counts_losses,
     fill_forward,
-    judge,
+    judge_events,
     lead_to_rows,
-    number_within,
+    number_equal_rows,
 )
 from heliograph.files.recording import Recording
 from heliograph.files.sources.reading import Reading, Unread
@@ -60,7 +60,7 @@ class EventTable:
         self.network, self.steps, self.numbers = network, TIME_STEP not in network.inputs, numbers
         self.step = None if step is None else round(scalar("step", step, 1 / SECOND) * SECOND)  # in nanoseconds
         self.start = start
-        self._plants: dict[str, dict[str, Columns]] = {}
+        self._plants: dict[str, dict[str, NodeEvents]] = {}
         self.notes: list[str] = []
         self.broken = ""
         self.refused, self.reasons = 0, list[str]()
@@ -91,19 +91,19 @@ class EventTable:
         return single
 
     @property
-    def columns(self) -> dict[str, Columns]:
+    def columns(self) -> dict[str, NodeEvents]:
         """Return the events of the single plant by node, its inputs under "inputs"; ValueError if there are more."""
         if len(self._plants) > 1:
             names = ", ".join(map(repr, list(self._plants)[:8]))
             raise fail("events", f"those of one plant, as events.of({next(iter(self._plants))!r}) has", names)
         return next(iter(self._plants.values()), {}) or self._columns_of("")
 
-    def _columns_of(self, plant: str) -> dict[str, Columns]:
+    def _columns_of(self, plant: str) -> dict[str, NodeEvents]:
         """Return the columns of a plant by node, and of its inputs; empty ones where it is new."""
         if plant not in self._plants:
             sizes = {INPUTS: len(self.network.inputs) - (not self.steps)}
             sizes |= {name: self.network.nodes[name].received for name in self.network.names}
-            self._plants[plant] = {name: Columns(size, self.numbers) for name, size in sizes.items()}
+            self._plants[plant] = {name: NodeEvents(size, self.numbers) for name, size in sizes.items()}
         return self._plants[plant]
 
     def add(self, reading: Reading, arrival: float) -> None:
@@ -366,18 +366,18 @@ class EventTable:
         """Return the values of each node, and last those of the inputs, whose number is -1."""
         return [self.columns[name].matrix() for name in (*self.network.names, INPUTS)]
 
-    def _sort_by_arrival(self) -> Events:
+    def _sort_by_arrival(self) -> ArrivedEvents:
         """Return the events in order of arrival; those without a count are told apart by their order at a time."""
         parts = []
         for node, name in enumerate((INPUTS, *self.network.names), -1):
             time, arrival, sequence = self.columns[name].arrays()
-            parts.append(Events(np.full(len(time), node), time, arrival, sequence, np.arange(len(time))))
-        events = Events(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+            parts.append(ArrivedEvents(np.full(len(time), node), time, arrival, sequence, np.arange(len(time))))
+        events = ArrivedEvents(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
         if not len(events.time):
             raise fail("events", "at least one", "none")
         events = events.of(np.lexsort((events.place, events.arrival)))
         uncounted = events.sequence < 0
-        events.sequence[uncounted] = number_within(events.node[uncounted], events.time[uncounted])
+        events.sequence[uncounted] = number_equal_rows(events.node[uncounted], events.time[uncounted])
         # Moments to the nearest step from the first.
         if self.step is None:
             return events
@@ -385,7 +385,7 @@ class EventTable:
         time, arrival = ((moments - first + half) // self.step for moments in (events.time, events.arrival))
         return events._replace(time=time, arrival=arrival)
 
-    def _judge_events(self, window: float, ahead: float) -> tuple[Events, Int[np.ndarray, " events"]]:
+    def _judge_events(self, window: float, ahead: float) -> tuple[ArrivedEvents, Int[np.ndarray, " events"]]:
         """Return the events in order of arrival, and what a timeline with this window would do with each."""
         events, matrices = self._sort_by_arrival(), self._matrices()
 
@@ -393,4 +393,4 @@ class EventTable:
             return np.asarray(matrices[events.node[i]][events.place[i]])
 
         limits = [limit if limit == np.inf or self._unit == 1 else round(limit * SECOND) for limit in (window, ahead)]
-        return events, judge(events, values, self._joint, *limits)
+        return events, judge_events(events, values, self._joint, *limits)

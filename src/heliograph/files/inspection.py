@@ -24,7 +24,7 @@ from heliograph.files.messages.in_files import (
     read_message_file,
 )
 from heliograph.files.sources.fields import TimeUnit, convert_time, decode_json, is_stamp, parse_arrival
-from heliograph.numerics.check import InputError, fail, show_error
+from heliograph.numerics.check import InputError, error_text, fail
 from heliograph.numerics.times.dates import UNITS, looks_like_date
 
 SECOND = 1e9  # nanoseconds
@@ -166,7 +166,7 @@ def _inspect_part(path: Path, topics: dict[str, Topic], progress: Progress | Non
                 if progress is not None and done % OFTEN == 0:
                     progress(done, total)
         except Exception as error:  # whatever damage makes a reader do
-            return str(fail(f"{path}, after message {done}", "a bag without damage", show_error(error)))
+            return str(fail(f"{path}, after message {done}", "a bag without damage", error_text(error)))
         return cut
 
 

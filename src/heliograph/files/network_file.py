@@ -91,7 +91,7 @@ def _find_network(module: ModuleType, name: str, file: str, path: Path | None) -
     """Return the network of a module, by its name or because there is only one."""
     networks = {key: value for key, value in vars(module).items() if isinstance(value, Network)}
     if name:
-        return _read_name(module, name, file, path, networks)
+        return _read_named_network(module, name, file, path, networks)
     if len({id(network) for network in networks.values()}) == 1:
         return next(iter(networks.values()))
     if networks:
@@ -100,7 +100,9 @@ def _find_network(module: ModuleType, name: str, file: str, path: Path | None) -
     raise fail(f"network {file}", f"a heliograph.Network (or {file}:FUNCTION that returns one)", "none in the module")
 
 
-def _read_name(module: ModuleType, name: str, file: str, path: Path | None, networks: dict[str, Network]) -> Network:
+def _read_named_network(
+    module: ModuleType, name: str, file: str, path: Path | None, networks: dict[str, Network]
+) -> Network:
     """Return the network that a name of a module stands for, or that the function of this name returns.
 
     `networks`: those of the module by name, for errors.
@@ -147,11 +149,11 @@ def _call_user_code(call: Callable[[], T], name: str, path: Path | None) -> T:
     try:
         return call()
     except (Exception, SystemExit) as error:
-        came = f"{type(error).__name__}{_find_line(error, path)}: {error}"
+        came = f"{type(error).__name__}{_find_error_line(error, path)}: {error}"
         raise fail(f"network {name}", "Python that runs", " ".join(came.split())) from error
 
 
-def _find_line(error: BaseException, path: Path | None) -> str:
+def _find_error_line(error: BaseException, path: Path | None) -> str:
     """Return the line in the user's file where an error was raised: the innermost frame there."""
     if isinstance(error, SyntaxError):
         return f" in line {error.lineno}"

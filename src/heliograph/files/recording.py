@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from heliograph.files.table import TIME, Rows, columns_of, read_back_name, read_rows, write_table
-from heliograph.files.table_rows import Cells, KeptRows, keep_rows, order_rows
+from heliograph.files.table_rows import KeptRows, RowsAsColumns, keep_rows, order_rows
 from heliograph.model.checks.inputs import find_time_step_fault
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail, flag, instance
@@ -172,7 +172,7 @@ class RowReader:
         """
         return self.arrange(self.read_cells(rows))
 
-    def arrange(self, cells: Cells) -> Recording:
+    def arrange(self, cells: RowsAsColumns) -> Recording:
         """Return rows as a recording; unless reading is strict, in the order of their times.
 
         Raises:
@@ -192,7 +192,7 @@ class RowReader:
         truth = [kept.fill(cells.truth.get(state, unknown)) for state in self.network.states]
         return Recording(measurements, u, time, np.stack(truth, axis=1))
 
-    def read_cells(self, rows: Rows) -> Cells:
+    def read_cells(self, rows: Rows) -> RowsAsColumns:
         """Return what stands in the rows that can be read, each by itself.
 
         Raises:
@@ -239,7 +239,7 @@ class _RowChecks:
         self.good &= ~bad
 
 
-def _read_cells(columns: Mapping[str, np.ndarray], network: Network, checks: _RowChecks) -> Cells:
+def _read_cells(columns: Mapping[str, np.ndarray], network: Network, checks: _RowChecks) -> RowsAsColumns:
     """Return what stands in the columns of a table; rows that cannot be read are refused by `checks`."""
     inputs, received, source = network.inputs, _list_received_columns(network), checks.source
     # A relay whose measurements are left out altogether loses its filter only.
@@ -265,7 +265,7 @@ def _read_cells(columns: Mapping[str, np.ndarray], network: Network, checks: _Ro
     truth = {
         state: _read_measurements(columns, name, checks) for state, name in truth_columns.items() if name in columns
     }
-    return Cells(checks.numbers, time, measurements, given, truth)
+    return RowsAsColumns(checks.numbers, time, measurements, given, truth)
 
 
 def _make_inputs(

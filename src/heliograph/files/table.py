@@ -11,17 +11,17 @@ import msgspec
 import numpy as np
 
 from heliograph.disk.quoting import quote_for_cell, unquote_cell
-from heliograph.disk.whole_file import FORMATS, check_output, format_of, whole_file
-from heliograph.files.text.csv_text import CsvRow, csv_rows, parse_cell
+from heliograph.disk.whole_file import FORMATS, check_writable, format_of, whole_file
+from heliograph.files.text.csv_text import CsvRow, parse_cell, read_csv_rows
 from heliograph.files.text.dialects import NO_VALUE, check_distinct
 from heliograph.files.text.plain_numbers import read_plain_numbers
-from heliograph.files.text.text_file import kind_of, until_cut_off
+from heliograph.files.text.text_file import kind_of, yield_until_cut_off
 from heliograph.numerics.check import InputError, fail, file_path, show_value, table
 from heliograph.numerics.masked import fill_masked, is_absent
 from heliograph.numerics.process.plugins import FORMATS as FORMATS_OF_OTHERS
 from heliograph.numerics.process.plugins import find_plugin
 from heliograph.numerics.times.dates import MISSING as NAT
-from heliograph.numerics.times.dates import dates, format_dates, looks_like_date, moment_of
+from heliograph.numerics.times.dates import format_dates, looks_like_date, parse_dates, parse_moment
 from heliograph.numerics.types import Shaped
 
 TIME = "time"
@@ -109,9 +109,9 @@ def _convert_objects(column: np.ndarray, name: str) -> np.ndarray:
     column = np.array([None if is_absent(value) else value for value in column], dtype=object)
     first = next((value for value in column if value is not None), None)
     if hasattr(first, "to_timestamp"):  # a period of pandas: its first moment
-        return dates([None if value is None else value.to_timestamp() for value in column], name)
+        return parse_dates([None if value is None else value.to_timestamp() for value in column], name)
     if (isinstance(first, str) and looks_like_date(first)) or hasattr(first, "isoformat"):
-        return dates(column, name)
+        return parse_dates(column, name)
     texts = [x for x in column if isinstance(x, str | bytes)]
     try:
         if texts:
@@ -179,7 +179,7 @@ def write_table(columns: Mapping[str, Shaped[np.ndarray, "..."]], path: str | Pa
     """
     path = file_path("table", path)
     _check_columns(columns)
-    check_output(path)
+    check_writable(path)
     with whole_file(path) as partial:
         (_write_csv if format_of(path) == ".csv" else _write_parquet)(columns, partial)
 
@@ -194,7 +194,7 @@ def _check_columns(columns: Mapping[str, np.ndarray]) -> None:
         raise fail("columns of a table", "at least one, all of one length", lengths)
 
 
-class CsvColumns:
+class CsvColumnReader:
     """Reads rows of CSV as columns, a part of a table at a time; a column is of dates if its first cell is one.
 
     Args:
@@ -276,7 +276,7 @@ class CsvColumns:
     def _read_moment(self, row: CsvRow, name: str, cell: str) -> int:
         """Return a date as nanoseconds; raise where dates of one column differ in having a zone."""
         where = f"{row.where}, column {name!r}"
-        moment, zoned = moment_of(cell, where)
+        moment, zoned = parse_moment(cell, where)
         if self._zoned.setdefault(name, zoned) != zoned:
             raise fail(where, "a zone with every date or with none", show_value(cell))
         return moment
@@ -299,9 +299,9 @@ def _read_csv(path: Path, only: Container[str] | None, strict: bool) -> "Rows":
         header, numbers = plain
         named = {name: numbers[:, i].copy() for i, name in enumerate(header) if only is None or name in only}
         return Rows(named, np.arange(1, len(numbers) + 1), [])
-    columns = CsvColumns(str(path), path, only, strict)
-    rows = csv_rows(path, marked=False)
-    return columns.read(rows if strict else until_cut_off(rows))
+    columns = CsvColumnReader(str(path), path, only, strict)
+    rows = read_csv_rows(path, marked=False)
+    return columns.read(rows if strict else yield_until_cut_off(rows))
 
 
 def _read_parquet(path: Path, only: Container[str] | None) -> Rows:

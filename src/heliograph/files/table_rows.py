@@ -8,14 +8,14 @@ import numpy as np
 from heliograph.files.table import TIME
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail
-from heliograph.numerics.times.row_order import SECOND, YEAR, find_astray, find_out_of_order
+from heliograph.numerics.times.row_order import SECOND, YEAR, find_out_of_order, find_unset_stamps
 from heliograph.numerics.times.row_times import backwards
 from heliograph.simulation.network import Network
 
 MOST_OUT = 0.5  # share of the rows that may be out of order where each row is a step
 
 
-class Cells(NamedTuple):
+class RowsAsColumns(NamedTuple):
     """Rows of time as columns: their numbers from 1, times, measurements by node, inputs and true states by name."""
 
     numbers: np.ndarray
@@ -24,22 +24,22 @@ class Cells(NamedTuple):
     inputs: dict[str, np.ndarray]
     truth: dict[str, np.ndarray]
 
-    def of(self, good: np.ndarray) -> "Cells":
+    def of(self, good: np.ndarray) -> "RowsAsColumns":
         """Return the rows of a mask, or of numbers."""
         parts = ({name: values[good] for name, values in part.items()} for part in self[2:])
-        return Cells(self.numbers[good], self.time[good], *parts)
+        return RowsAsColumns(self.numbers[good], self.time[good], *parts)
 
 
-def join_cells(parts: Sequence[Cells]) -> Cells:
+def join_cells(parts: Sequence[RowsAsColumns]) -> RowsAsColumns:
     """Return the rows of several parts of a table, one after the other."""
     named = (
         {name: np.concatenate([part[i][name] for part in parts]) for name in parts[0][i]}
-        for i in range(2, len(Cells._fields))
+        for i in range(2, len(RowsAsColumns._fields))
     )
-    return Cells(np.concatenate([p.numbers for p in parts]), np.concatenate([p.time for p in parts]), *named)
+    return RowsAsColumns(np.concatenate([p.numbers for p in parts]), np.concatenate([p.time for p in parts]), *named)
 
 
-def order_rows(cells: Cells, network: Network, source: str) -> tuple[Cells, list[InputError], str]:
+def order_rows(cells: RowsAsColumns, network: Network, source: str) -> tuple[RowsAsColumns, list[InputError], str]:
     """Return rows whose times do not go backwards, why others are refused, and a line on what was put in order.
 
     A time that is more than a year outside of all others was not set, and its row is refused alone. Where time is
@@ -59,7 +59,10 @@ def order_rows(cells: Cells, network: Network, source: str) -> tuple[Cells, list
     if TIME_STEP not in network.inputs:
         out, expected = find_out_of_order(stamps), "a time that does not go backwards"
     else:
-        out, expected = find_astray(stamps, YEAR if dated else YEAR / SECOND), "a time that was set, near the others"
+        out, expected = (
+            find_unset_stamps(stamps, YEAR if dated else YEAR / SECOND),
+            "a time that was set, near the others",
+        )
     if TIME_STEP in cells.inputs or np.mean(out) >= MOST_OUT:
         return cells, [], ""
     refused = [

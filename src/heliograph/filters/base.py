@@ -11,7 +11,7 @@ from typing_extensions import TypeAliasType
 
 from heliograph.engine.choice import compile_on_call
 from heliograph.filters.calls import call_with_inputs, call_with_state
-from heliograph.filters.chunks import Pass
+from heliograph.filters.chunks import ScanResult
 from heliograph.filters.filter_angles import FilterAngles
 from heliograph.filters.filter_data import Filtered, run_over_data, scan_inside_jit
 from heliograph.filters.plausibility import Judgement, judge_step
@@ -22,7 +22,7 @@ from heliograph.filters.vector import check_vector
 from heliograph.model.checks.inputs import check_time_step, do_inputs_spoil
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import steps_covered
-from heliograph.model.premises.premise import NOTHING, Kept, Premise, believes
+from heliograph.model.premises.premise import NOTHING, Premise, StaticPremise, believes
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.float64 import in_float64
@@ -30,8 +30,8 @@ from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.names import refuse_attribute
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 
-__all__ = ["AbstractFilter", "AbstractSizedFilter", "FilterAngles", "Step", "believes", "corrects", "estimates",
-           "in_float64", "make_sizes", "predicts", "step_number"]  # fmt: skip
+__all__ = ["AbstractFilter", "AbstractSizedFilter", "FilterAngles", "Step", "believes", "check_step_number",
+           "corrects", "estimates", "in_float64", "make_sizes", "predicts"]  # fmt: skip
 
 Step = TypeAliasType("Step", int | np.integer | Int[Array, ""])
 
@@ -69,7 +69,7 @@ class AbstractFilter(Module):
     states: eqx.AbstractVar[tuple[str, ...]]
     inputs: eqx.AbstractVar[tuple[str, ...]]
     received: eqx.AbstractVar[int]
-    kept: Kept = eqx.field(static=True, default=NOTHING, init=False, repr=False, compare=False)
+    kept: StaticPremise = eqx.field(static=True, default=NOTHING, init=False, repr=False, compare=False)
 
     if not TYPE_CHECKING:  # a type checker knows all attributes
 
@@ -123,7 +123,7 @@ class AbstractFilter(Module):
                 that is NaN.
         """
         z, u = self.check_measurement(z), self.check_input(u)
-        return call_with_inputs(self, state, _step, z, u, step_number(self, k))
+        return call_with_inputs(self, state, _step, z, u, check_step_number(self, k))
 
     def run(
         self,
@@ -175,7 +175,7 @@ class AbstractFilter(Module):
             ValueError: what `step` refuses.
         """
         z, u = self.check_measurement(z), self.check_input(u)
-        return call_with_state(self, state, step_with_judgement, z, u, step_number(self, k))
+        return call_with_state(self, state, step_with_judgement, z, u, check_step_number(self, k))
 
     def step_with_smoother(
         self, state: PyTree, z: ArrayLike, u: ArrayLike = (), k: Step = 0
@@ -186,7 +186,7 @@ class AbstractFilter(Module):
             ValueError: what `step` refuses; a filter that cannot be smoothed.
         """
         z, u = self.check_measurement(z), self.check_input(u)
-        return call_with_inputs(self, state, _step_with_smoother, z, u, step_number(self, k))
+        return call_with_inputs(self, state, _step_with_smoother, z, u, check_step_number(self, k))
 
     def check_measurement(self, z: ArrayLike) -> Float[Array, " received"]:
         """Return z as a measurement of the filter's length, NaN where a component did not arrive.
@@ -226,7 +226,7 @@ class AbstractFilter(Module):
         """Return the estimate after step k: `estimate(state)`, but of a filter that looks its covariance up by k."""
         return self.estimate(state)
 
-    def filter_rows(self, z: Array, u: Array, state: PyTree | None = None, begin: Array | int = 0) -> Pass | None:
+    def filter_rows(self, z: Array, u: Array, state: PyTree | None = None, begin: Array | int = 0) -> ScanResult | None:
         """Filter rows by native code of its own, from number `begin` on behind a state; None of most filters."""
         return None
 
@@ -383,12 +383,12 @@ def _check_calls(
 
     @wraps(function)
     def call(filter: AbstractFilter, state: PyTree, data: ArrayLike = (), k: Step = 0) -> R:
-        return call_checked(filter, state, run, check(filter, data), step_number(filter, k))
+        return call_checked(filter, state, run, check(filter, data), check_step_number(filter, k))
 
     return cast(Callable[P, R], call)
 
 
-def step_number(filter: AbstractFilter, k: Step) -> Step:
+def check_step_number(filter: AbstractFilter, k: Step) -> Step:
     """Return k as the number of a step that the filter covers."""
     if isinstance(k, jax.core.Tracer):
         return k

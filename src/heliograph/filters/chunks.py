@@ -21,18 +21,25 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import choose_code
-from heliograph.filters.recursion import FilterRows, Recursion, end_of_rows, linear_start, scan_chunk, sum_chunk
-from heliograph.filters.settled import (
-    CompleteRows,
-    Settled,
-    end_of_settled_rows,
-    find_complete,
-    find_settled,
-    repeat_state,
-    scan_settled,
-    sum_settled,
+from heliograph.filters.recursion import (
+    FilterRecursion,
+    Recursion,
+    linear_start,
+    scan_chunk,
+    state_after_rows,
+    sum_chunk,
 )
-from heliograph.filters.states import agree, beside_gaussians, means_of, with_gaussians
+from heliograph.filters.settled import (
+    CompleteBlocks,
+    SettledState,
+    find_complete_blocks,
+    find_settled_state,
+    means_after_settled_rows,
+    repeat_state,
+    scan_settled_rows,
+    sum_settled_rows,
+)
+from heliograph.filters.states import beside_gaussians, find_equal_states, means_of, with_gaussians
 from heliograph.filters.windows import Which, join_results, take, take_windows, take_windows_in_parts
 from heliograph.numerics.types import Array, Bool, Int, PyTree
 
@@ -41,7 +48,7 @@ PROBES = 8  # joints at which forgetting is tried before all rows are filtered
 BLOCKS = 64  # places in a pass without data
 
 
-class Lengths(NamedTuple):
+class ChunkLengths(NamedTuple):
     """Rows of a chunk, and rows ahead of it in which its start is forgotten."""
 
     chunk: int
@@ -50,17 +57,17 @@ class Lengths(NamedTuple):
 
 # Results of 2,048 rows in eight lanes are 4 MB, as fast as a fourth of them; in 512 rows positions and speeds of which
 # positions are measured every tenth of a second, or levels with a hundredth of their noise, are forgotten.
-LADDER = Lengths(2048, 512), Lengths(8192, 2048)
+LADDER = ChunkLengths(2048, 512), ChunkLengths(8192, 2048)
 
 
-class Pass(NamedTuple):
+class ScanResult(NamedTuple):
     """The state after the last row, and what is kept of each row (rows, ...)."""
 
     last: PyTree
     outputs: PyTree
 
 
-class Begun(NamedTuple):
+class ChunkStarts(NamedTuple):
     """How chunks begin: the state of each (chunks, ...), its first row (chunks,), and how long chunks are.
 
     `settled`: the state in which chunks of complete rows stay but for their means, None where it was not found, and
@@ -69,10 +76,10 @@ class Begun(NamedTuple):
 
     states: PyTree
     first: Int[np.ndarray, " chunks"]
-    lengths: Lengths
-    settled: Settled | None
+    lengths: ChunkLengths
+    settled: SettledState | None
     covered: Bool[np.ndarray, " chunks"]
-    complete: CompleteRows
+    complete: CompleteBlocks
 
 
 def is_long(total: int) -> bool:
@@ -82,7 +89,7 @@ def is_long(total: int) -> bool:
 
 def filter_in_chunks(
     filter: Any, z: Array, u: Array, output: Callable[..., PyTree], state: PyTree | None = None, begin: int = 0
-) -> Pass | None:
+) -> ScanResult | None:
     """Filter rows in chunks side by side; None where rows are few, or the filter is not linear or forgets too late.
 
     Args:
@@ -96,7 +103,7 @@ def filter_in_chunks(
     start = linear_start(filter) if is_long(len(z)) else None
     if start is None:
         return None
-    rows = FilterRows(filter, output, np.asarray(begin))
+    rows = FilterRecursion(filter, output, np.asarray(begin))
     return scan_in_chunks(rows, start if state is None else state, (np.asarray(z), np.asarray(u)))
 
 
@@ -105,28 +112,28 @@ def sum_filtered_in_chunks(filter: Any, z: Array, u: Array, output: Callable[...
     start = linear_start(filter) if is_long(len(z)) else None
     if start is None:
         return None
-    whole = sum_in_chunks(FilterRows(filter, output), start, (np.asarray(z), np.asarray(u)))
+    whole = sum_in_chunks(FilterRecursion(filter, output), start, (np.asarray(z), np.asarray(u)))
     return None if whole is None else jax.tree.map(lambda leaf: leaf.sum(axis=0), whole.outputs)
 
 
-def scan_in_chunks(recursion: Recursion, start: PyTree, rows: PyTree) -> Pass | None:
+def scan_in_chunks(recursion: Recursion, start: PyTree, rows: PyTree) -> ScanResult | None:
     """Step a recursion over rows in chunks side by side; None where rows are few, or it forgets too late."""
     with jax.enable_x64(True):
-        whole = _scan_all(recursion, start, rows, OF_ROWS)
+        whole = _scan_all_chunks(recursion, start, rows, OF_ROWS)
     if whole is None:
         return None
     total = len(jax.tree.leaves(rows)[0])
     joined = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:total], whole.outputs)
-    return Pass(whole.last, joined)
+    return ScanResult(whole.last, joined)
 
 
-def sum_in_chunks(recursion: Recursion, start: PyTree, rows: PyTree) -> Pass | None:
+def sum_in_chunks(recursion: Recursion, start: PyTree, rows: PyTree) -> ScanResult | None:
     """Step a recursion over rows as `scan_in_chunks` does; outputs are sums over each chunk (chunks, ...)."""
     with jax.enable_x64(True):
-        return _scan_all(recursion, start, rows, OF_SUMS)
+        return _scan_all_chunks(recursion, start, rows, OF_SUMS)
 
 
-def begin_chunks(recursion: Recursion, start: PyTree, rows: PyTree) -> Begun | None:
+def find_chunk_starts(recursion: Recursion, start: PyTree, rows: PyTree) -> ChunkStarts | None:
     """Return how each chunk of rows begins; None where rows are few, or a start is forgotten too late.
 
     The shortest chunks of LADDER before whose first row the start is forgotten; first with settled covariances, which
@@ -137,20 +144,20 @@ def begin_chunks(recursion: Recursion, start: PyTree, rows: PyTree) -> Begun | N
         if total < CHUNKS * lengths.chunk:
             return None
         first = np.arange(0, total, lengths.chunk)
-        complete = find_complete(rows[0], lengths.ahead)
+        complete = find_complete_blocks(rows[0], lengths.ahead)
         whole = complete.cover(first, lengths.chunk)
-        settled = find_settled(recursion, start, rows, lengths.ahead) if np.mean(whole) > 0.5 else None
+        settled = find_settled_state(recursion, start, rows, lengths.ahead) if np.mean(whole) > 0.5 else None
         for law in [None] if settled is None else [settled, None]:
-            states = _begin_with(Reach(recursion, rows, complete, law), start, first[1:])
+            states = _find_start_states(WarmUp(recursion, rows, complete, law), start, first[1:])
             if states is not None:
                 covered = whole & (False if law is None else law.covers(states))
-                return Begun(
+                return ChunkStarts(
                     states=states, first=first, lengths=lengths, settled=law, covered=covered, complete=complete
                 )
     return None
 
 
-def _predict_blocks(recursion: Recursion, state: PyTree, rows: PyTree, first: Array) -> tuple[PyTree, PyTree]:
+def _predict_moments_by_block(recursion: Recursion, state: PyTree, rows: PyTree, first: Array) -> tuple[PyTree, PyTree]:
     """Return what a state holds beside its Gaussians, which no data change, after all blocks, and before each.
 
     `rows` (block, row, ...), of which the first has the number `first`.
@@ -170,7 +177,7 @@ def _predict_blocks(recursion: Recursion, state: PyTree, rows: PyTree, first: Ar
     return beside_gaussians(last), before
 
 
-class Reach(NamedTuple):
+class WarmUp(NamedTuple):
     """Computes the state before a row from one some rows earlier, for many rows side by side.
 
     `settled`: covariances that stay as they are, of which only means are computed; None where they are not known.
@@ -178,8 +185,8 @@ class Reach(NamedTuple):
 
     recursion: Recursion
     rows: PyTree
-    complete: CompleteRows
-    settled: Settled | None
+    complete: CompleteBlocks
+    settled: SettledState | None
 
     @property
     def ahead(self) -> int:
@@ -198,7 +205,7 @@ class Reach(NamedTuple):
             return self._pass(states, windows, first)
         # Complete windows begin settled, and stay so; the others are passed as they are.
         arguments = self.recursion, self.settled, means_of(states), windows, first
-        choice = choose_code(end_of_settled_rows, arguments, [False, False, True, True, True])
+        choice = choose_code(means_after_settled_rows, arguments, [False, False, True, True, True])
         if choice.code is None:
             return None
         results = self.settled.repeated(choice.results())
@@ -209,28 +216,28 @@ class Reach(NamedTuple):
 
     def _pass(self, states: PyTree, windows: PyTree, first: Int[np.ndarray, " n"]) -> PyTree | None:
         """Return the states after windows of rows, row by row; None without native code."""
-        choice = choose_code(end_of_rows, (self.recursion, states, windows, first), [False, True, True, True])
+        choice = choose_code(state_after_rows, (self.recursion, states, windows, first), [False, True, True, True])
         return None if choice.code is None else choice.results()
 
 
-def _begin_with(reach: Reach, start: PyTree, first: Int[np.ndarray, " chunks"]) -> PyTree | None:
+def _find_start_states(reach: WarmUp, start: PyTree, first: Int[np.ndarray, " chunks"]) -> PyTree | None:
     """Return the state with which each chunk begins (chunks, ...); None where probes do not agree on theirs.
 
     What a state holds beside its Gaussians, moments before any data, may never forget: then it is computed of all rows.
     `first` has the first rows of all chunks but the first one.
     """
     starts = repeat_state(start, len(jax.tree.leaves(reach.rows)[0]) // reach.ahead)  # one each `ahead` rows
-    forgets = _is_forgotten(reach, starts, first)
+    forgets = _start_is_forgotten(reach, starts, first)
     if forgets is False and jax.tree.leaves(beside_gaussians(start)) and reach.settled is None:
         starts = _with_moments_before_data(reach.recursion, start, reach.rows, reach.ahead)
-        forgets = starts is not None and _is_forgotten(reach, starts, first)
+        forgets = starts is not None and _start_is_forgotten(reach, starts, first)
     if not forgets:
         return None
     reached = reach.states_before(first, starts)
     return jax.tree.map(lambda one, others: np.concatenate([one[None], others]), start, reached)
 
 
-def _is_forgotten(reach: Reach, starts: PyTree, first: Int[np.ndarray, " chunks"]) -> bool | None:
+def _start_is_forgotten(reach: WarmUp, starts: PyTree, first: Int[np.ndarray, " chunks"]) -> bool | None:
     """Return whether at most of some joints the start is forgotten `ahead` rows later; None without native code.
 
     It is where a state begun `ahead` rows before agrees with one begun twice as many rows before.
@@ -241,7 +248,7 @@ def _is_forgotten(reach: Reach, starts: PyTree, first: Int[np.ndarray, " chunks"
         return None
     twice = reach.states_before(probes, early, begun=True)
     among = jax.tree.map(lambda *leaves: np.concatenate(leaves), take(starts, slice(0, 1)), twice)
-    return bool(np.mean(agree(once, twice, among=among)) > 0.5)
+    return bool(np.mean(find_equal_states(once, twice, among=among)) > 0.5)
 
 
 def _with_moments_before_data(recursion: Recursion, start: PyTree, rows: PyTree, ahead: int) -> PyTree | None:
@@ -251,7 +258,7 @@ def _with_moments_before_data(recursion: Recursion, start: PyTree, rows: PyTree,
     for begin in range(0, len(jax.tree.leaves(rows)[0]), size):
         blocks = jax.tree.map(lambda leaf: leaf.reshape(BLOCKS, ahead, *leaf.shape[2:]),
                               take_windows(rows, np.array([begin]), size))  # fmt: skip
-        choice = choose_code(_predict_blocks, (recursion, state, blocks, np.asarray(begin)), [False] * 4)
+        choice = choose_code(_predict_moments_by_block, (recursion, state, blocks, np.asarray(begin)), [False] * 4)
         if choice.code is None:
             return None
         last, before = jax.tree.map(lambda leaf: leaf[0, ...], choice.results())
@@ -261,25 +268,25 @@ def _with_moments_before_data(recursion: Recursion, start: PyTree, rows: PyTree,
     return with_gaussians(joined, repeat_state(start, BLOCKS * len(parts)))
 
 
-class Programs(NamedTuple):
+class ChunkPrograms(NamedTuple):
     """How a chunk is scanned: in full, or settled by its means alone, and then what is kept of all chunks."""
 
     full: Callable[..., Any]
     settled: Callable[..., Any]
-    complete: Callable[[Settled, PyTree], PyTree]
+    complete: Callable[[SettledState, PyTree], PyTree]
 
 
-OF_ROWS = Programs(scan_chunk, scan_settled, Settled.rows_of)
-OF_SUMS = Programs(sum_chunk, sum_settled, lambda settled, sums: sums)
+OF_ROWS = ChunkPrograms(scan_chunk, scan_settled_rows, SettledState.rows_of)
+OF_SUMS = ChunkPrograms(sum_chunk, sum_settled_rows, lambda settled, sums: sums)
 
 
-def _scan_all(recursion: Recursion, start: PyTree, rows: PyTree, programs: Programs) -> Pass | None:
+def _scan_all_chunks(recursion: Recursion, start: PyTree, rows: PyTree, programs: ChunkPrograms) -> ScanResult | None:
     """Filter all chunks side by side, each from the state with which it is thought to begin.
 
     Then filter again, in order, each chunk that began otherwise than the one before it ends. Outputs are by chunk
     (chunks, ...). None where rows are few, where they forget too late, and without native code.
     """
-    begun = begin_chunks(recursion, start, rows)
+    begun = find_chunk_starts(recursion, start, rows)
     if begun is None:
         return None
     length, total = begun.lengths.chunk, np.asarray(len(jax.tree.leaves(rows)[0]))
@@ -292,7 +299,7 @@ def _scan_all(recursion: Recursion, start: PyTree, rows: PyTree, programs: Progr
         ]
         return join_results(programs.full, parts, [False, True, True, True, False])
 
-    def scan_means(settled: Settled) -> PyTree:
+    def scan_means(settled: SettledState) -> PyTree:
         """Return the results of all chunks, as if they were settled but for the means."""
         means = means_of(begun.states)
         parts = [
@@ -305,13 +312,13 @@ def _scan_all(recursion: Recursion, start: PyTree, rows: PyTree, programs: Progr
     results = scan_chunks(begun, scan, scan_means)
     if results is None:
         return None
-    mend_chunks(scan, begun.states, lambda results: results[0], results)  # changes the arrays of `results`
+    rescan_wrong_starts(scan, begun.states, lambda results: results[0], results)  # changes the arrays of `results`
     last, outputs = results
-    return Pass(jax.tree.map(lambda leaf: leaf[-1, ...], last), outputs)
+    return ScanResult(jax.tree.map(lambda leaf: leaf[-1, ...], last), outputs)
 
 
 def scan_chunks(
-    begun: Begun, scan: Callable[[PyTree, Which], PyTree], scan_means: Callable[[Settled], PyTree]
+    begun: ChunkStarts, scan: Callable[[PyTree, Which], PyTree], scan_means: Callable[[SettledState], PyTree]
 ) -> PyTree:
     """Scan all chunks: those that are settled by their means alone, the others in full; None without native code.
 
@@ -329,7 +336,7 @@ def scan_chunks(
     return results
 
 
-def mend_chunks(
+def rescan_wrong_starts(
     scan: Callable[[PyTree, slice], PyTree], begun: PyTree, ends_of: Callable[[PyTree], PyTree], results: PyTree
 ) -> None:
     """Scan each chunk again, in order, that began otherwise than the one before it ends; change `results` in place.
@@ -341,14 +348,14 @@ def mend_chunks(
         results: of all chunks, (chunks, ...).
     """
     ends = ends_of(results)
-    wrong = ~agree(take(ends, slice(None, -1)), take(begun, slice(1, None)), among=begun)
+    wrong = ~find_equal_states(take(ends, slice(None, -1)), take(begun, slice(1, None)), among=begun)
     for c in range(1, len(wrong) + 1):
         if not wrong[c - 1]:
             continue
         chunk = slice(c, c + 1)
         replace_chunk(results, chunk, scan(take(ends, slice(c - 1, c)), chunk))
         if c < len(wrong):
-            wrong[c] = not agree(take(ends, chunk), take(begun, slice(c + 1, c + 2)), among=begun)[0]
+            wrong[c] = not find_equal_states(take(ends, chunk), take(begun, slice(c + 1, c + 2)), among=begun)[0]
 
 
 def replace_chunk(results: PyTree, which: Which, new_results: PyTree) -> None:

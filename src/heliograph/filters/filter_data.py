@@ -11,14 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compute_once
-from heliograph.filters.chunks import Pass, filter_in_chunks
+from heliograph.filters.chunks import ScanResult, filter_in_chunks
 from heliograph.model.checks.inputs import check_inputs
 from heliograph.model.checks.row_times import common_dates, judge_dates
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.origin import KeptOrigin, Origin, last_input, usual_months, usual_spacing
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.float64 import quickly_compiled
-from heliograph.numerics.linalg import find_lost
+from heliograph.numerics.linalg import find_not_finite
 from heliograph.numerics.module import readable
 from heliograph.numerics.times.rows import check_rows
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
@@ -58,7 +58,7 @@ class SteppedFilter(Protocol):
     def after_step(self, state: PyTree, k: Array) -> Estimate:
         """Return the estimate of a row."""
 
-    def filter_rows(self, z: Array, u: Array, state: PyTree | None = None, begin: Array | int = 0) -> Pass | None:
+    def filter_rows(self, z: Array, u: Array, state: PyTree | None = None, begin: Array | int = 0) -> ScanResult | None:
         """Filter rows by native code of its own, None where it has none."""
 
 
@@ -139,7 +139,7 @@ def run_over_data(filter: SteppedFilter, z: ArrayLike, u: ArrayLike | None, afte
 
     The rows are the first ones, or those `after` an earlier result.
     """
-    before = None if after is None else _origin_of(filter, after)
+    before = None if after is None else _find_origin(filter, after)
     begin = 0 if before is None else int(before.step)
     rows_z, rows_u = check_data(filter, z, u, begin)
     clock = common_dates(_tables(z, u))
@@ -151,7 +151,7 @@ def run_over_data(filter: SteppedFilter, z: ArrayLike, u: ArrayLike | None, afte
     whole = whole or filter.filter_rows(rows_z, rows_u, *start)
     state, outputs = whole or compute_once(_compute_filtered, _by_xla, (filter, rows_z, rows_u, *start))
     mean, covariance, innovation, modes, counts = outputs
-    lost = find_lost(mean, 1)
+    lost = find_not_finite(mean, 1)
     if lost.any():
         row = begin + int(np.argmax(lost)) + 1
         said = f"{type(filter).__name__}: the estimate is no finite number from row {row} on"
@@ -176,7 +176,7 @@ def run_over_data(filter: SteppedFilter, z: ArrayLike, u: ArrayLike | None, afte
     )
 
 
-def _origin_of(filter: SteppedFilter, after: Filtered) -> Origin:
+def _find_origin(filter: SteppedFilter, after: Filtered) -> Origin:
     """Return the state after earlier rows; raise of what is no result of such a filter."""
     expected = "what `run` of this filter returned for the rows before"
     origin = instance("after", after, Filtered, expected).origin

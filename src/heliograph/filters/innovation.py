@@ -49,10 +49,10 @@ def mixed_innovation(
         total: its innovation covariance (parts, m, m).
         density: log-likelihood of z under the mixture.
     """
-    return innovation_of_means(weight, value, jnp.einsum("a,aij->ij", weight, total), density)
+    return innovation_of_mean_covariance(weight, value, jnp.einsum("a,aij->ij", weight, total), density)
 
 
-def innovation_of_means(
+def innovation_of_mean_covariance(
     weight: "Float[Array, ' parts']",
     value: "Float[Array, 'parts m']",
     within: "Float[Array, 'm m']",

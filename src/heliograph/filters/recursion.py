@@ -26,7 +26,7 @@ class Recursion(Module):
         return self.step(state, (missing, row[1]), k)[0]
 
 
-class FilterRows(Recursion):
+class FilterRecursion(Recursion):
     """A filter over rows, and what is kept of each: output(filter, state, innovation, k); `begin` is the first k."""
 
     filter: Any
@@ -84,7 +84,7 @@ def sum_rows(
     return jax.lax.scan(body, (state, none), (rows, numbers))[0]
 
 
-def end_of_rows(recursion: Recursion, state: PyTree, rows: PyTree, first: Array) -> PyTree:
+def state_after_rows(recursion: Recursion, state: PyTree, rows: PyTree, first: Array) -> PyTree:
     """Return the state after some rows, of which the first has the number `first`, and nothing of the rows."""
 
     def step(state: PyTree, row: tuple[PyTree, Array]) -> tuple[PyTree, None]:

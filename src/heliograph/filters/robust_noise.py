@@ -15,7 +15,7 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.traced import is_traced, library
 from heliograph.numerics.types import Array, Float
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.moments.components import Branches
+from heliograph.random_affine.moments.components import GaussianBranches
 from heliograph.random_affine.moments.second_moments import SecondOrder
 from heliograph.random_affine.noise import AbstractNoise, Independent
 from heliograph.random_affine.outliers import (
@@ -134,7 +134,7 @@ def describe_outlier_noise(
     late_variance: Array = late_mean
     if late is not None:
         log_share, mean, variance, late_mean, late_variance = _combine_branches(
-            Branches(log_share, mean, variance), late.branches()
+            GaussianBranches(log_share, mean, variance), late.branches()
         )
     return ReceivedNoise(
         log_share=log_share, mean=mean, variance=variance, late_mean=late_mean, late_variance=late_variance,
@@ -187,7 +187,7 @@ def _check_weighable(covariance: Array, independent: bool) -> None:
         raise fail("noise of a robust filter", expected, f"correlations whose least eigenvalue is {least:.3g}")
 
 
-def _combine_branches(sensed: Branches, late: Branches) -> tuple[Array, ...]:
+def _combine_branches(sensed: GaussianBranches, late: GaussianBranches) -> tuple[Array, ...]:
     """Return all pairs of a branch of the sensor and one of the last hop, (m, pairs) each.
 
     Log probabilities, means and variances of the sensor's, means and variances of the last hop's.

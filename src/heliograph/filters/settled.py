@@ -19,7 +19,7 @@ import numpy as np
 
 from heliograph.engine.choice import choose_code
 from heliograph.filters.recursion import Recursion, number_rows, sum_rows
-from heliograph.filters.states import ROUNDING, agree, means_of, select_state, with_means
+from heliograph.filters.states import ROUNDING, find_equal_states, means_of, select_state, with_means
 from heliograph.filters.windows import take
 from heliograph.numerics.process.equal_rows import repeat_row
 from heliograph.numerics.types import Array, Bool, Int, PyTree
@@ -28,7 +28,7 @@ from straightline import present
 TURNS = 4  # times as many rows as forget, after which a state is compared with what it was after half of them
 
 
-class Settled(NamedTuple):
+class SettledState(NamedTuple):
     """A state that stays as it is over complete rows but for its means, and what is kept of such a row.
 
     Means, and of `outputs` the leaves that `varies` marks, are of any value.
@@ -73,11 +73,11 @@ class Settled(NamedTuple):
         covered: np.ndarray = np.all(same, axis=0)
         others = np.flatnonzero(~covered)
         if len(others):
-            covered[others] = agree(take(states, others), self.repeated([mean[others] for mean in means]))
+            covered[others] = find_equal_states(take(states, others), self.repeated([mean[others] for mean in means]))
         return covered
 
 
-def find_settled(recursion: Recursion, start: PyTree, rows: PyTree, ahead: int) -> Settled | None:
+def find_settled_state(recursion: Recursion, start: PyTree, rows: PyTree, ahead: int) -> SettledState | None:
     """Find the state that complete rows lead to; None where there is none, or no native code.
 
     Args:
@@ -87,15 +87,15 @@ def find_settled(recursion: Recursion, start: PyTree, rows: PyTree, ahead: int) 
         ahead: length of a window of rows.
     """
     row = jax.tree.map(lambda leaf: np.zeros_like(leaf[0]), rows)
-    varies = find_varying(recursion, start, row)
+    varies = find_data_dependent_leaves(recursion, start, row)
     if varies is None:
         return None
     arguments = recursion, start, row, np.arange(TURNS * ahead).reshape(2, -1)
     choice = choose_code(_settle, arguments, [False] * len(arguments))
-    return None if choice.code is None else settled_of(varies, *choice.results())
+    return None if choice.code is None else compare_windows(varies, *choice.results())
 
 
-def settled_of(varies: tuple[bool, ...], after_windows: PyTree, outputs: PyTree) -> Settled | None:
+def compare_windows(varies: tuple[bool, ...], after_windows: PyTree, outputs: PyTree) -> SettledState | None:
     """Return the state after two windows of rows if it is the one after the first; None if not.
 
     Args:
@@ -106,12 +106,12 @@ def settled_of(varies: tuple[bool, ...], after_windows: PyTree, outputs: PyTree)
     halfway, end = (jax.tree.map(lambda leaf, at=at: leaf[:, at], after_windows) for at in (0, 1))
     # Means follow the data, and are left out; all else must be the same.
     zero_means = [np.zeros_like(mean) for mean in means_of(end)]
-    if not agree(with_means(end, zero_means), with_means(halfway, zero_means), ROUNDING)[0]:
+    if not find_equal_states(with_means(end, zero_means), with_means(halfway, zero_means), ROUNDING)[0]:
         return None
     # Of the axes (run, window) one run, and the second window.
     state = jax.tree.map(lambda leaf: leaf[0, ...], end)
     last_outputs = jax.tree.map(lambda leaf: leaf[0, 1, ...], outputs)
-    return Settled(state, last_outputs, varies)
+    return SettledState(state, last_outputs, varies)
 
 
 def _settle(recursion: Recursion, start: PyTree, row: PyTree, numbers: Array) -> tuple[PyTree, PyTree]:
@@ -136,7 +136,7 @@ def _settle(recursion: Recursion, start: PyTree, row: PyTree, numbers: Array) ->
     return ends
 
 
-def find_varying(recursion: Recursion, start: PyTree, row: PyTree) -> tuple[bool, ...] | None:
+def find_data_dependent_leaves(recursion: Recursion, start: PyTree, row: PyTree) -> tuple[bool, ...] | None:
     """Return which leaves of what is kept of a complete row depend on data.
 
     None if more than the means of the state depends on data, or without native code.
@@ -160,8 +160,8 @@ def step_settled(
     return recursion.step(with_means(state, means), (jax.tree.map(present, z), u), k)
 
 
-def scan_settled(
-    recursion: Recursion, settled: Settled, means: Sequence[Array], rows: PyTree, first: Array, count: Array
+def scan_settled_rows(
+    recursion: Recursion, settled: SettledState, means: Sequence[Array], rows: PyTree, first: Array, count: Array
 ) -> tuple[list[jax.Array], list[jax.Array]]:
     """Scan complete rows from a settled state with these means; return the last means, and what varies of each row.
 
@@ -177,10 +177,10 @@ def scan_settled(
     return jax.lax.scan(step, [jnp.asarray(mean) for mean in means], (rows, number_rows(rows, first)))
 
 
-def sum_settled(
-    recursion: Recursion, settled: Settled, means: Sequence[Array], rows: PyTree, first: Array, count: Array
+def sum_settled_rows(
+    recursion: Recursion, settled: SettledState, means: Sequence[Array], rows: PyTree, first: Array, count: Array
 ) -> tuple[list[jax.Array], PyTree]:
-    """Scan complete rows as `scan_settled` does; return the last means, and sums of all that is kept of a row."""
+    """Scan complete rows as `scan_settled_rows` does; return the last means, and sums of all that is kept of a row."""
 
     def step(means: list[jax.Array], data: PyTree, k: Array) -> tuple[list[jax.Array], PyTree]:
         after, outputs = step_settled(recursion, settled.state, means, data, k)
@@ -189,8 +189,8 @@ def sum_settled(
     return sum_rows(step, [jnp.asarray(mean) for mean in means], rows, first, count)
 
 
-def end_of_settled_rows(
-    recursion: Recursion, settled: Settled, means: Sequence[Array], rows: PyTree, first: Array
+def means_after_settled_rows(
+    recursion: Recursion, settled: SettledState, means: Sequence[Array], rows: PyTree, first: Array
 ) -> list[jax.Array]:
     """Return the means after some complete rows, of which the first has the number `first`, and nothing of the rows."""
 
@@ -201,7 +201,7 @@ def end_of_settled_rows(
     return jax.lax.scan(step, [jnp.asarray(mean) for mean in means], (rows, number_rows(rows, first)))[0]
 
 
-class CompleteRows(NamedTuple):
+class CompleteBlocks(NamedTuple):
     """Which blocks of `size` rows of measurements lack no number: `before`[i] of the first i blocks are complete."""
 
     size: int
@@ -213,7 +213,7 @@ class CompleteRows(NamedTuple):
         return np.asarray(self.before[end] - self.before[first] == end - first)
 
 
-def find_complete(z: PyTree, size: int) -> CompleteRows:
+def find_complete_blocks(z: PyTree, size: int) -> CompleteBlocks:
     """Return which blocks of `size` rows of measurements (rows, ...) lack no number."""
     total = len(jax.tree.leaves(z)[0])
     begin, complete = np.arange(0, total, size), np.ones(-(-total // size), bool)
@@ -221,7 +221,7 @@ def find_complete(z: PyTree, size: int) -> CompleteRows:
         for leaf in jax.tree.leaves(z):
             if leaf.size:
                 complete &= np.isfinite(np.add.reduceat(leaf.reshape(-1), begin * (leaf.size // total)))
-    return CompleteRows(size, np.append(0, np.cumsum(complete)))
+    return CompleteBlocks(size, np.append(0, np.cumsum(complete)))
 
 
 def repeat_state(state: PyTree, count: int) -> PyTree:

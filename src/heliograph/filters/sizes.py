@@ -5,7 +5,7 @@ from typing import Protocol, TypedDict
 from heliograph.model.estimate import Claim
 
 
-class Sizes(TypedDict):
+class FilterSizes(TypedDict):
     """Claim and sizes of a filter, as its class takes them."""
 
     claim: Claim
@@ -26,6 +26,6 @@ class HasStates(Protocol):
         """Names of the inputs."""
 
 
-def make_sizes(claim: Claim, like: HasStates, received: int) -> Sizes:
+def make_sizes(claim: Claim, like: HasStates, received: int) -> FilterSizes:
     """Return claim, and the sizes of a filter of the states and inputs of a plant, which receives so many numbers."""
-    return Sizes(claim=claim, states=like.states, inputs=like.inputs, received=received)
+    return FilterSizes(claim=claim, states=like.states, inputs=like.inputs, received=received)

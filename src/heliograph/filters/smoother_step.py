@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.factors.changes import settle, unsettle
-from heliograph.factors.columns import Columns, decorrelate, join_columns, triangularise, unit_lower
+from heliograph.factors.columns import WeightedColumns, decorrelate, join_columns, triangularise, unit_lower
 from heliograph.factors.gaussian import BackwardGain, Gaussian, condition_on_next_state, from_columns, rts_step
 from heliograph.filters.plausibility import innovation_distance
-from heliograph.filters.truncation import PlacedLimits, hold_mean, truncate_to_limits
+from heliograph.filters.truncation import PlacedLimits, hold_mean_within_limits, truncate_to_limits
 from heliograph.model.estimate import Claim, Estimate, Innovation, weakest
 from heliograph.numerics.angle import Angles, wrap_angles
 from heliograph.numerics.manifold import Manifold
@@ -51,7 +51,7 @@ class EarlierState(NamedTuple):
     mean: Float[jax.Array, " N"]
     link: Float[jax.Array, "N N"]
     lower: Float[jax.Array, " entries"]
-    noise: Columns
+    noise: WeightedColumns
 
     def through(self, rows: jax.Array) -> jax.Array:
         """Return M L^-1 times rows (N, ...)."""
@@ -123,7 +123,7 @@ class SmootherStep(Module):
             mean=self.after.mean,
             link=jnp.eye(n),
             lower=jnp.zeros_like(self.after.lower),
-            noise=Columns(jnp.eye(n), jnp.zeros(n)),
+            noise=WeightedColumns(jnp.eye(n), jnp.zeros(n)),
         )
 
     def ahead(self, point: EarlierState) -> EarlierState:
@@ -133,7 +133,7 @@ class SmootherStep(Module):
         x_j = mean + M L^-1 (K e + d) + noise, of which the data tell e alone: M L^-1 d joins the noise.
         """
         before = self.before
-        noise = Columns(point.through(before.left.root), before.left.variances)
+        noise = WeightedColumns(point.through(before.left.root), before.left.variances)
         after = EarlierState(
             mean=point.mean,
             link=point.through(before.gain),
@@ -154,7 +154,7 @@ class SmootherStep(Module):
 
     def reached(self, point: EarlierState) -> Gaussian:
         """Return the mean and covariance of an earlier state given all data up to this step."""
-        explained = Columns(point.through(self.after.root), self.after.variances)
+        explained = WeightedColumns(point.through(self.after.root), self.after.variances)
         return from_columns(point.mean, join_columns(explained, point.noise))
 
     def with_data(self, mean_before: jax.Array, mean_prior: jax.Array, mean_after: jax.Array) -> Self:
@@ -169,7 +169,7 @@ class SmootherStep(Module):
             mean, columns = self.projection @ mean, columns.through(self.projection)
         mean = mean if self.shift is None else mean + self.shift
         if self.limits:
-            law = hold_mean(from_columns(mean, columns), self.limits)
+            law = hold_mean_within_limits(from_columns(mean, columns), self.limits)
             _, inside = truncate_to_limits(jax.tree.map(lambda leaf: leaf[None], law), self.limits)
             return Estimate(wrap_angles(inside.mean[0], self.angles), inside.covariance[0], self.claim)
         mean = wrap_angles(mean, self.angles)
@@ -188,7 +188,7 @@ def with_gaussian(state: PyTree, x: Gaussian) -> PyTree:
 
 def smoother_step_of(
     step: StepTrace,
-    moved: tuple[Array, Columns],
+    moved: tuple[Array, WeightedColumns],
     claim: Claim,
     manifold: Manifold = EVERY_LINE,
     projection: Array | None = None,

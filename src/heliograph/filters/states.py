@@ -20,14 +20,14 @@ ROUNDINGS = 16  # of a number, by which two ways to it differ; of means a millio
 ROUNDING = ROUNDINGS * float(np.finfo(np.float64).eps)
 
 
-class Slopes(NamedTuple):
+class MomentSlopes(NamedTuple):
     """Derivatives of the Gaussian before them in a state, in one number: of its mean (n,) and covariance (n, n)."""
 
     mean: jax.Array
     covariance: jax.Array
 
 
-def agree(
+def find_equal_states(
     states: PyTree, others: PyTree, tolerance: float = TOLERANCE, among: PyTree | None = None
 ) -> Bool[np.ndarray, " n"]:
     """Return which states (n, ...) are the same as others, to a share of a deviation and some roundings of each number.
@@ -123,7 +123,7 @@ def _moving_parts(state: PyTree) -> list[Any]:
 
 def _is_moving(part: Any) -> bool:
     """Return whether a part of a state is a Gaussian or its derivatives."""
-    return isinstance(part, Gaussian | Slopes)
+    return isinstance(part, Gaussian | MomentSlopes)
 
 
 def _leaves_beside(state: PyTree) -> list[np.ndarray]:

@@ -40,7 +40,7 @@ def truncate_gaussians(
     return log_mass, jax.vmap(impose_moments_of_combination)(x, jnp.where(changes[:, None], row, 0.0), shift, ratio)
 
 
-def hold_mean(x: Gaussian, limits: PlacedLimits) -> Gaussian:
+def hold_mean_within_limits(x: Gaussian, limits: PlacedLimits) -> Gaussian:
     """Move the mean to the most likely point within the limits, one after the other; the covariance stays.
 
     The point of x_i = c that is most likely is m + P e_i (c - m_i) / P_ii. A component without variance stays.

@@ -11,16 +11,24 @@ from typing_extensions import TypeAliasType
 
 from heliograph.engine.choice import compute_once
 from heliograph.filters.filter_angles import FilterAngles
-from heliograph.forecasting.forecast import Target, targets_of
+from heliograph.forecasting.forecast import ForecastTarget, list_targets
 from heliograph.forecasting.outlook import Moments, Outlook
-from heliograph.forecasting.scores import LEVELS, Law, Mean, below, crps, log_score, overlapping_mean
+from heliograph.forecasting.scores import (
+    LEVELS,
+    MixtureLaws,
+    ScoreMean,
+    average_overlapping,
+    below,
+    crps,
+    log_score,
+)
 from heliograph.model.origin import Origin
 from heliograph.numerics.angle import wrap_angles
 from heliograph.numerics.check import check_count, fail, instance, items
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float, PyTree
-from heliograph.simulation.arguments import inputs_of
+from heliograph.simulation.arguments import read_plant_inputs
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.recorded import run
 from heliograph.simulation.results.record import Record
@@ -32,7 +40,7 @@ if TYPE_CHECKING:  # an extra
 ByNode = TypeAliasType("ByNode", Mapping[str, ArrayLike])
 Rows = TypeAliasType("Rows", Float[ArrayLike, "steps ..."] | None)
 Refit = TypeAliasType("Refit", Callable[[int], Network])  # of the first so many rows
-Coverage = TypeAliasType("Coverage", tuple[Mean, ...])  # of each level
+Coverage = TypeAliasType("Coverage", tuple[ScoreMean, ...])  # of each level
 
 
 @readable
@@ -59,11 +67,11 @@ class Score(NamedTuple):
     name: str
     horizon: int
     compared: int
-    bias: Mean
-    mse: Mean
+    bias: ScoreMean
+    mse: ScoreMean
     coverage: Coverage
-    log_score: Mean
-    crps: Mean
+    log_score: ScoreMean
+    crps: ScoreMean
 
     @property
     def rmse(self) -> float:
@@ -165,12 +173,14 @@ def backtest(
     first = check_count("skip", skip, 0)
     if not ahead or ahead[-1] + first >= rows:
         raise fail("backtest", f"horizons that, behind {first} skipped rows, end within the {rows} rows of data", ahead)
-    u = inputs_of(network, inputs, rows)
+    u = read_plant_inputs(network, inputs, rows)
     # Networks with the row from which each forecasts, and their targets.
     known = [(0, network)] if refit is None else [
         (row, _refit(refit, row, network)) for row in range(first, rows, check_count("every", every))
     ]  # fmt: skip
-    segments = [(row, targets_of(_origin(fitted, record, measurements, inputs, time, truth))) for row, fitted in known]
+    segments = [
+        (row, list_targets(_origin(fitted, record, measurements, inputs, time, truth))) for row, fitted in known
+    ]
     scores = list[Score]()
     for several in zip(*(targets for _, targets in segments), strict=True):
         if (several[0].node, several[0].filter) in filtered_places(network):
@@ -208,7 +218,7 @@ def filtered_places(network: Network) -> set[tuple[str, str]]:
     return set(network.places) | central
 
 
-def measured_by(target: Target, record: Record) -> np.ndarray:
+def measured_by(target: ForecastTarget, record: Record) -> np.ndarray:
     """Return the measurements of a filter (steps, received)."""
     z = record.measurements.get(target.node)
     if z is None:  # of a central filter, all nodes' numbers
@@ -216,7 +226,7 @@ def measured_by(target: Target, record: Record) -> np.ndarray:
     return z if target.outlook.filter.received else z[:, :0]
 
 
-class _Compared(NamedTuple):
+class _ComparedForecasts(NamedTuple):
     """Forecasts from each row, and what came: of the numbers that a filter receives, or of its states.
 
     part "received" or "state", names of the numbers, moments of their forecasts, came (rows, numbers), and the places
@@ -231,7 +241,7 @@ class _Compared(NamedTuple):
 
 
 def _score_filter(
-    segments: list[tuple[int, Target]], record: Record, u: np.ndarray, ahead: list[int], first: int
+    segments: list[tuple[int, ForecastTarget]], record: Record, u: np.ndarray, ahead: list[int], first: int
 ) -> list[Score]:
     """Score what one filter says ahead of each number that it receives, and of each state whose truth is known.
 
@@ -249,11 +259,11 @@ def _score_filter(
     z = measured_by(target, record)
     states, received = _roll_segments(segments, z, u, ahead)
     angles = filter.angles_used() or FilterAngles((), ())
-    compared = list[_Compared]()
+    compared = list[_ComparedForecasts]()
     if received is not None:
-        compared.append(_Compared("received", target.received, received, z, angles.received))
+        compared.append(_ComparedForecasts("received", target.received, received, z, angles.received))
     if record.truth is not None:
-        compared.append(_Compared("state", filter.states, states, record.truth, angles.states))
+        compared.append(_ComparedForecasts("state", filter.states, states, record.truth, angles.states))
     scores = list[Score]()
     for c in compared:
         for i, name in enumerate(c.names):
@@ -265,10 +275,10 @@ def _score_filter(
 
 
 def _roll_segments(
-    segments: list[tuple[int, Target]], z: np.ndarray, u: np.ndarray, ahead: list[int]
+    segments: list[tuple[int, ForecastTarget]], z: np.ndarray, u: np.ndarray, ahead: list[int]
 ) -> tuple[Moments, Moments | None]:
-    """Return forecasts from each row, as of `roll`, by the filter of the segment that the row lies in."""
-    rolled = [roll(target.outlook, z, u, ahead) for _, target in segments]
+    """Return forecasts from each row, as of `roll_forecasts`, by the filter of the segment that the row lies in."""
+    rolled = [roll_forecasts(target.outlook, z, u, ahead) for _, target in segments]
     ends = [*(row for row, _ in segments[1:]), len(z)]
     bounds = list(zip([0, *ends[:-1]], ends, strict=True))
 
@@ -280,32 +290,36 @@ def _roll_segments(
     return joined
 
 
-def _law(moments: Moments, number: int, horizon: int) -> Law:
+def _law(moments: Moments, number: int, horizon: int) -> MixtureLaws:
     """Return the law of one number at one horizon, from each row."""
     means, variances = np.asarray(moments.means), np.asarray(moments.covariances)
-    return Law(np.asarray(moments.weights)[:, horizon], means[:, horizon, :, number], variances[:, horizon, :, number])
+    return MixtureLaws(
+        np.asarray(moments.weights)[:, horizon], means[:, horizon, :, number], variances[:, horizon, :, number]
+    )
 
 
 def _score_number(
-    of: tuple[str, str, str, str], horizon: int, law: Law, values: np.ndarray, first: int, is_angle: bool
+    of: tuple[str, str, str, str], horizon: int, law: MixtureLaws, values: np.ndarray, first: int, is_angle: bool
 ) -> Score:
     """Score forecasts from each row against the number `horizon` rows later.
 
     `of` says which number: its node, filter, part and name; `law` is its forecast from each row, `values` what it was.
     """
-    law, came = Law(*(part[first:-horizon] for part in law)), values[first + horizon :]
+    law, came = MixtureLaws(*(part[first:-horizon] for part in law)), values[first + horizon :]
     # An angle within half a turn of what was expected.
     came = law.mean + wrap_angles((came - law.mean)[:, None], (0,) if is_angle else ())[:, 0]
     came = np.where(np.isfinite(law.variances).all(axis=1), came, np.nan)  # of what nothing was heard yet: none
     error, chance = came - law.mean, below(law, came)
     known = np.where(np.isnan(error), np.nan, 0.0)
-    coverage = tuple(overlapping_mean((np.abs(chance - 0.5) <= level / 2) + known, horizon) for level in LEVELS)
-    bias, mse = overlapping_mean(error, horizon), overlapping_mean(error**2, horizon)
-    density, ranked = (overlapping_mean(score(law, came), horizon) for score in (log_score, crps))
+    coverage = tuple(average_overlapping((np.abs(chance - 0.5) <= level / 2) + known, horizon) for level in LEVELS)
+    bias, mse = average_overlapping(error, horizon), average_overlapping(error**2, horizon)
+    density, ranked = (average_overlapping(score(law, came), horizon) for score in (log_score, crps))
     return Score(*of, horizon, int(np.sum(~np.isnan(error))), bias, mse, coverage, density, ranked)
 
 
-def roll(outlook: Outlook, z: np.ndarray, u: np.ndarray, horizons: Sequence[int]) -> tuple[Moments, Moments | None]:
+def roll_forecasts(
+    outlook: Outlook, z: np.ndarray, u: np.ndarray, horizons: Sequence[int]
+) -> tuple[Moments, Moments | None]:
     """Return forecasts from each row at each horizon: of the states, and of what would arrive.
 
     Their moments (rows, horizons, K, ...) have variances in the place of covariances.

@@ -123,13 +123,13 @@ def disturbances(
     plant, sensor = _find_model(filter)
     rows, inputs = check_data(filter, z, u)
     predicted = predict_rows(filter, rows, inputs)
-    if not _hands_on(predicted):
+    if not _is_received_unchanged(predicted):
         raise fail("disturbances", "a filter whose channel hands on what is measured", "one with gains or noise")
     C, R = np.asarray(sensor.matrix), np.asarray(sensor.noise.covariance)
     A, Q = np.asarray(plant.matrix), np.asarray(plant.noise.covariance)  # type: ignore[union-attr]  # a Gaussian's
     assert predicted.received is not None
     e = np.asarray(rows) - predicted.received.mean
-    noise, motion = _smooth(A, C, Q, R, e, predicted.states.covariance)
+    noise, motion = _smooth_noises(A, C, Q, R, e, predicted.states.covariance)
     sensed, moved = (_with_deviation(mean, covariance) for mean, covariance in (noise, motion))
     return Disturbances(tuple(predicted.received.names), tuple(filter.states), *sensed, *moved)
 
@@ -155,7 +155,7 @@ def _find_model(filter: AbstractFilter) -> tuple[LinearPlant, LinearSensor]:
     raise fail("disturbances", expected, f"{type(filter).__name__}, {filter.claim}")
 
 
-def _hands_on(predicted: Forecast) -> bool:
+def _is_received_unchanged(predicted: Forecast) -> bool:
     """Return whether what arrives is what is measured."""
     sent, came = predicted.outputs, predicted.received
     return (
@@ -167,7 +167,7 @@ def _hands_on(predicted: Forecast) -> bool:
     )
 
 
-def _smooth(
+def _smooth_noises(
     A: np.ndarray, C: np.ndarray, Q: np.ndarray, R: np.ndarray, e: np.ndarray, P: np.ndarray
 ) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
     """Return means and covariances of both noises, by innovations e (steps, m) and predicted covariances P.

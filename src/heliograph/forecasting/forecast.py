@@ -9,7 +9,7 @@ import numpy as np
 from heliograph.factors.gaussian import from_covariance
 from heliograph.filters.base import AbstractFilter, FilterAngles
 from heliograph.filters.gaussian.belief import open_loop_filter
-from heliograph.forecasting.horizons import Ahead, Horizons, Inputs, ahead_of, check_ahead
+from heliograph.forecasting.horizons import Horizons, Inputs, RowsAhead, check_ahead, find_rows_ahead
 from heliograph.forecasting.origins import Sources, origin_of_sources
 from heliograph.forecasting.outlook import (
     Outlook,
@@ -69,15 +69,15 @@ def forecasts_from(origin: Origin, horizons: Horizons, inputs: Inputs) -> Foreca
     """Forecast each estimate of an origin, by node and filter; a single filter is called ""."""
     model = origin.model
     assert isinstance(model, Network | AbstractFilter)  # nothing else makes one
-    ahead = ahead_of(origin, model.inputs, horizons, inputs)
+    ahead = find_rows_ahead(origin, model.inputs, horizons, inputs)
     forecasts: Forecasts = {}
-    for target in targets_of(origin):
+    for target in list_targets(origin):
         check_covered(target.outlook.filter, origin.step, ahead.u.shape[-2])
-        forecasts.setdefault(target.node, {})[target.filter] = _forecast_one(target, origin, ahead)
+        forecasts.setdefault(target.node, {})[target.filter] = _forecast_target(target, origin, ahead)
     return forecasts
 
 
-class Target(NamedTuple):
+class ForecastTarget(NamedTuple):
     """An estimate that is forecast: its node and filter, how it is read ahead, its state, the names of what arrives."""
 
     node: str
@@ -87,13 +87,13 @@ class Target(NamedTuple):
     received: tuple[str, ...]
 
 
-def target_of(origin: Origin, node: str | None, filter: str | None) -> Target:
+def find_target(origin: Origin, node: str | None, filter: str | None) -> ForecastTarget:
     """Return the estimate of this node and filter, or the only one where they are None.
 
     Raises:
         ValueError: none, or several of them.
     """
-    every = targets_of(origin)
+    every = list_targets(origin)
     found = [t for t in every if node in (None, t.node) and filter in (None, t.filter)]
     if len(found) != 1:
         known = ", ".join(f"{t.node}/{t.filter}" for t in every)
@@ -101,13 +101,13 @@ def target_of(origin: Origin, node: str | None, filter: str | None) -> Target:
     return found[0]
 
 
-def targets_of(origin: Origin) -> list[Target]:
+def list_targets(origin: Origin) -> list[ForecastTarget]:
     """List the estimates that an origin has."""
     model = origin.model
     if isinstance(model, AbstractFilter):
         outlook = outlook_of(model)
         outputs = () if outlook.sensor is None else tuple(first(outlook.sensor).outputs)
-        return [Target("", "", outlook, origin.state, name_values(outputs, model.received))]
+        return [ForecastTarget("", "", outlook, origin.state, name_values(outputs, model.received))]
     assert isinstance(model, Network)
     kinds, central, *_ = origin.state
     found = []
@@ -124,7 +124,7 @@ def targets_of(origin: Origin) -> list[Target]:
             else:
                 filter, state = _predict_without_nodes(model, estimate)
             outlook = outlook_of(filter, _find_sensor(model, node), model.plant)
-            found.append(Target(node, name, outlook, state, _received(model, node)))
+            found.append(ForecastTarget(node, name, outlook, state, _received(model, node)))
     return found
 
 
@@ -174,7 +174,7 @@ def check_covered(filter: AbstractFilter, step: int | np.ndarray, count: int) ->
         raise fail("horizons", f"at most {left} steps, which the model covers behind the data", count)
 
 
-def _forecast_one(target: Target, origin: Origin, ahead: Ahead) -> Forecast:
+def _forecast_target(target: ForecastTarget, origin: Origin, ahead: RowsAhead) -> Forecast:
     """Return the forecast of one filter."""
     outlook, filter = target.outlook, target.outlook.filter
     check_ahead(filter.inputs, ahead, filter, origin.step)

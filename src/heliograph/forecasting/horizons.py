@@ -31,7 +31,7 @@ class HasInputs(Protocol):
         """Names of the inputs."""
 
 
-class Ahead(NamedTuple):
+class RowsAhead(NamedTuple):
     """Rows to predict over: u (rows, inputs), the number of the row that ends at each horizon, and their times.
 
     Of several plants u and times have a leading axis.
@@ -44,7 +44,7 @@ class Ahead(NamedTuple):
     inputs: InputsAhead
 
 
-def ahead_of(origin: Origin, names: Sequence[str], horizons: Horizons, inputs: Inputs) -> Ahead:
+def find_rows_ahead(origin: Origin, names: Sequence[str], horizons: Horizons, inputs: Inputs) -> RowsAhead:
     """Return the rows of inputs from an origin to each horizon.
 
     Where time counts steps there is a row a step; where the plant has an input dt, a row from each horizon to the next.
@@ -64,7 +64,7 @@ def ahead_of(origin: Origin, names: Sequence[str], horizons: Horizons, inputs: I
     if continuous:
         u = np.insert(given, list(names).index(TIME_STEP), np.diff(distances, prepend=0.0), axis=-1)
     rows = np.arange(count) if continuous else distances.astype(int) - 1
-    return Ahead(
+    return RowsAhead(
         u,
         rows,
         distances if continuous else distances.astype(int),
@@ -98,7 +98,7 @@ def _convert_to_steps(origin: Origin, horizons: Horizons) -> np.ndarray:
 
 def _count_months(origin: Origin, date: datetime | np.datetime64) -> float:
     """Return how many steps of whole months a date lies ahead."""
-    apart = np.datetime64(date).astype("datetime64[M]") - _find_end(origin, date).astype("datetime64[M]")
+    apart = np.datetime64(date).astype("datetime64[M]") - _find_end_of_data(origin, date).astype("datetime64[M]")
     steps, left = divmod(int(apart.astype(int)), origin.months)
     if left or not steps:
         raise fail("horizons", f"whole steps of {origin.months} months", f"{show_value(date)}, {apart} ahead")
@@ -149,14 +149,14 @@ def _convert_to_seconds(origin: Origin, horizon: object) -> float | None:
         return float(np.timedelta64(horizon, "ns").astype(np.int64)) / SECOND
     if not isinstance(horizon, datetime | np.datetime64):
         return None
-    end = _find_end(origin, horizon)
+    end = _find_end_of_data(origin, horizon)
     ahead = np.datetime64(horizon).astype("datetime64[ns]") - end.astype("datetime64[ns]")
     if ahead <= np.timedelta64(0, "ns"):
         raise fail("horizons", f"dates after the data, which end at {end}", show_value(horizon))
     return float(ahead.astype(np.int64)) / SECOND
 
 
-def _find_end(origin: Origin, horizon: datetime | np.datetime64) -> np.datetime64:
+def _find_end_of_data(origin: Origin, horizon: datetime | np.datetime64) -> np.datetime64:
     """Return the date at which the data end, of several sources all of them.
 
     Raises:
@@ -196,7 +196,7 @@ def _complete_inputs(
     return np.repeat(held[..., None, :], count, axis=-2), "held"
 
 
-def check_ahead(names: Sequence[str], ahead: Ahead, models: object, step: int | np.ndarray) -> None:
+def check_ahead(names: Sequence[str], ahead: RowsAhead, models: object, step: int | np.ndarray) -> None:
     """Refuse inputs for which a function of the plant returns what it must not."""
     count, width = ahead.u.shape[-2:]
     if width:

@@ -10,7 +10,7 @@ from heliograph.engine.choice import compute_once
 from heliograph.filters.base import AbstractFilter, FilterAngles
 from heliograph.filters.filter_data import check_data
 from heliograph.forecasting.backtest import filtered_places, measured_by
-from heliograph.forecasting.forecast import Forecasts, targets_of
+from heliograph.forecasting.forecast import Forecasts, list_targets
 from heliograph.forecasting.origins import origin_of
 from heliograph.forecasting.outlook import Outlook, outlook_of, output_claim, prediction_of
 from heliograph.forecasting.prediction import Forecast, InputsAhead
@@ -18,7 +18,7 @@ from heliograph.model.over_time import first
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.types import ArrayLike, Float, PyTree
-from heliograph.simulation.arguments import inputs_of
+from heliograph.simulation.arguments import read_plant_inputs
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import name_values
 from heliograph.simulation.results.record import Record
@@ -49,7 +49,7 @@ def predict_rows(
     outlook = outlook_of(filter)
     sensor = first(outlook.sensor)
     names = name_values(() if sensor is None else tuple(sensor.outputs), filter.received)
-    return _predict(outlook, np.asarray(rows), np.asarray(inputs), names)
+    return _make_forecast(outlook, np.asarray(rows), np.asarray(inputs), names)
 
 
 def predict_record(record: Record, inputs: Float[ArrayLike, "steps inputs"] | None = None) -> Forecasts:
@@ -72,16 +72,16 @@ def predict_record(record: Record, inputs: Float[ArrayLike, "steps inputs"] | No
     """
     network = origin_of(instance("record", record, Record, "a Record")).model
     assert isinstance(network, Network)  # nothing else makes a record with an origin
-    u, filtered = inputs_of(network, inputs, len(record.time)), filtered_places(network)
+    u, filtered = read_plant_inputs(network, inputs, len(record.time)), filtered_places(network)
     found: Forecasts = {}
-    for target in targets_of(origin_of(record)):
+    for target in list_targets(origin_of(record)):
         if (target.node, target.filter) in filtered:
-            predicted = _predict(target.outlook, measured_by(target, record), u, target.received)
+            predicted = _make_forecast(target.outlook, measured_by(target, record), u, target.received)
             found.setdefault(target.node, {})[target.filter] = replace(predicted, time=record.time)
     return found
 
 
-def _predict(outlook: Outlook, z: np.ndarray, u: np.ndarray, names: tuple[str, ...]) -> Forecast:
+def _make_forecast(outlook: Outlook, z: np.ndarray, u: np.ndarray, names: tuple[str, ...]) -> Forecast:
     """Return the forecast of each row from those before it; `names` are those of what arrives."""
     filter, sensor = outlook.filter, first(outlook.sensor)
     states, outputs, received = compute_once(_predict_each_row, _by_xla, (outlook, z, u))

@@ -23,7 +23,7 @@ from heliograph.model.estimate import Claim, weakest
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor, LinearSensor
-from heliograph.numerics.angle import Angles, nearest, wrap_angles
+from heliograph.numerics.angle import Angles, wrap_angles, wrap_near
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
@@ -194,7 +194,7 @@ def prediction_of(moments: Moments, names: tuple[str, ...], claim: Claim, angles
     """
     weights, means, covariances = map(np.asarray, moments)
     variances = np.maximum(np.diagonal(covariances, axis1=-2, axis2=-1), 0.0)
-    means = nearest(means, means[..., :1, :], angles)  # within half a turn of the first part, to be averaged
+    means = wrap_near(means, means[..., :1, :], angles)  # within half a turn of the first part, to be averaged
     # First two moments of the mixture: within its parts, and between their means.
     mean = np.einsum("...k,...km->...m", weights, means)
     apart = means - mean[..., None, :]

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.modes.multiple_model import ModalBeliefs, MultipleModelFilter
-from heliograph.forecasting.forecast import Target, check_covered, target_of
-from heliograph.forecasting.horizons import Horizons, Inputs, ahead_of, check_ahead
+from heliograph.forecasting.forecast import ForecastTarget, check_covered, find_target
+from heliograph.forecasting.horizons import Horizons, Inputs, check_ahead, find_rows_ahead
 from heliograph.forecasting.origins import origin_of
 from heliograph.model.modes_of_motion import ModalPlant, ModalSensor, transition_over
 from heliograph.model.origin import HasOrigin
@@ -97,8 +97,8 @@ def draw_paths(
             start (`hg.diffuse`) of which not all has been heard.
     """
     origin = origin_of(source)
-    target = target_of(origin, node, filter)
-    ahead = ahead_of(origin, target.outlook.filter.inputs, horizons, inputs)
+    target = find_target(origin, node, filter)
+    ahead = find_rows_ahead(origin, target.outlook.filter.inputs, horizons, inputs)
     check_covered(target.outlook.filter, origin.step, len(ahead.u))
     check_ahead(target.outlook.filter.inputs, ahead, target.outlook.filter, origin.step)
     plant, sensor = target.outlook.plant, target.outlook.sensor
@@ -135,7 +135,7 @@ class Switching(NamedTuple):
         )
 
 
-def _switching_of(target: Target) -> Switching | None:
+def _switching_of(target: ForecastTarget) -> Switching | None:
     """Return how the modes of plant and sensor move; None where these have none."""
     filter, plant, sensor = target.outlook.filter, target.outlook.plant, target.outlook.sensor
     if not memories((plant, sensor)):
@@ -146,7 +146,7 @@ def _switching_of(target: Target) -> Switching | None:
     return Switching(filter, target.state.moved)
 
 
-def _draw_starts(target: Target, draws: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def _draw_starts(target: ForecastTarget, draws: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Draw states (draws, n) and modes from the last estimate: a part of its mixture by its weight, then its Gaussian.
 
     The modes are 0 where the filter has none.
@@ -176,10 +176,10 @@ def _draw_from_starts(
 ) -> tuple[jax.Array, jax.Array]:  # fmt: skip
     """Return the states and outputs of each path (draws, rows, ...), from its state and mode."""
 
-    def of_path(start: tuple[jax.Array, jax.Array], key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def draw_path(start: tuple[jax.Array, jax.Array], key: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Draw one path: what plant and sensor do over the steps of u, with the draws of this key."""
 
-        def move(now: tuple[jax.Array, jax.Array], row: tuple[jax.Array, jax.Array]) -> tuple[Any, Any]:
+        def move_path(now: tuple[jax.Array, jax.Array], row: tuple[jax.Array, jax.Array]) -> tuple[Any, Any]:
             """Move mode and state over a step; return them, and state and output."""
             (x, mode), (u_k, k) = now, row
             of_step = jax.random.fold_in(key, k)
@@ -195,8 +195,8 @@ def _draw_from_starts(
             return (x, mode), (x, wrap_angles(eye.measure(x) + eye.noise.sample(measuring), eye.angles))
 
         rows = jnp.asarray(u), jnp.asarray(step) + jnp.arange(len(u))
-        path: tuple[jax.Array, jax.Array] = jax.lax.scan(move, start, rows)[1]
+        path: tuple[jax.Array, jax.Array] = jax.lax.scan(move_path, start, rows)[1]
         return path
 
-    paths: tuple[jax.Array, jax.Array] = jax.vmap(of_path)(jax.tree.map(jnp.asarray, starts), keys)
+    paths: tuple[jax.Array, jax.Array] = jax.vmap(draw_path)(jax.tree.map(jnp.asarray, starts), keys)
     return paths

@@ -11,7 +11,7 @@ LEVELS = (0.5, 0.8, 0.95)  # probabilities of the central intervals whose covera
 BANDWIDTH = 1.3  # times the root of the number of rows
 
 
-class Law(NamedTuple):
+class MixtureLaws(NamedTuple):
     """Mixtures of Gaussians, one for each row: weights, means and variances (rows, K)."""
 
     weights: np.ndarray
@@ -24,12 +24,12 @@ class Law(NamedTuple):
         return np.asarray(np.sum(self.weights * self.means, axis=1))
 
 
-def below(law: Law, values: np.ndarray) -> np.ndarray:
+def below(law: MixtureLaws, values: np.ndarray) -> np.ndarray:
     """Return the probability that each lies below what came (rows,): uniform on (0, 1) where the laws are right."""
     return np.asarray(np.sum(law.weights * ndtr((values[:, None] - law.means) / np.sqrt(law.variances)), axis=1))
 
 
-def log_score(law: Law, values: np.ndarray) -> np.ndarray:
+def log_score(law: MixtureLaws, values: np.ndarray) -> np.ndarray:
     """Return the log density of what came (rows,), in nats: the larger the better."""
     terms = (
         np.log(law.weights)
@@ -39,7 +39,7 @@ def log_score(law: Law, values: np.ndarray) -> np.ndarray:
     return np.asarray(top + np.log(np.sum(np.exp(terms - top[:, None]), axis=1)))
 
 
-def crps(law: Law, values: np.ndarray) -> np.ndarray:
+def crps(law: MixtureLaws, values: np.ndarray) -> np.ndarray:
     """Return the continuous ranked probability score (rows,), in the unit of what came: the smaller the better.
 
     E|X - z| - E|X - X'| / 2 of independent X and X' of the law; of one Gaussian s (t (2 Phi(t) - 1) + 2 phi(t) -
@@ -62,14 +62,14 @@ def _mean_size(mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
     return np.asarray(mean * (2 * ndtr(t) - 1) + 2 * deviation * np.exp(-(t**2) / 2) / np.sqrt(2 * np.pi))
 
 
-class Mean(NamedTuple):
+class ScoreMean(NamedTuple):
     """A mean over rows with its standard error."""
 
     value: float
     error: float
 
 
-def overlapping_mean(values: np.ndarray, horizon: int) -> Mean:
+def average_overlapping(values: np.ndarray, horizon: int) -> ScoreMean:
     """Return the mean of a series (rows,), NaN where nothing came, and its standard error.
 
     Forecasts from neighbouring rows share what happens in between, so errors of horizon h are correlated over h - 1
@@ -80,11 +80,11 @@ def overlapping_mean(values: np.ndarray, horizon: int) -> Mean:
     came = ~np.isnan(values)
     count = int(came.sum())
     if not count:
-        return Mean(float("nan"), float("nan"))
+        return ScoreMean(float("nan"), float("nan"))
     mean = float(values[came].mean())
     apart = np.where(came, values - mean, 0.0)
     lags = min(max(horizon - 1, int(BANDWIDTH * count**0.5)), len(values) - 1)
     total = apart @ apart
     for lag in range(1, lags + 1):
         total += 2 * (1 - lag / (lags + 1)) * (apart[lag:] @ apart[:-lag])
-    return Mean(mean, float(np.sqrt(np.maximum(total, 0.0)) / count))
+    return ScoreMean(mean, float(np.sqrt(np.maximum(total, 0.0)) / count))

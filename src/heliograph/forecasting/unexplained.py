@@ -9,12 +9,12 @@ from scipy.stats import chi2, f
 from heliograph.filters.base import AbstractFilter, FilterAngles
 from heliograph.filters.filter_data import check_data
 from heliograph.forecasting.backtest import measured_by
-from heliograph.forecasting.forecast import targets_of
+from heliograph.forecasting.forecast import list_targets
 from heliograph.forecasting.one_step import predict_record, predict_rows
 from heliograph.forecasting.origins import origin_of
 from heliograph.forecasting.prediction import Array, Forecast
 from heliograph.forecasting.residual_figure import Quantiles, compare_quantiles, draw_residuals
-from heliograph.numerics.angle import Angles, nearest
+from heliograph.numerics.angle import Angles, wrap_near
 from heliograph.numerics.check import check_count, fail, instance, show_value
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
@@ -142,7 +142,7 @@ def record_residuals(
     """
     predicted = predict_record(record, inputs)
     found: dict[str, dict[str, Residuals]] = {}
-    for target in targets_of(origin_of(record)):
+    for target in list_targets(origin_of(record)):
         prediction = predicted.get(target.node, {}).get(target.filter)
         angles = (target.outlook.filter.angles_used() or FilterAngles((), ())).received
         judged = None if prediction is None else _standardise(prediction, measured_by(target, record), angles, LAGS)
@@ -157,7 +157,7 @@ def _standardise(predicted: Forecast, rows: np.ndarray, angles: Angles, lags: in
     if law is None or law.claim == "none":
         return None
     known = np.where(np.isfinite(law.deviation), law.deviation, np.nan)  # of what nothing was heard yet: none
-    values = (nearest(rows, law.mean, angles) - law.mean) / known
+    values = (wrap_near(rows, law.mean, angles) - law.mean) / known
     columns = [values[:, i] for i in range(values.shape[1])]
     correlations = np.stack([_autocorrelation(e, lags) for e in columns], axis=1)
     came = np.maximum([int(np.sum(~np.isnan(e))) for e in columns], 1)

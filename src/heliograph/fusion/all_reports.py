@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.factors.columns import (
-    Columns,
+    WeightedColumns,
     columns_of,
     eliminate,
     join_columns,
@@ -104,10 +104,10 @@ def initial_belief(errors: ErrorMoments, delays: int, received: int, quantized: 
     shapes = (received, n), (received,), (received, received), (n,)
     past = PastReports(*(jnp.zeros((delays + 1, nodes, *shape)) for shape in shapes))
     spill = jnp.zeros((len(mean), len(mean))) if quantized else None
-    return ReportsBelief(from_columns(mean, Columns(root, start.weights)), past, spill)
+    return ReportsBelief(from_columns(mean, WeightedColumns(root, start.weights)), past, spill)
 
 
-class ReportLine(NamedTuple):
+class ReportMap(NamedTuple):
     """Linear map of (zeta, reports sent one step ago, two steps ago, ...); `F @ columns` applies it.
 
     It moves zeta by its step, puts the reports x - e_i of the step before in front of the past ones, and drops the
@@ -139,11 +139,11 @@ def propagate_errors(state: ReportsBelief, happened: CentreStep, links: ReportMo
         rounding_of(jnp.tile(_square_mean(errors), 1 + nodes)),
     )
     # Past reports move on by one place, without a noise.
-    line = ReportLine(step.transition)
+    line = ReportMap(step.transition)
     shift, noise = jnp.pad(step.shift, (0, length - size)), noise.through(np.eye(length, size))
     spill = None if state.spill is None else symmetric(propagate_by_mode(line, state.spill, 0.0))
     return ReportsBelief(
-        predict_affine(state.gaussian, line, shift, noise), _prepend_present(state.past, errors, links), spill
+        predict_affine(state.gaussian, line, shift, noise), _prepend_present_reports(state.past, errors, links), spill
     )
 
 
@@ -184,7 +184,7 @@ def correct_with_reports(
         keep = jnp.eye(len(x.mean)) - gain @ output
         push = _cauchy_bound(gain @ _place_on_diagonal(past.gain), jnp.ravel(past.error))
         spill = symmetric(_bound_sum(propagate_by_mode(keep, state.spill, 0.0), push))
-    law = PredictedReports(expected, join_columns(Columns(slopes, x.variances), noise).covariance)
+    law = PredictedReports(expected, join_columns(WeightedColumns(slopes, x.variances), noise).covariance)
     return ReportsBelief(after, past, spill), law
 
 
@@ -210,7 +210,7 @@ def estimate_state(state: ReportsBelief, n: int) -> Fused:
     return mean, covariance if state.spill is None else _bound_sum(covariance, state.spill[:n, :n])
 
 
-def _prepend_present(past: PastReports, errors: ErrorMoments, links: ReportModel) -> PastReports:
+def _prepend_present_reports(past: PastReports, errors: ErrorMoments, links: ReportModel) -> PastReports:
     """Put the present reports before those of earlier steps, and drop the oldest."""
     mean = errors.state_mean - errors.bias
     blocks = jnp.einsum("iaib->iab", errors.joint)
@@ -245,7 +245,7 @@ def _make_output_matrix(past: PastReports, length: int) -> Float[jax.Array, "M N
     return jnp.einsum("aimn,ainN->aimN", past.gain, sent).reshape(ages * nodes * m, length)
 
 
-def _factor_measurement_noise(gain: Float[jax.Array, "node n m"], noise: Array) -> Columns:
+def _factor_measurement_noise(gain: Float[jax.Array, "node n m"], noise: Array) -> WeightedColumns:
     """Return the factors of K_i S_ij K_j', a column for each measurement; S_ij = 0 between nodes that share nothing."""
     nodes, _, m = gain.shape
     if noise.ndim == 3:
@@ -255,11 +255,11 @@ def _factor_measurement_noise(gain: Float[jax.Array, "node n m"], noise: Array) 
     return received.through(_place_on_diagonal(gain[None]))
 
 
-def _factor_each(noise: Float[jax.Array, "age node m m"]) -> Columns:
+def _factor_each(noise: Float[jax.Array, "age node m m"]) -> WeightedColumns:
     """Return the factors of the covariance of noises that are independent of each other, of all reports together."""
     ages, nodes, m, _ = noise.shape
     blocks = jax.vmap(eliminate)(noise.reshape(ages * nodes, m, m))
-    return Columns(_place_on_diagonal(blocks.matrix.reshape(noise.shape)), jnp.ravel(blocks.weights))
+    return WeightedColumns(_place_on_diagonal(blocks.matrix.reshape(noise.shape)), jnp.ravel(blocks.weights))
 
 
 def _place_on_diagonal(blocks: Float[jax.Array, "age node a b"]) -> Float[jax.Array, "M S"]:

@@ -32,7 +32,7 @@ class Motion(NamedTuple):
     noise: Float[Array, "n n"]
 
 
-class Observation(NamedTuple):
+class JointObservation(NamedTuple):
     """Measurements of all nodes after a step, z_i = M_i x + o_i + nu_i; rows that a node lacks are zero.
 
     Shapes: gain M (node, m, n), offset o (node, m); noise E[nu_i nu_j'] (node, m, node, m), or (node, m, m) where nodes
@@ -134,7 +134,7 @@ def initial_errors(
     return ErrorMoments(jnp.concatenate([mean[None], mean - starts]), jnp.tile(covariance, (1 + len(starts),) * 2))
 
 
-def error_step(filters: LinearStep, motion: Motion, observation: Observation) -> ErrorStep:
+def make_error_step(filters: LinearStep, motion: Motion, observation: JointObservation) -> ErrorStep:
     """Return the step of the errors of linear filters; `filters` has a leading axis of nodes."""
     # K, U = I - K C and L = K (M - C) of each node, with the letters of the first lines of this file.
     gain, keep, n = jnp.asarray(filters.gain), filters.keep(), len(motion.shift)

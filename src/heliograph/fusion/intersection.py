@@ -18,7 +18,7 @@ HALVINGS = 50  # of the interval of one weight, which shrinks to 1e-15
 FLAT = 1e-15  # share of its terms below which a slope is rounding
 
 
-def intersect(
+def intersect_covariances(
     means: Float[jax.Array, "count n"],
     information: Float[jax.Array, "count n n"],
     weights: Float[jax.Array, " count"],
@@ -51,7 +51,7 @@ def trace_optimal_weights(information: Float[jax.Array, "count n n"]) -> Float[j
         trace, gradient, hessian = _trace_derivatives(scaled, w)
         # The first multipliers are positive, and nearly those of the gradient.
         slack = jnp.where(iteration == 0, gradient - jnp.min(gradient) + 0.1 * trace, slack)
-        moved = _take_newton_step(_Point(w, slack, gradient, hessian))
+        moved = _take_newton_step(_InteriorPoint(w, slack, gradient, hessian))
         # Certificate of the excess: weights below it stay where they are.
         going = jnp.max(-gradient) > (1 + rounding(GAP, trace, LOOP)) * trace
         w, slack = (jnp.where(going, new, old) for new, old in zip(moved, (w, slack), strict=True))
@@ -64,7 +64,7 @@ def trace_optimal_weights(information: Float[jax.Array, "count n n"]) -> Float[j
     return jnp.asarray(w)
 
 
-class _Point(NamedTuple):
+class _InteriorPoint(NamedTuple):
     """Weights and their multipliers; the gradient of tr P and its Hessian."""
 
     weights: Float[jax.Array, " count"]
@@ -89,7 +89,7 @@ def _sum_weighted(w: Float[jax.Array, " count"], information: Float[jax.Array, "
     return jnp.einsum("k,kab->ab", w, information)
 
 
-def _take_newton_step(point: _Point) -> tuple[jax.Array, jax.Array]:
+def _take_newton_step(point: _InteriorPoint) -> tuple[jax.Array, jax.Array]:
     """Take one Newton step for g - s + m 1 = 0, sum w = 1, w s = target: eliminate s, then the multiplier m.
 
     g is the gradient and s the multipliers of w >= 0. The target follows from where the step with target 0 would end
@@ -126,7 +126,7 @@ def _longest_step(value: Float[jax.Array, " count"], move: Float[jax.Array, " co
     return jnp.minimum(1.0, STEP_BACK * jnp.min(to_zero))
 
 
-def intersect_inversely(
+def intersect_inverse_covariances(
     a: Float[jax.Array, " n"], p: Float[jax.Array, "n n"], b: Float[jax.Array, " n"], q: Float[jax.Array, "n n"]
 ) -> tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]:
     """Return the inverse covariance intersection of (a, P) and (b, Q), with the weight w of least trace.
@@ -156,7 +156,7 @@ def intersect_inversely(
     # Covariance and mean at the best weight.
     w = (low + high) / 2
     covariance, common = fused(w)
-    # The weights of the two means sum to I: a and a multiple of the difference, as in `intersect`.
+    # The weights of the two means sum to I: a and a multiple of the difference, as in `intersect_covariances`.
     mean = a + covariance @ ((q_information - (1 - w) * common) @ (b - a))
     return restore_exact_components(mean, symmetric(covariance), jnp.stack([a, b]), both)
 

@@ -140,7 +140,7 @@ def check_positive(name: str, value: ArrayLike) -> Parameter:
     return numbers
 
 
-def check_range(name: str, amplitude: Parameter, scale: Parameter, levels: Float[Array, ""]) -> None:
+def check_amplitude(name: str, amplitude: Parameter, scale: Parameter, levels: Float[Array, ""]) -> None:
     """Raise ValueError unless the amplitude and the error of a level are numbers, the latter to full precision."""
     if is_traced(amplitude, scale):
         return
@@ -178,7 +178,7 @@ class UniformQuantizer(AbstractQuantizer):
     def __init__(self, levels: int, amplitude: Float[ArrayLike, "*n"], scale: Float[ArrayLike, "*n"] = 1.0):
         self.levels = levels_of(levels)
         self.amplitude, self.scale = check_positive("amplitude", amplitude), check_positive("scale", scale)
-        check_range("amplitude times scale", self.amplitude, self.scale, self.levels)
+        check_amplitude("amplitude times scale", self.amplitude, self.scale, self.levels)
 
     def init(self, n: int) -> tuple[()]:
         """Return the empty state: a fixed amplitude remembers nothing."""
@@ -212,7 +212,7 @@ def _quantize_uniformly(
     return Quantized(scale * value, error, saturated, jnp.ones(x.shape, dtype=int))
 
 
-class Symbols(NamedTuple):
+class UplinkSymbols(NamedTuple):
     """Symbols sent over the uplink for one value, by component.
 
     How many escapes, then the segment from 0: -1 for NaN, `ABOVE` and `BELOW` for a value beyond the range of numbers.
@@ -294,7 +294,7 @@ class EscapeQuantizer(AbstractQuantizer):
             check_positive("smallest amplitude", smallest),
         )
         for name, value in (("amplitude", self.amplitude), ("smallest amplitude", self.smallest)):
-            check_range(name, value, np.ones(()), self.levels)
+            check_amplitude(name, value, np.ones(()), self.levels)
         self.decay, self.growth = _check_decay(decay), _check_growth(growth)
         self.interval = None if interval is None else check_count("interval", interval)
 
@@ -310,7 +310,7 @@ class EscapeQuantizer(AbstractQuantizer):
         return self.decode(state, self.encode(state, value))
 
     @in_float64
-    def encode(self, state: UplinkState, value: ArrayLike, restart: bool = False) -> Symbols:
+    def encode(self, state: UplinkState, value: ArrayLike, restart: bool = False) -> UplinkSymbols:
         """Encode a value (n,), from the amplitude that both ends know, or from the first one."""
         x = jnp.asarray(fill_masked(value), dtype=float)
         restarts = jnp.broadcast_to(self._is_restart(state.number) | restart, x.shape)
@@ -324,10 +324,12 @@ class EscapeQuantizer(AbstractQuantizer):
         segment = segment_of(x, jnp.ldexp(amplitude, escapes), self.levels)
         segment = jnp.where(beyond, jnp.where(x > 0, ABOVE, BELOW), jnp.where(is_value, segment, NOTHING))
         numbers = jnp.broadcast_to(state.number, x.shape)
-        return Symbols(jnp.where(is_value, escapes, 0).astype(int), segment.astype(int), numbers, restarts & is_value)
+        return UplinkSymbols(
+            jnp.where(is_value, escapes, 0).astype(int), segment.astype(int), numbers, restarts & is_value
+        )
 
     @in_float64
-    def decode(self, state: UplinkState, symbols: Symbols) -> tuple[UplinkState, Quantized]:
+    def decode(self, state: UplinkState, symbols: UplinkSymbols) -> tuple[UplinkState, Quantized]:
         """Decode at the receiver: next state and value, from the present state and the symbols alone."""
         escapes, segment, number, restart = (jnp.asarray(symbol) for symbol in symbols)
         restart, is_sent, beyond = restart != 0, segment != NOTHING, segment <= BELOW

@@ -15,7 +15,7 @@ from heliograph.model.over_time import OverTime, first
 from heliograph.numerics.check import array, check_count, fail, instance, probabilities, rank
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.masked import fill_masked
-from heliograph.numerics.module import Module, readable, same
+from heliograph.numerics.module import Module, are_same, readable
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 from heliograph.random_affine.base import AbstractRandomAffine
@@ -139,7 +139,7 @@ class ReportLink(Module):
 
     def delivers(self, n: int) -> bool:
         """Return whether every report of n numbers that is sent arrives as it is, after a fixed delay."""
-        return bool(np.max(self.delay) == 1) and (self.channel is None or same(self.channel, perfect(n)))
+        return bool(np.max(self.delay) == 1) and (self.channel is None or are_same(self.channel, perfect(n)))
 
     def received(self, n: int) -> int:
         """Return the number of received components of a report of n."""

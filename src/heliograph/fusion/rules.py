@@ -9,8 +9,8 @@ import numpy as np
 from heliograph.engine.choice import compile_on_call
 from heliograph.fusion.intersection import (
     equal_shares,
-    intersect,
-    intersect_inversely,
+    intersect_covariances,
+    intersect_inverse_covariances,
     intersection_weights,
     invert_covariances,
     restore_exact_components,
@@ -21,7 +21,7 @@ from heliograph.fusion.mesh.gains import NeighbourEstimates, NeighbourWeights, N
 from heliograph.fusion.mesh.graph import Graph
 from heliograph.model.estimate import Claim, Estimate, weakest
 from heliograph.model.plant import AnyPlant, manifold_among
-from heliograph.numerics.angle import nearest, wrap_angles
+from heliograph.numerics.angle import wrap_angles, wrap_near
 from heliograph.numerics.check import (
     array,
     fail,
@@ -115,7 +115,7 @@ def fuse(rule: AbstractFusion, estimates: list[Estimate], angles: "Sequence[int]
     places, attitude = manifold_among(angles, means.shape[-1])
     if attitude or any(estimate.attitude for estimate in estimates):
         raise fail("fusion", "estimates without attitudes", [estimate.attitude or attitude for estimate in estimates])
-    means = nearest(means, means[..., :1, :], places)
+    means = wrap_near(means, means[..., :1, :], places)
     # The rule, over all leading axes; the claim from those of the inputs.
     covariances = np.stack([np.asarray(fill_masked(e.covariance)) for e in estimates], axis=-3)
     mean, covariance = _combine_all(rule, means, covariances)
@@ -147,7 +147,7 @@ class AbstractIntersection(AbstractFusion):
     def combine(self, means: Means, covariances: Covariances) -> Fused:
         """Find the weights and intersect."""
         information = invert_covariances(covariances)
-        mean, covariance = intersect(means, information, self.weights_of(covariances, information))
+        mean, covariance = intersect_covariances(means, information, self.weights_of(covariances, information))
         return restore_exact_components(mean, covariance, means, covariances)
 
 
@@ -262,7 +262,7 @@ class InverseCovarianceIntersection(AbstractFusion):
         """Fuse the first two, the result with the third, and so on."""
         mean, covariance = means[0], covariances[0]
         for other, other_covariance in zip(means[1:], covariances[1:], strict=True):
-            mean, covariance = intersect_inversely(mean, covariance, other, other_covariance)
+            mean, covariance = intersect_inverse_covariances(mean, covariance, other, other_covariance)
         return mean, covariance
 
 

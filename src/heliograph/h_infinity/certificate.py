@@ -107,8 +107,8 @@ def certify_level(
     reasons += [f"P_{k} is not positive definite ({definite[k]:.3g})" for k in np.flatnonzero(~(definite > ROUNDING))]
     reasons += [f"step {k}: a multiplier is negative" for k in np.flatnonzero((lam < 0).any(axis=1))]
     reasons += _list_objections(system.growth, findings["f"]) + _list_objections(system.output_growth, findings["h"])
-    assumed = _list_assumed("f", system.growth, findings["f"])
-    assumed += _list_assumed("h", system.output_growth, findings["h"])
+    assumed = _list_assumed_constants("f", system.growth, findings["f"])
+    assumed += _list_assumed_constants("h", system.output_growth, findings["h"])
     return HInfinityCertificate(
         certified=not reasons,
         level=level,
@@ -149,7 +149,7 @@ def _list_positive(constants: Float[np.ndarray, "steps"]) -> list[float]:
     return list(dict.fromkeys(float(value) for value in constants if value > 0))
 
 
-def _list_assumed(letter: str, growth: Growth, findings: Sequence[GrowthFinding]) -> list[str]:
+def _list_assumed_constants(letter: str, growth: Growth, findings: Sequence[GrowthFinding]) -> list[str]:
     """List a function's constants that no finding proves.
 
     A bound of the slopes in a box bounds differences in it, and with f(0) = 0 and 0 in the box the function itself.
@@ -217,7 +217,7 @@ def theorem_matrix(
     disturbances = slice(4 * n + 2 * y, q)
     phi[disturbances, disturbances] -= level**2 * np.eye(v + r)
     _add_growth(phi, at, y, system, k, multipliers)
-    return _drop_absent(phi, at, y, system)
+    return _drop_absent_functions(phi, at, y, system)
 
 
 def _add_growth(
@@ -245,7 +245,7 @@ def _add_growth(
         phi[argument, argument] += multiplier * constant**2 * np.eye(n)
 
 
-def _drop_absent(
+def _drop_absent_functions(
     phi: Float[np.ndarray, "q q"], at: dict[str, int], y: int, system: GrowthSystem
 ) -> Float[np.ndarray, "kept kept"]:
     """Return Phi without f and f~, or h and h~, where the function is zero throughout.

@@ -80,7 +80,7 @@ def scale_steps(
     for k, step in enumerate(steps):
         eta = _compute_eta_covariance(system, k, step, x, e)
         target = max(target, float(np.trace(step.target @ eta)))
-        x, e, measured, best = _propagate(step, eta, None if gains is None else gains[k])
+        x, e, measured, best = _propagate_covariances(step, eta, None if gains is None else gains[k])
         nominal = best if gains is not None or k == 0 else _keep_gain(nominal, best, measured, e)
         states.append(_choose_state_scales(x, e, nothing_grows))
         received.append(_powers_of_four_near(np.sqrt(np.diagonal(measured))))
@@ -150,7 +150,7 @@ def _compute_eta_covariance(
     return total
 
 
-def _propagate(
+def _propagate_covariances(
     step: StepMatrices, eta: np.ndarray, given: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the covariances of x+, of e+ with the given or the best gain and of what is received, and that gain.

@@ -10,7 +10,7 @@ import scipy
 from typing_extensions import TypeAliasType
 
 from heliograph.h_infinity.interval import Interval, UnknownError, evaluate
-from heliograph.numerics.check import array, check_seed, fail, flag, scalar, show_error
+from heliograph.numerics.check import array, check_seed, error_text, fail, flag, scalar
 from heliograph.numerics.check import function as check_callable
 from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.module import readable
@@ -177,7 +177,7 @@ def _check_function(function: Function, point: Float[np.ndarray, "n"]) -> None:
         with jax.enable_x64(True):
             axes = len(jax.eval_shape(lambda x: jnp.atleast_1d(function(x)), point).shape)
     except (TypeError, ValueError, IndexError, ArithmeticError, AttributeError) as error:
-        raise fail("function", expected, show_error(error)) from error
+        raise fail("function", expected, error_text(error)) from error
     if axes != 1:
         raise fail("function", expected, f"{axes} axes")
 

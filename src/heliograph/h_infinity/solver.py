@@ -32,7 +32,7 @@ SCS_ACCURACY = 1e-9  # its own default, 1e-4, is coarser than MARGIN
 SCS_ITERATIONS = 100_000
 
 
-def solvers() -> ModuleType:
+def import_solvers() -> ModuleType:
     """Return the module cvxpy, imported; ModuleNotFoundError that says how to get it."""
     try:
         import cvxpy
@@ -51,7 +51,7 @@ def check_choice(name: str, value: str, choices: Any) -> None:
 
 def run_solver(problem: "Problem", solver: Solver) -> str:
     """Solve a problem and return its status; a solver that gives up or is not sure of its answer is a status too."""
-    cp = solvers()
+    cp = import_solvers()
     solve: Callable[..., object] = problem.solve  # it has no types
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Solution may be inaccurate")
@@ -93,7 +93,7 @@ class StepProblem:
         sizes: tuple[float, float] = (1.0, 1.0),
         start: Float[np.ndarray, "w w"] | None = None,
     ):
-        cp = solvers()
+        cp = import_solvers()
         self.layout, self.solver = layout, solver
         self.unknowns = cp.Variable(layout.size)
         self.fixed = cp.Parameter(step.energy.shape, symmetric=True)
@@ -179,7 +179,7 @@ class HorizonProblem:
         weight: Float[np.ndarray, "w w"],
         initial: Float[np.ndarray, "w w"] | None = None,
     ):
-        cp = solvers()
+        cp = import_solvers()
         self.layouts = layouts
         # One vector: the level squared (place 0), then each step's unknowns (places 1, 2, ...).
         sizes = [1, *(layout.size for layout in layouts)]
@@ -247,5 +247,5 @@ class HorizonProblem:
             columns.append(block_columns + self.places[index].start)
         entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
         form = csr_array(entries, shape=(constant.size, self.unknowns.size))
-        matrix = solvers().reshape(form @ self.unknowns, constant.shape, order="C") + constant
+        matrix = import_solvers().reshape(form @ self.unknowns, constant.shape, order="C") + constant
         self.constraints.append(matrix >> 0)

@@ -22,12 +22,12 @@ from heliograph.numerics.check import (
     SIMPLEX,
     Domain,
     array,
+    error_text,
     fail,
     function,
     instance,
     mark_checked,
     rank,
-    show_error,
     show_value,
 )
 from heliograph.numerics.module import readable
@@ -74,7 +74,7 @@ def free(start: ArrayLike, name: str | None = None, kind: Kind | None = None) ->
     return (value if value.ndim else float(value)) if reader is None else reader.read(value, name, kind)
 
 
-class _Reader(Protocol):
+class _FreeNumberReader(Protocol):
     """What answers the calls of `free` while a network is built."""
 
     def read(self, start: np.ndarray, name: str | None, kind: Kind | None) -> object:
@@ -82,11 +82,11 @@ class _Reader(Protocol):
 
 
 # What `free` answers depends on who builds the network: nobody, one who asks what is free, or one who tries values.
-_reader: ContextVar[_Reader | None] = ContextVar("reader of free numbers", default=None)
+_reader: ContextVar[_FreeNumberReader | None] = ContextVar("reader of free numbers", default=None)
 
 
 @contextmanager
-def answering_free_by(reader: _Reader) -> Iterator[None]:
+def answering_free_by(reader: _FreeNumberReader) -> Iterator[None]:
     """Have `free` answer as this reader does, inside the block."""
     token = _reader.set(reader)
     try:
@@ -95,7 +95,7 @@ def answering_free_by(reader: _Reader) -> Iterator[None]:
         _reader.reset(token)
 
 
-class _Mark:
+class _MarkedNumber:
     """A free number while it is being collected: its start, name, and the domain that its places leave it."""
 
     def __init__(self, start: np.ndarray, name: str | None, kind: Kind | None):
@@ -120,7 +120,7 @@ class FreeNumberCollector:
     """Reader that collects the free numbers, each at its start; checks of their places report their domains."""
 
     def __init__(self) -> None:
-        self.marks: list[_Mark] = []
+        self.marks: list[_MarkedNumber] = []
 
     def read(self, start: np.ndarray, name: str | None, kind: Kind | None) -> object:
         """Return the start, marked so that checks of its place report the domain."""
@@ -131,7 +131,7 @@ class FreeNumberCollector:
                         f"free number {name!r}", f"one start in all places, {mark.start.tolist()}", start.tolist()
                     )
                 return mark_checked(start, mark.report)
-        self.marks.append(_Mark(start, name, kind))
+        self.marks.append(_MarkedNumber(start, name, kind))
         return mark_checked(start, self.marks[-1].report)
 
     def parameters(self) -> Parameters:
@@ -197,7 +197,7 @@ class Description:
                 return check_network(self.build())
             except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
                 expected = "free numbers that only jax.numpy computes with, so that derivatives pass"
-                got = f"one that is read: {show_error(error)}"
+                got = f"one that is read: {error_text(error)}"
                 raise fail("network to be learned", expected, got) from error
 
     @cached_property

@@ -10,13 +10,13 @@ from typing_extensions import TypeAliasType
 from heliograph.learning.description import Build, Description, describe
 from heliograph.learning.fit_sentences import describe_boundaries, describe_forms
 from heliograph.learning.identification import Identifiability, identify_by_recording
-from heliograph.learning.inference import FitTest, Values, compare_likelihoods, criteria, wald_test
+from heliograph.learning.inference import FitTest, Values, compare_likelihoods, information_criteria, wald_test
 from heliograph.learning.inference_data import make_inference_data
 from heliograph.learning.intervals import LEVEL, METHODS, Method
 from heliograph.learning.likelihood.data import gather_data
-from heliograph.learning.likelihood.multistart import AWAY, SPREAD, Search
+from heliograph.learning.likelihood.multistart import AWAY, SPREAD, MaximumSearch
 from heliograph.learning.likelihood.objective import Form, make_objectives
-from heliograph.learning.likelihood.surface import Surface
+from heliograph.learning.likelihood.surface import LikelihoodSurface
 from heliograph.learning.likelihood.trust_region import Maximum
 from heliograph.learning.losses.delays import Delays, DelaysByNode, learn_delays
 from heliograph.learning.sender_fit import SenderFit, fit_sender, has_deciding_sender
@@ -99,17 +99,17 @@ class Fit:
     @property
     def aic(self) -> float:
         """Akaike's information criterion, 2 k - 2 l; the smaller the better."""
-        return criteria(self.log_likelihood, self.free_numbers, self.observations)[0]
+        return information_criteria(self.log_likelihood, self.free_numbers, self.observations)[0]
 
     @property
     def aicc(self) -> float:
         """Akaike's criterion for few data: + 2 k (k + 1) / (n - k - 1)."""
-        return criteria(self.log_likelihood, self.free_numbers, self.observations)[1]
+        return information_criteria(self.log_likelihood, self.free_numbers, self.observations)[1]
 
     @property
     def bic(self) -> float:
         """Schwarz's criterion, k log n - 2 l."""
-        return criteria(self.log_likelihood, self.free_numbers, self.observations)[2]
+        return information_criteria(self.log_likelihood, self.free_numbers, self.observations)[2]
 
     def likelihood_ratio(self, smaller: "Fit") -> FitTest:
         """Test a model with some of the free numbers fixed, fitted to the same data: 2 (l - l_0) is chi-square.
@@ -277,14 +277,14 @@ def fit(
     check_count("starts", starts)
     check_progress(progress, "a line of text")
     description = describe(network)
-    recording, delays = _convert_tables(recording)
+    recording, delays = _convert_event_tables(recording)
     if has_deciding_sender(description.start):
         if truth is not False:
             raise fail("truth", "none behind a sender that decides when to send", "one")
         return replace(fit_sender(description, recording, inputs, starts, check_seed("seed", seed)), delays=delays)
     data = gather_data(description.start, recording, inputs, description.parameters.size, truth)
     # each form's likelihood over the free numbers, and the starts
-    surfaces = [Surface(objective, data) for objective in make_objectives(description, truth is not False)]
+    surfaces = [LikelihoodSurface(objective, data) for objective in make_objectives(description, truth is not False)]
     points = _choose_starts(surfaces[0], starts, check_seed("seed", seed))
     identified = identify_by_recording(surfaces[-1], points[0], seed)
     solutions, ends, stopped = _search_forms(surfaces, points, seed, identified.ridges, progress or (lambda line: None))
@@ -296,7 +296,7 @@ def fit(
 
 
 def _search_forms(
-    surfaces: list[Surface], points: np.ndarray, seed: int, ridges: int, progress: Progress
+    surfaces: list[LikelihoodSurface], points: np.ndarray, seed: int, ridges: int, progress: Progress
 ) -> tuple[list[Solution], Float[np.ndarray, " starts"], bool]:
     """Maximise each form, from the best end of the one before.
 
@@ -308,7 +308,7 @@ def _search_forms(
     """
     ends, solutions = np.zeros(0), list[Solution]()
     for surface in surfaces:
-        search = Search(surface, _report_climbs(surface, progress))
+        search = MaximumSearch(surface, _report_climbs(surface, progress))
         try:
             top, stopped = search.run(points, seed), False
         except KeyboardInterrupt:
@@ -325,7 +325,7 @@ def _search_forms(
     return solutions, ends, False
 
 
-def _convert_tables(recording: Any) -> tuple[object, dict[str, Delays]]:
+def _convert_event_tables(recording: Any) -> tuple[object, dict[str, Delays]]:
     """Return recordings with tables of events turned into rows, and the laws of their delays by node."""
     several = recording if isinstance(recording, list) else [recording]
     tables = [table for table in several if hasattr(table, "lateness")]
@@ -339,7 +339,7 @@ def _convert_tables(recording: Any) -> tuple[object, dict[str, Delays]]:
     return [table.recording() if table in tables else table for table in several], delays
 
 
-def _choose_starts(surface: Surface, count: int, seed: int) -> Float[np.ndarray, "starts p"]:
+def _choose_starts(surface: LikelihoodSurface, count: int, seed: int) -> Float[np.ndarray, "starts p"]:
     """Return the starts at which the likelihood is finite: the given one, and others around it.
 
     Raises:
@@ -362,7 +362,7 @@ def _choose_starts(surface: Surface, count: int, seed: int) -> Float[np.ndarray,
     return points
 
 
-def _check_dependence(surface: Surface, points: np.ndarray) -> None:
+def _check_dependence(surface: LikelihoodSurface, points: np.ndarray) -> None:
     """Raise ValueError at a free number of which the data have no information at any of the points."""
     largest = np.nanmax(np.diagonal(surface.evaluations(points).information, axis1=1, axis2=2), axis=0)
     names = surface.objective.description.parameters.coordinates
@@ -371,7 +371,7 @@ def _check_dependence(surface: Surface, points: np.ndarray) -> None:
         raise fail(f"free number {without[0]!r}", "one on which the measurements depend", "one on which nothing does")
 
 
-def _report_climbs(surface: Surface, say: Progress) -> Callable[[Maximum], None]:
+def _report_climbs(surface: LikelihoodSurface, say: Progress) -> Callable[[Maximum], None]:
     """Return what says after each step of a search how far it is."""
     form = surface.objective.form
 

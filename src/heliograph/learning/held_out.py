@@ -23,7 +23,7 @@ LAGS = 10  # of the test for memory, with ten rows for each at least
 
 @readable
 @dataclass(frozen=True)
-class Expected:
+class PredictedRows:
     """Predictions of some rows by one filter: log-likelihoods, white innovations and the test of their memory.
 
     Shapes: log_likelihood (rows,), white (rows, received) in claimed deviations; the test is None for too few rows.
@@ -66,8 +66,8 @@ class Change:
 
     node: str
     filter: str
-    before: Expected
-    after: Expected
+    before: PredictedRows
+    after: PredictedRows
     gain: Comparison | None
 
 
@@ -137,12 +137,12 @@ def _transform_by_laws(network: Network, node: Node, z: np.ndarray, inputs: np.n
         return None
 
 
-def _predict_rows(filter: AbstractFilter, z: np.ndarray, u: np.ndarray, cut: int) -> Expected:
+def _predict_rows(filter: AbstractFilter, z: np.ndarray, u: np.ndarray, cut: int) -> PredictedRows:
     """Return a filter's predictions of the rows from `cut` on; it runs over all rows."""
     likelihood, white = (np.asarray(values)[cut:] for values in score_innovations(filter, z, u))
     lags = min(LAGS, len(white) // 10)
     has_enough = lags > 0 and np.count_nonzero(~np.isnan(white)) > LAGS
-    return Expected(likelihood, white, MemoryTest.of(white, lags, claimed=True) if has_enough else None)
+    return PredictedRows(likelihood, white, MemoryTest.of(white, lags, claimed=True) if has_enough else None)
 
 
 def compare_laws(a: Predictive, b: Predictive) -> Comparison:

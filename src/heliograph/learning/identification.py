@@ -9,11 +9,19 @@ import numpy as np
 
 from heliograph.learning.description import Build, describe
 from heliograph.learning.intervals import quantile
-from heliograph.learning.likelihood.data import Data
+from heliograph.learning.likelihood.data import LikelihoodData
 from heliograph.learning.likelihood.objective import Objective, join_world, make_objectives
-from heliograph.learning.likelihood.surface import Surface
+from heliograph.learning.likelihood.surface import LikelihoodSurface
 from heliograph.learning.parameters import Parameters
-from heliograph.learning.unidentified import WEAK, Confounded, Rank, find_confounded, product_text, rank_of, sum_text
+from heliograph.learning.unidentified import (
+    WEAK,
+    Confounded,
+    InformationRank,
+    find_confounded,
+    format_sum,
+    product_text,
+    rank_of_information,
+)
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.sensor import AbstractSensor
@@ -92,19 +100,19 @@ def identifiable(network: Build, inputs: ArrayLike | None = None, horizon: int =
     ranks = []
     for i, x in enumerate(points):
         z = _draw_data(objective, x, u, check_seed("seed", seed) + i)
-        data = Data(z[None], u[None], (len(z),))
-        ranks.append(rank_of(Surface(objective, data).evaluations(x[None]).late[0]))
+        data = LikelihoodData(z[None], u[None], (len(z),))
+        ranks.append(rank_of_information(LikelihoodSurface(objective, data).evaluations(x[None]).late[0]))
     return _judge_identifiability(description.parameters, points, ranks)
 
 
-def identify_by_recording(surface: Surface, start: Float[np.ndarray, " p"], seed: int) -> Identifiability:
+def identify_by_recording(surface: LikelihoodSurface, start: Float[np.ndarray, " p"], seed: int) -> Identifiability:
     """Return the identifiability by a recording, at three points around a start."""
     points = _choose_points(start, seed)
     late = surface.evaluations(np.stack(points)).late
     sound = [i for i in range(len(points)) if np.isfinite(late[i]).all()]
     if not sound:
         points, late, sound = [start], surface.evaluations(start[None]).late, [0]
-    ranks = [rank_of(late[i]) for i in sound]
+    ranks = [rank_of_information(late[i]) for i in sound]
     return _judge_identifiability(surface.objective.description.parameters, [points[i] for i in sound], ranks)
 
 
@@ -115,7 +123,9 @@ def _choose_points(start: np.ndarray, seed: int) -> list[np.ndarray]:
     return [start + rng.uniform(-AROUND, AROUND, len(start)) * reach for _ in range(POINTS)]
 
 
-def _judge_identifiability(parameters: Parameters, points: list[np.ndarray], ranks: list[Rank]) -> Identifiability:
+def _judge_identifiability(
+    parameters: Parameters, points: list[np.ndarray], ranks: list[InformationRank]
+) -> Identifiability:
     """Return the identifiability by the ranks of the information at several points, with its sentences."""
     groups = tuple(find_confounded(parameters, points, ranks))
     ridges = min(rank.flat.shape[1] for rank in ranks)
@@ -131,7 +141,7 @@ def describe_unidentified(identifiability: Identifiability, solution: "Solution 
     if solution is not None and any(
         group.fix + len(group.exponents) < len(group.places) for group in identifiability.groups
     ):
-        lines += describe_routes(solution)
+        lines += describe_identified_links(solution)
     if identifiability.weakest < WEAK:
         lines.append(
             f"The data hardly tell some of {', '.join(names)} apart (least eigenvalue {identifiability.weakest:.1g}): "
@@ -153,7 +163,7 @@ def _describe_group(parameters: Parameters, group: Confounded, solution: "Soluti
     for row in group.exponents:
         combinations.append(product_text(names, row) + _format_interval(parameters, group, row, solution, log=True))
     for row in group.weights:
-        combinations.append(sum_text(names, row) + _format_interval(parameters, group, row, solution, log=False))
+        combinations.append(format_sum(names, row) + _format_interval(parameters, group, row, solution, log=False))
     if not combinations:
         return f"The data tell only {_count_in_words(unnamed, 'combination')} of {_join_names(names)}; {fix}."
     kind = "product" if np.all(group.exponents >= 0) else "combination"
@@ -215,7 +225,7 @@ def _draw_expected(objective: Objective, x: Array, u: Array, key: jax.Array) -> 
     """Return a recording drawn from the filter itself: each z from N(E z, S) given those before it."""
     filter = objective.filter(jnp.asarray(x))
 
-    def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, jax.Array]:
+    def draw_row(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, jax.Array]:
         k, u_k, noise = row
         prior = filter.predict(state, u_k, k)
         # The innovation of z = 0 is -E z, with covariance S.
@@ -225,7 +235,7 @@ def _draw_expected(objective: Objective, x: Array, u: Array, key: jax.Array) -> 
 
     start = jax.tree.map(jnp.asarray, filter.init())
     noise = jax.random.normal(key, (len(u), filter.received), dtype=float)
-    measurements: jax.Array = jax.lax.scan(body, start, (jnp.arange(len(u)), jnp.asarray(u), noise))[1]
+    measurements: jax.Array = jax.lax.scan(draw_row, start, (jnp.arange(len(u)), jnp.asarray(u), noise))[1]
     return measurements
 
 
@@ -235,7 +245,7 @@ if TYPE_CHECKING:
 KINDS = ("mean gain", "gain variance", "noise")
 
 
-def describe_routes(solution: "Solution") -> list[str]:
+def describe_identified_links(solution: "Solution") -> list[str]:
     """Return sentences on the identified mean gain, gain variance and noise of each output, the sensor's included."""
     description = solution.surface.objective.description
     _, sensor, channel = join_world(description.start)
@@ -245,7 +255,7 @@ def describe_routes(solution: "Solution") -> list[str]:
     def measure_at(x: Array) -> jax.Array:
         """Return mean gain, gain variance and noise of each output at a point, (outputs, 3)."""
         _, sensor, channel = join_world(description.at(description.parameters.values(x)))
-        return _measure_route(first(sensor), first(channel))
+        return _compute_link_moments(first(sensor), first(channel))
 
     with jax.enable_x64(True):
         x = jnp.asarray(solution.x)
@@ -271,7 +281,7 @@ def _is_route_constant(sensor: AbstractSensor, channel: Channel) -> bool:
     return not (isinstance(channel, OverTime) or sensor.inputs or channel.remembers or channel.past)
 
 
-def _measure_route(sensor: AbstractSensor, link: AbstractRandomAffine) -> jax.Array:
+def _compute_link_moments(sensor: AbstractSensor, link: AbstractRandomAffine) -> jax.Array:
     """Return mean gain, gain variance and noise of each output, (outputs, 3).
 
     The noise is that of the sensor and of the channel together: the diagonal of M R M' + spread of the constant part.

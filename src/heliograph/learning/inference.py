@@ -85,7 +85,7 @@ def wald_test(
     return chi_square_test(float(distance @ np.linalg.solve(inner, distance)), len(places))
 
 
-def criteria(log_likelihood: float, free: int, observations: int) -> tuple[float, float, float]:
+def information_criteria(log_likelihood: float, free: int, observations: int) -> tuple[float, float, float]:
     """Return AIC, AICc and BIC; AICc is infinite where numbers are as many as data.
 
     Args:

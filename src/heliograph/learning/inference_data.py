@@ -35,7 +35,7 @@ def make_inference_data(solution: Solution, draws: int, seed: int) -> Any:
     density = np.concatenate([_evaluate_rows(solution, points[k : k + BLOCK]) for k in range(0, draws, BLOCK)])
     groups = {
         "posterior": _make_posterior(solution, points),
-        "log_likelihood": _make_rows(solution, density),
+        "log_likelihood": _list_arrived_rows(solution, density),
         "sample_stats": _make_sums(density),
     }
     arviz = import_module("arviz")
@@ -57,7 +57,7 @@ def _make_posterior(solution: Solution, points: np.ndarray) -> "xr.Dataset":
     return _make_dataset({name: (("chain", "draw"), values[None, :, i]) for i, name in enumerate(names)})
 
 
-def _make_rows(solution: Solution, density: np.ndarray) -> "xr.Dataset":
+def _list_arrived_rows(solution: Solution, density: np.ndarray) -> "xr.Dataset":
     """Return the rows in which something arrived, with the recording and the row of each."""
     data = solution.surface.data
     rows = [(i, k) for i, steps in enumerate(data.lengths) for k in range(steps)]

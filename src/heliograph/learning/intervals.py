@@ -10,7 +10,7 @@ from heliograph.numerics.types import Bool, Float
 
 def long_run_deviation(values: Float[np.ndarray, " steps"]) -> float:
     """Return sqrt(Var(sum of T values) / T) of a series (steps,), correlated over time, by Bartlett's weights."""
-    total = bartlett([values[:, None] - values.mean()]).covariance
+    total = estimate_by_bartlett([values[:, None] - values.mean()]).covariance
     return float(np.sqrt(max(total[0, 0], 0.0) / len(values)))
 
 
@@ -28,7 +28,7 @@ FEW = 1 / 3  # share of the data in which the information on a number lies, belo
 Scores = list[Float[np.ndarray, "steps p"]]
 
 
-class LongRun(NamedTuple):
+class LongRunCovariance(NamedTuple):
     """Covariance of the sum of scores, and the degrees of freedom with which it is known."""
 
     covariance: Float[np.ndarray, "p p"]
@@ -40,7 +40,7 @@ def count_cosines(steps: int) -> int:
     return max(int(0.4 * steps ** (2 / 3)), 1)
 
 
-def find_told_by_few(information: list[Float[np.ndarray, "steps k"]]) -> Bool[np.ndarray, " k"]:
+def find_numbers_told_by_few(information: list[Float[np.ndarray, "steps k"]]) -> Bool[np.ndarray, " k"]:
     """Return which numbers (k,) have their information in a few of the nu stretches of the data.
 
     (sum_b V_b)^2 / sum_b V_b^2, of V_b in stretch b, is the number of stretches if all tell the same, and 1 if one
@@ -67,7 +67,7 @@ def covariance_by_model(
     return [s - s[:, few] @ shares for s in scores], hessian[:, few] @ shares
 
 
-def cosines(scores: Scores) -> LongRun:
+def estimate_by_cosines(scores: Scores) -> LongRunCovariance:
     """Return the long-run covariance (T/nu) sum_j G_j G_j' of scores, summed over series, with its degrees of freedom.
 
     G_j = sqrt(2/T) sum_t s_t cos(pi j (t + 1/2)/T), j = 1..nu, nu = floor(0.4 T^(2/3)).
@@ -83,10 +83,10 @@ def cosines(scores: Scores) -> LongRun:
         parts.append(steps / count * g.T @ g)
         weights.append((steps, count))
     total = sum(steps for steps, _ in weights)
-    return LongRun(np.sum(parts, axis=0), total**2 / sum(steps**2 / count for steps, count in weights))
+    return LongRunCovariance(np.sum(parts, axis=0), total**2 / sum(steps**2 / count for steps, count in weights))
 
 
-def bartlett(scores: Scores) -> LongRun:
+def estimate_by_bartlett(scores: Scores) -> LongRunCovariance:
     """Return the long-run covariance of scores with Bartlett's weights, summed over series.
 
     sum_|l|<=L (1 - |l|/(L + 1)) sum_t s_t s_(t-l)', L = ceil(4 (T/100)^(2/9)).
@@ -98,12 +98,12 @@ def bartlett(scores: Scores) -> LongRun:
         lags = int(np.ceil(4 * (len(s) / 100) ** (2 / 9)))
         products = [s[lag:].T @ s[: len(s) - lag] * (1 - lag / (lags + 1)) for lag in range(min(lags + 1, len(s)))]
         results.append(products[0] + sum(product + product.T for product in products[1:]))
-    return LongRun(np.sum(results, axis=0), freedom=np.inf)
+    return LongRunCovariance(np.sum(results, axis=0), freedom=np.inf)
 
 
-def white(scores: Scores) -> LongRun:
+def white(scores: Scores) -> LongRunCovariance:
     """Return the covariance of the sum of scores that are uncorrelated over time, sum_t s_t s_t'."""
-    return LongRun(np.sum([s.T @ s for s in scores], axis=0), freedom=np.inf)
+    return LongRunCovariance(np.sum([s.T @ s for s in scores], axis=0), freedom=np.inf)
 
 
 def draw_block_sums(scores: Scores, draws: int, seed: int) -> Float[np.ndarray, "draws p"]:
@@ -125,18 +125,20 @@ def draw_block_sums(scores: Scores, draws: int, seed: int) -> Float[np.ndarray, 
     return total
 
 
-def long_run(method: Method, scores: Scores, hessian: Float[np.ndarray, "p p"]) -> LongRun:
+def estimate_long_run_covariance(
+    method: Method, scores: Scores, hessian: Float[np.ndarray, "p p"]
+) -> LongRunCovariance:
     """Return the covariance of the sum of scores by a method."""
     match method:
         case "bootstrap":
-            return LongRun(np.atleast_2d(np.cov(draw_block_sums(scores, DRAWS, 0).T)), np.inf)
+            return LongRunCovariance(np.atleast_2d(np.cov(draw_block_sums(scores, DRAWS, 0).T)), np.inf)
         case "cosines":
-            return cosines(scores)
+            return estimate_by_cosines(scores)
         case "bartlett":
-            return bartlett(scores)
+            return estimate_by_bartlett(scores)
         case "white":
             return white(scores)
-    return LongRun(hessian, np.inf)
+    return LongRunCovariance(hessian, np.inf)
 
 
 def quantile(freedom: float, level: float = LEVEL) -> float:

@@ -71,7 +71,7 @@ class Parameter:
         return (self.domain,) * self.start.size
 
 
-class Entry(NamedTuple):
+class TableEntry(NamedTuple):
     """Number of the table: its name, its domain, and the index of its coordinate; None if it has none of its own."""
 
     name: str
@@ -103,13 +103,13 @@ class Parameters:
         )
 
     @property
-    def entries(self) -> tuple[Entry, ...]:
+    def entries(self) -> tuple[TableEntry, ...]:
         """Return the numbers of the table, in order."""
         results, begin = [], 0
         for parameter in self.every:
             has_own = parameter.domain.kind == "interval"  # each entry a coordinate
             for i, (name, domain) in enumerate(zip(parameter.entries, parameter.entry_domains, strict=True)):
-                results.append(Entry(name, domain, begin + i if has_own else None))
+                results.append(TableEntry(name, domain, begin + i if has_own else None))
             begin += parameter.size
         return tuple(results)
 

@@ -14,17 +14,17 @@ from heliograph.learning.intervals import (
     allowed_fall,
     covariance_by_model,
     draw_block_sums,
-    find_told_by_few,
-    long_run,
+    estimate_long_run_covariance,
+    find_numbers_told_by_few,
     quantile,
     sandwich,
 )
-from heliograph.learning.likelihood.multistart import FURTHER, Top
+from heliograph.learning.likelihood.multistart import FURTHER, HighestPoint
 from heliograph.learning.likelihood.objective import Form
-from heliograph.learning.likelihood.surface import Surface
+from heliograph.learning.likelihood.surface import LikelihoodSurface
 from heliograph.learning.likelihood.transforms import link, unlink, unlink_slope
-from heliograph.learning.parameters import Entry, Parameters
-from heliograph.learning.unidentified import Rank, rank_of
+from heliograph.learning.parameters import Parameters, TableEntry
+from heliograph.learning.unidentified import InformationRank, rank_of_information
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Bool, Float
 
@@ -95,8 +95,8 @@ class Solution:
         ridges: number of directions in which the likelihood does not change.
     """
 
-    surface: Surface
-    top: Top
+    surface: LikelihoodSurface
+    top: HighestPoint
     ridges: int
     _tables: dict[tuple[Method, float], tuple[Row, ...]] = field(default_factory=dict, repr=False, compare=False)
 
@@ -150,7 +150,7 @@ class Solution:
         return [s[:steps] for s, steps in zip(score, self.surface.data.lengths, strict=True)]
 
     @cached_property
-    def rank(self) -> Rank:
+    def rank(self) -> InformationRank:
         """Flat directions at the maximum, among active coordinates, as many as the ridges."""
         return rank_of_late_rows(
             self.surface.evaluations(self.top.x[None]).late[0][np.ix_(self.active, self.active)], self.ridges
@@ -181,7 +181,7 @@ class Solution:
         places = np.flatnonzero(self.active & self.surface.domains.free)
         few = np.zeros(len(self.active), dtype=bool)
         if len(places) and not self.rank.flat.size:
-            few[places] = find_told_by_few(self.surface.information_by_row(self.top.x, places))
+            few[places] = find_numbers_told_by_few(self.surface.information_by_row(self.top.x, places))
         return np.asarray(few[self.active])
 
     def covariance(self, method: Method = "cosines") -> tuple[Float[np.ndarray, "active active"], float]:
@@ -194,7 +194,7 @@ class Solution:
             # The Hessian of all active coordinates from that along the directions, which are as many.
             inverse = np.linalg.inv(self.basis)
             scores, by_model = covariance_by_model(scores, inverse.T @ self.hessian @ inverse, self.few)
-        estimate = long_run(method, [s @ self.basis for s in scores], self.hessian)
+        estimate = estimate_long_run_covariance(method, [s @ self.basis for s in scores], self.hessian)
         if method != "hessian":
             estimate = estimate._replace(covariance=estimate.covariance + self._reduce(by_model))
         return np.asarray(self.basis @ sandwich(self.hessian, estimate.covariance) @ self.basis.T), estimate.freedom
@@ -224,7 +224,7 @@ class Solution:
             for entry, value, slope, error in zip(self.parameters.entries, values, slopes, errors, strict=True)
         ]
 
-    def _describe_entry(self, entry: Entry, value: float, slope: np.ndarray, error: float) -> str:
+    def _describe_entry(self, entry: TableEntry, value: float, slope: np.ndarray, error: float) -> str:
         """Return an estimate and its interval by a standard error on the scale where the domain is symmetric."""
         if entry.coordinate is not None and not self.active[entry.coordinate]:
             return f"{value:>10.4g}  (at the end of its domain)"
@@ -255,7 +255,7 @@ class Solution:
 
     def _compute_interval(
         self,
-        entry: Entry,
+        entry: TableEntry,
         value: float,
         slopes: np.ndarray,
         error: float,
@@ -280,7 +280,7 @@ class Solution:
         half = quantile(freedom, level) * error
         return center - half, center + half
 
-    def _make_row(self, entry: Entry, value: float, error: float, ends: tuple[float, float]) -> Row:
+    def _make_row(self, entry: TableEntry, value: float, error: float, ends: tuple[float, float]) -> Row:
         """Return the row of an identified number, with its interval."""
         least, most = sorted(float(unlink(entry.domain, end)) for end in ends)
         slope = abs(float(unlink_slope(entry.domain, link(entry.domain, value))))
@@ -298,7 +298,7 @@ class Solution:
         ends: np.ndarray = np.quantile(slopes @ self.basis @ drawn, [(1 - level) / 2, (1 + level) / 2])
         return ends
 
-    def _make_boundary_row(self, entry: Entry, value: float, level: float) -> Row:
+    def _make_boundary_row(self, entry: TableEntry, value: float, level: float) -> Row:
         """Return the row of a number at the end of its domain: from there to where the profile has fallen so far.
 
         The square root of the fall is half of a normal variable, so that a level of 95 % is the quantile of 90 %.
@@ -315,12 +315,12 @@ class Solution:
         return self.surface.crossings(self.top.x, self.total, coordinate, first, furthest, drop, self.active)
 
 
-def rank_of_late_rows(late: Float[np.ndarray, "p p"], ridges: int) -> Rank:
+def rank_of_late_rows(late: Float[np.ndarray, "p p"], ridges: int) -> InformationRank:
     """Return the rank of the second half's information, with as many flat directions as there are ridges.
 
     What is known before the first step pins a ridge weakly; that does not grow with the data, and is not used.
     """
-    rank = rank_of(late)
+    rank = rank_of_information(late)
     if rank.flat.shape[1] == ridges:
         return rank
     diagonal = np.diag(late)

@@ -8,9 +8,14 @@ import scipy
 
 from heliograph.filters.gaussian.belief import open_loop_filter
 from heliograph.learning.intervals import long_run_deviation
-from heliograph.learning.likelihood.predictive_density import NODES, StackDensities, score_signals, signal_filter
+from heliograph.learning.likelihood.predictive_density import (
+    NODES,
+    ChannelDensities,
+    evaluate_predictive,
+    signal_filter,
+)
 from heliograph.numerics.check import check_count, check_seed, fail, instance, scalar
-from heliograph.numerics.module import readable, same
+from heliograph.numerics.module import are_same, readable
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.laws.law import AbstractLaw
@@ -100,8 +105,8 @@ def _replace_law(channel: object, pair: tuple[AbstractLaw, AbstractLaw], law: Ab
     single = instance("channel", channel, AbstractRandomAffine, "one channel, that does not vary over time")
     leaves = jax.tree.leaves(single, is_leaf=_is_law_leaf)
     laws = [leaf for leaf in leaves if _is_law_leaf(leaf) and leaf.constant is None]
-    of_pair = [leaf for leaf in laws if any(same(leaf, law) for law in pair)]
-    chosen = of_pair or [leaf for leaf in laws if same(leaf, laws[0])]
+    of_pair = [leaf for leaf in laws if any(are_same(leaf, law) for law in pair)]
+    chosen = of_pair or [leaf for leaf in laws if are_same(leaf, laws[0])]
     if not of_pair and not 0 < len(chosen) == len(laws):
         raise fail("network", "gains of one law, or some whose law is one of the two", f"{len(laws)} random gains")
 
@@ -148,7 +153,7 @@ def _draw_likelihood_ratios(
     log_densities = []
     for channel in (true, other):
         received = channel.condition_on_arrival()
-        filter, parts = signal_filter(network.plant, node.sensor, received), StackDensities.of(received, nodes)
+        filter, parts = signal_filter(network.plant, node.sensor, received), ChannelDensities.of(received, nodes)
         y, spread, near = (np.asarray(a).reshape(-1, *a.shape[2:]) for a in filter.expect_signals(z, u))
-        log_densities.append(score_signals((y, spread, near), parts).log_likelihood.reshape(z.shape[:2]))
+        log_densities.append(evaluate_predictive((y, spread, near), parts).log_likelihood.reshape(z.shape[:2]))
     return np.asarray(log_densities[0] - log_densities[1])

@@ -31,7 +31,7 @@ class Confounded(NamedTuple):
     fix: int
 
 
-class Rank(NamedTuple):
+class InformationRank(NamedTuple):
     """Rank of the information at a point: directions of which nothing is known, and those of which something is.
 
     flat, rest: orthonormal directions of either kind, in columns, in units of each coordinate. unit: that unit,
@@ -45,7 +45,7 @@ class Rank(NamedTuple):
     weakest: float
 
 
-def rank_of(information: Float[np.ndarray, "p p"]) -> Rank:
+def rank_of_information(information: Float[np.ndarray, "p p"]) -> InformationRank:
     """Return the rank of I_ij / sqrt(I_ii I_jj); a coordinate of which nothing is known is a direction by itself."""
     diagonal = np.diag(information)
     known = diagonal > 0
@@ -53,11 +53,11 @@ def rank_of(information: Float[np.ndarray, "p p"]) -> Rank:
     values, vectors = np.linalg.eigh(information * unit[:, None] * unit)
     is_flat = values < NOTHING
     weakest = float(values[~is_flat].min(initial=np.inf))
-    return Rank(flat=vectors[:, is_flat], rest=vectors[:, ~is_flat], unit=unit, weakest=weakest)
+    return InformationRank(flat=vectors[:, is_flat], rest=vectors[:, ~is_flat], unit=unit, weakest=weakest)
 
 
 def find_confounded(
-    parameters: Parameters, points: list[Float[np.ndarray, " p"]], ranks: list[Rank]
+    parameters: Parameters, points: list[Float[np.ndarray, " p"]], ranks: list[InformationRank]
 ) -> list[Confounded]:
     """Return the groups of coordinates that the data do not separate at any of the points, with what they identify.
 
@@ -162,7 +162,7 @@ def product_text(names: list[str], exponents: Float[np.ndarray, " places"]) -> s
     return " / ".join([top, *below])
 
 
-def sum_text(names: list[str], weights: Float[np.ndarray, " places"]) -> str:
+def format_sum(names: list[str], weights: Float[np.ndarray, " places"]) -> str:
     """Return the text of a sum: a + 0.64 b."""
     text = ""
     for name, weight in zip(names, weights, strict=True):

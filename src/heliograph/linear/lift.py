@@ -5,12 +5,12 @@ from collections.abc import Sequence
 import equinox as eqx
 import numpy as np
 
-from heliograph.linear.routes import Route, check_model, model_routes
+from heliograph.linear.routes import StepMaps, check_model, make_step_maps
 from heliograph.linear.system import LinearSystem, Steps, repeat_last
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import AnyPlant, LinearPlant
-from heliograph.model.premises.premise import Premise, believing
+from heliograph.model.premises.premise import Premise, on_premise
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import check_count, check_horizon, fail
 from heliograph.numerics.lapack import spectral_radius
@@ -22,10 +22,10 @@ from heliograph.random_affine.moments.monomials import (
     MEMORY_LIMIT_ENTRIES,
     count_monomials,
     degrees,
-    exponents,
+    list_exponents,
     position,
 )
-from heliograph.random_affine.moments.push import products_of_monomials, push_known, push_moments
+from heliograph.random_affine.moments.push import products_of_monomials, push_moments, push_through_known_map
 from heliograph.random_affine.noise import Gaussian, noise_vector
 
 EPS = float(np.finfo(np.float64).eps)
@@ -51,7 +51,7 @@ class SteadyMoments:
         rate = 1 - spectral_radius(matrix)
         self._tolerance = -1.0 if varies or rate <= 0 else EPS * rate
         n, places = len(matrix), position(len(matrix) + 1, order)
-        self._powers = np.array(exponents(n + 1, order))[:, :n]
+        self._powers = np.array(list_exponents(n + 1, order))[:, :n]
         self._squares = [places[(*(2 * int(i == j) for j in range(n)), order - 2)] for i in range(n)]
         self._last: Moments | None = None
 
@@ -172,7 +172,7 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
     n, m = len(start.states), int(first(channel).outputs)
     refuse_lift(degree, n, m, horizon)
     routes, moments = (
-        model_routes(plant, sensor, channel, 2 * degree, horizon),
+        make_step_maps(plant, sensor, channel, 2 * degree, horizon),
         initial_monomial_moments(start, 2 * degree),
     )
     # Memory: monomials times the indicator of each joint mode.
@@ -183,7 +183,7 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
         chains = [modes[id(r.measurement)] for r in routes]
         refuse_lift(degree, n, m, horizon, max(len(mode.initial) for mode in modes.values()))
         of_modes = lift_modes([r.plant for r in routes], chains, degree, moments, projection)
-        return believing(of_modes, Premise(plant, sensor, channel, order=2 * degree))
+        return on_premise(of_modes, Premise(plant, sensor, channel, order=2 * degree))
     # Start of the lifted state: E Y_0 and Cov Y_0.
     before = products_of_monomials(moments, n + 1, degree)
     mean, spread = mean_and_spread(before)
@@ -199,11 +199,11 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
         received_rounding=received_rounding,
         start_rounding=start_lost,
     )
-    return believing(system, Premise(plant, sensor, channel, order=2 * degree))
+    return on_premise(system, Premise(plant, sensor, channel, order=2 * degree))
 
 
 def _lift_steps(
-    routes: Sequence[Route], degree: int, moments: Float[np.ndarray, "M"], varies: tuple[bool, bool]
+    routes: Sequence[StepMaps], degree: int, moments: Float[np.ndarray, "M"], varies: tuple[bool, bool]
 ) -> tuple[Steps, np.ndarray, np.ndarray]:
     """Lift each step to monomials; return the system's steps, and the roundings of process and received noise.
 
@@ -213,7 +213,7 @@ def _lift_steps(
     """
     steps, roundings = list[Steps](), list[tuple[np.ndarray, np.ndarray]]()
     steady = SteadyMoments(np.asarray(routes[0].plant.matrix), 2 * degree, any(varies))
-    last: Route | None = None
+    last: StepMaps | None = None
     for k, route in enumerate(routes):
         if steady.is_steady(moments):
             break
@@ -259,7 +259,7 @@ class LiftedMap:
         self.given = degrees(route.inputs, 2 * degree)
         # Monomials of z that hold no output of a random gain, and the highest moments of y in Cov(Z_i, Z_j | y).
         random = ~route.known_gains
-        known = ~np.any(np.array(exponents(route.outputs + 1, degree))[:, :-1][:, random], axis=1)
+        known = ~np.any(np.array(list_exponents(route.outputs + 1, degree))[:, :-1][:, random], axis=1)
         lowered = degrees(route.outputs, degree) - known
         self.highest = lowered[:, None] + lowered
         self.highest[~known[:, None] & ~known] = 2 * degree
@@ -315,7 +315,7 @@ def affine(
 
 def linear_rows(variables: int, degree: int, expected: int | None = None) -> Float[np.ndarray, "wanted monomials"]:
     """Return rows that read the first `expected` variables off their C(variables + degree, degree) - 1 monomials."""
-    places = {powers: i for i, powers in enumerate(exponents(variables + 1, degree))}
+    places = {powers: i for i, powers in enumerate(list_exponents(variables + 1, degree))}
     rows = np.zeros((variables if expected is None else expected, len(places) - 1))
     for i, row in enumerate(rows):
         row[places[(*(int(i == j) for j in range(variables)), degree - 1)]] = 1.0
@@ -327,7 +327,7 @@ def initial_monomial_moments(plant: LinearPlant, order: int) -> Float[np.ndarray
     law = plant.deviation if plant.deviation is not None else Gaussian(plant.initial_covariance)
     shift = np.eye(len(plant.states) + 1)
     shift[:-1, -1] = plant.initial_mean - law.mean
-    return np.asarray(push_known(shift, order, noise_vector(law, order)))
+    return np.asarray(push_through_known_map(shift, order, noise_vector(law, order)))
 
 
 def refuse_lift(degree: int, states: int, outputs: int, horizon: int, modes: int = 1) -> None:

@@ -15,12 +15,12 @@ from heliograph.linear.lift import (
     refuse_lift,
 )
 from heliograph.linear.recursion import lmmse
-from heliograph.linear.routes import check_model, model_routes
+from heliograph.linear.routes import check_model, make_step_maps
 from heliograph.linear.system import Gains, LinearSystem, Schedule, Steps, state_moments
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant
-from heliograph.model.premises.premise import Premise, believing
+from heliograph.model.premises.premise import Premise, on_premise
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.module import readable
@@ -29,8 +29,13 @@ from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Series, Stack
 from heliograph.random_affine.hop import GainAndNoise, known
 from heliograph.random_affine.laws.law import Constant
-from heliograph.random_affine.moments.monomials import exponents, symmetric_power
-from heliograph.random_affine.moments.push import Tabulated, products_of_monomials, push_known, push_moments
+from heliograph.random_affine.moments.monomials import list_exponents, symmetric_power
+from heliograph.random_affine.moments.push import (
+    TabulatedNoise,
+    products_of_monomials,
+    push_moments,
+    push_through_known_map,
+)
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
 
 
@@ -59,19 +64,19 @@ def quadratic_system_with_linear_estimate(
     refuse_lift(2, total, m + n, horizon)
     # (x_0, q_0, 0) is an affine function of x_0.
     beginning = _affine_matrix(np.eye(total, n), np.concatenate([np.zeros(n), linear.start, np.zeros(m)]))
-    moments = push_known(beginning, 4, initial_monomial_moments(start, 4))
+    moments = push_through_known_map(beginning, 4, initial_monomial_moments(start, 4))
     before = products_of_monomials(moments, total + 1, 2)
     mean, spread = mean_and_spread(before)
     received, stored = _make_received_products(n, m), _MomentCache()
     steps, rounding = list[Steps](), list[np.ndarray]()
-    for k, route in enumerate(model_routes(plant, sensor, channel, 4, horizon)):
+    for k, route in enumerate(make_step_maps(plant, sensor, channel, 4, horizon)):
         # (x, q, z) -> (x+, q) -> (x+, q, z+) -> (x+, q+, z+).
         move = stored.move(route.plant, m)
         measure_squares, measure_fourth = stored.append_measurement(route.measurement, n)
         update = _make_filter_map(Gains(*(field[k] for field in linear.gains)))
         # E[(x, q, z)+^2 | (x, q, z)^2] = Sym^2(filter) E Sym^2(channel) E Sym^2(plant).
         transition = symmetric_power(update, 2) @ measure_squares @ move.moments(2).matrix
-        moments = push_known(update, 4, measure_fourth @ push_moments(move, 4, moments))
+        moments = push_through_known_map(update, 4, measure_fourth @ push_moments(move, 4, moments))
         after = products_of_monomials(moments, total + 1, 2)
         # Cov(w) = E[Y+ Y+'] - M E[Y Y'] M'.
         process = after - transition @ before @ transition.T
@@ -82,7 +87,7 @@ def quadratic_system_with_linear_estimate(
         before = after
     over_time = Steps(*map(np.array, zip(*steps, strict=True)))
     system = LinearSystem(over_time, mean, spread, projection=linear_rows(total, 2, n), rounding=rounding)
-    return believing(system, Premise(plant, sensor, channel, order=4))
+    return on_premise(system, Premise(plant, sensor, channel, order=4))
 
 
 def _affine_matrix(matrix: Float[np.ndarray, "m n"], offset: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m+1 n+1"]:
@@ -112,7 +117,7 @@ class _MomentCache:
         n = plant.inputs
         if self.joint is None or plant.noise is not self.noise:
             still = Gaussian(np.zeros((n, n)))
-            self.noise, self.joint = plant.noise, Tabulated(Independent([plant.noise, still]), 4)
+            self.noise, self.joint = plant.noise, TabulatedNoise(Independent([plant.noise, still]), 4)
         matrix = np.zeros((2 * n, 2 * n + m))
         matrix[:n, :n], matrix[n:, n : 2 * n] = plant.matrix, np.eye(n)
         return GainAndNoise(Constant(1.0), matrix, self.joint)
@@ -128,8 +133,8 @@ class _MomentCache:
 def _make_received_products(n: int, m: int) -> np.ndarray:
     """Return the rows that read (monomials of z up to degree 2, z_i q_j) off all products of (x, q, z)."""
     total = 2 * n + m
-    places = {powers: i for i, powers in enumerate(exponents(total + 1, 2))}
-    expected = [(*(0,) * (2 * n), *powers) for powers in exponents(m + 1, 2)[:-1]]
+    places = {powers: i for i, powers in enumerate(list_exponents(total + 1, 2))}
+    expected = [(*(0,) * (2 * n), *powers) for powers in list_exponents(m + 1, 2)[:-1]]
     for i in range(m):
         for j in range(n):
             expected.append(tuple(int(v in (n + j, 2 * n + i)) for v in range(total + 1)))
@@ -238,7 +243,7 @@ def skewness(square: LinearSystem, states: int, outputs: int) -> float:
 
 def _place_products(variables: int) -> dict[tuple[int, ...], int]:
     """Return the positions of y_i and of y_i y_j among the monomials of degree 2."""
-    index = {powers: i for i, powers in enumerate(exponents(variables + 1, 2))}
+    index = {powers: i for i, powers in enumerate(list_exponents(variables + 1, 2))}
     unit = np.eye(variables + 1, dtype=int)
     places: dict[tuple[int, ...], int] = {
         (i,): index[tuple(int(v) for v in unit[i] + unit[-1])] for i in range(variables)

@@ -15,14 +15,14 @@ from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Series
 from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.laws.law import Constant
-from heliograph.random_affine.moments.push import Tabulated
+from heliograph.random_affine.moments.push import TabulatedNoise
 from heliograph.random_affine.noise import AbstractNoise
-from heliograph.random_affine.superposed import sensed_by_link
+from heliograph.random_affine.superposed import move_sensor_into_links
 
 T = TypeVar("T")
 
 
-class Route(NamedTuple):
+class StepMaps(NamedTuple):
     """One step of the model as two maps: the plant's, x -> x+, and from the state to what arrives, x+ -> z."""
 
     plant: GainAndNoise
@@ -41,7 +41,7 @@ def check_model(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> None:
         raise fail("polynomial filter", "process noise with a law", "a covariance that depends on inputs")
 
 
-def model_routes(plant: AnyPlant, sensor: AnySensor, channel: Channel, order: int, horizon: int) -> list[Route]:
+def make_step_maps(plant: AnyPlant, sensor: AnySensor, channel: Channel, order: int, horizon: int) -> list[StepMaps]:
     """Return the maps of each step, with the noises' moments up to `order` computed once for what does not vary."""
     plants = _convert_models(each_step(plant, horizon), order)
     sensors, channels = each_step(sensor, horizon), each_step(channel, horizon)
@@ -49,7 +49,7 @@ def model_routes(plant: AnyPlant, sensor: AnySensor, channel: Channel, order: in
         measurements = [_make_measurement_maps(sensors[:1], channels[:1], order)[0]] * horizon
     else:
         measurements = _make_measurement_maps(sensors, channels, order)
-    return [Route(*pair) for pair in zip(plants, measurements, strict=True)]
+    return [StepMaps(*pair) for pair in zip(plants, measurements, strict=True)]
 
 
 def _make_measurement_maps(
@@ -59,7 +59,7 @@ def _make_measurement_maps(
     apart = list[AbstractRandomAffine]()
     for sensor, channel in zip(sensors, channels, strict=True):
         assert isinstance(sensor, LinearSensor)  # checked before
-        by_link = sensed_by_link(sensor.matrix, sensor.noise, channel)
+        by_link = move_sensor_into_links(sensor.matrix, sensor.noise, channel)
         apart += [] if by_link is None else [by_link]
     if len(apart) == len(sensors):
         return apart
@@ -72,13 +72,13 @@ def _convert_models(models: Sequence[PyTree], order: int) -> list[GainAndNoise]:
     `check_model` has seen that all are linear. A model like the one before shares its map and table.
     """
     maps: list[GainAndNoise] = []
-    before, noise = None, Tabulated(models[0].noise, order)
+    before, noise = None, TabulatedNoise(models[0].noise, order)
     for model in models:
         if model is before:
             maps.append(maps[-1])
             continue
         if not eqx.tree_equal(model.noise, noise.source):
-            noise = Tabulated(model.noise, order)
+            noise = TabulatedNoise(model.noise, order)
         maps.append(GainAndNoise(Constant(1.0), model.matrix, noise))
         before = model
     return maps

@@ -10,7 +10,7 @@ from typing_extensions import TypeAliasType
 
 from heliograph.linear.jump_system import propagate_by_mode
 from heliograph.model.estimate import STRENGTH, Claim
-from heliograph.model.premises.premise import NOTHING, Kept
+from heliograph.model.premises.premise import NOTHING, StaticPremise
 from heliograph.numerics import check
 from heliograph.numerics.check import array, fail, file_path, instance, show_value
 from heliograph.numerics.module import Module, readable
@@ -63,7 +63,9 @@ class LinearSystem(Module):
     rounding: Float[np.ndarray, "time N"]
     received_rounding: Float[np.ndarray, "time m"]
     start_rounding: Float[np.ndarray, "N"]
-    kept: Kept = eqx.field(static=True, default=NOTHING, init=False, repr=False, compare=False)  # what it was made of
+    kept: StaticPremise = eqx.field(
+        static=True, default=NOTHING, init=False, repr=False, compare=False
+    )  # what it was made of
 
     def __init__(
         self,
@@ -207,7 +209,9 @@ class Schedule(Module):
     gains: Gains
     start: Float[np.ndarray, "N"]
     claim: Claim = eqx.field(static=True)
-    kept: Kept = eqx.field(static=True, default=NOTHING, init=False, repr=False, compare=False)  # what it was made for
+    kept: StaticPremise = eqx.field(
+        static=True, default=NOTHING, init=False, repr=False, compare=False
+    )  # what it was made for
 
     def __init__(self, gains: Gains, start: "Float[ArrayLike, ' N']", claim: Claim):
         instance("gains of a schedule", gains, Gains, "Gains")

@@ -36,7 +36,7 @@ class Event(NamedTuple):
     arrival: float | None = None
 
 
-class Known(NamedTuple):
+class CheckedEvent(NamedTuple):
     """An event whose parts are checked numbers, with the index of its node in the network, -1 for inputs."""
 
     node_index: int

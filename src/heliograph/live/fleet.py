@@ -7,15 +7,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.live.event import INPUTS, OF_STEPS, Known, Verdict
-from heliograph.live.held_watch import HeldWatch
+from heliograph.live.event import INPUTS, OF_STEPS, CheckedEvent, Verdict
+from heliograph.live.held_watch import RepeatWatch
 from heliograph.live.leap import ARRIVAL, Leap, find_leap
 from heliograph.live.link_counts import ScreenedEvent
 from heliograph.live.network_program import NetworkProgram
-from heliograph.live.plant import PlantState, Withdrawn
-from heliograph.live.pool import Pool, cut_into_legs, group_by_turn
-from heliograph.live.rows import BEFORE, HeldRow, Rows
-from heliograph.live.sender_status import Sender, SenderStatus
+from heliograph.live.plant import PlantState, WithdrawnEvent
+from heliograph.live.pool import SlotTable, cut_into_legs, group_by_turn
+from heliograph.live.rows import BEFORE, HeldRow, SortedRows
+from heliograph.live.sender_status import SenderStatus, SilenceRule
 from heliograph.model.checks.refusals import count_by_reason
 from heliograph.model.limits import Limits
 from heliograph.model.over_time import steps_covered
@@ -46,7 +46,7 @@ class Options(NamedTuple):
     step: float | None = None
 
 
-class Finalised(NamedTuple):
+class FinalisedPlant(NamedTuple):
     """What `Fleet.finalise` made final of one plant.
 
     Attributes:
@@ -61,7 +61,7 @@ class Finalised(NamedTuple):
     final: list[HeldRow]
     newest: HeldRow
     left: list[int]
-    withdrawn: list[Withdrawn]
+    withdrawn: list[WithdrawnEvent]
 
 
 class Fleet:
@@ -81,7 +81,7 @@ class Fleet:
         instance("options", options, Options, "Options")
         network = self.network = program.network
         self.options, self.program = _check_options(options), program
-        self.pool = Pool(program, alone)
+        self.pool = SlotTable(program, alone)
         # Index and size of each node's measurement, and of the inputs; their columns in a row, in this order.
         self.sizes = {name: (i, network.nodes[name].received) for i, name in enumerate(network.names)}
         self.sizes[INPUTS] = -1, self.program.given
@@ -94,11 +94,11 @@ class Fleet:
         self._names = [*network.names, INPUTS]
         self._joint = self.program.dt is None or network.common is not None
         self._limits = {name: node.limits for name, node in network.nodes.items() if node.limits is not None}
-        self.held_watches = {name: watch for name, node in network.nodes.items() if (watch := HeldWatch.of_node(node))}
+        self.held_watches = {n: watch for n, node in network.nodes.items() if (watch := RepeatWatch.of_node(node))}
         self.periods = dict[str, int]()  # after how many messages a node's count begins at 0 again, where it does
         # Nodes of which silence says something, and of these the ones whose sender decides when to send.
         nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
-        senders = {name: Sender.of_node(node) for name, node in nodes.items()}
+        senders = {name: SilenceRule.of_node(node) for name, node in nodes.items()}
         self.watched = {name: sender for name, sender in senders.items() if sender is not None}
         self.deciding = {name: sender.trigger for name, sender in self.watched.items() if sender.trigger is not None}
         # By index of a node whose messages are numbered, so that losses are known: how many values come first.
@@ -164,13 +164,13 @@ class Fleet:
         columns = self._places[node]
         return columns.stop - columns.start
 
-    def make_rows(self, base: HeldRow) -> Rows:
+    def make_rows(self, base: HeldRow) -> SortedRows:
         """Return the rows of a plant, of which so far there is only the one before all events, `base`."""
-        return Rows(base, self._joint, self._places, self.options.capacity)
+        return SortedRows(base, self._joint, self._places, self.options.capacity)
 
     def convert_message(
         self, node: str, sequence: int, time: float, values: list[float | None], arrival: float
-    ) -> Known:
+    ) -> CheckedEvent:
         """Return a message as an event; raise ValueError unless its node, number of values and time are possible."""
         index, size = self.sizes.get(node, (0, -1))
         if size < 0:  # no such node
@@ -179,7 +179,7 @@ class Fleet:
         if len(numbers) != size:
             raise fail(f"message of {node!r}, values", f"{size} numbers", len(values))
         self.check_step("message, time", time)
-        return Known(index, sequence, time, numbers, arrival)
+        return CheckedEvent(index, sequence, time, numbers, arrival)
 
     def with_losses(self, node: str, values: list[float]) -> list[float]:
         """Return a message's values, followed by NaN for each number of lost messages where these do not come with it.
@@ -219,7 +219,7 @@ class Fleet:
             end = "" if self.end_step == np.inf else f" to {self.end_step:g}"
             raise fail(name, f"a step, a whole number from 0{end}", f"{time} ({OF_STEPS})")
 
-    def screen(self, node: str, event: Known, plant: PlantState | None) -> ScreenedEvent:
+    def screen(self, node: str, event: CheckedEvent, plant: PlantState | None) -> ScreenedEvent:
         """Remove an event's values beyond the limits of its node, and those that repeat for too long.
 
         Readings repeat in the order in which they arrive; `plant` is None where it has not begun.
@@ -247,8 +247,9 @@ class Fleet:
         return ScreenedEvent(left, counts, said, screened.repeats)
 
     def take(
-        self, plant: PlantState, event: Known, given: bool = False, wall: float | None = None, clock: str | None = None
-    ) -> Verdict:
+        self, plant: PlantState, event: CheckedEvent, given: bool = False, wall: float | None = None,
+        clock: str | None = None,
+    ) -> Verdict:  # fmt: skip
         """Judge an event and hold it if it is used.
 
         An event more than `leap` after all before it is used, but nothing becomes final by it until another clock says
@@ -297,7 +298,7 @@ class Fleet:
         self.pool.give(plant.undo())
         plant.clock = clock
 
-    def finalise(self, touched: Iterable[PlantState], all_: bool = False) -> list[Finalised]:
+    def finalise(self, touched: Iterable[PlantState], all_: bool = False) -> list[FinalisedPlant]:
         """Step what is due, and let rows older than the window, or all, become final; return them by plant."""
         plants, results = list(touched), []
         self.step(plants)
@@ -305,7 +306,7 @@ class Fleet:
             withdrawn, their_slots = plant.take_withdrawn()
             watermark = np.inf if all_ else plant.confirmed - self.options.window
             final, left = plant.finalise(watermark, self.options.leap)
-            results.append(Finalised(plant, final, plant.rows.held[-1], left + their_slots, withdrawn))
+            results.append(FinalisedPlant(plant, final, plant.rows.held[-1], left + their_slots, withdrawn))
         return results
 
     def step(self, plants: Iterable[PlantState]) -> None:
@@ -382,7 +383,7 @@ class Fleet:
         link.count(verdict, event.sequence, event.time, self.periods.get(node, 0))
         link.count_screened(screened, verdict)
 
-    def free_slots(self, finalised: Iterable[Finalised]) -> None:
+    def free_slots(self, finalised: Iterable[FinalisedPlant]) -> None:
         """Free the slots that are not needed any more, once the outputs of the final rows have been read."""
         for of_plant in finalised:
             self.pool.give(of_plant.left)

@@ -42,7 +42,7 @@ class FleetRemarks:
         return self._steps.read_remarks(self._pool.table[row.slot, self._pool.state])
 
 
-class FleetHeld:
+class FleetRepeatWatch:
     """Watch for outputs that repeat for longer than their noise allows; each is said once, of one plant."""
 
     def __init__(self, fleet: Fleet):

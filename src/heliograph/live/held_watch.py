@@ -17,7 +17,7 @@ FIRST = Repeats()  # before the first reading
 SURE = 1e-12  # of a probability below one: a run is as long as one likes
 
 
-class HeldWatch:
+class RepeatWatch:
     """Watch for runs of equal readings that noise makes less than once in 10^9 readings, one sensor's, one by one.
 
     A reading of resolution q equals the one before with probability at most p(q), whatever the sensor measures
@@ -36,7 +36,7 @@ class HeldWatch:
         self._bounds = dict[tuple[int, float], float]()  # by output and resolution
 
     @staticmethod
-    def of(sensor: AnySensor | None, channel: Channel | None, received: int) -> "HeldWatch | None":
+    def of(sensor: AnySensor | None, channel: Channel | None, received: int) -> "RepeatWatch | None":
         """Return the watch for what arrives of a sensor; None if its law is not known, or readings arrive changed."""
         steps = [] if sensor is None else unstack(sensor)
         if channel is None or not steps or not all(isinstance(step, AbstractSensor) for step in steps):
@@ -52,15 +52,15 @@ class HeldWatch:
                 bound_equal_readings(noise, np.full(received, inf))
         except ValueError:
             return None
-        return HeldWatch(noises)
+        return RepeatWatch(noises)
 
     @staticmethod
-    def of_node(node: object) -> "HeldWatch | None":
+    def of_node(node: object) -> "RepeatWatch | None":
         """Return the watch for what a node receives; None if it refuses what is stuck, or its sender decides."""
         if not isinstance(node, Node) or node.trigger is not None or node.encoder is not None:
             return None
         refuses = node.limits is not None and node.limits.stuck is not None
-        return None if refuses else HeldWatch.of(node.sensor, node.channel, node.received)
+        return None if refuses else RepeatWatch.of(node.sensor, node.channel, node.received)
 
     def follow(self, values: Sequence[float], before: Repeats | None = None) -> Repeats:
         """Return the runs that end with these readings, NaN where none arrived, after those `before`, if any.

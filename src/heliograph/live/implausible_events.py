@@ -8,7 +8,7 @@ import numpy as np
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import Judgement
-from heliograph.live.event import Known
+from heliograph.live.event import CheckedEvent
 from heliograph.live.fleet import Fleet
 from heliograph.live.plant import PlantState
 from heliograph.live.rows import BEFORE, HeldRow
@@ -24,10 +24,10 @@ FLAGS = [Judgement._fields.index(name) for name in ("reason", "input")]
 
 
 # Number of a message, its plant, its event, which was used, and the row that this stands in.
-Candidate: TypeAlias = tuple[int, PlantState, Known, HeldRow]
+Candidate: TypeAlias = tuple[int, PlantState, CheckedEvent, HeldRow]
 
 
-class Judges:
+class JudgementReader:
     """Reader of the filters' judgements of the rows that were just stepped.
 
     A node's events are judged by its own filters; where it has none, by the central ones, which take all nodes'.
@@ -178,7 +178,7 @@ class Judges:
         return Judgement.why_values(judged) is None
 
 
-def _largest_number(event: Known) -> float:
+def _largest_number(event: CheckedEvent) -> float:
     """Return the largest absolute number of an event, -1 if it has none."""
     return float(np.max(np.abs(event.values), initial=-1.0, where=~np.isnan(event.values)))
 

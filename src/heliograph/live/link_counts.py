@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from heliograph.live.event import Known, Verdict
+from heliograph.live.event import CheckedEvent, Verdict
 from heliograph.live.leap import Moments
 from heliograph.model.checks.refusals import Reason
 from heliograph.model.stuck import Repeats
@@ -23,7 +23,7 @@ class ScreenedEvent(NamedTuple):
         repeats: runs of equal readings of the node that end with this event.
     """
 
-    event: Known
+    event: CheckedEvent
     refused: Mapping[Reason, int] = NONE
     why: str = ""
     repeats: Repeats = NO_REPEATS

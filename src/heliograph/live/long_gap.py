@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.factors.columns import unit_lower
-from heliograph.live.stored.old_layout import LOWER, VARIANCES, factorise, split_by_path
+from heliograph.live.stored.old_layout import LOWER, VARIANCES, factorise_covariance, split_by_path
 from heliograph.numerics.types import Float, PyTree
 
 Step = Callable[[Float[np.ndarray, "row state"], int], Float[np.ndarray, "row state"]]
@@ -22,22 +22,22 @@ LEAST = 2.0**-40  # of an entry of the map, in units of the movements
 STEADY = 0.01  # relative: a number that moves on by as much as before
 
 
-class Factors(NamedTuple):
+class FactorPlaces(NamedTuple):
     """Places of the factors of one covariance, or several, in a row: lower (..., n (n - 1) / 2), variances (..., n)."""
 
     lower: np.ndarray
     variances: np.ndarray
 
 
-def factors_in(places: PyTree) -> list[Factors]:
+def factors_in(places: PyTree) -> list[FactorPlaces]:
     """Return the places of all factors in a row, from the tree of a state whose leaves are their own places."""
     parts = {path: part.astype(int) for path, part in split_by_path(places).items()}
     stems = [path.removesuffix(VARIANCES) for path in parts if path.endswith(VARIANCES)]
-    return [Factors(parts[stem + LOWER], parts[stem + VARIANCES]) for stem in stems if stem + LOWER in parts]
+    return [FactorPlaces(parts[stem + LOWER], parts[stem + VARIANCES]) for stem in stems if stem + LOWER in parts]
 
 
 def convert_to_covariances(
-    rows: Float[np.ndarray, "row state"], places: Sequence[Factors]
+    rows: Float[np.ndarray, "row state"], places: Sequence[FactorPlaces]
 ) -> Float[np.ndarray, "row state"]:
     """Return rows with the entries of L D L' in the places of those of L below its diagonal, and of D."""
     rows = rows.copy()
@@ -50,7 +50,7 @@ def convert_to_covariances(
 
 
 def convert_to_factors(
-    rows: Float[np.ndarray, "row state"], places: Sequence[Factors]
+    rows: Float[np.ndarray, "row state"], places: Sequence[FactorPlaces]
 ) -> Float[np.ndarray, "row state"]:
     """Return rows with the factors L and D in the places of covariances: undo `convert_to_covariances`."""
     rows = rows.copy()
@@ -60,12 +60,12 @@ def convert_to_factors(
         below = np.tril_indices(n, -1)
         covariance[..., *below] = covariance[..., *below[::-1]] = rows[:, lower]
         covariance[..., np.arange(n), np.arange(n)] = rows[:, variances]
-        rows[:, lower], rows[:, variances] = factorise(covariance)
+        rows[:, lower], rows[:, variances] = factorise_covariance(covariance)
     return rows
 
 
 def pass_long_gap(step: Step, start: Float[np.ndarray, " state"], state: Float[np.ndarray, " state"], at: int,
-                 count: int, places: Sequence[Factors] = ()) -> Float[np.ndarray, " state"]:  # fmt: skip
+                 count: int, places: Sequence[FactorPlaces] = ()) -> Float[np.ndarray, " state"]:  # fmt: skip
     """Return the state after `count` silent steps from one after step number `at`, in bounded work.
 
     A silent step s' = g(s) is affine in means and covariances where the plant is linear: P' = F P F' + Q. Numbers that
@@ -89,7 +89,7 @@ def pass_long_gap(step: Step, start: Float[np.ndarray, " state"], state: Float[n
 
 
 def _pass_silent_steps(
-    step: Step, state: Float[np.ndarray, " state"], at: int, count: int, places: Sequence[Factors]
+    step: Step, state: Float[np.ndarray, " state"], at: int, count: int, places: Sequence[FactorPlaces]
 ) -> Float[np.ndarray, " state"]:
     """Take `count` steps of silence: a few probes, PROBED real steps each, and the rest at once by what these show.
 
@@ -118,16 +118,16 @@ def _pass_silent_steps(
     done = PROBED * (len(passed) - 1)
     if count - done < PROBED:
         return _step_through(step, passed[-1], at + done, count - done)
-    return _restore_factors(_extrapolate(as_covariances(passed), count - done), places)
+    return _restore_factors(_extrapolate_state(as_covariances(passed), count - done), places)
 
 
-def _restore_factors(state: Float[np.ndarray, " state"], places: Sequence[Factors]) -> Float[np.ndarray, " state"]:
+def _restore_factors(state: Float[np.ndarray, " state"], places: Sequence[FactorPlaces]) -> Float[np.ndarray, " state"]:
     """Return one state with factors in the places of covariances."""
     alone: Float[np.ndarray, " state"] = convert_to_factors(state[None], places)[0]
     return alone
 
 
-def _extrapolate(passed: Sequence[Float[np.ndarray, " state"]], count: int) -> Float[np.ndarray, " state"]:
+def _extrapolate_state(passed: Sequence[Float[np.ndarray, " state"]], count: int) -> Float[np.ndarray, " state"]:
     """Return the state `count` steps after the last of those passed, which are a probe of steps apart.
 
     Numbers that moved over the last quarter of the probes as they did over the quarter before go on at this rate; all

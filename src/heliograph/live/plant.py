@@ -6,13 +6,13 @@ from datetime import datetime
 from math import inf
 from typing import NamedTuple, TypeAlias
 
-from heliograph.live.event import INPUTS, Known
+from heliograph.live.event import INPUTS, CheckedEvent
 from heliograph.live.leap import ARRIVAL, Leap, find_leap
 from heliograph.live.link_counts import LinkCounts
-from heliograph.live.rows import HeldRow, Key, Rows
+from heliograph.live.rows import HeldRow, Key, SortedRows
 
 
-class Withdrawn(NamedTuple):
+class WithdrawnEvent(NamedTuple):
     """An event that was used until a later one showed that its clock is wrong."""
 
     node_index: int
@@ -72,7 +72,7 @@ class PlantState:
     """
 
     name: str
-    rows: Rows
+    rows: SortedRows
     now: float
     origin: datetime | None = None
     version: int = 0
@@ -185,14 +185,14 @@ class PlantState:
         """Return whether rows from before a leap are held, and `time` comes after the first of them."""
         return self.rows.first_from(leap.time - most) > 0 and time > self.rows.keys[0][0]
 
-    def take_withdrawn(self) -> tuple[list[Withdrawn], list[int]]:
+    def take_withdrawn(self) -> tuple[list[WithdrawnEvent], list[int]]:
         """Return the events of leaps that were taken back since the last call, and the slots of their rows."""
         leaps, self.aside = self.aside, []
-        events = [Withdrawn(*name) for leap in leaps for row in leap.rows for name in row.events]
+        events = [WithdrawnEvent(*name) for leap in leaps for row in leap.rows for name in row.events]
         return events, [row.slot for leap in leaps for row in leap.gone]
 
     def take(
-        self, event: Known, key: Key, take_slot: Callable[[], int], width: int, numbered: tuple[str, int] | None
+        self, event: CheckedEvent, key: Key, take_slot: Callable[[], int], width: int, numbered: tuple[str, int] | None
     ) -> None:
         """Add an event to the row with its key, or to a new row; record the change for `undo`.
 

@@ -16,7 +16,7 @@ FEWEST = 1024  # rows of the table at first; it doubles when it is full
 SHORTEST = 64  # rows of a history
 
 
-class Pool:
+class SlotTable:
     """Table with one row per slot; slots are taken and given back.
 
     The columns are (state, outputs, inputs held, step number, received, inputs, time); `state`, `outputs`, `held` and

@@ -15,7 +15,7 @@ from heliograph.simulation.results.record import Record
 
 
 @dataclass(frozen=True)
-class Played:
+class ReplayResult:
     """Results of a replay.
 
     Attributes:
@@ -32,7 +32,7 @@ class Played:
     forced: int
 
 
-def play(
+def replay_events(
     network: Network,
     events: Iterable[Event],
     window: float,
@@ -40,7 +40,7 @@ def play(
     start: float = 0.0,
     ahead: float = 0.0,
     capacity: int = 1000,
-) -> Played:
+) -> ReplayResult:
     """Push events in order of arrival, and advance the time until all are final.
 
     A sequence is put in that order; an iterator, which need not fit into memory, has to be in it already.
@@ -90,7 +90,7 @@ def play(
     timeline.advance(timeline.now + window + 1.0)
     finals.append(timeline.final())
     late = None if lag is None else _make_record(network, lagged)
-    return Played(_join_records(finals), late, timeline.counts, timeline.forced)
+    return ReplayResult(_join_records(finals), late, timeline.counts, timeline.forced)
 
 
 def _arrival_of(event: Event) -> float:

@@ -6,7 +6,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from heliograph.live.event import Known, Verdict
+from heliograph.live.event import CheckedEvent, Verdict
 
 Key: TypeAlias = "tuple[float, int, int]"  # of a row: time, place of the node (-1: inputs), sequence
 BEFORE = -2  # the place of what stands before everything at its time
@@ -28,7 +28,7 @@ class HeldRow:
         return bool(self.events) and max(self.events)[0] >= 0
 
 
-class Rows:
+class SortedRows:
     """Sorted rows; the first is the base, of which only the state after it is needed.
 
     `joint`: all events of one time form one row. `places` are the slices of each node's numbers in a row, the inputs'
@@ -43,7 +43,7 @@ class Rows:
         """Replace all rows by these, in their order."""
         self.held, self.keys = rows, [row.key for row in rows]
 
-    def key(self, event: Known) -> Key:
+    def key(self, event: CheckedEvent) -> Key:
         """Return the key of the row that an event belongs to."""
         return (event.time, 0, 0) if self.joint else (event.time, event.node_index, event.sequence)
 
@@ -59,7 +59,7 @@ class Rows:
         """Return the index of the first row from a time on."""
         return bisect_left(self.keys, (time,))
 
-    def verdict(self, event: Known, key: Key, watermark: float, ahead: float) -> Verdict:
+    def verdict(self, event: CheckedEvent, key: Key, watermark: float, ahead: float) -> Verdict:
         """Return the verdict on an event whose row has this key, where rows before the watermark are final.
 
         `ahead`: how much later than its arrival an event may be dated.
@@ -97,7 +97,7 @@ class Rows:
         """Remove a row."""
         del self.keys[index], self.held[index]
 
-    def fill(self, row: HeldRow, event: Known) -> None:
+    def fill(self, row: HeldRow, event: CheckedEvent) -> None:
         """Write an event's values into its row; NaN is left out."""
         at, values = self.places[event.node_index], event.values
         if row.events:  # else nothing is there yet
@@ -106,7 +106,7 @@ class Rows:
         row.events[event.name] = event.values
 
     def count_lost(
-        self, index: int, event: Known, column: int, newest: int
+        self, index: int, event: CheckedEvent, column: int, newest: int
     ) -> tuple[float, list[tuple[HeldRow, float]]]:
         """Return how many of a sender's messages were lost just before an event, by the running count; NaN if unknown.
 

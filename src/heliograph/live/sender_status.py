@@ -81,7 +81,7 @@ class LossChain(NamedTuple):
         return float((self.initial * self.loss @ np.linalg.matrix_power(moved * self.loss, count - 1)).sum())
 
 
-class Sender(NamedTuple):
+class SilenceRule(NamedTuple):
     """What tells how long a node may be silent.
 
     Args:
@@ -95,11 +95,11 @@ class Sender(NamedTuple):
     timeout: float | None
 
     @staticmethod
-    def of_node(node: Node) -> "Sender | None":
+    def of_node(node: Node) -> "SilenceRule | None":
         """Return the sender of a node; None of one that may be silent for any time."""
         if node.trigger is None:
-            return None if node.timeout is None else Sender(None, None, node.timeout)
-        return Sender(node.trigger, LossChain.of_channel(node.channel), node.timeout)
+            return None if node.timeout is None else SilenceRule(None, None, node.timeout)
+        return SilenceRule(node.trigger, LossChain.of_channel(node.channel), node.timeout)
 
     def status(self, last: float | None, begun: float, final: float, now: float) -> SenderStatus:
         """Return the status where the newest value is of `last`, the newest final moment `final` and the present `now`.

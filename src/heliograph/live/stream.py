@@ -12,16 +12,16 @@ from scipy.stats import chi2
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import Judgement
 from heliograph.live.filter_stepper import NativeFilterStepper, XlaFilterStepper, compile_native_step, compile_xla_step
-from heliograph.live.held_watch import HeldWatch
-from heliograph.live.sender_status import LossChain, Sender, SenderStatus
-from heliograph.live.stored.old_layout import can_read, describe_old_layout, relocate_parts, split_by_path
-from heliograph.live.stored.snapshot import Identity, check_same, pack, unpack, versions
+from heliograph.live.held_watch import RepeatWatch
+from heliograph.live.sender_status import LossChain, SenderStatus, SilenceRule
+from heliograph.live.stored.old_layout import can_read_layout, describe_old_layout, relocate_parts, split_by_path
+from heliograph.live.stored.snapshot import Identity, check_same_network, pack, unpack_snapshot, versions
 from heliograph.model.channel import Channel
 from heliograph.model.checks.faults import find_function_fault
 from heliograph.model.checks.inputs import check_inputs
 from heliograph.model.checks.refusals import SCREENED, Reason, count_by_reason
 from heliograph.model.estimate import JudgedEstimate, lower_unsound_claim, weakest
-from heliograph.model.limits import LimitsLike, Screened, limits_of
+from heliograph.model.limits import LimitsLike, ScreenedReadings, make_limits
 from heliograph.model.origin import Origin
 from heliograph.model.over_time import first
 from heliograph.model.stuck import Repeats, StuckLike
@@ -29,7 +29,7 @@ from heliograph.model.trigger import AbstractTrigger
 from heliograph.numerics.caching import share_by_object
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import readable
-from heliograph.numerics.trees.program_text import short_name, text_of
+from heliograph.numerics.trees.program_text import hash_numbers, text_of
 from heliograph.numerics.trees.static import cast
 from heliograph.numerics.types import ArrayLike, PyTree
 from heliograph.simulation.description.wide_angles import WideAngles
@@ -75,11 +75,11 @@ class Stream:
             raise fail("stream", "a filter", type(filter).__name__)
         self.filter, world = filter, filter.premise
         believed = (None, None) if world is None else (world.sensor, world.channel)
-        self.limits = limits_of(filter.received, limits, invalid, stuck, *believed)
+        self.limits = make_limits(filter.received, limits, invalid, stuck, *believed)
         self.refused = {reason: np.zeros(filter.received, dtype=np.int64) for reason in COUNTED}
         self._repeats = Repeats()
         refuses = self.limits is not None and self.limits.stuck is not None
-        self._watch = None if refuses or _sender_of(filter) else HeldWatch.of(*believed, filter.received)
+        self._watch = None if refuses or _sender_of(filter) else RepeatWatch.of(*believed, filter.received)
         # Steps done; step of a sender's newest value; unexpected measurements in a row; remarks made.
         self.steps, self._last, self._beyond, self._remarked = 0, -1, 0, 0
         self._inputs = np.full(len(filter.inputs), np.nan)
@@ -162,7 +162,7 @@ class Stream:
         found = self._repeats.found or [0] * self.filter.received
         return np.array(found, dtype=np.int64)
 
-    def _count_readings(self, screened: Screened | None, z: np.ndarray) -> None:
+    def _count_readings(self, screened: ScreenedReadings | None, z: np.ndarray) -> None:
         """Count what was screened; where none is stuck by rule, warn of the first run of each component that is."""
         if screened is not None:
             for reason, more in count_by_reason(screened.refused).items():
@@ -235,7 +235,7 @@ class Stream:
         if (sender := _sender_of(self.filter)) is None:
             raise fail("filter of a stream", "one of event_filter, whose sender decides", type(self.filter).__name__)
         last, now = None if self._last < 0 else self._last, self.steps - 1
-        return Sender(sender.trigger, LossChain.of_channel(sender.channel), None).status(last, -1, now, now)
+        return SilenceRule(sender.trigger, LossChain.of_channel(sender.channel), None).status(last, -1, now, now)
 
     def save(self) -> bytes:
         """Return state and step number for `restore`: after it, the same pushes give the same bits."""
@@ -276,9 +276,9 @@ class Stream:
         Raises:
             ValueError: no snapshot, or one of another filter or version.
         """
-        new, (head, arrays) = cls(filter, limits, invalid, stuck), unpack(data)
+        new, (head, arrays) = cls(filter, limits, invalid, stuck), unpack_snapshot(data)
         mine, other = new._compiled.identity, head.get("of", {})
-        check_same("snapshot", mine, other, SAME, accept_changes)
+        check_same_network("snapshot", mine, other, SAME, accept_changes)
         new.steps = int(head["steps"])
         # Until version 0.4.0 limits and codes together.
         counted = head.get("refused") or {"limits": head["dropped"]}
@@ -292,7 +292,7 @@ class Stream:
         paths = head.get("paths", list(describe_old_layout(layout)))
         leaves = [arrays[f"state.{i}"] for i in range(sum(name.startswith("state.") for name in arrays))]
         old = dict(zip(paths, leaves, strict=False))
-        if len(paths) != len(leaves) or not can_read({path: leaf.shape for path, leaf in old.items()}, layout):
+        if len(paths) != len(leaves) or not can_read_layout({path: leaf.shape for path, leaf in old.items()}, layout):
             expected = f"a state with the parts of {other['filter']} as it is here: {', '.join(layout)}"
             raise fail("snapshot", expected, ", ".join(f"{path} {list(leaf.shape)}" for path, leaf in old.items()))
         new._stepper.set_state(list(relocate_parts(old, layout).values()))
@@ -385,8 +385,8 @@ class _CompiledFilter:
             "states": ", ".join(filter.states),
             "inputs": ", ".join(filter.inputs),
             "numbers received": str(filter.received),
-            "numbers": short_name(self.numbers),
-            "what is computed": short_name(text),
+            "numbers": hash_numbers(self.numbers),
+            "what is computed": hash_numbers(text),
         }
 
 

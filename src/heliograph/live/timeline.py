@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from heliograph.filters.plausibility import Judgement
-from heliograph.live.event import INPUTS, VERDICTS, Known, Verdict, check_63_bits, check_moment, check_numbers
+from heliograph.live.event import INPUTS, VERDICTS, CheckedEvent, Verdict, check_63_bits, check_moment, check_numbers
 from heliograph.live.final_rows import FinalRows, GateCounts
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.fleet_remarks import FleetHeld, FleetRemarks
-from heliograph.live.implausible_events import FleetAngles, Judges
+from heliograph.live.fleet_remarks import FleetRemarks, FleetRepeatWatch
+from heliograph.live.implausible_events import FleetAngles, JudgementReader
 from heliograph.live.link_counts import LinkCounts
 from heliograph.live.network_program import shared_program
 from heliograph.live.row_origin import estimates_by_name, make_row_origin
@@ -20,7 +20,7 @@ from heliograph.live.rows import BEFORE, HeldRow
 from heliograph.live.sender_status import SenderStatus
 from heliograph.live.stored.migration import DESCRIPTION, SAME, PlantMigration, describe_network
 from heliograph.live.stored.plant_codec import pack_plant, unpack_plant
-from heliograph.live.stored.snapshot import check_same, pack, unpack
+from heliograph.live.stored.snapshot import check_same_network, pack, unpack_snapshot
 from heliograph.model.checks.refusals import SCREENED, Reason
 from heliograph.model.estimate import Estimate, JudgedEstimate
 from heliograph.model.origin import Origin
@@ -88,10 +88,10 @@ class Timeline:
         # A fleet of one plant, and a slot to look ahead in.
         self._fleet = Fleet(self._program, Options(self.window, self.ahead, capacity=self.capacity), alone=True)
         self._plant, self._spare = self._fleet.begin("", start, None), self._fleet.pool.take()
-        self._judges = Judges(self._fleet)
+        self._judges = JudgementReader(self._fleet)
         self.reasons: dict[str, str] = {}
         self._angles, self._remarks = FleetAngles(self._fleet), FleetRemarks(self._fleet)
-        self._held = FleetHeld(self._fleet)
+        self._held = FleetRepeatWatch(self._fleet)
         self._gates = GateCounts(self._program.places)
         self._finals = FinalRows(2 * self.capacity, self._program.step_rows.outputs.size)
 
@@ -101,7 +101,7 @@ class Timeline:
         return {"network": self.network, "saved": pack(head, arrays)}
 
     def __setstate__(self, stored: dict[str, Any]) -> None:
-        vars(self).update(vars(self._resume(stored["network"], *unpack(stored["saved"]))))
+        vars(self).update(vars(self._resume(stored["network"], *unpack_snapshot(stored["saved"]))))
 
     @property
     def engine(self) -> str:
@@ -182,7 +182,7 @@ class Timeline:
             warnings.warn(f"timeline, {line}", stacklevel=2)
         return verdict
 
-    def _why_implausible(self, event: Known, row: HeldRow) -> str | None:
+    def _why_implausible(self, event: CheckedEvent, row: HeldRow) -> str | None:
         """Step what an event changed; return why it is implausible, None if it is not.
 
         Inputs are also judged over one unit of time after them.
@@ -297,11 +297,11 @@ class Timeline:
         Raises:
             ValueError: no snapshot, or one of another network or version.
         """
-        head, arrays = unpack(data)
+        head, arrays = unpack_snapshot(data)
         mine, other = shared_program(network).identity, head.get("of", {})
         if accept_changes and mine != other:
             return cls._resume(network, head, cls._carry_over(network, head, arrays))
-        check_same("snapshot", mine, other, SAME)
+        check_same_network("snapshot", mine, other, SAME)
         return cls._resume(network, head, arrays)
 
     @classmethod
@@ -314,7 +314,7 @@ class Timeline:
         mine, other = fleet.program.identity | {DESCRIPTION: describe_network(fleet)}, head["of"]
         # A version before 0.3.0 did not write where states stand: it is known for the same nodes and filters.
         if DESCRIPTION not in head:
-            check_same("snapshot", mine, other, (*SAME, "nodes", "filters"), accept=True)
+            check_same_network("snapshot", mine, other, (*SAME, "nodes", "filters"), accept=True)
         there = other | {DESCRIPTION: head.get(DESCRIPTION) or describe_network(fleet, covariances=True)}
         carrier = PlantMigration(fleet, mine, lambda line: warnings.warn(f"timeline, {line}", stacklevel=5))
         carrier.begin("snapshot", there)
@@ -343,7 +343,9 @@ class Timeline:
         new._finals.add(arrays["final.time"], arrays["final"])
         return new
 
-    def _convert_event(self, node: str, sequence: int, time: float, values: ArrayLike, arrival: float | None) -> Known:
+    def _convert_event(
+        self, node: str, sequence: int, time: float, values: ArrayLike, arrival: float | None
+    ) -> CheckedEvent:
         """Return a pushed event as checked numbers; without an arrival it arrives when measured, or now if later."""
         sizes, name = self._fleet.sizes, f"event of {node!r}"
         if not isinstance(node, str) or node not in sizes:
@@ -354,7 +356,7 @@ class Timeline:
         came = max(self._plant.confirmed, at) if arrival is None else check_moment(f"{name}, arrival", arrival)
         given = check_numbers(name, values, size, self._fleet.values_of(node))
         known = self._fleet.with_losses(node, given.tolist())
-        return Known(index, check_63_bits(f"{name}, sequence", sequence), at, known, came)
+        return CheckedEvent(index, check_63_bits(f"{name}, sequence", sequence), at, known, came)
 
     def _finalise(self) -> None:
         """Move the base up to the watermark, and read the outputs of the rows that are final by it."""

@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 
 from heliograph.numerics.check import DEFINITENESS_TOLERANCE, fail, items, show_value, standard_deviations
-from heliograph.numerics.linalg import find_lost
+from heliograph.numerics.linalg import find_not_finite
 from heliograph.numerics.manifold import Manifold
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, Float, PyTree
@@ -136,7 +136,7 @@ def lower_by_noise(claim: Claim, *models: PyTree) -> Claim:
 
 def is_sound(estimate: Estimate) -> np.ndarray:
     """Return which means are finite and, where a covariance is claimed, positive semidefinite (to rounding)."""
-    finite = ~find_lost(np.asarray(estimate.mean), 1)
+    finite = ~find_not_finite(np.asarray(estimate.mean), 1)
     if estimate.claim == "none":
         return finite
     return np.asarray(finite & _are_covariances(np.asarray(estimate.covariance)))
@@ -154,7 +154,7 @@ def _are_covariances(bound: np.ndarray) -> np.ndarray:
 
 def _judge_covariances(bound: np.ndarray) -> np.ndarray:
     """Return the same mask, of each matrix by itself."""
-    finite = ~find_lost(bound, 2)
+    finite = ~find_not_finite(bound, 2)
     if finite.all() and _are_definite((bound + np.swapaxes(bound, -1, -2)) / 2):
         return np.asarray(finite)
     safe = np.where(finite[..., None, None], bound, np.eye(bound.shape[-1]))

@@ -28,7 +28,7 @@ from heliograph.random_affine.modes import (
     redraw_modes_each_step,
 )
 from heliograph.random_affine.noise import FiniteSupport, NoiseLike, as_noise, count_components
-from heliograph.random_affine.superposed import terms_without_common_memory
+from heliograph.random_affine.superposed import split_terms_without_common_memory
 
 
 def gilbert_elliott(
@@ -218,7 +218,7 @@ def memory_matters(channel: Channel) -> bool:
     if uncertain_chain(channel):
         return True
     # Parts of the channel with memories of their own, each over all steps.
-    terms = zip(*(terms_without_common_memory(step) for step in unstack(channel)), strict=True)
+    terms = zip(*(split_terms_without_common_memory(step) for step in unstack(channel)), strict=True)
     constant = not isinstance(channel, OverTime)
     return any(
         not is_memory_irrelevant_for_linear_filter([joint_modes(step) for step in term], constant) for term in terms

@@ -24,7 +24,7 @@ FIRST = Repeats()  # before the first reading
 LimitsLike = TypeAliasType("LimitsLike", "ArrayLike | Sequence[Sequence[float | None]] | Limits | None")
 
 
-def limits_of(
+def make_limits(
     received: int,
     limits: LimitsLike,
     invalid: ArrayLike,
@@ -46,7 +46,7 @@ def limits_of(
     return None if limits is None and codes.size == 0 and counts is None else Limits(received, limits, invalid, counts)
 
 
-class Screened(NamedTuple):
+class ScreenedReadings(NamedTuple):
     """Readings without those that count as missing.
 
     Args:
@@ -104,7 +104,7 @@ class Limits(Module):
         limited = bool(np.any(np.isfinite(self.low)) or np.any(np.isfinite(self.high)))
         return limited or self.stuck is not None
 
-    def screen(self, z: Float[np.ndarray, "time m"], before: Repeats = FIRST) -> Screened:
+    def screen(self, z: Float[np.ndarray, "time m"], before: Repeats = FIRST) -> ScreenedReadings:
         """Return readings without those that count as missing, given the runs of equal ones before them, if any.
 
         What is beyond limits or a code is no reading, and ends no run.
@@ -112,11 +112,11 @@ class Limits(Module):
         refused = self.judge_values(z)
         values = np.where(refused > 0, np.nan, z)
         if self.stuck is None:
-            return Screened(values, refused, before)
+            return ScreenedReadings(values, refused, before)
         counts, repeats = count_repeats(values, before)
         stuck = counts >= self.stuck
         refused = np.where(stuck, number_of("stuck"), refused)
-        return Screened(np.where(stuck, np.nan, values), refused, repeats)
+        return ScreenedReadings(np.where(stuck, np.nan, values), refused, repeats)
 
     def judge_values(self, z: Float[np.ndarray, "... m"]) -> Int[np.ndarray, "... m"]:
         """Return the number of the reason for which each value by itself counts as missing; 0 where it does not.

@@ -16,7 +16,7 @@ from heliograph.model.over_time import OverTime
 from heliograph.model.plant import TIME_STEP, AbstractPlant
 from heliograph.model.sensor import SEVERAL_TAKEN_BY, AbstractSensor
 from heliograph.numerics.check import array, fail, instance, items, show_value
-from heliograph.numerics.module import Module, same
+from heliograph.numerics.module import Module, are_same
 from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.chain import MarkovChain
@@ -265,7 +265,7 @@ def markov_plant(
                 raise fail(f"{what} of model {i}", f"{list(getattr(plants[0], what))}, as those of model 0{remedy}",
                            list(getattr(plant, what)))  # fmt: skip
         for what in ("initial_mean", "initial_covariance", "deviation"):
-            if not same(getattr(plant, what), getattr(plants[0], what)):
+            if not are_same(getattr(plant, what), getattr(plants[0], what)):
                 raise fail(f"law of x_0 of model {i}", "that of model 0, since the state starts before the first mode",
                            f"another {what.replace('_', ' ')}")  # fmt: skip
     if rates is None:

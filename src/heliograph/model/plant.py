@@ -14,7 +14,7 @@ from heliograph.model.over_time import OverTime, first
 from heliograph.model.turns import check_turns
 from heliograph.model.unknown_start import DiffuseStart
 from heliograph.numerics.angle import Angles, angles_at, read_angles
-from heliograph.numerics.check import array, covariance, fail, function, instance, items, name_list, names, show_error
+from heliograph.numerics.check import array, covariance, error_text, fail, function, instance, items, name_list, names
 from heliograph.numerics.linalg import cholesky
 from heliograph.numerics.manifold import Manifold
 from heliograph.numerics.module import Module, readable, unwritten
@@ -385,7 +385,7 @@ def check_shape(name: str, called: Callable[..., object], values: tuple[object, 
     try:
         got = trace_shape(name, called, *values)
     except (TypeError, ValueError, IndexError, ArithmeticError, AttributeError) as error:
-        raise fail(name, f"a function in operations of jax.numpy, of shape {shape}", show_error(error)) from error
+        raise fail(name, f"a function in operations of jax.numpy, of shape {shape}", error_text(error)) from error
     if got != shape:
         raise fail(name, f"shape {shape}", f"shape {got}")
 

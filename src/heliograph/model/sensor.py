@@ -17,13 +17,13 @@ from heliograph.numerics.angle import Angles, angles_at, read_angles
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import (
     array,
+    error_text,
     fail,
     function,
     instance,
     name_list,
     names,
     rank,
-    show_error,
     show_value,
 )
 from heliograph.numerics.float64 import in_float64
@@ -95,7 +95,7 @@ class AbstractSensor(Module):
         try:
             got = trace_shape("measure(x) of a sensor", self.measure, np.zeros(states))
         except (TypeError, ValueError, IndexError, ArithmeticError, AttributeError) as error:
-            raise fail("sensor", f"to measure a state of length {states}", show_error(error)) from error
+            raise fail("sensor", f"to measure a state of length {states}", error_text(error)) from error
         if got != (len(self.outputs),):
             raise fail("sensor", f"{len(self.outputs)} outputs {list(self.outputs)}", f"shape {got}")
 

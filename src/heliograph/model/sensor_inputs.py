@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.model.plant import NoiseFunction, check_shape
-from heliograph.numerics.check import array, fail, name_list, names, show_error
+from heliograph.numerics.check import array, error_text, fail, name_list, names
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import as_real, trace_shape
 from heliograph.numerics.types import ArrayLike, Names
@@ -65,7 +65,7 @@ def count_rows(matrix: object, inputs: tuple[str, ...]) -> int:
     try:
         shape = trace_shape("sensor matrix(u)", matrix, np.ones(len(inputs)))
     except (TypeError, ValueError, IndexError, ArithmeticError, AttributeError) as error:
-        raise fail("sensor matrix(u)", "a function in operations of jax.numpy", show_error(error)) from error
+        raise fail("sensor matrix(u)", "a function in operations of jax.numpy", error_text(error)) from error
     if len(shape) != 2:
         raise fail("sensor matrix(u)", "shape (outputs, states)", f"shape {shape}")
     return shape[0]

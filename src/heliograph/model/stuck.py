@@ -17,7 +17,7 @@ from heliograph.random_affine.base import AbstractRandomAffine, all_inner_maps
 from heliograph.random_affine.hop import AbstractHop
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
 from heliograph.random_affine.outliers import Contaminated, StudentT
-from heliograph.random_affine.words.rounded import Rounded
+from heliograph.random_affine.words.rounded import RoundedNoise
 
 SELDOM = 1e-9  # probability that a run as long begins at a reading by chance: one in a year at 32 Hz
 LEAST = 3  # equal readings: two may be one that was sent twice
@@ -99,7 +99,7 @@ def bound_equal_readings(
     Raises:
         ValueError: readings without a resolution, or noise that is not Gaussian, Student's or contaminated.
     """
-    if isinstance(noise, Rounded):
+    if isinstance(noise, RoundedNoise):
         return bound_equal_readings(noise.source, np.asarray(noise.step))
     if isinstance(noise, Independent):
         ends = np.cumsum([part.dimension for part in noise.parts])[:-1]

@@ -18,7 +18,7 @@ from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.laws.law import AbstractLaw
 from heliograph.random_affine.modes import ModeOutput
 from heliograph.random_affine.noise import AbstractNoise
-from heliograph.random_affine.told import FreshNumbers, FreshReading, GainTold, PilotedHop, Told, told_maps
+from heliograph.random_affine.told import FreshNumbers, FreshReading, PilotedHop, ToldGainHop, ToldMap, told_maps
 
 M = TypeVar("M", bound=AbstractRandomAffine)
 
@@ -92,7 +92,7 @@ def told(
     if memory.announced != len(names) or len(set(names)) < len(names):
         raise fail("numbers told", f"{memory.announced} different names", list(names))
     example = array("typical numbers", _average_law(law, memory) if typical is None else typical, (len(names),))
-    return deliver_told(Told(memory, link, example, names, flag("exogenous", exogenous), flag("fresh", fresh)))
+    return deliver_told(ToldMap(memory, link, example, names, flag("exogenous", exogenous), flag("fresh", fresh)))
 
 
 def _check_law(law: object) -> AbstractLaw | AbstractNoise | None:
@@ -122,7 +122,7 @@ def tell_gain(hop: GainAndNoise, known: KnownGain) -> GainAndNoise | Stack:
         return deliver_told(PilotedHop(FreshReading(hop.law, known.noise), hop.matrix, hop.noise, known.fresh))
     instance("known", known, bool, "True, False or a Pilot")
     typical = np.asarray([hop.law.moment(1)])
-    return deliver_told(Told(FreshNumbers(hop.law, 1), GainTold(hop.matrix, hop.noise), typical, ("gain",)))
+    return deliver_told(ToldMap(FreshNumbers(hop.law, 1), ToldGainHop(hop.matrix, hop.noise), typical, ("gain",)))
 
 
 def deliver_told(link: AbstractRandomAffine) -> Stack:
@@ -135,7 +135,7 @@ def _announce(link: AbstractRandomAffine, sent: int) -> list[ModeOutput]:
     return [ModeOutput(affine.memory, sent) for affine in told_maps(link)]
 
 
-class ToldApart(NamedTuple):
+class SeparatedTold(NamedTuple):
     """A channel taken apart: the link of the values, and the rows of z in which values and told numbers stand.
 
     Numbers are in the order of the link's `told_maps`, each once.
@@ -146,7 +146,7 @@ class ToldApart(NamedTuple):
     numbers: tuple[int, ...]
 
 
-def separate_told(channel: AbstractRandomAffine) -> ToldApart:
+def separate_told(channel: AbstractRandomAffine) -> SeparatedTold:
     """Take a channel apart into its link and what is told of it; of another one all rows are values."""
     maps = channel.maps if isinstance(channel, Stack) else (channel,)
     told_of = {affine.memory.identity for affine in told_maps(channel)}
@@ -161,10 +161,10 @@ def separate_told(channel: AbstractRandomAffine) -> ToldApart:
             links.append(part)
             values += places
     if not rows:
-        return ToldApart(channel, values, ())
+        return SeparatedTold(channel, values, ())
     link = links[0] if len(links) == 1 else Stack(links)
     numbers = [row for affine in told_maps(link) for row in rows[affine.memory.identity]]
-    return ToldApart(link, values, tuple(numbers))
+    return SeparatedTold(link, values, tuple(numbers))
 
 
 def build_with_told(build: Callable[[list[AbstractRandomAffine]], M], channels: Sequence[AbstractRandomAffine]) -> M:

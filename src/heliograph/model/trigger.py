@@ -35,7 +35,7 @@ class SendReason:
     SILENT, EVENT, HEARTBEAT, FIRST, SCHEDULE = range(5)
 
 
-class Sender(NamedTuple):
+class SenderState(NamedTuple):
     """State of a sender after a step, for each component of y.
 
     Shapes (m,) all: reference, what y is compared with; age, steps since the last transmission; begun, whether there is
@@ -86,13 +86,13 @@ class AbstractTrigger(Module):
     def check_outputs(self, outputs: int) -> None:
         """Raise ValueError unless the rule's numbers fit so many components."""
 
-    def start(self, outputs: int) -> Sender:
+    def start(self, outputs: int) -> SenderState:
         """Return a sender that has transmitted nothing yet."""
         nothing = jnp.zeros(outputs, dtype=int)
         begun = jnp.full(outputs, not self.needs_reference)
-        return Sender(jnp.zeros(outputs), nothing, begun, nothing, nothing)
+        return SenderState(jnp.zeros(outputs), nothing, begun, nothing, nothing)
 
-    def reasons(self, sender: Sender, y: jax.Array, key: jax.Array, k: jax.Array) -> jax.Array:
+    def reasons(self, sender: SenderState, y: jax.Array, key: jax.Array, k: jax.Array) -> jax.Array:
         """Return the reason for which each component is sent, (m,); 0 where it is not."""
         reason = jnp.where(self.event(y - sender.reference, key, k), self._event_reason(), SendReason.SILENT)
         if self.heartbeat is not None:
@@ -103,7 +103,7 @@ class AbstractTrigger(Module):
     def _event_reason(self) -> int:
         return SendReason.EVENT
 
-    def after(self, sender: Sender, y: jax.Array, reason: jax.Array, arrived: jax.Array) -> Sender:
+    def after(self, sender: SenderState, y: jax.Array, reason: jax.Array, arrived: jax.Array) -> SenderState:
         """Return the sender after it transmitted what has a reason, of which `arrived` arrived."""
         sent = reason > 0
         arrived = arrived & sent
@@ -111,11 +111,11 @@ class AbstractTrigger(Module):
         reference = jnp.where(renewed, y, sender.reference) if self.needs_reference else sender.reference
         lost = jnp.where(arrived, 0, sender.lost + (sent & ~arrived))
         last = jnp.where(sent & ~arrived, -reason, reason)
-        return Sender(reference, jnp.where(sent, 0, sender.age + 1), sender.begun | renewed, lost, last)
+        return SenderState(reference, jnp.where(sent, 0, sender.age + 1), sender.begun | renewed, lost, last)
 
     def transmit(
-        self, sender: Sender, y: jax.Array, z: jax.Array, key: jax.Array, k: jax.Array
-    ) -> tuple[Sender, jax.Array]:
+        self, sender: SenderState, y: jax.Array, z: jax.Array, key: jax.Array, k: jax.Array
+    ) -> tuple[SenderState, jax.Array]:
         """Return the sender that follows, and what the receiver gets where the channel would make z of y."""
         reason, there = self.reasons(sender, y, key, k), ~jnp.isnan(z)
         items = self.region == "each"
@@ -124,7 +124,7 @@ class AbstractTrigger(Module):
         received = jnp.concatenate([jnp.where(sent, z, jnp.nan), self.known_losses(sender, reason, arrived)])
         return self.after(sender, y, reason, arrived), received
 
-    def known_losses(self, sender: Sender, reason: jax.Array, arrived: jax.Array) -> jax.Array:
+    def known_losses(self, sender: SenderState, reason: jax.Array, arrived: jax.Array) -> jax.Array:
         """Return the numbers about losses that arrive behind z, from the sender before this step."""
         sent = reason > 0
         if self.losses == "numbered":
@@ -259,7 +259,7 @@ class StochasticTrigger(AbstractTrigger):
         silent = jnp.exp(-error @ self.matrix(len(error)) @ error / 2)
         return jnp.full(len(error), jax.random.uniform(key, dtype=float) > silent)
 
-    def known_losses(self, sender: Sender, reason: jax.Array, arrived: jax.Array) -> jax.Array:
+    def known_losses(self, sender: SenderState, reason: jax.Array, arrived: jax.Array) -> jax.Array:
         """Return the link's state, 1 where it is down, whether anything is sent or not: so silence stays Gaussian."""
         return (~arrived).astype(float)[: self.side_information(len(arrived))]
 

@@ -35,7 +35,7 @@ def check_turns(
         return
     center = np.asarray(center)
     turned = center + TURN * np.eye(len(center))[list(given.angles)]
-    _compare(f"{name} with circular states", function, center, turned, results, rest)
+    _compare_turned(f"{name} with circular states", function, center, turned, results, rest)
     # Attitudes: at one that is no special case, with rates that are not 0, and by its other rotation vector.
     change = np.zeros(len(center))
     change[list(given.rotations)] = np.resize(SOME_TURN, len(given.rotations))
@@ -43,10 +43,10 @@ def check_turns(
     others = [_turn_fully(some, given.rotations[i : i + 3]) for i in range(0, len(given.rotations), 3)]
     rates = tuple(np.ones_like(values) for values in rest)
     kind = f"{name} with an attitude (hg.models.turn_attitude turns one, hg.models.rotation_matrix has its axes)"
-    _compare(kind, function, some, others, results, rates)
+    _compare_turned(kind, function, some, others, results, rates)
 
 
-def _compare(
+def _compare_turned(
     name: str,
     function: Callable[..., jax.Array],
     center: np.ndarray,

@@ -68,7 +68,7 @@ def discretize(
     return model.over(step)
 
 
-class Continuous(Module):
+class ContinuousSystem(Module):
     """Matrices of dx = (A x + B u) dt + dW with the intensity S of W."""
 
     a: Array
@@ -90,7 +90,7 @@ class Continuous(Module):
             parts = jax.lax.fori_loop(0, HALVINGS, _double_where(count), parts)
         else:
             for _ in range(int(count)):
-                parts = _double(*parts)
+                parts = _double_step(*parts)
         growth, squared, integral, noise = parts
         # I + growth has lost what is small beside 1, the squared F what rounding of 1 was doubled to.
         decayed = xp.max(xp.abs(squared)) * 2**count < 1
@@ -117,7 +117,7 @@ class Continuous(Module):
         return parts[2], parts[3]
 
 
-def _double(growth: Any, matrix: Any, integral: Any, noise: Any) -> tuple[Any, Any, Any, Any]:
+def _double_step(growth: Any, matrix: Any, integral: Any, noise: Any) -> tuple[Any, Any, Any, Any]:
     """Return F - I, F, the integral of F, and Q over twice the step, given those over the step."""
     moved = noise + growth @ noise
     return (
@@ -135,25 +135,25 @@ def _double_where(count: Any) -> Callable[[Any, tuple[Any, ...]], tuple[Any, ...
         """Double the parts if i is below the count."""
         # What is not doubled any more is taken as zero, so that nothing overflows and derivatives stay finite.
         goes_on = i < count
-        doubled = _double(*(jnp.where(goes_on, part, 0.0) for part in parts))
+        doubled = _double_step(*(jnp.where(goes_on, part, 0.0) for part in parts))
         return tuple(jnp.where(goes_on, new, old) for new, old in zip(doubled, parts, strict=True))
 
     return turn
 
 
-def _read_continuous(A: ArrayLike, intensity: ArrayLike, B: ArrayLike | None) -> Continuous:
+def _read_continuous(A: ArrayLike, intensity: ArrayLike, B: ArrayLike | None) -> ContinuousSystem:
     """Return A, B and the noise intensity as arrays of shapes that fit."""
     a = array("matrix of the motion", A, (None, None))
     n = a.shape[0]
     a = array("matrix of the motion", a, (n, n))
     b = np.zeros((n, 0)) if B is None else array("input matrix", B, (n, "inputs"))
-    return Continuous(a, b, covariance("noise intensity", intensity, n))
+    return ContinuousSystem(a, b, covariance("noise intensity", intensity, n))
 
 
-class MatrixOver(Module):
+class TransitionOverStep(Module):
     """F of the step that an input says; `place` is that of dt among the inputs."""
 
-    model: Continuous
+    model: ContinuousSystem
     place: int = eqx.field(static=True)
 
     def __call__(self, u: jax.Array) -> jax.Array:
@@ -161,7 +161,7 @@ class MatrixOver(Module):
         return jnp.asarray(self.model.over(u[self.place]).matrix)
 
 
-class NoiseOver(MatrixOver):
+class NoiseOverStep(TransitionOverStep):
     """Q of the step that an input says."""
 
     def __call__(self, u: jax.Array) -> jax.Array:
@@ -169,7 +169,7 @@ class NoiseOver(MatrixOver):
         return jnp.asarray(self.model.over(u[self.place]).noise)
 
 
-class InputsOver(MatrixOver):
+class InputMatrixOverStep(TransitionOverStep):
     """Matrix of inputs that are held over the step that the last of them says."""
 
     def __call__(self, u: jax.Array) -> jax.Array:
@@ -220,11 +220,11 @@ def continuous_plant(
         return LinearPlant(*parts, limits=limits)
     every = with_time_step(named)
     return LinearPlant(
-        MatrixOver(model, count),
-        NoiseOver(model, count),
+        TransitionOverStep(model, count),
+        NoiseOverStep(model, count),
         initial_mean,
         initial_covariance,
-        InputsOver(model, count) if count else None,
+        InputMatrixOverStep(model, count) if count else None,
         states,
         every,
         limits=limits,

@@ -96,7 +96,7 @@ def join(plants: "Sequence[AbstractPlant]") -> LinearPlant | Plant:
     if not all(isinstance(plant, LinearPlant) for plant in parts):
         move = SideBySide(tuple(parts), places)
         return Plant(move, noise, center, start, states, inputs, circular=circular, attitude=attitude, limits=limits)
-    matrix, driven = _matrices(parts, places, len(inputs))
+    matrix, driven = _join_matrices(parts, places, len(inputs))
     return LinearPlant(matrix, noise, center, start, driven, states, inputs, circular=circular, limits=limits)
 
 
@@ -124,7 +124,7 @@ def _join_starts(parts: list[Any]) -> tuple[Any, Any]:
     return library(*means).concatenate(means), DiffuseStart()(names, block_diagonal(known))
 
 
-def _matrices(parts: list[Any], places: tuple[tuple[int, ...], ...], count: int) -> tuple[Any, Any]:
+def _join_matrices(parts: list[Any], places: tuple[tuple[int, ...], ...], count: int) -> tuple[Any, Any]:
     """Return A and B of linear plants side by side: constants, or functions of the inputs where some part is one."""
     if any(isinstance(value, OfInputs) for plant in parts for value in (plant.matrix, plant.input_matrix)):
         plants = tuple(parts)

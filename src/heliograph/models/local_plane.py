@@ -181,7 +181,7 @@ class LocalPlane(Module):
         """
         origin = np.radians(self.latitude)
         radius, above = self._origin
-        phi = _bowring(radius + across, above + along) - origin
+        phi = _find_latitude_by_bowring(radius + across, above + along) - origin
         r, z = _meridian_difference(origin, self.height, phi, np.zeros_like(phi))
         rise = np.cos(origin + phi) * (across - r) + np.sin(origin + phi) * (along - z)
         for _ in range(NEWTON_STEPS):
@@ -230,7 +230,7 @@ def _meridian_difference(
     return r, z
 
 
-def _bowring(r: np.ndarray, z: np.ndarray) -> np.ndarray:
+def _find_latitude_by_bowring(r: np.ndarray, z: np.ndarray) -> np.ndarray:
     """Return a latitude in radians by Bowring's formula, with the parametric latitude of a point at that direction."""
     ratio = 1 - FLATTENING  # b / a
     size = np.hypot(r, z)

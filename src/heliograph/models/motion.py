@@ -40,7 +40,7 @@ def constant_velocity(
 
     Source: Bar-Shalom, Li and Kirubarajan, Estimation with applications to tracking (2001), 6.2.2.
     """
-    return _on_axes([[0, 1], [0, 0]], _intensity(2, intensity), axes, dt, initial_mean, initial_covariance)
+    return _repeat_on_axes([[0, 1], [0, 0]], _intensity(2, intensity), axes, dt, initial_mean, initial_covariance)
 
 
 def constant_acceleration(
@@ -67,7 +67,7 @@ def constant_acceleration(
     Source: Bar-Shalom, Li and Kirubarajan, Estimation with applications to tracking (2001), 6.2.3.
     """
     motion = [[0, 1, 0], [0, 0, 1], [0, 0, 0]]
-    return _on_axes(motion, _intensity(3, intensity), axes, dt, initial_mean, initial_covariance)
+    return _repeat_on_axes(motion, _intensity(3, intensity), axes, dt, initial_mean, initial_covariance)
 
 
 def singer(
@@ -99,7 +99,7 @@ def singer(
     size, rate = _deviation_and_rate(deviation, time)
     motion = library(rate).asarray([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -rate]])
     start = library(size).asarray([WIDE, WIDE, size**2])
-    return _on_axes(motion, _intensity(3, 2 * size**2 * rate), axes, dt, initial_mean, initial_covariance, start)
+    return _repeat_on_axes(motion, _intensity(3, 2 * size**2 * rate), axes, dt, initial_mean, initial_covariance, start)
 
 
 def gauss_markov(
@@ -203,7 +203,7 @@ def _with_units(states: Sequence[str]) -> Sequence[str]:
     return [rename(name, str(name)) for name in states]
 
 
-def _on_axes(
+def _repeat_on_axes(
     motion: Any,
     intensity: Any,
     axes: Names,

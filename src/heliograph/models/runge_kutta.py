@@ -9,7 +9,7 @@ import numpy as np
 
 from heliograph.model.intervals import StateLimitsLike
 from heliograph.model.plant import Plant, check_shape
-from heliograph.models.continuous_time import Continuous, Drift, Number, Square, Start, with_time_step
+from heliograph.models.continuous_time import ContinuousSystem, Drift, Number, Square, Start, with_time_step
 from heliograph.numerics.check import array, check_count, covariance, function, name_list, scalar
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import as_real
@@ -17,7 +17,7 @@ from heliograph.numerics.types import Array, Names
 from heliograph.random_affine.noise import NoiseLike
 
 
-class Motion(Module):
+class MotionOverStep(Module):
     """dx/dt = f(x, u), and the length of a step: a number, or the last input."""
 
     drift: Drift
@@ -29,7 +29,7 @@ class Motion(Module):
         return (u, self.dt) if self.dt is not None else (u[:-1], u[-1])
 
 
-class RungeKuttaStep(Motion):
+class RungeKuttaStep(MotionOverStep):
     """The classical step of Runge and Kutta: local error of order dt^5."""
 
     def __call__(self, x: jax.Array, u: jax.Array) -> jax.Array:
@@ -37,7 +37,7 @@ class RungeKuttaStep(Motion):
         own, dt = self.split(u)
         h = dt / self.substeps
 
-        def turn(_: object, x: jax.Array) -> jax.Array:
+        def take_substep(_: object, x: jax.Array) -> jax.Array:
             """Return the state after one of the shorter steps."""
             first = as_real(self.drift(x, own))
             second = as_real(self.drift(x + h / 2 * first, own))
@@ -46,11 +46,13 @@ class RungeKuttaStep(Motion):
             moved: jax.Array = x + h / 6 * (first + 2 * second + 2 * third + fourth)
             return moved
 
-        moved: jax.Array = turn(0, x) if self.substeps == 1 else jax.lax.fori_loop(0, self.substeps, turn, x)
+        moved: jax.Array = (
+            take_substep(0, x) if self.substeps == 1 else jax.lax.fori_loop(0, self.substeps, take_substep, x)
+        )
         return moved
 
 
-class LinearizedNoise(Motion):
+class LinearizedNoise(MotionOverStep):
     """Q of a step: the intensity spread by the Jacobian of f at one state."""
 
     intensity: Array
@@ -60,7 +62,7 @@ class LinearizedNoise(Motion):
         """Return Q (n, n)."""
         own, dt = self.split(u)
         jacobian = jax.jacfwd(lambda x: as_real(self.drift(x, own)))(jnp.asarray(self.state))
-        return jnp.asarray(Continuous(jacobian, np.zeros((len(self.state), 0)), self.intensity).over(dt).noise)
+        return jnp.asarray(ContinuousSystem(jacobian, np.zeros((len(self.state), 0)), self.intensity).over(dt).noise)
 
 
 def runge_kutta_plant(

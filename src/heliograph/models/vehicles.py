@@ -16,7 +16,7 @@ from heliograph.random_affine.noise import NoiseLike
 NEAR = 1e-4  # radians: below this, series take the place of quotients, right to the last digit
 
 
-class Step(Module):
+class StepLength(Module):
     """The length of a step: a number, or the last input."""
 
     dt: Any
@@ -26,7 +26,7 @@ class Step(Module):
         return u[-1] if self.dt is None else self.dt
 
 
-class Turn(Step):
+class TurnMotion(StepLength):
     """The motion of (x, vx, y, vy, w) over a step: the velocity turns by the angle w dt."""
 
     def __call__(self, x: jax.Array, u: jax.Array) -> jax.Array:
@@ -41,7 +41,7 @@ class Turn(Step):
         )
 
 
-class TurnNoise(Step):
+class TurnNoise(StepLength):
     """Q of a turn: white accelerations on both axes, and a rate that wanders."""
 
     intensity: Any
@@ -55,7 +55,7 @@ class TurnNoise(Step):
         return jnp.asarray(jax.scipy.linalg.block_diag(axis, axis, rate))
 
 
-class Arc(Step):
+class ArcMotion(StepLength):
     """The motion of (x, y, heading) at the speed and turn rate of the inputs, over an arc of a circle.
 
     `wheelbase`: of a bicycle, whose second input is the angle of its front wheel; None of a unicycle.
@@ -74,7 +74,7 @@ class Arc(Step):
         return jnp.asarray(x + moved)
 
 
-class ScaledNoise(Step):
+class ScaledNoise(StepLength):
     """Q = S dt."""
 
     intensity: Array
@@ -128,7 +128,7 @@ def coordinated_turn(
     states = [first, f"{first}_velocity", second, f"{second}_velocity", "turn_rate"]
     inputs = [] if dt is not None else with_time_step(())
     noise = TurnNoise(step, q, wander)
-    return Plant(Turn(step), noise, initial_mean, initial_covariance, states=states, inputs=inputs)
+    return Plant(TurnMotion(step), noise, initial_mean, initial_covariance, states=states, inputs=inputs)
 
 
 def unicycle(
@@ -155,7 +155,7 @@ def unicycle(
 
     Source: Thrun, Burgard and Fox, Probabilistic robotics (2005), 5.3.
     """
-    return _vehicle(None, "turn_rate", intensity, initial_mean, initial_covariance, dt, axes)
+    return _make_vehicle_plant(None, "turn_rate", intensity, initial_mean, initial_covariance, dt, axes)
 
 
 def bicycle(
@@ -185,10 +185,10 @@ def bicycle(
     Source: Rajamani, Vehicle dynamics and control (2012), 2.2, without slip.
     """
     length = scalar("wheelbase", wheelbase, TINY)
-    return _vehicle(length, "steering", intensity, initial_mean, initial_covariance, dt, axes)
+    return _make_vehicle_plant(length, "steering", intensity, initial_mean, initial_covariance, dt, axes)
 
 
-def _vehicle(
+def _make_vehicle_plant(
     wheelbase: Any,
     steered_by: str,
     intensity: ArrayLike,
@@ -205,7 +205,7 @@ def _vehicle(
     spread = covariance("noise intensity", intensity, 3)
     inputs = ["speed", steered_by]
     return Plant(
-        Arc(step, wheelbase),
+        ArcMotion(step, wheelbase),
         ScaledNoise(step, spread) if step is None else spread * step,
         initial_mean,
         initial_covariance,

@@ -39,7 +39,7 @@ def angles_at(angles: object, size: int) -> Angles:
     return tuple(map(int, places))
 
 
-def nearest(value: A, reference: Array, angles: Angles) -> A:
+def wrap_near(value: A, reference: Array, angles: Angles) -> A:
     """Return the angles (..., n) with full turns removed, so that they lie within half a turn of `reference` (..., n).
 
     Components that are no angles are unchanged.
@@ -55,7 +55,7 @@ def nearest(value: A, reference: Array, angles: Angles) -> A:
 
 def wrap_angles(value: A, angles: Angles) -> A:
     """Return angles (..., n) between -pi and pi; other components are unchanged."""
-    return nearest(value, np.zeros(np.shape(value)[-1]), angles)
+    return wrap_near(value, np.zeros(np.shape(value)[-1]), angles)
 
 
 def continue_angles(
@@ -74,4 +74,4 @@ def continue_angles(
     for i in given:
         slope = jax.jvp(function, (center,), (jnp.zeros_like(center).at[i].set(1.0),))[1]
         turns = turns.at[:, i].set(jnp.round(slope))
-    return lambda x: nearest(function(x), start + turns @ (x - center), angles)
+    return lambda x: wrap_near(function(x), start + turns @ (x - center), angles)

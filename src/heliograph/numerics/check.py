@@ -27,33 +27,33 @@ REAL, POSITIVE, PROBABILITY = Domain(), Domain(low=0.0), Domain(low=0.0, high=1.
 SIMPLEX, COVARIANCE = Domain("simplex"), Domain("covariance")
 
 
-class Marked(np.ndarray):
+class MarkedArray(np.ndarray):
     """Array that reports the domain that a check requires of it; arrays computed from it report nothing."""
 
     report: Callable[[str, Domain], None] | None = None
 
 
-def mark_checked(value: object, report: Callable[[str, Domain], None]) -> Marked:
+def mark_checked(value: object, report: Callable[[str, Domain], None]) -> MarkedArray:
     """Return a copy of an array that calls `report(name, domain)` when it is checked."""
-    copy = np.array(value, dtype=np.float64).view(Marked)
+    copy = np.array(value, dtype=np.float64).view(MarkedArray)
     copy.report = report
     return copy
 
 
 def report_domain(name: str, value: object, whole: Domain, entry: Domain | None = None) -> None:
     """Tell a marked value what it is for; in a list, marked entries that they are each an `entry`."""
-    if isinstance(value, Marked):
+    if isinstance(value, MarkedArray):
         if value.report is not None:
             value.report(name, whole)
     elif isinstance(value, list | tuple):
         for element in value:
-            if isinstance(element, Marked | list | tuple):
+            if isinstance(element, MarkedArray | list | tuple):
                 report_domain(name, element, whole if entry is None else entry, entry)
 
 
 def report_covariance(name: str, value: object) -> None:
     """Tell a marked covariance or variance; in a list of rows, that those on the diagonal are variances."""
-    if isinstance(value, Marked):
+    if isinstance(value, MarkedArray):
         report_domain(name, value, COVARIANCE if value.ndim else POSITIVE)
     elif isinstance(value, list | tuple):
         for i, row in enumerate(value):
@@ -83,7 +83,7 @@ def show_value(value: object) -> str:
     return " ".join(repr(value).split())[:60]
 
 
-def show_error(error: Exception) -> str:
+def error_text(error: Exception) -> str:
     """Return an error of a user's function as a short part of one line; where JAX cannot trace, what to write."""
     if isinstance(error, jax.errors.TracerBoolConversionError):
         return "one that decides by a value: write jnp.where"

@@ -111,7 +111,7 @@ class _Evaluation:
     def _branch(self, inputs: list[Compensated], branches: Sequence[ClosedJaxpr]) -> list[Compensated]:
         """Take one of several programs, each evaluated so."""
 
-        def evaluate(branch: ClosedJaxpr, given: list[Compensated]) -> list[Compensated]:
+        def evaluate_branch(branch: ClosedJaxpr, given: list[Compensated]) -> list[Compensated]:
             """Return its results, each with a low part if it is a real number, as those of the others."""
             results = self.inline(branch, given)
             real = [jnp.issubdtype(jnp.result_type(x.high), jnp.floating) for x in results]
@@ -121,7 +121,9 @@ class _Evaluation:
             ]
 
         index = jnp.asarray(inputs[0].high, np.int32)
-        results: list[Compensated] = lax.switch(index, [partial(evaluate, branch) for branch in branches], inputs[1:])
+        results: list[Compensated] = lax.switch(
+            index, [partial(evaluate_branch, branch) for branch in branches], inputs[1:]
+        )
         return results
 
     def _add(self, a: Compensated, b: Compensated, **_: Any) -> Compensated:
@@ -184,7 +186,7 @@ class _Evaluation:
         """Multiply matrices by the products of entries, added one after another."""
         # Axes that are summed over, and axes of a batch; the result has the axes batch, rest of a, rest of b.
         (over_a, over_b), (same_a, same_b) = dimension_numbers
-        left, right = (_arrange(*part) for part in ((a, same_a, over_a, True), (b, same_b, over_b, False)))
+        left, right = (_arrange_factor(*part) for part in ((a, same_a, over_a, True), (b, same_b, over_b, False)))
         size_a, size_b = jnp.shape(a.high), jnp.shape(b.high)
         shape = [size_a[axis] for axis in same_a]
         shape += [n for axis, n in enumerate(size_a) if axis not in (*same_a, *over_a)]
@@ -263,7 +265,7 @@ def _take(x: Any, i: int, axis: int) -> Any:
     return lax.index_in_dim(x, i, axis, False) if isinstance(x, jax.Array) else np.take(x, i, axis)
 
 
-def _arrange(a: Compensated, same: Sequence[int], over: Sequence[int], left: bool) -> Compensated:
+def _arrange_factor(a: Compensated, same: Sequence[int], over: Sequence[int], left: bool) -> Compensated:
     """Arrange a factor as (batch, summed, rows, 1) or (batch, summed, 1, columns)."""
     shape = jnp.shape(a.high)
     rest = [i for i in range(len(shape)) if i not in (*same, *over)]

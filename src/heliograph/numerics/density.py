@@ -42,7 +42,7 @@ def log_density(
     variance = jnp.diagonal(left)
     reach = OFF_SUPPORT * jnp.sqrt(variance) + OFF_VALUE * jnp.where(present, size, 0.0)
 
-    def condition(j: Any, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+    def condition_on_component(j: Any, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         """Add log N of component j given those before it, and condition the components behind it on it."""
         rest, left, total, growth = carry
         pivot = left[j, j]
@@ -64,10 +64,10 @@ def log_density(
     none = jnp.zeros((), value.dtype)
     carry: tuple[jax.Array, ...] = (rest, left, none, none)
     if len(value) > WRITTEN:
-        carry = jax.lax.fori_loop(0, len(value), condition, carry)
+        carry = jax.lax.fori_loop(0, len(value), condition_on_component, carry)
         return carry[2]
     for j in range(len(value)):
-        carry = condition(j, carry)
+        carry = condition_on_component(j, carry)
     return carry[2]
 
 

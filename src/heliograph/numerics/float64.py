@@ -11,14 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.numerics.check import fail, show_value
-from heliograph.numerics.process.collector import no_collector
+from heliograph.numerics.process.collector import pause_collector
 from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import PyTree
 
 _first: list[int] = []  # the process in which something was computed first; a fork inherits it
 
 
-def check_process() -> None:
+def refuse_forked_process() -> None:
     """Raise ValueError in a fork of a process that has computed something; anywhere else remember the process."""
     here = os.getpid()
     if not _first:
@@ -64,7 +64,7 @@ def _compile_at_call(
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        with no_collector():  # a first call traces
+        with pause_collector():  # a first call traces
             return jitted()(*args, **kwargs)
 
     return call
@@ -123,7 +123,7 @@ def in_float64(function: Callable[P, R]) -> Callable[P, R]:
     def scoped(*args: P.args, **kwargs: P.kwargs) -> R:
         if is_traced((args, kwargs)):
             return function(*args, **kwargs)
-        check_process()
+        refuse_forked_process()
         with jax.enable_x64(True):
             arrays: R = to_numpy(function(*args, **kwargs))
         return arrays
@@ -177,7 +177,7 @@ def compile_in_float64(function: Callable[P, R]) -> Callable[P, R]:
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         if is_traced((args, kwargs)):
             return function(*args, **kwargs)
-        check_process()
+        refuse_forked_process()
         with jax.enable_x64(True):
             arrays: R = to_numpy(jitted(*jax.tree.map(as_array, args), **jax.tree.map(as_array, kwargs)))
         return arrays

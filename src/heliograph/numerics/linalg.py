@@ -200,7 +200,7 @@ def whiten(a: jax.Array, x: jax.Array) -> jax.Array:
     return jnp.where(scales == 0, jnp.nan, _substitute(lower, scales, x[:, None])[:, 0] * scales)
 
 
-def find_lost(values: np.ndarray, axes: int) -> np.ndarray:
+def find_not_finite(values: np.ndarray, axes: int) -> np.ndarray:
     """Return which arrays of the last `axes` axes have a number that is not finite.
 
     The sum of all is one too then, and takes a third of the time: only if it is not finite, by which it may also have

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.numerics.angle import Angles, continue_angles, nearest, wrap_angles
+from heliograph.numerics.angle import Angles, continue_angles, wrap_angles, wrap_near
 from heliograph.numerics.rotation import turn, turn_between
 from heliograph.numerics.types import Array
 
@@ -56,7 +56,7 @@ class Manifold(NamedTuple):
 
     def near(self, x: A, reference: Array) -> A:
         """Return the same state, its angles within half a turn of those of `reference` (..., n)."""
-        return nearest(x, reference, self.angles)
+        return wrap_near(x, reference, self.angles)
 
     def chart(self, function: Callable[[jax.Array], jax.Array], center: jax.Array) -> Callable[[jax.Array], jax.Array]:
         """Return the function of plain differences from `center`, x -> function(center plus (x - center)).

@@ -17,7 +17,7 @@ from heliograph.numerics.float64 import let_compute_in_float64
 from heliograph.numerics.names import refuse_attribute
 
 
-def same(x: Any, y: Any) -> bool:
+def are_same(x: Any, y: Any) -> bool:
     """Return one bool for objects that hold arrays: of the same class, and the same in each part.
 
     Arrays are the same if their shape, kind of number and numbers are; NaN is the same as NaN. A traced array is the
@@ -33,23 +33,23 @@ def same(x: Any, y: Any) -> bool:
         return False
     # Containers and dataclasses, part by part.
     if isinstance(x, Mapping):
-        return x.keys() == y.keys() and all(same(x[key], y[key]) for key in x) and _same_attributes(x, y)
+        return x.keys() == y.keys() and all(are_same(x[key], y[key]) for key in x) and _same_attributes(x, y)
     if isinstance(x, tuple | list):
-        return len(x) == len(y) and all(map(same, x, y))
+        return len(x) == len(y) and all(map(are_same, x, y))
     if isinstance(x, partial):
-        return same((x.func, x.args, x.keywords), (y.func, y.args, y.keywords))
+        return are_same((x.func, x.args, x.keywords), (y.func, y.args, y.keywords))
     if is_dataclass(x):
-        return all(same(getattr(x, f.name, None), getattr(y, f.name, None)) for f in fields(x) if f.compare)
+        return all(are_same(getattr(x, f.name, None), getattr(y, f.name, None)) for f in fields(x) if f.compare)
     # Objects without an equality of their class are compared by their attributes.
     kind: Any = type(x)
     if kind.__eq__ is object.__eq__ and not callable(x) and getattr(x, "__dict__", None):
-        return same(vars(x), vars(y))  # nobody has said when two of these are equal
+        return are_same(vars(x), vars(y))  # nobody has said when two of these are equal
     return bool(x == y) or (isinstance(x, float) and x != x and y != y)
 
 
 def _same_attributes(x: object, y: object) -> bool:
     """Compare the attributes that a subclass of dict has in addition to its entries."""
-    return same(getattr(x, "__dict__", None), getattr(y, "__dict__", None))
+    return are_same(getattr(x, "__dict__", None), getattr(y, "__dict__", None))
 
 
 def _same_array(value: Any, other: Any) -> bool:
@@ -112,10 +112,10 @@ def readable(kind: T) -> T:
 
 def _write_repr(self: object) -> str:
     """Return the object as text: one line, or a line for each part."""
-    whole = line(self, DEPTH)
+    whole = format_on_one_line(self, DEPTH)
     if len(whole) <= WIDTH:
         return whole
-    parts = [f"  {name}={line(value, DEPTH - 1)}" for name, value in islice(_list_parts(self), LINES - 2)]
+    parts = [f"  {name}={format_on_one_line(value, DEPTH - 1)}" for name, value in islice(_list_parts(self), LINES - 2)]
     left = sum(1 for _ in _list_parts(self)) - len(parts)
     more = [f"  … {left} more"] if left else []
     return "\n".join([f"{type(self).__name__}(", *(cut(text) for text in (*parts, *more)), ")"])
@@ -129,28 +129,37 @@ def _html(self: object) -> str:
 def _are_equal(self: object, other: object) -> bool:
     """Return whether both are of the same class and equal in every part; NaN equals NaN."""
     if type(self) is type(other) and not (is_dataclass(self) or isinstance(self, Mapping | tuple)):
-        return same(self.__getstate__(), other.__getstate__())
-    return same(self, other)
+        return are_same(self.__getstate__(), other.__getstate__())
+    return are_same(self, other)
 
 
-def line(value: object, depth: int) -> str:
+def format_on_one_line(value: object, depth: int) -> str:
     """Return any value on one line: arrays by their size, what lies deeper than `depth` by its class name."""
     if isinstance(value, np.ndarray | np.generic | jax.Array):
         return _format_array(value)
     # Containers, item by item.
     if isinstance(value, Mapping) and not _is_ours(value):
         return _join_some(
-            "{", value.items(), len(value), depth, lambda pair: f"{pair[0]!r}: {line(pair[1], depth - 1)}", "}"
+            "{",
+            value.items(),
+            len(value),
+            depth,
+            lambda pair: f"{pair[0]!r}: {format_on_one_line(pair[1], depth - 1)}",
+            "}",
         )
     if isinstance(value, tuple | list) and not _is_ours(value):
         marks = "[]" if isinstance(value, list) else ("(", ",)" if len(value) == 1 else ")")
-        return _join_some(marks[0], value, len(value), depth, lambda entry: line(entry, depth - 1), marks[1])
+        return _join_some(
+            marks[0], value, len(value), depth, lambda entry: format_on_one_line(entry, depth - 1), marks[1]
+        )
     # Objects with fields.
     if _is_ours(value) or is_dataclass(value):
         name, parts = type(value).__name__, list(islice(_list_parts(value), LARGE))
-        return _join_some(f"{name}(", parts, len(parts), depth, lambda p: f"{p[0]}={line(p[1], depth - 1)}", ")")
+        return _join_some(
+            f"{name}(", parts, len(parts), depth, lambda p: f"{p[0]}={format_on_one_line(p[1], depth - 1)}", ")"
+        )
     if isinstance(value, partial):
-        return line(value.func, depth)
+        return format_on_one_line(value.func, depth)
     if callable(value):
         return str(getattr(value, "__name__", type(value).__name__))
     return " ".join(repr(value).split())
@@ -220,6 +229,6 @@ def _list_entries(value: object) -> Iterable[tuple[str, object]]:
 
 def _format_cell(value: object, depth: int) -> str:
     """Return a value as a cell of HTML: a line of text, which opens to a table of the value's parts if it has some."""
-    text = escape(cut(line(value, depth)))
+    text = escape(cut(format_on_one_line(value, depth)))
     opens = _is_ours(value) or (isinstance(value, Mapping) and value)
     return f"<details><summary>{text}</summary>{_format_table(value, depth)}</details>" if opens and depth > 0 else text

@@ -8,7 +8,7 @@ from typing import NoReturn
 
 import lazy_loader
 
-from heliograph.numerics.process.collector import no_collector
+from heliograph.numerics.process.collector import pause_collector
 
 MOST = 3  # names that are offered
 ALIKE = 0.7  # as difflib measures it, so that neess offers nees and foo nothing
@@ -27,7 +27,7 @@ def lazy_names(package: str, file: str) -> tuple[Callable[[str], object], Callab
     def attribute(name: str) -> object:
         """Return a public name, loaded; raise with the names most like it where there is none."""
         if name in names or name.startswith("_"):
-            with no_collector():
+            with pause_collector():
                 return load(name)
         raise AttributeError(f"{package} has no attribute {name!r}{suggest_names(name, _list_public(package, names))}")
 

@@ -49,7 +49,7 @@ def rotation_vector_of(q: Array) -> Any:
     return 2 * v * xp.where(near, series, xp.arctan2(size, w) / size)
 
 
-def multiply(q: Array, p: Array) -> Any:
+def multiply_quaternions(q: Array, p: Array) -> Any:
     """Return the product of quaternions (..., 4): first the turn p, then q."""
     xp = _library(q, p)
     a, b, c, d = (q[..., i] for i in range(4))
@@ -65,12 +65,12 @@ def multiply(q: Array, p: Array) -> Any:
 
 def turn(r: Array, by: Array) -> Any:
     """Return r plus a turn in its own axes, log(exp(r) exp(by)): rotation vectors (..., 3)."""
-    return rotation_vector_of(multiply(quaternion_of(r), quaternion_of(by)))
+    return rotation_vector_of(multiply_quaternions(quaternion_of(r), quaternion_of(by)))
 
 
 def turn_between(r: Array, other: Array) -> Any:
     """Return the turn from `other` to r in the axes of `other`, log(exp(-other) exp(r)): rotation vectors (..., 3)."""
-    return rotation_vector_of(multiply(quaternion_of(-other), quaternion_of(r)))
+    return rotation_vector_of(multiply_quaternions(quaternion_of(-other), quaternion_of(r)))
 
 
 def matrix_of(r: Array) -> Any:

@@ -20,7 +20,12 @@ from heliograph.planning.moments import check_constant_noise, check_design_plant
 from heliograph.planning.network_of_design import add_best_filter
 from heliograph.planning.problem import Certificate, DesignProblem, PowerDesign
 from heliograph.planning.summed_links import ALIKE, HALVINGS, SummedLinks, Vector, solve_closed_form
-from heliograph.planning.transmitters import amplify_transmitter, compute_sent_powers, find_free, transmitter_names
+from heliograph.planning.transmitters import (
+    amplify_transmitter,
+    compute_sent_powers,
+    find_free_transmitters,
+    transmitter_names,
+)
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.moments.second_moments import second_order
 from heliograph.random_affine.noise import AbstractNoise
@@ -126,7 +131,7 @@ class SumTask(NamedTuple):
         return best
 
 
-def design_added(problem: DesignProblem, network: Network) -> PowerDesign:
+def design_sum_of_links(problem: DesignProblem, network: Network) -> PowerDesign:
     """Return the powers of the least steady error within the budget, or the least power that reaches a target error.
 
     Closed forms where all links of one signal are free, else a search with a bound beside it.
@@ -140,13 +145,13 @@ def design_added(problem: DesignProblem, network: Network) -> PowerDesign:
     if error.steps > 1:
         raise fail("design of a sum of links", "the steady error", f"an error over {error.steps} steps")
     plant, process = check_constant_noise(check_design_plant(network.plant))
-    links, unit_channel = links_of(node, np.asarray(measurement_moment(node.sensor, steady_moment(plant))))
+    links, unit_channel = find_links_of_sum(node, np.asarray(measurement_moment(node.sensor, steady_moment(plant))))
     names = tuple(f"{name}.{hop}" for hop in transmitter_names(node.channel))
     task = _make_task(problem, plant, process, links, names)
     chosen, certificate = (
-        _least_error(task, task.limits.total)
+        _find_least_error_amplitudes(task, task.limits.total)
         if problem.target_error is None
-        else _least_power(task, float(scalar("target error", problem.target_error, 0.0)))
+        else _find_least_power_amplitudes(task, float(scalar("target error", problem.target_error, 0.0)))
     )
     # The network with these amplitudes.
     channel: AbstractRandomAffine = unit_channel
@@ -170,7 +175,7 @@ def _make_task(
     problem: DesignProblem, plant: LinearPlant, process: AbstractNoise, links: SummedLinks, names: Sequence[str]
 ) -> SumTask:
     """Return the search: which links are free, the limits of their powers, and the error as a function of J."""
-    free = find_free(names, problem.free)
+    free = find_free_transmitters(names, problem.free)
     limits = make_unlimited(1, int(free.sum()))
     if problem.budget is not None:
         sent = links.present**2 * links.unit
@@ -188,7 +193,7 @@ def _make_task(
     )
 
 
-def _least_error(task: SumTask, total: float) -> tuple[Vector, Certificate]:
+def _find_least_error_amplitudes(task: SumTask, total: float) -> tuple[Vector, Certificate]:
     """Return the amplitudes of the least error with a total power of the free links, and the certificate."""
     solution = task.closed_form(total)
     if solution is not None:
@@ -202,7 +207,7 @@ def _least_error(task: SumTask, total: float) -> tuple[Vector, Certificate]:
     )
 
 
-def _least_power(task: SumTask, target: float) -> tuple[Vector, Certificate]:
+def _find_least_power_amplitudes(task: SumTask, target: float) -> tuple[Vector, Certificate]:
     """Return the amplitudes of the least power that reach a target error, and the certificate.
 
     By bisection of the power of the free links, since the least error falls with it.
@@ -251,19 +256,19 @@ def _reach_target(task: SumTask, target: float) -> tuple[Vector, Certificate]:
     total = task.largest_total
     if unlimited:  # any power to begin with: that sent at present, or the receiver's noise
         total = max(float((task.links.present**2 * task.links.unit).sum()), task.links.floor)
-    chosen, certificate = _least_error(task, total)
+    chosen, certificate = _find_least_error_amplitudes(task, total)
     for _ in range(DOUBLINGS if unlimited else 0):
         if certificate.value <= target:
             break
         total = 2 * total
-        chosen, certificate = _least_error(task, total)
+        chosen, certificate = _find_least_error_amplitudes(task, total)
     if certificate.value > target * (1 + ALIKE):
         within = "whatever the power" if unlimited else "within the budget"
         raise fail("target error", f"at least {certificate.value:.6g}, the least found {within}", f"{target:.6g}")
     return chosen, certificate
 
 
-def links_of(node: Node, second: Float[np.ndarray, "m1 m1"]) -> tuple[SummedLinks, Superposed]:
+def find_links_of_sum(node: Node, second: Float[np.ndarray, "m1 m1"]) -> tuple[SummedLinks, Superposed]:
     """Return the links of a node's sum, and the sum with all amplitudes 1.
 
     `second`: E (y, 1)(y, 1)' of the sensor's outputs.

@@ -82,7 +82,7 @@ def design_bits(network: Network, total: int) -> BitsDesign:
         if count and node.encoder is not None
     }
     found = {name: int(count) for name, count in zip(names, bits, strict=True)}
-    return BitsDesign(found, error, min(_relax(senders, budget), error), encoders)
+    return BitsDesign(found, error, min(_bound_by_relaxation(senders, budget), error), encoders)
 
 
 def _describe_senders(network: Network) -> _Senders:
@@ -103,7 +103,7 @@ def _describe_senders(network: Network) -> _Senders:
         r = np.asarray(node.sensor.noise.covariance)
         rows.append(np.asarray(node.sensor.matrix)[0])
         # j(B) = 1 / (R + D^2/12 + U (1/g^2 - 1)), U = D^2 (4^B - 1)/12, and 0 of no bits.
-        g, span = _gain_of(name, node), float(np.max(node.encoder.high) - np.min(node.encoder.low))
+        g, span = _find_bit_gain(name, node), float(np.max(node.encoder.high) - np.min(node.encoder.low))
         counts = np.arange(1, MOST + 1)
         step = span / (2.0**counts - 1)
         noise = r[0, 0] + step**2 / 12 * (1 + (4.0**counts - 1) * (1 / g**2 - 1))
@@ -111,7 +111,7 @@ def _describe_senders(network: Network) -> _Senders:
     return _Senders(a, q, np.array(rows), np.array(information))
 
 
-def _gain_of(name: str, node: Node) -> float:
+def _find_bit_gain(name: str, node: Node) -> float:
     """Return the gain g = 1 - 2p of a node's link for one bit; ValueError unless its error rate is constant."""
     link = node.channel
     if isinstance(link, Flips) and isinstance(link.error, Constant):
@@ -179,7 +179,7 @@ def _add_greedily(senders: _Senders, total: int) -> Float[np.ndarray, " senders"
     return bits
 
 
-def _relax(senders: _Senders, total: int) -> float:
+def _bound_by_relaxation(senders: _Senders, total: int) -> float:
     """Bound the error of any bits from below: that of the best real numbers of bits, with concave information.
 
     By Frank and Wolfe's steps j + 2 / (k + 2) (best - j); the error is convex in j, so that the tangent at each j is
@@ -189,7 +189,7 @@ def _relax(senders: _Senders, total: int) -> float:
     j, bound = np.zeros(len(hulls)), -np.inf
     for k in range(STEPS):
         slopes, error = _find_slopes(senders, j), _find_error(senders, j)
-        best = _spend(hulls, -slopes, total)
+        best = _spend_bits(hulls, -slopes, total)
         gap = float(slopes @ (j - best))
         bound = max(bound, error - gap)
         j = j + 2 / (k + 2) * (best - j)
@@ -210,7 +210,7 @@ def _find_envelope(values: Float[np.ndarray, " bits"]) -> list[tuple[int, float]
     return corners
 
 
-def _spend(hulls: list[list[tuple[int, float]]], worth: np.ndarray, total: int) -> Float[np.ndarray, " senders"]:
+def _spend_bits(hulls: list[list[tuple[int, float]]], worth: np.ndarray, total: int) -> Float[np.ndarray, " senders"]:
     """Return the j_i of real bits, `total` in sum, that maximise sum_i worth_i j_i: the steepest edges first.
 
     hulls: corners (bits, j) of each sender's concave envelope, between which j is linear.

@@ -17,7 +17,7 @@ from heliograph.planning.transmitters import transmitter_names, visit_hops
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.hop import AbstractHop, GainAndNoise
 from heliograph.random_affine.laws.law import GivenMoments
-from heliograph.random_affine.moments.route import Signal
+from heliograph.random_affine.moments.route import SignalMoment
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
@@ -215,7 +215,7 @@ def _insert_relay(channel: AbstractRandomAffine, name: str, exponent: float) -> 
     noise of the whole hop.
     """
 
-    def change(hop_name: str, hop: AbstractHop, signal: Signal | None) -> AbstractRandomAffine:
+    def insert_into_hop(hop_name: str, hop: AbstractHop, signal: SignalMoment | None) -> AbstractRandomAffine:
         """Return the two halves of this hop, any other hop as it is."""
         if hop_name != name or not isinstance(hop, GainAndNoise):
             return hop
@@ -224,4 +224,4 @@ def _insert_relay(channel: AbstractRandomAffine, name: str, exponent: float) -> 
         onward = GainAndNoise(law, np.eye(hop.outputs), hop.noise)
         return amplify_and_forward([GainAndNoise(law, hop.matrix, hop.noise), onward])
 
-    return visit_hops(channel, change)
+    return visit_hops(channel, insert_into_hop)

@@ -49,7 +49,7 @@ class MessageRate(NamedTuple):
     error_error: np.ndarray
 
 
-class _Scalar(NamedTuple):
+class _ScalarSystem(NamedTuple):
     """x+ = a x + N(0, q), y = c x + N(0, r)."""
 
     a: float
@@ -199,7 +199,7 @@ def send_on_delta_rate(plant: AnyPlant, sensor: AnySensor, delta: float) -> floa
     return rate
 
 
-def _send_on_delta_rate(system: _Scalar, delta: float) -> float:
+def _send_on_delta_rate(system: _ScalarSystem, delta: float) -> float:
     """Return the rate of messages, however small, extrapolated from two grids."""
     a, r, delta = system.a, system.r / system.c**2, delta / abs(system.c)  # in units of the state
     if not abs(a) < 1:
@@ -212,7 +212,7 @@ def _send_on_delta_rate(system: _Scalar, delta: float) -> float:
     return fine if fine == coarse else float(fine + (fine - coarse) * half**2 / (h**2 - half**2))
 
 
-def _choose_cells(system: _Scalar, delta: float, share: float) -> tuple[int, int, float]:
+def _choose_cells(system: _ScalarSystem, delta: float, share: float) -> tuple[int, int, float]:
     """Return how many cells lie on either side of 0, how many delta spans, and their length.
 
     Raises:
@@ -233,7 +233,7 @@ def _choose_cells(system: _Scalar, delta: float, share: float) -> tuple[int, int
     return n, cells, h
 
 
-def _compute_rate_on_grid(system: _Scalar, delta: float, share: float) -> tuple[float, float]:
+def _compute_rate_on_grid(system: _ScalarSystem, delta: float, share: float) -> tuple[float, float]:
     """Return the share of steps with a message of send-on-delta, by a grid of cells, and the cells' length.
 
     x+ = a x + w (variance q) is measured as z = x + v (variance r) and sent where |z - last sent| > delta:
@@ -251,7 +251,7 @@ def _compute_rate_on_grid(system: _Scalar, delta: float, share: float) -> tuple[
     size = 2 * n + 1
     beyond = max(size - cells - 1, 0)  # values sent last on one side of a measured cell, more than delta away at most
 
-    def send(f: np.ndarray) -> np.ndarray:
+    def send_part(f: np.ndarray) -> np.ndarray:
         """Return the part of the law that sends a message, after it: last sent is what is measured now."""
         # Of each measured cell the mass of values sent last that lie more than delta from it: above, then below.
         sums = np.cumsum(f, axis=1)
@@ -263,7 +263,7 @@ def _compute_rate_on_grid(system: _Scalar, delta: float, share: float) -> tuple[
     def step(vector: np.ndarray) -> np.ndarray:
         """Return the law after a step: x moves, then is sent or not."""
         f = move @ vector.reshape(size, size)
-        return np.asarray(f * quiet + send(f)).ravel()
+        return np.asarray(f * quiet + send_part(f)).ravel()
 
     # The stationary law is the eigenvector of a step for its largest eigenvalue, 1: power iterations (Arnoldi) from the
     # law of the state and a value that was just sent.
@@ -274,7 +274,7 @@ def _compute_rate_on_grid(system: _Scalar, delta: float, share: float) -> tuple[
     except ArpackError as why:
         raise fail("delta", "one whose rate of messages converges within seconds", f"{delta:g}") from why
     f = np.real(vectors[:, 0] / vectors.sum()).reshape(size, size)
-    return float(send(move @ f).sum()), h
+    return float(send_part(move @ f).sum()), h
 
 
 def _cell_probabilities(x: np.ndarray, means: np.ndarray, deviation: float) -> np.ndarray:
@@ -301,7 +301,9 @@ def delta_for_rate(plant: AnyPlant, sensor: AnySensor, rate: float) -> float:
     return _find_threshold(rate, lambda delta: _send_on_delta_rate(system, delta), system, GRID_ACCURACY)
 
 
-def _find_threshold(rate: float, rate_at: Callable[[float], float], system: _Scalar, accuracy: float = 1e-10) -> float:
+def _find_threshold(
+    rate: float, rate_at: Callable[[float], float], system: _ScalarSystem, accuracy: float = 1e-10
+) -> float:
     """Return the threshold delta at which `rate_at(delta)`, which falls with delta, has this rate."""
     if not 0 < scalar("rate", rate) < 1:
         raise fail("rate", "a number between 0 and 1", rate)
@@ -314,7 +316,7 @@ def _find_threshold(rate: float, rate_at: Callable[[float], float], system: _Sca
     return float(brentq(lambda delta: rate_at(delta) - rate, low, high, rtol=accuracy, xtol=accuracy * unit))
 
 
-def _check_scalar(plant: AnyPlant, sensor: AnySensor) -> _Scalar:
+def _check_scalar(plant: AnyPlant, sensor: AnySensor) -> _ScalarSystem:
     """Return the four numbers of a linear plant and sensor; ValueError unless they have one state and one output."""
     expected = "a LinearPlant and LinearSensor of one state and output"
     if not isinstance(plant, LinearPlant) or not isinstance(sensor, LinearSensor):
@@ -323,7 +325,7 @@ def _check_scalar(plant: AnyPlant, sensor: AnySensor) -> _Scalar:
         raise fail("rate before any data", expected, "several states")
     if len(sensor.outputs) != 1:
         raise fail("rate before any data", "one output", f"{len(sensor.outputs)}")
-    return _Scalar(
+    return _ScalarSystem(
         a=float(np.asarray(plant.matrix)[0, 0]),
         q=float(np.asarray(plant.noise_covariance(jnp.zeros(0)))[0, 0]),
         c=float(np.asarray(sensor.matrix)[0, 0]),

@@ -6,7 +6,7 @@ from heliograph.filters.linear.scheduled import ScheduledFilter
 from heliograph.model.relays import RECEIVER, SENSOR, RelayNetwork
 from heliograph.numerics.check import check_count, check_seed, fail, instance, scalar, show_value
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.planning.added import adds_up, design_added
+from heliograph.planning.added import adds_up, design_sum_of_links
 from heliograph.planning.budget import check_budget, make_power_limits, make_unlimited
 from heliograph.planning.error import Error
 from heliograph.planning.moments import measurement_moment, steady_moment
@@ -16,7 +16,7 @@ from heliograph.planning.paths.design import design_paths, make_power_task
 from heliograph.planning.paths.model import Paths
 from heliograph.planning.paths.networks import paths_of
 from heliograph.planning.problem import BudgetLike, Certificate, Designable, DesignProblem, Free, PowerDesign
-from heliograph.planning.transmitters import find_free
+from heliograph.planning.transmitters import find_free_transmitters
 from heliograph.relays.design import given_design, receiver_behind_relays, relay_schedules
 from heliograph.relays.periodic import (
     periodic_behind_relays,
@@ -99,7 +99,7 @@ def _design_powers(problem: DesignProblem) -> PowerDesign:
     if problem.budget is None and problem.target_error is None:
         raise fail("design", "a budget of power or a target error", "neither")
     if isinstance(problem.network, Network) and adds_up(problem.network):
-        return design_added(problem, problem.network)
+        return design_sum_of_links(problem, problem.network)
     starts, seed = check_count("starts", problem.starts), check_seed("seed", problem.seed)
     target = None if problem.target_error is None else float(scalar("target error", problem.target_error, 0.0))
     error, network = problem.criterion, problem.network
@@ -116,7 +116,7 @@ def _design_powers(problem: DesignProblem) -> PowerDesign:
         if problem.free is not None:
             raise fail("free powers of paths", "all of them", show_value(problem.free))
     # What is free, and its limits.
-    chosen = find_free(paths.names, problem.free)
+    chosen = find_free_transmitters(paths.names, problem.free)
     if problem.budget is None:
         limits = make_unlimited(error.steps, int(chosen.sum()))
     else:
@@ -173,11 +173,11 @@ def design_relays(problem: DesignProblem, relays: RelayNetwork) -> PowerDesign:
         sensitivity={name: float("nan") for name in powers},
         price=float("nan"),
         numbers=dict(gains),
-        realised=_run_relays(relays, gains),
+        realised=_make_relay_network(relays, gains),
     )
 
 
-def _run_relays(relays: RelayNetwork, gains: Gains) -> Network:
+def _make_relay_network(relays: RelayNetwork, gains: Gains) -> Network:
     """Return a network of the relays with these gains and the best receiver behind them, for COVERED steps or more."""
     slots, n = len(relays.slots), len(relays.states)
     times = -(-COVERED // slots)

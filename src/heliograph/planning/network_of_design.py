@@ -12,12 +12,12 @@ from heliograph.model.enlarged.joint import join_links
 from heliograph.model.over_time import OverTime, at, first, over_time
 from heliograph.model.plant import AnyPlant
 from heliograph.numerics.check import array, fail, instance, table
-from heliograph.numerics.module import same
+from heliograph.numerics.module import are_same
 from heliograph.numerics.types import Float
 from heliograph.planning.error import Error
 from heliograph.planning.moments import measurement_moment, moments_over, steady_moment
 from heliograph.planning.paths.model import require_at_least
-from heliograph.planning.transmitters import allocate, transmitter_names
+from heliograph.planning.transmitters import set_transmitter_powers, transmitter_names
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
@@ -56,7 +56,7 @@ def designed_network(network: Network, powers: Mapping[str, Float[np.ndarray, "s
     for k, second in enumerate(seconds):
         for name, node in nodes.items():
             moment = measurement_moment(node.sensor, second, k)
-            by_step[name].append(allocate(at(node.channel, k), moment, _select_node(name, powers, k), k))
+            by_step[name].append(set_transmitter_powers(at(node.channel, k), moment, _select_node(name, powers, k), k))
     channels = {name: _make_over_time(steps) for name, steps in by_step.items()}
     designed = {name: add_best_filter(plant, node, channels[name]) for name, node in nodes.items()}
     fused = {}
@@ -101,7 +101,7 @@ def add_best_filter(plant: AnyPlant, node: Node, channel: Channel) -> Node:
     holds.
     """
     filters = {BEST: linear_filter(plant, node.sensor, channel)}
-    if node.limits is None or same(channel, node.channel):
+    if node.limits is None or are_same(channel, node.channel):
         return Node(node.sensor, channel, filters, node.limits, timeout=node.timeout)
     return Node(node.sensor, channel, filters, invalid=node.limits.invalid, timeout=node.timeout)
 

@@ -227,7 +227,7 @@ def _average_draws(
         """Draw one trajectory of the plant; return (y, 1)(y, 1)' of each sensor at its steps."""
         begin, rest = jax.random.split(key)
 
-        def step(x: jax.Array, row: tuple[Array, Array]) -> tuple[jax.Array, dict[str, jax.Array]]:
+        def draw_step(x: jax.Array, row: tuple[Array, Array]) -> tuple[jax.Array, dict[str, jax.Array]]:
             k, u = row
             moves, *draws = jax.random.split(jax.random.fold_in(rest, k), 1 + len(sensors))
             # The state moves, then every sensor measures it.
@@ -241,7 +241,9 @@ def _average_draws(
             return x, moments
 
         start = at(plant, 0).sample_initial(begin)
-        over_time: dict[str, jax.Array] = jax.lax.scan(step, start, (jnp.arange(len(inputs)), jnp.asarray(inputs)))[1]
+        over_time: dict[str, jax.Array] = jax.lax.scan(
+            draw_step, start, (jnp.arange(len(inputs)), jnp.asarray(inputs))
+        )[1]
         return over_time
 
     runs: dict[str, jax.Array] = jax.vmap(jax.vmap(simulate))(keys)

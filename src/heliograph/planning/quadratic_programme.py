@@ -35,7 +35,7 @@ class Evaluation(NamedTuple):
     power_slope: Float[np.ndarray, "entries x"]
 
 
-class Limits(NamedTuple):
+class PowerAndErrorLimits(NamedTuple):
     """Limits rows @ powers <= most, with most 1 or 0, and error <= target if given; `steps` make the mean power."""
 
     rows: Float[np.ndarray, "limits entries"]
@@ -44,7 +44,7 @@ class Limits(NamedTuple):
     steps: int
 
 
-class Problem(NamedTuple):
+class DescentProblem(NamedTuple):
     """A design problem as a descent needs it.
 
     low, high, unit: least and largest values of x, and its scale. sharpnesses: smoothings of the error, one after
@@ -70,7 +70,7 @@ class Programme:
         start: a point x, whose value sets the size.
     """
 
-    def __init__(self, problem: Problem, limits: Limits, sharpness: int | None, start: Vector):
+    def __init__(self, problem: DescentProblem, limits: PowerAndErrorLimits, sharpness: int | None, start: Vector):
         self.problem, self.limits, self.sharpness = problem, limits, sharpness
         self.bounds = Bounds(problem.low / problem.unit, problem.high / problem.unit)
         self._last: tuple[bytes, Evaluation | None] = (b"", None)
@@ -210,7 +210,7 @@ class Programme:
         return step, solution[len(index) :], active
 
 
-def search(problem: Problem, limits: Limits, starts: Sequence[Vector]) -> Vector | None:
+def search_from_starts(problem: DescentProblem, limits: PowerAndErrorLimits, starts: Sequence[Vector]) -> Vector | None:
     """Return the best end x of descents from these points, refined and polished; None where none meets the limits."""
     points, sharpest = [start / problem.unit for start in starts], problem.sharpnesses[-1]
     # Coarse descents from everywhere, the largest eigenvalue sharper and sharper.

@@ -79,7 +79,7 @@ class SensorWorth:
         return "by the covariance" if self.exact else f"root mean square of {runs} runs"
 
 
-class _Case(NamedTuple):
+class _SensorCase(NamedTuple):
     """A case: its name, and which rows of each node are used, False where a node's value is left out (steps, nodes)."""
 
     name: str
@@ -119,7 +119,7 @@ def worth_of_sensors(
             with triggers or words, relays that filter.
     """
     instance("network", network, Network, "a Network")
-    nodes, added = _plain_nodes(network), table("additions", additions or {}, "nodes")
+    nodes, added = _check_plain_nodes(network), table("additions", additions or {}, "nodes")
     if taken := [name for name in added if name in nodes]:
         raise fail("additions", "nodes of other names than the network's", taken[0])
     check_count("steps", steps)
@@ -127,7 +127,7 @@ def worth_of_sensors(
     # One filter of all that is received, and one set of draws.
     every = {**nodes, **{name: instance(f"addition {name!r}", node, Node, "a Node") for name, node in added.items()}}
     bare = {name: Node(node.sensor, node.channel, {}) for name, node in every.items()}
-    best_filter = _filter_of_all(network, bare)
+    best_filter = _make_filter_of_all(network, bare)
     drawn = monte_carlo(Network(network.plant, bare), steps, check_count("runs", runs), key, inputs=inputs)
     u = np.zeros((steps, 0)) if inputs is None else np.asarray(inputs, float)
     exact, sizes = best_filter.claim == "exact", [bare[name].received for name in bare]
@@ -147,7 +147,7 @@ def worth_of_sensors(
     return SensorWorth(network.states, complete=errors[0], cases=tuple(errors[1:]), exact=exact, added=tuple(added))
 
 
-def _plain_nodes(network: Network) -> dict[str, Node]:
+def _check_plain_nodes(network: Network) -> dict[str, Node]:
     """Return the nodes; ValueError where more than a sensor and a link makes what they receive.
 
     Refused are relays that filter, nodes that share a channel, triggers and encoders.
@@ -162,7 +162,7 @@ def _plain_nodes(network: Network) -> dict[str, Node]:
 
 def _list_cases(
     names: list[str], added: list[str], steps: int, without: Sequence[str] | None, outages: Mapping[str, int]
-) -> Iterator[_Case]:
+) -> Iterator[_SensorCase]:
     """Yield the cases: all nodes first, then each left out, each outage, each addition."""
     each = names if len(names) > 1 else []
     left = each if without is None else items("nodes left out", without, "names")
@@ -171,24 +171,24 @@ def _list_cases(
             raise fail("sensor", f"one of the nodes {', '.join(names)}", repr(name))
     # Rows (steps, nodes) that are used: those of the network's nodes, not those of additions.
     base = np.tile(np.isin([*names, *added], names), (steps, 1))
-    yield _Case("all", base)
+    yield _SensorCase("all", base)
     for name in left:
         used = base.copy()
         used[:, names.index(name)] = False
-        yield _Case(f"without {name}", used)
+        yield _SensorCase(f"without {name}", used)
     for name, count in outages.items():
         if check_count(f"outage of {name!r}", count) > steps:
             raise fail(f"outage of {name!r}", f"at most the {steps} steps of the run", count)
         used = base.copy()
         used[steps - count :, names.index(name)] = False
-        yield _Case(f"{name} out for {count} steps", used)
+        yield _SensorCase(f"{name} out for {count} steps", used)
     for i, name in enumerate(added):
         used = base.copy()
         used[:, len(names) + i] = True
-        yield _Case(f"with {name}", used)
+        yield _SensorCase(f"with {name}", used)
 
 
-def _filter_of_all(network: Network, nodes: Mapping[str, Node]) -> AbstractFilter:
+def _make_filter_of_all(network: Network, nodes: Mapping[str, Node]) -> AbstractFilter:
     """Return the likelihood filter of all that the nodes receive: linear where plant, sensors and angles allow it."""
     # Of channels without memory the channel given arrival, since the filter skips what is lost (NaN). With memory, as
     # of bursts, a loss tells of the next one: the channel stays.

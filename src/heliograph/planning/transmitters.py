@@ -20,12 +20,12 @@ from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.chain import stationary
 from heliograph.random_affine.hop import AbstractHop, GainAndNoise
 from heliograph.random_affine.modes import joint_modes
-from heliograph.random_affine.moments.route import Position, Second, Signal, Visit
+from heliograph.random_affine.moments.route import ChannelPosition, Second, SignalMoment, Visit
 
 UNCHANGED = 1e-12  # change of a law in a step that counts as none
 
 
-def visit_hops(channel: AbstractRandomAffine, visit: Visit, signal: Signal | None = None) -> AbstractRandomAffine:
+def visit_hops(channel: AbstractRandomAffine, visit: Visit, signal: SignalMoment | None = None) -> AbstractRandomAffine:
     """Return the channel with every hop replaced by visit(name, hop, signal).
 
     The signal, E (y, 1)(y, 1)' of what the hop receives, is followed through maps without memory.
@@ -33,14 +33,14 @@ def visit_hops(channel: AbstractRandomAffine, visit: Visit, signal: Signal | Non
     Raises:
         ValueError: a map of a kind whose transmitters are not known.
     """
-    return channel.visit_hops(visit, Position("", 0, signal))[0]
+    return channel.visit_hops(visit, ChannelPosition("", 0, signal))[0]
 
 
 def transmitter_names(channel: AbstractRandomAffine) -> list[str]:
     """Return the names of the transmitters, in order of appearance."""
     names: dict[str, None] = {}
 
-    def note(name: str, hop: AbstractHop, signal: Signal | None) -> AbstractHop:
+    def note(name: str, hop: AbstractHop, signal: SignalMoment | None) -> AbstractHop:
         names.setdefault(name)
         return hop
 
@@ -98,14 +98,16 @@ def powers_of_law(channel: AbstractRandomAffine, second: Second, law: Float[Arra
         # Powers in a mode; a transmitter that is not received there sends as in other modes.
         powers: dict[str, Scalar] = {}
 
-        def note(name: str, hop: AbstractHop, signal: Signal | None, powers: dict[str, Scalar] = powers) -> AbstractHop:
+        def note(
+            name: str, hop: AbstractHop, signal: SignalMoment | None, powers: dict[str, Scalar] = powers
+        ) -> AbstractHop:
             """Note the power tr A E[y y'] A' that a hop sends, if it receives something; the hop stays."""
             assert signal is not None and isinstance(hop, GainAndNoise)
             if not hop.is_silent:
                 powers[name] = signal.arrives * (hop.matrix @ signal.second[:-1, :-1] * hop.matrix).sum()
             return hop
 
-        visit_hops(mode_map, note, Signal(second, 1.0))
+        visit_hops(mode_map, note, SignalMoment(second, 1.0))
         for name, power in powers.items():
             total[name] += weight * power
             occurs[name] += weight
@@ -120,7 +122,7 @@ def _divide_by_probability(total: Scalar, probability: Scalar) -> Scalar:
     return 0.0 if is_zero(probability) else plain(total / probability)
 
 
-def allocate(
+def set_transmitter_powers(
     channel: AbstractRandomAffine, second: Second, powers: Mapping[str, float], step: int = 0
 ) -> AbstractRandomAffine:
     """Return the channel whose named transmitters send these powers: each amplifies what it receives to its power.
@@ -143,7 +145,7 @@ def allocate(
 def amplify_transmitter(channel: AbstractRandomAffine, name: str, factor: float | None) -> AbstractRandomAffine:
     """Return the channel in which a transmitter amplifies by this factor more; None: it sends just what it receives."""
 
-    def change(hop_name: str, hop: AbstractHop, signal: Signal | None) -> AbstractHop:
+    def change(hop_name: str, hop: AbstractHop, signal: SignalMoment | None) -> AbstractHop:
         if hop_name != name:
             return hop
         matrix = np.eye(*np.shape(hop.matrix)) if factor is None else np.asarray(hop.matrix) * factor
@@ -153,7 +155,9 @@ def amplify_transmitter(channel: AbstractRandomAffine, name: str, factor: float 
     return visit_hops(channel, change)
 
 
-def find_free(names: Sequence[str], free: Sequence[str] | Mapping[str, object] | None) -> Bool[np.ndarray, "hop"]:
+def find_free_transmitters(
+    names: Sequence[str], free: Sequence[str] | Mapping[str, object] | None
+) -> Bool[np.ndarray, "hop"]:
     """Return which transmitters are free, all unless some are named.
 
     Raises:

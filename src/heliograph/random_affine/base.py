@@ -9,7 +9,7 @@ import numpy as np
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import fail, items, show_value
-from heliograph.numerics.module import Module, readable, same, unwritten
+from heliograph.numerics.module import Module, are_same, readable, unwritten
 from heliograph.numerics.traced import is_traced, stack_parts
 from heliograph.numerics.types import Bool, Float, PyTree
 from heliograph.random_affine.memory import (
@@ -18,11 +18,17 @@ from heliograph.random_affine.memory import (
     init_with_shared_memories,
     memories,
 )
-from heliograph.random_affine.moments.components import Component
+from heliograph.random_affine.moments.components import AffineComponent
 from heliograph.random_affine.moments.disturbed_gain import DisturbedGain
 from heliograph.random_affine.moments.intervals import CORNERS, Interval
-from heliograph.random_affine.moments.monomials import Moments, give_sizes
-from heliograph.random_affine.moments.route import Position, Signal, Visit, carry_by_moments, refuse_gain_on_angles
+from heliograph.random_affine.moments.monomials import JointMoments, give_moments
+from heliograph.random_affine.moments.route import (
+    ChannelPosition,
+    SignalMoment,
+    Visit,
+    carry_by_moments,
+    refuse_gain_on_angles,
+)
 from heliograph.random_affine.noise import AbstractNoise
 
 T = TypeVar("T")
@@ -52,7 +58,7 @@ class AbstractRandomAffine(Module):
         """Let a map's `moments` return the matrix alone."""
         super().__init_subclass__(**options)
         if (written := cls.__dict__.get("moments")) is not None:
-            type.__setattr__(cls, "moments", give_sizes(written))
+            type.__setattr__(cls, "moments", give_moments(written))
 
     @property
     def outputs(self) -> int:
@@ -121,7 +127,7 @@ class AbstractRandomAffine(Module):
             )
         return self.draw((), key)[1]
 
-    def moments(self, order: int) -> Moments:
+    def moments(self, order: int) -> JointMoments:
         """Return the nominal E[Sym^order(H)] of a map that forgets; a map of your own may return the matrix alone.
 
         Raises:
@@ -192,7 +198,7 @@ class AbstractRandomAffine(Module):
             raise refuse_gain_on_angles(type(self).__name__)
         return ()
 
-    def carry_signal(self, signal: Signal) -> Signal:
+    def carry_signal(self, signal: SignalMoment) -> SignalMoment:
         """Return E (z, 1)(z, 1)' of what arrives behind the map, and the probability that it does.
 
         Raises:
@@ -218,18 +224,18 @@ class AbstractRandomAffine(Module):
             raise fail("channel", "erasures of channels, not mixtures of them", type(self).__name__)
         return self
 
-    def list_outcomes(self) -> list["Outcome"]:
+    def list_outcomes(self) -> list["ArrivalOutcome"]:
         """Return every set of losses of a map without memory; those of probability 0 are left out."""
         check_forgets("channel with erasures", self)
         if not self.erases:
-            return [Outcome(1.0, self, np.ones(self.outputs, dtype=bool))]
+            return [ArrivalOutcome(1.0, self, np.ones(self.outputs, dtype=bool))]
         return [o for o in self._outcomes() if is_traced(o.probability) or o.probability > 0]
 
-    def _outcomes(self) -> list["Outcome"]:
+    def _outcomes(self) -> list["ArrivalOutcome"]:
         """Return the sets of losses of a map that erases; by default a refusal."""
         raise fail("channel with erasures", "erasures in series and stacks", type(self).__name__)
 
-    def list_atoms(self) -> list[Component]:
+    def list_atoms(self) -> list[AffineComponent]:
         """Return all combinations of gains and noises, where these are finitely many; by default a refusal."""
         raise fail("mixture filter", "maps made of hops, series, stacks, sums and mixtures", type(self).__name__)
 
@@ -271,7 +277,7 @@ class AbstractRandomAffine(Module):
             own: the other map.
             same_noise: tests whether two noises agree.
         """
-        if same(self, own):
+        if are_same(self, own):
             return True
         believed, parts = self.in_series, own.in_series
         if len(believed) == 1 == len(parts):
@@ -281,14 +287,14 @@ class AbstractRandomAffine(Module):
 
     def covers_kind(self, own: "AbstractRandomAffine", same_noise: SameNoise) -> bool:
         """Decide the same as `covers` of a map that is no series; by default only an equal map is covered."""
-        return same(self, own)
+        return are_same(self, own)
 
     @property
     def is_silent(self) -> bool:
         """True if the map is known to deliver noise alone, as a loss or a mode without reception does."""
         return False
 
-    def visit_hops(self, visit: Visit, position: Position) -> tuple["AbstractRandomAffine", Position]:
+    def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple["AbstractRandomAffine", ChannelPosition]:
         """Return the map with each hop replaced by visit(name, hop, signal), and the position behind it.
 
         Args:
@@ -339,7 +345,7 @@ def count_corners(channel: AbstractRandomAffine) -> int | None:
         return None
 
 
-class Outcome(NamedTuple):
+class ArrivalOutcome(NamedTuple):
     """Set of losses that the receiver can observe: with `probability` the outputs in `arrived` come through `map`."""
 
     probability: float | jax.Array

@@ -34,7 +34,7 @@ Rows = Float[jax.Array | np.ndarray, "modes modes"]
 Law = Float[jax.Array | np.ndarray, " modes"]
 
 
-class Nodes(NamedTuple):
+class MemoryStates(NamedTuple):
     """Finitely many states of a memory: their law at the first use, and row by row that of the next given the present.
 
     The rows sum to 1. Their entries are probabilities for a chain; for a drifting fading they reproduce all
@@ -77,7 +77,7 @@ class AbstractMemory(Module):
         """Draw the next state."""
         raise unwritten(self, "move")
 
-    def nodes(self, degree: int) -> Nodes:
+    def nodes(self, degree: int) -> MemoryStates:
         """Return the memory as finitely many states, exact for a mean that is a polynomial of `degree` in the state."""
         raise unwritten(self, "nodes")
 
@@ -179,9 +179,9 @@ class MarkovChain(AbstractMemory):
         """Draw the next mode."""
         return draw_index(jnp.asarray(self.transition)[state], key)
 
-    def nodes(self, degree: int) -> Nodes:
+    def nodes(self, degree: int) -> MemoryStates:
         """Return the modes, with the chain's initial law and transition: exact whatever the degree."""
-        return Nodes(np.arange(self.modes), self.initial, self.transition, self.radius)
+        return MemoryStates(np.arange(self.modes), self.initial, self.transition, self.radius)
 
     def state_from_number(self, number: jax.Array) -> jax.Array:
         """Return the nearest mode from below."""
@@ -245,7 +245,7 @@ class Autoregression(AbstractMemory):
         rho = jnp.asarray(self.correlation)
         return rho * state + jnp.sqrt(1 - rho**2) * jax.random.normal(key, dtype=float)
 
-    def nodes(self, degree: int) -> Nodes:
+    def nodes(self, degree: int) -> MemoryStates:
         """Return Gauss-Hermite nodes: the Lagrange polynomials on them take the place of the indicators of modes.
 
         With N = degree + 1 nodes x and weights w, E[L_j(c+) | c = x_i] = sum_{m < N} rho^m h_m(x_i) h_m(x_j) w_j, h_m
@@ -254,7 +254,7 @@ class Autoregression(AbstractMemory):
         """
         x, w, hermite = _hermite_quadrature(check_count("degree", degree, 0) + 1)
         powers = library(self.correlation).asarray(self.correlation) ** np.arange(len(x))
-        return Nodes(x, w, (hermite * powers) @ hermite.T * w)
+        return MemoryStates(x, w, (hermite * powers) @ hermite.T * w)
 
     def state_from_number(self, number: jax.Array) -> jax.Array:
         """Return the number itself: the state is a real number."""
@@ -266,7 +266,7 @@ class Autoregression(AbstractMemory):
         rho = jnp.asarray(self.correlation)
         return (jnp.asarray(x) if state is None else rho * state + jnp.sqrt(1 - rho**2) * x), w
 
-    def chain(self, modes: int) -> Nodes:
+    def chain(self, modes: int) -> MemoryStates:
         """Return a chain with the same mean, variance and correlation, without negative entries.
 
         Its states are binomial nodes, and E[c+ | c] = rho c.
@@ -277,7 +277,9 @@ class Autoregression(AbstractMemory):
         xp = library(self.correlation)
         stays = (1 + xp.asarray(self.correlation)) / 2
         rows = [xp.convolve(_compute_binomial(i, stays), _compute_binomial(n - i, 1 - stays)) for i in range(n + 1)]
-        return Nodes(np.sqrt(n) * np.linspace(-1, 1, n + 1), _compute_binomial(n, np.asarray(0.5)), xp.stack(rows))
+        return MemoryStates(
+            np.sqrt(n) * np.linspace(-1, 1, n + 1), _compute_binomial(n, np.asarray(0.5)), xp.stack(rows)
+        )
 
 
 def stationary(transition: Rows) -> Law:

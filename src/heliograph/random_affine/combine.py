@@ -16,26 +16,26 @@ from heliograph.numerics.traced import stack_parts
 from heliograph.numerics.types import Float, PyTree
 from heliograph.random_affine.base import (
     AbstractRandomAffine,
+    ArrivalOutcome,
     KnownGains,
-    Outcome,
     SameNoise,
     check_forgets,
     check_maps,
 )
 from heliograph.random_affine.composite import ARROW, AbstractComposite, list_in_words
 from heliograph.random_affine.hop import known
-from heliograph.random_affine.moments.components import Component, combine
+from heliograph.random_affine.moments.components import AffineComponent, combine_atoms
 from heliograph.random_affine.moments.disturbed_gain import DisturbedGain, stack_gains
-from heliograph.random_affine.moments.intervals import Interval, multiply_matrices, multiply_rows
+from heliograph.random_affine.moments.intervals import Interval, multiply_interval_polynomials, multiply_matrices
 from heliograph.random_affine.moments.monomials import (
-    Moments,
+    JointMoments,
     count_monomials,
-    exponents,
+    list_exponents,
     multiply_polynomials,
     position,
     refuse_if_too_large,
 )
-from heliograph.random_affine.moments.route import Position, Signal, Visit
+from heliograph.random_affine.moments.route import ChannelPosition, SignalMoment, Visit
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
 
 OUTCOME_LIMIT = 1024  # sets of losses that are listed
@@ -77,12 +77,14 @@ class AbstractCombination(AbstractComposite):
 
 
 def _join_outcomes(
-    a: list[Outcome], b: list[Outcome], join: Callable[[Outcome, Outcome], tuple[AbstractRandomAffine, np.ndarray]]
-) -> list[Outcome]:
+    a: list[ArrivalOutcome],
+    b: list[ArrivalOutcome],
+    join: Callable[[ArrivalOutcome, ArrivalOutcome], tuple[AbstractRandomAffine, np.ndarray]],
+) -> list[ArrivalOutcome]:
     """Return the sets of losses of two independent parts together; join(x, y) gives the map and what arrives."""
     if len(a) * len(b) > OUTCOME_LIMIT:
         raise fail("channel with erasures", f"at most {OUTCOME_LIMIT} sets of losses", f"{len(a) * len(b):,}")
-    return [Outcome(x.probability * y.probability, *join(x, y)) for x in a for y in b]
+    return [ArrivalOutcome(x.probability * y.probability, *join(x, y)) for x in a for y in b]
 
 
 class Series(AbstractCombination):
@@ -112,12 +114,12 @@ class Series(AbstractCombination):
         return state, reduce(lambda h, matrix: then(matrix, h), drawn)
 
     @cache_by_object
-    def moments(self, order: int) -> Moments:
+    def moments(self, order: int) -> JointMoments:
         """Return E[Sym^k(H2 H1)] = E[Sym^k(H2)] E[Sym^k(H1)]."""
         check_forgets("moments of a map", self)
         matrix = reduce(lambda done, affine: affine.moments(order).matrix @ done, self.maps[1:],
                         self.maps[0].moments(order).matrix)  # fmt: skip
-        return Moments(matrix, self.outputs, self.inputs, order)
+        return JointMoments(matrix, self.outputs, self.inputs, order)
 
     @cache_by_object
     def corner_moments(self, order: int) -> Corners:
@@ -154,13 +156,13 @@ class Series(AbstractCombination):
         """Return the same series of maps through which everything arrives."""
         return self.rebuilt(*(affine.condition_on_arrival() for affine in self.maps))
 
-    def _outcomes(self) -> list[Outcome]:
+    def _outcomes(self) -> list[ArrivalOutcome]:
         """Return the sets of losses: an output is lost where a map loses it, or has a gain on what one before lost."""
         return reduce(partial(_join_outcomes, join=_join_in_series), (m.list_outcomes() for m in self.maps))
 
-    def list_atoms(self) -> list[Component]:
+    def list_atoms(self) -> list[AffineComponent]:
         """Return every atom of each map, one after another."""
-        return combine([affine.list_atoms() for affine in self.maps], Component.then)
+        return combine_atoms([affine.list_atoms() for affine in self.maps], AffineComponent.then)
 
     def disturb_gain(self) -> DisturbedGain:
         """Return the joint moments of each map, then of the next."""
@@ -176,7 +178,7 @@ class Series(AbstractCombination):
         plain, noise = last.detach_outliers()
         return (self, None) if noise is None else (Series([*before, plain]), noise)
 
-    def visit_hops(self, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
+    def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
         """Visit the maps in their order, each with the signal that comes through those before it."""
         visited, signal = list[AbstractRandomAffine](), position.signal
         for i, affine in enumerate(self.maps):
@@ -186,12 +188,12 @@ class Series(AbstractCombination):
                 signal = affine.carry_signal(signal)
         return self.rebuilt(*visited), position
 
-    def carry_signal(self, signal: Signal) -> Signal:
+    def carry_signal(self, signal: SignalMoment) -> SignalMoment:
         """Return the signal behind each map in turn."""
         return reduce(lambda before, affine: affine.carry_signal(before), self.maps, signal)
 
 
-def _join_in_series(x: Outcome, y: Outcome) -> tuple[AbstractRandomAffine, np.ndarray]:
+def _join_in_series(x: ArrivalOutcome, y: ArrivalOutcome) -> tuple[AbstractRandomAffine, np.ndarray]:
     """Return y behind x, and which of its outputs arrive: those that use nothing that x lost."""
     received = known(np.diag(x.arrived.astype(float)))
     power = np.asarray(y.map.moments(2).second)[..., :-1, :-1]
@@ -228,7 +230,7 @@ class Stack(AbstractCombination):
         return state, jnp.concatenate([*rows, np.eye(1, self.inputs + 1, self.inputs)], axis=0)
 
     @cache_by_object
-    def moments(self, order: int) -> Moments:
+    def moments(self, order: int) -> JointMoments:
         """Return E[z1^a z2^b | y] = E[z1^a | y] E[z2^b | y], a product of polynomials in y."""
         check_forgets("moments of a map", self)
         refuse_if_too_large(
@@ -238,14 +240,17 @@ class Stack(AbstractCombination):
         )
         items = [m.moments(order) for m in self.maps]
         tables = [[m.lower(k) if k else None for k in range(order + 1)] for m in items]
-        return Moments(
-            stack_parts(stack_rows(self, order, tables, multiply_polynomials)), self.outputs, self.inputs, order
+        return JointMoments(
+            stack_parts(multiply_moments_of_parts(self, order, tables, multiply_polynomials)),
+            self.outputs,
+            self.inputs,
+            order,
         )
 
     def _interval_of_parts(self, order: int) -> Interval:
         """Return the products of the parts' interval polynomials, row by row."""
         tables = [[stack_parts(m.moment_interval(k)) if k else None for k in range(order + 1)] for m in self.maps]
-        rows = stack_parts(stack_rows(self, order, tables, multiply_rows))
+        rows = stack_parts(multiply_moments_of_parts(self, order, tables, multiply_interval_polynomials))
         return rows[:, 0], rows[:, 1]
 
     @property
@@ -271,13 +276,13 @@ class Stack(AbstractCombination):
         """Return the same stack of maps through which everything arrives."""
         return self.rebuilt(*(affine.condition_on_arrival() for affine in self.maps))
 
-    def _outcomes(self) -> list[Outcome]:
+    def _outcomes(self) -> list[ArrivalOutcome]:
         """Return every set of losses of each map with every one of the others."""
         return reduce(partial(_join_outcomes, join=_join_in_stack), (m.list_outcomes() for m in self.maps))
 
-    def list_atoms(self) -> list[Component]:
+    def list_atoms(self) -> list[AffineComponent]:
         """Return every atom of each map, one above another."""
-        return combine([affine.list_atoms() for affine in self.maps], Component.above)
+        return combine_atoms([affine.list_atoms() for affine in self.maps], AffineComponent.above)
 
     def disturb_gain(self) -> DisturbedGain:
         """Return the joint moments of the maps, one above another."""
@@ -295,18 +300,20 @@ class Stack(AbstractCombination):
         noises = [noise or Gaussian(np.zeros((plain.outputs, plain.outputs))) for plain, noise in parts]
         return Stack([plain for plain, _ in parts]), Independent(noises)
 
-    def visit_hops(self, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
+    def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
         """Visit each map as one part; return the whole as they became, and the place after it."""
         visited = [affine.visit_hops(visit, at)[0] for affine, at in position.number(self.maps, "part")]
         return self.rebuilt(*visited), position
 
 
-def _join_in_stack(x: Outcome, y: Outcome) -> tuple[AbstractRandomAffine, np.ndarray]:
+def _join_in_stack(x: ArrivalOutcome, y: ArrivalOutcome) -> tuple[AbstractRandomAffine, np.ndarray]:
     """Return y below x, and which of the outputs of both arrive."""
     return Stack([x.map, y.map]), np.concatenate([x.arrived, y.arrived])
 
 
-def stack_rows(channel: Stack, order: int, tables: list[list[Any]], times: Callable[..., Any]) -> list[Any]:
+def multiply_moments_of_parts(
+    channel: Stack, order: int, tables: list[list[Any]], times: Callable[..., Any]
+) -> list[Any]:
     """Return E[z^a | y] = prod_parts E[z_part^(a_part) | y] for each power a, as polynomials in y.
 
     Args:
@@ -316,7 +323,7 @@ def stack_rows(channel: Stack, order: int, tables: list[list[Any]], times: Calla
         times: product of two polynomials, from (a, degree of a, b, degree of b, number of variables).
     """
     variables, rows = channel.inputs + 1, []
-    for powers in exponents(channel.outputs + 1, order):
+    for powers in list_exponents(channel.outputs + 1, order):
         polynomial, degree, start = np.ones(1), 0, 0
         for m, table in zip(channel.maps, tables, strict=True):
             # The powers of this part's outputs, and its polynomial of them.

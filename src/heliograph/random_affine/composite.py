@@ -12,7 +12,7 @@ from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, inner_maps, replace_inner_maps
-from heliograph.random_affine.moments.route import Position, Visit, refuse_gain_on_angles
+from heliograph.random_affine.moments.route import ChannelPosition, Visit, refuse_gain_on_angles
 
 ARROW, DIRECT = " → ", "direct"  # between maps in series, and of one that only selects
 
@@ -82,7 +82,7 @@ class AbstractUniform(AbstractRandomAffine):
             raise refuse_gain_on_angles(type(self).__name__)
         return results.pop()
 
-    def visit_hops(self, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
+    def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
         """Visit the hops of each map, and return them with the position behind the map of most hops.
 
         All begin at `position`, since hops of equal places are the same transmitters in each map.

@@ -22,8 +22,8 @@ from heliograph.random_affine.hop import GainAndNoise, known
 from heliograph.random_affine.laws.law import Discrete
 from heliograph.random_affine.mixture import Mixture
 from heliograph.random_affine.modes import Modes
-from heliograph.random_affine.moments.monomials import Moments
-from heliograph.random_affine.moments.route import Position, Signal, Visit
+from heliograph.random_affine.moments.monomials import JointMoments
+from heliograph.random_affine.moments.route import ChannelPosition, SignalMoment, Visit
 
 # Steps; their law at each step; or a chain whose mode is the number of steps.
 Delay = TypeAliasType("Delay", int | Discrete | MarkovChain)
@@ -51,7 +51,7 @@ class AbstractDelayLine(AbstractMapWrapper):
         """Draw the map of the line."""
         return self.line.draw(state, key)
 
-    def moments(self, order: int) -> Moments:
+    def moments(self, order: int) -> JointMoments:
         """Return the moments of the map of the line."""
         return self.line.moments(order)
 
@@ -98,7 +98,7 @@ class DelayLine(AbstractDelayLine):
         """Return the map in words, and how many signals it is given."""
         return f"{self.link.in_words() or DIRECT}, of the last {self.steps + 1} signals"
 
-    def visit_hops(self, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
+    def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
         """Visit the hops of the map, to which the line of past signals goes."""
         plain, position = self.link.visit_hops(visit, position.on_delay_line(self.inputs // signal_size(self)))
         return replace_inner_maps(self, [plain]), position
@@ -165,12 +165,12 @@ class Delayed(AbstractDelayLine):
         late = f"{'/'.join(map(str, self.times))} steps late{', timestamped' if self.timestamped else ''}"
         return f"{self.link.in_words() or DIRECT}, {late}"
 
-    def visit_hops(self, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
+    def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
         """Visit the hops of the link; return it as they became, and the place after them."""
         link, position = self.link.visit_hops(visit, position)
         return replace_inner_maps(self, [link, self.delay]), position
 
-    def carry_signal(self, signal: Signal) -> Signal:
+    def carry_signal(self, signal: SignalMoment) -> SignalMoment:
         """Return the signal behind the link, as if it were not late."""
         return self.link.carry_signal(signal)
 
@@ -227,7 +227,7 @@ def place_part(channel: AbstractRandomAffine, total: int, start: int, past: int)
     return DelayLine(chosen, past) if past else chosen
 
 
-class DelayedLine(AbstractMapWrapper):
+class RelayStorage(AbstractMapWrapper):
     """Storage of a relay: received signals of this step and `steps` before, (r_k, ..., r_{k-steps}).
 
     A map of the line of what was sent. Draws are stored: a value that is forwarded twice has its gain and noise twice.
@@ -291,7 +291,7 @@ class Relayed(AbstractDelayLine):
         """Return the stages in series, each fed by the storage of the one before."""
         size, whole = signal_size(self.stages[0]), place_on_delay_line(self.stages[0])
         for stage in self.stages[1:]:
-            whole = Series([DelayedLine(whole, size, stage.past), place_on_delay_line(stage)])
+            whole = Series([RelayStorage(whole, size, stage.past), place_on_delay_line(stage)])
         return whole
 
     def carry_angles(self, sent: Angles) -> Angles:
@@ -325,13 +325,13 @@ def connect_in_series(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAf
             stages[-1].append(link)
     # Only random delays after the first stage need storage.
     if len(stages) == 1:
-        return _join_stage(stages[0])
+        return _join_links_behind_delay(stages[0])
     if any(isinstance(link, Delayed) and link.timestamped for link in links):
         raise fail("time stamps", "those of one link", "those of several in series")
-    return Relayed(tuple(_join_stage(stage) for stage in stages))
+    return Relayed(tuple(_join_links_behind_delay(stage) for stage in stages))
 
 
-def _join_stage(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAffine:
+def _join_links_behind_delay(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAffine:
     """Join links in series of which only the first may have a random delay."""
     delays = [link for link in links if isinstance(link, Delayed)]
     if not delays:

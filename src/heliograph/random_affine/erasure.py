@@ -8,11 +8,11 @@ from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import fail, scalar
 from heliograph.numerics.traced import plain
 from heliograph.numerics.types import ArrayLike, Float, PyTree
-from heliograph.random_affine.base import AbstractRandomAffine, Outcome, check_maps
+from heliograph.random_affine.base import AbstractRandomAffine, ArrivalOutcome, check_maps
 from heliograph.random_affine.composite import DIRECT, AbstractMapWrapper, percent_in_words
 from heliograph.random_affine.hop import known
-from heliograph.random_affine.moments.monomials import Moments
-from heliograph.random_affine.moments.route import Position, Signal, Visit
+from heliograph.random_affine.moments.monomials import JointMoments
+from heliograph.random_affine.moments.route import ChannelPosition, SignalMoment, Visit
 
 
 class Erasure(AbstractMapWrapper):
@@ -41,11 +41,11 @@ class Erasure(AbstractMapWrapper):
         """Return what arrives through the map."""
         return self.base.condition_on_arrival()
 
-    def _outcomes(self) -> list[Outcome]:
+    def _outcomes(self) -> list[ArrivalOutcome]:
         """Return the two outcomes: what the map delivers, or nothing."""
         arrival, lost = plain(self.arrival), np.zeros(self.outputs, dtype=bool)
         listed = [o._replace(probability=arrival * o.probability) for o in self.base.list_outcomes()]
-        return [*listed, Outcome(1 - arrival, known(np.zeros((self.outputs, self.inputs))), lost)]
+        return [*listed, ArrivalOutcome(1 - arrival, known(np.zeros((self.outputs, self.inputs))), lost)]
 
     def carry_angles(self, sent: Angles) -> Angles:
         """Return the angles of the map: what is lost is none."""
@@ -55,17 +55,17 @@ class Erasure(AbstractMapWrapper):
         """Return the map in words, and how much of it is lost."""
         return f"{self.base.in_words() or DIRECT}, {percent_in_words(1 - self.arrival)} lost"
 
-    def visit_hops(self, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
+    def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
         """Visit the hops of the map, which send whether they are received or not."""
         base, position = self.base.visit_hops(visit, position)
         return self.rebuilt(base), position
 
-    def carry_signal(self, signal: Signal) -> Signal:
+    def carry_signal(self, signal: SignalMoment) -> SignalMoment:
         """Return the signal behind the map, of what arrives."""
         signal = self.base.carry_signal(signal)
         return signal._replace(arrives=signal.arrives * plain(self.arrival))
 
-    def moments(self, order: int) -> Moments:
+    def moments(self, order: int) -> JointMoments:
         """Refuse: a filter skips lost packets, and asks for the moments of the channel inside."""
         raise fail("moments of a channel", "one without erasures (give the filter what is inside)", "an erasure")
 

@@ -12,18 +12,18 @@ from heliograph.numerics.traced import equal_to_rounding, is_traced, is_zero, li
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine, KnownGains, SameNoise
 from heliograph.random_affine.laws.law import AbstractLaw, Constant
-from heliograph.random_affine.moments.components import Component
+from heliograph.random_affine.moments.components import AffineComponent
 from heliograph.random_affine.moments.disturbed_gain import DisturbedGain, disturb_hop, noise_gain
 from heliograph.random_affine.moments.intervals import Interval
 from heliograph.random_affine.moments.monomials import (
-    Moments,
+    JointMoments,
     count_monomials,
     degrees,
+    plan_binomial_sums,
     refuse_if_too_large,
-    sum_plan,
     symmetric_power,
 )
-from heliograph.random_affine.moments.route import Position, Visit, refuse_gain_on_angles
+from heliograph.random_affine.moments.route import ChannelPosition, Visit, refuse_gain_on_angles
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Matrix, Vector, as_noise, noise_vector
 
 NOTHING_SENT = "nothing sent"  # in words
@@ -56,7 +56,7 @@ class AbstractHop(AbstractRandomAffine):
         """True of a gain that is known to be one; by default none is."""
         return False
 
-    def visit_hops(self, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
+    def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
         """Visit a hop that transmits, as the next along its chain."""
         if not self.transmits:
             return self, position
@@ -105,11 +105,11 @@ class GainAndNoise(AbstractHop):
         return False
 
     @cache_by_object
-    def moments(self, order: int) -> Moments:
+    def moments(self, order: int) -> JointMoments:
         """Return sum_k E[g^k] B_k, with B_k the `gain_coefficients`."""
         gains = gain_moments(self.law, order)
         basis = self.gain_coefficients(order)
-        return Moments(library(gains, basis).tensordot(gains, basis, axes=1), self.outputs, self.inputs, order)
+        return JointMoments(library(gains, basis).tensordot(gains, basis, axes=1), self.outputs, self.inputs, order)
 
     @cache_by_object
     def gain_coefficients(self, order: int) -> Float[jax.Array | np.ndarray, "order+1 rows columns"]:
@@ -117,7 +117,7 @@ class GainAndNoise(AbstractHop):
         rows, columns = count_monomials(self.outputs + 1, order), count_monomials(self.inputs + 1, order)
         refuse_if_too_large(rows, columns, f"moments of order {order}")
         deterministic = symmetric_power(affine_matrix(self.matrix), order)  # rows (A y)^b, made homogeneous with 1
-        row, column, rest, ways = sum_plan(self.outputs, order)
+        row, column, rest, ways = plan_binomial_sums(self.outputs, order)
         terms = (ways * noise_vector(self.noise, order)[rest])[:, None] * deterministic[column]
         return scatter((order + 1, rows, columns), (degrees(self.outputs, order)[column], row), terms)
 
@@ -175,10 +175,10 @@ class GainAndNoise(AbstractHop):
             raise refuse_gain_on_angles(f"the gains {rows[rows != 0].tolist()}")
         return tuple(int(i) for i in touched)
 
-    def list_atoms(self) -> list[Component]:
+    def list_atoms(self) -> list[AffineComponent]:
         """Combine every gain with every noise."""
         gains, noises = self.law.list_atoms(), self.noise.list_atoms()
-        return [Component(p * q, g * self.matrix, c, r) for p, g in gains for q, c, r in noises]
+        return [AffineComponent(p * q, g * self.matrix, c, r) for p, g in gains for q, c, r in noises]
 
     def disturb_gain(self) -> DisturbedGain:
         """Return the joint moments of [g A, N], N a root of the noise's covariance."""

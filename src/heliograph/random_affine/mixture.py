@@ -15,10 +15,10 @@ from heliograph.random_affine.combine import AbstractCombination, Corners
 from heliograph.random_affine.composite import DIRECT, AbstractUniform, percent_in_words
 from heliograph.random_affine.hop import NOTHING_SENT, GainAndNoise
 from heliograph.random_affine.laws.law import Constant, Discrete
-from heliograph.random_affine.moments.components import Component
+from heliograph.random_affine.moments.components import AffineComponent
 from heliograph.random_affine.moments.disturbed_gain import DisturbedGain, mix_gains
-from heliograph.random_affine.moments.monomials import Moments, product_table
-from heliograph.random_affine.moments.route import Position, Visit
+from heliograph.random_affine.moments.monomials import JointMoments, product_table
+from heliograph.random_affine.moments.route import ChannelPosition, Visit
 from heliograph.random_affine.noise import Gaussian, Matrix
 
 
@@ -51,14 +51,14 @@ class Mixture(AbstractUniform, AbstractCombination):
         return state, jnp.stack(drawn)[self.choice.sample(choice_key).astype(int)]
 
     @cache_by_object
-    def moments(self, order: int) -> Moments:
+    def moments(self, order: int) -> JointMoments:
         """Return sum_i p_i E[Sym^k(H_i)]."""
         check_forgets("moments of a map", self)
         parts = [m.moments(order).matrix for m in self.maps]
         matrix = library(parts, self.choice.probabilities).tensordot(
             self.choice.probabilities, stack_parts(parts), axes=1
         )
-        return Moments(matrix, self.outputs, self.inputs, order)
+        return JointMoments(matrix, self.outputs, self.inputs, order)
 
     def extremes(self) -> tuple[AbstractRandomAffine, ...]:
         """Return the extreme weights combined with the extremes of each map."""
@@ -87,7 +87,7 @@ class Mixture(AbstractUniform, AbstractCombination):
         """Return a mixture by a law that is believed possible, of maps that are covered one by one."""
         return isinstance(own, Mixture) and self.choice.covers(own.choice) and self.covers_maps(own, same_noise)
 
-    def list_atoms(self) -> list[Component]:
+    def list_atoms(self) -> list[AffineComponent]:
         """Return the atoms of each map, times its probability."""
         parts = zip(self.choice.probabilities, self.maps, strict=True)
         return [c._replace(weight=p * c.weight) for p, affine in parts for c in affine.list_atoms()]
@@ -105,7 +105,7 @@ class Mixture(AbstractUniform, AbstractCombination):
         choices = (f"{words} ({percent_in_words(p)})" for words, p in zip(parts, shares, strict=True))
         return f"({' or '.join(choices)})"
 
-    def visit_hops(self, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
+    def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
         """Visit each map as a choice with transmitters of its own; a hop and its loss are one."""
         if sum(not affine.is_silent for affine in self.maps) <= 1:
             return super().visit_hops(visit, position)

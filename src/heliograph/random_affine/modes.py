@@ -16,14 +16,14 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.traced import library, stack_parts
 from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.random_affine.base import AbstractModal, AbstractRandomAffine, SameNoise, check_forgets, check_maps
-from heliograph.random_affine.chain import AbstractMemory, Autoregression, Law, MarkovChain, Nodes, Rows
+from heliograph.random_affine.chain import AbstractMemory, Autoregression, Law, MarkovChain, MemoryStates, Rows
 from heliograph.random_affine.composite import DIRECT, AbstractMapWrapper, AbstractUniform
 from heliograph.random_affine.hop import AbstractHop, GainAndNoise, known
 from heliograph.random_affine.laws.law import Constant
 from heliograph.random_affine.memory import condition_on_states, memories, select_alike
 from heliograph.random_affine.mixture import Mixture
-from heliograph.random_affine.moments.monomials import Moments
-from heliograph.random_affine.moments.route import Position, Visit
+from heliograph.random_affine.moments.monomials import JointMoments
+from heliograph.random_affine.moments.route import ChannelPosition, Visit
 from heliograph.random_affine.noise import AbstractNoise, Matrix, as_noise
 
 MODES = 1024  # joint modes that are listed: a filter's matrices have as many blocks in a row
@@ -57,7 +57,7 @@ class Modes(AbstractUniform, AbstractModal):
         if isinstance(state, int | np.integer):
             return self.maps[state]
         present = select_alike(self.maps, jnp.asarray(state))
-        return _Chosen(self.maps, jnp.asarray(state)) if present is None else present
+        return _ChosenMap(self.maps, jnp.asarray(state)) if present is None else present
 
     def covers_kind(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
         """Return modes of a chain that is believed possible, with maps that are covered one by one."""
@@ -70,7 +70,7 @@ class Modes(AbstractUniform, AbstractModal):
         return f"{self.memory_in_words}modes ({' or '.join(affine.in_words() or DIRECT for affine in self.maps)})"
 
 
-class _Chosen(AbstractUniform):
+class _ChosenMap(AbstractUniform):
     """The map of a traced index among several."""
 
     maps: tuple[AbstractRandomAffine, ...]
@@ -79,9 +79,9 @@ class _Chosen(AbstractUniform):
     def sample(self, key: jax.Array) -> jax.Array:
         return jnp.stack([m.sample(key) for m in self.maps])[self.index]
 
-    def moments(self, order: int) -> Moments:
+    def moments(self, order: int) -> JointMoments:
         matrices = [jnp.asarray(m.moments(order).matrix) for m in self.maps]
-        return Moments(jnp.stack(matrices)[self.index], self.outputs, self.inputs, order)
+        return JointMoments(jnp.stack(matrices)[self.index], self.outputs, self.inputs, order)
 
 
 class ModeOutput(AbstractModal):
@@ -104,7 +104,7 @@ class ModeOutput(AbstractModal):
         """Return none: the output is the number of a mode, whatever is sent."""
         return ()
 
-    def visit_hops(self, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
+    def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
         """Return the map as it is, and the place as it was: it has no transmitter."""
         return self, position
 
@@ -142,7 +142,7 @@ class OneStepLate(AbstractMapWrapper):
         """Return the angles of the map."""
         return self.base.carry_angles(sent)
 
-    def visit_hops(self, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
+    def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
         """Visit the hops of the map; return it as they became, and the place after them."""
         base, position = self.base.visit_hops(visit, position)
         return self.rebuilt(base), position
@@ -266,7 +266,7 @@ def joint_modes(
     )
 
 
-def _nodes_of_memory(memory: AbstractMemory, degree: int, nodes: int | None) -> Nodes:
+def _nodes_of_memory(memory: AbstractMemory, degree: int, nodes: int | None) -> MemoryStates:
     """Return a memory as finitely many states, as many as its degree in the channel asks for."""
     if nodes is not None and isinstance(memory, Autoregression):
         return memory.chain(nodes)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.factors.columns import Columns, columns_of, eliminate, square_root
+from heliograph.factors.columns import WeightedColumns, columns_of, eliminate, square_root
 from heliograph.numerics import check
 from heliograph.numerics.check import array, fail, instance, items, show_value
 from heliograph.numerics.module import Module, readable, unwritten
@@ -17,14 +17,14 @@ from heliograph.numerics.traced import block_diagonal, is_traced, is_zero, libra
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.laws.law import draw_index
 from heliograph.random_affine.moments.components import (
-    Branches,
+    GaussianBranches,
     NoiseAtom,
     NoiseWithoutOutliers,
     SignalNoise,
-    combine,
+    combine_atoms,
     stack_branches,
 )
-from heliograph.random_affine.moments.monomials import Exponents, exponents
+from heliograph.random_affine.moments.monomials import Exponents, list_exponents
 
 LARGE = 100  # components of independent noises whose root needs no eigenvectors: 18 ms for 1,000 alike, 3 s with them
 FACTOR_TOLERANCE = 1e-10  # of two standard deviations: what a factor may miss of a covariance
@@ -56,7 +56,7 @@ class AbstractNoise(Module):
         return int(self.mean.shape[-1])
 
     @property
-    def columns(self) -> Columns:
+    def columns(self) -> WeightedColumns:
         """Covariance as a sum of squares W diag(w) W': by the root that is drawn from, where there is one."""
         return columns_of(self.covariance)
 
@@ -70,10 +70,10 @@ class AbstractNoise(Module):
         """True if the law is known to be symmetric about its mean."""
         return False
 
-    def branches(self) -> Branches:
+    def branches(self) -> GaussianBranches:
         """Return each component as a mixture of Gaussian branches about the mean; one unless the law says more."""
         variances = library(self.covariance).diagonal(self.covariance)[:, None]
-        return Branches(np.zeros((self.dimension, 1)), np.zeros((self.dimension, 1)), variances)
+        return GaussianBranches(np.zeros((self.dimension, 1)), np.zeros((self.dimension, 1)), variances)
 
     def without_outliers(self) -> NoiseWithoutOutliers:
         """Return the mean, relative to that of the whole, and covariance of the noise without its outliers."""
@@ -131,9 +131,9 @@ class Gaussian(AbstractNoise):
         self.weights = np.ones(n)
 
     @property
-    def columns(self) -> Columns:
+    def columns(self) -> WeightedColumns:
         """Covariance A diag(w) A' as columns A with weights w."""
-        return Columns(self.factor, self.weights)
+        return WeightedColumns(self.factor, self.weights)
 
     @property
     def is_symmetric(self) -> bool:
@@ -252,12 +252,12 @@ class Independent(AbstractNoise):
         self.covariance = block_diagonal(blocks)
 
     @property
-    def columns(self) -> Columns:
+    def columns(self) -> WeightedColumns:
         """Those of the parts, one after another."""
         parts = [component.columns for component in self.parts]
         matrices = [part.matrix for part in parts]
         weights = library(parts).concatenate([part.weights for part in parts])
-        return Columns(block_diagonal(matrices), weights)
+        return WeightedColumns(block_diagonal(matrices), weights)
 
     @property
     def has_outliers(self) -> bool:
@@ -269,7 +269,7 @@ class Independent(AbstractNoise):
         """True if all parts are."""
         return all(component.is_symmetric for component in self.parts)
 
-    def branches(self) -> Branches:
+    def branches(self) -> GaussianBranches:
         """Return the branches of the parts, one above the other."""
         return stack_branches([component.branches() for component in self.parts])
 
@@ -281,7 +281,7 @@ class Independent(AbstractNoise):
 
     def list_atoms(self) -> list[NoiseAtom]:
         """Return every atom of each part with every one of the others."""
-        return combine([component.list_atoms() for component in self.parts], NoiseAtom.above)
+        return combine_atoms([component.list_atoms() for component in self.parts], NoiseAtom.above)
 
     def _split(self, groups: Sequence[Sequence[int]]) -> list[AbstractNoise] | None:
         """Return the parts of each group, where no part is of two."""
@@ -333,7 +333,7 @@ class Shaped(AbstractNoise):
         self.covariance = self.matrix @ source.covariance @ self.matrix.T
 
     @property
-    def columns(self) -> Columns:
+    def columns(self) -> WeightedColumns:
         """Covariance B W diag(w) (B W)' as columns B W with weights w."""
         return self.source.columns.through(self.matrix)
 
@@ -397,4 +397,4 @@ def count_components(value: NoiseLike) -> int | None:
 def noise_vector(noise: AbstractNoise, order: int) -> Vector:
     """Return E[mono_order(n)] of a noise law: all moments up to `order`, (C(dimension + order, order),)."""
     moment = noise.moment  # of a module, whose methods are slow to look up
-    return stack_parts([moment(powers[:-1]) for powers in exponents(noise.dimension + 1, order)])
+    return stack_parts([moment(powers[:-1]) for powers in list_exponents(noise.dimension + 1, order)])

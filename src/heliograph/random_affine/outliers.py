@@ -14,7 +14,7 @@ from heliograph.numerics.check import TINY, array, check_count, fail, rank, scal
 from heliograph.numerics.traced import is_traced, library, plain, scipy_for
 from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.random_affine.laws.law import draw_index
-from heliograph.random_affine.moments.components import Branches, NoiseWithoutOutliers
+from heliograph.random_affine.moments.components import GaussianBranches, NoiseWithoutOutliers
 from heliograph.random_affine.moments.monomials import Exponents
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Matrix, Number, Square, Vector
 
@@ -71,12 +71,12 @@ class StudentT(AbstractNoise):
         """Always True."""
         return True
 
-    def branches(self) -> Branches:
+    def branches(self) -> GaussianBranches:
         """Return one for each of the PRECISIONS."""
         xp, n = library(self.degrees, self.scale), self.dimension
         shape = (n, len(PRECISIONS))
         shares = xp.broadcast_to(_take_log(precision_shares(self.degrees)), shape)
-        return Branches(shares, np.zeros(shape), xp.diagonal(self.scale)[:, None] / PRECISIONS)
+        return GaussianBranches(shares, np.zeros(shape), xp.diagonal(self.scale)[:, None] / PRECISIONS)
 
     def without_outliers(self) -> NoiseWithoutOutliers:
         """Return the Gaussian noise of the scale."""
@@ -198,12 +198,12 @@ class Contaminated(AbstractNoise):
         """True where no branch is biased."""
         return not np.any(np.asarray(self.means) != 0)
 
-    def branches(self) -> Branches:
+    def branches(self) -> GaussianBranches:
         """Return the branches of the law."""
         xp, n = library(self.shares), self.dimension
         shares = xp.broadcast_to(_take_log(self.shares), (n, len(self.shares)))
         variances = xp.diagonal(self.covariances, axis1=1, axis2=2).T
-        return Branches(shares, (self.means - self.mean).T, variances)
+        return GaussianBranches(shares, (self.means - self.mean).T, variances)
 
     def without_outliers(self) -> NoiseWithoutOutliers:
         """Return the first branch."""

@@ -10,8 +10,8 @@ from heliograph.numerics.traced import library
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.hop import known
-from heliograph.random_affine.moments.monomials import Moments, exponents, symmetric_power
-from heliograph.random_affine.moments.route import Position, Visit
+from heliograph.random_affine.moments.monomials import JointMoments, list_exponents, symmetric_power
+from heliograph.random_affine.moments.route import ChannelPosition, Visit
 
 # (a, b, 1) to (w, its conjugate, 1) with w = a + i b.
 TO_COMPLEX = np.array([[1, 1j, 0], [1, -1j, 0], [0, 0, 1]])
@@ -52,15 +52,15 @@ class Rotation(AbstractRandomAffine):
         return jnp.stack([jnp.stack([c, -s, 0 * c]), jnp.stack([s, c, 0 * c]), jnp.array([0.0, 0.0, 1.0])])
 
     @cache_by_object
-    def moments(self, order: int) -> Moments:
+    def moments(self, order: int) -> JointMoments:
         """Return Sym^k(C)^-1 diag(exp(-(p - q)^2 deviation^2 / 2)) Sym^k(C), C the map to w and its conjugate."""
-        turns = np.array([p - q for p, q, _ in exponents(3, order)])
+        turns = np.array([p - q for p, q, _ in list_exponents(3, order)])
         factors = library(self.deviation).exp(-(turns**2) * self.deviation**2 / 2)
         there, back = (symmetric_power(matrix, order) for matrix in (TO_COMPLEX, np.linalg.inv(TO_COMPLEX)))
         matrix = (np.asarray(back) * factors) @ there
-        return Moments(matrix.real, 2, 2, order)
+        return JointMoments(matrix.real, 2, 2, order)
 
-    def visit_hops(self, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
+    def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
         """Return the map as it is, and the place as it was: it has no transmitter."""
         return self, position
 

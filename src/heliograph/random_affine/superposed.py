@@ -18,21 +18,21 @@ from heliograph.random_affine.composite import list_in_words
 from heliograph.random_affine.hop import GainAndNoise, known
 from heliograph.random_affine.laws.law import Constant
 from heliograph.random_affine.memory import memories
-from heliograph.random_affine.moments.components import Component
+from heliograph.random_affine.moments.components import AffineComponent
 from heliograph.random_affine.moments.disturbed_gain import DisturbedGain
 from heliograph.random_affine.moments.intervals import Interval
 from heliograph.random_affine.moments.monomials import (
-    Moments,
+    JointMoments,
     count_monomials,
-    exponents,
     factor_variables,
-    place,
+    list_exponents,
+    place_monomials,
+    plan_binomial_sums,
     position,
     refuse_if_too_large,
-    sum_plan,
     times_one,
 )
-from heliograph.random_affine.moments.route import Position, Visit
+from heliograph.random_affine.moments.route import ChannelPosition, Visit
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Matrix, as_noise, noise_vector
 
 Places = tuple[int, ...]  # of what a map takes, among the components of y
@@ -127,11 +127,11 @@ class Superposed(AbstractCombination):
         return state, jnp.concatenate([top, np.eye(1, self.inputs + 1, self.inputs)])
 
     @cache_by_object
-    def moments(self, order: int) -> Moments:
+    def moments(self, order: int) -> JointMoments:
         """Return E[z^a | y] by halves."""
         check_forgets("moments of a map", self)
         parts = [m.moments(order).matrix[None] for m in self.maps]
-        return Moments(self._add_moments(parts, order)[0], self.outputs, self.inputs, order)
+        return JointMoments(self._add_moments(parts, order)[0], self.outputs, self.inputs, order)
 
     @cache_by_object
     def corner_moments(self, order: int) -> Corners:
@@ -157,7 +157,7 @@ class Superposed(AbstractCombination):
         rows: KnownGains = np.all([affine.carry_known_gains(known[list(at)]) for affine, at in parts], axis=0)
         return rows
 
-    def list_atoms(self) -> list[Component]:
+    def list_atoms(self) -> list[AffineComponent]:
         """Return the atoms of the sum of a stack."""
         return self.as_stack.list_atoms()
 
@@ -176,7 +176,7 @@ class Superposed(AbstractCombination):
         mean_alone = Gaussian(np.zeros((self.outputs, self.outputs)), self.noise.mean)
         return Superposed(self.maps, mean_alone, self.places, self.inputs), self.noise
 
-    def visit_hops(self, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
+    def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
         """Visit each map as one link, with the part of the signal that it takes."""
         parts = zip(position.number(self.maps, "link"), self.places, strict=True)
         visited = [affine.visit_hops(visit, at.select(taken))[0] for (affine, at), taken in parts]
@@ -196,7 +196,7 @@ class Superposed(AbstractCombination):
         return _assemble_moments(powers, self.outputs, self.inputs, order)
 
 
-class _Powers(NamedTuple):
+class _SumPowers(NamedTuple):
     """Powers of a sum t of maps: E[t^a | y] at each corner, by degree |a|, homogeneous polynomials in (y, 1).
 
     places: of the components of y on which t depends, in order; by_degree: each (corners, monomials of t, monomials).
@@ -206,7 +206,7 @@ class _Powers(NamedTuple):
     by_degree: list[Corners]
 
 
-def _expand_map(matrix: Corners, outputs: int, places: Places, order: int) -> _Powers:
+def _expand_map(matrix: Corners, outputs: int, places: Places, order: int) -> _SumPowers:
     """Return the polynomials E[t^a | y] of one map from its E[Sym^order(H)] at each corner."""
     ordered = tuple(sorted(places))
     ones = library(matrix).ones((len(matrix), 1, 1))
@@ -214,19 +214,21 @@ def _expand_map(matrix: Corners, outputs: int, places: Places, order: int) -> _P
     by_degree = [ones]
     for degree in range(1, order + 1):
         rows, columns = _find_degree(outputs, degree, order), times_one(len(places) + 1, degree, order)
-        target = np.argsort(place(np.array(where)[factor_variables(len(places) + 1, degree)], len(places) + 1))
+        target = np.argsort(
+            place_monomials(np.array(where)[factor_variables(len(places) + 1, degree)], len(places) + 1)
+        )
         by_degree.append(matrix[:, rows[:, None], columns[target]])
-    return _Powers(ordered, by_degree)
+    return _SumPowers(ordered, by_degree)
 
 
 @cache_arrays
 def _find_degree(outputs: int, degree: int, order: int) -> np.ndarray:
     """Return the positions at `order` of the monomials of z alone of this degree, times powers of 1."""
     alone = factor_variables(outputs, degree)
-    return place(np.pad(alone, ((0, 0), (0, order - degree)), constant_values=outputs), outputs + 1)
+    return place_monomials(np.pad(alone, ((0, 0), (0, order - degree)), constant_values=outputs), outputs + 1)
 
 
-def _sum_by_halves(terms: Sequence[_Powers], outputs: int) -> _Powers:
+def _sum_by_halves(terms: Sequence[_SumPowers], outputs: int) -> _SumPowers:
     """Return E[t^a | y] of a sum t of terms, from its halves: so polynomials of few variables are multiplied first."""
     if len(terms) == 1:
         return terms[0]
@@ -234,7 +236,7 @@ def _sum_by_halves(terms: Sequence[_Powers], outputs: int) -> _Powers:
     return _add_powers(_sum_by_halves(terms[:middle], outputs), _sum_by_halves(terms[middle:], outputs), outputs)
 
 
-def _add_powers(a: _Powers, b: _Powers, outputs: int) -> _Powers:
+def _add_powers(a: _SumPowers, b: _SumPowers, outputs: int) -> _SumPowers:
     """Return the powers of a sum t + r of independent maps at each pair of corners, those of t slowest.
 
     E[(t + r)^c | y] = sum_{b <= c} C(c, b) E[t^b | y] E[r^(c-b) | y].
@@ -254,15 +256,15 @@ def _add_powers(a: _Powers, b: _Powers, outputs: int) -> _Powers:
             rows = scatter((count_monomials(outputs, degree), len(where), corners), row, products.transpose(1, 2, 0))
             total = total + scatter((count_monomials(size, degree), *rows.shape[::2]), where, rows.swapaxes(0, 1))
         by_degree.append(total.transpose(2, 1, 0))
-    return _Powers(places, by_degree)
+    return _SumPowers(places, by_degree)
 
 
 @cache_arrays
 def _list_binomial_terms(outputs: int, degree: int) -> tuple[tuple[np.ndarray, ...], ...]:
     """Return terms of (t + r)^c with |c| = degree: places of c, b, c - b and C(c, b), for |b| = 0, 1, ..., degree."""
-    names = exponents(outputs + 1, degree)
+    names = list_exponents(outputs + 1, degree)
     by_degree_of_b: list[list[tuple[int, ...]]] = [[] for _ in range(degree + 1)]
-    for c, b, rest, weight in zip(*sum_plan(outputs, degree), strict=True):
+    for c, b, rest, weight in zip(*plan_binomial_sums(outputs, degree), strict=True):
         if not names[c][-1]:  # |c| = degree: no power of 1
             places = [position(outputs, sum(names[i][:-1]))[names[i][:-1]] for i in (c, b, rest)]
             by_degree_of_b[sum(names[b][:-1])].append((*places, weight))
@@ -278,10 +280,10 @@ def _place_products(a: Places, b: Places, first: int, second: int, size: int) ->
     left, right = np.array(a)[factor_variables(len(a), first)], np.array(b)[factor_variables(len(b), second)]
     shape = len(left), len(right)
     both = [np.broadcast_to(left[:, None], (*shape, first)), np.broadcast_to(right, (*shape, second))]
-    return place(np.concatenate(both, axis=-1), size)
+    return place_monomials(np.concatenate(both, axis=-1), size)
 
 
-def _assemble_moments(powers: _Powers, outputs: int, inputs: int, order: int) -> Corners:
+def _assemble_moments(powers: _SumPowers, outputs: int, inputs: int, order: int) -> Corners:
     """Return E[Sym^order(H)] at each corner from the polynomials of each degree."""
     size, corners = len(powers.places) + 1, len(powers.by_degree[0])
     names = np.array([*powers.places, inputs])
@@ -290,7 +292,7 @@ def _assemble_moments(powers: _Powers, outputs: int, inputs: int, order: int) ->
     for degree, polynomials in enumerate(powers.by_degree):
         rows = _find_degree(outputs, degree, order)
         chosen = np.pad(names[factor_variables(size, degree)], ((0, 0), (0, order - degree)), constant_values=inputs)
-        columns = place(chosen, inputs + 1)
+        columns = place_monomials(chosen, inputs + 1)
         if xp is np:
             matrix[:, rows[:, None], columns] = polynomials
         else:
@@ -298,7 +300,9 @@ def _assemble_moments(powers: _Powers, outputs: int, inputs: int, order: int) ->
     return matrix
 
 
-def sensed_by_link(matrix: Matrix, noise: AbstractNoise, channel: AbstractRandomAffine) -> AbstractRandomAffine | None:
+def move_sensor_into_links(
+    matrix: Matrix, noise: AbstractNoise, channel: AbstractRandomAffine
+) -> AbstractRandomAffine | None:
     """Return a sum of links of y = C x + v as one of links of x, C_i x + v_i through link i, whose moments are smaller.
 
     That holds where the parts of v that links carry are independent; else, and for another channel, there is none.
@@ -314,7 +318,7 @@ def sensed_by_link(matrix: Matrix, noise: AbstractNoise, channel: AbstractRandom
     return Series([Superposed(links, first.noise, [everything] * len(links), len(everything)), *rest])
 
 
-def terms_without_common_memory(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
+def split_terms_without_common_memory(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
     """Return maps that share no memory, independent of each other, whose sum is the channel; one if it is no sum.
 
     The maps of a sum that share one stay together, and so do those without; the first has the noise.

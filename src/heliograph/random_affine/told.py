@@ -15,7 +15,7 @@ from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array, Bool, Float
 from heliograph.random_affine.base import AbstractModal, AbstractRandomAffine, check_forgets
-from heliograph.random_affine.chain import AbstractMemory, CertainChain, MarkovChain, Nodes, identify_memory
+from heliograph.random_affine.chain import AbstractMemory, CertainChain, MarkovChain, MemoryStates, identify_memory
 from heliograph.random_affine.hop import AbstractHop, GainAndNoise
 from heliograph.random_affine.laws.law import AbstractLaw, CertainDiscrete, Constant, Discrete
 from heliograph.random_affine.laws.reading import check_density, gain_given_reading
@@ -32,7 +32,7 @@ class AbstractFresh(AbstractMemory):
         """Draw the next state, whatever the last one was."""
         return self.begin(key)
 
-    def nodes(self, degree: int) -> Nodes:
+    def nodes(self, degree: int) -> MemoryStates:
         """Refuse: what is told is no mode that a filter must find out.
 
         Raises:
@@ -145,7 +145,7 @@ class AbstractTold(AbstractModal):
         return jnp.all(jnp.isfinite(numbers))
 
 
-class Told(AbstractTold):
+class ToldMap(AbstractTold):
     """A map that is a function of the numbers that are told.
 
     Args:
@@ -217,7 +217,7 @@ class Told(AbstractTold):
         A variance of zero is one only where it is zero for typical numbers as well: elsewhere it means that nobody
         knows. A gain that is told decides no noise.
         """
-        if isinstance(self.make, GainTold):
+        if isinstance(self.make, ToldGainHop):
             return super().give_law(numbers)
         link, usual = self.believed(numbers), self.believed(jnp.asarray(self.typical))
         finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(link) if eqx.is_array(leaf)]
@@ -232,7 +232,7 @@ class Told(AbstractTold):
         return f"{self.believed(self.typical).in_words()} {self._say_told(', '.join(self.names))}"
 
 
-class GainTold(eqx.Module):
+class ToldGainHop(eqx.Module):
     """The hop z = g A y + n of a gain g that is told."""
 
     matrix: Matrix
@@ -320,7 +320,7 @@ def believe_told(channel: T, numbers: Numbers) -> T:
         channel: a channel, whose other memories stay.
         numbers: what is told of all its maps, one after another.
     """
-    parts = _share_out(channel, numbers)
+    parts = _share_numbers_by_map(channel, numbers)
 
     def believe(leaf: object) -> object:
         return leaf.believed(parts[leaf.memory.identity]) if isinstance(leaf, AbstractTold) else leaf
@@ -336,11 +336,11 @@ def give_law(channel: AbstractRandomAffine, numbers: Numbers) -> jax.Array:
         channel: a channel.
         numbers: what is told of all its maps, one after another.
     """
-    parts = _share_out(channel, numbers)
+    parts = _share_numbers_by_map(channel, numbers)
     return jnp.all(jnp.stack([affine.give_law(parts[affine.memory.identity]) for affine in told_maps(channel)]))
 
 
-def _share_out(channel: object, numbers: Numbers) -> dict[str, Numbers]:
+def _share_numbers_by_map(channel: object, numbers: Numbers) -> dict[str, Numbers]:
     """Return what is told of each map of a channel, by the identity of its memory."""
     assert isinstance(channel, AbstractRandomAffine)
     parts, start = dict[str, Numbers](), 0
@@ -364,7 +364,7 @@ def _is_covariance(matrix: jax.Array | np.ndarray, typical: jax.Array | np.ndarr
     return jnp.all(positive) & jnp.all(off <= FACTOR_TOLERANCE * jnp.sqrt(jnp.outer(variances, variances)))
 
 
-def made_certain(link: T) -> T:
+def make_certain(link: T) -> T:
     """Return a link whose laws of finitely many gains or modes are certain, whatever traces their numbers.
 
     Raises:

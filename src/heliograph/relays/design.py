@@ -12,7 +12,7 @@ from heliograph.linear.recursion import lmmse
 from heliograph.linear.system import Gains, LinearSystem, Schedule
 from heliograph.linear.system import Steps as SystemSteps
 from heliograph.model.estimate import lower_by_noise
-from heliograph.model.premises.premise import Premise, believing
+from heliograph.model.premises.premise import Premise, on_premise
 from heliograph.model.relays import RECEIVER, RelayNetwork, RelaySteps
 from heliograph.numerics.check import array, fail, instance, table
 from heliograph.numerics.float64 import compile_in_float64
@@ -72,7 +72,7 @@ def given_design(network: RelayNetwork, gains: GainsByFilter) -> RelayDesign:
     gains = table("gains", gains, "arrays (steps, n, received)")
     joined = join_gains(network, gains)
     steps = network.steps(len(joined))
-    return as_design(network, _propagate(steps, start_moments(network), joined))
+    return make_design(network, _propagate(steps, start_moments(network), joined))
 
 
 _propagate = compile_in_float64(propagate_slots)
@@ -108,7 +108,7 @@ def split_gains(
     }
 
 
-def as_design(network: RelayNetwork, propagated: Propagated) -> RelayDesign:
+def make_design(network: RelayNetwork, propagated: Propagated) -> RelayDesign:
     """Return a design of gains and moments as propagated; ValueError unless all moments are finite."""
     moments, n = np.asarray(propagated.moments), len(network.states)
     if not np.all(np.isfinite(moments)):
@@ -164,7 +164,7 @@ def relay_schedules(network: RelayNetwork, design: RelayDesign) -> dict[str, Sch
         schedules[name] = Schedule(arrays, network.initial()[0], lower_by_noise("exact", network))
     relayed = {name: schedules[name].gains.gain for name in network.relays}
     premise = Premise(network.plant, relays=network, gains=relayed)
-    return {name: believing(schedule, premise) for name, schedule in schedules.items()}
+    return {name: on_premise(schedule, premise) for name, schedule in schedules.items()}
 
 
 def _check_start(network: RelayNetwork, design: RelayDesign) -> None:
@@ -206,7 +206,7 @@ def local_error_design(network: RelayNetwork, horizon: int) -> RelayDesign:
     Source: filter-and-forward successive relays (IEEE/CAA JAS 11(5), 2024), Theorems 1 and 2, for any network.
     """
     instance("relay network", network, RelayNetwork, "a RelayNetwork")
-    return as_design(network, _propagate(network.steps(horizon), start_moments(network)))
+    return make_design(network, _propagate(network.steps(horizon), start_moments(network)))
 
 
 def receiver_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> Schedule:
@@ -266,7 +266,7 @@ def receiver_system(network: RelayNetwork, gains: GainsByFilter) -> LinearSystem
         name: np.asarray(gains[name]) * receives[:, None, end - size : end]
         for name, size, end in zip(network.relays, network.received, ends, strict=False)
     }
-    return believing(
+    return on_premise(
         LinearSystem(system, mean, covariance, np.eye(n, d + r)),
         Premise(network.plant, relays=network, gains=relayed),
     )

@@ -18,7 +18,7 @@ from heliograph.numerics.linalg import contract, psd_solve, symmetrize
 from heliograph.numerics.types import Array, Bool, Float
 
 
-class Sent(NamedTuple):
+class SentMoments(NamedTuple):
     """W = E (sent, 1)(sent, 1)' and each sender's power E |signal|^2, zero if silent."""
 
     second: Float[jax.Array, "T+1 T+1"]
@@ -66,7 +66,7 @@ def sent_mean(step: RelaySteps) -> Float[jax.Array, "sent"]:
     return jnp.concatenate([y, *[relayed] * (len(step.received) - 1), jnp.ones(1)])
 
 
-def step_moments(step: RelaySteps, moments: Float[Array, "d d"]) -> tuple[Float[jax.Array, "z z"], Sent]:
+def step_moments(step: RelaySteps, moments: Float[Array, "d d"]) -> tuple[Float[jax.Array, "z z"], SentMoments]:
     """Return Z = covariance of (eta+ before corrections, innovations), and what is sent, from the covariance of eta.
 
     d = (1 + F) n, z = d + R.
@@ -81,7 +81,7 @@ def step_moments(step: RelaySteps, moments: Float[Array, "d d"]) -> tuple[Float[
     z = propagate_by_mode(linear, sources, 0.0).at[d:, d:].add(contract(step.spread, second))
     m = step.sensing.shape[0]
     power = jnp.diagonal(second)[:-1].reshape(-1, m).sum(axis=1) * step.transmits_in_slot
-    return z, Sent(second, power)
+    return z, SentMoments(second, power)
 
 
 def correct_moments(z: Float[Array, "z z"], gain: Float[Array, "Fn R"]) -> Float[jax.Array, "z-R z-R"]:

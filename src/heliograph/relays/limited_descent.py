@@ -34,8 +34,8 @@ def minimise_over_gains(
     """Return the gains of least cost, by descent over the entries that multiply `free` received numbers.
 
     `steps`: those of one period. Entries of each filter are in units of its largest. A limit of power is kept by an
-    augmented Lagrangian: with g_s = power_s / limit_s - 1 in slot s the cost is that of `_penalise`, and after each
-    descent lambda_s = max(0, lambda_s + STIFFNESS g_s).
+    augmented Lagrangian: with g_s = power_s / limit_s - 1 in slot s the cost is that of `_penalise_power`, and after
+    each descent lambda_s = max(0, lambda_s + STIFFNESS g_s).
     """
     # Free entries: those that multiply a received number, and their units.
     where = np.nonzero(gain_mask(steps) & (steps.receives_in_slot[:, None, :] > 0) & free)
@@ -91,7 +91,7 @@ def _find_largest_entries(
     )
 
 
-def _penalise(
+def _penalise_power(
     traces: Float[jax.Array, "slots"],
     sound: Bool[jax.Array, ""],
     power: Float[jax.Array, "slots"],
@@ -125,7 +125,7 @@ def make_penalised_cost(traces: Callable[[RelaySteps, jax.Array], tuple[jax.Arra
 
         def cost_and_power(x: jax.Array) -> tuple[jax.Array, jax.Array]:
             trace, sound, power = traces(steps, jnp.asarray(base).at[where].add(x * unit))
-            return _penalise(trace, sound, power, limit, multipliers), power
+            return _penalise_power(trace, sound, power, limit, multipliers), power
 
         (cost, power), gradient = jax.value_and_grad(cost_and_power, has_aux=True)(x)
         return cost, gradient, power

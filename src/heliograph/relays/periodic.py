@@ -18,8 +18,8 @@ from heliograph.relays.design import (
     GainsByFilter,
     RelayDesign,
     RelaySide,
-    as_design,
     join_gains,
+    make_design,
     relay_gains,
     relay_side,
     split_gains,
@@ -68,7 +68,7 @@ def periodic_local_error_design(network: RelayNetwork) -> RelayDesign:
     propagated, change = _iterate_local_design(periodic_steps(network), start_moments(network))
     if not change <= CONVERGED:
         raise fail("steady state", "moments that converge", f"a change of {float(change):.2g} after {PERIODS} periods")
-    return as_design(network, propagated)
+    return make_design(network, propagated)
 
 
 def periodic_given_design(network: RelayNetwork, gains: GainsByFilter) -> RelayDesign:
@@ -85,7 +85,7 @@ def periodic_given_design(network: RelayNetwork, gains: GainsByFilter) -> RelayD
     """
     instance("relay network", network, RelayNetwork, "a RelayNetwork")
     joined = join_gains(network, gains)
-    return as_design(network, _steady(_check_converging(network, joined), joined))
+    return make_design(network, _steady(_check_converging(network, joined), joined))
 
 
 def periodic_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> Float[np.ndarray, "slots n n"]:
@@ -246,7 +246,7 @@ def periodic_receiver_error_design(
     design = periodic_local_error_design(network)
     gains = join_gains(network, design.gains if start is None else start)
     free = np.ones(gains.shape[-1], dtype=bool)
-    tuned = _tune(network, gains, free, _receiver_cost, power_limit)
+    tuned = _tune_gains(network, gains, free, _receiver_cost, power_limit)
     return periodic_given_design(network, split_gains(network, tuned))
 
 
@@ -271,11 +271,11 @@ def periodic_relays_for_best_receiver(
     # The receiver, whose received numbers are the last, is the best one whatever the relays do: its gains are not free.
     received = gains.shape[-1]
     free = np.arange(received) < received - network.received[-1]
-    tuned = split_gains(network, _tune(network, gains, free, _best_receiver_cost, power_limit))
+    tuned = split_gains(network, _tune_gains(network, gains, free, _best_receiver_cost, power_limit))
     return {name: gain for name, gain in tuned.items() if name != RECEIVER}
 
 
-def _tune(
+def _tune_gains(
     network: RelayNetwork,
     start: Float[np.ndarray, "slots Fn R"],
     free: Bool[np.ndarray, "R"],

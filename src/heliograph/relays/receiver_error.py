@@ -50,7 +50,7 @@ class PowerLimit(NamedTuple):
     limit: Float[Array, "*time"]
 
 
-class Limited(NamedTuple):
+class LimitedProblem(NamedTuple):
     """Minimise sum_k <cost_k, moments after step k> within a power limit, from the moments `start`."""
 
     steps: RelaySteps
@@ -95,7 +95,7 @@ def power_forms(steps: RelaySteps, d: int) -> Float[np.ndarray, "time {d} {d}"]:
 
 
 def minimise_within_limit(
-    problem: Limited, local_gains: Float[np.ndarray, "time Fn R"], iterations: int
+    problem: LimitedProblem, local_gains: Float[np.ndarray, "time Fn R"], iterations: int
 ) -> Float[np.ndarray, "time Fn R"]:
     """Return the gains of small cost that meet the limit; never dearer than `local_gains`, if those meet it.
 
@@ -121,7 +121,9 @@ def minimise_within_limit(
     return results[best]
 
 
-def _scale_into_limit(problem: Limited, local_gains: Float[np.ndarray, "time Fn R"]) -> Float[np.ndarray, "time Fn R"]:
+def _scale_into_limit(
+    problem: LimitedProblem, local_gains: Float[np.ndarray, "time Fn R"]
+) -> Float[np.ndarray, "time Fn R"]:
     """Scale the relays' gains by one factor so that ROOM of the limit is left; without gains all of it is."""
     relay_rows = local_gains.shape[1] - problem.steps.transition.shape[-1]  # without the receiver's, the last
 
@@ -142,7 +144,7 @@ def _scale_into_limit(problem: Limited, local_gains: Float[np.ndarray, "time Fn 
 
 @compile_in_float64
 def _compute_cost_and_slack(
-    problem: Limited, gains: Float[Array, "time Fn R"]
+    problem: LimitedProblem, gains: Float[Array, "time Fn R"]
 ) -> tuple[Float[Array, ""], Float[Array, "time"]]:
     """Return the cost of given gains, and the share of each limit that they leave free."""
     moments = propagate_slots(problem.steps, problem.start, gains).moments[1:]
@@ -161,7 +163,7 @@ def _change_gains(
 
 @compile_in_float64
 def _compute_cost_with_barrier(
-    problem: Limited, gains: Float[Array, "time Fn R"], units: Float[Array, "time r r"], barrier: float, x: Array
+    problem: LimitedProblem, gains: Float[Array, "time Fn R"], units: Float[Array, "time r r"], barrier: float, x: Array
 ) -> tuple[Float[Array, ""], Float[Array, "time r"]]:
     """Return the cost and barrier at gains moved by x, infinite outside the limit, and its gradient."""
 
@@ -176,7 +178,7 @@ def _compute_cost_with_barrier(
 
 
 def _evaluate_barrier(
-    problem: Limited, gains: np.ndarray, units: np.ndarray, barrier: float, x: Float[np.ndarray, "variables"]
+    problem: LimitedProblem, gains: np.ndarray, units: np.ndarray, barrier: float, x: Float[np.ndarray, "variables"]
 ) -> tuple[float, Float[np.ndarray, "variables"]]:
     """Return `_compute_cost_with_barrier` of all variables in one vector."""
     value, gradient = _compute_cost_with_barrier(problem, gains, units, barrier, x.reshape(units.shape[:2]))
@@ -184,7 +186,9 @@ def _evaluate_barrier(
 
 
 @compile_in_float64
-def _choose_units(problem: Limited, gains: Float[Array, "time Fn R"], barrier: float) -> Float[Array, "time r r"]:
+def _choose_units(
+    problem: LimitedProblem, gains: Float[Array, "time Fn R"], barrier: float
+) -> Float[Array, "time r r"]:
     """Return L'^-1 for each step, L L' the Hessian of its gains: in these units the cost curves alike all around.
 
     The gradient of cost and barrier by the moments is taken back step by step from the last.
@@ -255,7 +259,7 @@ def receiver_error_design(
         gains = _alternate_sweeps(steps, start, cost, first, np.arange(sweeps))
     else:
         limit = power_limit_of(steps, power_limit, start.shape[0])
-        gains = minimise_within_limit(Limited(steps, start, cost, limit), first, STEPS * sweeps)
+        gains = minimise_within_limit(LimitedProblem(steps, start, cost, limit), first, STEPS * sweeps)
     return given_design(network, split_gains(network, np.asarray(gains)))
 
 
@@ -289,7 +293,7 @@ def _sweep_backward(
 def _sweep_forward(steps: RelaySteps, start: Array, gains: jax.Array, ahead: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return the best gains for the gradients `ahead`, step by step from the first, and the moments after each step."""
 
-    def improve(
+    def improve_step(
         moments: jax.Array, row: tuple[RelaySteps, jax.Array, jax.Array]
     ) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
         """Return the moments after a step with its best gain; and this gain and these moments."""
@@ -299,7 +303,7 @@ def _sweep_forward(steps: RelaySteps, start: Array, gains: jax.Array, ahead: jax
         after = correct_moments(z, gain)
         return after, (gain, after)
 
-    return jax.lax.scan(improve, jnp.asarray(start), (steps, gains, ahead))[1]
+    return jax.lax.scan(improve_step, jnp.asarray(start), (steps, gains, ahead))[1]
 
 
 class SweepSearch(NamedTuple):

@@ -31,7 +31,7 @@ def say_memory(name: str, test: MemoryTest) -> str:
     )
 
 
-def say_off(name: str, off: ConstantError) -> str:
+def say_constant_error(name: str, off: ConstantError) -> str:
     """Return the sentence on the output whose constant error leaves nothing else doubtful, or explains most of it."""
     if not off.nothing_else:
         share = f"{min(off.explained, 0.99):.0%} of what its squared innovations are too large by"

@@ -15,11 +15,11 @@ from heliograph.numerics.types import ArrayLike, Float
 from heliograph.report.arrivals import Arrivals, list_arrivals
 from heliograph.report.compared_nodes import compare_nodes
 from heliograph.report.constant_error import ConstantError, find_constant_error
-from heliograph.report.doubts import say_apart, say_memory, say_off, say_overconfident, say_underconfident
+from heliograph.report.doubts import say_apart, say_constant_error, say_memory, say_overconfident, say_underconfident
 from heliograph.report.expected_squares import compare_squares, expect_squares
 from heliograph.report.forecasts import Forecasts, Residuals
 from heliograph.report.held import HeldValue
-from heliograph.report.outputs import Listener, OutputHealth, judge_outputs_of_filter, list_listeners, weighs
+from heliograph.report.outputs import ListeningFilter, OutputHealth, judge_outputs_of_filter, list_listeners, weighs
 from heliograph.report.time_unit import doubt_time_unit
 from heliograph.simulation.declared.judgement import DeclaredJudgement, judge_declared_links
 from heliograph.simulation.description.possible import doubt_estimates
@@ -152,7 +152,7 @@ class Health:
         name = f"{health.node}/{health.filter}"
         off = self.off.get((health.node, health.filter))
         if off is not None:
-            yield say_off(name, off)
+            yield say_constant_error(name, off)
             if off.nothing_else:
                 return
         said = _say_declared(health)
@@ -280,13 +280,15 @@ def examine(
     silences = find_long_silences(timeouts, record.measurements, u, network.inputs)
     links, possible = list_arrivals(network, record.time, record.measurements), doubt_estimates(network, record)
     health = Health(record, links, filters, outputs, network.shared, beliefs, possible=possible, silences=silences)
-    off = {(judged.node, judged.filter): _find_off(network, health, judged, u) for judged in health.doubted()}
+    off = {
+        (judged.node, judged.filter): _find_constant_error(network, health, judged, u) for judged in health.doubted()
+    }
     apart = None if health.held() else compare_nodes(network, record, u, FALSE)
     health = replace(health, off={place: error for place, error in off.items() if error is not None}, apart=apart)
     return replace(health, time_unit=_doubt_time_unit(network, health, u))
 
 
-def _examine_filter(network: Network, listener: Listener, record: Record, inputs: np.ndarray) -> FilterHealth:
+def _examine_filter(network: Network, listener: ListeningFilter, record: Record, inputs: np.ndarray) -> FilterHealth:
     """Return one filter's innovations in units of its claim, and what tests say of them."""
     node, name, filter, z = listener.node, listener.name, listener.filter, listener.measurements
     white, test, expected = None, None, np.ones(1)
@@ -318,13 +320,15 @@ def _doubt_time_unit(network: Network, health: Health, inputs: np.ndarray) -> st
     return doubt_time_unit(f"{one.node}/{one.name}", one.filter, one.measurements, inputs, network.inputs)
 
 
-def _find_listener(network: Network, record: Record, judged: FilterHealth) -> Listener:
+def _find_listener(network: Network, record: Record, judged: FilterHealth) -> ListeningFilter:
     """Return the filter that was judged, with what it listens to."""
     listeners = list_listeners(network, record)
     return next(one for one in listeners if (one.node, one.name) == (judged.node, judged.filter))
 
 
-def _find_off(network: Network, health: Health, judged: FilterHealth, inputs: np.ndarray) -> ConstantError | None:
+def _find_constant_error(
+    network: Network, health: Health, judged: FilterHealth, inputs: np.ndarray
+) -> ConstantError | None:
     """Return the constant error of one output that explains what is doubtful in a filter of several; else None."""
     if judged.test is None:
         return None

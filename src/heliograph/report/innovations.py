@@ -12,7 +12,7 @@ from heliograph.disk.quoting import quote_for_figure, visible
 from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, STYLE, VERMILION, stacked_panels
 from heliograph.report.health import FilterHealth, Health
 from heliograph.report.outputs import round_to
-from heliograph.report.pages.page import Choice, Picture, Section, Table, Text
+from heliograph.report.pages.page import Picture, PictureChoice, Section, Table, Text
 from heliograph.simulation.network import Network
 from heliograph.simulation.results.record import Record
 
@@ -166,11 +166,11 @@ def _make_declared_table(health: Health) -> list[Table]:
     return [Table(["filter", "declared", "values", "size", "scale"], rows, caption)] if rows else []
 
 
-def choose_picture(pictures: Mapping[str, Picture]) -> list[Picture | Choice]:
+def choose_picture(pictures: Mapping[str, Picture]) -> list[Picture | PictureChoice]:
     """Return pictures by node one below the other, or as a choice where there are many."""
     if len(pictures) <= FEW:
         return [*pictures.values()]
-    return [Choice("Node", list(map(visible, pictures)), list(pictures.values()))]
+    return [PictureChoice("Node", list(map(visible, pictures)), list(pictures.values()))]
 
 
 def say_not_drawn(names: Sequence[str], where: str) -> list[Text]:

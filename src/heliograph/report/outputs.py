@@ -22,7 +22,7 @@ from heliograph.simulation.network import Network
 from heliograph.simulation.results.record import Record
 
 
-class Errors(NamedTuple):
+class FilterErrors(NamedTuple):
     """Errors of one filter: RMSE by state (NaN where its truth is not known), and NEES per state, 1 for a true claim.
 
     `rmse_error` and `nees_error` are the standard errors, of errors that are correlated in time.
@@ -39,7 +39,7 @@ class Errors(NamedTuple):
     nees_error: float
 
 
-def compare_with_truth(record: Record) -> list[Errors]:
+def compare_with_truth(record: Record) -> list[FilterErrors]:
     """Compare each filter with the truth, the fused ones first; nothing without one."""
     if record.truth is None:
         return []
@@ -52,7 +52,7 @@ def compare_with_truth(record: Record) -> list[Errors]:
             rmse = record.rmse(node, name)
             per_state = nees / np.where(known > 0, known, np.nan)
             results.append(
-                Errors(
+                FilterErrors(
                     node,
                     name,
                     claim=weakest(np.unique(estimate.claims).tolist()),
@@ -112,7 +112,7 @@ class OutputHealth(NamedTuple):
         return f"{self.name}: {self.judged.summary}{blame}"
 
 
-class Listener(NamedTuple):
+class ListeningFilter(NamedTuple):
     """A filter with its measurements (time, m) and their names.
 
     trusted: whether the network relies on it. blames: whether its weights say which output is to blame.
@@ -127,7 +127,7 @@ class Listener(NamedTuple):
     blames: bool = True
 
 
-def list_listeners(network: Network, record: Record) -> Iterator[Listener]:
+def list_listeners(network: Network, record: Record) -> Iterator[ListeningFilter]:
     """Yield every filter with its measurements: those of the nodes, then central ones."""
     received, relied_on = record.measurements, _find_relied_on(network)
     for node, z in received.items():
@@ -135,11 +135,11 @@ def list_listeners(network: Network, record: Record) -> Iterator[Listener]:
         weighing = {name for name, filter in filters.items() if filter.received and weighs(filter)}
         blaming = weighing & relied_on[node] or weighing
         for name, filter in filters.items():
-            yield Listener(node, name, filter, z, names, name in relied_on[node], name in blaming)
+            yield ListeningFilter(node, name, filter, z, names, name in relied_on[node], name in blaming)
     every = [f"{node}: {name}" for node in received for name in network.nodes[node].received_names]
     for name, fusion in network.fused.items():
         if isinstance(fusion, AbstractFilter):
-            yield Listener(Network.FUSED, name, fusion, np.concatenate(list(received.values()), axis=1), every)
+            yield ListeningFilter(Network.FUSED, name, fusion, np.concatenate(list(received.values()), axis=1), every)
 
 
 def _find_relied_on(network: Network) -> dict[str, set[str]]:
@@ -165,7 +165,7 @@ def weighs(filter: AbstractFilter) -> bool:
 
 
 def judge_outputs_of_filter(
-    network: Network, listener: Listener, record: Record, inputs: np.ndarray
+    network: Network, listener: ListeningFilter, record: Record, inputs: np.ndarray
 ) -> list[OutputHealth]:
     """Judge each output by the innovations of one filter that claims a covariance.
 

@@ -69,11 +69,11 @@ def write_results(
     with progress(stages + 1) as advance, whole_folder(target) as folder:
         outcome = compute(advance)
         advance("drawing and writing")
-        write_into(results_of(outcome), folder)
+        write_into_folder(results_of(outcome), folder)
     return outcome
 
 
-def write_into(results: Results, folder: Path) -> None:
+def write_into_folder(results: Results, folder: Path) -> None:
     """Write figures, report, data and summary into a folder that is there."""
     from heliograph.report.figures import png, svg
 

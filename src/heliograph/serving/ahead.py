@@ -12,7 +12,7 @@ from heliograph.live.row_origin import make_row_origin
 from heliograph.live.rows import HeldRow
 from heliograph.model.origin import Origin
 from heliograph.numerics.check import fail, show_value
-from heliograph.serving.thresholds import Thresholds, check_names, find_crossings
+from heliograph.serving.thresholds import Thresholds, check_threshold_names, find_crossings
 
 # Forecasts at one horizon: its time, how far ahead it is, and what each filter says, by node and filter.
 Ahead = tuple[float, float, dict[str, dict[str, object]]]
@@ -43,7 +43,7 @@ class ForecastPublisher:
     """
 
     def __init__(self, fleet: Fleet, horizons: Spans, thresholds: Thresholds = ()):
-        check_names(fleet.network, thresholds)
+        check_threshold_names(fleet.network, thresholds)
         self._thresholds = thresholds
         self._fleet, self._continuous = fleet, fleet.program.dt is not None
         if isinstance(horizons, int):

@@ -19,7 +19,7 @@ from heliograph.serving.brokers.pipe import Pipe
 from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.brokers.transport import LOG, WHOLE, Part, TakenOverError, Transport
 from heliograph.serving.brokers.url import Address
-from heliograph.serving.loop import AbandonedError, BatchService, Ending, serve_until, signals
+from heliograph.serving.loop import AbandonedError, BatchService, StoppableWork, serve_until, set_stop_on_signals
 from heliograph.serving.patience import WaitingService, retry_while_away
 from heliograph.serving.service import Service
 from heliograph.serving.settings import NOTHING, SHORTEST, ServiceSettings
@@ -105,7 +105,7 @@ async def serve_leased_parts(leases: PartLeases, serve: Serve) -> None:
     """
     stop = asyncio.Event()
     parts: dict[int, _Part] = {}
-    with signals(stop):
+    with set_stop_on_signals(stop):
         try:
             while not stop.is_set():
                 await _serve_exactly(parts, leases, serve)
@@ -162,9 +162,9 @@ async def run(settings: ServiceSettings) -> None:
 async def _compile_steps(network: Network) -> NetworkProgram | None:
     """Compile the steps of a network in a thread, while the page answers; None if it is said to stop meanwhile."""
     stop = asyncio.Event()
-    with signals(stop):
+    with set_stop_on_signals(stop):
         try:
-            program = await Ending(stop).call(NetworkProgram, network)
+            program = await StoppableWork(stop).call(NetworkProgram, network)
         except AbandonedError:
             return None
     return None if stop.is_set() else program
@@ -206,7 +206,7 @@ async def _serve_alone(settings: ServiceSettings, program: NetworkProgram, wrap:
     step = settings.options.step if reads is None else reads.sources.step
     fleet = Fleet(program, settings.options._replace(step=step))
     fleet.periods = {} if reads is None else reads.sources.periods
-    with signals(stop), contextlib.ExitStack() as owning:
+    with set_stop_on_signals(stop), contextlib.ExitStack() as owning:
         # The store first, whose state the service goes on from.
         store = await asyncio.to_thread(retry_while_away, lambda: _open_store(settings, fleet, owning), stop)
         ahead = settings.forecast, settings.thresholds

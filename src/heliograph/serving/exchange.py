@@ -14,7 +14,7 @@ from heliograph.simulation.centres.node_filter import NodeFilter
 Moment = Callable[[PlantState, float], float | str]
 
 
-class Exchange:
+class NeighbourMessenger:
     """Makes a node's messages to its neighbours: one a step, with the estimate before the step and the measurement.
 
     A step's message goes with the measurement; from a node without a sensor when anything of the step comes, and where

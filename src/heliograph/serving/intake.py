@@ -8,14 +8,14 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from heliograph.live.event import INPUTS, Known, Verdict
+from heliograph.live.event import INPUTS, CheckedEvent, Verdict
 from heliograph.live.fleet import Fleet
-from heliograph.live.implausible_events import Candidate, Judges
+from heliograph.live.implausible_events import Candidate, JudgementReader
 from heliograph.live.leap import ARRIVAL, Leap, find_leap, make_first_leap
 from heliograph.live.link_counts import LinkCounts
-from heliograph.live.plant import PlantState, Withdrawn
+from heliograph.live.plant import PlantState, WithdrawnEvent
 from heliograph.numerics.check import InputError
-from heliograph.serving.message import AnyMessage, Read, UnreadMessage, seconds
+from heliograph.serving.message import AnyMessage, Read, UnreadMessage, convert_time_to_seconds
 
 # Of a message: its plant (None if it began none), a verdict (None if it could not be read), the reason, and notes on
 # parts that were left out of a used message.
@@ -47,21 +47,21 @@ class TimedEvents(NamedTuple):
     arrival: float
     clock: float | None
     origin: datetime | None
-    event: Known
-    inputs: Known | None
+    event: CheckedEvent
+    inputs: CheckedEvent | None
 
 
 class BatchIntake:
     """Gives the messages of a batch to their plants; `plants` are those in memory, by name."""
 
     def __init__(self, fleet: Fleet, plants: OrderedDict[str, PlantState]):
-        self.fleet, self.plants, self._judges = fleet, plants, Judges(fleet)
+        self.fleet, self.plants, self._judges = fleet, plants, JudgementReader(fleet)
         # Why something is refused, by the number of its message and whether it is the message's inputs.
         self._refused: dict[tuple[int, bool], str] = {}
         self._before: dict[str, PlantBefore] = {}
         self._taken: list[Candidate] = []
         self._anew: dict[str, int] = {}  # versions of plants that began anew in this batch
-        self.replaced: list[tuple[PlantState, list[Withdrawn]]] = []  # these as they were, with their events
+        self.replaced: list[tuple[PlantState, list[WithdrawnEvent]]] = []  # these as they were, with their events
 
     def apply_batch(self, messages: Sequence[Read], damaged: Container[str], wall: datetime) -> list[Outcome]:
         """Give a batch of messages to their plants, but for damaged ones, and step these; return each one's outcome.
@@ -208,7 +208,7 @@ class BatchIntake:
 
     def _time_as_number(self, moment: float | datetime, origin: datetime | None, plant: str) -> float:
         """Convert a time to a number: of a date, seconds from the origin, or the step that is nearest."""
-        at, step = seconds(moment, origin, plant), self.fleet.options.step
+        at, step = convert_time_to_seconds(moment, origin, plant), self.fleet.options.step
         return at if origin is None or step is None else floor(at / step + 0.5)
 
     def _find_plant(self, message: AnyMessage, wall: datetime) -> PlantState | None:
@@ -244,7 +244,7 @@ class BatchIntake:
         plant.now, plant.leap, plant.version = at, leap, self._anew.get(name, 0)
         if old is not None:
             plant.version = self._anew[name] = old.version
-            events = [Withdrawn(*event) for row in old.rows.held for event in row.events]
+            events = [WithdrawnEvent(*event) for row in old.rows.held for event in row.events]
             self.replaced.append((old, events))
             for node, sequence, time in events:
                 plant.link(INPUTS if node < 0 else self.fleet.network.names[node]).count("future", sequence, time)
@@ -254,7 +254,7 @@ class BatchIntake:
         return plant
 
     def _give_to_plant(
-        self, number: int, plant: PlantState, event: Known, given: bool, wall: float | None, clock: str
+        self, number: int, plant: PlantState, event: CheckedEvent, given: bool, wall: float | None, clock: str
     ) -> Verdict:
         """Let the plant judge an event; note it as taken if it is used.
 

@@ -17,7 +17,7 @@ PATIENCE = 7.0  # seconds from a stop to the end: what is not done then comes ag
 LEAST = 0.5  # seconds that each piece of work after a stop has in any case
 
 
-class Ending:
+class StoppableWork:
     """Runs the work of a service until a stop, and after it for the time that is left.
 
     The service is called in a thread of its own, which is not waited for in the end.
@@ -78,7 +78,7 @@ async def keep_running(service: BatchService, transport: Transport) -> None:
         transport: where messages come from and outputs go; it is closed at the end.
     """
     stop = asyncio.Event()
-    with signals(stop):
+    with set_stop_on_signals(stop):
         await serve_until(stop, service, transport)
 
 
@@ -93,7 +93,7 @@ async def serve_until(
         transport: where messages come from and outputs go; it is closed at the end.
         patience: seconds without messages after which the service takes that nothing came; None for never.
     """
-    ending = Ending(stop)
+    ending = StoppableWork(stop)
     try:
         await _publish(service, transport, service.unpublished(), ending)
         ended = await _serve(service, transport, ending, patience)
@@ -105,7 +105,7 @@ async def serve_until(
         await transport.close()
 
 
-async def _serve(service: BatchService, transport: Transport, ending: Ending, patience: float | None) -> bool:
+async def _serve(service: BatchService, transport: Transport, ending: StoppableWork, patience: float | None) -> bool:
     """Receive, take and publish until a stop or the transport's end; return whether it was the latter."""
     stop = ending.stop
     while not stop.is_set():
@@ -125,7 +125,9 @@ async def _serve(service: BatchService, transport: Transport, ending: Ending, pa
     return False
 
 
-async def _publish(service: BatchService, transport: Transport, outputs: Sequence[Output], ending: Ending) -> None:
+async def _publish(
+    service: BatchService, transport: Transport, outputs: Sequence[Output], ending: StoppableWork
+) -> None:
     """Publish outputs; what a reader does not take in the time after a stop is published after a restart."""
     publishing = asyncio.ensure_future(transport.publish(outputs))
     if not await ending.finished(publishing):
@@ -150,7 +152,7 @@ async def _await_unless_stopped(stop: asyncio.Event, waiting: Coroutine[object, 
 
 
 @contextmanager
-def signals(stop: asyncio.Event) -> Iterator[None]:
+def set_stop_on_signals(stop: asyncio.Event) -> Iterator[None]:
     """Set `stop` on SIGTERM and SIGINT, for the duration of a block."""
     loop, numbers = asyncio.get_running_loop(), (signal.SIGTERM, signal.SIGINT)
     before = [signal.getsignal(number) for number in numbers]

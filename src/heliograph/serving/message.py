@@ -14,13 +14,13 @@ from typing_extensions import TypeAliasType
 
 from heliograph.model.checks.refusals import Reason
 from heliograph.numerics.check import InputError, fail, instance, show_value
-from heliograph.numerics.times.dates import instant
+from heliograph.numerics.times.dates import parse_instant
 
 Name = TypeAliasType("Name", Annotated[str, Field(max_length=200, pattern=r"^[^\x00]*$")])  # PostgreSQL keeps no NUL
 # Text that is no date is refused: "0.1" is no number of seconds, nor a moment of 1970.
 Date = Annotated[
     datetime,
-    GetPydanticSchema(lambda _, __: no_info_after_validator_function(instant, str_schema())),
+    GetPydanticSchema(lambda _, __: no_info_after_validator_function(parse_instant, str_schema())),
     WithJsonSchema({"type": "string", "format": "date-time"}),
 ]
 Moment = TypeAliasType("Moment", float | Date)
@@ -196,7 +196,7 @@ def _describe_payload(payload: bytes) -> str:
         return f"{show_value(payload)}, which is no JSON{where}{table}"
 
 
-def seconds(moment: float | datetime, origin: datetime | None, plant: str) -> float:
+def convert_time_to_seconds(moment: float | datetime, origin: datetime | None, plant: str) -> float:
     """Convert a time to a number: for dates the seconds since `origin`, exact to the microsecond before rounding."""
     mend = f"if its first message was wrong, serve --anew {quote(plant)} begins it anew"
     if isinstance(moment, datetime):

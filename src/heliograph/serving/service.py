@@ -10,20 +10,20 @@ from time import perf_counter
 from typing import NamedTuple
 
 from heliograph.live.event import INPUTS, Verdict
-from heliograph.live.fleet import Finalised
+from heliograph.live.fleet import FinalisedPlant
 from heliograph.live.fleet import Fleet as Fleet
 from heliograph.live.fleet import Options as Options
-from heliograph.live.fleet_remarks import FleetHeld, FleetRemarks
+from heliograph.live.fleet_remarks import FleetRemarks, FleetRepeatWatch
 from heliograph.live.implausible_events import FleetAngles
 from heliograph.live.network_program import NetworkProgram as NetworkProgram
-from heliograph.live.plant import PlantState, Withdrawn
+from heliograph.live.plant import PlantState, WithdrawnEvent
 from heliograph.live.rows import HeldRow
 from heliograph.live.stored.plant_codec import pack_plant, unpack_plant
 from heliograph.numerics.check import instance, show_value
-from heliograph.numerics.process.collector import no_collector
+from heliograph.numerics.process.collector import pause_collector
 from heliograph.serving.ahead import ForecastPublisher, Spans
 from heliograph.serving.estimate_writer import EstimateWriter, encode_line
-from heliograph.serving.exchange import Exchange
+from heliograph.serving.exchange import NeighbourMessenger
 from heliograph.serving.intake import BatchIntake, Outcome, plant_of
 from heliograph.serving.message import AnyMessage, Message, Payload, Read, UnreadMessage, read_messages
 from heliograph.serving.output import Output
@@ -89,9 +89,9 @@ class Service:
         self.plants = OrderedDict[str, PlantState]()  # those in memory, in order of their newest message
         self.malformed, self.known, self.last = 0, 0, BatchStatistics(0, 0, 0.0, 0.0, 0.0)
         self._writer, self._intake = EstimateWriter(fleet.program), BatchIntake(fleet, self.plants)
-        self._exchange, self._silence = Exchange(fleet, self._time_in_messages), SilenceWatch(fleet, every)
+        self._exchange, self._silence = NeighbourMessenger(fleet, self._time_in_messages), SilenceWatch(fleet, every)
         self._angles, self._remarks, self._doubt = FleetAngles(fleet), FleetRemarks(fleet), say
-        self._held = FleetHeld(fleet)
+        self._held = FleetRepeatWatch(fleet)
         self._ahead = None if forecast is None else ForecastPublisher(fleet, forecast, thresholds)
         self._unsearched = 0  # messages since the last search for garbage
         self._published: int | None = None  # number of the newest output published since the last commit
@@ -104,7 +104,7 @@ class Service:
         Without messages, time has passed: plants whose senders decide when to send are stepped to the present, and
         senders that are silent for longer than their timeout are told.
         """
-        with no_collector():  # a batch makes many objects and no cycles, and a search would take a third of its time
+        with pause_collector():  # a batch makes many objects and no cycles, and a search would take a third of its time
             outputs = self._take_batch(payloads) if payloads else self._take_silence(datetime.now(UTC))
             if not payloads or self._silence.looks_between_batches(self.last.lag):
                 outputs += self._tell_timeouts(datetime.now(UTC))
@@ -336,13 +336,13 @@ class Service:
             plant.version = stored.version
             self._remarks.note_said(plant)
 
-    def _write_finals(self, finalised: Iterable[Finalised]) -> list[Entry]:
+    def _write_finals(self, finalised: Iterable[FinalisedPlant]) -> list[Entry]:
         """Return final estimates, each published once: of rows that are final now and received a measurement."""
         rows = [(each.plant, row) for each in finalised for row in each.final if row.has_data()]
         names = (plant.name for plant, _ in rows)
         return [*map(Entry._make, zip(names, repeat("final"), self._write_estimates(b"final", rows)))]
 
-    def _write_withdrawn(self, plant: PlantState, events: Iterable[Withdrawn]) -> Iterator[Entry]:
+    def _write_withdrawn(self, plant: PlantState, events: Iterable[WithdrawnEvent]) -> Iterator[Entry]:
         """Yield a refusal of each event that was used before its clock turned out wrong."""
         for node, sequence, time in events:
             name = INPUTS if node < 0 else self.fleet.network.names[node]

@@ -56,7 +56,7 @@ def parse_threshold(text: str) -> Threshold:
         ) from None
 
 
-def check_names(network: Network, thresholds: Thresholds) -> None:
+def check_threshold_names(network: Network, thresholds: Thresholds) -> None:
     """Raise ValueError unless each threshold is of a state of the network or of an output of its sensors.
 
     Raises:

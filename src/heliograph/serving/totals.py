@@ -47,7 +47,7 @@ def counts_of(link: LinkTotals) -> dict[str, int]:
     return {name: refused.get(name, 0) if name in OF_NODES else getattr(link, name) for name in FIELDS}
 
 
-class Totals:
+class CountTotals:
     """Sums of counts over plants, by node; a plant that leaves the memory takes nothing with it.
 
     `by_node` has the counts of messages by verdict, of what nodes refused by reason, of timeouts, and

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from heliograph.files.availability import LastWords
+from heliograph.files.availability import DeviceStatuses
 from heliograph.serving.loop import BatchService
 from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
@@ -18,7 +18,7 @@ class LastWordsService:
         store: where they are kept.
     """
 
-    def __init__(self, service: BatchService, words: LastWords, store: StoreProtocol):
+    def __init__(self, service: BatchService, words: DeviceStatuses, store: StoreProtocol):
         self._service, self._words, self._store = service, words, store
         self._unkept = dict[str, int]()
         words.restore(store.words())

@@ -26,7 +26,7 @@ def key_of(key: object) -> jax.Array:
     return seed_key(check_seed("key", key))
 
 
-def inputs_of(network: Network, inputs: ArrayLike | None, horizon: int) -> np.ndarray:
+def read_plant_inputs(network: Network, inputs: ArrayLike | None, horizon: int) -> np.ndarray:
     """Return the plant's inputs, checked, as an array (horizon, inputs); None is accepted of a plant without any."""
     count = len(network.inputs)
     if inputs is None and count:
@@ -44,7 +44,7 @@ def check_precision(precision: object) -> None:
         raise fail("precision", f"one of {', '.join(known)}", show_value(precision))
 
 
-def measurement_of(name: str, value: ArrayLike, steps: int, node: Node | ReceivingNode) -> np.ndarray:
+def read_measurements(name: str, value: ArrayLike, steps: int, node: Node | ReceivingNode) -> np.ndarray:
     """Return a node's measurements (steps, received), NaN where nothing arrived.
 
     (steps,) is accepted for one component. A table whose columns have the components' names must have their order too.

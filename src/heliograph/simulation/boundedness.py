@@ -23,7 +23,7 @@ from heliograph.numerics.check import fail, instance
 from heliograph.numerics.lapack import spectral_radius
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Float
-from heliograph.random_affine.base import AbstractRandomAffine, Outcome
+from heliograph.random_affine.base import AbstractRandomAffine, ArrivalOutcome
 from heliograph.random_affine.erasure import second_moments
 from heliograph.random_affine.memory import memories
 from heliograph.random_affine.modes import joint_modes, long_run_law
@@ -65,7 +65,7 @@ class JointLinks(NamedTuple):
 
     initial: Float[np.ndarray, "modes"]
     chain: Float[np.ndarray, "modes modes"]
-    outcomes: list[list[Outcome]]
+    outcomes: list[list[ArrivalOutcome]]
     sensing: Float[np.ndarray, "m n"]
     sensor_mean: Float[np.ndarray, "m"]
     sensor_noise: Float[np.ndarray, "m m"]
@@ -224,7 +224,7 @@ class KnownGainSums(NamedTuple):
     exact: bool
     random: bool
 
-    def noise(self, outcome: Outcome, links: JointLinks) -> Float[np.ndarray, "r r"]:
+    def noise(self, outcome: ArrivalOutcome, links: JointLinks) -> Float[np.ndarray, "r r"]:
         """Return Cov(D z) in one outcome, at x = 0 and about the mean over the outcomes that look the same.
 
         With z = G y, E y = v and the common mean M v: E[(G y - M v)(G y - M v)'].
@@ -239,7 +239,9 @@ class KnownGainSums(NamedTuple):
         return np.asarray(self.combine @ (total + np.outer(about, about)) @ self.combine.T)
 
 
-def _find_known_sums(alike: Sequence[Outcome], links: JointLinks, space: Float[np.ndarray, "n d"]) -> KnownGainSums:
+def _find_known_sums(
+    alike: Sequence[ArrivalOutcome], links: JointLinks, space: Float[np.ndarray, "n d"]
+) -> KnownGainSums:
     """Return the sums of known gain: the null space of E[(G - M) C Y Y' C' (G - M)'] over outcomes that look the same.
 
     G is the random gain of mean M, C the sensors' matrix, Y (n, d) the basis `space` of the states that matter.

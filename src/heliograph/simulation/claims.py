@@ -11,13 +11,13 @@ from heliograph.filters.linear.scheduled import ScheduledFilter
 from heliograph.fusion.network_fusion import Fusion
 from heliograph.model.estimate import Claim
 from heliograph.model.premises.agreement import RANGE, join_premises, list_differences, part_of
-from heliograph.model.premises.premise import Kept, Premise
+from heliograph.model.premises.premise import Premise, StaticPremise
 from heliograph.simulation.node import FUSED, HasNodes, Node, ReceivingNode
 
 UNSAID = "something that it does not say"
 
 
-class Belief(NamedTuple):
+class OtherBelief(NamedTuple):
     """What a filter of a network believes that is not so at its node (`FUSED` for a filter of all measurements).
 
     `parts`: the parts of the model in which it believes another world. `lowered`: whether it would claim more than
@@ -48,7 +48,7 @@ def lower_claim(claim: Claim) -> Claim:
     return "none" if claim == "none" else "nominal"
 
 
-def nominal(filter: AbstractFilter) -> AbstractFilter:
+def lower_to_nominal(filter: AbstractFilter) -> AbstractFilter:
     """Return a copy of the filter, and of those inside it, that claims "nominal" at most, and keeps what it claimed."""
 
     def is_inner(leaf: object) -> bool:
@@ -56,30 +56,30 @@ def nominal(filter: AbstractFilter) -> AbstractFilter:
         return leaf is not filter and isinstance(leaf, AbstractFilter)
 
     leaves, tree = jax.tree.flatten(filter, is_leaf=is_inner)
-    inner = [nominal(leaf) if is_inner(leaf) else leaf for leaf in leaves]
+    inner = [lower_to_nominal(leaf) if is_inner(leaf) else leaf for leaf in leaves]
     twin: AbstractFilter = copy(jax.tree.unflatten(tree, inner))
     object.__setattr__(twin, "claim", lower_claim(filter.claim))
-    object.__setattr__(twin, "kept", Kept(filter.premise, filter.claim != twin.claim or filter.kept.lowered))
+    object.__setattr__(twin, "kept", StaticPremise(filter.premise, filter.claim != twin.claim or filter.kept.lowered))
     return twin
 
 
 def judge_filter(own: Premise, filter: AbstractFilter) -> AbstractFilter:
-    """Return the filter with its claim if it believes the world where it stands, else `nominal`.
+    """Return the filter with its claim if it believes the world where it stands, else lowered to nominal.
 
     Args:
         own: plant, sensor, channel and trigger of the place where it stands.
         filter: the filter, which keeps its claim outside of the network.
     """
     is_weak = lower_claim(filter.claim) == filter.claim
-    return filter if is_weak or not parts_apart(own, filter) else nominal(filter)
+    return filter if is_weak or not parts_apart(own, filter) else lower_to_nominal(filter)
 
 
 def judge_nodes(network: HasNodes) -> dict[str, Node | ReceivingNode]:
-    """Return the nodes, with each filter `nominal` that believes another world than its node's."""
+    """Return the nodes, with each filter lowered to nominal that believes another world than its node's."""
     results = dict(network.nodes)
     for name, node in network.nodes.items():
         if node.filters:
-            own = premise_at(network, name)
+            own = find_premise(network, name)
             results[name] = _replace_filters(node, {f: judge_filter(own, filter) for f, filter in node.filters.items()})
     return results
 
@@ -94,7 +94,7 @@ def nodes_alike(nodes: Mapping[str, Node | ReceivingNode]) -> dict[str, Node | R
 
 
 def judge_fused_standing(network: HasNodes) -> dict[str, Fusion | AbstractFilter]:
-    """Return the fusions, with each filter of all measurements `nominal` that believes another world."""
+    """Return the fusions, with each filter of all measurements lowered to nominal that believes another world."""
     if not any(isinstance(fusion, AbstractFilter) for fusion in network.fused.values()):
         return network.fused
     own = premise_of_all(network)
@@ -104,14 +104,14 @@ def judge_fused_standing(network: HasNodes) -> dict[str, Fusion | AbstractFilter
 def nominal_nodes(network: HasNodes) -> dict[str, Node | ReceivingNode]:
     """Return the nodes with filters that claim "nominal" at most."""
     return {
-        name: _replace_filters(node, {label: nominal(filter) for label, filter in node.filters.items()})
+        name: _replace_filters(node, {label: lower_to_nominal(filter) for label, filter in node.filters.items()})
         for name, node in network.nodes.items()
     }
 
 
 def nominal_fused(network: HasNodes) -> dict[str, Fusion | AbstractFilter]:
     """Return the fusions, with filters that claim "nominal" at most."""
-    return {name: nominal(f) if isinstance(f, AbstractFilter) else f for name, f in network.fused.items()}
+    return {name: lower_to_nominal(f) if isinstance(f, AbstractFilter) else f for name, f in network.fused.items()}
 
 
 def _replace_filters(node: Node | ReceivingNode, filters: dict[str, AbstractFilter]) -> Node | ReceivingNode:
@@ -128,7 +128,7 @@ def parts_apart(own: Premise, filter: AbstractFilter) -> tuple[str, ...]:
     return (UNSAID,) if filter.premise is None else list_differences(filter.premise, own)
 
 
-def premise_at(network: HasNodes, name: str) -> Premise:
+def find_premise(network: HasNodes, name: str) -> Premise:
     """Return the world at a node: plant, sensor, channel and trigger, and its limits where they refuse values."""
     node, plant = network.nodes[name], network.plant
     if isinstance(node, Node):
@@ -153,10 +153,10 @@ def premise_of_all(network: HasNodes) -> Premise:
     if network.common is not None:
         return Premise(network.plant, network.common.sensor, network.common.channel)
     nodes = [name for name in network.names if isinstance(network.nodes[name], Node)]
-    return join_premises([premise_at(network, name) for name in nodes]) if nodes else Premise(network.plant)
+    return join_premises([find_premise(network, name) for name in nodes]) if nodes else Premise(network.plant)
 
 
-def list_other_beliefs(network: HasNodes) -> Iterator[Belief]:
+def list_other_beliefs(network: HasNodes) -> Iterator[OtherBelief]:
     """Yield the filters that believe another world than that in which they stand, node after node, fused ones last.
 
     Args:
@@ -164,15 +164,15 @@ def list_other_beliefs(network: HasNodes) -> Iterator[Belief]:
     """
     for name in network.names:
         if filters := network.nodes[name].filters:
-            yield from _collect_beliefs(name, premise_at(network, name), filters)
+            yield from _collect_beliefs(name, find_premise(network, name), filters)
     central = {name: fusion for name, fusion in network.fused.items() if isinstance(fusion, AbstractFilter)}
     if central:
         yield from _collect_beliefs(FUSED, premise_of_all(network), central)
 
 
-def _collect_beliefs(node: str, own: Premise, filters: Mapping[str, AbstractFilter]) -> Iterator[Belief]:
+def _collect_beliefs(node: str, own: Premise, filters: Mapping[str, AbstractFilter]) -> Iterator[OtherBelief]:
     """Yield the filters of a node that claim something and were made for another world, with what differs."""
     for label, filter in filters.items():
         says = filter.premise is not None or filter.kept.lowered
         if filter.claim != "none" and says and (parts := parts_apart(own, filter)):
-            yield Belief(node, label, parts, filter.kept.lowered)
+            yield OtherBelief(node, label, parts, filter.kept.lowered)

@@ -7,14 +7,14 @@ from typing import NamedTuple
 from heliograph.model.over_time import structure
 
 
-class Kind(NamedTuple):
+class FilterKind(NamedTuple):
     """Filters that differ in numbers alone: `filters` of the nodes of one group."""
 
     group: int
     filters: tuple[str, ...]
 
 
-class Place(NamedTuple):
+class EstimatePlace(NamedTuple):
     """Where an estimate stands: number of its kind, of its filter within the kind, and of its node within the group."""
 
     kind: int
@@ -22,10 +22,12 @@ class Place(NamedTuple):
     node: int
 
 
-def places_of(groups: Sequence[Sequence[str]], kinds: Sequence[Kind]) -> dict[tuple[str, str], Place]:
+def find_estimate_places(
+    groups: Sequence[Sequence[str]], kinds: Sequence[FilterKind]
+) -> dict[tuple[str, str], EstimatePlace]:
     """Return the place of each estimate, by node and filter."""
     return {
-        (node, name): Place(kind=k, filter=f, node=i)
+        (node, name): EstimatePlace(kind=k, filter=f, node=i)
         for k, kind in enumerate(kinds)
         for f, name in enumerate(kind.filters)
         for i, node in enumerate(groups[kind.group])
@@ -40,17 +42,19 @@ def group_by_structure(items: Iterable[tuple[str, object]]) -> tuple[tuple[str, 
     return tuple(tuple(names) for names in results.values())
 
 
-def list_kinds(groups: Sequence[Sequence[str]], filters: Mapping[str, Mapping[str, object]]) -> tuple[Kind, ...]:
+def list_kinds(groups: Sequence[Sequence[str]], filters: Mapping[str, Mapping[str, object]]) -> tuple[FilterKind, ...]:
     """Return the kinds of filters, group after group; `filters` are those of each node, which are alike in a group."""
     return tuple(
-        Kind(g, alike) for g, names in enumerate(groups) for alike in group_by_structure(filters[names[0]].items())
+        FilterKind(g, alike)
+        for g, names in enumerate(groups)
+        for alike in group_by_structure(filters[names[0]].items())
     )
 
 
-def list_mesh_kinds(groups: Sequence[Sequence[str]], meshes: Mapping[str, Sequence[str]]) -> tuple[Kind, ...]:
+def list_mesh_kinds(groups: Sequence[Sequence[str]], meshes: Mapping[str, Sequence[str]]) -> tuple[FilterKind, ...]:
     """Return the kinds of fusions between neighbours, sorted as in compiled code; `meshes` are those of each node."""
     every = sorted({mesh for of_node in meshes.values() for mesh in of_node})
-    return tuple(Kind(g, (mesh,)) for mesh in every for g, names in enumerate(groups) if mesh in meshes[names[0]])
+    return tuple(FilterKind(g, (mesh,)) for mesh in every for g, names in enumerate(groups) if mesh in meshes[names[0]])
 
 
 def join_rows(received: Mapping[str, int]) -> dict[str, range]:

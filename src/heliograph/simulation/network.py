@@ -29,7 +29,7 @@ from heliograph.random_affine.memory import drop_names, memories
 from heliograph.simulation.centres.centre import along_estimates, claim_of_informed, claim_of_reports
 from heliograph.simulation.centres.mesh_check import check_mesh, mesh_claim
 from heliograph.simulation.claims import (
-    Belief,
+    OtherBelief,
     judge_fused_standing,
     judge_nodes,
     list_other_beliefs,
@@ -38,20 +38,20 @@ from heliograph.simulation.claims import (
     nominal_fused,
     nominal_nodes,
 )
-from heliograph.simulation.description.diagram import short_text_of, table_of, text_of
+from heliograph.simulation.description.diagram import short_text_of, text_of, write_html_table
 from heliograph.simulation.flags import check_flags
 from heliograph.simulation.index import (
-    Kind,
-    Place,
+    EstimatePlace,
+    FilterKind,
+    find_estimate_places,
     group_by_structure,
     join_rows,
     list_kinds,
     list_mesh_kinds,
-    places_of,
 )
 from heliograph.simulation.node import FUSED as FUSED
 from heliograph.simulation.node import (
-    Common,
+    CommonReception,
     Node,
     ReceivingNode,
     check_angles,
@@ -95,15 +95,15 @@ class Network(Module):
     fused: dict[str, Fusion | AbstractFilter]
     meshes: dict[str, Fusion]
     relays: RelayNetwork | None
-    common: Common | None
+    common: CommonReception | None
     # The index: names in the given order (compiled code sorts dictionaries), and where each stands.
     names: tuple[str, ...] = eqx.field(static=True)
     states: tuple[str, ...] = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
     groups: tuple[tuple[str, ...], ...] = eqx.field(static=True)
-    kinds: tuple[Kind, ...] = eqx.field(static=True)
-    mesh_kinds: tuple[Kind, ...] = eqx.field(static=True)  # of fusions between neighbours, sorted as in compiled code
-    places: FrozenMapping[tuple[str, str], Place] = eqx.field(static=True)  # by node and filter
+    kinds: tuple[FilterKind, ...] = eqx.field(static=True)
+    mesh_kinds: tuple[FilterKind, ...] = eqx.field(static=True)  # of meshes, sorted as in compiled code
+    places: FrozenMapping[tuple[str, str], EstimatePlace] = eqx.field(static=True)  # by node and filter
     rows: FrozenMapping[str, range] = eqx.field(static=True)  # among all measurements, joined in the order of the nodes
     claimed: FrozenMapping[tuple[str, str], Claim] = eqx.field(static=True)  # by node and filter, fused ones last
 
@@ -113,7 +113,7 @@ class Network(Module):
         nodes: "Mapping[str, Node | ReceivingNode | None]",
         fused: "Mapping[str, Fusion | AbstractFilter] | None" = None,
         relays: "RelayNetwork | None" = None,
-        common: "Common | None" = None,
+        common: "CommonReception | None" = None,
     ):
         self.plant, self.relays, self.common = plant, relays, common
         self.nodes = {
@@ -140,7 +140,7 @@ class Network(Module):
         )
         self.kinds = list_kinds(self.groups, {name: node.filters for name, node in self.nodes.items()})
         self.mesh_kinds = list_mesh_kinds(self.groups, meshes)
-        self.places = FrozenMapping(places_of(self.groups, self.kinds))
+        self.places = FrozenMapping(find_estimate_places(self.groups, self.kinds))
         self._check_links()
         self._check_fused()
         self.fused = judge_fused_standing(self)
@@ -261,7 +261,7 @@ class Network(Module):
         nodes = {
             name: ReceivingNode(dict(by_name), received[name], names, complete) for name, by_name in filters.items()
         }
-        return Network(plant, nodes, fused, common=Common(sensor, channel))
+        return Network(plant, nodes, fused, common=CommonReception(sensor, channel))
 
     def restricted_to(self, names: Iterable[str]) -> "Network":
         """Return the network of a recording that lacks the measurements of some relays, without their filters.
@@ -338,7 +338,7 @@ class Network(Module):
             claims[FUSED, name] = lower_claim(claim) if by_data and isinstance(fusion, Fusion) else claim
         return claims
 
-    def beliefs(self) -> tuple[Belief, ...]:
+    def beliefs(self) -> tuple[OtherBelief, ...]:
         """Return filters that believe another world than that in which they stand, node after node, fused ones last."""
         return tuple(list_other_beliefs(self))
 
@@ -388,7 +388,7 @@ class Network(Module):
 
 readable(Network)
 Network.__repr__ = short_text_of  # type: ignore[method-assign, assignment]
-Network._repr_html_ = table_of  # type: ignore[attr-defined]
+Network._repr_html_ = write_html_table  # type: ignore[attr-defined]
 
 
 def _describe_received(node: Node | ReceivingNode) -> object:

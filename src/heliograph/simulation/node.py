@@ -10,7 +10,7 @@ from heliograph.filters.wrappers.fed_back import FedBackFilter
 from heliograph.fusion.network_fusion import Fusion
 from heliograph.model.channel import Channel, check_sent
 from heliograph.model.estimate import Claim
-from heliograph.model.limits import Limits, LimitsLike, limits_of
+from heliograph.model.limits import Limits, LimitsLike, make_limits
 from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.relays import RelayNetwork
@@ -109,7 +109,7 @@ class Node(Module):
         self.received = int(first(channel).outputs) + side_information
         self.complete = not first(channel).erases and trigger is None
         check_filters(self.filters, self.received)
-        self.limits = limits_of(self.received, limits, invalid, stuck, self.sensor, self.channel)
+        self.limits = make_limits(self.received, limits, invalid, stuck, self.sensor, self.channel)
         # Side information of the right step; feedback to one filter alone.
         for name, filter in self.filters.items():
             check_flags(f"filter {name!r}", filter, [first(channel)])
@@ -184,7 +184,7 @@ class ReceivingNode(Module):
 
 
 @readable
-class Common(Module):
+class CommonReception(Module):
     """Common sensor and channel of all nodes: each receives the outputs that follow those of the nodes before it."""
 
     sensor: AnySensor
@@ -211,7 +211,7 @@ class HasNodes(Protocol):
         """Relays that filter and forward."""
 
     @property
-    def common(self) -> Common | None:
+    def common(self) -> CommonReception | None:
         """Sensor and channel of all nodes together."""
 
     @property

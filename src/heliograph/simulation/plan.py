@@ -16,7 +16,7 @@ from heliograph.simulation.stepping import AllFilters
 from heliograph.smoothing.backward_pass import plan_with_past
 
 
-def plan(filters: AllFilters, u: Float[Array, "horizon inputs"]) -> AllFilters:
+def plan_filters(filters: AllFilters, u: Float[Array, "horizon inputs"]) -> AllFilters:
     """Return the filters with all that depends on no data precomputed for inputs u, where all data arrive."""
     central = filters.central if all(filters.complete) else {}
     planned = [_plan_alike(a, u) if filters.complete[a.group] else a for a in filters.alike]

@@ -13,7 +13,7 @@ from heliograph.model.checks.faults import find_function_fault
 from heliograph.model.over_time import first
 from heliograph.model.trigger import AbstractThreshold
 from heliograph.numerics.types import Float, PyTree
-from heliograph.simulation.centres.uplinks import Drawn
+from heliograph.simulation.centres.uplinks import UplinkDraws
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node, ReceivingNode
 from heliograph.simulation.stepping import AllFilters
@@ -51,7 +51,7 @@ def step_plausibly(
     z: Sequence[jax.Array],
     u: jax.Array,
     k: jax.Array,
-    drawn: Mapping[str, Drawn] | None = None,
+    drawn: Mapping[str, UplinkDraws] | None = None,
 ) -> Stepped:
     """Step all filters with all data, which they judge; where some is implausible, step again without it.
 
@@ -80,7 +80,7 @@ def step_plausibly(
     return stepped
 
 
-class Judges:
+class FilterJudges:
     """The filters that judge what each node received; reads their judgements of a step, or of a recording's rows."""
 
     def __init__(self, network: Network):
@@ -126,7 +126,7 @@ def find_refused_rows(
 
     Nodes without filters of their own are judged by the central ones, all alike: the first tells for all.
     """
-    judges, refused = Judges(network), dict[str, dict[int, str]]()
+    judges, refused = FilterJudges(network), dict[str, dict[int, str]]()
     without_own = judges.without_own
     for name in network.names:
         if name not in without_own and (reasons_by_row := _list_reasons(judges.of_node(outcome, name))):
@@ -169,7 +169,7 @@ def describe_doubts(
             lines.append(f"filter {name!r} of {node!r} alone: {_format_rows(rows)} implausible, left out: {why}")
     # Inputs, judged by all filters.
     if network.inputs:
-        votes = Judges(network).of_all(outputs)
+        votes = FilterJudges(network).of_all(outputs)
         rows = [k for k in _find_flagged(votes, "input") if Judgement.why_inputs(votes[k])]
         lines += [f"inputs: {_format_rows(rows)} implausible: {INPUT}"] if rows else []
     return lines
@@ -213,7 +213,7 @@ def _format_rows(rows: Sequence[int]) -> str:
     return f"{len(rows)} rows ({listed}) are" if len(rows) > 1 else f"row {listed} is"
 
 
-def forbidden_rows(node: Node | ReceivingNode, z: Float[np.ndarray, "steps received"]) -> list[int]:
+def find_forbidden_rows(node: Node | ReceivingNode, z: Float[np.ndarray, "steps received"]) -> list[int]:
     """Return the rows at which a value came though it was within delta of the value before, and no heartbeat was due.
 
     Only of a sender on delta whose values all arrive as they are: elsewhere no single value is impossible. A filter

@@ -13,10 +13,10 @@ from heliograph.model.checks.row_times import common_dates, warn_of_unequal_step
 from heliograph.model.origin import Origin, last_input, usual_months, usual_spacing
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import array, check_columns, fail, instance, rank, table
-from heliograph.numerics.float64 import check_process
+from heliograph.numerics.float64 import refuse_forked_process
 from heliograph.numerics.times.row_times import check_times
 from heliograph.numerics.types import ArrayLike, PyTree, units_in
-from heliograph.simulation.arguments import inputs_of, measurement_of
+from heliograph.simulation.arguments import read_measurements, read_plant_inputs
 from heliograph.simulation.centres.blame import refuse_centrally
 from heliograph.simulation.centres.uplinks import SentReports
 from heliograph.simulation.description.possible import doubt_estimates
@@ -24,7 +24,7 @@ from heliograph.simulation.description.remarks import say_remarks
 from heliograph.simulation.description.wide_angles import warn_beyond_a_turn, warn_wide_in_rows
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.plausible_step import (
-    Judges,
+    FilterJudges,
     any_implausible,
     describe_doubts,
     find_refused_rows,
@@ -95,20 +95,20 @@ def run(
             cannot be smoothed; `after` of another network or of later rows, or with what needs rows of both: smoothing,
             a fusion whose messages may be late.
     """
-    check_process()
+    refuse_forked_process()
     instance("network", network, Network, "a Network")
     example = f"arrays of nodes, such as {{{next(iter(network.nodes))!r}: z}},"
     measured = table("measurements", measurements, example)
     network = network.restricted_to(measured)
     steps = _count_rows(next(iter(measured.values())))
     # Measurements, inputs and times of one length.
-    z = {name: measurement_of(name, measurements[name], steps, node) for name, node in network.nodes.items()}
+    z = {name: read_measurements(name, measurements[name], steps, node) for name, node in network.nodes.items()}
     smoothing = None if smooth is None else select_smoothed_part(network, smooth, steps)
     filters = AllFilters(network, None if smoothing is None else smoothing.kinds, judges=True)
     before = None if after is None else origin_behind(filters, after, smooths=smooth is not None)
     first = 0 if before is None else int(before.step)
     network.check_horizon(first + steps)
-    u = inputs_of(network, inputs, steps)
+    u = read_plant_inputs(network, inputs, steps)
     check_columns("truth", truth, network.states)
     true = None if truth is None else array("truth", truth, (steps, len(network.states)), missing=True)
     times = _find_times(measured, {"inputs": inputs, "truth": truth}, time, steps)
@@ -232,7 +232,7 @@ def _filter_plausible(
         # Find all rows that are, then filter again without them.
         outputs = first_time = filter_rows(task, group_measurements(), judged=True)
         refused = dict[str, dict[int, str]]()
-        while new := _find_refused(network, outputs, z, group_measurements(), task, refused):
+        while new := _find_refused_rows(network, outputs, z, group_measurements(), task, refused):
             for name, rows in new.items():
                 refused[name] = dict(sorted((refused.get(name, {}) | rows).items()))
                 z[name] = z[name].copy()
@@ -246,7 +246,7 @@ def _filter_plausible(
     return {name: values for name, values in outputs.items() if not name.startswith("judged")}
 
 
-def _find_refused(
+def _find_refused_rows(
     network: Network, outputs: PyTree, z: dict[str, np.ndarray], grouped: tuple[np.ndarray, ...], task: FilteringTask,
     before: dict[str, dict[int, str]],
 ) -> dict[str, dict[int, str]]:  # fmt: skip
@@ -259,7 +259,7 @@ def _find_refused(
     if centrally:
         states = central_states_before_rows(task, grouped)
         in_order = {name: z[name] for name in network.names}
-        nodes = Judges(network).without_own
+        nodes = FilterJudges(network).without_own
         refused |= refuse_centrally(filters.central, states, in_order, u, centrally, nodes)
     new = {name: {k: why for k, why in rows.items() if k not in before.get(name, ())} for name, rows in refused.items()}
     return {name: rows for name, rows in new.items() if rows}

@@ -15,7 +15,7 @@ from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.types import Array, PyTree
 from heliograph.simulation.plausible_step import step_plausibly
 from heliograph.simulation.results.record import Record
-from heliograph.simulation.smoothed import Smoother
+from heliograph.simulation.smoothed import NetworkSmoother
 from heliograph.simulation.stepping import AllFilters, initial_states
 
 EXPECTED = "what hg.run of this network returned for the rows before"
@@ -37,7 +37,7 @@ class FilteringTask(NamedTuple):
     """
 
     filters: AllFilters
-    smoother: Smoother | None
+    smoother: NetworkSmoother | None
     u: np.ndarray
     arrivals: dict[str, PyTree]
     begin: Begin | None = None
@@ -87,8 +87,8 @@ def filter_rows(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool) ->
     """Return what all filters made of a recording's rows, as NumPy arrays: what `AllFilters.step` puts out, by row.
 
     z are the measurements (steps, node, received) by group; if `judged`, what is implausible is left out. Beside them
-    stand "measurements", z, and "state", the last one; with a smoother it is what `Smoother.smooth_run` returns. It is
-    computed in chunks side by side, by native code, or by XLA.
+    stand "measurements", z, and "state", the last one; with a smoother it is what `NetworkSmoother.smooth_run` returns.
+    It is computed in chunks side by side, by native code, or by XLA.
     """
     results = None if judged else _filter_in_chunks(task, z)
     if results is not None:
@@ -98,7 +98,7 @@ def filter_rows(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool) ->
     return _scan_in_parts(task, z, judged) if by_xla else compute_once(_run_filters, _by_xla, (task, z, judged))
 
 
-class NetworkRows(Recursion):
+class NetworkRecursion(Recursion):
     """Recursion of all filters of a network over rows; each row's output is all that they estimate and judge."""
 
     filters: AllFilters
@@ -118,7 +118,7 @@ def _filter_in_chunks(task: FilteringTask, z: tuple[np.ndarray, ...]) -> PyTree 
     if task.smoother is not None or not task.filters.are_linear:
         return None
     begin = task.begin or Begin(initial_states(task.filters), np.asarray(0))
-    filtered = scan_in_chunks(NetworkRows(task.filters, begin.step), to_numpy(begin.states), (z, task.u))
+    filtered = scan_in_chunks(NetworkRecursion(task.filters, begin.step), to_numpy(begin.states), (z, task.u))
     return None if filtered is None else _collect_results(None, z, *filtered)
 
 
@@ -143,10 +143,10 @@ def _scan_in_parts(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool)
 
 def _run_filters(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool) -> PyTree:
     """Return what `filter_rows` does, of all rows in one scan."""
-    return _collect_results(task.smoother, z, *_scan(task.filters, task.first_states(), task.rows(z), judged))
+    return _collect_results(task.smoother, z, *_scan_rows(task.filters, task.first_states(), task.rows(z), judged))
 
 
-def _scan(
+def _scan_rows(
     filters: AllFilters, states: PyTree, rows: tuple[PyTree, ...], judged: bool, counts: np.ndarray | None = None
 ) -> tuple[PyTree, dict[str, PyTree]]:
     """Step over rows: return the last states, and the results by row; rows that do not count change no state."""
@@ -164,7 +164,7 @@ def _scan(
 
 
 def _collect_results(
-    smoother: Smoother | None, z: tuple[np.ndarray, ...], state: PyTree, results: dict[str, PyTree]
+    smoother: NetworkSmoother | None, z: tuple[np.ndarray, ...], state: PyTree, results: dict[str, PyTree]
 ) -> PyTree:
     """Return what the filters judged, their last state, and their results, smoothed if there is a smoother."""
     results = {"measurements": z, **results}
@@ -189,5 +189,5 @@ def _collect_central_states(task: FilteringTask, z: tuple[np.ndarray, ...]) -> P
     return before
 
 
-_by_xla, _scanned_by_xla = quickly_compiled(_run_filters), quickly_compiled(_scan)
+_by_xla, _scanned_by_xla = quickly_compiled(_run_filters), quickly_compiled(_scan_rows)
 _central_states_by_xla = quickly_compiled(_collect_central_states)

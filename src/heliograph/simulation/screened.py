@@ -12,7 +12,7 @@ from heliograph.model.timeouts import find_long_silences
 from heliograph.numerics.types import Float, Int
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node, ReceivingNode
-from heliograph.simulation.plausible_step import forbidden_rows
+from heliograph.simulation.plausible_step import find_forbidden_rows
 
 
 class ScreenedRecording(NamedTuple):
@@ -55,7 +55,7 @@ def screen_recording(
                 _describe_refused(reason, node.limits, z[name], refused[name], node)
                 for reason in count_by_reason(refused[name])
             ]
-        if rows := forbidden_rows(node, kept[name]):
+        if rows := find_forbidden_rows(node, kept[name]):
             lines.append(
                 f"{len(rows)} values came that the rule of their sender forbids; row {rows[0] + 1}: "
                 "within delta of the value before, and no heartbeat due"

@@ -15,33 +15,33 @@ from typing_extensions import TypeAliasType
 from heliograph.engine.limits import BLOCK
 from heliograph.model.over_time import first
 from heliograph.numerics.check import check_count, check_progress, fail, instance
-from heliograph.numerics.float64 import check_process, quickly_compiled
+from heliograph.numerics.float64 import quickly_compiled, refuse_forked_process
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.random_affine.memory import drop_identities
-from heliograph.simulation.arguments import Precision, check_precision, inputs_of, key_of
+from heliograph.simulation.arguments import Precision, check_precision, key_of, read_plant_inputs
 from heliograph.simulation.centres.mesh_building import build_meshes
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
-from heliograph.simulation.plan import has_plan, plan
+from heliograph.simulation.plan import has_plan, plan_filters
 from heliograph.simulation.results.no_numbers import warn_of_no_numbers
 from heliograph.simulation.results.record import Record
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Result, Trajectories
 from heliograph.simulation.results.statistics import BATCHES
-from heliograph.simulation.runs.by_run import each_run, read_by, simulate_trajectories
+from heliograph.simulation.runs.by_run import apply_to_each_run, read_by, simulate_trajectories
 from heliograph.simulation.runs.lanes import (
     LANES,
     RunLanes,
-    Shared,
+    SharedResult,
     added,
     advance_in_chunks,
     batch_counts,
     is_shared,
     one_processor,
 )
-from heliograph.simulation.runs.memory import Needed, check_memory, explain_out_of_memory, size_of
+from heliograph.simulation.runs.memory import NeededMemory, check_memory, explain_out_of_memory, size_of
 from heliograph.simulation.runs.native import simulate_natively
-from heliograph.simulation.smoothed import Recorded, Smoother, finish, reduce_run, select_smoothed_part
+from heliograph.simulation.smoothed import NetworkSmoother, ReducedRuns, finish_result, reduce_run, select_smoothed_part
 from heliograph.simulation.stepping import AllFilters
 from heliograph.simulation.transmission.build_reception import make_reception
 from heliograph.simulation.world import World
@@ -94,14 +94,14 @@ def monte_carlo(
             that is no multiple of 32, an unknown precision, a filter or fusion that cannot be smoothed, more memory
             than is available.
     """
-    check_process()
+    refuse_forked_process()
     instance("network", network, Network, "a Network")
     _check_counts(horizon, runs, chunk, first_run)
     check_progress(progress, "(done, total)")
     network.check_horizon(horizon)
     reducer = cast(AbstractReducer[Result], Trajectories()) if keep is None else keep
     instance("keep", reducer, AbstractReducer, "what is kept, such as Statistics()")
-    u = inputs_of(network, inputs, horizon)
+    u = read_plant_inputs(network, inputs, horizon)
     base = key_of(key)
     check_precision(precision)
     if precision == "float32":
@@ -118,8 +118,8 @@ def monte_carlo(
             return _warn_of_nan(by_native_code, network)
     # Otherwise XLA: the world, and what is collected of it.
     filters = AllFilters(network, None if smoothing is None else smoothing.kinds)
-    planned = plan(filters, u) if has_plan(filters) else filters
-    job = _Job(
+    planned = plan_filters(filters, u) if has_plan(filters) else filters
+    job = _SimulationJob(
         world=World(drop_identities(network.plant), make_reception(network), planned),
         later=None if smoothing is None else smoothing.smoother(filters),
         inputs=u,
@@ -132,7 +132,7 @@ def monte_carlo(
         check_memory(_estimate_memory(job, runs, chunk), runs, horizon)
     with explain_out_of_memory(runs, horizon):
         recorded = _run_chunks(job, first_run, runs, chunk, progress)
-    return _warn_of_nan(finish(reducer, recorded, network, smoothing), network)
+    return _warn_of_nan(finish_result(reducer, recorded, network, smoothing), network)
 
 
 def _warn_of_nan(result: Result, network: Network) -> Result:
@@ -173,11 +173,11 @@ def _warn_if_lost(network: Network) -> None:
         warnings.warn(said, stacklevel=3)
 
 
-class _Job(Module):
+class _SimulationJob(Module):
     """What a simulation by XLA needs: world, smoother, inputs and key, the run after its last, reducer, precision."""
 
     world: World
-    later: Smoother | None
+    later: NetworkSmoother | None
     inputs: np.ndarray
     key: jax.Array
     stop: np.ndarray
@@ -185,7 +185,7 @@ class _Job(Module):
     precision: Precision = eqx.field(static=True)
 
 
-def _run_chunks(job: _Job, first_run: int, runs: int, chunk: int, progress: Progress | None) -> Recorded:
+def _run_chunks(job: _SimulationJob, first_run: int, runs: int, chunk: int, progress: Progress | None) -> ReducedRuns:
     """Return the sums over all runs, and what is collected of them, chunk by chunk."""
     with jax.enable_x64(True):
         lanes = RunLanes(
@@ -202,23 +202,23 @@ def _run_chunks(job: _Job, first_run: int, runs: int, chunk: int, progress: Prog
         jax.tree.map(read, total, is_leaf=is_shared)
         for read in (lambda leaf: leaf.value if is_shared(leaf) else leaf, is_shared)
     )
-    return Recorded(OfStep(*sums), OfStep(*common), batch_counts(first_run, first_run + runs), collected)
+    return ReducedRuns(OfStep(*sums), OfStep(*common), batch_counts(first_run, first_run + runs), collected)
 
 
 @quickly_compiled
-def _make_zero_sums(job: _Job) -> PyTree:
+def _make_zero_sums(job: _SimulationJob) -> PyTree:
     """Return the sums of zero before the first block; compiled, so that shapes are worked out once a network."""
     shapes = eqx.filter_eval_shape(_simulate_block, job, np.arange(BLOCK))[0]
     return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), shapes)
 
 
 @partial(quickly_compiled, donate="all-except-first")
-def _simulate_lane(todo: tuple[_Job, PyTree], carry: PyTree) -> tuple[PyTree, PyTree]:
+def _simulate_lane(todo: tuple[_SimulationJob, PyTree], carry: PyTree) -> tuple[PyTree, PyTree]:
     """Simulate (job, blocks) as `_simulate_blocks` does, compiled, in the memory of the carry."""
     return _simulate_blocks(*todo, carry)
 
 
-def _simulate_blocks(job: _Job, blocks: PyTree, carry: PyTree) -> tuple[PyTree, PyTree]:
+def _simulate_blocks(job: _SimulationJob, blocks: PyTree, carry: PyTree) -> tuple[PyTree, PyTree]:
     """Simulate blocks (block, BLOCK) one after another; return the carry with their sums, and what is collected.
 
     Width and order of the sums are fixed, so that chunks do not change a bit.
@@ -233,13 +233,13 @@ def _simulate_blocks(job: _Job, blocks: PyTree, carry: PyTree) -> tuple[PyTree, 
 
 
 @quickly_compiled
-def _simulate_all_lanes(job: _Job, blocks: PyTree, carries: PyTree) -> tuple[PyTree, PyTree]:
+def _simulate_all_lanes(job: _SimulationJob, blocks: PyTree, carries: PyTree) -> tuple[PyTree, PyTree]:
     """Simulate the blocks of all lanes, which are the leading axis of everything."""
     sums: tuple[PyTree, PyTree] = jax.vmap(partial(_simulate_blocks, job))(blocks, carries)
     return sums
 
 
-def _simulate_block(job: _Job, runs: jax.Array) -> tuple[tuple[PyTree, PyTree], PyTree]:
+def _simulate_block(job: _SimulationJob, runs: jax.Array) -> tuple[tuple[PyTree, PyTree], PyTree]:
     """Return the sums by batch of one block of runs and flags likewise, and what is collected, (run, time, ...)."""
     recorded = _reduced(job.reducer, job.later, _simulate_outputs(job, runs))
     valid, start = jnp.asarray(runs) < job.stop, runs[0] % BATCHES
@@ -247,7 +247,7 @@ def _simulate_block(job: _Job, runs: jax.Array) -> tuple[tuple[PyTree, PyTree], 
     def sum_by_batch(leaf: jax.Array) -> PyTree:
         """Return (run, ...) as (..., batch), without runs beyond the last; what all runs share as of one."""
         if len(leaf) < len(runs):
-            return Shared(leaf[0].astype(float))
+            return SharedResult(leaf[0].astype(float))
         return group_by_batch(jnp.where(valid, jnp.moveaxis(leaf, 0, -1).astype(float), 0.0), start)
 
     sums, ever = jax.tree.map(sum_by_batch, (recorded.sums, recorded.ever))
@@ -255,7 +255,7 @@ def _simulate_block(job: _Job, runs: jax.Array) -> tuple[tuple[PyTree, PyTree], 
     return (sums, ever), collected
 
 
-def _simulate_outputs(job: _Job, runs: jax.Array) -> PyTree:
+def _simulate_outputs(job: _SimulationJob, runs: jax.Array) -> PyTree:
     """Return trajectories of one block of runs, (run, time, ...), in double precision whatever simulated them."""
     if job.precision == "float64":
         return _trajectories(job.world, job.inputs, job.key, runs)
@@ -265,7 +265,7 @@ def _simulate_outputs(job: _Job, runs: jax.Array) -> PyTree:
     return jax.tree.map(lambda leaf: leaf.astype(float) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, outputs)
 
 
-def _estimate_memory(job: _Job, runs: int, chunk: int) -> Needed:
+def _estimate_memory(job: _SimulationJob, runs: int, chunk: int) -> NeededMemory:
     """Return the memory of a simulation by XLA on a processor, from its shapes.
 
     Sums stand once in each lane; a lane in flight also has those after its block, and rows of batches from which they
@@ -280,7 +280,7 @@ def _estimate_memory(job: _Job, runs: int, chunk: int) -> Needed:
     in_flight = 1 if job.world.filters.meshes else min(LANES, at_once, os.cpu_count() or 1)
     rows = size_of(sums) * (BATCHES + BLOCK - 1) / BATCHES  # as `group_by_batch` makes them
     kept = blocks * size_of(collected)
-    return Needed(
+    return NeededMemory(
         collected=2 * kept,  # by chunk, then joined, when no trajectories are left
         sums=min(LANES, blocks) * size_of(sums) + in_flight * (size_of(sums) + rows),
         trajectories=max(0.0, in_flight * size_of(read) - kept),
@@ -311,9 +311,9 @@ def _simulate_world(world: World, u: PyTree, key: jax.Array, runs: jax.Array) ->
     return simulate_trajectories(world.init, world.step, keys, (jnp.arange(len(u)), jnp.asarray(u)))
 
 
-def _reduce_runs(reducer: AbstractReducer[Any], later: Smoother | None, outputs: PyTree) -> OfStep:
+def _reduce_runs(reducer: AbstractReducer[Any], later: NetworkSmoother | None, outputs: PyTree) -> OfStep:
     """Return what is summed and collected of each run's trajectories, smoothed where there is a smoother."""
-    recorded: OfStep = each_run(partial(reduce_run, reducer, later), outputs)
+    recorded: OfStep = apply_to_each_run(partial(reduce_run, reducer, later), outputs)
     return recorded
 
 

@@ -16,7 +16,7 @@ from heliograph.model.estimate import Claim, Estimate
 from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.relays import RECEIVER
-from heliograph.numerics.angle import Angles, nearest
+from heliograph.numerics.angle import Angles, wrap_near
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
@@ -35,7 +35,7 @@ from heliograph.simulation.stepping import AllFilters
 from heliograph.smoothing.fixed_interval_lag_point import AbstractSmoothing, nis_sums, warn_if_inconsistent
 
 
-class Smoother(Module):
+class NetworkSmoother(Module):
     """Smooths a network's filters: `kinds` are the numbers of those smoothed, `groups` of the nodes that have them.
 
     `fusions`: of smoothed estimates at the same time.
@@ -88,7 +88,7 @@ def _turn_to_truth(
         """Turn the angles of an estimate (time, ..., n); truth (time, n)."""
         mean = jnp.asarray(estimate.mean)
         truth_at_each = truth.reshape(len(truth), *[1] * (mean.ndim - 2), -1)
-        return replace(estimate, mean=nearest(mean, truth_at_each, angles))
+        return replace(estimate, mean=wrap_near(mean, truth_at_each, angles))
 
     # All kinds that have angles have the plant's.
     of_plant = next((angles for angles in angles_of_kinds if angles), ())
@@ -102,7 +102,7 @@ def _fuse_at_each_time(fusion: StackedFusions, estimates: Sequence[Estimate]) ->
     return fused
 
 
-def reduce_run(reducer: AbstractReducer[Result], later: Smoother | None, outputs: PyTree) -> OfStep:
+def reduce_run(reducer: AbstractReducer[Result], later: NetworkSmoother | None, outputs: PyTree) -> OfStep:
     """Reduce the results of a run (time, ...); with a smoother pairs of filtered and smoothed ones, and its NIS."""
     if later is None:
         return reduce_rows(reducer, outputs)
@@ -124,9 +124,9 @@ class SmoothedPart(NamedTuple):
     groups: tuple[int, ...]
     claims: Claims
 
-    def smoother(self, filters: AllFilters) -> Smoother:
+    def smoother(self, filters: AllFilters) -> NetworkSmoother:
         """Build the smoother for these filters of the whole network."""
-        return Smoother(self.smoothing, filters.fusions, self.kinds, self.groups)
+        return NetworkSmoother(self.smoothing, filters.fusions, self.kinds, self.groups)
 
 
 def select_smoothed_part(network: Network, smoothing: AbstractSmoothing, horizon: int) -> SmoothedPart:
@@ -193,7 +193,7 @@ def _warn_of_inconsistency(network: Network, nis: PyTree) -> None:
 
 
 def make_smoothed_record(network: Network, smoothing: SmoothedPart, outputs: PyTree, time: np.ndarray) -> Record:
-    """Return the record of a recording with its smoothed part, from `Smoother.smooth_run`; warn of bad consistency."""
+    """Return the record of a recording with its smoothed part, by `NetworkSmoother`; warn of bad consistency."""
     _warn_of_inconsistency(smoothing.network, outputs["nis"])
     filtered = trajectories_record(network, {"truth": None, **outputs["filtered"]}, time)
     length = outputs["smoothed"]["measurements"][0].shape[0]
@@ -221,7 +221,7 @@ def add_truth(record: Record, plant: AnyPlant, truth: np.ndarray, smoothing: Abs
     return replace(record, truth=truth, estimates=estimates, smoothed=later)
 
 
-class Recorded(NamedTuple):
+class ReducedRuns(NamedTuple):
     """Sums by batch of `runs` each and what is collected of all runs; `common`: whether all runs share a sum."""
 
     sums: OfStep
@@ -230,8 +230,8 @@ class Recorded(NamedTuple):
     collected: PyTree
 
 
-def finish(
-    reducer: AbstractReducer[Result], recorded: Recorded, network: Network, smoothing: SmoothedPart | None
+def finish_result(
+    reducer: AbstractReducer[Result], recorded: ReducedRuns, network: Network, smoothing: SmoothedPart | None
 ) -> Result:
     """Make the result of a network, with that of its smoothed part; warn of filters that are not consistent."""
     sums, common, count, collected = recorded

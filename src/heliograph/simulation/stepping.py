@@ -22,14 +22,20 @@ from heliograph.numerics.check import fail, instance, text
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.centres.centre import (
-    Centre,
     CentreFilter,
     CentreState,
+    FusionCentre,
     claim_of_reports,
 )
 from heliograph.simulation.centres.fused_innovation import FusedInnovation, following_prior, make_fused_innovations
-from heliograph.simulation.centres.fusions import Reporting, StackedFusions, centres_of, fusions_of, sources_of
-from heliograph.simulation.centres.linearised import Followed, LinearisedCentre
+from heliograph.simulation.centres.fusions import (
+    ReportFusion,
+    StackedFusions,
+    centres_of,
+    find_source_filters,
+    list_stacked_fusions,
+)
+from heliograph.simulation.centres.linearised import FollowedFusion, LinearisedCentre
 from heliograph.simulation.centres.mesh import Mesh
 from heliograph.simulation.centres.mesh_building import build_meshes
 from heliograph.simulation.centres.uplinks import uplinks_of
@@ -47,8 +53,8 @@ class AllFilters(Module):
 
     alike: tuple[StackedFilters, ...]
     fusions: tuple[StackedFusions, ...]
-    centres: tuple[Centre | LinearisedCentre, ...]
-    reporting: dict[str, Reporting]
+    centres: tuple[FusionCentre | LinearisedCentre, ...]
+    reporting: dict[str, ReportFusion]
     meshes: dict[str, Mesh]
     tests: dict[str, FusedInnovation]
     central: dict[str, AbstractFilter]
@@ -89,8 +95,8 @@ class AllFilters(Module):
         self.alike = tuple(alike)
         # Central filters, fusions, informed centres, centres with reports.
         self.central = {name: fusion for name, fusion in network.fused.items() if isinstance(fusion, AbstractFilter)}
-        self.fusions, self.centres = fusions_of(network), centres_of(network)
-        self.reporting, self.meshes = _make_reporting(network), build_meshes(network)
+        self.fusions, self.centres = list_stacked_fusions(network), centres_of(network)
+        self.reporting, self.meshes = _make_report_fusions(network), build_meshes(network)
         self.tests = make_fused_innovations(network, self.alike) if tests else {}
         # Permutation of the groups' measurements into the order of the nodes.
         grouped = [name for names in network.groups for name in names]
@@ -118,8 +124,8 @@ class AllFilters(Module):
         )
 
     def _init_centre(
-        self, centre: Centre | LinearisedCentre, states: Sequence[PyTree]
-    ) -> CentreState | dict[str, Followed]:
+        self, centre: FusionCentre | LinearisedCentre, states: Sequence[PyTree]
+    ) -> CentreState | dict[str, FollowedFusion]:
         """Return the state in which a centre begins, from the first means of the filters whose estimates it fuses.
 
         Those of one kind are stacked, (filter, node, n), of which a source takes filter number f.
@@ -135,11 +141,11 @@ class AllFilters(Module):
         return not fuses and all(filter.is_linear for filter in filters)
 
     @property
-    def informed(self) -> tuple[Centre, ...]:
+    def informed(self) -> tuple[FusionCentre, ...]:
         """Centres of filters whose gains do not depend on data."""
-        return tuple(centre for centre in self.centres if isinstance(centre, Centre))
+        return tuple(centre for centre in self.centres if isinstance(centre, FusionCentre))
 
-    def matrices(self, centre: Centre, states: PyTree, u: jax.Array, k: jax.Array) -> list[LinearStep]:
+    def matrices(self, centre: FusionCentre, states: PyTree, u: jax.Array, k: jax.Array) -> list[LinearStep]:
         """Return the matrices of a centre's sources at step k; they depend on covariances alone, so z may be zero."""
         sources = [(self.alike[kind], states[kind], f, self._make_zeros(kind)) for kind, f in centre.sources]
         return [alike.matrices(centre.read, state, f, zeros, u, k) for alike, state, f, zeros in sources]
@@ -273,7 +279,7 @@ class AllFilters(Module):
 
     def _step_centre(
         self,
-        centre: Centre | LinearisedCentre,
+        centre: FusionCentre | LinearisedCentre,
         state: PyTree,
         states: PyTree,
         z: Sequence[jax.Array],
@@ -315,16 +321,16 @@ def initial_states(filters: AllFilters) -> PyTree:
     return jax.tree.map(jnp.asarray, filters.init())
 
 
-def _make_reporting(network: Network) -> dict[str, Reporting]:
+def _make_report_fusions(network: Network) -> dict[str, ReportFusion]:
     """Return the fusions by reports, each with its uplinks and its centre."""
     results = {}
     for name, fusion in network.fused.items():
         if isinstance(fusion, Fusion) and fusion.by_report:
             centre = centre_filter(network, name)
             nodes = network.nodes_with(fusion.filter)
-            sources, order = sources_of(network, network.places, nodes, fusion.filter)
+            sources, order = find_source_filters(network, network.places, nodes, fusion.filter)
             uplinks = uplinks_of(fusion, nodes, len(network.states))
-            results[name] = Reporting(uplinks, centre, order, sources, tuple(nodes))
+            results[name] = ReportFusion(uplinks, centre, order, sources, tuple(nodes))
     return results
 
 

@@ -19,8 +19,8 @@ from heliograph.simulation.stepping import AllFilters
 from heliograph.simulation.transmission.reception import AbstractMedium
 from heliograph.simulation.transmission.shared_fading import (
     PLANT,
-    memory_places,
     move_modes,
+    number_memories,
     start_modes,
 )
 from straightline import present
@@ -46,7 +46,7 @@ class World(Module):
     @property
     def _places(self) -> np.ndarray:
         """Places of the memories of the plant, (memories,)."""
-        return memory_places({PLANT: self.plant}, self.plant)[PLANT]
+        return number_memories({PLANT: self.plant}, self.plant)[PLANT]
 
     def step(self, carry: PyTree, key: jax.Array, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
         """Step to k with the input u: next state, and truth (n,), measurements and estimates."""

@@ -107,7 +107,7 @@ def sweep_over_lag(steps: SmootherStep, lag: int | Int[Array, ""]) -> Estimate:
     last = len(steps.mean) - 1
     times = jnp.arange(last + 1)
 
-    def body(done: jax.Array, later: Gaussian) -> Gaussian:
+    def pass_one_step_back(done: jax.Array, later: Gaussian) -> Gaussian:
         """Pass from the state after step k + lag - done to the one before it, unless the data end earlier."""
         ahead = times + lag - done
         before = jax.vmap(lambda step, law: step.back(law))(take_steps(steps, jnp.minimum(ahead, last)), later)
@@ -118,7 +118,7 @@ def sweep_over_lag(steps: SmootherStep, lag: int | Int[Array, ""]) -> Estimate:
 
     # From the newest step that each one may use, as many steps back as the lag has.
     newest = take_steps(steps.end, jnp.minimum(times + lag, last))
-    smoothed = jax.lax.fori_loop(0, lag, body, newest)
+    smoothed = jax.lax.fori_loop(0, lag, pass_one_step_back, newest)
     estimate: Estimate = jax.vmap(lambda step, law: step.estimate_from(law))(steps, smoothed)
     return estimate
 

@@ -14,16 +14,16 @@ import numpy as np
 
 from heliograph.engine.choice import choose_code
 from heliograph.factors.gaussian import Gaussian
-from heliograph.filters.chunks import Begun, begin_chunks, mend_chunks, replace_chunk, scan_chunks
+from heliograph.filters.chunks import ChunkStarts, find_chunk_starts, replace_chunk, rescan_wrong_starts, scan_chunks
 from heliograph.filters.recursion import linear_start, scan_chunk
-from heliograph.filters.settled import Settled
+from heliograph.filters.settled import SettledState
 from heliograph.filters.smoother_step import SmootherStep, gaussian_of
-from heliograph.filters.states import agree, select_state
+from heliograph.filters.states import find_equal_states, select_state
 from heliograph.filters.windows import Which, take, take_windows
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.types import Array, Float, PyTree
-from heliograph.smoothing.fixed_interval_lag_point import sum_blocks
-from heliograph.smoothing.settled import SmoothedChunk, SmootherRows, smooth_settled_chunks
+from heliograph.smoothing.fixed_interval_lag_point import sum_nis_over_blocks
+from heliograph.smoothing.settled import SmoothedChunk, SmootherStepRecursion, smooth_settled_chunks
 
 
 class SmoothedRows(NamedTuple):
@@ -45,12 +45,18 @@ def smooth_in_chunks(filter: Any, z: Array, u: Array) -> SmoothedRows | None:
     if start is None:
         return None
     with jax.enable_x64(True):
-        begun = begin_chunks(SmootherRows(filter, 0), start, rows)
-        return None if begun is None else _smooth_all(SmootherRows(filter, begun.lengths.chunk), begun, rows)
+        begun = find_chunk_starts(SmootherStepRecursion(filter, 0), start, rows)
+        return None if begun is None else _smooth_all(SmootherStepRecursion(filter, begun.lengths.chunk), begun, rows)
 
 
 def smooth_chunk(
-    recursion: SmootherRows, state: PyTree, rows: PyTree, first: Array, end: Array, later: Gaussian, is_given: Array
+    recursion: SmootherStepRecursion,
+    state: PyTree,
+    rows: PyTree,
+    first: Array,
+    end: Array,
+    later: Gaussian,
+    is_given: Array,
 ) -> SmoothedChunk:
     """Smooth a chunk by its own rows and those behind it, up to row `end`.
 
@@ -83,7 +89,7 @@ def smooth_chunk(
     return SmoothedChunk(after, entered, left, estimate, steps.nis, steps.received)
 
 
-def _smooth_all(recursion: SmootherRows, begun: Begun, rows: PyTree) -> SmoothedRows | None:
+def _smooth_all(recursion: SmootherStepRecursion, begun: ChunkStarts, rows: PyTree) -> SmoothedRows | None:
     """Smooth all chunks side by side, and again those that a neighbour contradicts.
 
     A chunk has `own` rows. It filters `ahead` rows more and passes back over these, begun by the filter's own law at
@@ -94,7 +100,7 @@ def _smooth_all(recursion: SmootherRows, begun: Begun, rows: PyTree) -> Smoothed
     windows = take_windows(rows, begun.first, own + ahead)
     ends = np.minimum(begun.first + own + ahead, total)
 
-    def smooth(states: PyTree, which: Which, later: Gaussian | None = None) -> SmoothedChunk | None:
+    def smooth_chunks_from(states: PyTree, which: Which, later: Gaussian | None = None) -> SmoothedChunk | None:
         """Smooth some chunks from these states; backwards from `later` at the end of their own rows, if given."""
         first = begun.first[which]
         end = ends[which] if later is None else first + own
@@ -103,26 +109,28 @@ def _smooth_all(recursion: SmootherRows, begun: Begun, rows: PyTree) -> Smoothed
         choice = choose_code(smooth_chunk, arguments, [False, *[True] * 6])
         return None if choice.code is None else choice.results()
 
-    def smooth_means(settled: Settled) -> SmoothedChunk | None:
+    def smooth_means(settled: SettledState) -> SmoothedChunk | None:
         """Smooth all chunks as if they were settled."""
         return smooth_settled_chunks(recursion, settled, begun, windows)
 
     # Settled chunks are those whose rows are complete, their own and those behind, of which none are beyond the end.
     whole = begun.complete.cover(begun.first, own + ahead) & (begun.first + own + ahead <= total)
     begun = begun._replace(covered=begun.covered & whole)
-    results = scan_chunks(begun, smooth, smooth_means)
+    results = scan_chunks(begun, smooth_chunks_from, smooth_means)
     if results is None:
         return None
-    mend_chunks(smooth, begun.states, lambda results: results.end, results)
+    rescan_wrong_starts(smooth_chunks_from, begun.states, lambda results: results.end, results)
     # The states with which chunks begin are those in which the ones before them end.
-    wrong = ~agree(take(results.entered, slice(None, -1)), take(results.left, slice(1, None)))
+    wrong = ~find_equal_states(take(results.entered, slice(None, -1)), take(results.left, slice(1, None)))
     for c in range(len(wrong) - 1, -1, -1):
         if wrong[c]:
             here, law = slice(c, c + 1), take(results.left, slice(c + 1, c + 2))
             state = take(results.end, slice(c - 1, c)) if c else take(begun.states, here)
-            replace_chunk(results, here, smooth(state, here, law))
+            replace_chunk(results, here, smooth_chunks_from(state, here, law))
             # This chunk is left by another law now, with which the one before it has to agree.
             if c:
-                wrong[c - 1] = not agree(take(results.entered, slice(c - 1, c)), take(results.left, here))[0]
+                wrong[c - 1] = not find_equal_states(take(results.entered, slice(c - 1, c)), take(results.left, here))[
+                    0
+                ]
     estimate, nis, received = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:total], results[3:])
-    return SmoothedRows(estimate, np.asarray(sum_blocks(nis, received)))
+    return SmoothedRows(estimate, np.asarray(sum_nis_over_blocks(nis, received)))

@@ -31,10 +31,10 @@ def nis_sums(steps: SmootherStep) -> Float[Array, "5"]:
     """
     if steps.nis is None or steps.received is None:
         return jnp.zeros(5)
-    return sum_blocks(steps.nis, steps.received)
+    return sum_nis_over_blocks(steps.nis, steps.received)
 
 
-def sum_blocks(nis: Float[Array, " time"], received: Float[Array, " time"]) -> Float[Array, "5"]:
+def sum_nis_over_blocks(nis: Float[Array, " time"], received: Float[Array, " time"]) -> Float[Array, "5"]:
     """Return `nis_sums` of the squares e' S^-1 e of each step, and of the number of components that arrived."""
     xp, time = library(nis), len(nis)
     count = min(BLOCKS, time)

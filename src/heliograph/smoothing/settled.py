@@ -14,9 +14,9 @@ import numpy as np
 
 from heliograph.engine.choice import choose_code
 from heliograph.factors.gaussian import Gaussian
-from heliograph.filters.chunks import Begun
+from heliograph.filters.chunks import ChunkStarts
 from heliograph.filters.recursion import Recursion
-from heliograph.filters.settled import Settled, find_settled, scan_settled, step_settled
+from heliograph.filters.settled import SettledState, find_settled_state, scan_settled_rows, step_settled
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, gaussian_of, make_smoother_step
 from heliograph.filters.states import means_of, with_means
 from heliograph.filters.windows import take
@@ -24,7 +24,7 @@ from heliograph.model.estimate import Estimate
 from heliograph.numerics.types import Array, PyTree
 
 
-class SmootherRows(Recursion):
+class SmootherStepRecursion(Recursion):
     """A filter's recursion over rows, with the smoother step of each row as its output.
 
     Args:
@@ -58,10 +58,10 @@ class SmoothedChunk(NamedTuple):
     received: Array
 
 
-class BackRows(Recursion):
+class BackwardRecursion(Recursion):
     """The smoothed law passed back over rows (parts of smoother steps that vary, nothing), with an estimate of each."""
 
-    settled: Settled
+    settled: SettledState
 
     def step(self, law: Gaussian, row: tuple[list[Array], Array], k: Array) -> tuple[Gaussian, Estimate]:
         """Smooth the state before a row from the law behind it, of which the row's estimate is."""
@@ -70,7 +70,7 @@ class BackRows(Recursion):
 
 
 def smooth_settled_chunks(
-    recursion: SmootherRows, settled: Settled, begun: Begun, windows: PyTree
+    recursion: SmootherStepRecursion, settled: SettledState, begun: ChunkStarts, windows: PyTree
 ) -> SmoothedChunk | None:
     """Smooth chunks, as if all were settled, by their rows and those behind them (chunks, rows, ...).
 
@@ -83,10 +83,10 @@ def smooth_settled_chunks(
         windows: rows of each chunk.
     """
     # The smoothed law that stands still, by repeating the settled smoother step.
-    back = BackRows(settled)
+    back = BackwardRecursion(settled)
     leaves = zip(jax.tree.leaves(settled.outputs), settled.varies, strict=True)
     varying = [np.asarray(leaf)[None] for leaf, varies in leaves if varies]
-    smoothed = find_settled(back, settled.outputs.after, (varying, np.zeros((1, 0))), begun.lengths.ahead)
+    smoothed = find_settled_state(back, settled.outputs.after, (varying, np.zeros((1, 0))), begun.lengths.ahead)
     if smoothed is None:
         return None
     arguments = recursion, back, smoothed, means_of(begun.states), windows, begun.first
@@ -105,7 +105,12 @@ def smooth_settled_chunks(
 
 
 def _smooth_settled(
-    recursion: SmootherRows, back: BackRows, smoothed: Settled, means: Sequence[Array], rows: PyTree, first: Array
+    recursion: SmootherStepRecursion,
+    back: BackwardRecursion,
+    smoothed: SettledState,
+    means: Sequence[Array],
+    rows: PyTree,
+    first: Array,
 ) -> tuple[PyTree, ...]:
     """Smooth a settled chunk that begins with these means, by its own rows and those behind it.
 
@@ -114,8 +119,8 @@ def _smooth_settled(
         estimates that vary (own, ...), and the squared innovations (own,).
     """
     own, settled, end = recursion.own, back.settled, first + len(rows[0])
-    after, steps = scan_settled(recursion, settled, means, take(rows, slice(own)), first, end)
-    last, steps_behind = scan_settled(recursion, settled, after, take(rows, slice(own, None)), first + own, end)
+    after, steps = scan_settled_rows(recursion, settled, means, take(rows, slice(own)), first, end)
+    last, steps_behind = scan_settled_rows(recursion, settled, after, take(rows, slice(own, None)), first + own, end)
 
     def pass_back(means: list[jax.Array], varying: list[jax.Array]) -> tuple[list[jax.Array], list[jax.Array]]:
         """Return the smoothed means before a row from those behind it, and what varies of its estimate."""

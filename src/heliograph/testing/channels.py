@@ -10,7 +10,7 @@ from heliograph.numerics.types import PyTree
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.memory import memories
 from heliograph.random_affine.modes import JointModes, joint_modes
-from heliograph.random_affine.moments.monomials import evaluate_monomials, exponents
+from heliograph.random_affine.moments.monomials import evaluate_monomials, list_exponents
 from heliograph.simulation.runs.over_runs import over_runs
 
 FALSE_ALARM = 1e-6  # probability that a correct object fails, shared by all numbers compared (Bonferroni)
@@ -54,7 +54,7 @@ def check_random_affine(channel: AbstractRandomAffine, seed: int = 0, samples: i
         z = first[:, :-1] @ np.append(y, 1.0)
         for order in range(1, highest + 1):
             expected = channel.moments(order).expect(evaluate_monomials(y, order))
-            worst = max(worst, _compare(f"order {order}", expected, _evaluate_rows(z, order)))
+            worst = max(worst, _compare_means(f"order {order}", expected, _evaluate_rows(z, order)))
     return worst
 
 
@@ -75,7 +75,7 @@ def _compare_draw_pairs(modes: JointModes, now: np.ndarray, later: np.ndarray) -
     means = np.array([m.moments(1).mean[:-1] for m in modes.maps])
     expected = np.einsum("i,ij,iab,jcd->abcd", modes.initial, modes.transition, means, means)
     seen = np.einsum("sab,scd->sabcd", now, later)
-    return _compare("two draws in a row", expected.reshape(-1), seen.reshape(len(now), -1))
+    return _compare_means("two draws in a row", expected.reshape(-1), seen.reshape(len(now), -1))
 
 
 def _compare_modes(
@@ -97,12 +97,12 @@ def _compare_modes(
     }
     for order, (at_first, at_second) in by_mode.items():
         first, second = initial @ at_first, initial @ transition @ at_second
-        worst = max(worst, _compare(f"order {order}, first draw", first, _evaluate_rows(now, order)))
-        worst = max(worst, _compare(f"order {order}, second draw", second, _evaluate_rows(later, order)))
+        worst = max(worst, _compare_means(f"order {order}, first draw", first, _evaluate_rows(now, order)))
+        worst = max(worst, _compare_means(f"order {order}, second draw", second, _evaluate_rows(later, order)))
     for i, j in product(range(1, highest // 2 + 1), repeat=2):
         expected = np.einsum("a,ab,am,bl->ml", initial, transition, by_mode[i][0], by_mode[j][1]).reshape(-1)
         seen = np.einsum("sm,sl->sml", _evaluate_rows(now, i), _evaluate_rows(later, j)).reshape(len(now), -1)
-        worst = max(worst, _compare(f"orders {i} and {j} of two draws in a row", expected, seen))
+        worst = max(worst, _compare_means(f"orders {i} and {j} of two draws in a row", expected, seen))
     return worst
 
 
@@ -139,11 +139,11 @@ def _evaluate_rows(z: np.ndarray, order: int) -> np.ndarray:
     """Return the monomials up to an order of each row of z, (sample, monomials)."""
     values = np.column_stack([z, np.ones(len(z))])
     columns = np.arange(values.shape[1])
-    powers = exponents(len(columns), order)
+    powers = list_exponents(len(columns), order)
     return np.column_stack([values[:, np.repeat(columns, exponent)].prod(axis=1) for exponent in powers])
 
 
-def _compare(what: str, expected: np.ndarray | jax.Array, seen: np.ndarray) -> float:
+def _compare_means(what: str, expected: np.ndarray | jax.Array, seen: np.ndarray) -> float:
     """Compare means over samples (sample, number) with expected ones; return the largest |difference| / standard error.
 
     The standard error is that of each mean. A number that does not vary has to agree to rounding.

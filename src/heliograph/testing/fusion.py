@@ -112,10 +112,10 @@ def check_quantizer(quantizer: AbstractQuantizer, n: int = 2, steps: int = 20, s
         AssertionError: naming the rule that is broken.
     """
     with jax.enable_x64(True):
-        _check_steps(quantizer, n, steps, np.random.default_rng(seed))
+        _check_quantizer_steps(quantizer, n, steps, np.random.default_rng(seed))
 
 
-def _check_steps(quantizer: AbstractQuantizer, n: int, steps: int, generator: np.random.Generator) -> None:
+def _check_quantizer_steps(quantizer: AbstractQuantizer, n: int, steps: int, generator: np.random.Generator) -> None:
     """Check a quantizer on random values, each of which follows the last from the state that it left.
 
     Its errors hold, Q(Q(x)) = Q(x) from the same state, and it does the same under jit and vmap.

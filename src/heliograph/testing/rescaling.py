@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import Columns
+from heliograph.factors.columns import WeightedColumns
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.belief import OpenLoop
 from heliograph.filters.gaussian.gaussian import GaussianFilter
@@ -32,7 +32,7 @@ from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor, Sen
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, Float
-from heliograph.random_affine.moments.monomials import exponents
+from heliograph.random_affine.moments.monomials import list_exponents
 from heliograph.random_affine.moments.quadratic_map import QuadraticMap
 from heliograph.random_affine.moments.second_moments import SecondOrder, describe_second_moments
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Shaped
@@ -51,7 +51,7 @@ WithEnds = (
 Ended = TypeVar("Ended", bound=WithEnds)
 
 
-class InUnits(Module):
+class FunctionInUnits(Module):
     """A function of vectors in other units: out f(x_1 / into_1, ...). Functions in all units share one program."""
 
     function: Callable[..., ArrayLike]
@@ -172,11 +172,11 @@ def _rescale_plant(plant: AbstractPlant, units: Units) -> AbstractPlant:
     center = s * plant.initial_mean
     if plant.deviation is not None:
         law, center = _rescale_noise(plant.deviation, s), s * (plant.initial_mean - plant.deviation.mean)
-    noise: AbstractNoise | InUnits
+    noise: AbstractNoise | FunctionInUnits
     if isinstance(plant.noise, AbstractNoise):
         noise = _rescale_noise(plant.noise, s)
     else:
-        noise = InUnits(plant.noise, np.outer(s, s), (u,))
+        noise = FunctionInUnits(plant.noise, np.outer(s, s), (u,))
     size = dict(zip(plant.states, s, strict=True))
     limits = {name: (size[name] * low, size[name] * high) for name, (low, high) in plant.limits}
     names = plant.states, plant.inputs, plant.circular
@@ -184,17 +184,17 @@ def _rescale_plant(plant: AbstractPlant, units: Units) -> AbstractPlant:
         matrix = _rescale_matrix(plant.matrix, s, s, u)
         input_matrix = _rescale_matrix(plant.input_matrix, s, u, u)
         return LinearPlant(matrix, noise, center, law, input_matrix, *names, limits=limits)
-    move = InUnits(plant.transition, s, (s, u))
+    move = FunctionInUnits(plant.transition, s, (s, u))
     return Plant(move, noise, center, law, *names, attitude=plant.attitude, limits=limits)
 
 
 def _rescale_matrix(
     matrix: OfInputs | ArrayLike, out: np.ndarray, into: np.ndarray, inputs: np.ndarray
-) -> InUnits | np.ndarray:
+) -> FunctionInUnits | np.ndarray:
     """Return the matrix out A / into, a function of the inputs if A is one: element ij is out_i A_ij / into_j."""
     factor = out[:, None] / into
     if isinstance(matrix, OfInputs):
-        return InUnits(matrix.function, factor, (inputs,))
+        return FunctionInUnits(matrix.function, factor, (inputs,))
     return np.asarray(out[:, None] * matrix / into)
 
 
@@ -211,7 +211,9 @@ def _rescale_sensor(sensor: AbstractSensor, units: Units) -> AbstractSensor:
         return LinearSensor(
             r[:, None] * sensor.matrix / s, _rescale_noise(sensor.noise, r), sensor.outputs, sensor.circular
         )
-    return Sensor(InUnits(sensor.measure, r, (s,)), _rescale_noise(sensor.noise, r), sensor.outputs, sensor.circular)
+    return Sensor(
+        FunctionInUnits(sensor.measure, r, (s,)), _rescale_noise(sensor.noise, r), sensor.outputs, sensor.circular
+    )
 
 
 def _rescale_moments(channel: SecondOrder | OverTime, units: Units) -> SecondOrder | OverTime:
@@ -244,7 +246,7 @@ def _rescale_by_mode(channel: Modes | OverTime, units: Units) -> Modes | OverTim
     """Return the description of z = Q G R^-1 y + Q n for each mode."""
     values: Modes = stacked(channel)
     of_mean, of_spread = _scale_channel(units)
-    noise = Columns(units.received[:, None] * values.noise.matrix, values.noise.weights)
+    noise = WeightedColumns(units.received[:, None] * values.noise.matrix, values.noise.weights)
     gains = of_spread * values.gain_spread
     scaled: Modes = replace(values, mean=of_mean * values.mean, gain_spread=gains, noise=noise)
     return OverTime(scaled) if isinstance(channel, OverTime) else scaled
@@ -258,7 +260,7 @@ def _rescale_combinations(components: AtomCombinations | OverTime, units: Units)
         values.weight,
         q[:, None] * values.gain / units.states,
         q * values.offset,
-        Columns(q[:, None] * values.noise.matrix, values.noise.weights),
+        WeightedColumns(q[:, None] * values.noise.matrix, values.noise.weights),
         values.mode,
         values.transition,
     )
@@ -302,5 +304,5 @@ def _rescale_system(filter: LinearSystemFilter, degree: int, units: Units) -> Li
 
 def _scale_monomials(factors: Float[np.ndarray, " n"], degree: int) -> Float[np.ndarray, " N"]:
     """Return the factors of the monomials up to `degree` of numbers with these factors, the constant 1 left out."""
-    table = np.array(exponents(len(factors) + 1, degree))[:-1, :-1]
+    table = np.array(list_exponents(len(factors) + 1, degree))[:-1, :-1]
     return np.asarray(np.prod(factors**table, axis=1))

@@ -3,7 +3,7 @@
 import platform
 from functools import cache
 
-from straightline.llvm.transposed import Lines
+from straightline.llvm.transposed import TextLines
 
 
 @cache
@@ -28,12 +28,12 @@ def gather_name(bits: int, spread: bool) -> str:
     return f"hg_gather{bits}_{'lanes' if spread else 'table'}"
 
 
-def gather(bits: int, spread: bool, width: int) -> str:
+def write_gather(bits: int, spread: bool, width: int) -> str:
     """Write `%i64 @hg_gather64_table(ptr start, %i64 places)`, which loads in each lane the number at its place.
 
     If `spread`, a place has a number for each lane, of which each lane loads its own.
     """
-    vector, text, total = f"%i{bits}", Lines(), "poison"
+    vector, text, total = f"%i{bits}", TextLines(), "poison"
     row, entry = (f"[{width} x i{bits}]", ", i64 {}") if spread else (f"i{bits}", "")
     for lane in range(width):
         index = text.add(f"extractelement %i64 %places, i64 {lane}")

@@ -6,13 +6,13 @@ from typing import Any, NamedTuple
 from straightline.llvm.operations import BITS
 from straightline.llvm.text import loops_of, turns_of
 from straightline.nodes import REAL, Buffer, Node, Unsupported
-from straightline.program import Program, Summed, uses
+from straightline.program import Program, SummedOutputs, list_used_nodes
 
 LINE = 64  # bytes: where vectors of any width may start
 FILLED = ("scratch", "carried")  # kinds of memory that the program fills
 
 
-class Parts(NamedTuple):
+class ProgramParts(NamedTuple):
     """Items of a program in order, and what of them differs between runs: `spread`; all else is computed once.
 
     `lanes` are the inputs that differ. `alone`: there is one run, whose arrays are used in place. A vector has at most
@@ -26,7 +26,7 @@ class Parts(NamedTuple):
     spread: set[Any]
     alone: bool
     width: int
-    summed: Summed | None
+    summed: SummedOutputs | None
 
     @property
     def tables(self) -> list[Buffer]:
@@ -52,7 +52,7 @@ class Parts(NamedTuple):
         return [b for b, is_sum in pairs if is_sum and b in self.spread]
 
 
-class Layout(NamedTuple):
+class MemoryLayout(NamedTuple):
     """Offsets of buffers, and their ends, in bytes: of memory that belongs to a thread, and that all runs share.
 
     `turning` are shared buffers within loops that have a place for each turn.
@@ -65,7 +65,7 @@ class Layout(NamedTuple):
     turning: set[Buffer]
 
 
-def lay_out(parts: Parts, mine: Collection[Any]) -> Layout:
+def lay_out(parts: ProgramParts, mine: Collection[Any]) -> MemoryLayout:
     """Place what differs between runs in the memory of a thread, and what the program fills for all in shared memory.
 
     `mine` are the items of the function of blocks. What it reads of memory that is filled anew in each turn of a loop
@@ -79,7 +79,7 @@ def lay_out(parts: Parts, mine: Collection[Any]) -> Layout:
     common = [b for b in owners if b not in parts.spread and b.kind in FILLED]
     turning = {b for b in common if loops_of(b.block)}
     turning &= _read(mine) if turning else turning
-    return Layout(*_place_buffers(own, parts.width), *_place_buffers(common, 1, turning), turning)
+    return MemoryLayout(*_place_buffers(own, parts.width), *_place_buffers(common, 1, turning), turning)
 
 
 def _check_sums(items: Iterable[Any], outputs: Collection[Buffer]) -> None:
@@ -91,7 +91,7 @@ def _check_sums(items: Iterable[Any], outputs: Collection[Buffer]) -> None:
 
 def _read(items: Iterable[Any]) -> set[Buffer]:
     """Return the buffers that these items, or what they use directly, load numbers of."""
-    nodes = (node for x in items for node in (x, *uses(x)) if isinstance(node, Node))
+    nodes = (node for x in items for node in (x, *list_used_nodes(x)) if isinstance(node, Node))
     return {node.value[0].owner[0] for node in nodes if node.op == "load"}
 
 

@@ -12,35 +12,35 @@ import numpy as np
 from straightline.cycles import keep_cycles
 from straightline.folding import DTYPES
 from straightline.limits import LONGEST, TABLE
-from straightline.llvm.lanes import WIDTH, gather, lane_numbers, types, write_flush
-from straightline.llvm.layout import FILLED, LINE, Layout, Parts, lay_out
+from straightline.llvm.lanes import WIDTH, lane_numbers, types, write_flush, write_gather
+from straightline.llvm.layout import FILLED, LINE, MemoryLayout, ProgramParts, lay_out
 from straightline.llvm.operations import BITS
-from straightline.llvm.prefetch import Rows, longest, share
-from straightline.llvm.text import Slots, Writer, turns_of
-from straightline.llvm.transposed import FEW, Move, mover
-from straightline.lowering import Lowering, Value, refusing
+from straightline.llvm.prefetch import PrefetchedRows, longest, share
+from straightline.llvm.text import FunctionWriter, SharedSlots, turns_of
+from straightline.llvm.transposed import FEW, Move, write_mover
+from straightline.lowering import Lowering, Value, refuse_failures
 from straightline.memory import InMemory, contiguous
 from straightline.nodes import Buffer, Loop, Node, Type, Unsupported
 from straightline.program import (
     Program,
-    Summed,
-    crossing,
+    SummedOutputs,
+    find_crossing_items,
     find_differing,
+    find_fusable_products,
     list_needed,
-    products_of,
     row_length,
     sort_items,
 )
 from straightline.rules.loops import copied
-from straightline.rules.random_bits import hash_function
-from straightline.vectors.elementary import FUNCTIONS, functions
+from straightline.rules.random_bits import write_hash_function
+from straightline.vectors.elementary import FUNCTIONS, write_functions
 
 WIDEST = 8  # runs of a vector of doubles: one register of the widest processors, two of others; more only spill
 LONG = 60  # operations of an elementary function or of a hash: 30 to 150, and 80
 SQUARED = ("f64", "i64", "u64", "f32")  # types whose arrays are long enough, or wide, to be moved in squares
 
 
-class Source(NamedTuple):
+class FunctionSource(NamedTuple):
     """Text of a function, from which code is generated once or twice.
 
     compressed: the text, to a tenth, since it is needed again only if the program turns out to be executed often.
@@ -59,7 +59,7 @@ class Source(NamedTuple):
         return "\n".join([types(width), *(helper(width) for helper in self.helpers), body])
 
 
-class Output(NamedTuple):
+class OutputShape(NamedTuple):
     """Type and shape of a result of one run: its buffer without the program that fills it."""
 
     type: Type
@@ -71,7 +71,7 @@ class Output(NamedTuple):
         return math.prod(self.shape)
 
 
-class Code(NamedTuple):
+class ModuleText(NamedTuple):
     """Text of a program's two functions, for blocks of runs and once for what all runs share, and their memory.
 
     `pointers` are to memory of the inputs, the tables, the outputs and last to `shared` bytes that all runs share;
@@ -79,10 +79,10 @@ class Code(NamedTuple):
     program, `divisions` those of them that divide or take roots. `width`: the most runs of a vector.
     """
 
-    blocks: Source
-    once: Source | None
+    blocks: FunctionSource
+    once: FunctionSource | None
     tables: list[np.ndarray]
-    outputs: list[Output]
+    outputs: list[OutputShape]
     common: list[bool]
     places: list[int]  # of common outputs in the shared memory
     shared: int
@@ -92,7 +92,7 @@ class Code(NamedTuple):
     width: int
 
 
-def output_buffers(program: Program, last: Collection[int] = ()) -> list[Buffer]:
+def choose_output_buffers(program: Program, last: Collection[int] = ()) -> list[Buffer]:
     """Return a buffer for each result, none used twice: an array that the program fills is used where it is.
 
     What is not in memory is stored, number by number; so are the results with the numbers `last`, since they may
@@ -129,7 +129,7 @@ def _store_in_memory(lowering: Lowering, value: Value) -> InMemory:
     return InMemory.whole(buffer)
 
 
-@refusing("the text of a program")
+@refuse_failures("the text of a program")
 def write_module(
     program: Program,
     differing: Iterable[bool],
@@ -137,8 +137,8 @@ def write_module(
     fuse: bool,
     alone: bool = False,
     last: Collection[int] = (),
-    summed: Summed | None = None,
-) -> Code:
+    summed: SummedOutputs | None = None,
+) -> ModuleText:
     """Return the LLVM text of a program: a function for blocks of runs, and one that computes once what runs share.
 
     The program's graph is freed.
@@ -155,32 +155,32 @@ def write_module(
     Raises:
         Unsupported: an operation that LLVM's text does not have here, or a program that is too long.
     """
-    outputs = output_buffers(program, last)
+    outputs = choose_output_buffers(program, last)
     lanes = [b for b, d in zip(program.inputs, differing, strict=True) if d or alone]
     items = sort_items(keep_cycles(program.graph, outputs) if alone else list_needed(outputs))
     counts = _count_operations(items)
     # What differs between runs, what the function of blocks needs for it, and where all of it lies.
     differs = {*items, *program.inputs} if alone else find_differing(items, lanes)
     differs = {x for x in differs if not (isinstance(x, Buffer) and x.kind == "table")}
-    parts = Parts(
+    parts = ProgramParts(
         program, items, outputs, lanes, spread=differs, alone=alone, width=width or widest(differs), summed=summed
     )
-    of_blocks = crossing(items, differs)
+    of_blocks = find_crossing_items(items, differs)
     layout = lay_out(parts, of_blocks)
     # The function of blocks computes what differs, and reads the rest from slots.
-    slots = Slots(layout.shared)
-    blocks = Writer(alone, of_blocks, products_of(items) if fuse else set(), differs, slots)
+    slots = SharedSlots(layout.shared)
+    blocks = FunctionWriter(alone, of_blocks, find_fusable_products(items) if fuse else set(), differs, slots)
     blocks.turning, blocks.flushes = layout.turning, _is_single(items)
     source = _write_blocks(blocks, parts, layout)
     # The other function fills these slots, once for all runs.
     once = _write_once(blocks, parts, layout)
     arrays = [np.ascontiguousarray(b.table, dtype=DTYPES[b.type]) for b in parts.tables if b.table is not None]
     program.graph.top.let_go()
-    return Code(
+    return ModuleText(
         blocks=source,
         once=once,
         tables=arrays,
-        outputs=[Output(b.type, b.shape) for b in outputs],
+        outputs=[OutputShape(b.type, b.shape) for b in outputs],
         common=parts.common,
         places=[layout.in_shared.get(b, 0) for b in outputs],
         shared=slots.size,
@@ -220,26 +220,26 @@ def _is_single(items: Iterable[Any]) -> bool:
     return "f32" in types_ and "f64" not in types_
 
 
-def _finish_source(text: str, writer: Writer, movers: Sequence[Callable[[int], str]]) -> Source:
+def _finish_source(text: str, writer: FunctionWriter, movers: Sequence[Callable[[int], str]]) -> FunctionSource:
     """Return the source of a written text, with its helpers and counts; a loop of unknown length counts as one turn."""
     counts = Counter([x.block for x in writer.mine if isinstance(x, Node)])
     turns = {block: turns_of(block) for block in counts}
     work = sum(count * turns[block] for block, count in counts.items())
-    helpers: list[Callable[[int], str]] = [*movers, *(partial(gather, *kind) for kind in sorted(writer.gathered))]
+    helpers: list[Callable[[int], str]] = [*movers, *(partial(write_gather, *kind) for kind in sorted(writer.gathered))]
     if writer.flushes:
         helpers.append(write_flush)
     called = writer.called - {"threefry"}
     if called:
-        helpers.append(partial(functions, called))
+        helpers.append(partial(write_functions, called))
     if "threefry" in writer.called:
-        text = f"{hash_function()}\n{text}"
-    return Source(zlib.compress(text.encode(), 1), helpers, counts.total(), work)
+        text = f"{write_hash_function()}\n{text}"
+    return FunctionSource(zlib.compress(text.encode(), 1), helpers, counts.total(), work)
 
 
 HEAD = "(ptr %pointers, ptr %scratch, i64 %begin, i64 %end, i64 %runs)"
 
 
-def _write_blocks(writer: Writer, parts: Parts, layout: Layout) -> Source:
+def _write_blocks(writer: FunctionWriter, parts: ProgramParts, layout: MemoryLayout) -> FunctionSource:
     """Return the function for blocks `begin` to `end` of W runs: transpose inputs, compute, transpose outputs back."""
     names = _write_pointers(writer, parts.pointers, layout.in_shared)
     for buffer, offset in layout.in_scratch.items():
@@ -268,11 +268,13 @@ def _write_blocks(writer: Writer, parts: Parts, layout: Layout) -> Source:
     writer.line("br i1 %more, label %block, label %exit")
     writer.start("exit")
     helpers: list[Callable[[int], str]] = [] if parts.summed is None else [lane_numbers]
-    helpers += [partial(mover, move) for move in sorted(movers)]
+    helpers += [partial(write_mover, move) for move in sorted(movers)]
     return _finish_source(_write_run("\n".join(writer.lines), writer), writer, helpers)
 
 
-def _write_move(writer: Writer, names: dict[Buffer, str], buffer: Buffer, kind: Literal["take", "give"]) -> Move:
+def _write_move(
+    writer: FunctionWriter, names: dict[Buffer, str], buffer: Buffer, kind: Literal["take", "give"]
+) -> Move:
     """Write the call that takes a buffer's rows into lanes or gives them back; return what it calls."""
     few = buffer.size if buffer.size < FEW else 0
     called = Move(BITS[buffer.type], kind == "take", buffer.type in SQUARED, few)
@@ -282,7 +284,7 @@ def _write_move(writer: Writer, names: dict[Buffer, str], buffer: Buffer, kind: 
 
 
 def _ask_for_rows(
-    writer: Writer, parts: Parts, names: dict[Buffer, str], taken: list[Buffer], given: list[Buffer]
+    writer: FunctionWriter, parts: ProgramParts, names: dict[Buffer, str], taken: list[Buffer], given: list[Buffer]
 ) -> None:
     """Let the longest loop, if there is one, ask for the memory of inputs and outputs before it is used."""
     writer.asking = longest(x for x in parts.program.graph.top.items if x in writer.mine)
@@ -291,20 +293,25 @@ def _ask_for_rows(
 
 
 def _locate_rows(
-    writer: Writer, names: dict[Buffer, str], taken: list[Buffer], given: list[Buffer], width: int, loop: Loop
-) -> list[Rows]:
+    writer: FunctionWriter, names: dict[Buffer, str], taken: list[Buffer], given: list[Buffer], width: int, loop: Loop
+) -> list[PrefetchedRows]:
     """Locate the rows that a loop asks for: the next block's inputs, and this block's outputs."""
-    following, results = writer.add(f"add i64 %first, {WIDTH}"), list[Rows]()
+    following, results = writer.add(f"add i64 %first, {WIDTH}"), list[PrefetchedRows]()
     for buffer in (*taken, *given):
         bytes_, writes = buffer.size * BITS[buffer.type] // 8, buffer in given
         place = writer.add(f"mul i64 {'%first' if writes else following}, {bytes_}")
         start = writer.add(f"getelementptr i8, ptr {names[buffer]}, i64 {place}")
-        results.append(Rows(start, bytes_, share(bytes_, width, loop), writes))
+        results.append(PrefetchedRows(start, bytes_, share(bytes_, width, loop), writes))
     return results
 
 
 def _add_to_sums(
-    writer: Writer, summed: Summed, names: dict[Buffer, str], number: Buffer, outputs: list[Buffer], width: int
+    writer: FunctionWriter,
+    summed: SummedOutputs,
+    names: dict[Buffer, str],
+    number: Buffer,
+    outputs: list[Buffer],
+    width: int,
 ) -> None:
     """Make the writer's stores to these outputs add to sums over runs; `number`: the input with a run's number.
 
@@ -324,20 +331,20 @@ def _add_to_sums(
         writer.sums[buffer] = row_length(width, summed.batches)
 
 
-def _write_once(blocks: Writer, parts: Parts, layout: Layout) -> Source | None:
+def _write_once(blocks: FunctionWriter, parts: ProgramParts, layout: MemoryLayout) -> FunctionSource | None:
     """Return the function that computes what all runs share; None if neither blocks nor a caller need any of it."""
     shared_outputs = [b for b, is_common in zip(parts.outputs, parts.common, strict=True) if is_common]
     roots: list[Any] = [*blocks.slots.places, *(b for b in blocks.read if b.kind in FILLED), *shared_outputs]
     if not roots:
         return None
-    writer = Writer(True, list_needed(roots), blocks.products, set(), blocks.slots)
+    writer = FunctionWriter(True, list_needed(roots), blocks.products, set(), blocks.slots)
     writer.turning, writer.flushes = blocks.turning, blocks.flushes
     _write_pointers(writer, parts.pointers, layout.in_shared)
     writer.block(parts.program.graph.top)
     return _finish_source(_write_run("\n".join(writer.lines), writer), writer, [])
 
 
-def _write_run(body: str, writer: Writer) -> str:
+def _write_run(body: str, writer: FunctionWriter) -> str:
     """Return the function `run` around its body; in single precision alone, subnormal numbers are zeros in it."""
     before = after = ""
     if writer.flushes:
@@ -345,7 +352,7 @@ def _write_run(body: str, writer: Writer) -> str:
     return f"define void @run{HEAD} {{\nentry:\n{before}{body}\n{after}  ret void\n}}\n"
 
 
-def _write_pointers(writer: Writer, pointers: list[Buffer], in_shared: dict[Buffer, int]) -> dict[Buffer, str]:
+def _write_pointers(writer: FunctionWriter, pointers: list[Buffer], in_shared: dict[Buffer, int]) -> dict[Buffer, str]:
     """Load the addresses of inputs, tables and outputs, the bases of their buffers; return the names of all."""
     names: dict[Buffer, str] = {}
     for number, buffer in enumerate([*pointers, None]):

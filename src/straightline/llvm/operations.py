@@ -48,7 +48,7 @@ def splat(value: float | int | bool, type: Type) -> str:
     return f"splat ({LLVM[type]} {literal(value, type)})"
 
 
-def operation(node: Node, names: list[str], emit: Emit) -> str:
+def write_operation(node: Node, names: list[str], emit: Emit) -> str:
     """Write the operation of a node on its arguments' names; return the name of the result."""
     source: Type = node.args[0].type if node.args else node.type
     operand_type = vector(source)

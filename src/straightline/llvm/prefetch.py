@@ -14,7 +14,7 @@ LINE = 64  # bytes
 PATIENCE = 8  # operations of vectors, of 0.3 ns, that take as long as a line: at 24 GB/s it is there in 2.7 ns
 
 
-class Rows(NamedTuple):
+class PrefetchedRows(NamedTuple):
     """Rows of a block of runs, one after another in memory: what a loop asks for.
 
     `start` names the address of the first one; a row has `bytes`, a turn's share of all so many `lines`; `writes` says
@@ -43,7 +43,7 @@ def share(bytes: int, width: int, loop: Loop) -> int:
     return lines if lines * PATIENCE <= operations else 0
 
 
-def write_requests(rows: Rows, turns: int, counter: str, lanes: str, add: Callable[[str], str]) -> list[str]:
+def write_requests(rows: PrefetchedRows, turns: int, counter: str, lanes: str, add: Callable[[str], str]) -> list[str]:
     """Write what one turn asks for.
 
     Args:

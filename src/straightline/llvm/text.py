@@ -1,6 +1,6 @@
 """Programs as text of LLVM IR: one function for blocks of W runs, and one for what all runs share.
 
-What the second computes is in memory between them, in `Slots`.
+What the second computes is in memory between them, in `SharedSlots`.
 """
 
 import math
@@ -8,15 +8,15 @@ from collections.abc import Collection, Sequence
 from typing import Any
 
 from straightline.llvm.lanes import WIDTH, gather_name
-from straightline.llvm.operations import BITS, CALLED, LLVM, called, operation, splat, vector, write_fused
-from straightline.llvm.prefetch import Rows, write_requests
-from straightline.nodes import REAL, Block, Buffer, Check, Guard, Loop, Node, Store, Type
+from straightline.llvm.operations import BITS, CALLED, LLVM, called, splat, vector, write_fused, write_operation
+from straightline.llvm.prefetch import PrefetchedRows, write_requests
+from straightline.nodes import REAL, Block, Buffer, Guard, Loop, LoopExit, Node, Store, Type
 from straightline.program import fusable
 
 Scope = dict[Any, str]
 
 
-class Slots:
+class SharedSlots:
     """Layout of numbers that all runs share: one function computes them, the other reads them.
 
     A number in a loop has a place for each turn.
@@ -34,14 +34,14 @@ class Slots:
             self.size += 8 * turns_of(node.block)
         return self.places[node]
 
-    def load(self, writer: "Writer", node: Node) -> str:
+    def load(self, writer: "FunctionWriter", node: Node) -> str:
         """Load a shared number, a scalar."""
         address = self._address(writer, node)
         if node.type == "bool":
             return writer.add(f"trunc i8 {writer.add(f'load i8, ptr {address}, align 8')} to i1")
         return writer.add(f"load {LLVM[node.type]}, ptr {address}, align 8")
 
-    def store(self, writer: "Writer", node: Node, name: str) -> None:
+    def store(self, writer: "FunctionWriter", node: Node, name: str) -> None:
         """Store a number, which the other function uses."""
         kind = vector(node.type)
         address = self._address(writer, node)
@@ -49,7 +49,7 @@ class Slots:
             name, kind = writer.add(f"zext {kind} {name} to %i8"), "%i8"
         writer.line(f"store {kind} {name}, ptr {address}, align 1")
 
-    def _address(self, writer: "Writer", node: Node) -> str:
+    def _address(self, writer: "FunctionWriter", node: Node) -> str:
         start = writer.add(f"getelementptr i8, ptr {self.base}, i64 {self.offset_of(node)}")
         return writer.of_turn(start, node.block, 8)
 
@@ -64,7 +64,7 @@ def turns_of(block: Block) -> int:
     return math.prod(loop.length or 1 for loop in loops_of(block))
 
 
-class Writer:
+class FunctionWriter:
     """Writer of one of a program's two functions: of those of its operations that are in the set `mine`.
 
     Args:
@@ -75,7 +75,7 @@ class Writer:
         slots: places of numbers that all runs share and that the other function computes.
     """
 
-    def __init__(self, single: bool, mine: Collection[Any], products: set[Node], spread: set[Any], slots: Slots):
+    def __init__(self, single: bool, mine: Collection[Any], products: set[Node], spread: set[Any], slots: SharedSlots):
         self.single, self.mine, self.products, self.spread, self.slots = single, mine, products, spread, slots
         self.lines: list[str] = []
         self.scopes: list[Scope] = [{}]
@@ -90,7 +90,7 @@ class Writer:
         self.counted = ""  # the lanes that count
         self.flushes = False  # whether subnormal numbers are zeros
         self.asking: Loop | None = None  # the loop that asks for memory, and for which
-        self.asked: list[Rows] = []
+        self.asked: list[PrefetchedRows] = []
 
     def add(self, text: str) -> str:
         """Append an operation; return the new name of its result."""
@@ -139,7 +139,7 @@ class Writer:
             return write_fused(node, product, names, self.add)
         if node.op in CALLED:
             self.called.add(called(node))
-        return operation(node, [self.operand(a) for a in node.args], self.add)
+        return write_operation(node, [self.operand(a) for a in node.args], self.add)
 
     def operand(self, node: Node) -> str:
         """Return the name of a number in all lanes."""
@@ -333,7 +333,7 @@ class Writer:
         Returns the names of what it carries on, and of what is left at its end.
         """
         # The body up to the loop's check, and what follows it in a turn.
-        check = next(i for i, s in enumerate(loop.body.items) if isinstance(s, Check) and s.loop is loop)
+        check = next(i for i, s in enumerate(loop.body.items) if isinstance(s, LoopExit) and s.loop is loop)
         head, tail = Block(loop.body.parent), Block(loop.body.parent)
         head.items, tail.items = loop.body.items[:check], loop.body.items[check + 1 :]
         self.block(head)

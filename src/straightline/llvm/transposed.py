@@ -14,7 +14,7 @@ REGISTER = 512  # bits of the largest one: a row of a square
 FEW = 8  # entries of a run from which on squares of the largest registers are filled
 
 
-class Lines:
+class TextLines:
     """Text with fresh names."""
 
     def __init__(self) -> None:
@@ -57,12 +57,12 @@ class Move(NamedTuple):
         return f"{kind}x{self.few}" if self.few else kind
 
 
-def mover(move: Move, width: int) -> str:
+def write_mover(move: Move, width: int) -> str:
     """Write `void @take64(ptr runs, ptr lanes, i64 size, i64 first, i64 last)`, or `give64`, which moves back.
 
     Lane l is run first + l, or the last run if there are fewer: it then repeats the computation of that run.
     """
-    text, bits = Lines(), move.bits
+    text, bits = TextLines(), move.bits
     side = min(REGISTER // bits if move.squared or move.few else FEW, width)
     if move.few and width > 1:
         _write_whole(text, move, side, width)
@@ -77,15 +77,17 @@ def mover(move: Move, width: int) -> str:
         # Squares, then the remaining entries.
         start = "0"
         if move.squared and not move.few:
-            text.loop(f"g{group}", "0", "%size", side, _write_square(text, rows, width, group, bits, move.inwards))
+            text.loop(
+                f"g{group}", "0", "%size", side, _make_square_transposer(text, rows, width, group, bits, move.inwards)
+            )
             start = text.add(f"and i64 %size, {-side}")
-        text.loop(f"h{group}", start, "%size", 1, _write_single(text, rows, width, group, bits, move.inwards))
+        text.loop(f"h{group}", start, "%size", 1, _make_entry_mover(text, rows, width, group, bits, move.inwards))
     body = "\n".join(text.lines)
     arguments = "ptr noalias %runs, ptr noalias %lanes, i64 %size, i64 %first, i64 %last"
     return f"define internal void @{move.name}({arguments}) noinline nounwind {{\n{body}\n  ret void\n}}\n"
 
 
-def _write_whole(text: Lines, move: Move, side: int, width: int) -> None:
+def _write_whole(text: TextLines, move: Move, side: int, width: int) -> None:
     """Move a block in which each lane has a run, and return: few entries of runs are registers one after another."""
     text.lines.append(f"  %end = add i64 %first, {width - 1}")
     text.lines.append("  %whole = icmp sle i64 %end, %last")
@@ -112,7 +114,7 @@ def _place(bits: int, start: str, number: int) -> str:
     return f"getelementptr i{bits}, ptr {start}, i64 {number}"
 
 
-def _choose(text: Lines, registers: list[str], places: list[tuple[int, int]], vector: str) -> str:
+def _choose(text: TextLines, registers: list[str], places: list[tuple[int, int]], vector: str) -> str:
     """Return a register of these numbers, of each the register that has it and its place there."""
     chosen, side = "poison", len(places)
     for number in sorted({register for register, _ in places}):
@@ -123,12 +125,12 @@ def _choose(text: Lines, registers: list[str], places: list[tuple[int, int]], ve
     return chosen
 
 
-def _write_square(
-    text: Lines, rows: list[str], width: int, group: int, bits: int, inwards: bool
+def _make_square_transposer(
+    text: TextLines, rows: list[str], width: int, group: int, bits: int, inwards: bool
 ) -> Callable[[str], None]:
     """Return what writes the move of entries i, i + 1, ... of as many runs: a square, from rows to lanes or back."""
 
-    def body(i: str) -> None:
+    def write_one_turn(i: str) -> None:
         """Write the transposition of one square: load its rows, exchange halves until each is a column, store."""
         vector = f"<{len(rows)} x i{bits}>"
         in_rows = [text.add(f"getelementptr i{bits}, ptr {row}, i64 {i}") for row in rows]
@@ -143,10 +145,10 @@ def _write_square(
         for p, x in zip(targets, moved, strict=True):
             text.lines.append(f"  store {vector} {x}, ptr {p}, align {bits // 8}")
 
-    return body
+    return write_one_turn
 
 
-def _exchange_squares(text: Lines, rows: list[str], half: int, bits: int) -> list[str]:
+def _exchange_squares(text: TextLines, rows: list[str], half: int, bits: int) -> list[str]:
     """Return rows with the off-diagonal squares of side `half` exchanged: one step of a transposition."""
     exchanged, side = rows[:], len(rows)
     for i in range(side):
@@ -163,12 +165,12 @@ def _exchange_squares(text: Lines, rows: list[str], half: int, bits: int) -> lis
     return exchanged
 
 
-def _write_single(
-    text: Lines, rows: list[str], width: int, group: int, bits: int, inwards: bool
+def _make_entry_mover(
+    text: TextLines, rows: list[str], width: int, group: int, bits: int, inwards: bool
 ) -> Callable[[str], None]:
     """Return what writes the move of entry i of each run, from its row to its lane or back."""
 
-    def body(i: str) -> None:
+    def write_one_turn(i: str) -> None:
         """Write the move of each lane, one after another."""
         base = text.add(f"mul i64 {i}, {width}")
         base = text.add(f"add i64 {base}, {group}")
@@ -180,4 +182,4 @@ def _write_single(
             x = text.add(f"load i{bits}, ptr {source}, align {bits // 8}")
             text.lines.append(f"  store i{bits} {x}, ptr {target}, align {bits // 8}")
 
-    return body
+    return write_one_turn

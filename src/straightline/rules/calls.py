@@ -12,9 +12,9 @@ from jax.extend.core import JaxprEqn
 
 from straightline.limits import DEAR
 from straightline.lowering import IN_MEMORY, RULES, Lowering, Value, array_of
-from straightline.nodes import Block, Guard, Key, Node
+from straightline.nodes import Block, Guard, Node, RandomKey
 from straightline.rules.elementwise import select
-from straightline.rules.loops import size_of
+from straightline.rules.loops import estimate_size
 
 CALLS = (
     "jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr",
@@ -70,7 +70,7 @@ def _lower_cond(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> 
         return lowering.inline(branches[0], inputs[1:])
     # Small branches are computed in any case, large ones in guarded blocks.
     conditions = _find_taken(lowering, which, len(branches))
-    sizes = [size_of(lowering, branch.jaxpr) for branch in branches]
+    sizes = [estimate_size(lowering, branch.jaxpr) for branch in branches]
     results: dict[int, list[np.ndarray]] = {}
     for k in sorted(range(len(branches)), key=lambda k: sizes[k]):
         results[k] = _lower_branch(lowering, conditions[k], branches[k], inputs[1:])
@@ -111,8 +111,8 @@ def _lower_branch(lowering: Lowering, condition: Node, branch: Any, inputs: list
 
 def _guard_result(lowering: Lowering, guard: Guard, value: Any) -> Any:
     """Return a number of a guarded block as seen from outside of it: zero where the block is skipped."""
-    if isinstance(value, Key):
-        return Key(_guard_result(lowering, guard, value.first), _guard_result(lowering, guard, value.second))
+    if isinstance(value, RandomKey):
+        return RandomKey(_guard_result(lowering, guard, value.first), _guard_result(lowering, guard, value.second))
     if value.block is not guard.body:
         return value
     if value in guard.values:

@@ -11,7 +11,7 @@ from jax.extend.core import JaxprEqn
 from straightline.folding import DTYPES
 from straightline.graph import Graph
 from straightline.lowering import RULES, Lowering, Rule, array_of, result_shape, result_type
-from straightline.nodes import REAL, Key, Node, Type, Unsupported
+from straightline.nodes import REAL, Node, RandomKey, Type, Unsupported
 
 # Operation of JAX -> the graph's.
 ELEMENTWISE = {name: name for name in (
@@ -57,8 +57,8 @@ def _make_rule(function: Any) -> Rule:
 
 def select(graph: Graph, condition: Node, a: Any, b: Any) -> Any:
     """Select a where the condition holds, else b: of numbers or of keys."""
-    if isinstance(a, Key):
-        return Key(select(graph, condition, a.first, b.first), select(graph, condition, a.second, b.second))
+    if isinstance(a, RandomKey):
+        return RandomKey(select(graph, condition, a.first, b.first), select(graph, condition, a.second, b.second))
     return graph.node("select", a.type, condition, a, b)
 
 

@@ -10,8 +10,8 @@ from straightline.lowering import RULES, Lowering, known_integers
 from straightline.memory import contiguous
 from straightline.nodes import Unsupported
 from straightline.rules.elementwise import select
-from straightline.rules.loops import in_memory
-from straightline.rules.places import clamp_place, fill_of, fills, inside, narrowed, places_of
+from straightline.rules.loops import put_in_memory
+from straightline.rules.places import clamp_place, fill_of, fills, find_window_places, inside, narrowed
 from straightline.rules.shapes import select_array
 
 
@@ -50,7 +50,7 @@ def _gather_clipped(equation: JaxprEqn, lowering: Lowering, x: np.ndarray, indic
     batching = list(zip(numbers.operand_batching_dims, numbers.start_indices_batching_dims, strict=True))
     removed = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
     index_map = numbers.start_index_map
-    places = places_of(x.shape, params["slice_sizes"], known, index_map, batching, removed, clips=True)
+    places = find_window_places(x.shape, params["slice_sizes"], known, index_map, batching, removed, clips=True)
     first = known.ndim - 1
     places = np.moveaxis(places, range(first, places.ndim), numbers.offset_dims)
     gathered: np.ndarray = x.ravel()[places.ravel()].reshape(places.shape)
@@ -68,7 +68,9 @@ def _gather_by_cases(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indi
     last = x.shape[axis] - sizes[axis]
     if last >= FEW:
         return _gather_from_memory(lowering, equation, x, indices, column)
-    cases = [_gather_clipped(equation, lowering, x, _with(lowering, indices, column, n)) for n in range(last + 1)]
+    cases = [
+        _gather_clipped(equation, lowering, x, _replace_indices(lowering, indices, column, n)) for n in range(last + 1)
+    ]
     selected = cases[-1].copy()
     for entry in np.ndindex(*selected.shape):
         which = indices[(*_row(entry, numbers), column)]
@@ -85,11 +87,11 @@ def _gather_from_memory(
     numbers, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
     axis = numbers.start_index_map[column]
     last = x.shape[axis] - sizes[axis]
-    begin = _with(lowering, indices, column, 0)
+    begin = _replace_indices(lowering, indices, column, 0)
     if known_integers(begin) is None:
         raise Unsupported("gather at two places that data decide")
     starts = _gather_clipped(equation, lowering, np.arange(x.size, dtype=object).reshape(x.shape), begin)
-    buffer, stride = in_memory(lowering, x).buffer, contiguous(x.shape)[axis]
+    buffer, stride = put_in_memory(lowering, x).buffer, contiguous(x.shape)[axis]
     loaded = np.empty(starts.shape, dtype=object)
     for entry in np.ndindex(*loaded.shape):
         start = indices[(*_row(entry, numbers), column)]
@@ -101,7 +103,7 @@ def _gather_from_memory(
     return loaded
 
 
-def _with(lowering: Lowering, indices: np.ndarray, column: int, number: int) -> np.ndarray:
+def _replace_indices(lowering: Lowering, indices: np.ndarray, column: int, number: int) -> np.ndarray:
     """Replace the indices that depend on data by a number."""
     replaced = indices.copy()
     for row in np.ndindex(*indices.shape[:-1]):

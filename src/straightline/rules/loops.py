@@ -12,7 +12,7 @@ from straightline.graph import Graph
 from straightline.limits import WRITTEN_OUT
 from straightline.lowering import IN_MEMORY, Lowering, Value, array_of, scalars
 from straightline.memory import InMemory
-from straightline.nodes import Block, Buffer, Check, Key, Loop, Node, Type, Unsupported
+from straightline.nodes import Block, Buffer, Loop, LoopExit, Node, RandomKey, Type, Unsupported
 from straightline.rules.elementwise import select
 
 Turn = Callable[[Node, list[np.ndarray]], tuple[Sequence[np.ndarray], Sequence[np.ndarray]]]
@@ -32,7 +32,7 @@ def repeat_turns(
         loop.counter = counter = graph.fresh("counter", "i64", (), loop.body, loop)
         row = graph.node("sub", "i64", graph.constant(length - 1, "i64"), counter) if backwards else counter
         following, stacked = turn(row, carry)
-        return following, [_stack(lowering, length, x, counter, backwards, outer) for x in stacked]
+        return following, [_store_row(lowering, length, x, counter, backwards, outer) for x in stacked]
 
     return _lower_loop(lowering, length, carry, body)
 
@@ -86,7 +86,7 @@ def _entries(arrays: Sequence[np.ndarray], halves: Sequence[bool]) -> list[Node]
     return [n for x in parts for n in scalars(x)]
 
 
-def _stack(
+def _store_row(
     lowering: Lowering, length: int, value: np.ndarray, counter: Node, backwards: bool, outer: Block
 ) -> InMemory:
     """Store one turn's array as one row of memory; return the array (length, ...) of all turns."""
@@ -105,7 +105,7 @@ def _stack(
 def _list_numbers(value: np.ndarray) -> list[Node]:
     """Return the nodes of an array in order; raise if they are keys of random numbers."""
     flat: list[Node] = value.ravel().tolist()
-    if any(isinstance(x, Key) for x in flat):
+    if any(isinstance(x, RandomKey) for x in flat):
         raise Unsupported("keys of random numbers in memory")
     return flat
 
@@ -117,7 +117,9 @@ def _restore_arrays(arrays: Sequence[np.ndarray], nodes: Sequence[Node], halves:
     for a, half in zip(arrays, halves, strict=True):
         n = a.shape[-1] if half else 0
         old = a[..., *np.triu_indices(n)] if half else a
-        new = [Key(next(rest), next(rest)) if isinstance(x, Key) else next(rest) for x in old.ravel().tolist()]
+        new = [
+            RandomKey(next(rest), next(rest)) if isinstance(x, RandomKey) else next(rest) for x in old.ravel().tolist()
+        ]
         restored = array_of(new, old.shape)
         results.append(_mirror(restored, n) if half else restored)
     return results
@@ -136,17 +138,19 @@ def _lower_scan(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> 
     (consts, carried), length = _count_arguments(params), params["length"]
     fixed, carry, rows = inputs[:consts], inputs[consts : consts + carried], inputs[consts + carried :]
     # Short loops are written out.
-    if length * size_of(lowering, params["jaxpr"].jaxpr) <= lowering.written_out or length <= 1:
+    if length * estimate_size(lowering, params["jaxpr"].jaxpr) <= lowering.written_out or length <= 1:
         return _write_out_scan(lowering, equation, fixed, [lowering.nodes(x) for x in carry], rows)
     jaxpr = params["jaxpr"].jaxpr
     # Of the carried arrays, by number: what the body returns unchanged is a constant of the loop, a long array is
     # carried in memory (`held`), all others as numbers (`moving`).
     unchanged = [jaxpr.outvars[k] is jaxpr.invars[consts + k] for k in range(carried)]
-    held = {k: Held(lowering, carry[k]) for k in range(carried) if not unchanged[k] and carry[k].size > WRITTEN_OUT}
+    held = {
+        k: CarriedMemory(lowering, carry[k]) for k in range(carried) if not unchanged[k] and carry[k].size > WRITTEN_OUT
+    }
     moving = [k for k in range(carried) if not unchanged[k] and k not in held]
-    rows = [in_memory(lowering, x) for x in rows]
+    rows = [put_in_memory(lowering, x) for x in rows]
 
-    def turn(row: Node, numbers: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    def lower_turn(row: Node, numbers: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """Lower the body for one row of the stacked arguments; return the moving carry, and what is stacked."""
         arrays: dict[int, Value] = dict(zip(moving, numbers, strict=True)) | {k: x.in_turn() for k, x in held.items()}
         whole_carry = [arrays.get(k, carry[k]) for k in range(carried)]
@@ -156,12 +160,12 @@ def _lower_scan(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> 
         return [nodes[k] for k in moving], nodes[carried:]
 
     start = [lowering.nodes(carry[k]) for k in moving]
-    finals, stacked = repeat_turns(lowering, length, start, turn, params["reverse"])
+    finals, stacked = repeat_turns(lowering, length, start, lower_turn, params["reverse"])
     after: dict[int, Value] = dict(zip(moving, finals, strict=True)) | {k: x.after() for k, x in held.items()}
     return [*(after.get(k, carry[k]) for k in range(carried)), *stacked]
 
 
-class Held:
+class CarriedMemory:
     """Memory of an array that a loop carries and that is too long for numbers of its own.
 
     A turn reads it, and fills it anew at its end; each run has its own, whatever it is computed from.
@@ -169,7 +173,7 @@ class Held:
 
     def __init__(self, lowering: Lowering, start: Value):
         self._graph = lowering.graph
-        self.memory = copied(lowering, in_memory(lowering, start)).buffer
+        self.memory = copied(lowering, put_in_memory(lowering, start)).buffer
         self.memory.kind = "carried"
 
     def in_turn(self) -> InMemory:
@@ -190,10 +194,10 @@ class Held:
         return InMemory.whole(buffer)
 
 
-def hold(lowering: Lowering, filled: Sequence[tuple[Held, Value]]) -> None:
+def hold(lowering: Lowering, filled: Sequence[tuple[CarriedMemory, Value]]) -> None:
     """Fill the memory of carried arrays at the end of a turn: all that is read of it is read before."""
     memory = {held.memory for held, _ in filled}
-    arrays = [(held, in_memory(lowering, x)) for held, x in filled]
+    arrays = [(held, put_in_memory(lowering, x)) for held, x in filled]
     arrays = [(held, copied(lowering, x) if x.buffer.owner[0] in memory else x) for held, x in arrays]
     for held, x in arrays:
         held.fill(lowering, x)
@@ -232,7 +236,7 @@ def _entry(x: np.ndarray, turn: int) -> np.ndarray:
     return x[turn : turn + 1].reshape(x.shape[1:])
 
 
-def in_memory(lowering: Lowering, value: Value) -> InMemory:
+def put_in_memory(lowering: Lowering, value: Value) -> InMemory:
     """Return an array in memory: as it is if it is there, a table of constants, else stored entry by entry."""
     if isinstance(value, InMemory):
         return value
@@ -266,7 +270,7 @@ def _lower_while(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
         """Write the check, then the body; return the next carry, selected by each run's condition."""
         active = lowering.nodes(lowering.inline(params["cond_jaxpr"], [*of_condition, *carry])[0])
         loop.condition = reduce(lambda a, b: graph.node("or", "bool", a, b), scalars(active))
-        loop.body.items.append(Check(loop))
+        loop.body.items.append(LoopExit(loop))
         moved = [lowering.nodes(x) for x in lowering.inline(params["body_jaxpr"], [*of_body, *carry])]
         return [_where_active(graph, active, new, old) for new, old in zip(moved, carry, strict=True)], None
 
@@ -280,13 +284,13 @@ def _where_active(graph: Graph, active: np.ndarray, new: np.ndarray, old: np.nda
     return array_of([select(graph, condition, x, y) for condition, x, y in entries], old.shape)
 
 
-def size_of(lowering: Lowering, jaxpr: Any) -> int:
+def estimate_size(lowering: Lowering, jaxpr: Any) -> int:
     """Estimate the count of numbers that a traced program computes: a scan's body once a turn, a while loop's once."""
     if jaxpr in lowering.sizes:
         return lowering.sizes[jaxpr]
     total = 0
     for equation in jaxpr.eqns:
-        inner = [size_of(lowering, getattr(p, "jaxpr", p)) for p in _programs(equation.params)]
+        inner = [estimate_size(lowering, getattr(p, "jaxpr", p)) for p in _programs(equation.params)]
         turns = equation.params["length"] if equation.primitive.name == "scan" else 1
         total += turns * sum(inner) + sum(math.prod(v.aval.shape) for v in equation.outvars)
     lowering.sizes[jaxpr] = total

@@ -24,7 +24,7 @@ def total(graph: Graph, op: str, type: Type, nodes: Sequence[Node], empty: float
 def _reduce_by(op: str, empty: float) -> Rule:
     """Return the rule that reduces along axes by `op`; over nothing the result is `empty`."""
 
-    def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    def lower_operation(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
         axes, shape, type = equation.params["axes"], result_shape(equation), result_type(equation)
         # (entry of the result, terms); no terms of a sum over nothing.
         terms = math.prod(inputs[0].shape[axis] for axis in axes)
@@ -32,7 +32,7 @@ def _reduce_by(op: str, empty: float) -> Rule:
         neutral = _clip_to_type(type, empty)
         return [array_of([total(lowering.graph, op, type, row, neutral) for row in x.tolist()], shape)]
 
-    return rule
+    return lower_operation
 
 
 ALL_BITS = np.nan  # stands for the neutral element of "and": true, -1, or the greatest unsigned integer
@@ -54,7 +54,7 @@ def _clip_to_type(type: Type, number: float) -> float:
 def _accumulate_by(op: str) -> Rule:
     """Return the rule that accumulates along an axis by `op`."""
 
-    def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    def lower_operation(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
         axis, type, reverse = equation.params["axis"], result_type(equation), equation.params["reverse"]
         if not inputs[0].size:
             return inputs
@@ -68,13 +68,13 @@ def _accumulate_by(op: str) -> Rule:
         cumulated = array_of([n for row in rows for n in row], shape)
         return [np.moveaxis(cumulated[::-1] if reverse else cumulated, 0, axis)]
 
-    return rule
+    return lower_operation
 
 
 def _find_extreme(op: str) -> Rule:
     """Return the rule of the first index of the greatest ("gt") or least ("lt") entry; of the first NaN, as in JAX."""
 
-    def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    def lower_operation(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
         graph, type, axis = lowering.graph, result_type(equation), equation.params["axes"][0]
         x = np.moveaxis(inputs[0], axis, -1).reshape(-1, inputs[0].shape[axis])
         results = []
@@ -91,7 +91,7 @@ def _find_extreme(op: str) -> Rule:
             results.append(index)
         return [array_of(results, result_shape(equation))]
 
-    return rule
+    return lower_operation
 
 
 def write_product(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:

@@ -23,7 +23,7 @@ _primitive: Any = Primitive("operation")
 _primitive.multiple_results = True
 
 
-class _Program(NamedTuple):
+class _OperationProgram(NamedTuple):
     """One operation on arguments of one shape: its plain function as traced, and what native code computes instead."""
 
     name: str
@@ -35,7 +35,7 @@ class _Program(NamedTuple):
         return id(self.plain)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Program) and self.plain is other.plain
+        return isinstance(other, _OperationProgram) and self.plain is other.plain
 
     def __repr__(self) -> str:
         return self.name  # by which the texts of two programs differ
@@ -59,7 +59,7 @@ def operation(native: Callable[P, R]) -> Callable[[Callable[P, R]], Callable[P, 
         """Return the function as one operation of a program, whose native rule is `native`."""
 
         @cache
-        def trace(tree: Any, kinds: tuple[Any, ...], x64: bool) -> tuple[_Program, Any]:
+        def trace_plain_function(tree: Any, kinds: tuple[Any, ...], x64: bool) -> tuple[_OperationProgram, Any]:
             """Trace the plain function for arguments of these shapes and types; return it and its results' tree."""
             result_tree: list[Any] = []
 
@@ -72,25 +72,27 @@ def operation(native: Callable[P, R]) -> Callable[[Callable[P, R]], Callable[P, 
 
             traced = jax.make_jaxpr(partial(call_on_leaves, plain))(*(like(*kind) for kind in kinds))
             name = f"{plain.__module__}.{plain.__qualname__}"
-            return _Program(name, traced, partial(call_on_leaves, native), x64), result_tree[0]
+            return _OperationProgram(name, traced, partial(call_on_leaves, native), x64), result_tree[0]
 
         @wraps(plain)
-        def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        def call_as_operation(*args: P.args, **kwargs: P.kwargs) -> R:
             """Trace the function once for these shapes, then bind it as one primitive, which `vmap` and others see."""
             leaves, tree = jax.tree.flatten((args, kwargs))
             leaves = [jnp.asarray(leaf) for leaf in leaves]
             kinds = tuple((leaf.shape, leaf.dtype) for leaf in leaves)
-            program, result_tree = trace(tree, kinds, bool(jnp.result_type(float) == np.float64))
+            program, result_tree = trace_plain_function(tree, kinds, bool(jnp.result_type(float) == np.float64))
             flat = _primitive.bind(*leaves, program=program, levels=(), sizes=())  # under no vmap yet
             results: R = jax.tree.unflatten(result_tree, flat)
             return results
 
-        return call
+        return call_as_operation
 
     return decorate
 
 
-def _apply_plain(*leaves: Any, program: _Program, levels: tuple[Axes, ...], sizes: tuple[int, ...]) -> list[Any]:
+def _apply_plain(
+    *leaves: Any, program: _OperationProgram, levels: tuple[Axes, ...], sizes: tuple[int, ...]
+) -> list[Any]:
     """Compute the plain function, not the native one, under its levels of `vmap`, the innermost first.
 
     `sizes` is a parameter of the primitive only.
@@ -101,13 +103,13 @@ def _apply_plain(*leaves: Any, program: _Program, levels: tuple[Axes, ...], size
     return list(function(*leaves))
 
 
-def _shapes(*_: Any, program: _Program, levels: tuple[Axes, ...], sizes: tuple[int, ...]) -> list[Any]:
+def _shapes(*_: Any, program: _OperationProgram, levels: tuple[Axes, ...], sizes: tuple[int, ...]) -> list[Any]:
     """Return shapes and types of the results: those of the plain function, behind an axis for each level of vmap."""
     return [jax.core.ShapedArray((*sizes, *aval.shape), aval.dtype) for aval in program.plain.out_avals]
 
 
 def _batch_operation(
-    leaves: Sequence[Any], axes: Sequence[int | None], *, program: _Program, levels: tuple[Axes, ...],
+    leaves: Sequence[Any], axes: Sequence[int | None], *, program: _OperationProgram, levels: tuple[Axes, ...],
     sizes: tuple[int, ...],
 ) -> tuple[list[Any], list[int]]:  # fmt: skip
     """Add a level of `vmap`, whose axis becomes the first one."""
@@ -138,7 +140,7 @@ def _apply_native(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -
 
     Known zeros of the arguments decide how many it has: so it is tried.
     """
-    program: _Program = equation.params["program"]
+    program: _OperationProgram = equation.params["program"]
     try:
         with lowering.graph.at_most(MANY_TERMS):
             return lowering.inline(_trace_in_loops(lowering, equation, program.native), inputs)

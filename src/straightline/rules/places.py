@@ -56,7 +56,7 @@ def fill_of(lowering: Lowering, equation: JaxprEqn) -> Node:
     return lowering.scalar(lowering.known(np.full((), equation.params["fill_value"], aval.dtype)))
 
 
-def places_of(
+def find_window_places(
     shape: tuple[int, ...],
     sizes: Sequence[int],
     indices: np.ndarray,

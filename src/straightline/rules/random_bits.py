@@ -18,7 +18,7 @@ from jax.extend.core import JaxprEqn
 from straightline.graph import Graph
 from straightline.limits import LOADED
 from straightline.lowering import RULES, Lowering, array_of, keys_of, result_shape
-from straightline.nodes import Key, Node, Unsupported
+from straightline.nodes import Node, RandomKey, Unsupported
 from straightline.rules.elementwise import broadcast
 
 Word = Any  # of 32 bits, in an integer or an array of wider ones
@@ -26,7 +26,7 @@ ROTATIONS = (13, 15, 26, 6), (17, 29, 16, 24)
 PARITY = 0x1BD11BDA
 
 
-def threefry(graph: Graph, key: Key, high: Node, low: Node) -> Node:
+def threefry(graph: Graph, key: RandomKey, high: Node, low: Node) -> Node:
     """Hash a counter's two words, the first word above the second; a constant if all words are."""
     words = (key.first, key.second, high, low)
     if all(word.op == "constant" for word in words):
@@ -34,11 +34,11 @@ def threefry(graph: Graph, key: Key, high: Node, low: Node) -> Node:
     return graph.node("threefry", "u64", *words)
 
 
-def _new_key(graph: Graph, key: Key, high: Node, low: Node) -> Key:
+def _new_key(graph: Graph, key: RandomKey, high: Node, low: Node) -> RandomKey:
     """Return the hash of a counter's two words by a key, as a key."""
     both = threefry(graph, key, high, low)
     shifted = graph.node("shift_right", "u64", both, graph.constant(32, "u64"))
-    return Key(graph.node("convert", "u32", shifted), graph.node("convert", "u32", both))
+    return RandomKey(graph.node("convert", "u32", shifted), graph.node("convert", "u32", both))
 
 
 def _wrap(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
@@ -90,13 +90,13 @@ def _seed(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> l
     _check(equation.outvars[0])
     graph = lowering.graph
 
-    def words(number: Node) -> Key:
+    def words(number: Node) -> RandomKey:
         """Return the key of a number: its high word, 0 of one of 32 bits, and its low word."""
         if number.type[1:] == "32":
-            return Key(graph.constant(0, "u32"), graph.node("convert", "u32", number))
+            return RandomKey(graph.constant(0, "u32"), graph.node("convert", "u32", number))
         whole = graph.node("convert", "u64", number)
         shifted = graph.node("shift_right", "u64", whole, graph.constant(32, "u64"))
-        return Key(graph.node("convert", "u32", shifted), graph.node("convert", "u32", whole))
+        return RandomKey(graph.node("convert", "u32", shifted), graph.node("convert", "u32", whole))
 
     return [array_of(map(words, inputs[0].ravel().tolist()), result_shape(equation))]
 
@@ -105,7 +105,7 @@ def _hash(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> l
     """Hash words (...) with Threefry; return both words of each pair."""
     shape = result_shape(equation)
     items = zip(*broadcast(inputs, shape), strict=True)
-    keys = [_new_key(lowering.graph, Key(first, second), high, low) for first, second, high, low in items]
+    keys = [_new_key(lowering.graph, RandomKey(first, second), high, low) for first, second, high, low in items]
     return [array_of([key.first for key in keys], shape), array_of([key.second for key in keys], shape)]
 
 
@@ -159,7 +159,7 @@ def hash_words(first: Word, second: Word, high: Word, low: Word) -> Word:
 
 
 @cache
-def hash_function() -> str:
+def write_hash_function() -> str:
     """Write `define internal %i64 @hg_threefry(%i32 ...)` of a key's and a counter's two words."""
     vector, wide = "%i32", "%i64"
     lines: list[str] = []

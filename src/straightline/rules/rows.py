@@ -17,7 +17,7 @@ from straightline.lowering import IN_MEMORY, RULES, Lowering, Rule, Value, array
 from straightline.memory import InMemory
 from straightline.nodes import Node, Type
 from straightline.rules.elementwise import ELEMENTWISE
-from straightline.rules.loops import Turn, in_memory, repeat_turns
+from straightline.rules.loops import Turn, put_in_memory, repeat_turns
 from straightline.rules.matrices import total, write_product
 
 OF_ENTRIES = (
@@ -62,13 +62,13 @@ def _are_written_out(inputs: list[Value], count: int) -> bool:
 def _apply_by_row(name: str) -> Rule:
     """Return the rule of an elementwise operation that computes long arrays row by row, in a loop."""
 
-    def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    def lower_row_by_row(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
         shape, ndim = result_shape(equation), max(len(x.shape) for x in inputs)
         if not is_long(inputs):
             return list(RULES[name](lowering, equation, [lowering.nodes(x) for x in inputs]))
         # Arguments with rows are read from memory; those that all rows share stay as they are.
-        items = [x if len(x.shape) < ndim or x.shape[0] == 1 else in_memory(lowering, x) for x in inputs]
-        row_equation = like_row(equation)
+        items = [x if len(x.shape) < ndim or x.shape[0] == 1 else put_in_memory(lowering, x) for x in inputs]
+        row_equation = make_row_equation(equation)
 
         def turn(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
             """Return no carry, and the operation's result for one row."""
@@ -77,7 +77,7 @@ def _apply_by_row(name: str) -> Rule:
 
         return list(repeat_turns(lowering, shape[0], [], lambda p, c: as_nodes(lowering, turn(p, c)))[1])
 
-    return rule
+    return lower_row_by_row
 
 
 def as_nodes(lowering: Lowering, results: tuple[list[Value], list[Value]]) -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -95,7 +95,7 @@ def row_of(lowering: Lowering, x: Value, row: Node, ndim: int) -> Value:
     return x[:1].reshape(x.shape[1:])
 
 
-def like_row(equation: JaxprEqn, **params: Any) -> Any:
+def make_row_equation(equation: JaxprEqn, **params: Any) -> Any:
     """Return the same operation for one row."""
     avals: list[Any] = [v.aval for v in equation.outvars]
     rows = [SimpleNamespace(aval=like(a.shape[1:], a.dtype)) for a in avals]
@@ -120,7 +120,7 @@ def _dot_general(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
     if (factors := _find_few_terms(equation, short)) is not None:
         return list(_write_out_product(lowering, equation, factors))
     # The axis of each argument that is looped over, None where an argument is used whole in every turn.
-    a, b = (in_memory(lowering, x) for x in inputs)
+    a, b = (put_in_memory(lowering, x) for x in inputs)
     in_left, in_right = (left_batch[0], right_batch[0]) if left_batch else (_find_free_axis(a, left), None)
     if in_left is None:
         in_right = _find_free_axis(b, right)
@@ -130,7 +130,7 @@ def _dot_general(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
     # The operation on one row: dimension numbers without that axis, which comes first.
     contracted = _without(left, in_left), _without(right, in_right)
     batch = _without(left_batch[1:], in_left), _without(right_batch[1:], in_right)
-    row_equation = like_row(equation, dimension_numbers=(contracted, batch))
+    row_equation = make_row_equation(equation, dimension_numbers=(contracted, batch))
     a, b = (x if axis is None else _move_to_front(x, axis) for x, axis in ((a, in_left), (b, in_right)))
 
     def turn(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -154,7 +154,7 @@ def _multiply_nodes(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndar
     (left, right), (batch, _) = equation.params["dimension_numbers"]
     if batch or len(left) != 1 or _count_terms(inputs[0], left[0], inputs[1], right[0]) <= MANY_TERMS:
         return write_product(lowering, equation, inputs)
-    return _dot_general(lowering, equation, [in_memory(lowering, x) for x in inputs])
+    return _dot_general(lowering, equation, [put_in_memory(lowering, x) for x in inputs])
 
 
 def _count_terms(a: np.ndarray, left: int, b: np.ndarray, right: int) -> int:
@@ -242,7 +242,7 @@ def _without(axes: Sequence[int], removed: int | None) -> tuple[int, ...]:
 def _reduce_by_row(name: str) -> Rule:
     """Return the rule of a reduction: of short arrays at once, of long ones row by row in a loop."""
 
-    def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    def lower_row_by_row(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
         x, axes = inputs[0], equation.params["axes"]
         if not is_long(inputs):
             return list(RULES[name](lowering, equation, [lowering.nodes(x)]))
@@ -269,7 +269,7 @@ def _reduce_by_row(name: str) -> Rule:
 
         return list(repeat_turns(lowering, x.shape[0], [start], accumulate)[0])
 
-    return rule
+    return lower_row_by_row
 
 
 REDUCTIONS = ("reduce_sum", "reduce_prod", "reduce_or", "reduce_and", "reduce_max", "reduce_min")

@@ -14,13 +14,13 @@ from straightline.limits import WRITTEN_OUT
 from straightline.lowering import RULES, Lowering, Rule, known_integers
 from straightline.nodes import Node, Unsupported
 from straightline.rules.elementwise import select
-from straightline.rules.places import fills, narrowed, places_of
+from straightline.rules.places import fills, find_window_places, narrowed
 
 
-def _scatter(op: str | None) -> Rule:
+def _make_scatter_rule(op: str | None) -> Rule:
     """Make a rule that applies updates one after another; those outside the array are dropped."""
 
-    def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    def scatter_updates(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
         """Combine each update with the entry at its place, in order; places beyond the array are dropped or clipped."""
         x, indices, updates = inputs
         numbers = equation.params["dimension_numbers"]
@@ -35,7 +35,7 @@ def _scatter(op: str | None) -> Rule:
         # Places of all updates in the flat array, -1 outside, with axes in the order of the updates'.
         batching = list(zip(numbers.operand_batching_dims, numbers.scatter_indices_batching_dims, strict=True))
         index_map = numbers.scatter_dims_to_operand_dims
-        places = places_of(x.shape, sizes, known, index_map, batching, removed, _clips(equation))
+        places = find_window_places(x.shape, sizes, known, index_map, batching, removed, _clips(equation))
         places = np.moveaxis(places, range(known.ndim - 1, places.ndim), numbers.update_window_dims)
         updated = x.ravel().copy()
         for index, new in zip(places.ravel().tolist(), updates.ravel().tolist(), strict=True):
@@ -43,7 +43,7 @@ def _scatter(op: str | None) -> Rule:
                 updated[index] = _combine(lowering.graph, op, updated[index], new)
         return [updated.reshape(x.shape)]
 
-    return rule
+    return scatter_updates
 
 
 def _clips(equation: JaxprEqn) -> bool:
@@ -124,7 +124,8 @@ def _yield_starts(
 
 
 RULES |= {
-    "scatter": _scatter(None), "scatter-add": _scatter("add"), "scatter_add": _scatter("add"),
-    "scatter-mul": _scatter("mul"), "scatter_mul": _scatter("mul"), "scatter-sub": _scatter("sub"),
-    "scatter-min": _scatter("min"), "scatter-max": _scatter("max"),
+    "scatter": _make_scatter_rule(None), "scatter-sub": _make_scatter_rule("sub"),
+    "scatter-add": _make_scatter_rule("add"), "scatter_add": _make_scatter_rule("add"),
+    "scatter-mul": _make_scatter_rule("mul"), "scatter_mul": _make_scatter_rule("mul"),
+    "scatter-min": _make_scatter_rule("min"), "scatter-max": _make_scatter_rule("max"),
 }  # fmt: skip

@@ -21,7 +21,7 @@ LARGE, TERMS = 2000.0, 20  # the shape from which gamma masses are expanded, to 
 TURNS = 5000  # of a series or a fraction, several times as many as it takes
 
 
-class Series(NamedTuple):
+class SeriesState(NamedTuple):
     """State of a series: a number that counts its terms, the last term, and the sum."""
 
     step: jax.Array
@@ -29,7 +29,7 @@ class Series(NamedTuple):
     total: jax.Array
 
 
-class Quotients(NamedTuple):
+class ContinuedFraction(NamedTuple):
     """State of a continued fraction: the turn, Lentz's quotients C and D, the value, and its last relative change."""
 
     turn: jax.Array
@@ -50,35 +50,35 @@ def gamma_masses(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     functions in Mie scattering calculations using continued fractions (1976).
     """
     valid = (a > 0) & (x >= 0)
-    large, by_expansion, given_x, at_zero = a > LARGE, large_masses(a, x), x, (a == 0) & (x > 0)
+    large, by_expansion, given_x, at_zero = a > LARGE, gamma_masses_of_large_shape(a, x), x, (a == 0) & (x > 0)
     a, x = jnp.where(large | ~valid, 1.0, a), jnp.where(large | ~valid, 1.0, x)
     above = x > a + 1
     density = jnp.exp(a * jnp.log(x) - x - jax.lax.lgamma(a))
 
     # Below the mean the series; each loop ends at once where the other serves.
-    def add_term(state: Series) -> Series:
+    def add_term(state: SeriesState) -> SeriesState:
         shape, term, total = state
         term = term * x / (shape + 1)
-        return Series(shape + 1, term, total + term)
+        return SeriesState(shape + 1, term, total + term)
 
-    def has_more_terms(state: Series) -> jax.Array:
+    def has_more_terms(state: SeriesState) -> jax.Array:
         return (state.term > EPSILON * state.total) & (state.step < a + TURNS)
 
     first = jnp.where(above, 0.0, 1 / a)
-    lower = density * jax.lax.while_loop(has_more_terms, add_term, Series(a, first, first)).total
+    lower = density * jax.lax.while_loop(has_more_terms, add_term, SeriesState(a, first, first)).total
 
     # Above it the continued fraction by Lentz's two quotients C and D, from the front.
-    def continue_fraction(state: Quotients) -> Quotients:
+    def continue_fraction(state: ContinuedFraction) -> ContinuedFraction:
         n, c, d, fraction, _ = state
         numerator, b = n * (a - n), x + 2 * n + 1 - a
         c, d = b + numerator / c, 1 / _keep_from_zero(b + numerator * d)
-        return Quotients(n + 1, _keep_from_zero(c), d, fraction * c * d, jnp.abs(c * d - 1))
+        return ContinuedFraction(n + 1, _keep_from_zero(c), d, fraction * c * d, jnp.abs(c * d - 1))
 
-    def still_changes(state: Quotients) -> jax.Array:
+    def still_changes(state: ContinuedFraction) -> jax.Array:
         return (state.change > EPSILON) & (state.turn < TURNS)
 
     start = 1 / jnp.where(above, x + 1 - a, 1.0)
-    state = Quotients(jnp.ones_like(x), jnp.full_like(x, 1 / TINY), start, start, jnp.where(above, 1.0, 0.0))
+    state = ContinuedFraction(jnp.ones_like(x), jnp.full_like(x, 1 / TINY), start, start, jnp.where(above, 1.0, 0.0))
     upper = density * jax.lax.while_loop(still_changes, continue_fraction, state).value
 
     # Both masses, the smaller one to all its digits.
@@ -90,7 +90,7 @@ def gamma_masses(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     return jnp.where(valid | at_zero, p, jnp.nan), jnp.where(valid | at_zero, q, jnp.nan)
 
 
-def large_masses(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+def gamma_masses_of_large_shape(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Compute P(a, x) and Q(a, x) of a large shape a, in which the series above would take many terms.
 
     With y^2 / 2 = m - log(1 + m), m = x / a - 1, y of the sign of m,
@@ -108,7 +108,7 @@ def large_masses(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     y = jnp.where(m < 0, -1.0, 1.0) * jnp.sqrt(2 * half)
     # The three coefficients as power series of y.
     rest = jnp.zeros_like(y)
-    for series in expansion()[::-1]:
+    for series in expand_coefficients()[::-1]:
         value = jnp.zeros_like(y)
         for c in series[::-1]:
             value = value * y + c
@@ -119,7 +119,7 @@ def large_masses(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 @cache
-def expansion() -> list[list[float]]:
+def expand_coefficients() -> list[list[float]]:
     """Compute the power series in y of c_0, c_1 and c_2, of `TERMS` terms.
 
     c_0 = 1 / m - 1 / y, c_k = c_(k-1)' / y + (-1)^k g_k / m with g_1 = 1 / 12, g_2 = 1 / 288, and y (1 + m) = m m'.
@@ -158,18 +158,18 @@ def scaled_bessel(order: int, x: jax.Array) -> jax.Array:
     large = size > FAR
 
     # Both series, each term the last one times a ratio, until terms are rounding.
-    def add_term(state: Series) -> Series:
+    def add_term(state: SeriesState) -> SeriesState:
         k, term, total = state
         power_ratio = size * size / (4 * k * (k + order))
         asymptotic_ratio = ((2 * k - 1) ** 2 - 4 * order**2) / (8 * k * jnp.where(large, size, 1.0))
         ratio = jnp.where(large, asymptotic_ratio, power_ratio)
-        return Series(k + 1, term * ratio, total + term * ratio)
+        return SeriesState(k + 1, term * ratio, total + term * ratio)
 
-    def has_more_terms(state: Series) -> jax.Array:
+    def has_more_terms(state: SeriesState) -> jax.Array:
         return jnp.abs(state.term) > EPSILON / 8 * state.total
 
     first = jnp.where(large | (order == 0), 1.0, size / 2)
-    total = jax.lax.while_loop(has_more_terms, add_term, Series(jnp.ones_like(x), first, first)).total
+    total = jax.lax.while_loop(has_more_terms, add_term, SeriesState(jnp.ones_like(x), first, first)).total
     scale = jnp.where(large, 1 / (np.sqrt(2 * np.pi) * jnp.sqrt(jnp.where(large, size, 1.0))), jnp.exp(-size))
     value = jnp.where(jnp.isnan(x), jnp.nan, total * scale)
     return jnp.where(x < 0, -value, jnp.where(x == 0, x, value)) if order else value

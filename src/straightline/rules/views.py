@@ -10,9 +10,9 @@ from jax.extend.core import JaxprEqn
 from straightline.limits import FEW, LOADED, TABLE
 from straightline.lowering import IN_MEMORY, RULES, Lowering, Rule, Value, array_of, result_shape
 from straightline.memory import InMemory, contiguous
-from straightline.nodes import Buffer, Key, Node
+from straightline.nodes import Buffer, Node, RandomKey
 from straightline.rules.elementwise import PASSED_ON, select
-from straightline.rules.loops import copied, in_memory, repeat_turns
+from straightline.rules.loops import copied, put_in_memory, repeat_turns
 from straightline.rules.places import clamp_place, fill_of, fills, inside, narrowed
 from straightline.rules.shapes import select_array
 
@@ -93,7 +93,7 @@ def _dynamic_slice_of_nodes(lowering: Lowering, equation: JaxprEqn, inputs: list
     for axis, (start, size) in enumerate(zip(starts, sizes, strict=True)):
         last = x.shape[axis] - size
         if start.op != "constant" and last >= FEW:
-            return _lower_dynamic_slice(lowering, equation, [in_memory(lowering, inputs[0]), *inputs[1:]])
+            return _lower_dynamic_slice(lowering, equation, [put_in_memory(lowering, inputs[0]), *inputs[1:]])
         x = _slice_window(lowering, x, axis, start, size) if last else x
     return [x]
 
@@ -117,10 +117,10 @@ def make_indexable(lowering: Lowering, x: Value, places: list[Value]) -> Value:
     if isinstance(x, InMemory) or places_are_known:
         return x
     flat = x.ravel().tolist()
-    has_keys, is_table = any(isinstance(n, Key) for n in flat), all(n.op == "constant" for n in flat)
+    has_keys, is_table = any(isinstance(n, RandomKey) for n in flat), all(n.op == "constant" for n in flat)
     if has_keys or not (is_table or len(flat) > FEW):
         return x
-    return in_memory(lowering, x)
+    return put_in_memory(lowering, x)
 
 
 def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
@@ -169,7 +169,7 @@ def _concatenate(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
     if math.prod(shape) <= TABLE or known:
         return list(RULES["concatenate"](lowering, equation, [lowering.nodes(x) for x in inputs]))
     if axis != 0:
-        parts = [in_memory(lowering, x) for x in inputs]
+        parts = [put_in_memory(lowering, x) for x in inputs]
 
         def turn(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
             return [], [np.concatenate([lowering.nodes(x.row(row)) for x in parts], axis=axis - 1)]

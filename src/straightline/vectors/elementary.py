@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable
 from straightline.vectors import error_function as error
 from straightline.vectors import exponential as exponential
 from straightline.vectors import trigonometry as trigonometry
-from straightline.vectors.formulas import Vector, function
+from straightline.vectors.formulas import Vector, write_function
 
 FUNCTIONS: dict[str, tuple[Callable[..., Vector], int]] = {
     "exp": (exponential.exp, 1),
@@ -49,7 +49,7 @@ SCALAR = {
 }
 
 
-def functions(names: Iterable[str], width: int) -> str:
+def write_functions(names: Iterable[str], width: int) -> str:
     """Return the text of `define internal %double @hg_NAME(%double ...)` for each name, with declarations.
 
     A name that ends in f is that of a function of floats, as in C.
@@ -63,7 +63,7 @@ def functions(names: Iterable[str], width: int) -> str:
             texts.append(_write_by_number(name, kind, SCALAR[op], width))
         else:
             formula, count = OF_FLOATS.get(op, FUNCTIONS[op]) if kind == "float" else FUNCTIONS[op]
-            texts.append(function(name, formula, count, kind))
+            texts.append(write_function(name, formula, count, kind))
     return "\n".join([*declared, *texts, ATTRIBUTES])
 
 

@@ -8,7 +8,7 @@ from straightline.vectors.formulas import Vector, copy_sign, fma, polynomial, se
 LOG2_E = 1 / math.log(2)
 
 
-class Format(NamedTuple):
+class PrecisionFormat(NamedTuple):
     """Numbers of a precision, and what depends on it in a formula.
 
     `word`: the integer of as many bits. `fraction`: bits after the leading one, of which `round`, added to a small
@@ -37,14 +37,14 @@ class Format(NamedTuple):
 
 
 FORMATS = {
-    "double": Format(
+    "double": PrecisionFormat(
         "i64", 52, 1.5 * 2.0**52, 0x4338000000000000, 0x3FF0000000000000, 0x3FE6A09E667F3BCD,
         (6.93147180369123816490e-01, 1.90821492927058770002e-10), 2.0**-1022, 709.782712893384, -745.1332191019412,
         [1 / math.factorial(i) for i in range(2, 15)],
         [6.666666666666735130e-01, 3.999999999940941908e-01, 2.857142874366239149e-01, 2.222219843214978396e-01,
          1.818357216161805012e-01, 1.531383769920937332e-01, 1.479819860511658591e-01],
     ),
-    "float": Format(
+    "float": PrecisionFormat(
         "i32", 23, 1.5 * 2.0**23, 0x4B400000, 0x3F800000, 0x3F3504F3,
         (6.9314575195e-01, 1.4286067653e-06), 2.0**-126, 88.72283935546875, -103.97208404541016,
         [1 / math.factorial(i) for i in range(2, 8)],
@@ -53,7 +53,7 @@ FORMATS = {
 }  # fmt: skip
 
 
-def format_of(x: Vector) -> Format:
+def format_of(x: Vector) -> PrecisionFormat:
     """Return the format of a vector's numbers."""
     return FORMATS[x.scalar]
 
@@ -133,7 +133,7 @@ def _reduce_argument(x: Vector, n: Vector) -> tuple[Vector, Vector]:
     return r, (first - r) - rest
 
 
-def _power(form: Format, n: Vector) -> Vector:
+def _power(form: PrecisionFormat, n: Vector) -> Vector:
     """Return 2^n of integers -1022 ... 1023, of floats -126 ... 127."""
     return ((n << form.fraction) + form.one_bits).as_type("double" if form.word == "i64" else "float")
 

@@ -1,4 +1,4 @@
-"""Formulas on vectors as text of LLVM IR: `a * b + c` on `Vector`s appends operations to a `Body`.
+"""Formulas on vectors as text of LLVM IR: `a * b + c` on `Vector`s appends operations to a `FormulaBody`.
 
 Every function of this folder is one straight line of such operations. Numbers of Python stand for vectors of that
 number. Operations are written as they stand: no contraction, no reordering; `fma` rounds once.
@@ -15,7 +15,7 @@ REALS = ("double", "float")
 
 
 @dataclass
-class Body:
+class FormulaBody:
     """Operations of one function on vectors, of as many numbers as the text that it stands in says."""
 
     lines: list[str] = field(default_factory=list)
@@ -50,7 +50,7 @@ class Body:
         return self.add(args[0].scalar, f"call {real} @llvm.{intrinsic}({', '.join(f'{real} {a.name}' for a in args)})")
 
 
-def _operator(real: str, whole: str, turned: bool = False) -> Callable[["Vector", Operand], "Vector"]:
+def _make_operator(real: str, whole: str, turned: bool = False) -> Callable[["Vector", Operand], "Vector"]:
     """Return the method of an operator of vectors: the instruction `real` on real numbers, `whole` on integers.
 
     `turned`: whether the other argument is the first one, as in `2 - x`.
@@ -78,7 +78,7 @@ def _make_comparison(real: str, whole: str) -> Callable[["Vector", Operand], "Ve
 class Vector:
     """A vector in a body: doubles, floats, integers or truths (scalars "double", "float", "i64", "i32", "i1")."""
 
-    body: Body
+    body: FormulaBody
     scalar: str
     name: str
 
@@ -89,14 +89,14 @@ class Vector:
 
     def like(self, value: Operand) -> "Vector":
         """Convert a number to a vector of this type; vectors are returned unchanged."""
-        return value if isinstance(value, Vector) else constant(self.body, self.scalar, value)
+        return value if isinstance(value, Vector) else make_constant(self.body, self.scalar, value)
 
-    __add__, __radd__ = _operator("fadd", "add"), _operator("fadd", "add", turned=True)
-    __sub__, __rsub__ = _operator("fsub", "sub"), _operator("fsub", "sub", turned=True)
-    __mul__, __rmul__ = _operator("fmul", "mul"), _operator("fmul", "mul", turned=True)
-    __truediv__, __rtruediv__ = _operator("fdiv", "sdiv"), _operator("fdiv", "sdiv", turned=True)
-    __and__, __or__, __xor__ = _operator("and", "and"), _operator("or", "or"), _operator("xor", "xor")
-    __lshift__, __rshift__ = _operator("shl", "shl"), _operator("ashr", "ashr")  # the second arithmetically
+    __add__, __radd__ = _make_operator("fadd", "add"), _make_operator("fadd", "add", turned=True)
+    __sub__, __rsub__ = _make_operator("fsub", "sub"), _make_operator("fsub", "sub", turned=True)
+    __mul__, __rmul__ = _make_operator("fmul", "mul"), _make_operator("fmul", "mul", turned=True)
+    __truediv__, __rtruediv__ = _make_operator("fdiv", "sdiv"), _make_operator("fdiv", "sdiv", turned=True)
+    __and__, __or__, __xor__ = _make_operator("and", "and"), _make_operator("or", "or"), _make_operator("xor", "xor")
+    __lshift__, __rshift__ = _make_operator("shl", "shl"), _make_operator("ashr", "ashr")  # the second arithmetically
     __lt__, __le__ = _make_comparison("olt", "slt"), _make_comparison("ole", "sle")
     __gt__, __ge__ = _make_comparison("ogt", "sgt"), _make_comparison("oge", "sge")
     equals = _make_comparison("oeq", "eq")  # false for NaN
@@ -123,7 +123,7 @@ def rounded(value: float) -> float:
     return nearest
 
 
-def constant(body: Body, scalar: str, value: float) -> Vector:
+def make_constant(body: FormulaBody, scalar: str, value: float) -> Vector:
     """Return a vector of one number."""
     if scalar in REALS:
         value = value if scalar == "double" else rounded(value)
@@ -138,7 +138,7 @@ def constant(body: Body, scalar: str, value: float) -> Vector:
 def select(condition: Vector, yes: Operand, no: Operand) -> Vector:
     """Select `yes` where the condition holds, else `no`; one of them is a vector, or both are real numbers."""
     body = condition.body
-    model = next((v for v in (yes, no) if isinstance(v, Vector)), constant(body, "double", 0.0))
+    model = next((v for v in (yes, no) if isinstance(v, Vector)), make_constant(body, "double", 0.0))
     a, b = model.like(yes), model.like(no)
     text = f"select {condition.type} {condition.name}, {a.type} {a.name}, {b.type} {b.name}"
     return body.add(model.scalar, text)
@@ -169,9 +169,9 @@ def polynomial(x: Vector, coefficients: Sequence[Operand]) -> Vector:
 
 
 @cache
-def function(name: str, formula: Callable[..., Vector], arguments: int = 1, scalar: str = "double") -> str:
+def write_function(name: str, formula: Callable[..., Vector], arguments: int = 1, scalar: str = "double") -> str:
     """Return the text of an internal function of vectors of doubles, or of floats."""
-    body = Body()
+    body = FormulaBody()
     real = body.type(scalar)
     value = formula(*(Vector(body, scalar, f"%x{i}") for i in range(arguments)))
     lines = "".join(f"  {line}\n" for line in body.lines)

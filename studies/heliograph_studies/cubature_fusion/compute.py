@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import heliograph as hg
-from heliograph.factors.columns import Columns, decorrelate, join_columns, reciprocal_or_zero, square_root
+from heliograph.factors.columns import WeightedColumns, decorrelate, join_columns, reciprocal_or_zero, square_root
 from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.gaussian import GaussianFilter, correct_signal
@@ -76,7 +76,7 @@ class RawMoment(AbstractReading):
 
     def condition(self, signal: Signal, channel: SecondOrder, z: ArrivedInnovation, nominal: Gaussian) -> Gaussian:
         """Take E[y y'] for Cov(y): E y (E y)' is one more column of its noise."""
-        noise = join_columns(signal.noise, Columns(signal.mean[:, None], jnp.ones(1)))
+        noise = join_columns(signal.noise, WeightedColumns(signal.mean[:, None], jnp.ones(1)))
         return _condition(self.update, signal._replace(noise=noise), channel, z)
 
 
@@ -137,7 +137,7 @@ class MixedCross(AbstractFilter):
         slopes = decorrelate(x.root, cross).T * reciprocal_or_zero(x.variances)
         weights, vectors = eigh(spread - (slopes * x.variances) @ slopes.T)
         second = spread + jnp.outer(mean, mean)
-        signal = Signal(x, mean, slopes, Columns(vectors, weights), second, jnp.diagonal(second))
+        signal = Signal(x, mean, slopes, WeightedColumns(vectors, weights), second, jnp.diagonal(second))
         after, innovation = correct_signal(signal, channel, self.base.rule, jnp.asarray(z))
         return state._replace(gaussian=after), innovation
 

@@ -14,7 +14,7 @@ from heliograph.filters.gaussian.bounds import as_scalars, observe_by_young, sca
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.gaussian.signal import ArrivedInnovation, Signal
 from heliograph.filters.gaussian.transform import AbstractTransform
-from heliograph.filters.gaussian.update import AbstractUpdate, interval_description
+from heliograph.filters.gaussian.update import AbstractUpdate, combine_hop_ranges
 from heliograph.numerics.check import check_count
 from heliograph.random_affine.moments.second_moments import SecondOrder
 from heliograph_studies import check_fields
@@ -40,7 +40,7 @@ class LooseInterval(AbstractUpdate):
         Raises:
             ValueError: a channel that is not a chain of scalar hops.
         """
-        return interval_description(channel, lambda hop: hop.largest_second + (hop.mean - hop.mean_radius) ** 2)
+        return combine_hop_ranges(channel, lambda hop: hop.largest_second + (hop.mean - hop.mean_radius) ** 2)
 
     def described(self) -> AbstractUpdate:
         """Young's bound, as for a polytope."""

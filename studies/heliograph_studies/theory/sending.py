@@ -21,7 +21,7 @@ import heliograph as hg
 from heliograph.factors.roots import observe_information, roots_of
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.planning.paths.model import Paths, Plants, error_covariances, path_information
+from heliograph.planning.paths.model import Paths, PlantSteps, error_covariances, path_information
 from heliograph.planning.paths.relaxation import compute_envelope, split_paths
 
 Steps = tuple[tuple[int, ...], ...]  # the sensors of each step
@@ -70,7 +70,7 @@ class Bursts(NamedTuple):
 def steady_error(paths: Paths, information: Float[np.ndarray, "time path"]) -> float:
     """Mean trace of the error over steps that repeat for ever, at each of which the paths carry this information."""
     a, q = (np.repeat(m, len(information), axis=0) for m in (paths.plants.transition, paths.plants.process))
-    covariances = error_covariances(paths._replace(plants=Plants(a, q, None)), information)
+    covariances = error_covariances(paths._replace(plants=PlantSteps(a, q, None)), information)
     return float(np.trace(covariances, axis1=1, axis2=2).mean())
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.factors import Columns, condition_on_observation, from_covariance
+from heliograph.factors import WeightedColumns, condition_on_observation, from_covariance
 from heliograph.factors.gaussian import Gaussian
 from tests.follow import follow
 
@@ -323,7 +323,7 @@ def exact_after_dropout(matrix, mean, tenths):
 
 def updated(x, rows, variances):
     """Gain, and x given what rows (m, n) with uncorrelated noises of these variances show of it."""
-    noise = Columns(np.eye(len(rows)), jnp.asarray(variances))
+    noise = WeightedColumns(np.eye(len(rows)), jnp.asarray(variances))
     ways = jax.vmap(lambda z: condition_on_observation(x, rows @ x.root, z, noise)[0])(jnp.eye(len(rows)))
     return ways.mean.T, jax.tree.map(lambda leaf: leaf[0], ways)
 

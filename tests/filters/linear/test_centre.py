@@ -5,7 +5,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.random_affine.moments import about_mean
-from heliograph.random_affine.moments.moment_noise import AboutMean
+from heliograph.random_affine.moments.moment_noise import CentredNoise
 from heliograph.testing import check_filter
 from tests.follow import last
 
@@ -70,7 +70,7 @@ def test_far_from_zero_behind_a_random_gain_the_claim_is_lowered():
     ids=lambda law: type(law).__name__,
 )
 def test_a_law_about_its_mean(law):
-    for item in (about_mean(law), AboutMean(law)):
+    for item in (about_mean(law), CentredNoise(law)):
         np.testing.assert_allclose(item.mean, 0.0, atol=1e-15)
         np.testing.assert_allclose(item.covariance, law.covariance)
         assert item.moment((1, 0)) == pytest.approx(0.0, abs=1e-14)

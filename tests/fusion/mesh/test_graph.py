@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.fusion.mesh import graph_of, upstream
+from heliograph.fusion.mesh import find_upstream_nodes, graph_of
 
 
 def neighbours_of(table):
@@ -57,7 +57,7 @@ def test_rows_of_a_graph_are_padded_with_the_node_itself():
 
 def test_upstream_follows_directed_paths():
     graph = graph_of({"a": ["b"], "b": ["a"], "c": ["b"], "d": []}, list("abcd"))
-    places = upstream(graph)
+    places = find_upstream_nodes(graph)
     assert [mine.tolist() for mine in places] == [[0, 1], [0, 1], [0, 1, 2], [3]]
     assert places[0] is places[1]
 

@@ -7,7 +7,7 @@ import pytest
 import heliograph as hg
 from heliograph.filters import chunks
 from heliograph.learning.description import describe
-from heliograph.learning.likelihood import Data, Surface, make_objectives
+from heliograph.learning.likelihood import LikelihoodData, LikelihoodSurface, make_objectives
 
 ROWS = 40_001  # a chunk that is not full at the end
 RNG = np.random.default_rng(11)
@@ -43,8 +43,8 @@ def everywhere():
 
 def evaluated(network, z, u, by_row=False):
     objective = make_objectives(describe(network))[0]
-    data = Data(z[None], u[None], (len(z),))
-    surface, x = Surface(objective, data), objective.description.parameters.start[None] + 0.1
+    data = LikelihoodData(z[None], u[None], (len(z),))
+    surface, x = LikelihoodSurface(objective, data), objective.description.parameters.start[None] + 0.1
     return surface.evaluate_rows(x) if by_row else surface.evaluations(x)
 
 

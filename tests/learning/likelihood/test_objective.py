@@ -7,7 +7,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.learning.description import describe
-from heliograph.learning.likelihood import Data, Surface, make_objectives
+from heliograph.learning.likelihood import LikelihoodData, LikelihoodSurface, make_objectives
 from heliograph.learning.likelihood.evaluation import _by_xla
 
 STEPS, RECORDINGS = 157, 2
@@ -53,7 +53,7 @@ def both(request):
     z = np.cumsum(np.random.default_rng(0).normal(size=(RECORDINGS, STEPS, received)), axis=1)
     z[0, 3, 0] = z[0, 20:23] = np.nan
     u = np.random.default_rng(2).normal(size=(RECORDINGS, STEPS, len(objective.description.start.inputs)))
-    return objective, Data(z, u, (STEPS,) * RECORDINGS)
+    return objective, LikelihoodData(z, u, (STEPS,) * RECORDINGS)
 
 
 def points(objective):
@@ -65,7 +65,7 @@ def points(objective):
 def test_native_code_computes_what_the_compiler_of_jax_does(both):
     objective, data = both
     x = points(objective)
-    native = Surface(objective, data).evaluations(x)
+    native = LikelihoodSurface(objective, data).evaluations(x)
     with jax.enable_x64(True):
         for i, point in enumerate(x):
             parts = [_by_xla(objective, point, z, u) for z, u in zip(data.measurements, data.inputs, strict=True)]
@@ -81,12 +81,15 @@ def test_native_code_computes_what_the_compiler_of_jax_does(both):
 def test_scores_are_the_derivatives_of_the_likelihood(both):
     objective, data = both
     for x in points(objective):
-        result = Surface(objective, data).evaluations(x[None])
+        result = LikelihoodSurface(objective, data).evaluations(x[None])
         with jax.enable_x64(True):
             rows = zip(data.measurements, data.inputs, strict=True)
             total = sum(hg.log_likelihood(objective.filter(x), z, u) for z, u in rows)
         np.testing.assert_allclose(result.total[0], total, rtol=1e-12)
-        ends = [Surface(objective, data).evaluations(x + sign * DIFFERENCE * np.eye(len(x))).total for sign in (-1, 1)]
+        ends = [
+            LikelihoodSurface(objective, data).evaluations(x + sign * DIFFERENCE * np.eye(len(x))).total
+            for sign in (-1, 1)
+        ]
         slopes = (ends[1] - ends[0]) / (2 * DIFFERENCE)
         np.testing.assert_allclose(result.gradient[0], slopes, rtol=1e-6, atol=1e-6 * np.abs(slopes).max())
 
@@ -99,8 +102,8 @@ def test_behind_a_known_gain_they_are_those_of_the_factors(network):
     z = np.random.default_rng(0).normal(size=(40, objective.description.start.nodes["node"].received))
     z[[3, 20], 0] = z[21] = np.nan
     u = np.random.default_rng(2).normal(size=(40, len(objective.description.start.inputs)))
-    data, x = Data(z[None], u[None], (40,)), points(objective)[0]
-    result = Surface(objective, data).evaluations(x[None])
+    data, x = LikelihoodData(z[None], u[None], (40,)), points(objective)[0]
+    result = LikelihoodSurface(objective, data).evaluations(x[None])
     with jax.enable_x64(True):
         total, slopes = jax.value_and_grad(lambda x: hg.log_likelihood(objective.filter(x), z, u))(x)
     np.testing.assert_allclose(result.total[0], total, rtol=1e-12)

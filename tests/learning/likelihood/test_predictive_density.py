@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import norm
 
 import heliograph as hg
-from heliograph.learning.likelihood.predictive_density import law_nodes
+from heliograph.learning.likelihood.predictive_density import approximate_law_by_nodes
 from heliograph.random_affine import AbstractLaw
 
 SIGNAL = (np.array([[2.0]]), np.array([[[0.5]]]))
@@ -45,7 +45,7 @@ class Uniform(AbstractLaw):
     ids=lambda item: type(item).__name__,
 )
 def test_nodes_have_the_laws_moments(law, tolerance):
-    nodes = law_nodes(law, 64)
+    nodes = approximate_law_by_nodes(law, 64)
     for order in (1, 2, 3):
         assert nodes.moment(order) == pytest.approx(float(law.moment(order)), rel=tolerance)
 

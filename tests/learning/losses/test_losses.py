@@ -7,7 +7,7 @@ from scipy.special import expit, logit
 from scipy.stats import binomtest, chi2_contingency
 
 import heliograph as hg
-from heliograph.learning.losses.hidden_losses import HiddenModeLosses, Runs
+from heliograph.learning.losses.hidden_losses import FateRuns, HiddenModeLosses
 from heliograph.learning.losses.loss_law import IndependentLosses, MarkovLosses
 
 NAN = np.nan
@@ -51,13 +51,13 @@ def by_enumeration(fate, good, bad, fails, recovers):
 def test_the_hidden_modes_likelihood_is_the_sum_over_all_modes():
     shares = expit(LOGITS)
     expected = sum(np.log(by_enumeration(part, *shares)) for part in BURSTS)
-    assert Runs.of(BURSTS).likelihood(LOGITS)[0] == pytest.approx(expected, rel=1e-13)
+    assert FateRuns.of(BURSTS).likelihood(LOGITS)[0] == pytest.approx(expected, rel=1e-13)
     law = HiddenModeLosses(*map(share, shares))
     assert np.nansum(law.log_likelihoods(BURSTS)) == pytest.approx(expected, rel=1e-13)
 
 
 def test_its_gradient_is_that_of_differences(bursts):
-    runs, step = Runs.of([bursts[:500]]), 1e-5 * np.eye(4)
+    runs, step = FateRuns.of([bursts[:500]]), 1e-5 * np.eye(4)
     differences = [(runs.likelihood(LOGITS + e)[0] - runs.likelihood(LOGITS - e)[0]) / 2e-5 for e in step]
     np.testing.assert_allclose(runs.likelihood(LOGITS)[1], differences, rtol=1e-6)  # of central differences
 
@@ -72,7 +72,7 @@ def test_it_finds_the_modes_it_was_drawn_from(learned):
 
 def test_the_profile_falls_by_half_the_chi_square_point_at_the_ends_of_an_interval(learned, bursts):
     """Where one share stands at an end of its interval and the others are the likeliest ones."""
-    runs, shares = Runs.of([bursts]), learned.laws["hidden"].shares()
+    runs, shares = FateRuns.of([bursts]), learned.laws["hidden"].shares()
     top = runs.likelihood(logit([s.estimate for s in shares.values()]))
     assert np.max(np.abs(top[1])) < 1e-2
     for i, single in enumerate(shares.values()):

@@ -5,7 +5,13 @@ import pytest
 
 import heliograph as hg
 from heliograph.factors.gaussian import Gaussian
-from heliograph.live.stored import can_read, describe_old_layout, factorise, relocate_parts, split_by_path
+from heliograph.live.stored import (
+    can_read_layout,
+    describe_old_layout,
+    factorise_covariance,
+    relocate_parts,
+    split_by_path,
+)
 from heliograph.live.stored.old_layout import place_flags
 
 NEW = {
@@ -21,14 +27,14 @@ OLD = {".mean": [2, 3], ".covariance": [2, 3, 3], ".inner.covariance": [1, 1], "
 
 def test_an_older_layout_is_that_of_now_with_covariances():
     assert describe_old_layout(NEW) == OLD and list(describe_old_layout(NEW)) == list(OLD)
-    assert can_read(OLD, NEW) and can_read(NEW, NEW) and can_read(OLD, OLD)
+    assert can_read_layout(OLD, NEW) and can_read_layout(NEW, NEW) and can_read_layout(OLD, OLD)
     for other in (
         OLD | {".covariance": [2, 2, 2]},
         OLD | {".more": []},
         {path: shape for path, shape in OLD.items() if path != ".law"},
         NEW | {".covariance": [2, 3, 3]},
     ):
-        assert not can_read(other, NEW)
+        assert not can_read_layout(other, NEW)
 
 
 def test_a_gaussian_that_is_a_part_of_its_own_stood_beside_the_others():
@@ -38,10 +44,15 @@ def test_a_gaussian_that_is_a_part_of_its_own_stood_beside_the_others():
     flat = {path.replace(".gaussian", ""): shape for path, shape in new.items()}
     old = {".mean": [2, 3], ".covariance": [2, 3, 3], ".law": [4], ".errors.mean": [2]}
     assert describe_old_layout(new) == old
-    assert can_read(flat, new) and can_read(old, new) and can_read(new, new) and not can_read(new, flat)
+    assert (
+        can_read_layout(flat, new)
+        and can_read_layout(old, new)
+        and can_read_layout(new, new)
+        and not can_read_layout(new, flat)
+    )
     parts = {path: np.full(shape, float(i)) for i, (path, shape) in enumerate(flat.items())}
     assert [part.flat[0] for part in relocate_parts(parts, new).values()] == [0, 1, 2, 3, 4]
-    assert can_read(
+    assert can_read_layout(
         {path: shape for path, shape in old.items() if path != ".errors.mean"} | {".errors.gaussian.mean": [2]}, new
     )
 
@@ -63,7 +74,7 @@ def test_factors_of_covariances_are_theirs(count):
         roots = generator.normal(size=(count, n, n)) * 10.0 ** generator.uniform(-6, 6, (count, n, 1))
         roots[0, :, 1:] = 0.0
         covariance = roots @ np.swapaxes(roots, -1, -2)
-        lower, variances = factorise(covariance.reshape(count, 1, n, n))
+        lower, variances = factorise_covariance(covariance.reshape(count, 1, n, n))
         assert lower.shape == (count, 1, n * (n - 1) // 2) and variances.shape == (count, 1, n)
         assert np.all(variances >= 0)
         again = Gaussian(variances, lower, variances).covariance[:, 0]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.live.stored import pack, unpack
+from heliograph.live.stored import pack, unpack_snapshot
 from heliograph.live.stored.plant_codec import HEAD
 
 SENSOR = hg.LinearSensor([[1.0]], 0.5)
@@ -25,7 +25,7 @@ def written_before(data):
     Its time, the newest arrival before it, and of each node's count then the first, the newest, its time, what was lost
     and the newest time.
     """
-    head, arrays = unpack(data)
+    head, arrays = unpack_snapshot(data)
     plant = arrays["plant"].tobytes()
     length, *counts = HEAD.unpack_from(plant)
     of_plant = json.loads(plant[HEAD.size : HEAD.size + length])

@@ -3,7 +3,7 @@ import threading
 
 import pytest
 
-from heliograph.numerics import no_collector
+from heliograph.numerics import pause_collector
 
 
 @pytest.fixture(autouse=True)
@@ -14,16 +14,16 @@ def on():
 
 def test_the_collector_is_off_within_and_as_it_was_afterwards():
     assert gc.isenabled()
-    with no_collector():
+    with pause_collector():
         assert not gc.isenabled()
-        with no_collector():  # a trace that begins another
+        with pause_collector():  # a trace that begins another
             pass
         assert not gc.isenabled()
     assert gc.isenabled()
 
 
 def test_it_is_on_again_after_an_error():
-    @no_collector()
+    @pause_collector()
     def refused():
         raise ValueError("no")
 
@@ -35,7 +35,7 @@ def test_it_is_on_again_after_an_error():
 def test_who_switched_it_off_finds_it_off():
     gc.disable()
     try:
-        with no_collector():
+        with pause_collector():
             pass
         assert not gc.isenabled()
     finally:
@@ -46,11 +46,11 @@ def test_threads_that_overlap_leave_it_on():
     begun, ended = threading.Event(), threading.Event()
 
     def second():
-        with no_collector():  # finds it off
+        with pause_collector():  # finds it off
             begun.set()
             ended.wait(10)
 
-    with no_collector():
+    with pause_collector():
         thread = threading.Thread(target=second)
         thread.start()
         begun.wait(10)

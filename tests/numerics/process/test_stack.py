@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from heliograph.numerics import make_room
+from heliograph.numerics import reserve_stack
 
 CALLS = 200
 
@@ -31,11 +31,11 @@ def test_it_is_the_same_function():
             raise ValueError("no")
         return x * by
 
-    roomy = make_room(scaled)
+    roomy = reserve_stack(scaled)
     assert roomy(2, by=3) == 6 and roomy(2) == 2 and (roomy.__name__, roomy.__doc__) == ("scaled", "Scale.")
     with pytest.raises(ValueError, match="no"):
         roomy(2, by=0)
-    assert make_room(roomy)(5) == 5
+    assert reserve_stack(roomy)(5) == 5
 
 
 def slowest(measure):
@@ -47,5 +47,5 @@ def slowest(measure):
 def test_how_deep_a_caller_stands_makes_no_difference():
     """Without room a call across the end of a chunk takes 20 to 100 times as long: in a thread, as tests have room."""
     with ThreadPoolExecutor(1) as thread:
-        assert thread.submit(slowest, make_room(from_depth)).result() < 5
+        assert thread.submit(slowest, reserve_stack(from_depth)).result() < 5
         assert thread.submit(slowest, from_depth).result() > 5

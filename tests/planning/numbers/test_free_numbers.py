@@ -8,7 +8,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.planning import Budget, Error
-from heliograph.planning.numbers.problem import NumberProblem, check_numbers
+from heliograph.planning.numbers.problem import NumberProblem, check_free_numbers
 
 PLANT = hg.LinearPlant([[0.9, 0.2], [0.0, 0.7]], np.diag([0.1, 0.3]), np.zeros(2), np.eye(2))
 BOTH = hg.LinearSensor(np.eye(2), np.diag([0.2, 0.4]))
@@ -74,7 +74,7 @@ def check_gradients(problem, relative=2e-3):
 @cache
 def problem_of(name):
     build, free = CASES[name]
-    return NumberProblem(build, check_numbers(free), Error({"x0": 1.0, "x1": 0.5}))
+    return NumberProblem(build, check_free_numbers(free), Error({"x0": 1.0, "x1": 0.5}))
 
 
 @pytest.fixture(scope="module", params=CASES)
@@ -248,7 +248,7 @@ def test_an_arrival_probability_is_free_where_nothing_is_transmitted(loss, budge
 
 @pytest.mark.parametrize(("low", "high"), [(-1.0, 2.0), (0.1, -np.inf)])
 def test_ends_at_which_there_is_no_network_are_refused_before_any_descent(low, high, monkeypatch):
-    monkeypatch.setattr("heliograph.planning.numbers.design.search", None)
+    monkeypatch.setattr("heliograph.planning.numbers.design.search_from_starts", None)
     sign, ends = (1, (0.5, low, high)) if high > 0 else (-1, (-0.5, -2.0, 1.0))
 
     def built(noise):

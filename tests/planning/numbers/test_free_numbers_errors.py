@@ -6,7 +6,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.planning import Budget, Error
-from heliograph.planning.numbers.problem import NumberProblem, check_numbers
+from heliograph.planning.numbers.problem import NumberProblem, check_free_numbers
 from tests.planning.numbers.test_free_numbers import CASES, FADING, PLANT, check_gradients, observed_modes, uncertain
 
 SENSORS = {"p": hg.LinearSensor([[1.0, 0.0]], 0.2), "q": hg.LinearSensor([[0.0, 1.0]], 0.4)}
@@ -39,7 +39,7 @@ UNSTABLE = hg.LinearPlant([[1.2, 0.2], [0.0, 0.7]], np.diag([0.1, 0.3]), [1.0, 2
     ],
 )
 def test_gradients_of_every_error_are_those_of_differences(build, free, error):
-    check_gradients(NumberProblem(build, check_numbers(free), error))
+    check_gradients(NumberProblem(build, check_free_numbers(free), error))
 
 
 @pytest.mark.parametrize(

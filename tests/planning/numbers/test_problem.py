@@ -5,7 +5,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.planning import Error
-from heliograph.planning.numbers.problem import NumberProblem, check_numbers, read_free_numbers
+from heliograph.planning.numbers.problem import NumberProblem, check_free_numbers, read_free_numbers
 
 PLANT = hg.LinearPlant([[0.9]], 0.3, [0.0], 1.0)
 OUTSIDE = {"noise": 0.3}
@@ -21,7 +21,7 @@ def marks():
 
 
 def problem(start=1.2, build=one_hop, **error):
-    return NumberProblem(build, check_numbers({"amplification": (start, 0.1, 5.0)}), Error(**error))
+    return NumberProblem(build, check_free_numbers({"amplification": (start, 0.1, 5.0)}), Error(**error))
 
 
 def test_budgets_and_weights_are_no_reason_to_compile_again():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from heliograph.planning import Error
-from heliograph.planning.paths.model import Plants, RiccatiMap, adjoint, covariances, solve_fixed_point
+from heliograph.planning.paths.model import PlantSteps, RiccatiMap, adjoint, compute_covariances, solve_fixed_point
 from heliograph.planning.paths.networks import paths_of
 from tests.planning.published import A, Q, path_problem, two_hops
 
@@ -29,25 +29,25 @@ def random_steps(steps, seed):
 @pytest.mark.parametrize("period", [1, 2, 5])
 def test_the_fixed_point_is_where_the_recursion_converges(period):
     a, q, j = random_steps(period, period)
-    plants = Plants(a, q, None)
+    plants = PlantSteps(a, q, None)
     limit = recursion(plants, j, np.eye(3), 100 * period)[-period:]
-    np.testing.assert_allclose(covariances(plants, j), limit, rtol=1e-11)  # inverses of the plain form round
+    np.testing.assert_allclose(compute_covariances(plants, j), limit, rtol=1e-11)  # inverses of the plain form round
 
 
 def test_a_horizon_is_the_recursion_from_its_start():
     a, q, j = random_steps(6, 7)
-    plants = Plants(a, q, np.diag([1.0, 2.0, 3.0]))
-    np.testing.assert_allclose(covariances(plants, j), recursion(plants, j, plants.start, 6), rtol=1e-12)
+    plants = PlantSteps(a, q, np.diag([1.0, 2.0, 3.0]))
+    np.testing.assert_allclose(compute_covariances(plants, j), recursion(plants, j, plants.start, 6), rtol=1e-12)
 
 
 @pytest.mark.parametrize("start", [None, np.eye(3)], ids=["period", "horizon"])
 def test_the_adjoint_is_the_gradient(start):
     a, q, j = random_steps(4, 3)
-    plants, weights = Plants(a, q, start), random_steps(4, 5)[2]
-    p = covariances(plants, j)
+    plants, weights = PlantSteps(a, q, start), random_steps(4, 5)[2]
+    p = compute_covariances(plants, j)
     gradient = -p @ adjoint(plants, j, p, weights) @ p
     way = random_steps(4, 9)[1]  # a direction of informations
-    cost = lambda s: np.sum(weights * covariances(plants, j + s * way))  # noqa: E731
+    cost = lambda s: np.sum(weights * compute_covariances(plants, j + s * way))  # noqa: E731
     h = 1e-4
     slope = (8 * (cost(h) - cost(-h)) - (cost(2 * h) - cost(-2 * h))) / (12 * h)
     assert slope == pytest.approx(np.sum(gradient * way), rel=1e-8)  # differences of fourth order leave h^4

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from heliograph.random_affine.moments import (
     count_monomials,
     evaluate_monomials,
-    exponents,
+    list_exponents,
     multiply_polynomials,
     position,
     symmetric_power,
@@ -27,8 +27,8 @@ def test_degree_two_in_order():
 
 @pytest.mark.parametrize(("variables", "degree"), [(1, 4), (3, 2), (4, 3), (5, 4)])
 def test_count_and_positions(variables, degree):
-    assert len(exponents(variables, degree)) == count_monomials(variables, degree)
-    assert all(exponents(variables, degree)[i] == p for p, i in position(variables, degree).items())
+    assert len(list_exponents(variables, degree)) == count_monomials(variables, degree)
+    assert all(list_exponents(variables, degree)[i] == p for p, i in position(variables, degree).items())
 
 
 @given(seed=st.integers(0, 1000), degree=st.integers(1, 4), rows=st.integers(1, 3), columns=st.integers(1, 3))

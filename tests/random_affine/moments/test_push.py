@@ -5,13 +5,13 @@ import pytest
 
 import heliograph as hg
 from heliograph.random_affine.moments import (
-    Tabulated,
+    TabulatedNoise,
     count_monomials,
     evaluate_monomials,
-    exponents,
+    list_exponents,
     products_of_monomials,
-    push_known,
     push_moments,
+    push_through_known_map,
 )
 from heliograph.random_affine.noise import noise_vector
 from tests.random_affine.test_contract import CHANNELS
@@ -46,7 +46,7 @@ def test_a_known_map_moves_points():
     matrix = np.array([[1.0, 2.0, 0.5], [0.0, -1.0, 3.0], [0.0, 0.0, 1.0]])
     y = np.array([0.4, -0.2])
     for order in (1, 2, 3, 4):
-        pushed = push_known(matrix, order, evaluate_monomials(y, order))
+        pushed = push_through_known_map(matrix, order, evaluate_monomials(y, order))
         np.testing.assert_allclose(pushed, evaluate_monomials((matrix @ [*y, 1.0])[:-1], order), rtol=1e-13)
 
 
@@ -62,9 +62,9 @@ def test_a_table_knows_what_the_law_knows():
     law = hg.random_affine.Shaped(
         [[1.0, 0.5], [0.0, 2.0]], hg.random_affine.FiniteSupport([[1.0, 0.0], [-1.0, 2.0]], [0.25, 0.75])
     )
-    table = Tabulated(law, 4)
+    table = TabulatedNoise(law, 4)
     np.testing.assert_array_equal(noise_vector(table, 4), noise_vector(law, 4))
-    assert all(table.moment(a) == law.moment(a) for k in range(5) for a in exponents(2, k))
+    assert all(table.moment(a) == law.moment(a) for k in range(5) for a in list_exponents(2, k))
 
 
 def test_a_large_order_needs_no_large_matrix():

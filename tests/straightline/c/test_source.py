@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from straightline.c_source import CSource, literal
+from straightline.c_source import CSource, write_literal
 from straightline.lowering import scalars
 from straightline.memory import InMemory
 from straightline.nodes import Unsupported
-from straightline.program import lower
+from straightline.program import lower_function
 from tests.export.device import needs_compiler
 from tests.straightline.conformance.c import FLAGS
 
@@ -21,7 +21,7 @@ X = np.array([0.3, -1.7, 2.5, 0.9])
 
 def written(function, x, real="double"):
     """The statements, tables and results of a function of one array."""
-    program = lower(function, x)
+    program = lower_function(function, x)
     arrays = [x.nodes(program.graph) if isinstance(x, InMemory) else x for x in program.outputs]
     results = [node for array in arrays for node in scalars(array)]
     source = CSource(results, {program.inputs[0]: "x[{}]".format}, real, "made")
@@ -147,15 +147,17 @@ def test_the_text_follows_from_the_function_alone():
 
 @pytest.mark.parametrize("value", [0.1, -1e-300, 1 / 3, 5e-324, 1.7976931348623157e308, -0.0])
 def test_a_literal_has_every_digit(value):
-    text = literal(value, "f64", "double").strip("()")
+    text = write_literal(value, "f64", "double").strip("()")
     assert float(text) == value and np.signbit(float(text)) == np.signbit(value)
 
 
 def test_a_literal_in_single_precision_is_the_nearest():
-    assert np.float32(literal(1 / 3, "f64", "float").rstrip("f")) == np.float32(1 / 3)
-    assert literal(float("nan"), "f64", "float") == "NAN" and literal(-np.inf, "f64", "float") == "(-INFINITY)"
+    assert np.float32(write_literal(1 / 3, "f64", "float").rstrip("f")) == np.float32(1 / 3)
+    assert (
+        write_literal(float("nan"), "f64", "float") == "NAN" and write_literal(-np.inf, "f64", "float") == "(-INFINITY)"
+    )
     with pytest.raises(ValueError, match=r"single precision: expected numbers up to 3.4e38, got 1e\+39"):
-        literal(1e39, "f64", "float")
+        write_literal(1e39, "f64", "float")
 
 
 def test_what_c_has_not_is_named():

@@ -11,7 +11,7 @@ from straightline.limits import TABLE
 from straightline.lowering import Lowering, trace_function, type_of
 from straightline.memory import InMemory
 from straightline.nodes import Buffer
-from straightline.program import Program, lower
+from straightline.program import Program, lower_function
 from tests.straightline.conformance.case import Case
 
 
@@ -31,7 +31,7 @@ def by_xla(cases: Sequence[Case]) -> list[list[np.ndarray]]:
 
 def by_lanes(case: Case) -> list[np.ndarray]:
     """By native code, each run a lane."""
-    program = lower(lambda *row: jax.tree.leaves(case.function(*row)), *case.row(0))
+    program = lower_function(lambda *row: jax.tree.leaves(case.function(*row)), *case.row(0))
     return [np.asarray(x) for x in Compiled(program, [True] * len(case.arguments))(*case.arguments)]
 
 

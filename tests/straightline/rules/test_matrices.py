@@ -9,9 +9,9 @@ import pytest
 
 from straightline.compiled import compile
 from straightline.jax_function import function_of
-from straightline.llvm.module import output_buffers
+from straightline.llvm.module import choose_output_buffers
 from straightline.nodes import Node
-from straightline.program import list_needed, lower
+from straightline.program import list_needed, lower_function
 
 RANDOM = np.random.default_rng(7)
 SPARSE = np.where(RANDOM.random((5, 5)) < 0.5, 0.0, RANDOM.normal(size=(5, 5)))
@@ -20,8 +20,8 @@ VALUES = np.array([np.nan, np.inf, -np.inf, 1.5, -2.0])
 
 def operations(function, *shapes):
     """Additions and products, and numbers that a loop carries, of a function of arrays of these shapes."""
-    program = lower(function, *(jax.ShapeDtypeStruct(s, np.float64) for s in shapes))
-    nodes = [n for n in list_needed(output_buffers(program)) if isinstance(n, Node)]
+    program = lower_function(function, *(jax.ShapeDtypeStruct(s, np.float64) for s in shapes))
+    nodes = [n for n in list_needed(choose_output_buffers(program)) if isinstance(n, Node)]
     counts = Counter(n.op for n in nodes)
     return counts["add"] + counts["sub"] + counts["mul"], counts["parameter"]
 
@@ -46,7 +46,7 @@ def test_nan_and_infinity_pass_through_a_known_matrix_to_what_depends_on_them_an
     expected = np.array([without_zeros(SPARSE, one) for one in x])
     assert np.isnan(expected).any() and np.isinf(expected).any() and np.isfinite(expected).any()
     np.testing.assert_allclose(compile(function, x[0])(x), expected, rtol=1e-14, atol=1e-14)
-    program = lower(function, x[0])
+    program = lower_function(function, x[0])
     with jax.enable_x64(True):
         np.testing.assert_allclose(jax.vmap(function_of(program))(x), expected, rtol=1e-14, atol=1e-14)
 

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from straightline.folding import DTYPES, EVALUATED
 from straightline.lowering import scalars
 from straightline.nodes import Node, Unsupported
-from straightline.program import lower
-from straightline.rules.random_bits import hash_function, hash_words
+from straightline.program import lower_function
+from straightline.rules.random_bits import hash_words, write_hash_function
 from tests.straightline.compiled import WIDTH, engine_of
 
 WORD = st.integers(0, 2**32 - 1)
@@ -24,7 +24,7 @@ WORD = st.integers(0, 2**32 - 1)
 
 def computed(function: Callable[..., Any], *arguments: Any) -> list[np.ndarray]:
     """The results of a lowered function, its operations computed one by one by NumPy; keys as their words."""
-    program = lower(function, *arguments)
+    program = lower_function(function, *arguments)
     words = [np.asarray(jax.random.key_data(a) if _is_key(a) else a) for a in arguments]
     given = dict(zip(program.inputs, words, strict=True))
     known: dict[Node, Any] = {}
@@ -122,15 +122,15 @@ def test_the_hash_of_jax() -> None:
 
 
 def test_known_keys_are_computed_before() -> None:
-    program = lower(lambda: jax.random.uniform(jax.random.fold_in(jax.random.key(5), 3), (2,), dtype=float))
+    program = lower_function(lambda: jax.random.uniform(jax.random.fold_in(jax.random.key(5), 3), (2,), dtype=float))
     assert all(node.op == "constant" for node in scalars(program.outputs[0]))
 
 
 def test_keys_of_another_hash_are_refused() -> None:
     with pytest.raises(Unsupported, match=r"key<rbg>"):
-        lower(lambda key: jax.random.fold_in(key, 1), jax.random.key(0, impl="rbg"))
+        lower_function(lambda key: jax.random.fold_in(key, 1), jax.random.key(0, impl="rbg"))
     with jax.threefry_partitionable(False), pytest.raises(Unsupported, match="jax_threefry_partitionable"):
-        lower(lambda key: jax.random.fold_in(key, 1), jax.random.key(0))
+        lower_function(lambda key: jax.random.fold_in(key, 1), jax.random.key(0))
 
 
 def test_the_compiled_hash() -> None:
@@ -139,7 +139,7 @@ def test_the_compiled_hash() -> None:
         f"  %p{i} = getelementptr {words}, ptr %in, i64 {i}\n  %w{i} = load {words}, ptr %p{i}, align 4\n"
         for i in range(4)
     )
-    text = hash_function() + (
+    text = write_hash_function() + (
         f"define void @all(ptr %in, ptr %out) {{\n{loads}"
         f"  %r = call {wide} @hg_threefry({', '.join(f'{words} %w{i}' for i in range(4))})\n"
         f"  store {wide} %r, ptr %out, align 8\n  ret void\n}}\n"

@@ -16,7 +16,7 @@ from heliograph.files.bags.message_layout import Decoder, RawMessage
 from heliograph.files.event_table import EventTable
 from heliograph.files.sources.reading import Unread
 from heliograph.files.sources.sources import Sources
-from heliograph.numerics.check import InputError, fail, show_error
+from heliograph.numerics.check import InputError, error_text, fail
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -87,7 +87,7 @@ def read_bag(
         # Messages become events, many at once where all of them can.
         total, done, decoder = sum(counts[topic] for topic in used), 0, Decoder(reader, sources)
         try:
-            for batch in batches(read_raw_messages(path, reader, used)):
+            for batch in batch_messages(read_raw_messages(path, reader, used)):
                 if not decoder.add(batch, events):
                     _append_messages(path, reader, sources, batch, done, events, strict)
                 done += len(batch)
@@ -117,7 +117,7 @@ def open_bag(path: Path) -> "Iterator[tuple[AnyReader, str]]":
         raise fail(str(path), "a bag", "nothing of that name")
     with ExitStack() as stack:
         readable, cut = path, ""
-        if path.suffix.lower() == ".mcap" and is_cut(path):
+        if path.suffix.lower() == ".mcap" and is_cut_off(path):
             readable, end = stack.enter_context(copy_whole_part(path))
             got = f"one that was cut off after {end:,} bytes of whole records"
             cut = str(fail(str(path), "a bag that ends", f"{got}; what was read before it stays"))
@@ -169,7 +169,7 @@ def read_raw_messages(path: Path, reader: "AnyReader", topics: list[str]) -> Ite
         count += 1
 
 
-def batches(messages: Iterator[RawMessage]) -> Iterator[list[RawMessage]]:
+def batch_messages(messages: Iterator[RawMessage]) -> Iterator[list[RawMessage]]:
     """Yield messages in lists of bounded size; an error comes after what was read before it."""
     batch, size, failure = list[RawMessage](), 0, None
     # Up to so many messages or bytes, or to the end.
@@ -276,7 +276,7 @@ def _has_field(fields: dict[str, str], path: str) -> bool:
 
 def _format_reason(error: Exception) -> str:
     """Return why something cannot be read, on one line without a full stop."""
-    return " ".join(show_error(error).split()).rstrip(".")
+    return " ".join(error_text(error).split()).rstrip(".")
 
 
 def _join_names(names: "list[str] | Counter[str]", most: int = LISTED) -> str:
@@ -290,7 +290,7 @@ def _join_counts(counts: dict[str, int]) -> str:
     return _join_names([f"{topic} ({count})" for topic, count in counts.items()])
 
 
-def is_cut(path: Path) -> bool:
+def is_cut_off(path: Path) -> bool:
     """Return whether a file begins as MCAP and does not end as MCAP does: it was cut off."""
     if not path.is_file() or path.stat().st_size < 2 * len(MAGIC):
         return False

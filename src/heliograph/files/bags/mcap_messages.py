@@ -15,7 +15,7 @@ from heliograph.files.bags.protobuf import Schema
 from heliograph.files.messages.in_files import FileMessage
 from heliograph.files.sources.sources import Sources
 from heliograph.files.text.text_file import CutOffError
-from heliograph.numerics.check import InputError, fail, show_error
+from heliograph.numerics.check import InputError, error_text, fail
 
 SCHEMA, CHANNEL, MESSAGE, CHUNK = 0x03, 0x04, 0x05, 0x06  # kinds of records
 RECORD = struct.Struct("<BQ")  # kind and length of a record
@@ -106,7 +106,7 @@ def read_mcap_messages(path: Path, sources: Sources | None = None) -> Iterator[F
         except Exception as error:  # whatever damage makes a reader do
             where = f"{path}, after message {count}"
             yield CutOffError(
-                f"{fail(where, 'a file without damage', show_error(error))}; what was read before it stays"
+                f"{fail(where, 'a file without damage', error_text(error))}; what was read before it stays"
             )
 
 

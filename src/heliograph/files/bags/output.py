@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.disk.whole_file import check_output, whole_file
+from heliograph.disk.whole_file import check_writable, whole_file
 from heliograph.model.estimate import Claim, is_sound
 from heliograph.numerics.check import fail, instance, text
 from heliograph.numerics.module import readable
@@ -101,7 +101,7 @@ def write_bag(record: Record, path: str | Path, origin: np.datetime64 | None = N
     """
     instance("record", record, Record, "a Record")
     path = Path(path)
-    check_output(path, (".mcap",))
+    check_writable(path, (".mcap",))
     pose = pose_of(record.states) if pose is None else instance("pose", pose, Pose, "a Pose")
     pose.places(record.states)
     from rosbags.rosbag2 import StoragePlugin, Writer
@@ -203,7 +203,7 @@ def _make_odometry(
     geometry = "geometry_msgs/msg/"
     vector, header = types[f"{geometry}Vector3"], types["std_msgs/msg/Header"]
     (position, bound), (velocity, twist_bound) = (_select_pose(mean, covariance, states) for states in places)
-    rotation = types[f"{geometry}Quaternion"](*_convert_angles(*position[3:]))
+    rotation = types[f"{geometry}Quaternion"](*_convert_angles_to_quaternion(*position[3:]))
     there = types[f"{geometry}Pose"](types[f"{geometry}Point"](*position[:3]), rotation)
     moving = types[f"{geometry}Twist"](vector(*velocity[:3]), vector(*velocity[3:]))
     return types[ODOMETRY](
@@ -229,7 +229,7 @@ def _select_pose(
     return numbers, bound.ravel()
 
 
-def _convert_angles(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
+def _convert_angles_to_quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
     """Return x, y, z, w of the rotation by yaw about z, then pitch about the new y, then roll about the new x."""
     (sr, sp, sy), (cr, cp, cy) = (f(np.array([roll, pitch, yaw]) / 2).tolist() for f in (np.sin, np.cos))
     return (

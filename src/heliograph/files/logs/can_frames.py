@@ -11,7 +11,7 @@ from heliograph.files.logs.log import DIGITS, Log, Wanted
 from heliograph.files.logs.log_sources import STAMP, LogSources
 from heliograph.files.messages.in_files import FileMessage
 from heliograph.files.text.text_file import CutOffError
-from heliograph.numerics.check import InputError, fail, show_error
+from heliograph.numerics.check import InputError, error_text, fail
 
 if TYPE_CHECKING:
     from can import Message
@@ -52,7 +52,7 @@ def read_database(path: Path) -> Database:
         # Signals of real databases overlap.
         loaded: Any = database.load_file(path, strict=False)
     except Exception as error:  # whatever a damaged file makes a parser do
-        raise fail(str(path), "a database of a CAN bus", show_error(error)) from None
+        raise fail(str(path), "a database of a CAN bus", error_text(error)) from None
     if not isinstance(loaded, CanDatabase):
         raise fail(str(path), "a database of a CAN bus", "one of diagnostics")
     return {(m.frame_id, m.is_extended_frame): m for m in loaded.messages if not m.is_container}
@@ -122,7 +122,7 @@ class FrameReader:
             try:
                 signals: Any = described.decode(bytes(frame.data), decode_choices=False)
             except Exception as error:  # a multiplexer that the database does not know
-                yield fail(where, f"what {self._sources.dbc} describes", show_error(error))
+                yield fail(where, f"what {self._sources.dbc} describes", error_text(error))
                 return
             # Signals that a multiplexed message does not have this time did not arrive: None.
             content = dict.fromkeys(signal.name for signal in described.signals) | signals
@@ -163,14 +163,14 @@ def _read_frames(path: Path, sources: LogSources) -> "Iterator[tuple[Message, fl
         except (InputError, ModuleNotFoundError):
             raise
         except Exception as error:  # whatever a damaged file makes a reader do
-            raise fail(str(path), "a log of a CAN bus", show_error(error)) from None
+            raise fail(str(path), "a log of a CAN bus", error_text(error)) from None
         shift = shift if sources.start is None else sources.start - begin
         frames = iter(reader)
         while True:
             try:
                 frame = next(frames, None)
             except Exception as error:  # whatever a damaged file makes a reader do
-                yield CutOffError(str(fail(f"{path}, after frame {number}", "a log without damage", show_error(error))))
+                yield CutOffError(str(fail(f"{path}, after frame {number}", "a log without damage", error_text(error))))
                 return
             if frame is None:
                 return

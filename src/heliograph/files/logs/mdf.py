@@ -7,7 +7,7 @@ import numpy as np
 
 from heliograph.files.logs.log import Log, Series, Wanted, merge_series
 from heliograph.files.logs.log_sources import LogSources
-from heliograph.numerics.check import InputError, fail, show_error
+from heliograph.numerics.check import InputError, error_text, fail
 
 if TYPE_CHECKING:
     from asammdf import MDF
@@ -35,7 +35,7 @@ def open_mdf(path: Path, sources: LogSources, wanted: Wanted) -> Log:
     except InputError:
         raise
     except Exception as error:  # whatever a damaged file makes a reader do
-        raise fail(str(path), "an MDF4 file", show_error(error)) from None
+        raise fail(str(path), "an MDF4 file", error_text(error)) from None
     return Log(units, dict.fromkeys(names, "MDF4"), merge_series(path, begin, series), [])
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from heliograph.files.logs.log import Log, Series, Wanted, merge_series
 from heliograph.files.logs.log_sources import STAMP, LogSources
-from heliograph.numerics.check import fail, show_error
+from heliograph.numerics.check import error_text, fail
 
 if TYPE_CHECKING:
     from pyulog import ULog
@@ -32,7 +32,7 @@ def open_ulog(path: Path, sources: LogSources, wanted: Wanted) -> Log:
         with path.open("rb") as opened:
             file = ULog(opened)
     except Exception as error:  # whatever a damaged file makes a reader do
-        raise fail(str(path), "a ULog file", show_error(error)) from None
+        raise fail(str(path), "a ULog file", error_text(error)) from None
     topics = {data.name if data.multi_id == 0 else f"{data.name}.{data.multi_id}": data for data in file.data_list}
     units = {name: dict.fromkeys((field for field in data.data if field != STAMP), "") for name, data in topics.items()}
     series = {

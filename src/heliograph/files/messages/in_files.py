@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from heliograph.files.sources.fields import decode_items, decode_json, fail_of_doubled, parse_number
-from heliograph.files.text.csv_text import CsvRow, csv_rows, read_csv_header
+from heliograph.files.text.csv_text import CsvRow, read_csv_header, read_csv_rows
 from heliograph.files.text.dialects import check_distinct
-from heliograph.files.text.text_file import is_text, kind_of, open_text, until_cut_off
+from heliograph.files.text.text_file import is_text, kind_of, open_text, yield_until_cut_off
 from heliograph.numerics.check import InputError, fail, show_value
-from heliograph.numerics.times.dates import instant
+from heliograph.numerics.times.dates import parse_instant
 
 TOPIC, PAYLOAD = "topic", "payload"  # of a message in a log
 ARRIVALS = ("arrival", "tst")  # fields that say when a message of a log arrived; `mosquitto_sub -F %j` has the second
@@ -82,7 +82,7 @@ def read_message_file(path: Path) -> Iterator[FileMessage | InputError]:
     if kind == ".parquet":
         yield from (convert_row(where, row) for where, row in _read_parquet_rows(path))
     else:
-        yield from until_cut_off(_read_lines(path) if kind in LINES else _read_csv_messages(path))
+        yield from yield_until_cut_off(_read_lines(path) if kind in LINES else _read_csv_messages(path))
 
 
 def parse_log_line(text: str) -> tuple[str, str, str | None] | None:
@@ -112,7 +112,7 @@ def _is_moment(value: object) -> bool:
     number = parse_number(value) if isinstance(value, str) else value
     if isinstance(number, str):
         try:
-            instant(number)
+            parse_instant(number)
         except ValueError:
             return False
         return True
@@ -188,7 +188,7 @@ def _convert_item(where: str, content: object, doubled: str | None) -> FileMessa
 
 def _read_csv_messages(path: Path) -> Iterator[FileMessage | InputError]:
     """Yield the messages of the rows of a CSV file, or why one cannot be read."""
-    for row in csv_rows(path, marked=True):
+    for row in read_csv_rows(path, marked=True):
         yield row if isinstance(row, InputError) else convert_row(row.where, typed_cells(row))
 
 

@@ -17,7 +17,7 @@ from heliograph.files.text.text_file import CutOffError, kind_of
 from heliograph.live.event import INPUTS, OF_STEPS, check_63_bits
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail, show_value
-from heliograph.numerics.times.dates import looks_like_date, moment_of
+from heliograph.numerics.times.dates import looks_like_date, parse_moment
 from heliograph.simulation.network import Network
 
 EXACT = 2**53  # up to here doubles hold every whole number
@@ -199,7 +199,7 @@ class OwnReader:
             return self._read_number_of_time(cell, name, is_step=self.steps and column == TIME), False
         if self.steps:
             raise fail(name, "a step, a whole number from 0", f"{show_value(cell)} ({OF_STEPS})")
-        moment, zoned = moment_of(cell, name)
+        moment, zoned = parse_moment(cell, name)
         self._zoned = zoned if self._zoned is None else self._zoned
         if zoned != self._zoned:
             raise fail(name, "a zone with every date or with none", show_value(cell))

@@ -113,7 +113,7 @@ def _read_bags(path: Path, sources: Sources, progress: Progress | None, strict: 
     events = EventTable(sources.network, sources.step)
     for part in parts_of(path) or [path]:
         if holds_messages(part):
-            found = _append_all(part, read_mcap_messages(part, sources), sources, events, strict)
+            found = _append_messages_by_topic(part, read_mcap_messages(part, sources), sources, events, strict)
             missing = [topic for topic in sources.topics if not set("+#") & set(topic) and topic not in found]
             events.notes += [f"{part}: not in the bag: {', '.join(missing)}"] if missing else []
         else:
@@ -121,7 +121,7 @@ def _read_bags(path: Path, sources: Sources, progress: Progress | None, strict: 
     return events
 
 
-def is_mapped(path: Path | StoreTable, sources: object) -> bool:
+def is_of_messages(path: Path | StoreTable, sources: object) -> bool:
     """Return whether a recording has messages or events, and not rows of time: a bag, a log, a table with a topic."""
     if isinstance(path, StoreTable):
         named = isinstance(sources, Mapping) and (path.topic in sources or TOPIC in path.columns)
@@ -183,11 +183,11 @@ def _read_by_topic(path: Path | StoreTable, network: Network, sources: Sources |
 def _read_log(path: Path, table: object, sources: Sources, strict: bool) -> EventTable:
     """Return the events of a vehicle's log; `table` are its sources as the network's file has them."""
     events = EventTable(sources.network, sources.step)
-    _append_all(path, read_log(path, table, sources, events.notes), sources, events, strict)
+    _append_messages_by_topic(path, read_log(path, table, sources, events.notes), sources, events, strict)
     return events
 
 
-def _append_all(
+def _append_messages_by_topic(
     path: Path, messages: Iterator[FileMessage | InputError], sources: Sources, events: EventTable, strict: bool
 ) -> set[str | None]:
     """Append the events of messages that name their topics, and return these topics."""

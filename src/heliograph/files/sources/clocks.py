@@ -14,7 +14,7 @@ from heliograph.numerics.times.row_order import YEAR
 
 
 @dataclass
-class Clock:
+class TopicClock:
     """The clock of a topic, as far as its times show it.
 
     Attributes:
@@ -37,18 +37,18 @@ class Clock:
         return self.numbers and 2 * self.far_from_1970 <= self.count
 
 
-class Clocks:
+class TopicClocks:
     """Clocks by topic, of messages that nothing dates but their own times."""
 
     def __init__(self) -> None:
-        self._by_topic: dict[str, Clock] = {}
+        self._by_topic: dict[str, TopicClock] = {}
 
     def note(self, topic: str, content: object, time: int, sources: Iterable[Source]) -> None:
         """Note the time of a message, in nanoseconds since 1970."""
         clock = self._by_topic.get(topic)
         if clock is None:
             path, value = _find_time(topic, content, sources)
-            clock = Clock(path, not (isinstance(value, str) and looks_like_date(value)), time)
+            clock = TopicClock(path, not (isinstance(value, str) and looks_like_date(value)), time)
             self._by_topic[topic] = clock
         clock.count += 1
         clock.far_from_1970 += abs(time) >= YEAR

@@ -15,7 +15,7 @@ import numpy as np
 from heliograph.files.text.dialects import NO_VALUE
 from heliograph.live.event import check_63_bits
 from heliograph.numerics.check import InputError, fail, show_value
-from heliograph.numerics.times.dates import UNITS, dates, instant
+from heliograph.numerics.times.dates import UNITS, parse_dates, parse_instant
 
 TimeUnit = Literal["s", "ms", "us", "ns", "step"]
 # Fields of a stamp, of seconds and nanoseconds: of ROS 2 and 1, protobuf, Foxglove.
@@ -39,7 +39,7 @@ def decode_json(text: str | bytes, name: str) -> Any:
     Raises:
         ValueError: no JSON, or a field that is there twice; one line.
     """
-    content, doubled = _decode(text, name)
+    content, doubled = _decode_json(text, name)
     if doubled:
         raise fail_of_doubled(name, doubled[0][1])
     return content
@@ -54,7 +54,7 @@ def decode_items(text: str | bytes, name: str) -> list[tuple[Any, str | None]]:
     Raises:
         ValueError: no JSON; one line.
     """
-    content, doubled = _decode(text, name)
+    content, doubled = _decode_json(text, name)
     return [(item, _find_doubled(item, doubled)) for item in _flatten(content)]
 
 
@@ -63,7 +63,7 @@ def fail_of_doubled(name: str, field: str) -> InputError:
     return fail(name, "distinct fields", f"{field!r} more than once")
 
 
-def _decode(text: str | bytes, name: str) -> tuple[Any, list[tuple[dict[str, Any], str]]]:
+def _decode_json(text: str | bytes, name: str) -> tuple[Any, list[tuple[dict[str, Any], str]]]:
     """Return the content of JSON, and each object in it that has a field twice, with the field's name."""
     doubled: list[tuple[dict[str, Any], str]] = []
 
@@ -140,7 +140,7 @@ def field_at(message: object, path: str, where: str) -> Any:
         elif hasattr(value, name) and not isinstance(value, list | tuple | np.ndarray | Mapping | str | int | float):
             value = getattr(value, name)
         else:
-            raise MissingFieldError(str(fail(where, f"a field {path!r}", f"no {name!r} in {_name_fields(value)}")))
+            raise MissingFieldError(str(fail(where, f"a field {path!r}", f"no {name!r} in {_list_field_names(value)}")))
     return value
 
 
@@ -203,10 +203,10 @@ def convert_time(value: Any, unit: TimeUnit, name: str, quoted: bool = False) ->
         value = parse_number(value) if quoted else value
     if isinstance(value, str):
         try:
-            instant(value)
+            parse_instant(value)
         except ValueError:
             raise fail(name, "a date of ISO 8601 with its zone", show_value(value)) from None
-        return int(dates([value], name)[0].astype(np.int64))
+        return int(parse_dates([value], name)[0].astype(np.int64))
     if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not np.isfinite(value):
         raise fail(name, "a time: a date with its zone, a stamp, or a number", show_value(value))
     if unit == "step":
@@ -259,7 +259,7 @@ def convert_name(value: Any, name: str) -> str:
     return value
 
 
-def _name_fields(value: object) -> str:
+def _list_field_names(value: object) -> str:
     """Return the names of a value's fields for an error; the value itself where it has no fields."""
     if isinstance(value, Mapping):
         names = [str(key) for key in value]

@@ -19,7 +19,7 @@ COUNT_BITS = 16  # of a frame
 RADIO = ("rssi", "snr")  # what a gateway says of how it received an uplink
 
 
-class _Uplinks(NamedTuple):
+class _UplinkLayout(NamedTuple):
     """How a LoRaWAN server lays out uplinks: topic, and paths of values, time, frame count, device and reception."""
 
     topic: str
@@ -53,7 +53,7 @@ class _Uplinks(NamedTuple):
         return {self.topic: source}
 
 
-THE_THINGS_STACK = _Uplinks(
+THE_THINGS_STACK = _UplinkLayout(
     topic="v3/+/devices/+/up",
     values="uplink_message.decoded_payload",
     time="received_at",
@@ -61,7 +61,7 @@ THE_THINGS_STACK = _Uplinks(
     device="end_device_ids.device_id",
     reception="uplink_message.rx_metadata.0",
 )
-CHIRPSTACK = _Uplinks(
+CHIRPSTACK = _UplinkLayout(
     topic="application/+/device/+/event/up",
     values="object",
     time="time",

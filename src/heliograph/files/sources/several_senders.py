@@ -13,7 +13,7 @@ WORDS = re.compile(
 )
 
 
-class SeveralSenders:
+class SenderCounter:
     """Counts the values of fields that are named as a sender's name is, in messages read as one node of one plant."""
 
     def __init__(self) -> None:

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.files.availability import LastWords
-from heliograph.files.sources.clocks import Clocks
+from heliograph.files.availability import DeviceStatuses
+from heliograph.files.sources.clocks import TopicClocks
 from heliograph.files.sources.derived import Computed, ZeroIfAbsent
 from heliograph.files.sources.fields import (
     MissingFieldError,
@@ -19,7 +19,7 @@ from heliograph.files.sources.fields import (
 )
 from heliograph.files.sources.json_field import Field, Source
 from heliograph.files.sources.reading import Reading, Unread
-from heliograph.files.sources.several_senders import SeveralSenders
+from heliograph.files.sources.several_senders import SenderCounter
 from heliograph.live.event import INPUTS
 from heliograph.model.checks.refusals import RefusedError
 from heliograph.model.plant import TIME_STEP
@@ -31,7 +31,7 @@ LISTED = 8  # topics in one line
 COPY = 10 * SECOND  # a message that comes again so soon, with its count and values, is a copy
 
 
-class Mapped(NamedTuple):
+class MappedSource(NamedTuple):
     """A source, the pattern of its topics, and by node the places of its values in the node's measurement.
 
     The nodes are those that its messages may be of.
@@ -57,7 +57,7 @@ class Sources:
 
     def __init__(self, table: object, network: Network, others: Collection[str] = ()):
         self.network, self.others = network, others
-        self.senders, self.clocks = SeveralSenders(), Clocks()
+        self.senders, self.clocks = SenderCounter(), TopicClocks()
         self.unknown = Counter[str]()  # messages of topics that are not in the table
         self.stored = 0  # messages that only their arrival would date, which is that of a new subscriber
         self.excluded = Counter[str]()  # messages that a condition leaves out, by topic
@@ -72,10 +72,10 @@ class Sources:
         if not isinstance(table, Mapping):
             raise fail("sources", "a dictionary of topics, each with json_field or a list of them", show_value(table))
         self._table = {topic: self._check_sources(topic, items) for topic, items in table.items()}
-        self._known: dict[str, list[Mapped]] = {}
+        self._known: dict[str, list[MappedSource]] = {}
         self._asked: dict[str, set[str]] = {}
         mapped = [single for several in self._table.values() for single in several]
-        self.words = LastWords(condition for single in mapped for condition in single.source.available)
+        self.words = DeviceStatuses(condition for single in mapped for condition in single.source.available)
         steps = {single.source.step for single in mapped}
         if len(steps) > 1:
             raise fail("sources, step", "the same of all", sorted(map(str, steps)))
@@ -137,7 +137,7 @@ class Sources:
                 asked |= {path.split(".")[0] for path in (*names, *paths, *source.where)}
         return self._asked[topic]
 
-    def of(self, topic: str) -> list[Mapped]:
+    def of(self, topic: str) -> list[MappedSource]:
         """Return the sources of a topic, each with the places of its values in the node's measurement."""
         if topic not in self._known:
             matching = [items for pattern, items in self._table.items() if match_topic(topic, pattern)]
@@ -203,7 +203,7 @@ class Sources:
         """Return the error of the first field that no message of its topic had; "" if there is none."""
         return next((said for key, said in self.absent.items() if key not in self.found), "")
 
-    def _read(self, mapped: Mapped, topic: str, message: object, where: str) -> Reading | None:
+    def _read(self, mapped: MappedSource, topic: str, message: object, where: str) -> Reading | None:
         """Return a message's reading by one source; None if a condition leaves it out or another process reads it.
 
         Raises:
@@ -239,7 +239,9 @@ class Sources:
         period = 0 if source.sequence is None else source.sequence.period
         return Reading(plant, node, sequence, _read_time(source, message, where), values, period)
 
-    def _read_count(self, mapped: Mapped, topic: str, message: object, where: str, error: InputError) -> Reading | None:
+    def _read_count(
+        self, mapped: MappedSource, topic: str, message: object, where: str, error: InputError
+    ) -> Reading | None:
         """Return plant, node, count and time of a message with this error; None if these cannot be read either."""
         sequence, missing = None, False
         try:
@@ -275,14 +277,14 @@ class Sources:
         name = f"{where}, field {path!r}"
         return source.sequence.check(convert_count(value, name, source.quoted), name), False
 
-    def _check_sources(self, topic: object, items: object) -> list[Mapped]:
+    def _check_sources(self, topic: object, items: object) -> list[MappedSource]:
         """Return the sources of a topic, checked, with the places of their values in each node's measurement."""
         if not isinstance(topic, str) or not topic:
             raise fail("sources", "topics that are text", show_value(topic))
         sources = [items] if isinstance(items, Source) else items
         if not isinstance(sources, Sequence) or not all(isinstance(s, Source) for s in sources) or not sources:
             raise fail(f"sources, {topic!r}", "json_field, or a list of them", show_value(items))
-        return [Mapped(source, topic, self._place_outputs(topic, source)) for source in sources]
+        return [MappedSource(source, topic, self._place_outputs(topic, source)) for source in sources]
 
     def _place_outputs(self, topic: str, source: Source) -> dict[str, np.ndarray]:
         """Return by node which output each value of a source is; raise ValueError if it does not fit the network."""
@@ -331,7 +333,7 @@ class Sources:
         return np.array([known.index(output) for output in outputs])
 
 
-def _read_names(mapped: Mapped, topic: str, message: object, where: str) -> tuple[str, str]:
+def _read_names(mapped: MappedSource, topic: str, message: object, where: str) -> tuple[str, str]:
     """Return the plant of a message, "" for a single one, and its node."""
     source = mapped.source
     node = source.node if isinstance(source.node, str) else source.node.of(topic, message, where)

@@ -16,7 +16,7 @@ from urllib.parse import urlencode, urlsplit
 import numpy as np
 
 from heliograph.files.stores.address import StoreAddress
-from heliograph.files.stores.influx_answers import read_flux, read_influxql, read_rows, shorten
+from heliograph.files.stores.influx_answers import read_flux, read_influxql, read_sql_rows, shorten
 from heliograph.numerics.check import InputError, fail
 
 PORT = 8086
@@ -35,11 +35,11 @@ def ask_influx(address: StoreAddress) -> tuple[str, dict[str, Any]]:
     query = address.query or f'SELECT * FROM "{_escape(address.table, chr(34))}"'
     match address.language:
         case "flux":
-            return read_flux(address, _send(address, "POST", *_make_flux_request(address)))
+            return read_flux(address, _send_request(address, "POST", *_make_flux_request(address)))
         case "sql":
             target = urlencode({"db": address.database, "q": query, "format": "json"})
-            return read_rows(address, _send(address, "GET", f"/api/v3/query_sql?{target}"))
-    answer = _send(address, "GET", f"/query?{urlencode({'db': address.database, 'q': query, 'epoch': 'ns'})}")
+            return read_sql_rows(address, _send_request(address, "GET", f"/api/v3/query_sql?{target}"))
+    answer = _send_request(address, "GET", f"/query?{urlencode({'db': address.database, 'q': query, 'epoch': 'ns'})}")
     return read_influxql(address, answer)
 
 
@@ -63,7 +63,7 @@ def write_influx(address: StoreAddress, columns: Mapping[str, np.ndarray], momen
     done = 0
     for body, rows in _batch_lines(address.written_table, columns, moments, plant):
         try:
-            _send(address, "POST", target, body)
+            _send_request(address, "POST", target, body)
         except InputError as error:
             if not done:
                 raise
@@ -75,7 +75,7 @@ def write_influx(address: StoreAddress, columns: Mapping[str, np.ndarray], momen
 
 def check_influx(address: StoreAddress) -> None:
     """Raise ValueError where no server answers there."""
-    _send(address, "GET", "/ping")
+    _send_request(address, "GET", "/ping")
 
 
 def _batch_lines(
@@ -108,7 +108,7 @@ def _escape(name: str, signs: str) -> str:
     return re.sub(f"([{re.escape(signs)}])", r"\\\1", name)
 
 
-def _send(address: StoreAddress, method: str, target: str, body: bytes | None = None) -> bytes:
+def _send_request(address: StoreAddress, method: str, target: str, body: bytes | None = None) -> bytes:
     """Send one request; return the body of the answer.
 
     Raises:

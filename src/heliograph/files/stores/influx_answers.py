@@ -41,7 +41,7 @@ def read_influxql(address: StoreAddress, answer: bytes) -> Answer:
     return name, _make_columns(address, names, rows, lambda time: int(time), len(series) > 1)
 
 
-def read_rows(address: StoreAddress, answer: bytes) -> Answer:
+def read_sql_rows(address: StoreAddress, answer: bytes) -> Answer:
     """Return the table of an answer of version 3 to SQL, a list of rows, each an object of JSON.
 
     Raises:

@@ -36,7 +36,7 @@ class CsvRow(NamedTuple):
     cells: list[str]
 
 
-class CsvText:
+class CsvReader:
     """Reader of a table of CSV, to which lines are given one after another.
 
     The first line that is not empty has the names of the columns; annotations of Influx begin a table with a header of
@@ -129,13 +129,13 @@ class CsvText:
         return None
 
 
-def csv_rows(path: Path, marked: bool) -> Iterator[CsvRow | InputError]:
-    """Yield the rows of a file of CSV, or why one cannot be read; `marked` is as of `CsvText`.
+def read_csv_rows(path: Path, marked: bool) -> Iterator[CsvRow | InputError]:
+    """Yield the rows of a file of CSV, or why one cannot be read; `marked` is as of `CsvReader`.
 
     Raises:
         ValueError: a header that names no columns; a packed file that is damaged, from there on.
     """
-    text = CsvText(str(path), path, marked)
+    text = CsvReader(str(path), path, marked)
     with open_text(path) as file:
         for line in file:
             yield from text.add(line)
@@ -144,7 +144,7 @@ def csv_rows(path: Path, marked: bool) -> Iterator[CsvRow | InputError]:
 
 def read_csv_header(path: Path) -> list[str]:
     """Return the names of the columns of a CSV file; none of a file that is none."""
-    text = CsvText(str(path), path, marked=True)
+    text = CsvReader(str(path), path, marked=True)
     try:
         with open_text(path) as file:
             for line in file:

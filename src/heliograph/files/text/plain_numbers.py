@@ -6,7 +6,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from heliograph.files.text.csv_text import CsvText
+from heliograph.files.text.csv_text import CsvReader
 from heliograph.numerics.types import Float
 
 PLAIN = b"0123456789+-.eE,\r\n"  # all that such lines are made of
@@ -28,7 +28,7 @@ def read_plain_numbers(path: Path) -> tuple[list[str], Float[np.ndarray, "rows c
         start = file.readline(BLOCK)
         if not start.isascii() or b"\0" in start or start.count(b'"') % 2:  # a name that goes on in the next line
             return None
-        text = CsvText(str(path), path, marked=False)
+        text = CsvReader(str(path), path, marked=False)
         text.add(start.decode())
         while text.header and (lines := file.readlines(BLOCK)):
             numbers = _read_block(b"".join(lines), len(text.header))

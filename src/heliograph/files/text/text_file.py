@@ -43,7 +43,7 @@ def _begins_as_table(path: Path) -> bool:
     return len(names) > 1 and words and all(len(row.split(",")) == len(names) for row in rows)
 
 
-def encoding_of(start: bytes) -> str:
+def guess_encoding(start: bytes) -> str:
     """Return the encoding of a text by its first two bytes: UTF-16 by its mark or by a NUL beside a letter."""
     if start.startswith(WIDE):
         return "utf-16"
@@ -69,7 +69,7 @@ def open_text(path: Path) -> Iterator[TextIO]:
         packed = file.read(len(GZIP)) == GZIP
     try:
         with gzip.open(path, "rb") if packed else path.open("rb") as file:
-            encoding = encoding_of(file.read(len(WIDE[0])))
+            encoding = guess_encoding(file.read(len(WIDE[0])))
         errors = "surrogateescape" if encoding == "utf-8-sig" else "replace"
         if packed:
             with gzip.open(path, "rt", newline="", encoding=encoding, errors=errors) as text:
@@ -81,7 +81,7 @@ def open_text(path: Path) -> Iterator[TextIO]:
         raise CutOffError(str(fail(str(path), "a packed file without damage", _shorten(error)))) from None
 
 
-def until_cut_off(parts: Iterable[T]) -> Iterator[T | CutOffError]:
+def yield_until_cut_off(parts: Iterable[T]) -> Iterator[T | CutOffError]:
     """Yield parts of a text, and at last why they end before its end, if they do.
 
     Raises:

@@ -3,7 +3,7 @@
 import codecs
 import zlib
 
-from heliograph.files.text.text_file import GZIP, WIDE, encoding_of
+from heliograph.files.text.text_file import GZIP, WIDE, guess_encoding
 from heliograph.numerics.check import fail
 
 AT_ONCE = 1 << 23  # bytes that are unpacked at a time
@@ -72,7 +72,7 @@ class TextStream:
                 raise fail(self.source, "text: CSV, lines of JSON, a log", came)
         if start.startswith(GZIP):
             self._packed, self._inside = b"", TextStream(self.source)
-        elif (encoding := encoding_of(start)) != "utf-8-sig":
+        elif (encoding := guess_encoding(start)) != "utf-8-sig":
             self._decode = codecs.getincrementaldecoder(encoding)("replace")
         return start.removeprefix(codecs.BOM_UTF8)
 

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import Columns, eliminate, join_columns, zero_covariance
+from heliograph.factors.columns import WeightedColumns, eliminate, join_columns, zero_covariance
 from heliograph.factors.gaussian import Gaussian, condition_on_observation, from_columns
 from heliograph.filters.event.gaussian_sum import GaussianSum
 from heliograph.filters.event.truncated_normal import truncated_normal, upper_tail
@@ -73,7 +73,7 @@ def truncate_to_ball(parts: GaussianSum, directions: jax.Array, radius: jax.Arra
     def truncate_one(x: Gaussian) -> tuple[jax.Array, Gaussian]:
         """Truncate one Gaussian: diagonalise what is seen, take its moments in the ball, carry them to all of x."""
         rows, centre = directions @ x.root, directions @ x.mean
-        variance, turn = eigh(Columns(rows, x.variances).covariance)
+        variance, turn = eigh(WeightedColumns(rows, x.variances).covariance)
         # What has no variance lies where it is.
         least = CERTAIN**0.5 * (radius**2 + jnp.sum(centre**2))
         rows, centre = turn.T @ rows, turn.T @ centre

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.factors.columns import Columns
+from heliograph.factors.columns import WeightedColumns
 from heliograph.factors.gaussian import Gaussian, append_rows, from_covariance, take_leading
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.event.belief import EventBelief
@@ -23,10 +23,10 @@ from heliograph.filters.event.gaussian_sum import (
 )
 from heliograph.filters.event.joint_gaussian import (
     LinkMoments,
-    augment,
-    condition_parts,
-    predict_jointly,
+    augment_by_signal,
+    condition_parts_on_received,
     predict_received,
+    predict_with_reference,
     set_known_components,
 )
 from heliograph.filters.event.silent_region import SilentRegion
@@ -98,7 +98,7 @@ class EventFilter(AbstractSizedFilter):
         """Return the prior, and no reference yet."""
         start, m = at(self.plant, 0), self.outputs
         x = from_covariance(start.initial_mean, start.initial_covariance)
-        both = append_rows(x, jnp.zeros(m), jnp.zeros((m, len(start.states))), Columns(np.eye(m), jnp.zeros(m)))
+        both = append_rows(x, jnp.zeros(m), jnp.zeros((m, len(start.states))), WeightedColumns(np.eye(m), jnp.zeros(m)))
         counts = COUNTED if self.trigger.losses == "numbered" else 1
         label = jnp.zeros((len(self.senders), len(self.initial), self.ages, counts))
         label = label.at[:, :, 0, 0].set(jnp.asarray(self.initial))
@@ -128,7 +128,7 @@ class EventFilter(AbstractSizedFilter):
     def predict(self, state: EventBelief, u: ArrayLike = (), k: Step = 0) -> EventBelief:
         """Move x and the modes; r stays, or is the prediction; the age of the last value sent grows by one step."""
         plant, u, start = at(self.plant, k), jnp.asarray(u), second_moments_at_start(self.plant)
-        both = jax.vmap(lambda x: predict_jointly(plant, self.transform, x, u, start))(state.gaussian)
+        both = jax.vmap(lambda x: predict_with_reference(plant, self.transform, x, u, start))(state.gaussian)
         if self.trigger.reference == "prediction":
             expected = self.reference(self._merge_state(state).mean, u, k)
             of_reference = len(self.states) + np.arange(self.outputs)
@@ -159,7 +159,7 @@ class EventFilter(AbstractSizedFilter):
         for s, components in enumerate(self.senders):
             received = values[components] if len(self.senders) > 1 else values
             lost = losses[s] if len(losses) else jnp.asarray(jnp.nan)
-            augmented = augment(plant, sensor, self.transform, parts, start)
+            augmented = augment_by_signal(plant, sensor, self.transform, parts, start)
             arrived = jnp.any(~jnp.isnan(received))
             after, expected, spread = self._condition_on_sender(augmented, channel, received, lost, s, begun[s])
             log_likelihood = log_total(after.log_weight)
@@ -266,7 +266,9 @@ class EventFilter(AbstractSizedFilter):
             moments = channel.mean, channel.gain_spread, channel.noise
             links.append(LinkMoments(*jax.tree.map(lambda part, at=(mode, kind): jnp.asarray(part)[at], moments)))
             before.append(augmented.relabel_sender(s, only))
-            used.append(condition_parts(before[-1], z, arrived, links[-1], sender, self.outputs, self.delivers))
+            used.append(
+                condition_parts_on_received(before[-1], z, arrived, links[-1], sender, self.outputs, self.delivers)
+            )
         # Restricted to where the sender had to send.
         count, size = len(links), len(label)
         selected = self._select_sent(concatenate([*used, *before]), s, begun)

@@ -16,7 +16,7 @@ from heliograph.model.estimate import Claim, lower_by_noise
 from heliograph.model.fading import uncertain_chain
 from heliograph.model.over_time import OverTime, first, restack, unstack
 from heliograph.model.plant import AnyPlant, check_plant
-from heliograph.model.premises.premise import Premise, believing
+from heliograph.model.premises.premise import Premise, on_premise
 from heliograph.model.sensor import AnySensor, is_linear, refuse_angles
 from heliograph.model.trigger import AbstractThreshold, AbstractTrigger, Periodic, StochasticTrigger
 from heliograph.numerics.check import check_count, fail, instance
@@ -86,7 +86,7 @@ def event_filter(
     premise = Premise(plant, sensor, channel, trigger, order=None)
     if isinstance(trigger, StochasticTrigger | Periodic):
         claim = _decide_claim(plant, sensor, channel, trigger)
-        return believing(
+        return on_premise(
             StochasticEventFilter(trigger=trigger, **shared, **make_sizes(claim, start, received)), premise
         )
     filter = EventFilter(
@@ -99,7 +99,7 @@ def event_filter(
         **shared,
         **make_sizes("nominal", start, received),
     )
-    return believing(filter, premise)
+    return on_premise(filter, premise)
 
 
 def _describe_channel(channel: Channel) -> tuple[SideInformation | OverTime, np.ndarray]:

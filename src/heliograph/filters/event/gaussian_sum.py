@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import Columns
+from heliograph.factors.columns import WeightedColumns
 from heliograph.factors.gaussian import (
     Gaussian,
     from_columns,
@@ -57,7 +57,7 @@ class GaussianSum(NamedTuple):
 
         def select(x: Gaussian) -> Gaussian:
             """Select components of one Gaussian."""
-            return from_columns(x.mean[places], Columns(x.root[places], x.variances))
+            return from_columns(x.mean[places], WeightedColumns(x.root[places], x.variances))
 
         return self._replace(gaussian=jax.vmap(select)(self.gaussian))
 

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import Columns, below_diagonal, join_columns, rounding_of
+from heliograph.factors.columns import WeightedColumns, below_diagonal, join_columns, rounding_of
 from heliograph.factors.gaussian import (
     Gaussian,
     append_rows,
@@ -30,16 +30,16 @@ class LinkMoments(NamedTuple):
 
     mean: jax.Array
     gain_spread: jax.Array
-    noise: Columns
+    noise: WeightedColumns
 
     def select_sender(self, sender: slice, m: int) -> "LinkMoments":
         """Select the outputs that carry a sender's components: all, unless each component has its own sender."""
         rows = slice(None) if sender == slice(0, m) else sender
-        noise = Columns(self.noise.matrix[rows], self.noise.weights)
+        noise = WeightedColumns(self.noise.matrix[rows], self.noise.weights)
         return LinkMoments(self.mean[rows], self.gain_spread[rows, rows], noise)
 
 
-def augment(
+def augment_by_signal(
     plant: AbstractPlant, sensor: AbstractSensor, transform: AbstractTransform, parts: GaussianSum, start: jax.Array
 ) -> GaussianSum:
     """Return each Gaussian of (x, r) as one of (x, r, y), y = h(x) + v; `start` (n,) is E[x_i^2] before any data."""
@@ -56,7 +56,7 @@ def augment(
     return parts._replace(gaussian=jax.vmap(augment_one)(parts.gaussian))
 
 
-def predict_jointly(
+def predict_with_reference(
     plant: AbstractPlant, transform: AbstractTransform, both: Gaussian, u: jax.Array, start: jax.Array
 ) -> Gaussian:
     """Return the Gaussian of (f(x, u) + w, r): r stays; `start` (n,) is E[x_i^2] before any data."""
@@ -66,9 +66,9 @@ def predict_jointly(
     noise = sum_unexplained(image, process_noise(plant, u, start))
     # Rows of x by the slopes of f, rows of r as they are; noise of x alone.
     slopes = jnp.concatenate([jnp.pad(image.slopes, ((0, 0), (0, length_of_r))), both.root[n:]])
-    noise_of_both = Columns(jnp.pad(noise.matrix, ((0, length_of_r), (0, 0))), noise.weights)
+    noise_of_both = WeightedColumns(jnp.pad(noise.matrix, ((0, length_of_r), (0, 0))), noise.weights)
     mean = jnp.concatenate([image.mean + plant.noise_mean(), both.mean[n:]])
-    return from_columns(mean, join_columns(Columns(slopes, both.variances), noise_of_both))
+    return from_columns(mean, join_columns(WeightedColumns(slopes, both.variances), noise_of_both))
 
 
 def set_known_components(x: Gaussian, places: np.ndarray, values: jax.Array) -> Gaussian:
@@ -78,7 +78,7 @@ def set_known_components(x: Gaussian, places: np.ndarray, values: jax.Array) -> 
     return Gaussian(x.mean.at[places].set(values), below_diagonal(root), variances)
 
 
-def condition_parts(
+def condition_parts_on_received(
     parts: GaussianSum,
     z: jax.Array,
     arrived: jax.Array,
@@ -111,15 +111,15 @@ def predict_received(x: Gaussian, link: LinkMoments, sender: slice, m: int) -> G
     def receive_one(x: Gaussian) -> Gaussian:
         """Predict z from one Gaussian."""
         expected, slopes, noise = _transform_by_link(x, link.select_sender(sender, m), m)
-        return from_columns(expected, join_columns(Columns(slopes, x.variances), noise))
+        return from_columns(expected, join_columns(WeightedColumns(slopes, x.variances), noise))
 
     received: Gaussian = jax.vmap(receive_one)(x)
     return received
 
 
-def _transform_by_link(x: Gaussian, link: LinkMoments, m: int) -> tuple[jax.Array, jax.Array, Columns]:
+def _transform_by_link(x: Gaussian, link: LinkMoments, m: int) -> tuple[jax.Array, jax.Array, WeightedColumns]:
     """Return E z, slopes and noise of z = G y + n, y the last m components."""
     centre, rows, gain = x.mean[-m:], x.root[-m:], link.mean[:, :-1]
-    second = Columns(rows, x.variances).covariance + outer(centre, centre)
+    second = WeightedColumns(rows, x.variances).covariance + outer(centre, centre)
     noise = join_columns(link.noise, gain_noise(link.gain_spread, second, centre))
     return gain @ centre + link.mean[:, -1], gain @ rows, noise

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.factors.columns import Columns, eliminate, join_columns, zero_covariance
+from heliograph.factors.columns import WeightedColumns, eliminate, join_columns, zero_covariance
 from heliograph.factors.gaussian import Gaussian, condition_on_observation, from_columns, from_covariance
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.event.gaussian_sum import FLOOR, GaussianSum, concatenate, merge_groups, safe_log
@@ -192,13 +192,13 @@ class StochasticEventFilter(AbstractSizedFilter):
         """Return log P(sent | z) = log(1 - P(silent | z)), by the law of y given z with this innovation."""
         y = _law_of_signal(signal)
         slopes = gain @ y.root
-        noise = factor_spread(covariance - Columns(slopes, y.variances).covariance)
+        noise = factor_spread(covariance - WeightedColumns(slopes, y.variances).covariance)
         y, _ = condition_on_observation(y, slopes, value, noise)
         log_silent, _ = self._observe_silence(y, y.root, zero_covariance(len(y.mean)), y.mean, reference)
         return jnp.log(jnp.maximum(-jnp.expm1(jnp.minimum(log_silent, 0.0)), FLOOR))
 
     def _observe_silence(
-        self, x: Gaussian, slopes: jax.Array, noise: Columns, expected: jax.Array, reference: jax.Array
+        self, x: Gaussian, slopes: jax.Array, noise: WeightedColumns, expected: jax.Array, reference: jax.Array
     ) -> tuple[jax.Array, Gaussian]:
         """Return log P(silent), and x given silence: r = y + v, Cov v = W^-1, y = expected + slopes xi + noise."""
         noise = join_columns(noise, eliminate(self._inverse_weight()))
@@ -238,7 +238,7 @@ class StochasticEventFilter(AbstractSizedFilter):
 
 def _law_of_signal(signal: Signal) -> Gaussian:
     """Return the Gaussian of the signal y itself, before z."""
-    return from_columns(signal.mean, join_columns(Columns(signal.slopes, signal.prior.variances), signal.noise))
+    return from_columns(signal.mean, join_columns(WeightedColumns(signal.slopes, signal.prior.variances), signal.noise))
 
 
 def _sum_of_one_gaussian(log_weight: jax.Array, belief: Gaussian, law: jax.Array) -> GaussianSum:

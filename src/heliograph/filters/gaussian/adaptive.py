@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.factors.columns import Columns
+from heliograph.factors.columns import WeightedColumns
 from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.base import (
     AbstractFilter,
@@ -26,15 +26,15 @@ from heliograph.filters.gaussian.scores import (
     expected_squared_residuals,
     joint_update,
     reweight,
-    score_update,
+    update_by_score,
 )
 from heliograph.filters.robust_noise import NoiseBranches, ReceivedNoise, describe_outlier_noise
 from heliograph.filters.wrappers.wrapper import AbstractWrapper
 from heliograph.model.estimate import Innovation
 from heliograph.model.over_time import OverTime, at, at_each_step
-from heliograph.model.premises.premise import believing
+from heliograph.model.premises.premise import on_premise
 from heliograph.model.sensor import AbstractSensor
-from heliograph.numerics.angle import nearest
+from heliograph.numerics.angle import wrap_near
 from heliograph.numerics.check import TINY, fail, scalar
 from heliograph.numerics.density import log_density
 from heliograph.numerics.types import ArrayLike, Float
@@ -104,7 +104,7 @@ class AdaptiveFilter(AbstractWrapper):
         signal = signal_without_noise(plant, sensor, base.transform, belief, second_moments_at_start(base.plant, base))
         before = predict_behind_channel(signal, at(base.channel, k))
         angles = base.received_angles if isinstance(base, RobustFilter) else base.observed_angles
-        z = nearest(jnp.asarray(z), before.signal, angles)
+        z = wrap_near(jnp.asarray(z), before.signal, angles)
         rule = base.rule if isinstance(base, RobustFilter) else None
         law = noise.law(signal.mean) if isinstance(base, RobustFilter) and rule is None else None
         learned = _variational_update(
@@ -186,7 +186,7 @@ def _variational_update(
         previous_noise, noise = noise, jnp.where(received, learned / after_shape, noise)
     # The state with the last variances.
     if law is not None:
-        x = score_update(before, z, _scale_law(law, previous_noise / variance)).state
+        x = update_by_score(before, z, _scale_law(law, previous_noise / variance)).state
     else:
         x = joint_update(before, e, received, used)
     a, b = jnp.where(received, after_shape, state[0]), jnp.where(received, noise * after_shape, state[1])
@@ -195,9 +195,9 @@ def _variational_update(
     )
 
 
-def _make_independent_noise(variance: jax.Array) -> Columns:
+def _make_independent_noise(variance: jax.Array) -> WeightedColumns:
     """Return the noise of independent components with these variances (m,)."""
-    return Columns(np.eye(len(variance)), variance)
+    return WeightedColumns(np.eye(len(variance)), variance)
 
 
 def _scale_law(law: NoiseBranches, ratio: jax.Array) -> NoiseBranches:
@@ -234,7 +234,7 @@ def adaptive_filter(filter: AbstractFilter, memory: ArrayLike = 0.98) -> Adaptiv
         base=filter, noise=noise, memory=stored, claim="nominal", states=filter.states, inputs=filter.inputs,
         received=filter.received,
     )  # fmt: skip
-    return believing(adaptive, filter.premise)
+    return on_premise(adaptive, filter.premise)
 
 
 def _find_sensor_noise(filter: GaussianFilter) -> ReceivedNoise | OverTime:

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.factors.changes import settle
-from heliograph.factors.columns import Columns, columns_of, join_columns, rounding_of, triangularise
+from heliograph.factors.columns import WeightedColumns, columns_of, join_columns, rounding_of, triangularise
 from heliograph.factors.gaussian import (
     Gaussian,
     Image,
@@ -28,7 +28,7 @@ from heliograph.filters.base import (
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, linear_image
 from heliograph.filters.innovation import no_innovation
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, gaussian_of, smoother_step_of
-from heliograph.filters.wrappers.limited import keeps_limits
+from heliograph.filters.wrappers.limited import accept_limits
 from heliograph.model.estimate import Claim, Estimate, Innovation, lower_by_noise
 from heliograph.model.modes_of_motion import ModalPlant
 from heliograph.model.over_time import at, first
@@ -108,7 +108,7 @@ def second_moments_at_start(plant: AnyPlant, start: HasStart | None = None) -> F
     return jnp.asarray(size)
 
 
-def process_noise(plant: AbstractPlant, u: jax.Array, start: jax.Array) -> Columns:
+def process_noise(plant: AbstractPlant, u: jax.Array, start: jax.Array) -> WeightedColumns:
     """Return factors of Cov w plus the rounding of a state that had the second moments `start`, (n,)."""
     w = plant.noise.columns if isinstance(plant.noise, AbstractNoise) else columns_of(plant.noise_covariance(u))
     return triangularise(join_columns(w, rounding_of(start + jnp.diagonal(plant.noise_covariance(u)))))
@@ -118,7 +118,7 @@ def image_of(plant: AbstractPlant, transform: AbstractTransform, x: Gaussian, u:
     """Return the moments of f(x, u), exactly where it is linear, else by the transform."""
     if isinstance(plant, LinearPlant):
         return linear_image(plant.transition_matrix(u), plant.transition(x.mean, u), x)
-    return move_about_mean(plant, transform, x, u)[1]
+    return transform_about_mean(plant, transform, x, u)[1]
 
 
 def predict_gaussian(
@@ -128,12 +128,12 @@ def predict_gaussian(
     noise = process_noise(plant, u, start)
     if isinstance(plant, LinearPlant):
         return predict_affine(x, plant.transition_matrix(u), plant.shift(u), noise)
-    middle, image = move_about_mean(plant, transform, x, u)
+    middle, image = transform_about_mean(plant, transform, x, u)
     image = image._replace(mean=image.mean + plant.noise_mean())
     return settle(plant.manifold, middle, add_noise_to_image(image, noise))
 
 
-def move_about_mean(
+def transform_about_mean(
     plant: AbstractPlant, transform: AbstractTransform, x: Gaussian, u: jax.Array
 ) -> tuple[jax.Array, Image]:
     """Return the state about which the moments of f(x, u) are, and these: of attitudes about their mean on the group.
@@ -192,7 +192,7 @@ class OpenLoop(AbstractBeliefFilter):
         return state, no_innovation()
 
 
-@keeps_limits
+@accept_limits
 @believes
 def open_loop_filter(
     plant: AnyPlant,

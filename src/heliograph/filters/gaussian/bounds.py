@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import Columns, decorrelate, join_columns, reciprocal_or_zero
+from heliograph.factors.columns import WeightedColumns, decorrelate, join_columns, reciprocal_or_zero
 from heliograph.factors.gaussian import Gaussian, condition_on_observation, from_columns
 from heliograph.factors.repeated import triangularise_noise
 from heliograph.filters.gaussian.scalars import (
@@ -109,7 +109,7 @@ def observe_by_zero_mean(signal: Signal, channel: SecondOrder, z: ArrivedInnovat
     shift = channel.shift(covariance_part, present)
     # Power of the prior error that the received components explain: columns Cov(x, y) N^-T of Cov y = N diag(s) N'.
     used = mask_received(channel, present)[:, None]
-    signals = join_columns(Columns(signal.slopes, prior.variances), signal.noise)
+    signals = join_columns(WeightedColumns(signal.slopes, prior.variances), signal.noise)
     factors = triangularise_noise(signals._replace(matrix=jnp.where(used, signals.matrix, 0.0)))
     explained = decorrelate(factors.matrix, jnp.where(used, signal.cross.T, 0.0)).T
     share = reciprocal_or_zero(factors.weights)
@@ -120,7 +120,7 @@ def observe_by_zero_mean(signal: Signal, channel: SecondOrder, z: ArrivedInnovat
     after = condition_on_observation(
         prior, slopes, z.innovation, factor_spread(base + shift / beta - of_state), present
     )[0]
-    wider = from_columns(after.mean, join_columns(after.columns, Columns(explained, beta * share)))
+    wider = from_columns(after.mean, join_columns(after.columns, WeightedColumns(explained, beta * share)))
     return keep_where_unchanged(jnp.any(present), wider, after)
 
 
@@ -130,7 +130,7 @@ def _select_received(
     """Return M H of what arrived, M H P H' M' and M R M'."""
     gain = jnp.where(present[:, None], jnp.asarray(channel.mean_gain), 0.0)
     slopes = gain @ signal.slopes
-    return slopes, Columns(slopes, signal.prior.variances).covariance, signal.noise.through(gain).covariance
+    return slopes, WeightedColumns(slopes, signal.prior.variances).covariance, signal.noise.through(gain).covariance
 
 
 def unit_variance_where_absent(present: jax.Array) -> jax.Array:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.centred import CentredGaussian, center_gaussian, center_known
+from heliograph.factors.centred import SplitMeanGaussian, center_gaussian, center_known
 from heliograph.factors.columns import unit_of
 from heliograph.filters.base import AbstractFilter, Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.gaussian.belief import AbstractBeliefFilter
@@ -16,7 +16,7 @@ from heliograph.filters.wrappers.wrapper import AbstractWrapper
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import at, first, unstack
 from heliograph.model.plant import AbstractPlant, LinearPlant, NoiseFunction
-from heliograph.model.premises.premise import believing
+from heliograph.model.premises.premise import on_premise
 from heliograph.model.sensor import AbstractSensor, LinearSensor
 from heliograph.numerics.angle import Angles, wrap_angles
 from heliograph.numerics.compensated import Compensated, compensate, split_sum
@@ -132,12 +132,12 @@ class CentredFilter(AbstractWrapper):
         return ()
 
     @in_float64
-    def init(self) -> CentredGaussian:
+    def init(self) -> SplitMeanGaussian:
         """Return the prior about its mean as single precision has it."""
         return center_known(self.base.init())
 
     @predicts
-    def predict(self, state: CentredGaussian, u: ArrayLike = (), k: Step = 0) -> CentredGaussian:
+    def predict(self, state: SplitMeanGaussian, u: ArrayLike = (), k: Step = 0) -> SplitMeanGaussian:
         """Predict about the origin, which becomes what the center moves to."""
         plant, center, u = at(self.base.plant, k), jnp.asarray(state.high), jnp.asarray(u)
         unit, x = unit_of(center), state.about_center
@@ -153,7 +153,7 @@ class CentredFilter(AbstractWrapper):
         return center_gaussian(center_after.high, base.predict(x, u, k))
 
     @corrects
-    def correct(self, state: CentredGaussian, z: ArrayLike, k: Step = 0) -> tuple[CentredGaussian, Innovation]:
+    def correct(self, state: SplitMeanGaussian, z: ArrayLike, k: Step = 0) -> tuple[SplitMeanGaussian, Innovation]:
         """Correct about the origin, by what differs from the signal that it has."""
         sensor, channel, center = at(self.base.sensor, k), at(self.base.channel, k), jnp.asarray(state.high)
         unit, z = unit_of(center), jnp.asarray(z)
@@ -169,12 +169,12 @@ class CentredFilter(AbstractWrapper):
         return center_gaussian(center, after), innovation
 
     @estimates
-    def estimate(self, state: CentredGaussian) -> Estimate:
+    def estimate(self, state: SplitMeanGaussian) -> Estimate:
         """Return the mean as it is rounded, angles between -pi and pi, and the covariance."""
         mean = wrap_angles(jnp.asarray(state.high), first(self.base.plant).angles)
         return Estimate(mean, state.about_center.covariance, self.claim)
 
-    def after_step(self, state: CentredGaussian, k: Step) -> Estimate:
+    def after_step(self, state: SplitMeanGaussian, k: Step) -> Estimate:
         """Return mean and covariance after step k."""
         return self.estimate(state)
 
@@ -193,7 +193,7 @@ def center_filter(filter: AbstractBeliefFilter) -> AbstractFilter:
         known_gain=all(not np.any(c.gain_spread) and not c.uncertain for c in unstack(base.channel)),
         **make_sizes(base.claim, base, base.received),
     )
-    return believing(centred, base.premise)
+    return on_premise(centred, base.premise)
 
 
 def _start_at_zero(base: Any) -> Any:

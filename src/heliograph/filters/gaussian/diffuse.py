@@ -23,7 +23,7 @@ from heliograph.model.channel import perfect
 from heliograph.model.estimate import Estimate, Innovation, lower_by_noise
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant
-from heliograph.model.premises.premise import Premise, believing
+from heliograph.model.premises.premise import Premise, on_premise
 from heliograph.model.sensor import AnySensor, check_linear, check_sensor
 from heliograph.model.unknown_start import UnknownStart
 from heliograph.numerics.check import fail
@@ -102,4 +102,4 @@ def diffuse_filter(plant: AnyPlant, sensor: AnySensor) -> DiffuseFilter:
     filter = DiffuseFilter(
         plant=plant, sensor=sensor, **make_sizes(lower_by_noise("exact", plant, sensor), plant, outputs)
     )
-    return believing(filter, Premise(plant, sensor, perfect(outputs)))
+    return on_premise(filter, Premise(plant, sensor, perfect(outputs)))

@@ -6,15 +6,15 @@ from heliograph.filters.gaussian.diffuse import DiffuseFilter, diffuse_filter, h
 from heliograph.filters.gaussian.gaussian import GaussianFilter, describe_channel_moments, make_perfect_channel
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, Linearization
 from heliograph.filters.gaussian.update import AbstractUpdate, Polytope
-from heliograph.filters.wrappers.limited import keeps_limits
-from heliograph.filters.wrappers.sensor_inputs import takes_sensor_inputs
-from heliograph.filters.wrappers.told import takes_told
+from heliograph.filters.wrappers.limited import accept_limits
+from heliograph.filters.wrappers.sensor_inputs import accept_sensor_inputs
+from heliograph.filters.wrappers.told import accept_told_numbers
 from heliograph.model.channel import Channel, check_link, find_received_angles, mean_gain
 from heliograph.model.estimate import lower_by_noise
 from heliograph.model.fading import memory_matters, without_memory
 from heliograph.model.over_time import first, unstack
 from heliograph.model.plant import AnyPlant, check_plant
-from heliograph.model.premises.premise import Premise, believing
+from heliograph.model.premises.premise import Premise, on_premise
 from heliograph.model.sensor import SEVERAL_TAKEN_BY, AnySensor, is_linear
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.types import ArrayLike, Float
@@ -67,12 +67,12 @@ def _make_gaussian_filter(
         observed_angles=angles,
         **make_sizes(claim, start, first(channel).outputs),
     )
-    return believing(filter, premise)
+    return on_premise(filter, premise)
 
 
-@keeps_limits
-@takes_sensor_inputs
-@takes_told
+@accept_limits
+@accept_sensor_inputs
+@accept_told_numbers
 def gaussian_filter(
     plant: AnyPlant,
     sensor: AnySensor,
@@ -110,9 +110,9 @@ def gaussian_filter(
     )
 
 
-@keeps_limits
-@takes_sensor_inputs
-@takes_told
+@accept_limits
+@accept_sensor_inputs
+@accept_told_numbers
 def cubature_filter(
     plant: AnyPlant,
     sensor: AnySensor,
@@ -143,9 +143,9 @@ def cubature_filter(
     return gaussian_filter(plant, sensor, channel, Cubature(), update, initial_mean, initial_covariance)
 
 
-@keeps_limits
-@takes_sensor_inputs
-@takes_told
+@accept_limits
+@accept_sensor_inputs
+@accept_told_numbers
 def extended_filter(
     plant: AnyPlant,
     sensor: AnySensor,
@@ -174,7 +174,7 @@ def extended_filter(
     return gaussian_filter(plant, sensor, channel, Linearization(), update, initial_mean, initial_covariance)
 
 
-@keeps_limits
+@accept_limits
 def mean_gain_filter(
     plant: AnyPlant,
     sensor: AnySensor,
@@ -221,8 +221,8 @@ def gaussian_filter_of(
     return instance(f"channel of a {name}", filter, GaussianFilter, "one of which nothing is told")
 
 
-@keeps_limits
-@takes_sensor_inputs
+@accept_limits
+@accept_sensor_inputs
 def kalman_filter(
     plant: AnyPlant,
     sensor: AnySensor,

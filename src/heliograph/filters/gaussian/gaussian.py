@@ -22,7 +22,7 @@ from heliograph.model.channel import Channel, perfect
 from heliograph.model.estimate import Innovation
 from heliograph.model.over_time import OverTime, at, at_each_step, first
 from heliograph.model.sensor import AbstractSensor, AnySensor
-from heliograph.numerics.angle import Angles, nearest
+from heliograph.numerics.angle import Angles, wrap_near
 from heliograph.numerics.check import instance
 from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.types import Array, ArrayLike, Float
@@ -77,7 +77,7 @@ class GaussianFilter(AbstractBeliefFilter):
             k, z_k, u_k = row
             prior = self.predict(state, u_k, k)
             channel, y = at(self.channel, k), self.predict_signal(prior, k)
-            near = nearest(z_k, channel.mean_gain @ y.mean + channel.offset, self.observed_angles)
+            near = wrap_near(z_k, channel.mean_gain @ y.mean + channel.offset, self.observed_angles)
             return self.correct(prior, z_k, k)[0], (y.mean, y.covariance, near)
 
         def expect(z: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.factors.columns import Columns, join_columns
+from heliograph.factors.columns import WeightedColumns, join_columns
 from heliograph.factors.gaussian import Gaussian, from_columns
 from heliograph.filters.base import (
     AbstractSizedFilter,
@@ -25,7 +25,7 @@ from heliograph.filters.remark import Remark
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import at
 from heliograph.model.plant import TIME_STEP
-from heliograph.numerics.angle import nearest
+from heliograph.numerics.angle import wrap_near
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import ArrayLike, Float
 
@@ -33,7 +33,7 @@ CONTRADICTED = float(np.log(1000.0))  # the other numbers speak for the gated st
 NEVER = -1.0  # step of the last giving in, before the first
 
 
-class WatchedBelief(NamedTuple):
+class GateAndRival(NamedTuple):
     """What a gate believes, and the rival state that believes what the gate refuses.
 
     Args:
@@ -91,10 +91,10 @@ class GivingInFilter(AbstractSizedFilter):
         return self.base.angles_used()
 
     @compile_on_call
-    def init(self) -> WatchedBelief:
+    def init(self) -> GateAndRival:
         """Return the belief before any data."""
         start, zero = self.base.init(), jnp.zeros(())
-        return WatchedBelief(
+        return GateAndRival(
             believed=start,
             rival=start,
             refused=jnp.zeros(self.received),
@@ -106,7 +106,7 @@ class GivingInFilter(AbstractSizedFilter):
         )
 
     @predicts
-    def predict(self, state: WatchedBelief, u: ArrayLike = (), k: Step = 0) -> WatchedBelief:
+    def predict(self, state: GateAndRival, u: ArrayLike = (), k: Step = 0) -> GateAndRival:
         """Predict the gate's state and its rival over step k."""
         elapsed = state.elapsed
         if TIME_STEP in self.inputs:
@@ -116,7 +116,7 @@ class GivingInFilter(AbstractSizedFilter):
         return state._replace(believed=believed, rival=rival, elapsed=elapsed)
 
     @corrects
-    def correct(self, state: WatchedBelief, z: ArrayLike, k: Step = 0) -> tuple[WatchedBelief, Innovation]:
+    def correct(self, state: GateAndRival, z: ArrayLike, k: Step = 0) -> tuple[GateAndRival, Innovation]:
         """Correct the gate's state, and its rival with what the gate refused too; believe the rival if it is time."""
         z = jnp.asarray(z)
         arrived = ~jnp.isnan(z)
@@ -132,9 +132,9 @@ class GivingInFilter(AbstractSizedFilter):
         # It gives in after refusals for long enough, unless the other numbers contradict the rival.
         gives_in = self._is_long(refused, state.elapsed) & (evidence > -CONTRADICTED)
         rival_continues = jnp.any(suspect) & ~gives_in
-        jump = nearest(rival.mean, after.mean, self.angles_used().states) - after.mean
+        jump = wrap_near(rival.mean, after.mean, self.angles_used().states) - after.mean
         chosen = _choose(gives_in, rival, after)
-        belief = WatchedBelief(
+        belief = GateAndRival(
             believed=chosen,
             rival=_choose(rival_continues, rival, chosen),
             refused=jnp.where(gives_in, 0.0, refused),
@@ -161,14 +161,14 @@ class GivingInFilter(AbstractSizedFilter):
         noise, rule = at(self.base.noise, k), _gate_of(self.base)
         # Innovation e, its variance S, and V = Var t of the state alone.
         total = predicted.columns.diagonal + jnp.diagonal(jnp.asarray(noise.covariance))
-        e = nearest(z, predicted.signal, self.base.received_angles) - predicted.signal - noise.center
+        e = wrap_near(z, predicted.signal, self.base.received_angles) - predicted.signal - noise.center
         of_state = predicted.slopes**2 @ predicted.prior.variances
         needs_room = left_out & (e**2 > rule.c * total) & (of_state > 0)
         # delta of each number that is to be used, (n, m); each state by itself.
         change = _most_probable_change(predicted, jnp.where(needs_room, e, 0.0), of_state)
         # P + n diag(delta^2) / min(c, 1), summed over these numbers.
         n = len(self.states)
-        wider = Columns(jnp.eye(n), n / jnp.minimum(rule.c, 1.0) * jnp.sum(change**2, axis=1))
+        wider = WeightedColumns(jnp.eye(n), n / jnp.minimum(rule.c, 1.0) * jnp.sum(change**2, axis=1))
         return from_columns(predicted.prior.mean, join_columns(predicted.prior.columns, wider))
 
     def _compare(self, rival: Innovation, gate: Innovation, counts: jax.Array) -> jax.Array:
@@ -184,11 +184,11 @@ class GivingInFilter(AbstractSizedFilter):
         return jnp.sum(log_density(rival) - log_density(gate))
 
     @estimates
-    def estimate(self, state: WatchedBelief) -> Estimate:
+    def estimate(self, state: GateAndRival) -> Estimate:
         """Return the mean and covariance of the gate's state."""
         return self.base.estimate(state.believed)
 
-    def remark(self, state: WatchedBelief) -> Remark:
+    def remark(self, state: GateAndRival) -> Remark:
         """Say how often the gate has given in, when it last did, and which states moved how far then."""
         times = int(state.given_in)
         if not times:
@@ -221,7 +221,7 @@ def _choose(condition: jax.Array, if_true: Any, if_false: Any) -> Any:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), if_true, if_false)
 
 
-def give_in(base: RobustFilter, rule: Gate) -> GivingInFilter:
+def build_giving_in_filter(base: RobustFilter, rule: Gate) -> GivingInFilter:
     """Return the gate that gives in as its rule says.
 
     Args:

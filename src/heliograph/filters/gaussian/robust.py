@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import Columns, columns_of, zero_covariance
+from heliograph.factors.columns import WeightedColumns, columns_of, zero_covariance
 from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.base import (
     AbstractFilter,
@@ -21,7 +21,7 @@ from heliograph.filters.gaussian.scores import (
     ScoreUpdate,
     expected_squared_residuals,
     reweight,
-    score_update,
+    update_by_score,
     update_weighted,
 )
 from heliograph.filters.gaussian.signal import Signal, make_received_noise, signal_of
@@ -31,7 +31,7 @@ from heliograph.model.estimate import Innovation
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor
-from heliograph.numerics.angle import Angles, nearest
+from heliograph.numerics.angle import Angles, wrap_near
 from heliograph.numerics.check import TINY, check_count, scalar
 from heliograph.numerics.density import log_density
 from heliograph.numerics.types import ArrayLike, Float
@@ -144,7 +144,7 @@ class StudentVB(AbstractWeights):
         return rule
 
     def iterate(
-        self, before: PredictedMeasurement, noise: Columns, e: jax.Array, present: jax.Array
+        self, before: PredictedMeasurement, noise: WeightedColumns, e: jax.Array, present: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
         """Return the weights of the last update, and those that it would give the next one."""
         scale = noise.diagonal
@@ -184,11 +184,11 @@ class RobustFilter(AbstractBeliefFilter):
     def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
         """Use what arrived of the measurement, component after component or with weights."""
         before, sensed = self.predict_received(state, k)
-        z = nearest(jnp.asarray(z), before.signal, self.received_angles)
+        z = wrap_near(jnp.asarray(z), before.signal, self.received_angles)
         noise = at(self.noise, k)
         if self.rule is None:
             law = noise.law(sensed)
-            after = score_update(before, z, law)
+            after = update_by_score(before, z, law)
             center, variance = law.mean_and_variance()
             return after.state, _innovation_about_mean(before, z, center, jnp.diag(variance), after, by_law=True)
         after = update_weighted(before, z, noise.center, columns_of(noise.covariance), self.rule)

@@ -3,13 +3,13 @@
 import numpy as np
 
 from heliograph.filters.gaussian.belief import prior_of
-from heliograph.filters.gaussian.giving_in import GivingInFilter, give_in
+from heliograph.filters.gaussian.giving_in import GivingInFilter, build_giving_in_filter
 from heliograph.filters.gaussian.robust import Gate, RobustFilter, StudentVB
 from heliograph.filters.gaussian.scores import AbstractWeights
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
 from heliograph.filters.robust_noise import ReceivedNoise, Vector, separate_outlier_noise
-from heliograph.filters.wrappers.limited import keeps_limits
-from heliograph.filters.wrappers.told import takes_told
+from heliograph.filters.wrappers.limited import accept_limits
+from heliograph.filters.wrappers.told import accept_told_numbers
 from heliograph.model.channel import Channel, check_link, find_received_angles
 from heliograph.model.fading import without_memory
 from heliograph.model.over_time import first
@@ -33,9 +33,9 @@ def _student_degrees_of(noise: ReceivedNoise) -> Vector:
     return degrees
 
 
-@keeps_limits
+@accept_limits
 @believes
-@takes_told
+@accept_told_numbers
 def robust_filter(
     plant: AnyPlant,
     sensor: AnySensor,
@@ -86,5 +86,5 @@ def robust_filter(
         states=start.states, inputs=start.inputs, received=first(channel).outputs,
     )  # fmt: skip
     if isinstance(rule, Gate) and rule.gives_in:
-        return give_in(robust, rule)
+        return build_giving_in_filter(robust, rule)
     return robust

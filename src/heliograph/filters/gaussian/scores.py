@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from heliograph.factors.columns import Columns, join_columns
+from heliograph.factors.columns import WeightedColumns, join_columns
 from heliograph.factors.gaussian import (
     Gaussian,
     append_rows,
@@ -34,12 +34,12 @@ class PredictedMeasurement(NamedTuple):
     prior: Gaussian
     signal: jax.Array
     slopes: jax.Array
-    noise: Columns
+    noise: WeightedColumns
 
     @property
-    def columns(self) -> Columns:
+    def columns(self) -> WeightedColumns:
         """Columns whose weighted products are Cov t."""
-        return join_columns(Columns(self.slopes, self.prior.variances), self.noise)
+        return join_columns(WeightedColumns(self.slopes, self.prior.variances), self.noise)
 
 
 class ScoreUpdate(NamedTuple):
@@ -50,7 +50,7 @@ class ScoreUpdate(NamedTuple):
     log_density: jax.Array
 
 
-def score_update(before: PredictedMeasurement, z: jax.Array, law: NoiseBranches) -> ScoreUpdate:
+def update_by_score(before: PredictedMeasurement, z: jax.Array, law: NoiseBranches) -> ScoreUpdate:
     """Return exact posterior moments, component after component, for a Gaussian prior and noise of Gaussian branches.
 
     With s_j = V_ii + r_j (at least `least`), u_j = (e - m_j) / s_j and q_j in proportion to p_j N(e; m_j, s_j), the
@@ -90,7 +90,7 @@ class _Score(NamedTuple):
 def _compute_score(e: jax.Array, v: jax.Array, log_share: jax.Array, mean: jax.Array, noise: jax.Array) -> _Score:
     """Return the score of an innovation e about a t of variance v, with branches (branches,) of the noise.
 
-    `log_share`, `mean`, `noise`: log probability, mean and variance of each branch; symbols as of `score_update`.
+    `log_share`, `mean`, `noise`: log probability, mean and variance of each branch; symbols as of `update_by_score`.
     """
     s = v + noise
     reach = LARGEST * jnp.sqrt(jnp.max(s))
@@ -116,7 +116,7 @@ class AbstractWeights(Module):
         raise unwritten(self, "weights")
 
     def iterate(
-        self, before: PredictedMeasurement, noise: Columns, e: jax.Array, present: jax.Array
+        self, before: PredictedMeasurement, noise: WeightedColumns, e: jax.Array, present: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
         """Return the weights of the update, and those to report, for noise of m components."""
         scale = noise.diagonal
@@ -125,7 +125,7 @@ class AbstractWeights(Module):
 
 
 def update_weighted(
-    before: PredictedMeasurement, z: jax.Array, center: jax.Array, noise: Columns, rule: AbstractWeights
+    before: PredictedMeasurement, z: jax.Array, center: jax.Array, noise: WeightedColumns, rule: AbstractWeights
 ) -> ScoreUpdate:
     """Return one joint update with noise r_ij / sqrt(w_i w_j), of mean `center`; without components of weight zero."""
     arrived = ~jnp.isnan(z)
@@ -135,18 +135,18 @@ def update_weighted(
     return ScoreUpdate(after, jnp.where(arrived, shown, jnp.nan), jnp.zeros_like(z[0]))
 
 
-def reweight(noise: Columns, w: jax.Array) -> Columns:
+def reweight(noise: WeightedColumns, w: jax.Array) -> WeightedColumns:
     """Return r_ij / sqrt(w_i w_j): each row over the root of its weight."""
     return noise.through(jnp.diag(1 / jnp.sqrt(jnp.maximum(w, SMALLEST))))
 
 
-def joint_update(before: PredictedMeasurement, e: jax.Array, present: jax.Array, noise: Columns) -> Gaussian:
+def joint_update(before: PredictedMeasurement, e: jax.Array, present: jax.Array, noise: WeightedColumns) -> Gaussian:
     """Return the state after the components that are present, with noise of this covariance besides that of t."""
     return condition_on_observation(before.prior, before.slopes, e, join_columns(before.noise, noise), present)[0]
 
 
 def expected_squared_residuals(
-    before: PredictedMeasurement, noise: Columns, e: jax.Array, present: jax.Array
+    before: PredictedMeasurement, noise: WeightedColumns, e: jax.Array, present: jax.Array
 ) -> jax.Array:
     """Return E[(e_i - t_i)^2 | e] = (e_i - t_i+)^2 + V_ii+ after a joint update with this noise, (m,)."""
     t = from_columns(jnp.zeros_like(e), before.columns)

@@ -24,7 +24,7 @@ from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.model.estimate import Estimate, Innovation, weakest
 from heliograph.model.over_time import alike, stack
 from heliograph.model.premises.agreement import join_premises
-from heliograph.model.premises.premise import believing
+from heliograph.model.premises.premise import on_premise
 from heliograph.numerics.check import fail, instance, items
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import ArrayLike, PyTree
@@ -132,4 +132,4 @@ def sequential_filter(filters: Sequence[GaussianFilter]) -> SequentialFilter:
         ),
     )
     premises = [filter.premise for filter in nodes if filter.premise is not None]
-    return believing(central, join_premises(premises) if len(premises) == len(nodes) else None)
+    return on_premise(central, join_premises(premises) if len(premises) == len(nodes) else None)

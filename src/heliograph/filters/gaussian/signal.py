@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.factors.columns import (
-    Columns,
+    WeightedColumns,
     eliminate,
     join_columns,
     rounding_of,
@@ -23,7 +23,7 @@ from heliograph.filters.gaussian.transform import AbstractTransform, linear_imag
 from heliograph.model.estimate import Innovation
 from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor, LinearSensor
-from heliograph.numerics.angle import Angles, continue_angles, nearest
+from heliograph.numerics.angle import Angles, continue_angles, wrap_near
 from heliograph.numerics.linalg import contract
 from heliograph.numerics.types import Array
 from heliograph.random_affine.moments.second_moments import SecondOrder
@@ -48,14 +48,14 @@ class Signal(NamedTuple):
     prior: Gaussian
     mean: jax.Array
     slopes: jax.Array
-    noise: Columns
+    noise: WeightedColumns
     second: jax.Array
     size: jax.Array
 
     @property
     def covariance(self) -> jax.Array:
         """Covariance Cov y (p, p) of the signal, with the sensor's noise."""
-        return join_columns(Columns(self.slopes, self.prior.variances), self.noise).covariance
+        return join_columns(WeightedColumns(self.slopes, self.prior.variances), self.noise).covariance
 
     @property
     def cross(self) -> jax.Array:
@@ -73,7 +73,7 @@ def signal_of(
     transform: AbstractTransform,
     prior: Gaussian,
     start: jax.Array,
-    noise: Columns | None = None,
+    noise: WeightedColumns | None = None,
 ) -> Signal:
     """Return the moments of the sensor's signal y = h(x) + v under the prior of x.
 
@@ -109,7 +109,7 @@ def signal_size_at_start(sensor: LinearSensor, start: jax.Array) -> jax.Array:
     return reach**2 + variances
 
 
-def make_received_noise(signal: Signal, channel: SecondOrder) -> Columns:
+def make_received_noise(signal: Signal, channel: SecondOrder) -> WeightedColumns:
     """Return the noise of z given the state, under the nominal law: M v, n, the spread of the gain, and rounding.
 
     The noises v and n are made triangular, so that a combination of outputs free of both is known to eps. What the
@@ -119,24 +119,24 @@ def make_received_noise(signal: Signal, channel: SecondOrder) -> Columns:
     return noise_behind_gain(signal, jnp.asarray(channel.mean_gain), channel.gain_spread, channel.noise)
 
 
-def noise_behind_gain(signal: Signal, gain: jax.Array, gain_spread: Array, link: Columns) -> Columns:
+def noise_behind_gain(signal: Signal, gain: jax.Array, gain_spread: Array, link: WeightedColumns) -> WeightedColumns:
     """Return `make_received_noise` of a channel with this mean gain M, spread of the gain and noise n."""
     rounding = rounding_of((jnp.abs(gain) @ square_root(signal.size)) ** 2)
     plain = triangularise_noise(join_columns(signal.noise.through(gain), link, rounding))
     return join_columns(plain, gain_noise(gain_spread, signal.second, signal.mean))
 
 
-def gain_noise(gain_spread: Array, second: jax.Array, mean: jax.Array) -> Columns:
+def gain_noise(gain_spread: Array, second: jax.Array, mean: jax.Array) -> WeightedColumns:
     """Return factors of E[(G - M) y y' (G - M)'], m columns, from E[y y'] and E[y]."""
     return factor_spread(contract(gain_spread, augmented_second_moment(second, mean, 1.0)))
 
 
-def factor_spread(spread: jax.Array) -> Columns:
+def factor_spread(spread: jax.Array) -> WeightedColumns:
     """Return factors of a covariance that was formed as a matrix; what is below a hundred eps of it counts as zero."""
     return eliminate(spread, LOST * unit_of(spread))
 
 
-def link_noise(channel: SecondOrder, second: jax.Array, mean: jax.Array) -> Columns:
+def link_noise(channel: SecondOrder, second: jax.Array, mean: jax.Array) -> WeightedColumns:
     """Return Cov z given a y with these moments, under the nominal law: n and the spread of the gain."""
     return join_columns(channel.noise, gain_noise(channel.gain_spread, second, mean))
 
@@ -148,14 +148,14 @@ def condition_on_received(signal: Signal, channel: SecondOrder, z: ArrivedInnova
 
 
 def condition_on_measurement(
-    x: Gaussian, slopes: jax.Array, noise: Columns, z: jax.Array, expected: jax.Array, angles: Angles = ()
+    x: Gaussian, slopes: jax.Array, noise: WeightedColumns, z: jax.Array, expected: jax.Array, angles: Angles = ()
 ) -> tuple[Gaussian, Innovation]:
     """Condition x = m + L xi on z = expected + slopes xi + noise, NaN where a component did not arrive."""
     present = ~jnp.isnan(z)
-    z = nearest(z, expected, angles)
+    z = wrap_near(z, expected, angles)
     value = z - expected
     after, innovations = condition_on_observation(x, slopes, value, noise, present)
-    total = join_columns(Columns(slopes, x.variances), noise).covariance
+    total = join_columns(WeightedColumns(slopes, x.variances), noise).covariance
     density = innovations.log_density(present, jnp.abs(z) + jnp.abs(expected))
     return after, Innovation(value, jnp.where(present[:, None] & present, total, jnp.nan), density)
 
@@ -163,7 +163,9 @@ def condition_on_measurement(
 def innovation_covariance(signal: Signal, channel: SecondOrder) -> jax.Array:
     """Return Cov z = M Cov(y) M' + E[((G - M) y + n - b)(...)'] under the nominal law (m, m)."""
     slopes = jnp.asarray(channel.mean_gain) @ signal.slopes
-    return join_columns(Columns(slopes, signal.prior.variances), make_received_noise(signal, channel)).covariance
+    return join_columns(
+        WeightedColumns(slopes, signal.prior.variances), make_received_noise(signal, channel)
+    ).covariance
 
 
 def augmented_second_moment(second: jax.Array, mean: jax.Array, last: float) -> jax.Array:

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import Columns, decorrelate, eliminate, reciprocal_or_zero, square_root
+from heliograph.factors.columns import WeightedColumns, decorrelate, eliminate, reciprocal_or_zero, square_root
 from heliograph.factors.gaussian import Gaussian, Image, from_covariance, image_by_slopes
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.module import Module, readable, unwritten
@@ -83,8 +83,8 @@ class Cubature(AbstractTransform):
         even = ahead + behind
         middle = jnp.sum(even, axis=1) * (1 / n)
         weights = np.full(n, 1 / (4 * n))
-        curvature = Columns(even - middle[:, None], weights)
-        return Image(middle / 2, Columns(ahead - behind, weights), 2 * steps, curvature)
+        curvature = WeightedColumns(even - middle[:, None], weights)
+        return Image(middle / 2, WeightedColumns(ahead - behind, weights), 2 * steps, curvature)
 
 
 def evaluate_beside_mean(function: Function, x: Gaussian, steps: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -147,8 +147,8 @@ class PolynomialMoments(AbstractTransform):
         center = values @ weights
         slopes = (values * weights) @ points  # in units of each deviation
         rest = values - center[:, None] - slopes @ points.T
-        explained = Columns(slopes, np.ones(len(deviations)))
-        return Image(center, explained, deviations, eliminate(Columns(rest, weights).covariance))
+        explained = WeightedColumns(slopes, np.ones(len(deviations)))
+        return Image(center, explained, deviations, eliminate(WeightedColumns(rest, weights).covariance))
 
 
 def _quadratic_image(function: Function, mean: jax.Array, factor: jax.Array, deviations: jax.Array) -> Image:
@@ -165,8 +165,8 @@ def _quadratic_image(function: Function, mean: jax.Array, factor: jax.Array, dev
     slopes, squares = (ahead - behind) / 2, (ahead + behind) / 2 - start
     mixed = both - ahead[:, rows] - ahead[:, columns] + start
     weights = np.concatenate([np.full(n, 2.0), np.ones(len(rows))])
-    curvature = Columns(jnp.concatenate([squares, mixed], axis=1), weights)
-    return Image(start[:, 0] + jnp.sum(squares, axis=1), Columns(slopes, np.ones(n)), deviations, curvature)
+    curvature = WeightedColumns(jnp.concatenate([squares, mixed], axis=1), weights)
+    return Image(start[:, 0] + jnp.sum(squares, axis=1), WeightedColumns(slopes, np.ones(n)), deviations, curvature)
 
 
 def _hermite_grid(dimension: int, count: int) -> tuple[np.ndarray, np.ndarray]:

@@ -2,13 +2,13 @@
 
 import jax.numpy as jnp
 
-from heliograph.factors.columns import Columns, square_root
+from heliograph.factors.columns import WeightedColumns, square_root
 from heliograph.factors.gaussian import Gaussian, Image
 from heliograph.filters.gaussian.factories import gaussian_filter
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.gaussian.transform import AbstractTransform, Function, evaluate_beside_mean
 from heliograph.filters.gaussian.update import AbstractUpdate
-from heliograph.filters.wrappers.limited import keeps_limits
+from heliograph.filters.wrappers.limited import accept_limits
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant, check_plant
@@ -84,11 +84,11 @@ class Unscented(AbstractTransform):
         shift = middle * (n / (2 * scale))
         weights = jnp.full(n, 1 / (4 * scale))
         with_shift = jnp.append(weights, alpha**2 * kappa / n + beta)
-        curvature = Columns(jnp.concatenate([even - middle[:, None], shift[:, None]], axis=1), with_shift)
-        return Image(here + shift, Columns(ahead - behind, weights), 2 * steps, curvature)
+        curvature = WeightedColumns(jnp.concatenate([even - middle[:, None], shift[:, None]], axis=1), with_shift)
+        return Image(here + shift, WeightedColumns(ahead - behind, weights), 2 * steps, curvature)
 
 
-@keeps_limits
+@accept_limits
 def unscented_filter(
     plant: AnyPlant,
     sensor: AnySensor,

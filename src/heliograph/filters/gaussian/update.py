@@ -189,7 +189,7 @@ class Interval(AbstractUpdate):
         Raises:
             ValueError: a channel that is not a chain of scalar hops.
         """
-        return interval_description(
+        return combine_hop_ranges(
             channel, lambda hop: hop.largest_second - max(abs(hop.mean) - hop.mean_radius, 0.0) ** 2
         )
 
@@ -238,7 +238,7 @@ def _is_multiple_of_identity(matrix: jax.Array | np.ndarray) -> bool:
     return matrix.shape[0] == matrix.shape[1] and bool(np.all(matrix == matrix[0, 0] * np.eye(len(matrix))))
 
 
-def interval_description(channel: AbstractRandomAffine, variance: Callable[[HopRange], float]) -> SecondOrder:
+def combine_hop_ranges(channel: AbstractRandomAffine, variance: Callable[[HopRange], float]) -> SecondOrder:
     """Return the worst cases of a chain of hops, from the range of each.
 
     Hop after hop: V <- var S + (|m| + r)^2 V for the spread, S <- s S for the power, N <- (a^2 s) N + Q for the noise,

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import Columns
+from heliograph.factors.columns import WeightedColumns
 from heliograph.factors.gaussian import Gaussian, from_covariance, predict_affine
 from heliograph.filters.gaussian.belief import process_noise
 from heliograph.model.plant import AbstractPlant, LinearPlant
@@ -25,7 +25,7 @@ class PlantMotion(NamedTuple):
     matrix: jax.Array
     shift: jax.Array
     covariance: jax.Array
-    noise: Columns
+    noise: WeightedColumns
 
 
 def motion_of_plant(plant: LinearPlant, u: jax.Array, start: jax.Array) -> PlantMotion:

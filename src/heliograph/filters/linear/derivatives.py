@@ -22,13 +22,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.factors.gaussian import Gaussian
-from heliograph.filters.states import Slopes
+from heliograph.filters.states import MomentSlopes
 from heliograph.model.over_time import at
 from heliograph.numerics.linalg import psd_solve, symmetric
 from heliograph.numerics.types import Array
 
 
-class Matrices(NamedTuple):
+class ModelMatrices(NamedTuple):
     """A step x+ = F x + b + w, z = H x + c + v with Cov w = Q and Cov v = R, the channel's gain and noise within."""
 
     F: jax.Array
@@ -39,11 +39,11 @@ class Matrices(NamedTuple):
     R: jax.Array
 
 
-class Differentiated(NamedTuple):
+class EstimateWithDerivatives(NamedTuple):
     """An estimate and its derivatives in each of the free numbers."""
 
     gaussian: Gaussian
-    slopes: tuple[Slopes, ...]
+    slopes: tuple[MomentSlopes, ...]
 
 
 class DifferentiatedInnovation(NamedTuple):
@@ -60,7 +60,7 @@ class DifferentiatedInnovation(NamedTuple):
     lost: jax.Array
 
 
-def differentiate_start(make: Callable[[Array], Any], x: Array) -> Differentiated:
+def differentiate_start(make: Callable[[Array], Any], x: Array) -> EstimateWithDerivatives:
     """Return the estimate before the first step.
 
     Args:
@@ -68,12 +68,12 @@ def differentiate_start(make: Callable[[Array], Any], x: Array) -> Differentiate
         x: the free numbers (p,).
     """
     starts = [jax.jvp(lambda x: _start_of(make(x)), (x,), (axis,))[1] for axis in np.eye(len(x))]
-    return Differentiated(jax.tree.map(jnp.asarray, make(x).init().gaussian), tuple(starts))
+    return EstimateWithDerivatives(jax.tree.map(jnp.asarray, make(x).init().gaussian), tuple(starts))
 
 
 def differentiate_step(
-    make: Callable[[Array], Any], x: Array, before: Differentiated, row: tuple[Array, Array], k: Array
-) -> tuple[Differentiated, DifferentiatedInnovation]:
+    make: Callable[[Array], Any], x: Array, before: EstimateWithDerivatives, row: tuple[Array, Array], k: Array
+) -> tuple[EstimateWithDerivatives, DifferentiatedInnovation]:
     """Return the estimate after a row (z, u), z NaN for what did not arrive, and the row's innovation.
 
     Args:
@@ -85,25 +85,25 @@ def differentiate_step(
     """
     z, u = row
     filter, present = make(x), ~jnp.isnan(z)
-    pairs = [jax.jvp(lambda x: matrices_of(make(x), u, k), (x,), (axis,)) for axis in np.eye(len(x))]
+    pairs = [jax.jvp(lambda x: find_model_matrices(make(x), u, k), (x,), (axis,)) for axis in np.eye(len(x))]
     # Behind a known gain no moment before data matters: those at the start stand for all.
     prior = filter.predict(filter.init()._replace(gaussian=before.gaussian), u, k)
     after, innovation = filter.correct(prior, z, k)
     value, covariance = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
-    step = Step(pairs[0][0], before.gaussian, prior.gaussian, value, covariance, present)
+    step = FilterStep(pairs[0][0], before.gaussian, prior.gaussian, value, covariance, present)
     following, errors, spreads = zip(
         *(step.differentiate(d, one) for (_, d), one in zip(pairs, before.slopes, strict=True)), strict=True
     )
     lost = jnp.any(jnp.isnan(after.gaussian.mean))
     whole = DifferentiatedInnovation(value, covariance, jnp.stack(errors), jnp.stack(spreads), present, lost)
-    return Differentiated(after.gaussian, following), whole
+    return EstimateWithDerivatives(after.gaussian, following), whole
 
 
-def matrices_of(filter: Any, u: Array, k: Array) -> Matrices:
+def find_model_matrices(filter: Any, u: Array, k: Array) -> ModelMatrices:
     """Return the matrices of a step."""
     plant, sensor, channel = at(filter.plant, k), at(filter.sensor, k), at(filter.channel, k)
     law, gain = sensor.noise, jnp.asarray(channel.mean_gain)
-    return Matrices(
+    return ModelMatrices(
         plant.transition_matrix(u),
         plant.shift(u),
         plant.noise_covariance(u),
@@ -113,26 +113,26 @@ def matrices_of(filter: Any, u: Array, k: Array) -> Matrices:
     )
 
 
-def _start_of(filter: Any) -> Slopes:
+def _start_of(filter: Any) -> MomentSlopes:
     """Return the mean and covariance before the first step."""
     plant = at(filter.plant, 0)
-    return Slopes(jnp.asarray(plant.initial_mean), jnp.asarray(plant.initial_covariance))
+    return MomentSlopes(jnp.asarray(plant.initial_mean), jnp.asarray(plant.initial_covariance))
 
 
-class Step(NamedTuple):
+class FilterStep(NamedTuple):
     """A step of a filter: its matrices, the laws before it and after its prediction, innovation e and covariance S.
 
     `present`: which components of e arrived (m,).
     """
 
-    matrices: Matrices
+    matrices: ModelMatrices
     before: Gaussian
     prior: Gaussian
     e: jax.Array
     S: jax.Array
     present: jax.Array
 
-    def differentiate(self, d: Matrices, before: Slopes) -> tuple[Slopes, jax.Array, jax.Array]:
+    def differentiate(self, d: ModelMatrices, before: MomentSlopes) -> tuple[MomentSlopes, jax.Array, jax.Array]:
         """Return the derivatives of the estimate after the step, and of e and S, zero of what did not arrive."""
         F, H, P = self.matrices.F, self.matrices.H, self.prior.covariance
         # Prediction.
@@ -152,4 +152,4 @@ class Step(NamedTuple):
         mean = mean + gain @ e + (cross - gain @ S) @ w
         # C' K' + K C'' - K S' K' = (C' - K S' / 2) K' and its transpose.
         turned = (cross - gain @ S / 2) @ gain.T
-        return Slopes(mean, symmetric(covariance - (turned + turned.T))), e, S
+        return MomentSlopes(mean, symmetric(covariance - (turned + turned.T))), e, S

@@ -18,7 +18,7 @@ from heliograph.filters.gaussian.update import Polytope
 from heliograph.filters.linear.belief import LinearBelief, motion_of_plant, predict_belief, prior_belief
 from heliograph.filters.linear.given_record import LinearFilterOfRecord
 from heliograph.filters.linear.plan import plan_filter
-from heliograph.filters.linear.scores import ScoreRows
+from heliograph.filters.linear.scores import ScoreRecursion
 from heliograph.filters.modes.additive import additive_modal_filter, independent_terms
 from heliograph.filters.modes.modal import modal_filter
 from heliograph.filters.modes.side_information import side_information_filter
@@ -26,16 +26,16 @@ from heliograph.filters.modes.uncertain import uncertain_modal_filter
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
 from heliograph.filters.words.linear import build_behind_words
 from heliograph.filters.wrappers.delay import build_behind_delays, deliver_line_as_current
-from heliograph.filters.wrappers.limited import keeps_limits
-from heliograph.filters.wrappers.sensor_inputs import takes_sensor_inputs
-from heliograph.filters.wrappers.told import takes_told
+from heliograph.filters.wrappers.limited import accept_limits
+from heliograph.filters.wrappers.sensor_inputs import accept_sensor_inputs
+from heliograph.filters.wrappers.told import accept_told_numbers
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation, lower_by_noise
 from heliograph.model.fading import memory_matters, uncertain_chain, without_memory
 from heliograph.model.modes_of_motion import models_of
 from heliograph.model.over_time import OverTime, at, first, stacked
 from heliograph.model.plant import AnyPlant
-from heliograph.model.premises.premise import believes, believing
+from heliograph.model.premises.premise import believes, on_premise
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.model.words.encoder import Words
 from heliograph.numerics.check import fail
@@ -119,7 +119,7 @@ class LinearFilter(AbstractSizedFilter):
         whole = stacked(self.channel)
         return not (whole.uncertain or np.any(np.asarray(whole.gain_spread)) or find_rounded(self.sensor))
 
-    def score_rows(self, make: Callable[[Array], "LinearFilter"], x: Float[Array, " p"], half: Array) -> ScoreRows:
+    def score_rows(self, make: Callable[[Array], "LinearFilter"], x: Float[Array, " p"], half: Array) -> ScoreRecursion:
         """Return the log-likelihood of rows, its derivatives and information, of a filter like this with free numbers.
 
         Args:
@@ -129,7 +129,7 @@ class LinearFilter(AbstractSizedFilter):
 
         Source: Gupta and Mehra, Computational aspects of maximum likelihood estimation (1974).
         """
-        return ScoreRows(make, x, half, informed=True)
+        return ScoreRecursion(make, x, half, informed=True)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains."""
@@ -169,10 +169,10 @@ def correct_linear(
     return state._replace(gaussian=after), innovation
 
 
-@keeps_limits
+@accept_limits
 @believes
-@takes_sensor_inputs
-@takes_told
+@accept_sensor_inputs
+@accept_told_numbers
 def linear_filter(
     plant: AnyPlant,
     sensor: AnySensor,
@@ -223,7 +223,7 @@ def linear_filter(
             raise fail("update", "none behind a channel that remembers", type(update).__name__)
         if has_bounded_noise(plant, sensor, channel):
             raise fail("noise behind a channel that remembers", "a known law", "bounds of outliers alone")
-        filter = _make_behind_memory(plant, sensor, channel)
+        filter = _make_filter_behind_memory(plant, sensor, channel)
         return replace(filter, claim=lower_by_noise(filter.claim, sensor)) if find_rounded(sensor) else filter
     # Independent draws: second moments of the channel are all that matters.
     rule = Polytope() if update is None else update
@@ -244,10 +244,10 @@ def linear_filter(
     )
 
 
-def _make_behind_memory(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> AbstractFilter:
+def _make_filter_behind_memory(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> AbstractFilter:
     """Return the filter that estimates the modes of links, plant and sensor jointly with the state."""
     if is_modal(first(plant)) or is_modal(first(sensor)):
-        return _make_of_jump_system(plant, sensor, channel)
+        return _make_jump_system_filter(plant, sensor, channel)
     if first(channel).erases:
         return side_information_filter(plant, sensor, channel)
     if uncertain_chain(channel):
@@ -256,7 +256,7 @@ def _make_behind_memory(plant: AnyPlant, sensor: AnySensor, channel: Channel) ->
     return additive_modal_filter(plant, sensor, terms) if len(terms) > 1 else modal_filter(plant, sensor, channel)
 
 
-def _make_of_jump_system(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> AbstractFilter:
+def _make_jump_system_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> AbstractFilter:
     """Return the filter of a plant or sensor that has modes; raise behind links that lose or have uncertain laws."""
     if first(channel).erases:
         expected = "a link without losses where plant or sensor has modes (a row that is lost is NaN; imm_filter else)"
@@ -268,8 +268,8 @@ def _make_of_jump_system(plant: AnyPlant, sensor: AnySensor, channel: Channel) -
 
 
 @believes
-@takes_sensor_inputs
-@takes_told
+@accept_sensor_inputs
+@accept_told_numbers
 def memoryless_filter(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, update: Polytope | None = None
 ) -> AbstractFilter:
@@ -330,4 +330,4 @@ def as_current_filter(
 
 def _claim_nominal(ignoring: LinearFilter) -> LinearFilter:
     """Return the same filter with claim nominal: it ignores delay or memory that the link has."""
-    return believing(replace(ignoring, claim="nominal"), ignoring.premise)
+    return on_premise(replace(ignoring, claim="nominal"), ignoring.premise)

@@ -23,7 +23,7 @@ from heliograph.model.estimate import Claim, Estimate, Innovation, lower_by_nois
 from heliograph.model.fading import uncertain_chain
 from heliograph.model.over_time import at, first, steps_covered, unstack
 from heliograph.model.plant import AnyPlant
-from heliograph.model.premises.premise import Premise, believing
+from heliograph.model.premises.premise import Premise, on_premise
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.density import log_density
@@ -188,7 +188,7 @@ def polynomial_filter(
     claim = lmmse(system, polynomial_claim(plant, sensor, channel, degree)).claim
     inner = LinearSystemFilter(system, claim, first(plant).states)
     filter = PolynomialFilter(inner, degree, _is_steady(plant, sensor, channel, system), centre)
-    return believing(filter, Premise(plant, sensor, channel, order=2 * degree))
+    return on_premise(filter, Premise(plant, sensor, channel, order=2 * degree))
 
 
 def _lift_about_mean(
@@ -229,7 +229,7 @@ def scheduled_polynomial_filter(
     """
     centre, system = _lift_about_mean(plant, sensor, channel, degree, horizon)
     inner = ScheduledFilter(lmmse(system, polynomial_claim(plant, sensor, channel, degree)), first(plant).states)
-    return believing(PolynomialFilter(inner, degree, centre=centre), Premise(plant, sensor, channel, order=2 * degree))
+    return on_premise(PolynomialFilter(inner, degree, centre=centre), Premise(plant, sensor, channel, order=2 * degree))
 
 
 class MemoryState(NamedTuple):
@@ -312,7 +312,7 @@ def memory_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon:
     products = lmmse(quadratic_system_with_linear_estimate(centred_plant, sensor, channel, linear), linear.claim)
     names = first(plant).states
     filter = MemoryFilter(ScheduledFilter(linear, names), ScheduledFilter(products, names), products.claim, centre)
-    return believing(filter, Premise(plant, sensor, channel, order=4))
+    return on_premise(filter, Premise(plant, sensor, channel, order=4))
 
 
 def polynomial_claim(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: int) -> Claim:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.factors.columns import Columns, columns_of_each, join_columns, rounding_of, triangularise
+from heliograph.factors.columns import WeightedColumns, factor_covariances, join_columns, rounding_of, triangularise
 from heliograph.factors.gaussian import Gaussian, from_covariance, predict_affine
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.gaussian.signal import condition_on_measurement
@@ -193,8 +193,8 @@ class LinearSystemFilter(AbstractSizedFilter):
 class SystemNoises(NamedTuple):
     """Factors of both noises of a step, with the rounding of the state and of the measurement."""
 
-    process: Columns
-    measurement: Columns
+    process: WeightedColumns
+    measurement: WeightedColumns
 
 
 @in_float64
@@ -207,27 +207,27 @@ def _factor_noises(system: LinearSystem) -> SystemNoises:
     s = system.steps
     of_states, of_received = _second_moments_of_steps(system)
 
-    def factor(covariances: np.ndarray, seconds: np.ndarray, lost: np.ndarray) -> Columns:
+    def factor(covariances: np.ndarray, seconds: np.ndarray, lost: np.ndarray) -> WeightedColumns:
         """Return the factors of noises (time, n, n), with the rounding of numbers of second moments (time, n)."""
         rounding = seconds + np.diagonal(covariances, axis1=1, axis2=2)
-        return _factor_with_rounding(columns_of_each(covariances), rounding, lost)
+        return _factor_with_rounding(factor_covariances(covariances), rounding, lost)
 
     process = factor(np.asarray(s.process), of_states, np.zeros(of_states.shape))
     return SystemNoises(process, factor(np.asarray(s.noise), of_received, system.received_rounding))
 
 
 @compile_in_float64
-def _factor_with_rounding(noise: Columns, seconds: Array, lost: Array) -> Columns:
+def _factor_with_rounding(noise: WeightedColumns, seconds: Array, lost: Array) -> WeightedColumns:
     """Return the factors of each step's noise, the rounding of numbers of these second moments, and what was lost.
 
     Shapes: noise (steps, n, columns), seconds and lost (steps, n), variances lost already.
     """
 
-    def factor_step(noise: Columns, seconds: jax.Array, lost: jax.Array) -> Columns:
+    def factor_step(noise: WeightedColumns, seconds: jax.Array, lost: jax.Array) -> WeightedColumns:
         """Return the factors of one step."""
-        return triangularise(join_columns(noise, rounding_of(seconds), Columns(np.eye(len(lost)), lost)))
+        return triangularise(join_columns(noise, rounding_of(seconds), WeightedColumns(np.eye(len(lost)), lost)))
 
-    factor_steps: Callable[..., Columns] = jax.vmap(factor_step)
+    factor_steps: Callable[..., WeightedColumns] = jax.vmap(factor_step)
     return factor_steps(noise, seconds, lost)
 
 

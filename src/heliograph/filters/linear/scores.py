@@ -10,7 +10,7 @@ import numpy as np
 
 from heliograph.engine.choice import compute_once
 from heliograph.filters.chunks import is_long, scan_in_chunks, sum_in_chunks
-from heliograph.filters.linear.derivatives import Differentiated, differentiate_start, differentiate_step
+from heliograph.filters.linear.derivatives import EstimateWithDerivatives, differentiate_start, differentiate_step
 from heliograph.filters.recursion import Recursion
 from heliograph.numerics.density import differentiate_log_density
 from heliograph.numerics.float64 import quickly_compiled
@@ -19,7 +19,7 @@ from heliograph.numerics.types import Array, PyTree
 Scores = tuple[Array, Array, Array]  # log-densities, scores, information by half of the recording
 
 
-class ScoreRows(Recursion):
+class ScoreRecursion(Recursion):
     """A filter with free numbers x over rows: log-density and score of each row, with the derivatives of its estimate.
 
     Where it is `informed` also information (2, p, p), by halves of the recording.
@@ -36,7 +36,9 @@ class ScoreRows(Recursion):
     half: Array
     informed: bool = eqx.field(static=True)
 
-    def step(self, state: Differentiated, row: tuple[Array, Array], k: Array) -> tuple[Differentiated, PyTree]:
+    def step(
+        self, state: EstimateWithDerivatives, row: tuple[Array, Array], k: Array
+    ) -> tuple[EstimateWithDerivatives, PyTree]:
         """Return the estimate and its derivatives after row k, and what is kept of the row."""
         after, (e, s, *slopes, present, lost) = differentiate_step(self.make, self.x, state, row, k)
         size = jnp.abs(row[0]) + jnp.abs(row[0] - e)
@@ -50,7 +52,7 @@ class ScoreRows(Recursion):
 
     def scan(self, z: Array, u: Array) -> Scores:
         """Return log-densities (rows,) and scores (rows, p) row by row, and the information; it may be traced."""
-        Now = tuple[Differentiated, jax.Array]  # a state, and the information of the rows before
+        Now = tuple[EstimateWithDerivatives, jax.Array]  # a state, and the information of the rows before
 
         def body(now: Now, row: tuple[Array, Array, Array]) -> tuple[Now, tuple[jax.Array, jax.Array]]:
             k, z, u = row
@@ -74,15 +76,15 @@ class ScoreRows(Recursion):
         sums = self.sum_long(z, u)
         if sums is None:
             return None
-        rows = scan_in_chunks(ScoreRows(self.make, self.x, self.half, informed=False), self._start(), (z, u))
+        rows = scan_in_chunks(ScoreRecursion(self.make, self.x, self.half, informed=False), self._start(), (z, u))
         return None if rows is None else (*rows.outputs, sums[2])
 
-    def _start(self) -> Differentiated:
-        start: Differentiated = compute_once(_start_at, _start_by_xla, (self.make, self.x))
+    def _start(self) -> EstimateWithDerivatives:
+        start: EstimateWithDerivatives = compute_once(_start_at, _start_by_xla, (self.make, self.x))
         return start
 
 
-def _start_at(make: Callable[[Array], Any], x: Array) -> Differentiated:
+def _start_at(make: Callable[[Array], Any], x: Array) -> EstimateWithDerivatives:
     return differentiate_start(make, x)
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from jax.scipy.linalg import block_diag
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.factors.columns import Columns, join_columns, rounding_of, side_by_side, triangularise
+from heliograph.factors.columns import WeightedColumns, join_columns, rounding_of, side_by_side, triangularise
 from heliograph.factors.gaussian import Gaussian, from_columns, from_covariance
 from heliograph.filters.base import Step, corrects, make_sizes, predicts
 from heliograph.filters.gaussian.signal import factor_spread
@@ -44,7 +44,7 @@ from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.linalg import outer
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
-from heliograph.random_affine.superposed import terms_without_common_memory
+from heliograph.random_affine.superposed import split_terms_without_common_memory
 
 Terms = tuple[ChannelByMode | OverTime, ...]  # of a sum, each with modes of its own
 Laws = tuple[jax.Array, ...]  # of the modes of each term
@@ -100,7 +100,7 @@ class AdditiveModalFilter(AbstractModalFilter):
         moved = predict_by_mode(centred[:, None], move, _function_transition(rows).T)[:, 0]
         mean = moved + self._mean_from_centre(centre)
         root, noise_of_zeta = self._transition_factors(state, u, k)
-        after = from_columns(mean, join_columns(Columns(root, state.gaussian.variances), noise_of_zeta))
+        after = from_columns(mean, join_columns(WeightedColumns(root, state.gaussian.variances), noise_of_zeta))
         second = move @ state.second @ move.T + noise
         return AdditiveBelief(after, second, _next_laws(state.laws, rows), centre, jnp.asarray(True))
 
@@ -143,7 +143,7 @@ class AdditiveModalFilter(AbstractModalFilter):
         chains = [jnp.asarray(term.transition) for term in at(self.terms, k)]
         return tuple(jnp.where(state.moved, chain, jnp.eye(len(chain))) for chain in chains)
 
-    def _transition_factors(self, state: AdditiveBelief, u: ArrayLike, k: Step) -> tuple[jax.Array, Columns]:
+    def _transition_factors(self, state: AdditiveBelief, u: ArrayLike, k: Step) -> tuple[jax.Array, WeightedColumns]:
         """Return F L of zeta = E zeta + L xi, and columns of Cov(zeta+ - F zeta).
 
         They are those of C x A~ E[x~ x~'] A~' + Gamma+ x Q~, with C = sum_i P(i) Cov(1{next} | i) of each chain.
@@ -156,7 +156,9 @@ class AdditiveModalFilter(AbstractModalFilter):
         ]
         jumps = _block_diagonal_columns(np.zeros((1, 0)), jump_covariances)
         carried = factor_spread(move @ state.second @ move.T)
-        by_jumps = Columns(kron(jumps.matrix, carried.matrix), outer(jumps.weights, carried.weights).reshape(-1))
+        by_jumps = WeightedColumns(
+            kron(jumps.matrix, carried.matrix), outer(jumps.weights, carried.weights).reshape(-1)
+        )
         next_gamma = _second_moment_of_functions(_next_laws(state.laws, rows))
         noise = join_columns(by_jumps, self.process_noise_by_mode(u, k, next_gamma))
         return predict_by_mode(state.gaussian.root, move, _function_transition(rows).T), noise
@@ -176,7 +178,7 @@ class AdditiveModalFilter(AbstractModalFilter):
         mean_gain_by_function = jnp.einsum("ac,amp->cmp", gamma.matrix, gains)
         sensor_columns = jnp.asarray(mean_gain_by_function[:, :, :-1] @ sensor.noise.columns.matrix)
         weights = jnp.broadcast_to(sensor.noise.columns.weights, (len(sensor_columns), sensor_columns.shape[-1]))
-        known_noise = [side_by_side(Columns(sensor_columns, weights), gamma.weights)]
+        known_noise = [side_by_side(WeightedColumns(sensor_columns, weights), gamma.weights)]
         # Noise of the links themselves, in the mean over the modes j of each.
         known_noise += [side_by_side(term.noise, law) for term, law in zip(terms, state.laws, strict=True)]
         # Spread of the gains given the mode, on what is sent, in the mean over the modes (m, m).
@@ -215,19 +217,19 @@ def _indicator_covariance(law: jax.Array) -> jax.Array:
     return jnp.diag(law[1:]) - jnp.outer(law[1:], law[1:])
 
 
-def _second_moment_of_functions(laws: Laws) -> Columns:
+def _second_moment_of_functions(laws: Laws) -> WeightedColumns:
     """Return Gamma = E[phi phi'] of (1, phi_1, ...) as columns."""
     return _block_diagonal_columns(np.eye(1), [_indicator_covariance(law) for law in laws])
 
 
-def _block_diagonal_columns(one: np.ndarray, covariances: Sequence[jax.Array]) -> Columns:
+def _block_diagonal_columns(one: np.ndarray, covariances: Sequence[jax.Array]) -> WeightedColumns:
     """Return the columns of blkdiag(one one', C_1, C_2, ...) for covariances C_i."""
     factors = [factor_spread(covariance) for covariance in covariances if len(covariance)]
     weights = jnp.concatenate([jnp.ones(one.shape[1]), *(factor.weights for factor in factors)])
     rows = sum(len(factor.matrix) for factor in factors)
     blocks: jax.Array = block_diag(*(factor.matrix for factor in factors)).reshape(rows, -1)
     top = jnp.concatenate([jnp.asarray(one), np.zeros((1, blocks.shape[1]))], axis=1)
-    return Columns(jnp.concatenate([top, jnp.pad(blocks, ((0, 0), (one.shape[1], 0)))]), weights)
+    return WeightedColumns(jnp.concatenate([top, jnp.pad(blocks, ((0, 0), (one.shape[1], 0)))]), weights)
 
 
 def additive_modal_filter(plant: AnyPlant, sensor: AnySensor, terms: Sequence[Channel]) -> AdditiveModalFilter:
@@ -240,7 +242,7 @@ def additive_modal_filter(plant: AnyPlant, sensor: AnySensor, terms: Sequence[Ch
 
 def independent_terms(channel: Channel) -> list[Channel]:
     """Return the terms of a sum that share no memory; a channel that is no sum, or of one term, is that term."""
-    steps = [terms_without_common_memory(step) for step in unstack(channel)]
+    steps = [split_terms_without_common_memory(step) for step in unstack(channel)]
     if len({len(terms) for terms in steps}) > 1 or len(steps[0]) == 1:
         return [channel]
     return [restack(parts, channel) for parts in zip(*steps, strict=True)]

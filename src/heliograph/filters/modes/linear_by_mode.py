@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import Columns, rounding_of
+from heliograph.factors.columns import WeightedColumns, rounding_of
 from heliograph.filters.gaussian.belief import process_noise
 from heliograph.model.plant import LinearPlant
 from heliograph.model.sensor import LinearSensor
@@ -42,12 +42,12 @@ def centred_measurement(sensor: LinearSensor, centre: jax.Array) -> tuple[jax.Ar
     return measure.at[:-1, -1].add(measure[:-1, :-1] @ centre), noise
 
 
-def noise_in_mode(plant: LinearPlant, u: ArrayLike, start: jax.Array) -> Columns:
+def noise_in_mode(plant: LinearPlant, u: ArrayLike, start: jax.Array) -> WeightedColumns:
     """Return factors of the process noise of x~ = (x, 1), with the rounding of the state and of the indicator."""
     w = process_noise(plant, jnp.asarray(u), start)
     of_indicator = rounding_of(np.ones(1))
     matrix = jax.scipy.linalg.block_diag(w.matrix, of_indicator.matrix)
-    return Columns(matrix, jnp.append(w.weights, of_indicator.weights))
+    return WeightedColumns(matrix, jnp.append(w.weights, of_indicator.weights))
 
 
 def pad_with_zeros(a: jax.Array) -> jax.Array:
@@ -95,11 +95,13 @@ def centred_motion(
 
 def noise_by_mode(
     plants: Sequence[LinearPlant], modes: Sequence[int], u: ArrayLike, start: jax.Array, law: jax.Array
-) -> Columns:
+) -> WeightedColumns:
     """Return columns of the process noise and rounding of zeta, P(j) Cov w_j in the block of mode j."""
     parts = [noise_in_mode(plant, u, start) for plant in plants]
     matrix = jax.scipy.linalg.block_diag(*(parts[mode].matrix for mode in modes))
-    return Columns(matrix, jnp.concatenate([p * parts[mode].weights for p, mode in zip(law, modes, strict=True)]))
+    return WeightedColumns(
+        matrix, jnp.concatenate([p * parts[mode].weights for p, mode in zip(law, modes, strict=True)])
+    )
 
 
 def centred_sensing(

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.factors.columns import Columns, columns_of_each, join_columns, rounding_of, square_root
+from heliograph.factors.columns import WeightedColumns, factor_covariances, join_columns, rounding_of, square_root
 from heliograph.factors.gaussian import (
     Gaussian,
     condition_on_observation,
@@ -28,15 +28,15 @@ from heliograph.filters.base import (
 from heliograph.filters.gaussian.belief import process_noise, second_moments_at_start
 from heliograph.filters.innovation import mixed_innovation, posterior_weights
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
-from heliograph.filters.wrappers.limited import keeps_limits
-from heliograph.filters.wrappers.told import takes_told
+from heliograph.filters.wrappers.limited import accept_limits
+from heliograph.filters.wrappers.told import accept_told_numbers
 from heliograph.model.channel import Channel, check_link, find_received_angles
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first, list_steps, restack, steps_covered
 from heliograph.model.plant import AnyPlant
 from heliograph.model.premises.premise import believes
 from heliograph.model.sensor import AnySensor, LinearSensor, is_linear
-from heliograph.numerics.angle import Angles, nearest, wrap_angles
+from heliograph.numerics.angle import Angles, wrap_angles, wrap_near
 from heliograph.numerics.check import fail, scalar
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import is_traced, stack_parts
@@ -62,7 +62,7 @@ class AtomCombinations(Module):
     weight: Array
     gain: Array
     offset: Array
-    noise: Columns
+    noise: WeightedColumns
     mode: np.ndarray
     transition: Array
 
@@ -125,19 +125,21 @@ class MixtureFilter(AbstractSizedFilter):
         prior, size = state.law[c.mode] * jnp.asarray(c.weight), square_root(second_moments_at_start(self.plant))
         present = ~jnp.isnan(z)
 
-        def condition(gain: jax.Array, offset: jax.Array, noise: Columns) -> tuple[Gaussian, tuple[jax.Array, ...]]:
+        def condition_on_combination(
+            gain: jax.Array, offset: jax.Array, noise: WeightedColumns
+        ) -> tuple[Gaussian, tuple[jax.Array, ...]]:
             """Return one combination's update, and log-likelihood, count of exact components, innovation and Cov z."""
             slopes, value = gain @ x.root, wrap_angles(z - gain @ x.mean - offset, self.observed_angles)
             noise = join_columns(noise, rounding_of((jnp.abs(gain) @ size) ** 2))
             after, innovations = condition_on_observation(x, slopes, value, noise, present)
             likelihood = innovations.log_density(present, jnp.abs(z) + jnp.abs(z - value))
-            total = join_columns(Columns(slopes, x.variances), noise).covariance
+            total = join_columns(WeightedColumns(slopes, x.variances), noise).covariance
             return after, (likelihood, jnp.sum(present & innovations.determined), value, total)
 
-        after, (likelihood, certain, value, total) = jax.vmap(condition)(c.gain, c.offset, c.noise)
+        after, (likelihood, certain, value, total) = jax.vmap(condition_on_combination)(c.gain, c.offset, c.noise)
         weight, density, excluded = posterior_weights(prior, drop_below_point_mass(likelihood, certain))
         # Innovation of the mixture, angles near that of the most probable combination.
-        value = nearest(value, value[jnp.argmax(prior)], self.observed_angles)
+        value = wrap_near(value, value[jnp.argmax(prior)], self.observed_angles)
         total = jnp.where(present[:, None] & present, total, jnp.nan)
         innovation = mixed_innovation(prior, value, total, density)
         modes = weight @ (c.mode[:, None] == jnp.arange(len(state.law)))
@@ -169,9 +171,9 @@ def drop_below_point_mass(likelihood: Float[Array, " a"], certain: Int[Array, " 
     return jnp.where(agrees & (certain < most), -jnp.inf, likelihood)
 
 
-@keeps_limits
+@accept_limits
 @believes
-@takes_told
+@accept_told_numbers
 def mixture_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, resolution: float = 0.0) -> MixtureFilter:
     """Return the filter on the full laws of gains and noises of finitely many values, with one Gaussian a step.
 
@@ -243,7 +245,7 @@ def _list_combinations(sensor: AnySensor, now: JointModes, before: JointModes, f
         weight=weight,
         gain=gain,
         offset=offset,
-        noise=columns_of_each(noise + floor * np.eye(noise.shape[-1])),
+        noise=factor_covariances(noise + floor * np.eye(noise.shape[-1])),
         mode=np.array(modes),
         transition=before.transition,
     )

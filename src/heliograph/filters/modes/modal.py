@@ -20,7 +20,7 @@ import numpy as np
 
 from heliograph.engine.choice import compile_on_call
 from heliograph.factors.columns import (
-    Columns,
+    WeightedColumns,
     below_diagonal,
     join_columns,
     rounding_of,
@@ -71,7 +71,7 @@ class ChannelByMode(Module):
     radius: Float[Array, "M M"]
     mean: Float[Array, "M m p1"]
     gain_spread: Float[Array, "M m m p1 p1"]
-    noise: Columns
+    noise: WeightedColumns
 
     @property
     def spread(self) -> Float[Array, "M m m p1 p1"]:
@@ -108,7 +108,7 @@ class MeasurementModel(NamedTuple):
 
     matrix: jax.Array
     common: jax.Array
-    noise: Columns
+    noise: WeightedColumns
 
 
 class AbstractModalFilter(AbstractSizedFilter):
@@ -121,16 +121,16 @@ class AbstractModalFilter(AbstractSizedFilter):
     def estimate(self, state: PyTree) -> Estimate:
         """Return x, a projection of zeta, and the covariance of its error."""
         projection, x = self._projection_to_state(), state.gaussian
-        return Estimate(projection @ x.mean, Columns(projection @ x.root, x.variances).covariance, self.claim)
+        return Estimate(projection @ x.mean, WeightedColumns(projection @ x.root, x.variances).covariance, self.claim)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains."""
         return plan_filter(self, inputs, self._projection_to_state())
 
-    def process_noise_by_mode(self, u: ArrayLike, k: Step, of_mode: Columns) -> Columns:
+    def process_noise_by_mode(self, u: ArrayLike, k: Step, of_mode: WeightedColumns) -> WeightedColumns:
         """Return columns of zeta's process noise and rounding, from `of_mode` = E[phi phi'] of the next functions."""
         parts = noise_in_mode(at(self.plant, k), u, second_moments_at_start(self.plant))
-        return Columns(kron(of_mode.matrix, parts.matrix), outer(of_mode.weights, parts.weights).reshape(-1))
+        return WeightedColumns(kron(of_mode.matrix, parts.matrix), outer(of_mode.weights, parts.weights).reshape(-1))
 
     @abstractmethod
     def _projection_to_state(self) -> Float[np.ndarray, "n N"]:
@@ -183,7 +183,7 @@ class ModalFilter(AbstractJointModalFilter):
         centred = state.gaussian.mean - mean_from_centre(state.law, state.centre)
         mean = predict_by_mode(centred[:, None], motion.moves, rows)[:, 0] + mean_from_centre(law, motion.centre)
         root, noise = self._transition_factors(state, u, k)
-        after = from_columns(mean, join_columns(Columns(root, state.gaussian.variances), noise))
+        after = from_columns(mean, join_columns(WeightedColumns(root, state.gaussian.variances), noise))
         moments = propagate_by_mode(motion.moves, arriving, law[:, None, None] * motion.noises)
         return ModalBelief(after, moments, motion.centre, jnp.asarray(True))
 
@@ -202,13 +202,13 @@ class ModalFilter(AbstractJointModalFilter):
         """Return the transition matrix (M, M) of the chain; the identity before the first prediction."""
         return jnp.where(state.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(state.moments)))
 
-    def _transition_factors(self, state: ModalBelief, u: ArrayLike, k: Step) -> tuple[jax.Array, Columns]:
+    def _transition_factors(self, state: ModalBelief, u: ArrayLike, k: Step) -> tuple[jax.Array, WeightedColumns]:
         """Return F L of zeta = E zeta + L xi, and columns of Cov(zeta+ - F zeta)."""
         rows, moves, plants = self._transition_matrix(state, k), self._motion(state, u, k).moves, self._plants(k)
         # What the chain draws moves in its mode.
         among = mode_transition_covariance(state.moments, rows)
         parts = among.matrix.reshape(*moves.shape[:2], -1)
-        drawn = Columns((moves @ parts).reshape(among.matrix.shape), among.weights)
+        drawn = WeightedColumns((moves @ parts).reshape(among.matrix.shape), among.weights)
         start = second_moments_at_start(self.plant)
         of_process = noise_by_mode(plants, self.plant_modes, u, start, state.law @ rows)
         return predict_by_mode(state.gaussian.root, moves, rows), join_columns(drawn, of_process)
@@ -249,7 +249,7 @@ def predict_by_mode(columns: jax.Array, moves: jax.Array, rows: jax.Array) -> ja
     return jnp.reshape(moves @ parts, columns.shape)
 
 
-def mode_transition_covariance(moments: jax.Array, rows: jax.Array) -> Columns:
+def mode_transition_covariance(moments: jax.Array, rows: jax.Array) -> WeightedColumns:
     """Return columns of sum_i Cov(1{next} | i) x E_i (N, N), what the chain draws, from the moments E_i (M, s, s)."""
     return separate_modes(jnp.einsum("ijl,iab->jalb", covariance_of_mode(rows)[:, :-1, :-1], moments))
 
@@ -259,7 +259,7 @@ def covariance_of_mode(rows: jax.Array) -> jax.Array:
     return rows[:, :, None] * (np.eye(rows.shape[1]) - rows[:, None, :])
 
 
-def separate_modes(among: jax.Array) -> Columns:
+def separate_modes(among: jax.Array) -> WeightedColumns:
     """Return columns (M s, ...) of a covariance over all M modes, whose parts of size s sum to zero over the modes.
 
     `among` (M - 1, s, M - 1, s): the covariance of all modes but the last, whose part is minus the sum of theirs.
@@ -269,14 +269,14 @@ def separate_modes(among: jax.Array) -> Columns:
     return factors.through(np.concatenate([np.eye(others * size), -np.tile(np.eye(size), (1, others))]))
 
 
-def known_noise(channel: ChannelByMode, sent: Sequence[Columns], law: jax.Array) -> Columns:
+def known_noise(channel: ChannelByMode, sent: Sequence[WeightedColumns], law: jax.Array) -> WeightedColumns:
     """Return the columns of sum_j P(j) (Hbar_j Cov(v_j) Hbar_j' + Cov n_j) (m, m), which no signal scales."""
     gains = jnp.asarray(channel.mean)[:, :, :-1]
     received = [noise.through(gain).times(p) for gain, noise, p in zip(gains, sent, law, strict=True)]
     return join_columns(*received, side_by_side(channel.noise, law))
 
 
-def rounding_of_received(gains: jax.Array, sent: jax.Array) -> Columns:
+def rounding_of_received(gains: jax.Array, sent: jax.Array) -> WeightedColumns:
     """Return the rounding (m, m) of z, of gains (M, m, p + 1), from E[y~ y~' 1{mode}] (M, p + 1, p + 1)."""
     return rounding_of(jnp.einsum("jma,jab,jmb->m", gains, sent, gains))
 
@@ -373,7 +373,7 @@ def channel_by_mode(now: JointModes, before: JointModes) -> ChannelByMode:
     """Return the moments of the channel by mode at one step, and the transition from the step before."""
     mean = stack_parts([m.moments(1).mean[:-1] for m in now.maps])
     gains, noises = zip(*(split_off_noise(nominal_spread(m).center) for m in now.maps), strict=True)
-    noise = Columns(*(stack_parts(part) for part in zip(*noises, strict=True)))
+    noise = WeightedColumns(*(stack_parts(part) for part in zip(*noises, strict=True)))
     return ChannelByMode(
         transition=before.transition, radius=before.radius, mean=mean, gain_spread=stack_parts(gains), noise=noise
     )

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.factors.columns import Columns
+from heliograph.factors.columns import WeightedColumns
 from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.gaussian.belief import second_moments_at_start
@@ -23,7 +23,7 @@ from heliograph.model.estimate import Estimate, Innovation, lower_by_noise
 from heliograph.model.fading import uncertain_chain, with_flag
 from heliograph.model.over_time import at, at_each_step, first, unstack
 from heliograph.model.plant import AnyPlant
-from heliograph.model.premises.premise import Premise, believing
+from heliograph.model.premises.premise import Premise, on_premise
 from heliograph.model.sensor import AnySensor, check_linear
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import ArrayLike, Bool, Float
@@ -78,7 +78,7 @@ class ModeObservedFilter(AbstractSizedFilter):
             belief=belief,
             before=belief,
             z=jnp.full(first(self.channel).outputs, jnp.nan),
-            move=PlantMotion(jnp.eye(n), jnp.zeros(n), zeros, Columns(zeros, jnp.zeros(n))),
+            move=PlantMotion(jnp.eye(n), jnp.zeros(n), zeros, WeightedColumns(zeros, jnp.zeros(n))),
             begun=jnp.asarray(False),
         )
 
@@ -233,4 +233,4 @@ def _make_mode_observed_filter(plant: AnyPlant, sensor: AnySensor, channel: Chan
         **make_sizes(lower_by_noise(claim, plant, sensor, channel), start, received_numbers),
     )
     received = at_each_step(lambda link: with_flag(link, late=late), channel) if memories(channel) else channel
-    return believing(filter, Premise(plant, sensor, received))
+    return on_premise(filter, Premise(plant, sensor, received))

@@ -26,11 +26,11 @@ def describe_modes(
     no_flags = np.ones((len(steps[0].initial), 1))
     parts = describe_by_pattern(steps, no_flags)
     for step in parts if len(no_flags) > 1 else []:
-        _check_random(step)
+        _check_density(step)
     return steps[0], restack(parts, channel)
 
 
-def _check_random(channel: SideInformation) -> None:
+def _check_density(channel: SideInformation) -> None:
     """Raise unless z has a density in every combination of mode and pattern of arrivals, for an x that has one."""
     for j, a in np.argwhere(np.asarray(channel.chance) > 0):
         # M M' plus the spread at Y = I is regular where every combination of the rows that arrive is random.

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.factors.columns import Columns
+from heliograph.factors.columns import WeightedColumns
 from heliograph.factors.gaussian import (
     BackwardGain,
     Gaussian,
@@ -48,9 +48,9 @@ from heliograph.filters.modes.models_by_mode import fields_of_mode_filters
 from heliograph.filters.modes.pairs import ModalLaw, ModalSmootherStep, move_pairs
 from heliograph.filters.modes.patterns import SideInformation, pattern_of
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
-from heliograph.filters.wrappers.limited import keeps_limits
-from heliograph.filters.wrappers.sensor_inputs import takes_sensor_inputs
-from heliograph.filters.wrappers.told import takes_told
+from heliograph.filters.wrappers.limited import accept_limits
+from heliograph.filters.wrappers.sensor_inputs import accept_sensor_inputs
+from heliograph.filters.wrappers.told import accept_told_numbers
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.modes_of_motion import ModalPlant, models_of, transition_over
@@ -58,7 +58,7 @@ from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.premises.premise import believes
 from heliograph.model.sensor import AnySensor
-from heliograph.numerics.angle import Angles, nearest, wrap_angles
+from heliograph.numerics.angle import Angles, wrap_angles, wrap_near
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, PyTree
 
 T = TypeVar("T", bound=PyTree)
@@ -89,16 +89,16 @@ def correct_in_every_mode(
     weights, density, excluded = posterior_weights(prior, jnp.where(chance > 0, received.log_likelihood, -jnp.inf))
     possible = (chance > 0) & ~excluded  # a mode in which this cannot arrive has no map for it
     after = jax.tree.map(lambda a, b: jnp.where(possible[:, None], a, b), posteriors, signal.prior)
-    value = nearest(jnp.asarray(received.value), received.value[jnp.argmax(prior)], angles)
+    value = wrap_near(jnp.asarray(received.value), received.value[jnp.argmax(prior)], angles)
     return after, weights, mixed_innovation(prior, value, received.covariance, density)
 
 
 def _correct_in_mode(
-    signal: Signal, mean: jax.Array, gain_spread: jax.Array, link: Columns, z: jax.Array, angles: Angles
+    signal: Signal, mean: jax.Array, gain_spread: jax.Array, link: WeightedColumns, z: jax.Array, angles: Angles
 ) -> tuple[Gaussian, Innovation]:
     """Correct the prior of a signal in one mode of the channel, of moments as in `SecondOrder`."""
     expected = mean[:, :-1] @ signal.mean + mean[:, -1]
-    z = nearest(z, expected, angles)
+    z = wrap_near(z, expected, angles)
     slopes, noise = mean[:, :-1] @ signal.slopes, noise_behind_gain(signal, mean[:, :-1], gain_spread, link)
     return condition_on_measurement(signal.prior, slopes, noise, z, expected)
 
@@ -274,10 +274,10 @@ def align_angles(plant: AbstractPlant, mean: jax.Array, weight: jax.Array) -> ja
     return plant.near(mean, mean[jnp.argmax(weight)]) if plant.circular else mean
 
 
-@keeps_limits
+@accept_limits
 @believes
-@takes_sensor_inputs
-@takes_told
+@accept_sensor_inputs
+@accept_told_numbers
 def imm_filter(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, transform: AbstractTransform | None = None, nodes: int = NODES
 ) -> MultipleModelFilter:
@@ -307,10 +307,10 @@ def imm_filter(
     )
 
 
-@keeps_limits
+@accept_limits
 @believes
-@takes_sensor_inputs
-@takes_told
+@accept_sensor_inputs
+@accept_told_numbers
 def gpb1_filter(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, transform: AbstractTransform | None = None, nodes: int = NODES
 ) -> MultipleModelFilter:
@@ -336,10 +336,10 @@ def gpb1_filter(
     return MultipleModelFilter(merging=MergeAll(), **fields_of_mode_filters(plant, sensor, channel, transform, nodes))
 
 
-@keeps_limits
+@accept_limits
 @believes
-@takes_sensor_inputs
-@takes_told
+@accept_sensor_inputs
+@accept_told_numbers
 def gpb2_filter(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, transform: AbstractTransform | None = None, nodes: int = NODES
 ) -> MultipleModelFilter:

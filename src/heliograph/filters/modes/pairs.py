@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import Columns, decorrelate, join_columns, unit_lower
+from heliograph.factors.columns import WeightedColumns, decorrelate, join_columns, unit_lower
 from heliograph.factors.gaussian import (
     BackwardGain,
     Gaussian,
@@ -29,10 +29,10 @@ from heliograph.filters.gaussian.signal import condition_on_measurement
 from heliograph.filters.gaussian.transform import AbstractTransform
 from heliograph.filters.modes.mixing import normalise_columns
 from heliograph.filters.smoother_step import EarlierState, SmootherStep
-from heliograph.filters.truncation import hold_mean, truncate_to_limits
+from heliograph.filters.truncation import hold_mean_within_limits, truncate_to_limits
 from heliograph.model.estimate import Estimate
 from heliograph.model.plant import AbstractPlant
-from heliograph.numerics.angle import nearest, wrap_angles
+from heliograph.numerics.angle import wrap_angles, wrap_near
 from heliograph.numerics.check import fail
 from heliograph.numerics.lapack import eigh
 from heliograph.numerics.types import Float
@@ -51,7 +51,7 @@ class ModalLaw(NamedTuple):
     law: Float[jax.Array, "*time M"]
 
 
-class Moved(NamedTuple):
+class MovedPairs(NamedTuple):
     """Gaussians of the mode before, moved by the mode after, (M, M, n) by pair, and the smoother gains back."""
 
     gaussian: Gaussian
@@ -65,23 +65,23 @@ def move_pairs(
     parts: Gaussian,
     u: jax.Array,
     start: jax.Array,
-) -> Moved:
+) -> MovedPairs:
     """Return each of M Gaussians moved by the plant of each of M modes; `plant_of`: which plant each mode has."""
 
-    def move(plant: AbstractPlant, x: Gaussian) -> Moved:
+    def move(plant: AbstractPlant, x: Gaussian) -> MovedPairs:
         """Move one Gaussian by one plant."""
         image = image_of(plant, transform, x, u)
         rest = sum_unexplained(image, process_noise(plant, u, start))
         mean = image.mean + plant.noise_mean()
         predicted = from_columns(mean, join_columns(image.explained, rest))
-        return Moved(predicted, condition_on_next_state(x, image.slopes, mean, rest))
+        return MovedPairs(predicted, condition_on_next_state(x, image.slopes, mean, rest))
 
     by_plant = [jax.vmap(lambda x, plant=plant: move(plant, x))(parts) for plant in plants]
-    pairs: Moved = jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=1)[:, plant_of], *by_plant)
+    pairs: MovedPairs = jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=1)[:, plant_of], *by_plant)
     return pairs
 
 
-class Observation(NamedTuple):
+class FutureObservation(NamedTuple):
     """What the future says of a mode's state: h x + noise = value, NaN where it says nothing.
 
     Shapes: rows h (n, n), value and noise (n,).
@@ -92,7 +92,7 @@ class Observation(NamedTuple):
     noise: jax.Array
 
 
-def ratio_of(later: Gaussian, known: Gaussian) -> Observation:
+def divide_gaussians(later: Gaussian, known: Gaussian) -> FutureObservation:
     """Return the ratio of two Gaussians, N(later) / N(known), as an observation of a state that has `known`.
 
     V and e as in the module's words: V' Q V = I with Q = Cov known, V' S V = diag(e) with S = Cov later. Rows are
@@ -113,7 +113,7 @@ def ratio_of(later: Gaussian, known: Gaussian) -> Observation:
     axes = turn.T @ whitening
     rows = share[:, None] * axes
     value = rows @ known.mean + axes @ (later.mean - known.mean) / share
-    return Observation(
+    return FutureObservation(
         rows=rows,
         value=jnp.where(tells, value, jnp.nan),
         noise=jnp.where(tells, jnp.maximum(e, 0.0), 1.0),
@@ -141,12 +141,12 @@ class ModalSmootherStep(SmootherStep):
 
     def back(self, later: ModalLaw) -> ModalLaw:  # type: ignore[override]
         """Smooth the modes before the step from those after it, both given the same later data."""
-        near = nearest(later.gaussian.mean, self.known.mean, self.angles)
-        observations = jax.vmap(ratio_of)(later.gaussian._replace(mean=near), self.known)
+        near = wrap_near(later.gaussian.mean, self.known.mean, self.angles)
+        observations = jax.vmap(divide_gaussians)(later.gaussian._replace(mean=near), self.known)
 
-        def observe(x: Gaussian, observed: Observation) -> tuple[Gaussian, jax.Array]:
+        def observe(x: Gaussian, observed: FutureObservation) -> tuple[Gaussian, jax.Array]:
             """Condition one pair on what the future says of its later mode; return it and the log-likelihood."""
-            noise, expected = Columns(jnp.eye(len(x.mean)), observed.noise), observed.rows @ x.mean
+            noise, expected = WeightedColumns(jnp.eye(len(x.mean)), observed.noise), observed.rows @ x.mean
             after, innovation = condition_on_measurement(x, observed.rows @ x.root, noise, observed.value, expected)
             return after, jnp.asarray(innovation.log_likelihood)
 
@@ -170,11 +170,11 @@ class ModalSmootherStep(SmootherStep):
             return super().estimate_from(law)
         parts = law.gaussian
         if self.limits:
-            held = jax.vmap(lambda x: hold_mean(x, self.limits))(parts)
+            held = jax.vmap(lambda x: hold_mean_within_limits(x, self.limits))(parts)
             log_mass, parts = truncate_to_limits(held, self.limits)
             weight = law.law * jnp.exp(log_mass - jnp.max(log_mass))
             law = ModalLaw(parts, weight / jnp.sum(weight))
-        mean = nearest(parts.mean, parts.mean[jnp.argmax(law.law)], self.angles)
+        mean = wrap_near(parts.mean, parts.mean[jnp.argmax(law.law)], self.angles)
         mean, covariance = moments_of_mixture(mean, jax.vmap(lambda x: x.covariance)(parts), law.law)
         return Estimate(wrap_angles(mean, self.angles), covariance, self.claim, law.law)
 

@@ -38,7 +38,7 @@ from heliograph.filters.particles.resampling import (
     resample_systematically,
 )
 from heliograph.filters.particles.state_particles import MANY, StateParticleFilter, build_state_particles
-from heliograph.filters.wrappers.limited import keeps_limits
+from heliograph.filters.wrappers.limited import accept_limits
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.modes_of_motion import ModalPlant, ModalSensor
@@ -145,7 +145,7 @@ class ParticleFilter(AbstractSizedFilter):
 AnyParticleFilter = TypeAliasType("AnyParticleFilter", ParticleFilter | PartlyDrawnFilter | StateParticleFilter)
 
 
-@keeps_limits
+@accept_limits
 @believes
 def particle_filter(
     plant: "AnyPlant",

@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import Columns
+from heliograph.factors.columns import WeightedColumns
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, Bool, Float
-from heliograph.random_affine.base import Outcome
+from heliograph.random_affine.base import ArrivalOutcome
 from heliograph.random_affine.erasure import second_moments
 from heliograph.random_affine.modes import JointModes
 from heliograph.random_affine.moments.second_moments import join_gain_and_noise, split_off_noise
@@ -33,7 +33,7 @@ class SideInformation(Module):
     chance: Float[Array, "M A"]
     mean: Float[Array, "M A m p1"]
     gain_spread: Float[Array, "M A m m p1 p1"]
-    noise: Columns
+    noise: WeightedColumns
     flags: Float[Array, "M F"]
 
     @property
@@ -58,7 +58,10 @@ def describe_by_pattern(steps: Sequence[JointModes], flags: Float[np.ndarray, "M
 
 
 def _describe_step_by_pattern(
-    outcomes: list[list[Outcome]], patterns: list[tuple[bool, ...]], before: JointModes, flags: Float[np.ndarray, "M F"]
+    outcomes: list[list[ArrivalOutcome]],
+    patterns: list[tuple[bool, ...]],
+    before: JointModes,
+    flags: Float[np.ndarray, "M F"],
 ) -> SideInformation:
     """Return the channel of one step, from the outcomes of each mode; `before`: the modes of the step before."""
     m, p = outcomes[0][0].map.outputs, outcomes[0][0].map.inputs + 1
@@ -76,7 +79,7 @@ def _describe_step_by_pattern(
     mean, second = mean / divisor[..., None, None], second / divisor[..., None, None, None, None]
     spread = second - np.array([[symmetric_product(gain, gain) for gain in row] for row in mean])
     gains, noises = zip(*(split_off_noise(part) for row in spread for part in row), strict=True)
-    noise = Columns(*(np.reshape(part, (*shape, *np.shape(part[0]))) for part in zip(*noises, strict=True)))
+    noise = WeightedColumns(*(np.reshape(part, (*shape, *np.shape(part[0]))) for part in zip(*noises, strict=True)))
     return SideInformation(
         transition=before.transition,
         present=np.array(patterns).reshape(len(patterns), m),

@@ -10,7 +10,7 @@ import numpy as np
 
 from heliograph.engine.choice import compile_on_call
 from heliograph.factors.columns import (
-    Columns,
+    WeightedColumns,
     below_diagonal,
     join_columns,
     reciprocal_or_zero,
@@ -39,7 +39,7 @@ from heliograph.model.estimate import Estimate, Innovation, lower_by_noise
 from heliograph.model.fading import uncertain_chain, with_flag
 from heliograph.model.over_time import OverTime, at, at_each_step, first, restack, unstack
 from heliograph.model.plant import AnyPlant
-from heliograph.model.premises.premise import Premise, believing
+from heliograph.model.premises.premise import Premise, on_premise
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import array, probabilities
@@ -65,15 +65,17 @@ class SideInformationBelief(NamedTuple):
     moved: Bool[jax.Array, ""]
 
     @property
-    def moments(self) -> Columns:
+    def moments(self) -> WeightedColumns:
         """E[q q' 1{mode}] of each mode as columns (M, q, q)."""
-        return Columns(unit_lower(self.lower), self.variances)
+        return WeightedColumns(unit_lower(self.lower), self.variances)
 
     @property
-    def errors(self) -> Columns:
+    def errors(self) -> WeightedColumns:
         """E[e e' | side information] as columns (N, M q)."""
         moments = self.moments
-        return side_by_side(Columns(moments.matrix[:, : len(self.mean)], moments.weights), np.ones(len(self.lower)))
+        return side_by_side(
+            WeightedColumns(moments.matrix[:, : len(self.mean)], moments.weights), np.ones(len(self.lower))
+        )
 
     @property
     def covariance(self) -> Float[jax.Array, "N N"]:
@@ -112,7 +114,7 @@ class SideInformationFilter(AbstractSizedFilter):
         x = jnp.concatenate([jnp.pad(prior.root, ((0, 1), (0, 0))), unit], axis=1)
         constant = jnp.zeros_like(x).at[:, -1:].set(unit)
         errors = [kron(of_mode[:, None], x) - kron(law[:, None], constant) for of_mode in jnp.eye(len(law))]
-        moments = Columns(
+        moments = WeightedColumns(
             jnp.stack([jnp.concatenate([e, x]) for e in errors]), outer(law, jnp.append(prior.variances, 1.0))
         )
         mean = jnp.kron(law, unit[:, 0])
@@ -137,10 +139,10 @@ class SideInformationFilter(AbstractSizedFilter):
         # From all modes to each: their columns side by side, and the process noise.
         noise = noise_in_mode(plant, u, second_moments_at_start(self.plant))
 
-        def collect_into(one_j: jax.Array, chances: jax.Array, probability: jax.Array) -> Columns:
+        def collect_into(one_j: jax.Array, chances: jax.Array, probability: jax.Array) -> WeightedColumns:
             """Return E[q+ q+' 1{mode j}], from the chances of i -> j and the probability of j."""
-            moved = Columns(jax.vmap(move_columns)(one_j - rows, errors, x), weights)
-            process = Columns(kron(jnp.append(one_j, 1.0)[:, None], noise.matrix), probability * noise.weights)
+            moved = WeightedColumns(jax.vmap(move_columns)(one_j - rows, errors, x), weights)
+            process = WeightedColumns(kron(jnp.append(one_j, 1.0)[:, None], noise.matrix), probability * noise.weights)
             return triangularise(join_columns(side_by_side(moved, chances), process))
 
         moments = jax.vmap(collect_into)(jnp.eye(modes), rows.T, law)
@@ -195,7 +197,7 @@ class ReceivedModel(NamedTuple):
 
     output: jax.Array
     common: jax.Array
-    noise: Columns
+    noise: WeightedColumns
 
 
 class PredictedInnovation(NamedTuple):
@@ -211,7 +213,9 @@ def _split_columns(state: SideInformationBelief) -> tuple[jax.Array, jax.Array, 
     return root[:, :count], root[:, count:], jnp.asarray(state.variances)
 
 
-def _make_belief(mean: jax.Array, moments: Columns, centre: jax.Array, moved: jax.Array) -> SideInformationBelief:
+def _make_belief(
+    mean: jax.Array, moments: WeightedColumns, centre: jax.Array, moved: jax.Array
+) -> SideInformationBelief:
     """Build the state from the triangular factors of each mode's moments (M, q, q)."""
     lower = jax.vmap(below_diagonal)(jnp.asarray(moments.matrix))
     return SideInformationBelief(mean, lower, jnp.asarray(moments.weights), centre, moved)
@@ -228,7 +232,7 @@ def _describe_received(
     size: jax.Array,
     gains: jax.Array,
     gain_spread: jax.Array,
-    link: Columns,
+    link: WeightedColumns,
 ) -> ReceivedModel:
     """Return what is received of zeta: the output matrix, the mean output, and the noise in each mode.
 
@@ -238,7 +242,9 @@ def _describe_received(
     (measure, noise), (_, x, weights) = centred_measurement(sensor, state.centre), _split_columns(state)
     law = _mode_probabilities(x, weights)
 
-    def describe_noise(gain: jax.Array, spread: jax.Array, link: Columns, x: Columns, p: jax.Array) -> Columns:
+    def describe_noise(
+        gain: jax.Array, spread: jax.Array, link: WeightedColumns, x: WeightedColumns, p: jax.Array
+    ) -> WeightedColumns:
         """Return the noise of z in one mode, of probability p."""
         sent = x.through(measure).covariance + p * noise
         plain = join_columns(sensor.noise.columns.through(gain[:, :-1]), link).times(p)
@@ -248,7 +254,9 @@ def _describe_received(
     # Output matrix of zeta less the mean output; modes of probability zero have none.
     output, common = subtract_mean_output(gains @ measure, law)
     output = concatenate_modes(jnp.where(law[:, None, None] > 0, output, 0.0))
-    return ReceivedModel(output, common, jax.vmap(describe_noise)(gains, gain_spread, link, Columns(x, weights), law))
+    return ReceivedModel(
+        output, common, jax.vmap(describe_noise)(gains, gain_spread, link, WeightedColumns(x, weights), law)
+    )
 
 
 def _project_on_data(
@@ -278,13 +286,15 @@ def _project_on_data(
     inverses = reciprocal_or_zero(jnp.where(variances > smallest, variances, 0.0))
     gains = (rows @ (excess * basis).T) * inverses
     rows, values = rows - gains @ basis, jnp.append(values, -state.mean) - gains @ basis_values
-    expected = PredictedInnovation(values[:m], Columns(rows[:m], weights).covariance)
+    expected = PredictedInnovation(values[:m], WeightedColumns(rows[:m], weights).covariance)
     # Then what z says of e.
     rows, values, variances = gram_schmidt_first(rows, values, weights, m)
     innovations = Innovations(values[:m], variances, jnp.diagonal(expected.covariance))
     # Factors of each mode.
     remaining = jnp.moveaxis(rows[m:].reshape(count, modes, -1), 1, 0)
-    moments = jax.vmap(triangularise)(Columns(jnp.concatenate([remaining, x], axis=1), weights.reshape(modes, -1)))
+    moments = jax.vmap(triangularise)(
+        WeightedColumns(jnp.concatenate([remaining, x], axis=1), weights.reshape(modes, -1))
+    )
     return _make_belief(-values[m:], moments, state.centre, state.moved), innovations, expected
 
 
@@ -352,7 +362,7 @@ def side_information_filter(
     if flags is not None and len(memories(channel)) != 1:  # of several chains' joint mode: no channel delivers them
         return filter
     received = channel if flags is None else at_each_step(lambda link: with_flag(link, chances), channel)
-    return believing(filter, Premise(plant, sensor, received))
+    return on_premise(filter, Premise(plant, sensor, received))
 
 
 @cache_by_object

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.factors.columns import Columns, join_columns, triangularise
+from heliograph.factors.columns import WeightedColumns, join_columns, triangularise
 from heliograph.factors.gaussian import Gaussian, from_columns
 from heliograph.filters.base import Step, corrects, predicts
 from heliograph.filters.gaussian.signal import factor_spread
@@ -78,7 +78,7 @@ class UncertainModalFilter(AbstractJointModalFilter):
         root, young, fresh = self._transition_factors(state, u, k)
         centred, law = x.mean - mean_from_centre(state.law, state.centre), state.law @ rows
         mean = predict_by_mode(centred[:, None], move, rows)[:, 0] + mean_from_centre(law, centre)
-        after = from_columns(mean, join_columns(Columns(root, (1 + young) * x.variances), fresh))
+        after = from_columns(mean, join_columns(WeightedColumns(root, (1 + young) * x.variances), fresh))
         # E[x~ x~'] and nominal law one step later.
         second, (low, high) = move @ state.second @ move.T + noise, _bound_next_law(rows, radius, state.low, state.high)
         return UncertainBelief(after, second, centre, law, low, high, jnp.asarray(True))
@@ -91,7 +91,7 @@ class UncertainModalFilter(AbstractJointModalFilter):
 
     def _transition_factors(
         self, state: UncertainBelief, u: ArrayLike, k: Step
-    ) -> tuple[jax.Array, jax.Array, Columns]:
+    ) -> tuple[jax.Array, jax.Array, WeightedColumns]:
         """Return F L, b, and the columns of (1 + 1/b) D + W, of Sigma- = (1 + b) F Sigma F' + (1 + 1/b) D + W."""
         move, _, _ = centred_transition(at(self.plant, k), u, state.centre)
         rows, radius = self._chain_and_radius(state, k)
@@ -128,7 +128,7 @@ class UncertainModalFilter(AbstractJointModalFilter):
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the smoother step of zeta+ = F zeta + noise; nominal, as the bound is not proved for smoothing."""
         slopes, young, fresh = self._transition_factors(step.before, step.u, step.k)
-        noise = triangularise(join_columns(Columns(slopes, young * step.before.gaussian.variances), fresh))
+        noise = triangularise(join_columns(WeightedColumns(slopes, young * step.before.gaussian.variances), fresh))
         moved, projection = (slopes, noise), self._projection_to_state()
         return smoother_step_of(step, moved, "nominal", projection=projection)
 

@@ -21,7 +21,7 @@ MOVES = ("reshape", "broadcast_in_dim", "transpose", "squeeze", "slice", "concat
 LOOKUPS = ("gather", "dynamic_slice")  # the first operand is moved, by indices
 
 
-class _Traced(NamedTuple):
+class _TracedArray(NamedTuple):
     """Degrees of an array's entries, and its value where all of them are known."""
 
     degree: np.ndarray
@@ -46,16 +46,16 @@ def is_affine(function: Callable[..., jax.Array], x: np.ndarray, places: Sequenc
     program = jax.make_jaxpr(function)(x, *rest)
     degree = np.full(x.shape, GIVEN)
     degree[list(places)] = AFFINE
-    arguments = [_Traced(degree), *(_Traced(np.full(np.shape(argument), GIVEN)) for argument in rest)]
+    arguments = [_TracedArray(degree), *(_TracedArray(np.full(np.shape(argument), GIVEN)) for argument in rest)]
     return all(np.all(result.degree <= AFFINE) for result in _trace_degrees(program, arguments))
 
 
-def _trace_degrees(program: core.ClosedJaxpr, arguments: Sequence[_Traced]) -> list[_Traced]:
+def _trace_degrees(program: core.ClosedJaxpr, arguments: Sequence[_TracedArray]) -> list[_TracedArray]:
     """Return the degrees of a program's results, operation by operation."""
     values = dict(zip(program.jaxpr.invars, arguments, strict=True))
     values.update(zip(program.jaxpr.constvars, map(_constant, program.consts), strict=True))
 
-    def read(atom: Any) -> _Traced:
+    def read(atom: Any) -> _TracedArray:
         """Return the degrees of an operand: a literal number, or a result of an earlier operation."""
         return _constant(atom.val) if isinstance(atom, core.Literal) else values[atom]
 
@@ -65,12 +65,12 @@ def _trace_degrees(program: core.ClosedJaxpr, arguments: Sequence[_Traced]) -> l
     return [read(atom) for atom in program.jaxpr.outvars]
 
 
-def _constant(value: Any) -> _Traced:
+def _constant(value: Any) -> _TracedArray:
     """Return the degrees of a known array."""
-    return _Traced(np.full(np.asarray(value).shape, KNOWN), value)
+    return _TracedArray(np.full(np.asarray(value).shape, KNOWN), value)
 
 
-def _degrees_of_operation(equation: Any, x: list[_Traced]) -> list[_Traced]:
+def _degrees_of_operation(equation: Any, x: list[_TracedArray]) -> list[_TracedArray]:
     """Return the degrees of the results of one operation on operands x."""
     name, params = equation.primitive.name, equation.params
 
@@ -86,17 +86,17 @@ def _degrees_of_operation(equation: Any, x: list[_Traced]) -> list[_Traced]:
         return [_constant(value) for value in compute([operand.value for operand in x])]
     shapes = [out.aval.shape for out in equation.outvars]
     if all(np.all(operand.degree <= GIVEN) for operand in x):
-        return [_Traced(np.full(shape, GIVEN)) for shape in shapes]
+        return [_TracedArray(np.full(shape, GIVEN)) for shape in shapes]
     # Operations that move numbers move their degrees alike.
     if name in MOVES:
-        return [_Traced(np.asarray(degree)) for degree in compute([operand.degree for operand in x])]
+        return [_TracedArray(np.asarray(degree)) for degree in compute([operand.degree for operand in x])]
     if name in LOOKUPS and all(index.value is not None for index in x[1:]):
         moved = compute([x[0].degree, *(index.value for index in x[1:])])
-        return [_Traced(np.asarray(degree)) for degree in moved]
-    return [_Traced(np.broadcast_to(_degree_of_arithmetic(name, params, x), shape)) for shape in shapes]
+        return [_TracedArray(np.asarray(degree)) for degree in moved]
+    return [_TracedArray(np.broadcast_to(_degree_of_arithmetic(name, params, x), shape)) for shape in shapes]
 
 
-def _degree_of_arithmetic(name: str, params: dict[str, Any], x: list[_Traced]) -> Any:
+def _degree_of_arithmetic(name: str, params: dict[str, Any], x: list[_TracedArray]) -> Any:
     """Return the degrees of a sum, a product, a choice; OTHER of what is not linear."""
     match name:
         case "add" | "add_any" | "sub":
@@ -127,7 +127,7 @@ def _of_product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.where(np.minimum(a, b) <= GIVEN, np.maximum(a, b), OTHER)
 
 
-def _degree_of_contraction(a: _Traced, b: _Traced, dimensions: Any) -> np.ndarray:
+def _degree_of_contraction(a: _TracedArray, b: _TracedArray, dimensions: Any) -> np.ndarray:
     """Return the degrees of sums of products, in which a known zero takes its product away."""
 
     def count(of_a: np.ndarray, of_b: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.filters.base import AbstractSizedFilter, FilterAngles, Step
-from heliograph.filters.chunks import Pass
+from heliograph.filters.chunks import ScanResult
 from heliograph.filters.particles.expected import find_reference
 from heliograph.filters.particles.lanes import filter_particles
 from heliograph.filters.particles.moments import StateSums
@@ -26,7 +26,7 @@ ENOUGH = 200  # particles; of 100 a row takes 80 us in lanes and half of it othe
 State = TypeVar("State", bound=tuple[Any, ...])
 
 
-class Resampled(NamedTuple):
+class ResampledParticles(NamedTuple):
     """Result of a resampling: numbers of the particles that go on (N,), and their log weights (N,)."""
 
     which: jax.Array
@@ -69,7 +69,7 @@ class AbstractStateParticleFilter(AbstractSizedFilter):
         """Return the angles of its plant, and those that its channel delivers."""
         return FilterAngles(models_of(first(self.plant))[0].angles, self.observed_angles)
 
-    def filter_rows(self, z: Array, u: Array, state: PyTree | None = None, begin: Array | int = 0) -> Pass | None:
+    def filter_rows(self, z: Array, u: Array, state: PyTree | None = None, begin: Array | int = 0) -> ScanResult | None:
         """Filter rows with a lane for each particle where these are enough."""
         return filter_particles(self, z, u, state, begin) if self.particles >= ENOUGH else None
 
@@ -123,13 +123,13 @@ class AbstractStateParticleFilter(AbstractSizedFilter):
         """True: a value of likelihood 0 under every particle is excluded by its model."""
         return True
 
-    def resampled(self, log_weight: jax.Array, key: jax.Array) -> Resampled:
+    def resampled(self, log_weight: jax.Array, key: jax.Array) -> ResampledParticles:
         """Resample systematically where the effective number is too small; else all particles go on as they are."""
         weight = jax.nn.softmax(log_weight)
         too_few = effective_number(weight) < jnp.asarray(self.resample) * self.particles
         start, all_particles = jax.random.uniform(key, (), weight.dtype), jnp.arange(self.particles)
         which = jax.lax.cond(too_few, resample_systematically, lambda *_: all_particles, weight, start)
-        return Resampled(which, jnp.where(too_few, 0.0, log_weight))
+        return ResampledParticles(which, jnp.where(too_few, 0.0, log_weight))
 
 
 def keep_unused(used: jax.Array, updated: State, before: State) -> State:

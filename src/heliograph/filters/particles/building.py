@@ -36,7 +36,7 @@ def build_partly_drawn(
     for model in models_of(instance("sensor", first(sensor), AbstractSensor, "a sensor")):
         model.refuse_inputs("particle_filter")
         check_link(model, first(channel), len(start.states), moments=False)
-    drawn_places = _places_of(start, drawn)
+    drawn_places = _find_places_of_drawn(start, drawn)
     _check_linear_given(plant, sensor, drawn_places)
     # One chain of the modes of plant, sensor and links: joint.beside has plant and sensor in each joint mode.
     joint = joint_modes(first(channel), nodes, beside=(first(plant), first(sensor)))
@@ -66,7 +66,7 @@ def build_partly_drawn(
     )
 
 
-def _places_of(start: AbstractPlant, drawn: Sequence[str] | None) -> tuple[int, ...]:
+def _find_places_of_drawn(start: AbstractPlant, drawn: Sequence[str] | None) -> tuple[int, ...]:
     """Return the places of the drawn states, in the plant's order."""
     if drawn is None:
         return tuple(range(len(start.states)))

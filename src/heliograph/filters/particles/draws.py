@@ -11,7 +11,9 @@ from heliograph.factors.repeated import rounding_of_products
 from heliograph.numerics.density import LOG_TURN
 
 
-def slopes_given(function: Callable[[jax.Array], jax.Array], x: Gaussian, drawn: int) -> tuple[jax.Array, jax.Array]:
+def slopes_given_drawn(
+    function: Callable[[jax.Array], jax.Array], x: Gaussian, drawn: int
+) -> tuple[jax.Array, jax.Array]:
     """Return f(mean), and the slopes (m, n) of f in xi of x = m + L xi; `drawn`: leading states that are known.
 
     The slopes in the drawn states are 0, since these have no variance.
@@ -40,7 +42,7 @@ def find_certain(x: Gaussian, d: jax.Array) -> jax.Array:
     return x.variances[:drawn] <= rounding_of_products(drawn, second)
 
 
-def condition_on_leading(x: Gaussian, d: jax.Array, certain: jax.Array) -> tuple[Gaussian, jax.Array]:
+def condition_on_leading_states(x: Gaussian, d: jax.Array, certain: jax.Array) -> tuple[Gaussian, jax.Array]:
     """Return x given its leading states d (drawn,), and log of their density; `certain` ones have none and count 0."""
     drawn = len(d)
     xi = decorrelate(x.root[:drawn, :drawn], (d - x.mean[:drawn])[:, None])[:, 0]

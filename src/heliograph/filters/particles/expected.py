@@ -7,20 +7,20 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.filters.particles.moments import FirstSums
-from heliograph.filters.particles.received_density import Atoms
+from heliograph.filters.particles.received_density import ReceivedAtoms
 from heliograph.model.estimate import Innovation
-from heliograph.numerics.angle import Angles, nearest
+from heliograph.numerics.angle import Angles, wrap_near
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array
 
 
-class Expected(NamedTuple):
+class ExpectedMeasurement(NamedTuple):
     """The atoms of z (m,) given h(x), and h(x) of a particle of reference (p,), which is no number if none is.
 
     Innovations are summed as differences from that of the reference's first atom: of angles within half a turn of it.
     """
 
-    atoms: Atoms
+    atoms: ReceivedAtoms
     z: jax.Array
     reference: jax.Array
     angles: Angles
@@ -29,7 +29,7 @@ class Expected(NamedTuple):
     def base(self) -> jax.Array:
         """Return the innovation (m,) of the reference's first atom."""
         value = self.z - self.atoms.expected(jnp.nan_to_num(self.reference, nan=0.0, posinf=0.0, neginf=0.0))[0]
-        return nearest(value, jnp.zeros(len(self.z)), self.angles)
+        return wrap_near(value, jnp.zeros(len(self.z)), self.angles)
 
     def apart(self, weight: jax.Array, predicted: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return weights (B a,) of particles and atoms, and how far their innovations are from the base (B a, m).
@@ -41,7 +41,7 @@ class Expected(NamedTuple):
         valid, known = jnp.all(jnp.isfinite(predicted), axis=1), jnp.all(jnp.isfinite(self.reference))
         both = jnp.where(valid | ~known, weight, 0.0)[:, None] * jnp.asarray(self.atoms.weight)
         value = self.z - jax.vmap(self.atoms.expected)(jnp.where(valid[:, None], predicted, 0.0))
-        apart = nearest(value - self.base, jnp.zeros(len(self.z)), self.angles)
+        apart = wrap_near(value - self.base, jnp.zeros(len(self.z)), self.angles)
         return both.ravel(), apart.reshape(-1, len(self.z))
 
     def innovation(self, first: FirstSums, second: jax.Array, density: jax.Array) -> Innovation:

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.model.estimate import Innovation
-from heliograph.numerics.angle import Angles, nearest
+from heliograph.numerics.angle import Angles, wrap_near
 
 
 class ExpectedMixture(NamedTuple):
@@ -35,7 +35,7 @@ class ReceivedSums(NamedTuple):
 def find_base(reference: ExpectedMixture, z: jax.Array, angles: Angles) -> jax.Array:
     """Return the innovation (m,) of the largest part of what a particle expects, 0 for one that is no number."""
     expected = jnp.asarray(reference.expected)[jnp.argmax(jnp.asarray(reference.share))]
-    return nearest(z - jnp.where(jnp.isfinite(expected), expected, 0.0), jnp.zeros(len(z)), angles)
+    return wrap_near(z - jnp.where(jnp.isfinite(expected), expected, 0.0), jnp.zeros(len(z)), angles)
 
 
 def sum_mixtures(
@@ -43,7 +43,7 @@ def sum_mixtures(
 ) -> ReceivedSums:
     """Return sums over particles (B,) of weights before z; parts that are no number do not count."""
     present, m = ~jnp.isnan(z), len(z)
-    value = nearest(z - predicted.expected - base, jnp.zeros(m), angles)
+    value = wrap_near(z - predicted.expected - base, jnp.zeros(m), angles)
     valid = jnp.all(jnp.isfinite(value) | ~present, axis=-1)
     share = jnp.where(valid, weight[:, None] * predicted.share, 0.0).ravel()
     value = jnp.where(valid[..., None], value, 0.0).reshape(-1, m)

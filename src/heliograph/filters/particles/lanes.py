@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import choose_code, compute_once
-from heliograph.filters.chunks import Pass
+from heliograph.filters.chunks import ScanResult
 from heliograph.filters.particles.expected import find_reference
-from heliograph.filters.particles.resampling import resample_known
+from heliograph.filters.particles.resampling import resample_concrete_weights
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.types import Array, PyTree
 
@@ -24,7 +24,7 @@ Call = Callable[..., Any]
 GROUP = 16  # particles that a lane adds up
 
 
-class Row(NamedTuple):
+class DataRow(NamedTuple):
     """A row of data: its number, measurement and input; keys of its noises and proposals; whether it is not the first.
 
     Of rows, with a leading axis.
@@ -47,7 +47,7 @@ class Group(NamedTuple):
     predicted: tuple[Array, ...]
 
 
-class Sums(NamedTuple):
+class ParticleSums(NamedTuple):
     """Sums over the particles of a row: of states and of what is received as `_pack` makes them, `second` (n, n).
 
     `reference` is what the particle expects from which innovations are counted, `density` log p(z | earlier rows).
@@ -62,7 +62,7 @@ class Sums(NamedTuple):
 
 def filter_particles(
     filter: Any, z: Array, u: Array, state: PyTree | None = None, begin: Array | int = 0
-) -> Pass | None:
+) -> ScanResult | None:
     """Filter rows with particles in lanes; None of no rows, or without native code.
 
     Args:
@@ -81,7 +81,7 @@ def filter_particles(
         return _filter_rows(filter, np.asarray(z), np.asarray(u), state, int(begin))
 
 
-class _Memory(NamedTuple):
+class _RowMemory(NamedTuple):
     """Arrays that the programs of a row read in place: the row, particles, and sums over them.
 
     `particles` are those before the row, a tree, and `log_weight` their log weights, the largest 0; `prior` are the
@@ -89,7 +89,7 @@ class _Memory(NamedTuple):
     of weight 0 fill the last group, at the place of the first.
     """
 
-    row: Row
+    row: DataRow
     used: np.ndarray
     particles: PyTree
     log_weight: np.ndarray
@@ -100,13 +100,13 @@ class _Memory(NamedTuple):
     states: np.ndarray
 
 
-class _Programs(NamedTuple):
+class _ParticlePrograms(NamedTuple):
     """Code of what is done with particles, with the filter's own arrays: calls in memory of their own.
 
     `now` are the particles behind the last row, and `log_weight` their log weights; `predicted` what each expected.
     """
 
-    memory: _Memory
+    memory: _RowMemory
     now: PyTree
     log_weight: np.ndarray
     predicted: tuple[np.ndarray, ...]
@@ -115,16 +115,18 @@ class _Programs(NamedTuple):
     second: Any
 
 
-def _prepare(filter: Any, z: np.ndarray, u: np.ndarray, keys: tuple[np.ndarray, np.ndarray]) -> _Programs | None:
+def _compile_programs(
+    filter: Any, z: np.ndarray, u: np.ndarray, keys: tuple[np.ndarray, np.ndarray]
+) -> _ParticlePrograms | None:
     """Return the code for a filter, for rows like these and their keys; None if there is none."""
     length = -(-filter.particles // GROUP) * GROUP
     numbers = np.arange(length, dtype=np.uint32)
     # Programs share what of a row and of particles more than one reads.
     own, proposing = (np.zeros_like(part[0]) for part in keys)
-    row = Row(np.zeros((), int), np.zeros_like(z[0]), np.zeros_like(u[0]), own, proposing, np.ones((), bool))
+    row = DataRow(np.zeros((), int), np.zeros_like(z[0]), np.zeros_like(u[0]), own, proposing, np.ones((), bool))
     log_weight, prior, weight = np.zeros((3, length))
     before = row, np.ones((), bool), filter.make_room(length), log_weight, numbers
-    advance = _hold(_advance, filter, before, (False, False, True, True, True), length)
+    advance = _hold(_advance_particle, filter, before, (False, False, True, True, True), length)
     if advance is None:
         return None
     leaves, form = jax.tree.flatten(before[2])
@@ -141,8 +143,8 @@ def _prepare(filter: Any, z: np.ndarray, u: np.ndarray, keys: tuple[np.ndarray, 
     states = np.zeros(first.outputs[0].shape[1])
     arguments = states, group.weight, group.particles
     second = _hold(_sum_second, filter, arguments, (False, True, True), len(group.weight))
-    memory = _Memory(*before, prior, weight, reference, states)
-    made = _Programs(memory, now, advance.outputs[len(leaves)], predicted, advance, first, second)
+    memory = _RowMemory(*before, prior, weight, reference, states)
+    made = _ParticlePrograms(memory, now, advance.outputs[len(leaves)], predicted, advance, first, second)
     return None if second is None else made
 
 
@@ -170,8 +172,8 @@ def _take_first(tree: PyTree) -> PyTree:
     return jax.tree.map(lambda leaf: leaf[0], tree)
 
 
-def _advance(
-    filter: Any, row: Row, used: Array, particle: PyTree, log_weight: Array, number: Array
+def _advance_particle(
+    filter: Any, row: DataRow, used: Array, particle: PyTree, log_weight: Array, number: Array
 ) -> tuple[PyTree, jax.Array, tuple[jax.Array, ...]]:
     """Move a particle and weigh it by z where the row is used; return it, its log weight, and what it expected."""
     numbers = jnp.asarray(number)[None]
@@ -183,7 +185,7 @@ def _advance(
     return _take_first(told), jnp.asarray(log_weight) + likelihood, _take_first(weighed.predicted)
 
 
-def _sum_first(filter: Any, row: Row, reference: tuple[Array, ...], group: Group) -> tuple[jax.Array, jax.Array]:
+def _sum_first(filter: Any, row: DataRow, reference: tuple[Array, ...], group: Group) -> tuple[jax.Array, jax.Array]:
     """Return the first sums of the states of a group of particles, and the sums of what they expect of z."""
     group = jax.tree.map(jnp.asarray, group)
     received = filter.sum_received(reference, group.prior, group.predicted, row.z, row.k)
@@ -193,16 +195,16 @@ def _sum_first(filter: Any, row: Row, reference: tuple[Array, ...], group: Group
 def _sum_second(filter: Any, states: Array, weight: Array, particles: PyTree) -> jax.Array:
     """Return the second sums of the states of a group of particles, about the means of all."""
     weight, particles = jax.tree.map(jnp.asarray, (weight, particles))
-    second: jax.Array = filter.sum_apart(weight, particles, _unpack(states, filter.sum_states, weight, particles))
+    second: jax.Array = filter.sum_apart(weight, particles, _unpack_sums(states, filter.sum_states, weight, particles))
     return second
 
 
-def _tell_row(filter: Any, row: Row, sums: Sums) -> tuple[Any, ...]:
+def _make_outputs_of_row(filter: Any, row: DataRow, sums: ParticleSums) -> tuple[Any, ...]:
     """Return what is told of a row, by its sums."""
     one, weight = jax.tree.map(jnp.asarray, filter.make_room(1)), jnp.ones(1)
-    states = _unpack(sums.states, filter.sum_states, weight, one)
+    states = _unpack_sums(sums.states, filter.sum_states, weight, one)
     predicted = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], sums.reference)
-    received = _unpack(sums.received, filter.sum_received, sums.reference, weight, predicted, row.z, row.k)
+    received = _unpack_sums(sums.received, filter.sum_received, sums.reference, weight, predicted, row.z, row.k)
     estimate = filter.estimate_of(states, sums.second)
     innovation = filter.innovation_of(received, sums.reference, row.z, row.k, sums.density)
     count = states.first.weight**2 / states.first.square
@@ -214,7 +216,7 @@ def _pack(sums: PyTree) -> jax.Array:
     return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(sums)])
 
 
-def _unpack(vector: Array, function: Call, *arguments: Any) -> Any:
+def _unpack_sums(vector: Array, function: Call, *arguments: Any) -> Any:
     """Return the sums that `_pack` made one vector of, like those of a function of these arguments."""
     leaves, form = jax.tree.flatten(jax.eval_shape(function, *arguments))
     ends = np.cumsum([math.prod(leaf.shape) for leaf in leaves])[:-1].tolist()
@@ -222,16 +224,16 @@ def _unpack(vector: Array, function: Call, *arguments: Any) -> Any:
     return jax.tree.unflatten(form, [part.reshape(leaf.shape) for part, leaf in parts])
 
 
-def _filter_rows(filter: Any, z: np.ndarray, u: np.ndarray, state: PyTree | None, begin: int) -> Pass | None:
+def _filter_rows(filter: Any, z: np.ndarray, u: np.ndarray, state: PyTree | None, begin: int) -> ScanResult | None:
     """Filter rows of data, the first of number `begin` behind a state; None without native code."""
     key = None if state is None else np.asarray(state.key)
     of_start, start, last, own, proposing = compute_once(_draw_keys, _draw_keys_by_xla, (filter, z, key))
     k = begin + np.arange(len(z))
     moved = (np.arange(len(z)) > 0) | (state is not None and bool(state.moved))
-    rows, programs = Row(k, z, u, own, proposing, moved), _prepare(filter, z, u, (own, proposing))
+    rows, programs = DataRow(k, z, u, own, proposing, moved), _compile_programs(filter, z, u, (own, proposing))
     if programs is None:
         return None
-    loop = _Loop(filter, programs)
+    loop = _ParticleLoop(filter, programs)
     if state is None:
         numbers = programs.memory.numbers[: filter.particles]
         draw = _bind(_draw_start, filter, (of_start, numbers), (False, True))
@@ -240,12 +242,14 @@ def _filter_rows(filter: Any, z: np.ndarray, u: np.ndarray, state: PyTree | None
         loop.begin(draw(of_start, numbers), np.zeros(filter.particles))
     else:
         loop.begin(jax.tree.map(np.asarray, filter.particles_of(state)), np.asarray(state.log_weight))
-    steps = [loop.step(Row(*row), choice) for row, choice in zip(zip(*rows, strict=True), start.tolist(), strict=True)]
-    sums: Sums = jax.tree.map(lambda *parts: np.stack(parts), *steps)
-    told = choose_code(_tell_row, (filter, rows, sums), [False, True, True])
+    steps = [
+        loop.step(DataRow(*row), choice) for row, choice in zip(zip(*rows, strict=True), start.tolist(), strict=True)
+    ]
+    sums: ParticleSums = jax.tree.map(lambda *parts: np.stack(parts), *steps)
+    told = choose_code(_make_outputs_of_row, (filter, rows, sums), [False, True, True])
     if told.code is None:
         return None
-    return Pass(loop.last_state(last), told.results())
+    return ScanResult(loop.last_state(last), told.results())
 
 
 def _draw_keys(filter: Any, z: Array, key: Array | None) -> tuple[jax.Array, ...]:
@@ -267,10 +271,10 @@ def _draw_keys(filter: Any, z: Array, key: Array | None) -> tuple[jax.Array, ...
 _draw_keys_by_xla = quickly_compiled(_draw_keys)
 
 
-class _Loop:
+class _ParticleLoop:
     """Particles that are moved and weighed row by row, and sums of them that the next row needs."""
 
-    def __init__(self, filter: Any, programs: _Programs):
+    def __init__(self, filter: Any, programs: _ParticlePrograms):
         self.filter, self.programs, self.memory, self.count = filter, programs, programs.memory, filter.particles
         self.resample, self.sum, self.square = float(filter.resample), 0.0, 0.0
         self.now, self.log_weight, self.predicted = programs.now, programs.log_weight, programs.predicted
@@ -286,7 +290,7 @@ class _Loop:
         np.exp(memory.log_weight, out=memory.weight)
         self.sum, self.square = float(memory.weight.sum()), float(memory.weight @ memory.weight)
 
-    def step(self, row: Row, start: float) -> Sums:
+    def step(self, row: DataRow, start: float) -> ParticleSums:
         """Choose the particles that go on, move and weigh them; return the sums over them."""
         memory, programs = self.memory, self.programs
         for held, new in zip(memory.row, row, strict=True):
@@ -310,7 +314,7 @@ class _Loop:
         before, self.sum, self.square = self.sum, float(states[0]), float(states[1])
         density = -np.inf if excluded else math.log(self.sum) + largest - math.log(before)
         reference = tuple(part.copy() for part in memory.reference)
-        return Sums(states.copy(), received, second, reference, np.asarray(density))
+        return ParticleSums(states.copy(), received, second, reference, np.asarray(density))
 
     def _choose(self, start: float) -> None:
         """Let particles go on as they are, or resampled where the effective number is too small."""
@@ -320,7 +324,7 @@ class _Loop:
                 new[...] = held
             memory.prior[...] = memory.weight
             return
-        which = resample_known(memory.weight[:count], start)
+        which = resample_concrete_weights(memory.weight[:count], start)
         for held, new in self.pairs:
             np.take(held, which, axis=0, out=new[:count], mode="clip")
         memory.log_weight[:count], memory.prior[:count], self.sum = 0.0, 1.0, float(count)

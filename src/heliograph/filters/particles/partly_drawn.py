@@ -14,17 +14,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.factors.columns import Columns, columns_of_each, join_columns
+from heliograph.factors.columns import WeightedColumns, factor_covariances, join_columns
 from heliograph.factors.gaussian import Gaussian, condition_on_observation, from_columns, from_covariance
 from heliograph.filters.base import Step, corrects, estimates, predicts
 from heliograph.filters.particles.base import AbstractStateParticleFilter, Weighed, keep_unused, relative_to_largest
 from heliograph.filters.particles.cloud import Cloud, PartlyDrawn, repeat_for_modes, sum_clouds, sum_clouds_apart
 from heliograph.filters.particles.draws import (
     condition_on_draw,
-    condition_on_leading,
+    condition_on_leading_states,
     draw_index,
     find_certain,
-    slopes_given,
+    slopes_given_drawn,
 )
 from heliograph.filters.particles.expected_mixture import (
     ExpectedMixture,
@@ -35,18 +35,18 @@ from heliograph.filters.particles.expected_mixture import (
 )
 from heliograph.filters.particles.moments import StateSums
 from heliograph.filters.particles.proposal import PRIOR_SHARE, noise_columns
-from heliograph.filters.particles.received_density import Atoms
+from heliograph.filters.particles.received_density import ReceivedAtoms
 from heliograph.filters.particles.resampling import draw_normals, draw_uniforms, fold_in_bits
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.modes_of_motion import models_of
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AbstractPlant, LinearPlant
 from heliograph.model.sensor import AbstractSensor, LinearSensor
-from heliograph.numerics.angle import Angles, nearest, wrap_angles
+from heliograph.numerics.angle import Angles, wrap_angles, wrap_near
 from heliograph.numerics.types import Array, Float
 
 
-class Received(NamedTuple):
+class ReceivedByMode(NamedTuple):
     """What arrived: z (m,), and for each mode the atoms of its density given h(x), and these as one Gaussian.
 
     Shapes: weight (M, a), gain (M, a, m, p), offset (M, a, m), noise factors (M, a, m, m); `overall` without a.
@@ -56,8 +56,8 @@ class Received(NamedTuple):
     weight: jax.Array
     gain: jax.Array
     offset: jax.Array
-    noise: Columns
-    overall: tuple[jax.Array, jax.Array, Columns]
+    noise: WeightedColumns
+    overall: tuple[jax.Array, jax.Array, WeightedColumns]
 
 
 class PartlyDrawnFilter(AbstractStateParticleFilter):
@@ -161,10 +161,10 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
             """Return f(x), drawn states first in x and in the result."""
             return plant.transition(self._in_plants_order(x), u)[order]
 
-        mean, slopes = slopes_given(move, x, known)
-        spread = Columns(slopes[:, known:], x.variances[known:])
+        mean, slopes = slopes_given_drawn(move, x, known)
+        spread = WeightedColumns(slopes[:, known:], x.variances[known:])
         return from_columns(
-            mean + plant.noise_mean()[order], join_columns(spread, Columns(noise.matrix[order], noise.weights))
+            mean + plant.noise_mean()[order], join_columns(spread, WeightedColumns(noise.matrix[order], noise.weights))
         )
 
     def _in_plants_order(self, x: jax.Array) -> jax.Array:
@@ -209,16 +209,16 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         predicted = jax.vmap(partial(self._expect, sensors, received))(gaussian, log_mode)
         return Weighed(Cloud(repeat_for_modes(x, modes), certain), log_ratio, tuple(predicted))
 
-    def _describe_received(self, z: jax.Array, atoms: Atoms) -> Received:
+    def _describe_received(self, z: jax.Array, atoms: ReceivedAtoms) -> ReceivedByMode:
         """Return what arrived, with the atoms of each mode, and with one Gaussian in their place."""
         gain, offset, noise = jax.vmap(lambda of_mode: of_mode.moments())(atoms)
-        return Received(
+        return ReceivedByMode(
             z=z,
             weight=jnp.asarray(atoms.weight),
             gain=jnp.asarray(atoms.gain),
             offset=jnp.asarray(atoms.offset),
-            noise=jax.vmap(columns_of_each)(jnp.asarray(atoms.noise)),
-            overall=(gain, offset, columns_of_each(noise)),
+            noise=jax.vmap(factor_covariances)(jnp.asarray(atoms.noise)),
+            overall=(gain, offset, factor_covariances(noise)),
         )
 
     def _angles_in_order(self, plant: AbstractPlant) -> Angles:
@@ -235,7 +235,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
     def _draw_and_weigh(
         self,
         sensors: Sequence[AbstractSensor],
-        received: Received,
+        received: ReceivedByMode,
         x: Gaussian,
         log_mode: jax.Array,
         draw: jax.Array,
@@ -267,8 +267,8 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         d = condition_on_draw(source, draw).mean[: self.drawn]
         # log p(j, d) - log q(j, d), with q = (1 - share) (linearised posterior of j and d) + share P(j) N(d).
         certain = find_certain(prior, d)
-        rest, log_prior = condition_on_leading(prior, d, certain)
-        log_linearised = log_posterior_mode[mode] + condition_on_leading(linearised, d, certain)[1]
+        rest, log_prior = condition_on_leading_states(prior, d, certain)
+        log_linearised = log_posterior_mode[mode] + condition_on_leading_states(linearised, d, certain)[1]
         log_p = log_mode[mode] + log_prior
         log_total = log_p - jax.nn.logsumexp(log_mode)  # of the prior's share, which is a law
         log_q = jnp.logaddexp(jnp.log1p(-share) + log_linearised, jnp.log(share) + log_total)
@@ -276,7 +276,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         after, log_density = self._condition_on_atoms(sensors, received, mode, rest, uniform[2])
         return after, mode, log_density + log_p - log_q
 
-    def _prior_share(self, sensors: Sequence[AbstractSensor], received: Received) -> float:
+    def _prior_share(self, sensors: Sequence[AbstractSensor], received: ReceivedByMode) -> float:
         """Return the share of particles that are drawn without z."""
         if not self.optimal:
             return 1.0
@@ -284,31 +284,36 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         return 0.0 if is_exact else PRIOR_SHARE
 
     def _linearised_posterior(
-        self, sensors: Sequence[AbstractSensor], received: Received, mode: jax.Array, x: Gaussian
+        self, sensors: Sequence[AbstractSensor], received: ReceivedByMode, mode: jax.Array, x: Gaussian
     ) -> tuple[Gaussian, jax.Array]:
         """Return x given z in this mode, and the log density of z, of z = gain h(x) + n.
 
         h is linearised at the mean, in all states; n is one Gaussian in place of the atoms.
         """
         gain, offset, noise = jax.tree.map(lambda leaf: leaf[mode], received.overall)
-        y, slopes = slopes_given(partial(self._measure, sensors, mode), x, drawn=0)
+        y, slopes = slopes_given_drawn(partial(self._measure, sensors, mode), x, drawn=0)
         return self._condition(x, gain @ slopes, gain @ y + offset, noise, received.z)
 
     def _condition(
-        self, x: Gaussian, slopes: jax.Array, expected: jax.Array, noise: Columns, z: jax.Array
+        self, x: Gaussian, slopes: jax.Array, expected: jax.Array, noise: WeightedColumns, z: jax.Array
     ) -> tuple[Gaussian, jax.Array]:
         """Return x given z = expected + slopes xi + v, and the log density of z."""
-        value = nearest(z - expected, jnp.zeros(len(z)), self.observed_angles)
+        value = wrap_near(z - expected, jnp.zeros(len(z)), self.observed_angles)
         after, innovations = condition_on_observation(x, slopes, value, noise, ~jnp.isnan(z))
         return after, innovations.log_density(~jnp.isnan(z), jnp.abs(z) + jnp.abs(expected))
 
     def _condition_on_atoms(
-        self, sensors: Sequence[AbstractSensor], received: Received, mode: jax.Array, x: Gaussian, uniform: jax.Array
+        self,
+        sensors: Sequence[AbstractSensor],
+        received: ReceivedByMode,
+        mode: jax.Array,
+        x: Gaussian,
+        uniform: jax.Array,
     ) -> tuple[Gaussian, jax.Array]:
         """Return x, whose drawn states are known, given z and an atom drawn by its probability; and log p(z) of all."""
-        y, slopes = slopes_given(partial(self._measure, sensors, mode), x, self.drawn)
+        y, slopes = slopes_given_drawn(partial(self._measure, sensors, mode), x, self.drawn)
 
-        def condition_on_atom(gain: jax.Array, offset: jax.Array, noise: Columns) -> tuple[Gaussian, jax.Array]:
+        def condition_on_atom(gain: jax.Array, offset: jax.Array, noise: WeightedColumns) -> tuple[Gaussian, jax.Array]:
             """Return x given z of one atom, and the log density of z."""
             return self._condition(x, gain @ slopes, gain @ y + offset, noise, received.z)
 
@@ -319,16 +324,16 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         return jax.tree.map(lambda leaf: leaf[atom], after), jax.nn.logsumexp(densities)
 
     def _expect(
-        self, sensors: Sequence[AbstractSensor], received: Received, x: Gaussian, log_mode: jax.Array
+        self, sensors: Sequence[AbstractSensor], received: ReceivedByMode, x: Gaussian, log_mode: jax.Array
     ) -> ExpectedMixture:
         """Return what a particle expects of z in each mode and atom, to first order in h."""
 
         def expect_in_mode(mode: jax.Array, x: Gaussian) -> tuple[jax.Array, jax.Array]:
             """Return means (atoms, m) of z and their covariances."""
-            y, slopes = slopes_given(partial(self._measure, sensors, mode), x, drawn=0)
+            y, slopes = slopes_given_drawn(partial(self._measure, sensors, mode), x, drawn=0)
             gain = received.gain[mode]
-            spread = jax.vmap(lambda g: Columns(g @ slopes, x.variances).covariance)(gain)
-            noise = jax.vmap(lambda matrix, weights: Columns(matrix, weights).covariance)(
+            spread = jax.vmap(lambda g: WeightedColumns(g @ slopes, x.variances).covariance)(gain)
+            noise = jax.vmap(lambda matrix, weights: WeightedColumns(matrix, weights).covariance)(
                 *jax.tree.map(lambda leaf: leaf[mode], received.noise)
             )
             return gain @ y + received.offset[mode], spread + noise

@@ -9,18 +9,18 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from heliograph.factors.columns import Columns, columns_of
-from heliograph.filters.particles.received_density import Atoms
+from heliograph.factors.columns import WeightedColumns, columns_of
+from heliograph.filters.particles.received_density import ReceivedAtoms
 from heliograph.filters.particles.resampling import draw_uniforms
 from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor, LinearSensor
-from heliograph.numerics.angle import Angles, nearest
+from heliograph.numerics.angle import Angles, wrap_near
 from heliograph.random_affine.noise import AbstractNoise
 
 PRIOR_SHARE = 0.1  # of the proposal: weights are then bounded, where h saturates too
 
 
-class Moved(NamedTuple):
+class MoveLaw(NamedTuple):
     """Law of x+ before the measurement, of each particle: m + G e with e ~ N(0, I), and a draw of e.
 
     Shapes: center m (N, n), root G (n, n), the same of all particles, zero once x+ was drawn with a measurement; draws
@@ -32,23 +32,23 @@ class Moved(NamedTuple):
     draws: jax.Array
 
 
-class Proposed(NamedTuple):
+class ProposedParticles(NamedTuple):
     """Positions (N, n) drawn with the measurement; corrections of the log weights, log N(e; 0, I) / q(e) (N,)."""
 
     position: jax.Array
     correction: jax.Array
 
 
-def propose(
-    moved: Moved,
+def propose_particles(
+    moved: MoveLaw,
     sensor: AbstractSensor,
-    atoms: Atoms,
+    atoms: ReceivedAtoms,
     z: jax.Array,
     angles: Angles,
     key: jax.Array,
     numbers: jax.Array | None,
     particles: int,
-) -> Proposed:
+) -> ProposedParticles:
     """Draw x = center + G e of each particle, e near what z says of it, and weigh it for not being drawn from N(0, I).
 
     e is of q = N(C' S^-1 r, I - C' S^-1 C), its law given z, with C = M H G, S = C C' + R and r = z - E z. The
@@ -70,7 +70,7 @@ def propose(
         """Return the position of one particle, and the correction of its log weight."""
         slope = jnp.asarray(sensor.matrix) if isinstance(sensor, LinearSensor) else jax.jacfwd(sensor.measure)(center)
         columns = jnp.where(arrived[:, None], gain @ slope @ moved.root, 0.0)
-        innovation = nearest(z - gain @ sensor.measure(center) - offset, jnp.zeros(len(z)), angles)
+        innovation = wrap_near(z - gain @ sensor.measure(center) - offset, jnp.zeros(len(z)), angles)
         # The law of e given z, by its precision L L'.
         scaled = jnp.linalg.solve(noise, columns)
         lower = jnp.linalg.cholesky(jnp.eye(len(center)) + columns.T @ scaled)
@@ -87,9 +87,9 @@ def propose(
             log_q = jnp.logaddexp(jnp.log(1 - prior_share) + log_q, jnp.log(prior_share) + log_prior)
         return center + moved.root @ e, jnp.where(jnp.isfinite(log_q), log_prior - log_q, 0.0)
 
-    return Proposed(*jax.vmap(propose_one)(moved.center, moved.draws, from_prior))
+    return ProposedParticles(*jax.vmap(propose_one)(moved.center, moved.draws, from_prior))
 
 
-def noise_columns(plant: AbstractPlant, u: jax.Array) -> Columns:
+def noise_columns(plant: AbstractPlant, u: jax.Array) -> WeightedColumns:
     """Return the factors of Cov w."""
     return plant.noise.columns if isinstance(plant.noise, AbstractNoise) else columns_of(plant.noise_covariance(u))

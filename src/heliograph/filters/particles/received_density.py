@@ -8,22 +8,22 @@ import numpy as np
 
 from heliograph.filters.modes.patterns import pattern_of
 from heliograph.model.sensor import AbstractSensor
-from heliograph.numerics.angle import Angles, nearest
+from heliograph.numerics.angle import Angles, wrap_near
 from heliograph.numerics.check import fail
 from heliograph.numerics.density import LOG_TURN
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import Array, Bool, Float
-from heliograph.random_affine.base import AbstractRandomAffine, Outcome
+from heliograph.random_affine.base import AbstractRandomAffine, ArrivalOutcome
 from heliograph.random_affine.combine import Series
 from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.laws.law import Constant
-from heliograph.random_affine.moments.components import Component
+from heliograph.random_affine.moments.components import AffineComponent
 
 CERTAIN = 1e-14  # of the largest eigenvalue of a noise's correlations: below it a combination has no noise
 
 
-class Atoms(Module):
+class ReceivedAtoms(Module):
     """Atoms of z given y = h(x) for one set of arrivals: z = gain y + offset + N(0, noise) with probability `weight`.
 
     Shapes: weight (a,), gain (a, m, p), offset (a, m), noise (a, m, m).
@@ -48,7 +48,7 @@ class Atoms(Module):
             """Return log N(z; gain y + offset, noise) of one atom (N,)."""
             expected = y @ gain.T + offset
             valid = jnp.all(jnp.isfinite(expected) | ~present, axis=1)
-            value = nearest(z - expected, jnp.zeros(len(z)), angles)
+            value = wrap_near(z - expected, jnp.zeros(len(z)), angles)
             value = jnp.where(valid[:, None] & present, value, 0.0)
             # Whitened by the factor of the noise; what did not arrive has variance 1.
             factor = jnp.linalg.cholesky(jnp.where(both, noise, jnp.eye(len(z))))
@@ -78,12 +78,12 @@ class ReceivedDensity(Module):
 
     present: Bool[Array, "A m"]
     chance: Float[Array, "M A"]
-    atoms: Atoms
+    atoms: ReceivedAtoms
 
-    def given_arrivals(self, z: jax.Array) -> tuple[Atoms, jax.Array]:
+    def given_arrivals(self, z: jax.Array) -> tuple[ReceivedAtoms, jax.Array]:
         """Return the atoms, and the chance (M,), of the smallest set in which all arrive that did, in each mode."""
         kind = pattern_of(self, ~jnp.isnan(z)) if len(self.present) > 1 else 0
-        chosen: Atoms = jax.tree.map(lambda leaf: jnp.asarray(leaf)[:, kind], self.atoms)
+        chosen: ReceivedAtoms = jax.tree.map(lambda leaf: jnp.asarray(leaf)[:, kind], self.atoms)
         return chosen, jnp.asarray(self.chance)[:, kind]
 
 
@@ -115,7 +115,7 @@ def find_received_density(
     )
 
 
-def _list_atoms(sensor: AbstractSensor, outcome: Outcome) -> list[Component]:
+def _list_atoms(sensor: AbstractSensor, outcome: ArrivalOutcome) -> list[AffineComponent]:
     """Return the atoms of one set of arrivals; raise unless each has noise in all that arrives."""
     outputs = len(sensor.outputs)
     received = GainAndNoise(Constant(1.0), np.eye(outputs), sensor.noise)
@@ -140,8 +140,8 @@ def _check_noise(covariance: np.ndarray) -> None:
         raise fail("output of particles", expected, f"the covariance {covariance.tolist()}")
 
 
-def _stack_atoms(atoms: Sequence[Component], count: int) -> Atoms:
+def _stack_atoms(atoms: Sequence[AffineComponent], count: int) -> ReceivedAtoms:
     """Stack atoms into arrays of `count`, the missing ones of weight zero."""
     filled = [*atoms, *[atoms[0]._replace(weight=0.0)] * (count - len(atoms))]
     weight, gain, offset, noise = (np.stack([np.asarray(x, float) for x in part]) for part in zip(*filled, strict=True))
-    return Atoms(weight / weight.sum(), gain, offset, noise)
+    return ReceivedAtoms(weight / weight.sum(), gain, offset, noise)

@@ -18,7 +18,7 @@ def resample_systematically(weight: jax.Array, start: jax.Array) -> jax.Array:
     return invert_distribution(weight, (start + jnp.arange(len(weight))) / len(weight))
 
 
-def resample_known(weight: np.ndarray, start: float) -> np.ndarray:
+def resample_concrete_weights(weight: np.ndarray, start: float) -> np.ndarray:
     """Resample known weights (N,) of any sum like `resample_systematically`, in a time that does not grow by log N.
 
     Particle i is drawn for the j with N C_(i-1) < start + j <= N C_i, C the distribution function; and of a j the

@@ -7,13 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.factors.columns import Columns, columns_of, join_columns, square_root, triangularise
+from heliograph.factors.columns import WeightedColumns, columns_of, join_columns, square_root, triangularise
 from heliograph.filters.base import Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.particles.base import AbstractStateParticleFilter, Weighed, keep_unused, relative_to_largest
-from heliograph.filters.particles.expected import Expected
+from heliograph.filters.particles.expected import ExpectedMeasurement
 from heliograph.filters.particles.moments import FirstSums, StateSums, first_sums, second_sums
-from heliograph.filters.particles.proposal import Moved, noise_columns, propose
-from heliograph.filters.particles.received_density import Atoms, find_received_density
+from heliograph.filters.particles.proposal import MoveLaw, noise_columns, propose_particles
+from heliograph.filters.particles.received_density import ReceivedAtoms, find_received_density
 from heliograph.filters.particles.resampling import draw_normals, effective_number, fold_in_bits
 from heliograph.model.channel import Channel, check_link, find_received_angles
 from heliograph.model.estimate import Estimate, Innovation
@@ -42,7 +42,7 @@ class StateParticles(NamedTuple):
 
     position: Float[jax.Array, "N n"]
     log_weight: Float[jax.Array, " N"]
-    law: Moved | None
+    law: MoveLaw | None
     key: Int[jax.Array, " 2"]
     moved: Bool[jax.Array, ""]
 
@@ -85,7 +85,7 @@ class StateParticleFilter(AbstractStateParticleFilter):
     def state_of(self, position: jax.Array, log_weight: jax.Array, key: jax.Array) -> StateParticles:
         """Return the state of particles (N, n) with these log weights, of which none is left to draw."""
         size = position.shape[1]
-        law = Moved(position, jnp.zeros((size, size)), jnp.zeros_like(position)) if self.optimal else None
+        law = MoveLaw(position, jnp.zeros((size, size)), jnp.zeros_like(position)) if self.optimal else None
         return StateParticles(position, log_weight, law, key, jnp.asarray(True))
 
     def start_keys(self) -> tuple[jax.Array, jax.Array]:
@@ -113,7 +113,7 @@ class StateParticleFilter(AbstractStateParticleFilter):
 
     def move(
         self, x: jax.Array, numbers: jax.Array | None, key: jax.Array, u: jax.Array, k: Step, moved: jax.Array
-    ) -> tuple[jax.Array, Moved | None]:
+    ) -> tuple[jax.Array, MoveLaw | None]:
         """Move particles x (B, n) with noises of their own; return with them the law of the move, if z is to use it."""
         plant = at(self.plant, k)
         center = jax.vmap(lambda one: plant.transition(one, u))(x)
@@ -124,9 +124,9 @@ class StateParticleFilter(AbstractStateParticleFilter):
         draws = draw_normals(key, numbers, x.shape[1], self.particles)
         center, root = center + plant.noise_mean(), _root_of(noise_columns(plant, u))
         position = wrap_angles(center + draws @ root.T, plant.angles)
-        return position, self._law(plant, moved, Moved(center, root, draws), u) if self.optimal else None
+        return position, self._law(plant, moved, MoveLaw(center, root, draws), u) if self.optimal else None
 
-    def _law(self, plant: AbstractPlant, moved: jax.Array, law: Moved, u: jax.Array) -> Moved:
+    def _law(self, plant: AbstractPlant, moved: jax.Array, law: MoveLaw, u: jax.Array) -> MoveLaw:
         """Return the law of x+ of each particle; at the first step of a linear plant that of x_0 and w together.
 
         So a first measurement that is far more precise than x_0 leaves more than few of the particles.
@@ -159,7 +159,7 @@ class StateParticleFilter(AbstractStateParticleFilter):
         return key, jax.random.fold_in(key, 2)
 
     def weigh(
-        self, position: jax.Array, law: Moved | None, numbers: jax.Array | None, key: jax.Array, z: jax.Array, k: Step
+        self, position: jax.Array, law: MoveLaw | None, numbers: jax.Array | None, key: jax.Array, z: jax.Array, k: Step
     ) -> Weighed:
         """Weigh particles (B, n) by z, after they are drawn anew with it where the law of their move is given.
 
@@ -169,22 +169,24 @@ class StateParticleFilter(AbstractStateParticleFilter):
         predicted = received = jax.vmap(sensor.measure)(position)
         correction = jnp.zeros(len(position))
         if law is not None:
-            drawn = propose(law, sensor, atoms, z, self.observed_angles, key, numbers, self.particles)
+            drawn = propose_particles(law, sensor, atoms, z, self.observed_angles, key, numbers, self.particles)
             position, correction = wrap_angles(drawn.position, at(self.plant, k).angles), drawn.correction
             received = jax.vmap(sensor.measure)(position)
         likelihood = atoms.log_densities(received, z, self.observed_angles) + correction
         return Weighed(position, likelihood, (predicted,))
 
-    def atoms_of(self, z: jax.Array, k: Step) -> Atoms:
+    def atoms_of(self, z: jax.Array, k: Step) -> ReceivedAtoms:
         """Return the atoms of what is received given h(x)."""
-        atoms: Atoms = jax.tree.map(lambda leaf: leaf[0], at(self.density, k).given_arrivals(z)[0])
+        atoms: ReceivedAtoms = jax.tree.map(lambda leaf: leaf[0], at(self.density, k).given_arrivals(z)[0])
         return atoms
 
     def sum_received(
         self, reference: tuple[Any, ...], weight: jax.Array, predicted: tuple[Any, ...], z: jax.Array, k: Step
     ) -> tuple[FirstSums, jax.Array]:
         """Return both sums of how far innovations of particles (B,) and atoms are from that of a reference."""
-        both, apart = Expected(self.atoms_of(z, k), z, reference[0], self.observed_angles).apart(weight, *predicted)
+        both, apart = ExpectedMeasurement(self.atoms_of(z, k), z, reference[0], self.observed_angles).apart(
+            weight, *predicted
+        )
         return first_sums(both, apart, ()), second_sums(both, apart)
 
     def innovation_of(
@@ -196,7 +198,9 @@ class StateParticleFilter(AbstractStateParticleFilter):
         density: jax.Array,
     ) -> Innovation:
         """Return z less its mean over particles and atoms, the covariance of these, and the log-likelihood."""
-        return Expected(self.atoms_of(z, k), z, reference[0], self.observed_angles).innovation(*received, density)
+        return ExpectedMeasurement(self.atoms_of(z, k), z, reference[0], self.observed_angles).innovation(
+            *received, density
+        )
 
     def sum_states(self, weight: jax.Array, position: jax.Array) -> StateSums:
         """Return the first sums of positions (B, n)."""
@@ -217,7 +221,7 @@ class StateParticleFilter(AbstractStateParticleFilter):
         return self.compute_estimate(state)
 
 
-def _root_of(columns: Columns) -> jax.Array:
+def _root_of(columns: WeightedColumns) -> jax.Array:
     """Return a square root (n, n) of a covariance given by its columns."""
     triangular = triangularise(columns)
     return jnp.asarray(triangular.matrix * square_root(triangular.weights))

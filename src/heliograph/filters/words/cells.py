@@ -13,7 +13,7 @@ import numpy as np
 from heliograph.filters.event.truncated_normal import truncated_normal
 from heliograph.filters.words.edges import ADDED, ROOT_TWO_PI, SMOOTH, Smooth
 from heliograph.filters.words.merged import sum_merged, sum_overloads
-from heliograph.filters.words.sums import FINE, REACH, Grid, Prior, Sums, multiply_bits, tabulate
+from heliograph.filters.words.sums import FINE, REACH, LikelihoodSums, SignalPrior, WordGrid, multiply_bits, tabulate
 
 TABLE = 6  # bits of words that are all summed
 BLOCK = 3  # bits of neighbouring words whose likelihoods are those of the bits above times one table
@@ -23,7 +23,9 @@ NARROW = 1e-3  # of a deviation: the density is linear over a cell of this half 
 LEAST = 1e-3  # width, in deviations, of the dither by which edges are smoothed: less changes nothing
 
 
-def sum_by_edges(t: jax.Array, jumps: jax.Array, at_zero: jax.Array, width: jax.Array, smooth: Smooth) -> Sums:
+def sum_by_edges(
+    t: jax.Array, jumps: jax.Array, at_zero: jax.Array, width: jax.Array, smooth: Smooth
+) -> LikelihoodSums:
     """Return the sums M, E[t L], E[t^2 L] of a likelihood L that is constant but for jumps at the edges t.
 
     `jumps`: L above each edge less L below it. `at_zero`: L(0). `width`: of the dither, in deviations.
@@ -34,12 +36,18 @@ def sum_by_edges(t: jax.Array, jumps: jax.Array, at_zero: jax.Array, width: jax.
     sign = jnp.where(t < 0, -1.0, 1.0)
     step = smooth(jnp.abs(t), jnp.maximum(width, LEAST))
     mass = at_zero + jumps @ (sign * step.beyond)
-    return Sums(mass, jumps @ step.density, mass + jumps @ (sign * step.slope))
+    return LikelihoodSums(mass, jumps @ step.density, mass + jumps @ (sign * step.slope))
 
 
 def sum_neighbours(
-    pairs: list[jax.Array], weights: jax.Array, start: jax.Array, blocks: int, grid: Grid, prior: Prior, dither: str
-) -> Sums:
+    pairs: list[jax.Array],
+    weights: jax.Array,
+    start: jax.Array,
+    blocks: int,
+    grid: WordGrid,
+    prior: SignalPrior,
+    dither: str,
+) -> LikelihoodSums:
     """Sum over blocks of neighbouring words, of which the first and the last are taken for half-lines.
 
     The likelihood of a word is that of the bits above its block times that of those in it, a table for all blocks.
@@ -60,7 +68,9 @@ def sum_neighbours(
         """Return the likelihood of the bits above a block for each combination, times its probability."""
         return weights * jnp.stack([multiply_bits(pair[BLOCK:], start / size + block) for pair in pairs])
 
-    def add_block(carried: tuple[Sums, jax.Array], block: jax.Array) -> tuple[tuple[Sums, jax.Array], None]:
+    def add_block(
+        carried: tuple[LikelihoodSums, jax.Array], block: jax.Array
+    ) -> tuple[tuple[LikelihoodSums, jax.Array], None]:
         """Add the edges of one block: those above each of its words."""
         total, above = carried
         following = weigh_bits_above(block + 1)
@@ -77,15 +87,15 @@ def sum_neighbours(
         sums = sum_by_edges(t[1:], jumps, at_zero, grid.step / prior.deviation, SMOOTH[dither])
         return (total.plus(sums), following), None
 
-    zero = Sums(*jnp.zeros((3, *weights.shape[:-1])))
+    zero = LikelihoodSums(*jnp.zeros((3, *weights.shape[:-1])))
     (sums, _), _ = jax.lax.scan(add_block, (zero, weigh_bits_above(jnp.zeros(()))), jnp.arange(blocks, dtype=float))
     return sums
 
 
 def sum_window(
-    pairs: list[jax.Array], weights: jax.Array, received: jax.Array, grid: Grid, prior: Prior, dither: str
-) -> Sums:
-    """Sum over the words within the reach of the prior, and the one that was received; arguments `change_by_bits`'."""
+    pairs: list[jax.Array], weights: jax.Array, received: jax.Array, grid: WordGrid, prior: SignalPrior, dither: str
+) -> LikelihoodSums:
+    """Sum over the words within the reach of the prior, and the one that was received; arguments `effect_of_bits`'."""
     count = WINDOW * 2**BLOCK
     start = jnp.floor((prior.mean - REACH * prior.deviation - grid.low) / (grid.step * 2**BLOCK)) * 2**BLOCK
     start = jnp.clip(start, 0.0, 2.0**grid.bits - count)
@@ -96,7 +106,9 @@ def sum_window(
     return sums.plus(sum_cell(likelihood * outside, received, grid, prior, dither))
 
 
-def sum_cell(likelihood: jax.Array, index: jax.Array, grid: Grid, prior: Prior, dither: str) -> Sums:
+def sum_cell(
+    likelihood: jax.Array, index: jax.Array, grid: WordGrid, prior: SignalPrior, dither: str
+) -> LikelihoodSums:
     """Sum over one word that is far from the prior."""
     edges = index + jnp.array([-0.5, 0.5])
     t = (grid.low + edges * grid.step - prior.mean) / prior.deviation
@@ -108,7 +120,7 @@ def sum_cell(likelihood: jax.Array, index: jax.Array, grid: Grid, prior: Prior, 
     return sum_by_edges(t, jumps, at_zero, grid.step / prior.deviation, SMOOTH[dither])
 
 
-class Change(NamedTuple):
+class WordEffect(NamedTuple):
     """What a word does to y: log M, E y - m in deviations, and Var y over s^2."""
 
     log_mass: jax.Array
@@ -116,26 +128,26 @@ class Change(NamedTuple):
     ratio: jax.Array
 
 
-def change_by_sums(sums: Sums) -> Change:
+def change_by_sums(sums: LikelihoodSums) -> WordEffect:
     """Return the moments from the sums; log M is -inf where it is less than the smallest number."""
     possible = sums.mass > np.finfo(float).tiny
     mass = jnp.where(possible, sums.mass, 1.0)
     shift = sums.first / mass
-    return Change(jnp.where(possible, jnp.log(mass), -jnp.inf), shift, sums.second / mass - shift**2)
+    return WordEffect(jnp.where(possible, jnp.log(mass), -jnp.inf), shift, sums.second / mass - shift**2)
 
 
-def widen(prior: Prior, grid: Grid, dither: str) -> tuple[Prior, jax.Array]:
+def widen(prior: SignalPrior, grid: WordGrid, dither: str) -> tuple[SignalPrior, jax.Array]:
     """Return the law of y + d, taken for Gaussian as the step D is small, and its variance over that of y."""
     wide = 1 + ADDED[dither] * (grid.step / prior.deviation) ** 2
-    return Prior(prior.mean, prior.deviation * jnp.sqrt(wide)), wide
+    return SignalPrior(prior.mean, prior.deviation * jnp.sqrt(wide)), wide
 
 
-def narrow(change: Change, wide: jax.Array) -> Change:
+def narrow(change: WordEffect, wide: jax.Array) -> WordEffect:
     """Return what is known of y from what is known of y + d, whose variance is `wide` times that of y."""
-    return Change(change.log_mass, change.shift / jnp.sqrt(wide), 1 - (1 - change.ratio) / wide)
+    return WordEffect(change.log_mass, change.shift / jnp.sqrt(wide), 1 - (1 - change.ratio) / wide)
 
 
-def change_by_cell(index: jax.Array, grid: Grid, prior: Prior, dither: str) -> Change:
+def effect_of_cell(index: jax.Array, grid: WordGrid, prior: SignalPrior, dither: str) -> WordEffect:
     """Return what the word of number `index` does to y, where no bit can have flipped."""
     wider, wide = widen(prior, grid, dither)
     cut = narrow(_cut_to_cell(index, grid, wider), wide)
@@ -146,10 +158,10 @@ def change_by_cell(index: jax.Array, grid: Grid, prior: Prior, dither: str) -> C
     width = grid.step / prior.deviation
     smooth = change_by_sums(sum_cell(jnp.ones(()), index, grid, prior, dither))
     use = (width >= FINE) & (away - width < FAR)
-    return Change(*(jnp.where(use, a, b) for a, b in zip(smooth, cut, strict=True)))
+    return WordEffect(*(jnp.where(use, a, b) for a, b in zip(smooth, cut, strict=True)))
 
 
-def _cut_to_cell(index: jax.Array, grid: Grid, prior: Prior) -> Change:
+def _cut_to_cell(index: jax.Array, grid: WordGrid, prior: SignalPrior) -> WordEffect:
     """Return what knowing its cell does to y: by the cell's ends, or its centre where their difference loses digits.
 
     The end cells of words of so many `bits` reach to infinity; bits 0: words without end.
@@ -165,13 +177,13 @@ def _cut_to_cell(index: jax.Array, grid: Grid, prior: Prior) -> Change:
     # Of a short cell of half width h about c, the density is linear: mass 2 h phi(c), mean - c = -c h^2 / 3 and
     # variance h^2 / 3.
     log_mass = -(centre**2) / 2 - np.log(ROOT_TWO_PI) + jnp.log(2 * half)
-    short = Change(log_mass, centre * (1 - half**2 / 3), half**2 / 3)
-    return Change(*(jnp.where(narrow_cell, a, b) for a, b in zip(short, cut, strict=True)))
+    short = WordEffect(log_mass, centre * (1 - half**2 / 3), half**2 / 3)
+    return WordEffect(*(jnp.where(narrow_cell, a, b) for a, b in zip(short, cut, strict=True)))
 
 
-def change_by_bits(
-    pairs: list[jax.Array], weights: jax.Array, received: jax.Array, grid: Grid, prior: Prior, dither: str
-) -> Change:
+def effect_of_bits(
+    pairs: list[jax.Array], weights: jax.Array, received: jax.Array, grid: WordGrid, prior: SignalPrior, dither: str
+) -> WordEffect:
     """Return what the received bits of a word do to y.
 
     Args:
@@ -186,16 +198,16 @@ def change_by_bits(
         blocks = 2 ** max(grid.bits - BLOCK, 0)
         return change_by_sums(sum_neighbours(pairs, weights, jnp.zeros(()), blocks, grid, prior, dither))
 
-    def change_by_wide_words() -> Change:
+    def change_by_wide_words() -> WordEffect:
         """Sum word by word within the prior's reach."""
         return change_by_sums(sum_window(pairs, weights, received, grid, prior, dither))
 
-    def change_by_fine_words() -> Change:
+    def change_by_fine_words() -> WordEffect:
         """Sum over cells of several words each."""
         wider, wide = widen(prior, grid, dither)
         sums = [sum_merged(pair, received, grid, wider).plus(sum_overloads(pair, grid, wider)) for pair in pairs]
-        merged = Sums(*(weights @ jnp.stack(terms) for terms in zip(*sums, strict=True)))
+        merged = LikelihoodSums(*(weights @ jnp.stack(terms) for terms in zip(*sums, strict=True)))
         return narrow(change_by_sums(merged), wide)
 
-    change: Change = jax.lax.cond(grid.step >= FINE * prior.deviation, change_by_wide_words, change_by_fine_words)
+    change: WordEffect = jax.lax.cond(grid.step >= FINE * prior.deviation, change_by_wide_words, change_by_fine_words)
     return change

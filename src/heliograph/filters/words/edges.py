@@ -36,7 +36,7 @@ POWERS = (
 )  # of (1 + 2 x) e^(x^2) erfc x
 
 
-class Steps(NamedTuple):
+class LikelihoodStep(NamedTuple):
     """What a step of a likelihood from 0 to 1 at |t| = a adds to the sums, smoothed by a dither.
 
     beyond: Q(a) = P(t' > a) of a standard normal t' plus dither; density: -Q'(a); slope: Q''(a), without dither
@@ -48,7 +48,7 @@ class Steps(NamedTuple):
     slope: jax.Array
 
 
-Smooth = Callable[[jax.Array, jax.Array], Steps]
+Smooth = Callable[[jax.Array, jax.Array], LikelihoodStep]
 
 
 def tail_and_density(a: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -74,24 +74,24 @@ def signed_tail_and_density(a: jax.Array) -> tuple[jax.Array, jax.Array]:
     return jnp.where(a < 0, 1 - q, q), density
 
 
-def step_as_it_is(a: jax.Array, width: jax.Array) -> Steps:
+def step_as_it_is(a: jax.Array, width: jax.Array) -> LikelihoodStep:
     """Return a step without dither: Q, phi and a phi."""
     q, density = tail_and_density(a)
-    return Steps(q, density, a * density)
+    return LikelihoodStep(q, density, a * density)
 
 
-def step_by_uniform(a: jax.Array, width: jax.Array) -> Steps:
+def smooth_step_by_uniform(a: jax.Array, width: jax.Array) -> LikelihoodStep:
     """Return a step by a uniform dither of width D: differences over D of I(a) = E(t - a)+ = phi - a Q, Q and phi."""
     low, high = a - width / 2, a + width / 2
     (q_low, p_low), (q_high, p_high) = (signed_tail_and_density(x) for x in (low, high))
-    return Steps(
+    return LikelihoodStep(
         beyond=(p_low - low * q_low - p_high + high * q_high) / width,
         density=(q_low - q_high) / width,
         slope=(p_low - p_high) / width,
     )
 
 
-def step_by_triangle(a: jax.Array, width: jax.Array) -> Steps:
+def smooth_step_by_triangle(a: jax.Array, width: jax.Array) -> LikelihoodStep:
     """Return a step by a triangular dither: second differences of E((t - a)+)^2 / 2 = ((1 + a^2) Q - a phi)/2, I, Q."""
     tails, squares, means = [], [], []
     for x in (a - width, a, a + width):
@@ -104,13 +104,15 @@ def step_by_triangle(a: jax.Array, width: jax.Array) -> Steps:
         """Return (f(a - D) - 2 f(a) + f(a + D)) / D^2."""
         return (values[0] - 2 * values[1] + values[2]) / width**2
 
-    return Steps(beyond=second_difference(squares), density=second_difference(means), slope=second_difference(tails))
+    return LikelihoodStep(
+        beyond=second_difference(squares), density=second_difference(means), slope=second_difference(tails)
+    )
 
 
 SMOOTH: dict[str, Smooth] = {
     "none": step_as_it_is,
     "subtracted": step_as_it_is,
-    "stochastic": step_by_uniform,
-    "triangular": step_by_triangle,
+    "stochastic": smooth_step_by_uniform,
+    "triangular": smooth_step_by_triangle,
 }
 ADDED = {"none": 0.0, "subtracted": 0.0, "stochastic": 1 / 12, "triangular": 1 / 6}  # variance of a dither, in D^2

@@ -16,20 +16,20 @@ from heliograph.model.channel import Channel, check_link, perfect
 from heliograph.model.fading import without_memory
 from heliograph.model.over_time import at_each_step, first, unstack
 from heliograph.model.plant import AnyPlant, check_plant
-from heliograph.model.premises.premise import Premise, believing
+from heliograph.model.premises.premise import Premise, on_premise
 from heliograph.model.sensor import AbstractSensor, AnySensor, check_sensor, refuse_angles
 from heliograph.model.words.encoder import Dither, Words
-from heliograph.model.words.route import FLAG, about_centres, find_places
+from heliograph.model.words.route import FLAG, find_places, rewrite_about_centres
 from heliograph.numerics.check import fail, instance, show_value
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Stack
 from heliograph.random_affine.delay import Delayed
 from heliograph.random_affine.modes import ModeOutput
 from heliograph.random_affine.moments.second_moments import SecondOrder, second_order
-from heliograph.random_affine.words.rounded import Rounded, find_rounded
+from heliograph.random_affine.words.rounded import RoundedNoise, find_rounded
 
 
-class Alphabet(NamedTuple):
+class WordAlphabet(NamedTuple):
     """The words of each component: the lowest (or any one), step and centre (m,); bits, 0 for words without end."""
 
     low: np.ndarray
@@ -39,7 +39,7 @@ class Alphabet(NamedTuple):
     dither: Dither
 
 
-def _alphabet_of(sensor: AbstractSensor, encoder: Words | None) -> Alphabet:
+def _alphabet_of(sensor: AbstractSensor, encoder: Words | None) -> WordAlphabet:
     """Return the words of an encoder, or of a sensor that reports multiples of its resolution."""
     m = len(sensor.outputs)
     rounded = find_rounded(sensor)
@@ -49,15 +49,15 @@ def _alphabet_of(sensor: AbstractSensor, encoder: Words | None) -> Alphabet:
             expected = "one without resolution, as words have their own"
             raise fail("sensor of a node with an encoder", expected, "a resolution")
         low, step, centre = (encoder.each(end, m) for end in (encoder.low, encoder.step, encoder.centre))
-        return Alphabet(low, step, centre, encoder.bits, encoder.dither)
-    if not isinstance(sensor.noise, Rounded):
+        return WordAlphabet(low, step, centre, encoder.bits, encoder.dither)
+    if not isinstance(sensor.noise, RoundedNoise):
         raise fail("word filter", "an encoder (Words), or a sensor with a resolution", "neither")
-    return Alphabet(np.zeros(m), np.asarray(sensor.noise.step), np.zeros(m), 0, "none")
+    return WordAlphabet(np.zeros(m), np.asarray(sensor.noise.step), np.zeros(m), 0, "none")
 
 
 def _take_off_rounding(sensor: AbstractSensor) -> AbstractSensor:
     """Return the sensor with the noise that it has before it rounds."""
-    if not isinstance(sensor.noise, Rounded):
+    if not isinstance(sensor.noise, RoundedNoise):
         return sensor
     twin = copy(sensor)
     object.__setattr__(twin, "noise", sensor.noise.source)
@@ -68,7 +68,7 @@ def _describe_numbers(encoder: Words | None, channel: AbstractRandomAffine) -> S
     """Return the second moments of the words that arrive as numbers about their centres, modes averaged over."""
     words = [part for part in channel.in_parallel if not isinstance(part, ModeOutput)]
     link = words[0] if len(words) == 1 else Stack(words)
-    numbers = link if encoder is None else about_centres(encoder, link)
+    numbers = link if encoder is None else rewrite_about_centres(encoder, link)
     forgets = without_memory(first(numbers).condition_on_arrival())
     return second_order(first(forgets))
 
@@ -147,4 +147,4 @@ def word_filter(
         **make_sizes("nominal", start, len(places) + dithers),
     )
     filter: AbstractFilter = one_gaussian if no_flips or hypotheses == 1 else keep_two_hypotheses(one_gaussian)
-    return believing(filter, Premise(plant, sensor, channel, encoder=encoder, order=None))
+    return on_premise(filter, Premise(plant, sensor, channel, encoder=encoder, order=None))

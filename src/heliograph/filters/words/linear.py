@@ -23,12 +23,12 @@ from heliograph.model.over_time import at_each_step, first, unstack
 from heliograph.model.plant import AnyPlant, check_plant
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.model.words.encoder import Words
-from heliograph.model.words.route import FLAG, about_centres, find_places
+from heliograph.model.words.route import FLAG, find_places, rewrite_about_centres
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.types import Array, ArrayLike, PyTree
 from heliograph.random_affine.moments.second_moments import has_random_gain, second_order
 from heliograph.random_affine.noise import AbstractNoise, Gaussian
-from heliograph.random_affine.words.rounded import Rounded, find_rounded
+from heliograph.random_affine.words.rounded import RoundedNoise, find_rounded
 
 SEEN = 0.01  # share of the rms error that overload may change a claim by
 MakeFilter = Callable[[AnyPlant, AnySensor, Channel], AbstractFilter]
@@ -99,9 +99,9 @@ def build_behind_words(
     outputs = len(first(sensor).outputs)
     instance("encoder", encoder, Words, "Words").check_outputs(outputs)
     check_sent(first(sensor), first(channel))
-    places, numbers = find_places(channel), about_centres(encoder, channel)
+    places, numbers = find_places(channel), rewrite_about_centres(encoder, channel)
     # Laws of the words: of each mode where modes are told, of each step else.
-    told = [about_centres(encoder, link) for link in list_told_modes(first(channel))]
+    told = [rewrite_about_centres(encoder, link) for link in list_told_modes(first(channel))]
     laws = [first(law) for law in told or unstack(numbers)]
     remembers = first(channel).remembers
     fades = (remembers and not told) or any(has_random_gain(law, second_order(law)) for law in laws)
@@ -143,7 +143,7 @@ def _round_sensor(sensor: LinearSensor, encoder: Words, gaussian: bool, matters:
     """Return the sensor of y - c whose noise has the error of rounding."""
     m = len(sensor.outputs)
     step, centre, high = (encoder.each(end, m) for end in (encoder.step, encoder.centre, encoder.high))
-    noise = Rounded(sensor.noise, step, high - centre, centre, encoder.dither, gaussian, matters)
+    noise = RoundedNoise(sensor.noise, step, high - centre, centre, encoder.dither, gaussian, matters)
     return LinearSensor(sensor.matrix, noise, sensor.outputs)
 
 

@@ -5,14 +5,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.words.edges import ROOT_TWO_PI, signed_tail_and_density
-from heliograph.filters.words.sums import FINE, REACH, Grid, Prior, Sums, multiply_bits, tabulate
+from heliograph.filters.words.sums import FINE, REACH, LikelihoodSums, SignalPrior, WordGrid, multiply_bits, tabulate
 
 MERGED = 4  # bits of neighbouring cells whose likelihoods are those of the bits above times one table
 BLOCKS = 10  # of cells of an eighth to a quarter of a deviation within the reach, which may begin a block earlier
-Carried = tuple[Sums, jax.Array, jax.Array, jax.Array]  # sums, e^(-a^2 / (2 v)), r and a of a block's first cell
+Carried = tuple[
+    LikelihoodSums, jax.Array, jax.Array, jax.Array
+]  # sums, e^(-a^2 / (2 v)), r and a of a block's first cell
 
 
-def sum_merged(pairs: jax.Array, received: jax.Array, grid: Grid, prior: Prior) -> Sums:
+def sum_merged(pairs: jax.Array, received: jax.Array, grid: WordGrid, prior: SignalPrior) -> LikelihoodSums:
     """Return the sums over cells of 2^b fine words, an eighth to a quarter of a deviation wide, without the overloads.
 
     Within a merged cell the low bits say that y is about mu with a variance v, a Gaussian as the prior: with
@@ -55,10 +57,12 @@ def sum_merged(pairs: jax.Array, received: jax.Array, grid: Grid, prior: Prior) 
     # Of the product of both Gaussians: E t = a / wide, E t^2 = a^2 / wide^2 + 1 - 1 / wide.
     scale = inner * grid.step / (prior.deviation * ROOT_TWO_PI * jnp.sqrt(wide))
     first, second = first / wide, second / wide**2
-    return Sums(scale * mass, scale * first, scale * (second + mass * (1 - 1 / wide)))
+    return LikelihoodSums(scale * mass, scale * first, scale * (second + mass * (1 - 1 / wide)))
 
 
-def _sum_blocks(pairs: jax.Array, number: jax.Array, away: jax.Array, width: jax.Array, wide: jax.Array) -> Sums:
+def _sum_blocks(
+    pairs: jax.Array, number: jax.Array, away: jax.Array, width: jax.Array, wide: jax.Array
+) -> LikelihoodSums:
     """Return the sums over cells of likelihood times e^(-a^2 / (2 wide)), of that times a, and times a^2.
 
     Of the cell j of a block, whose first is at a, e^(-(a + j w)^2 / (2 v)) is e^(-a^2 / (2 v)) r^j e^(-(j w)^2 / (2 v))
@@ -92,13 +96,13 @@ def _sum_blocks(pairs: jax.Array, number: jax.Array, away: jax.Array, width: jax
             inside = inside * ratio + coefficients[row]
         inside = inside * (density * multiply_bits(pairs[MERGED:], number + block))
         first, second = inside[1] * width, inside[2] * width**2
-        sums = sums.plus(Sums(inside[0], a * inside[0] + first, a * (a * inside[0] + 2 * first) + second))
+        sums = sums.plus(LikelihoodSums(inside[0], a * inside[0] + first, a * (a * inside[0] + 2 * first) + second))
         power = ratio
         for _ in range(MERGED):
             power = power**2
         return (sums, density * power * once, ratio * shrink, a + 2**MERGED * width), None
 
-    start = Sums(*jnp.zeros(3)), jnp.exp(-(away**2) / (2 * wide)), jnp.exp(-away * width / wide), away
+    start = LikelihoodSums(*jnp.zeros(3)), jnp.exp(-(away**2) / (2 * wide)), jnp.exp(-away * width / wide), away
     (sums, *_), _ = jax.lax.scan(add_block, start, jnp.arange(BLOCKS, dtype=float))
     return sums
 
@@ -117,11 +121,11 @@ def _shift_bits(pairs: jax.Array, count: jax.Array) -> jax.Array:
     return shifted
 
 
-def sum_overloads(pair: jax.Array, grid: Grid, prior: Prior) -> Sums:
+def sum_overloads(pair: jax.Array, grid: WordGrid, prior: SignalPrior) -> LikelihoodSums:
     """Return the sums over y beyond both ends of the range, where all bits are zeros or ones."""
     ends = jnp.array([0.0, 2.0**grid.bits - 1])
     outwards = jnp.array([-1.0, 1.0])
     t = (grid.low + (ends + outwards / 2) * grid.step - prior.mean) / prior.deviation
     a, likelihood = t * outwards, jnp.prod(pair, axis=0)
     mass, density = (likelihood * part for part in signed_tail_and_density(a))
-    return Sums(jnp.sum(mass), jnp.sum(outwards * density), jnp.sum(mass + a * density))
+    return LikelihoodSums(jnp.sum(mass), jnp.sum(outwards * density), jnp.sum(mass + a * density))

@@ -19,7 +19,7 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, Float
 from heliograph.random_affine.moments.second_moments import SecondOrder, second_order
-from heliograph.random_affine.words.rounded import Rounded
+from heliograph.random_affine.words.rounded import RoundedNoise
 
 STEPS = 500  # that are looked at, if the models do not end before
 MOST = 1e-3  # probability of an overload at a step that is not refused
@@ -144,7 +144,7 @@ def _evaluate_motion(plant: LinearPlant) -> tuple[Array, Array, Array]:
 def _sensing(sensor: LinearSensor) -> Sensing:
     """Return C, the mean of y - c - C x, Cov v and the covariance of the rounding error."""
     law = sensor.noise
-    assert isinstance(law, Rounded)
+    assert isinstance(law, RoundedNoise)
     source = np.asarray(law.source.covariance)
     return np.asarray(sensor.matrix), np.asarray(law.mean), source, np.asarray(law.covariance) - source
 

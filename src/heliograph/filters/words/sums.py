@@ -9,19 +9,19 @@ REACH = 8.5  # deviations to each side, beyond which 2e-17 lies
 FINE = 0.25  # of a deviation: finer words are merged
 
 
-class Sums(NamedTuple):
+class LikelihoodSums(NamedTuple):
     """Sums M = E L, E[t L] and E[t^2 L] of a likelihood L of y, over the prior of t = (y - mean) / deviation."""
 
     mass: jax.Array
     first: jax.Array
     second: jax.Array
 
-    def plus(self, other: "Sums") -> "Sums":
+    def plus(self, other: "LikelihoodSums") -> "LikelihoodSums":
         """Return the sums over these words and others."""
-        return Sums(self.mass + other.mass, self.first + other.first, self.second + other.second)
+        return LikelihoodSums(self.mass + other.mass, self.first + other.first, self.second + other.second)
 
 
-class Grid(NamedTuple):
+class WordGrid(NamedTuple):
     """Words of one component: the lowest, the step, and their number."""
 
     low: jax.Array
@@ -29,7 +29,7 @@ class Grid(NamedTuple):
     bits: int
 
 
-class Prior(NamedTuple):
+class SignalPrior(NamedTuple):
     """Mean and deviation of y before the word."""
 
     mean: jax.Array

@@ -20,7 +20,7 @@ from heliograph.factors.repeated import triangularise_noise
 from heliograph.filters.base import AbstractSizedFilter, FilterAngles, Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.gaussian.belief import predict_gaussian, second_moments_at_start, smoother_step_by_transform
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
-from heliograph.filters.words.word_filter import Received, WordFilter
+from heliograph.filters.words.word_filter import ReceivedWords, WordFilter
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import at, first
 from heliograph.numerics.angle import wrap_angles
@@ -107,14 +107,14 @@ class TwoHypothesesFilter(AbstractSizedFilter):
         return smoother_step_by_transform(self.base, step.map_states(_merge), self.base)
 
     def _split_and_merge(
-        self, joint: Hypotheses, i: int, words: Received, begun: jax.Array
+        self, joint: Hypotheses, i: int, words: ReceivedWords, begun: jax.Array
     ) -> tuple[Hypotheses, jax.Array]:
         """Condition either hypothesis on word i and on whether it was right, and merge by whether all have been.
 
         begun: whether another word of the message was used. Returns the probability of what came, too.
         """
 
-        def split(part: Gaussian) -> tuple[Gaussian, jax.Array]:
+        def split_by_answer(part: Gaussian) -> tuple[Gaussian, jax.Array]:
             """Return one hypothesis given each answer, right or not (2, ...), and the chances of word and answer."""
             row = part.root[len(self.states) + i]
             prior = self.base.prior_of(part, i)
@@ -129,14 +129,14 @@ class TwoHypothesesFilter(AbstractSizedFilter):
 
             return jax.vmap(impose)(possible, change.shift, change.ratio), jnp.where(possible, mass, 0.0)
 
-        parts, mass = jax.lax.map(split, joint.parts)  # by hypothesis before and answer
+        parts, mass = jax.lax.map(split_by_answer, joint.parts)  # by hypothesis before and answer
         mass = mass * joint.weights[:, None]
         total = jnp.sum(mass)
         # Right: this word, and under the first hypothesis those before it.
         right = jnp.array([[True, False], [True, False]]) & jnp.stack([jnp.asarray(True), ~begun])[:, None]
         flat = jax.tree.map(lambda leaf: leaf.reshape(4, *leaf.shape[2:]), parts)
 
-        def merge(chosen: jax.Array) -> tuple[Gaussian, jax.Array]:
+        def merge_chosen(chosen: jax.Array) -> tuple[Gaussian, jax.Array]:
             """Merge the chosen of the four parts; return their probability too. Without any, merge all."""
             chosen_mass = jnp.where(chosen, mass, 0.0).ravel()
             probability = jnp.sum(chosen_mass)
@@ -146,7 +146,7 @@ class TwoHypothesesFilter(AbstractSizedFilter):
             )
             return merge_mixture(flat, shares), probability
 
-        merged, weights = jax.vmap(merge)(jnp.stack([right, ~right]))
+        merged, weights = jax.vmap(merge_chosen)(jnp.stack([right, ~right]))
         used = words.present[i] & (total > 0)
         after = Hypotheses(merged, weights / jnp.where(total > 0, total, 1.0))
         return jax.tree.map(lambda new, old: jnp.where(used, new, old), after, joint), total

@@ -7,15 +7,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import Columns, join_columns, rounding_of
+from heliograph.factors.columns import WeightedColumns, join_columns, rounding_of
 from heliograph.factors.gaussian import Gaussian, append_rows, impose_moments_of_combination, take_leading
 from heliograph.factors.repeated import triangularise_noise
 from heliograph.filters.base import Step, corrects
 from heliograph.filters.gaussian.belief import AbstractBeliefFilter, second_moments_at_start
 from heliograph.filters.gaussian.signal import Signal, innovation_covariance, signal_of
-from heliograph.filters.words.cells import Change, change_by_bits, change_by_cell
+from heliograph.filters.words.cells import WordEffect, effect_of_bits, effect_of_cell
 from heliograph.filters.words.received import LinkOfBits
-from heliograph.filters.words.sums import Grid, Prior
+from heliograph.filters.words.sums import SignalPrior, WordGrid
 from heliograph.model.estimate import Innovation
 from heliograph.model.over_time import OverTime, at
 from heliograph.model.sensor import AnySensor
@@ -89,7 +89,7 @@ class WordFilter(AbstractBeliefFilter):
         plant, sensor = at(self.plant, k), at(self.sensor, k)
         return signal_of(plant, sensor, self.transform, state, second_moments_at_start(self.plant, self))
 
-    def read(self, z: jax.Array, link: LinkOfBits) -> "Received":
+    def read(self, z: jax.Array, link: LinkOfBits) -> "ReceivedWords":
         """Return which words were received, and what their bits say of those that were sent.
 
         z has the received words, and flags of modes among them, as `places` says; behind these, where dither is
@@ -121,14 +121,14 @@ class WordFilter(AbstractBeliefFilter):
             received_bits = jnp.stack([1 - bit, bit], axis=-1)
             pairs = link.pairs(jnp.where(arrived[:, None, None], received_bits, 1.0))
             weights = link.weigh(z[:outputs])
-        return Received(numbers, dithers, present, pairs, weights, ~jnp.any(no_word & arrived))
+        return ReceivedWords(numbers, dithers, present, pairs, weights, ~jnp.any(no_word & arrived))
 
-    def prior_of(self, joint: Gaussian, i: int) -> Prior:
+    def prior_of(self, joint: Gaussian, i: int) -> SignalPrior:
         """Return the law of y_i in that of the state and y."""
         place = len(self.states) + i
-        return Prior(joint.mean[place], jnp.sqrt(joint.root[place] ** 2 @ joint.variances))
+        return SignalPrior(joint.mean[place], jnp.sqrt(joint.root[place] ** 2 @ joint.variances))
 
-    def condition_by_leading_bits(self, i: int, words: "Received", prior: Prior, leading: int) -> Change:
+    def condition_by_leading_bits(self, i: int, words: "ReceivedWords", prior: SignalPrior, leading: int) -> WordEffect:
         """Return what its word does to y_i, if the word was right in its `leading` bits and if not, (2,) each.
 
         A pair of `words.pairs` has, bit by bit, the likelihoods of a sent 0 and of a sent 1, (bits, 2).
@@ -141,27 +141,27 @@ class WordFilter(AbstractBeliefFilter):
         all_and_right = [*pairs, *(pair * if_right for pair in pairs)]
         right, wrong = jnp.append(0 * words.weights, words.weights), jnp.append(words.weights, -words.weights)
         weights = jnp.stack([right, wrong])
-        return change_by_bits(all_and_right, weights, words.numbers[i], self._grid(i, words), prior, self.dither)
+        return effect_of_bits(all_and_right, weights, words.numbers[i], self._grid(i, words), prior, self.dither)
 
-    def _condition(self, i: int, words: "Received", prior: Prior) -> Change:
+    def _condition(self, i: int, words: "ReceivedWords", prior: SignalPrior) -> WordEffect:
         """Return what was received of its word does to y_i."""
         grid = self._grid(i, words)
         if self.certain:
-            return change_by_cell(words.numbers[i], grid, prior, self.dither)
+            return effect_of_cell(words.numbers[i], grid, prior, self.dither)
         pairs = [pair[i] for pair in words.pairs]
-        return change_by_bits(pairs, words.weights, words.numbers[i], grid, prior, self.dither)
+        return effect_of_bits(pairs, words.weights, words.numbers[i], grid, prior, self.dither)
 
-    def _grid(self, i: int, words: "Received") -> Grid:
+    def _grid(self, i: int, words: "ReceivedWords") -> WordGrid:
         """Return the words of y_i, less the dither."""
-        return Grid(jnp.asarray(self.low)[i] - words.dithers[i], jnp.asarray(self.spacing)[i], self.bits)
+        return WordGrid(jnp.asarray(self.low)[i] - words.dithers[i], jnp.asarray(self.spacing)[i], self.bits)
 
     def innovation(
-        self, signal: Signal, words: "Received", z: jax.Array, numbers: SecondOrder, total: jax.Array
+        self, signal: Signal, words: "ReceivedWords", z: jax.Array, numbers: SecondOrder, total: jax.Array
     ) -> Innovation:
         """Return the innovation of the words as numbers about their centres, flags and dithers as not received."""
         error = LARGEST[self.dither].error * jnp.asarray(self.spacing) ** 2
         mean = signal.mean - jnp.asarray(self.centre)
-        noise = join_columns(signal.noise, Columns(np.eye(len(self.low)), error))
+        noise = join_columns(signal.noise, WeightedColumns(np.eye(len(self.low)), error))
         second = signal.covariance + jnp.diag(error) + jnp.outer(mean, mean)
         about_centre = signal._replace(mean=mean, noise=noise, second=second)
         rows = np.array([i for i, place in enumerate(self.places) if place != FLAG])
@@ -179,7 +179,7 @@ class WordFilter(AbstractBeliefFilter):
         return Innovation(jnp.full(len(z), jnp.nan).at[rows].set(value), covariance_of_all, total)
 
 
-class Received(NamedTuple):
+class ReceivedWords(NamedTuple):
     """What was received: number of the word, dither and presence of each component, and what the bits say.
 
     Shapes: numbers, dithers, present (components,), pairs (components, bits, 2) of each combination of error rates,

@@ -24,7 +24,7 @@ from heliograph.model.over_time import at
 from heliograph.model.plant import AnyPlant, check_plant
 from heliograph.model.premises.premise import believes
 from heliograph.model.sensor import AnySensor
-from heliograph.numerics.angle import nearest
+from heliograph.numerics.angle import wrap_near
 from heliograph.numerics.check import fail, items
 from heliograph.numerics.lapack import eigh
 from heliograph.numerics.types import ArrayLike, Bool, Float, Int
@@ -103,7 +103,7 @@ class ClockFilter(AbstractWrapper):
         sensor, prior = at(base.sensor, k), state.gaussian
         signal = signal_of(at(base.plant, k), sensor, base.transform, prior, second_moments_at_start(base.plant, base))
         expected = jnp.asarray(channel.mean_gain @ signal.mean + channel.offset)
-        z = nearest(jnp.asarray(z), expected, base.observed_angles)
+        z = wrap_near(jnp.asarray(z), expected, base.observed_angles)
         # Innovation covariance S, for all components.
         present, total = ~jnp.isnan(z), jnp.asarray(innovation_covariance(signal, channel))
         # Observability of each clock through the components that arrived recently.

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.factors.columns import Columns
+from heliograph.factors.columns import WeightedColumns
 from heliograph.filters.base import (
     AbstractFilter,
     Step,
@@ -26,12 +26,12 @@ from heliograph.filters.linear.plan import PlannedFilter, plan_filter
 from heliograph.filters.modes.patterns import append_flag
 from heliograph.filters.wrappers.wrapper import AbstractWrapper
 from heliograph.model.channel import Channel, check_link, delayed
-from heliograph.model.enlarged.bias import driven_by
+from heliograph.model.enlarged.bias import append_driving_plant
 from heliograph.model.enlarged.past import with_past
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import at_each_step, first, stack
 from heliograph.model.plant import AnyPlant, LinearPlant, Plant
-from heliograph.model.premises.premise import believes, believing
+from heliograph.model.premises.premise import believes, on_premise
 from heliograph.model.sensor import AnySensor, LinearSensor
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
@@ -80,7 +80,7 @@ def part_filter(filter: AbstractFilter, states: int) -> PartFilter:
     return PartFilter(filter, states)
 
 
-class HeldFilter(AbstractWrapper):
+class RelayLinesFilter(AbstractWrapper):
     """Best linear filter of (x, past signals of the sensor, past received signals of each relay).
 
     Each line of past signals is as long as its values may still be received. At each step relay i receives r = G l + n
@@ -101,7 +101,7 @@ class HeldFilter(AbstractWrapper):
         """Move the plant, send the sensor's signal, and receive it at one relay after another."""
         state = self.base.predict(state, u, k)
         for link, line in zip(self.links, self.lines, strict=True):
-            state = _receive_at(state, link, *line)
+            state = _receive_into_line(state, link, *line)
         return state
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
@@ -109,7 +109,7 @@ class HeldFilter(AbstractWrapper):
         return plan_filter(self, inputs, np.eye(len(self.states), len(self.base.states)))
 
 
-def _receive_at(state: LinearBelief, link: SecondOrder, start: int, length: int, position: int) -> LinearBelief:
+def _receive_into_line(state: LinearBelief, link: SecondOrder, start: int, length: int, position: int) -> LinearBelief:
     """Receive r = G l + n and put it at `position` of the state.
 
     l is the part of the state, `length` numbers from `start` on, that has the signals under way to this link, at the
@@ -124,7 +124,9 @@ def _receive_at(state: LinearBelief, link: SecondOrder, start: int, length: int,
     # E Cov(r | l), by the moments of l before any data: what a random gain adds as noise is in proportion to l itself.
     mean, covariance = state.state_mean[line], state.state_covariance[line, line]
     received = link_noise(link, covariance + jnp.outer(mean, mean), mean)
-    noise = Columns(jnp.zeros((total, received.matrix.shape[1])).at[place].set(received.matrix), received.weights)
+    noise = WeightedColumns(
+        jnp.zeros((total, received.matrix.shape[1])).at[place].set(received.matrix), received.weights
+    )
     return predict_belief(state, PlantMotion(matrix, shift, noise.covariance, noise))
 
 
@@ -135,7 +137,7 @@ def enlarge_by_relays(
 
     Returns:
         The larger plant, the sensor of the last relay's line, the link behind that, and of each relay the line that it
-        receives and the place of its received signal, as `HeldFilter` has them.
+        receives and the place of its received signal, as `RelayLinesFilter` has them.
     """
     for stage in channel.stages:
         check_forgets("link of a relay that is late by chance", stage)
@@ -162,17 +164,17 @@ def _append_relay_line(plant: PyTree, relay: int, size: int, steps: int) -> Line
     names = [f"relay_{relay}_{j}_{d}_ago" for d in range(1 + steps) for j in range(size)]
     shift, nothing = np.kron(np.eye(1 + steps, k=-1), np.eye(size)), np.zeros((held, held))
     line = LinearPlant(shift, nothing, np.zeros(held), nothing, states=names)
-    return driven_by(plant, line, np.zeros((len(plant.states), held)))
+    return append_driving_plant(plant, line, np.zeros((len(plant.states), held)))
 
 
-def relayed_filter(plant: AnyPlant, channel: Relayed, base: AbstractFilter, lines: PyTree) -> HeldFilter:
+def relayed_filter(plant: AnyPlant, channel: Relayed, base: AbstractFilter, lines: PyTree) -> RelayLinesFilter:
     """Build the filter behind relays from `base`, the filter of all lines."""
     # Only the moments under known probabilities make the filter optimal.
     links = tuple(second_order(place_on_delay_line(stage)) for stage in channel.stages[:-1])
     if any(link.uncertain for link in links):
         raise fail("link to a relay that is late by chance", "known probabilities", "uncertain ones")
     start = first(plant)
-    return HeldFilter(
+    return RelayLinesFilter(
         base=base,
         links=links,
         lines=lines,
@@ -263,8 +265,8 @@ def late_filter(filter: AbstractFilter, delay: int) -> LateFilter:
     late = LateFilter(instance("filter", filter, AbstractFilter, "a filter"), check_count("delay", delay, 0))
     premise = filter.premise
     if premise is None or not delay or premise.channel is None:
-        return believing(late, premise)
-    return believing(late, premise.replaced(channel=at_each_step(lambda link: delayed(link, delay), premise.channel)))
+        return on_premise(late, premise)
+    return on_premise(late, premise.replaced(channel=at_each_step(lambda link: delayed(link, delay), premise.channel)))
 
 
 class KnownDelayFilter(AbstractWrapper):
@@ -317,7 +319,7 @@ def build_behind_delays(plant: AnyPlant, sensor: AnySensor, channel: Channel, ma
     return PartFilter(make(*with_past(plant, sensor, channel)), n)
 
 
-def _build_behind_relays(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Make) -> HeldFilter:
+def _build_behind_relays(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Make) -> RelayLinesFilter:
     """Build the filter behind relays that store what they received."""
     if not isinstance(channel, Relayed):
         raise fail("channel with relays that are late by chance", "one that does not vary", "one in over_time")

@@ -32,12 +32,12 @@ from heliograph.filters.base import (
 from heliograph.filters.particles.state_particles import StateParticles
 from heliograph.filters.remark import Remark
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, gaussian_of, with_gaussian
-from heliograph.filters.truncation import PlacedLimits, hold_mean, truncate_to_limits
+from heliograph.filters.truncation import PlacedLimits, hold_mean_within_limits, truncate_to_limits
 from heliograph.filters.wrappers.sensor_inputs import StateUnderInputs
 from heliograph.model.estimate import Claim, Estimate, Innovation, weakest
 from heliograph.model.over_time import at_each_step, first
 from heliograph.model.plant import AbstractPlant, AnyPlant
-from heliograph.model.premises.premise import believing
+from heliograph.model.premises.premise import on_premise
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import ArrayLike, PyTree
 
@@ -138,7 +138,7 @@ class LimitedFilter(AbstractSizedFilter):
 
     def _hold_one(self, x: Gaussian) -> Gaussian:
         """Return one Gaussian with its mean held within the limits."""
-        return hold_mean(x, self.limits)
+        return hold_mean_within_limits(x, self.limits)
 
     def _condition(self, state: PyTree) -> tuple[jax.Array, PyTree]:
         """Return log P(within the limits), and the state given that."""
@@ -205,7 +205,7 @@ def without_limits(plant: AnyPlant) -> AnyPlant:
     return unlimited
 
 
-def keeps_limits(make: Callable[P, F]) -> Callable[P, F]:
+def accept_limits(make: Callable[P, F]) -> Callable[P, F]:
     """Let a function that makes a filter take plants whose states have limits, by a `LimitedFilter` of what it makes.
 
     Args:
@@ -214,7 +214,7 @@ def keeps_limits(make: Callable[P, F]) -> Callable[P, F]:
     parameters = inspect.signature(make)
 
     @wraps(make)
-    def build(*args: P.args, **kwargs: P.kwargs) -> F:
+    def build_limited(*args: P.args, **kwargs: P.kwargs) -> F:
         """Make the filter of a plant without limits, and put limits around it where the plant has some."""
         given = parameters.bind(*args, **kwargs)
         plant = given.arguments.get("plant")
@@ -222,16 +222,16 @@ def keeps_limits(make: Callable[P, F]) -> Callable[P, F]:
         if not isinstance(start, AbstractPlant) or not start.limits:
             return make(*args, **kwargs)
         given.arguments["plant"] = without_limits(cast(Any, plant))
-        return cast(F, _limit(make(*given.args, **given.kwargs), cast(Any, plant)))
+        return cast(F, _make_limited_filter(make(*given.args, **given.kwargs), cast(Any, plant)))
 
-    return build
+    return build_limited
 
 
-def _limit(base: AbstractFilter, plant: AnyPlant) -> LimitedFilter:
+def _make_limited_filter(base: AbstractFilter, plant: AnyPlant) -> LimitedFilter:
     """Return the filter of the plant with limits, from that of the plant without."""
     start = first(plant)
     limits = tuple((start.states.index(name), low, high) for name, (low, high) in start.limits)
     claim: Claim = weakest([base.claim, "nominal"])
     limited = LimitedFilter(base=base, limits=limits, **make_sizes(claim, base, base.received))
     premise = base.premise
-    return believing(limited, premise and premise.replaced(plant=plant))
+    return on_premise(limited, premise and premise.replaced(plant=plant))

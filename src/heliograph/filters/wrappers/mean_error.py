@@ -18,7 +18,7 @@ from heliograph.numerics.times.rows import check_rows
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.chain import AbstractMemory, MarkovChain
 from heliograph.random_affine.laws.law import AbstractLaw
-from heliograph.random_affine.laws.reading import gain_nodes, reading_nodes
+from heliograph.random_affine.laws.reading import gain_quadrature, reading_quadrature
 from heliograph.random_affine.noise import FiniteSupport
 from heliograph.random_affine.told import FreshNumbers, FreshReading, told_maps
 
@@ -29,7 +29,7 @@ MOST = 20_000  # combinations of numbers that are summed over
 Carry = tuple[LinearBelief, jax.Array, jax.Array]
 
 
-class Contexts(NamedTuple):
+class ToldContexts(NamedTuple):
     """Numbers that may be told at a step, by mode of the chain that tells them; one mode where they are fresh.
 
     Shapes: numbers (modes, nodes, told), weights (modes, nodes) that sum to 1 in each mode, initial (modes,),
@@ -70,11 +70,11 @@ def mean_error_bound(
         raise fail("filter", "a linear_filter behind a link without memory that tells numbers", got)
     given = np.zeros((steps, 0)) if inputs is None and not filter.inputs else inputs
     u = check_rows("inputs", given, steps, len(filter.inputs), missing=False)
-    return np.asarray(_bound(filter, _list_contexts(filter), np.asarray(u)))
+    return np.asarray(_bound_mean_covariance(filter, _list_contexts(filter), np.asarray(u)))
 
 
 @compile_in_float64
-def _bound(filter: ToldFilter, contexts: Contexts, u: Array) -> jax.Array:
+def _bound_mean_covariance(filter: ToldFilter, contexts: ToldContexts, u: Array) -> jax.Array:
     """Return the bound on the mean covariance at each step (steps, n, n): compiled body of `mean_error_bound`."""
     start = filter.init()
     modes = len(contexts.initial)
@@ -86,7 +86,7 @@ def _bound(filter: ToldFilter, contexts: Contexts, u: Array) -> jax.Array:
         covariance: jax.Array = after.gaussian.covariance
         return covariance
 
-    def step(carry: Carry, row: tuple[jax.Array, jax.Array]) -> tuple[Carry, jax.Array]:
+    def bound_step(carry: Carry, row: tuple[jax.Array, jax.Array]) -> tuple[Carry, jax.Array]:
         """Step over one row: the mean covariance in each mode, and as output that in the mean over the modes."""
         state, before, law = carry
         k, u_k = row
@@ -109,11 +109,11 @@ def _bound(filter: ToldFilter, contexts: Contexts, u: Array) -> jax.Array:
 
     covariances = jnp.broadcast_to(start.gaussian.covariance, (modes, *start.gaussian.covariance.shape))
     carry = jax.tree.map(jnp.asarray, start), covariances, jnp.asarray(contexts.initial)
-    covariances_over_time: jax.Array = jax.lax.scan(step, carry, (jnp.arange(len(u)), jnp.asarray(u)))[1]
+    covariances_over_time: jax.Array = jax.lax.scan(bound_step, carry, (jnp.arange(len(u)), jnp.asarray(u)))[1]
     return covariances_over_time
 
 
-def _list_contexts(filter: ToldFilter) -> Contexts:
+def _list_contexts(filter: ToldFilter) -> ToldContexts:
     """List the numbers that may be told, with their probabilities.
 
     Those of a chain are its modes, one in each; those that are drawn anew are all combinations over the maps.
@@ -125,7 +125,9 @@ def _list_contexts(filter: ToldFilter) -> Contexts:
             raise fail("numbers told", "one chain alone, of known probabilities", f"{len(memories)} maps")
         modes = chains[0].modes
         numbers = np.arange(float(modes))[:, None, None]
-        return Contexts(numbers, np.ones((modes, 1)), np.asarray(chains[0].initial), np.asarray(chains[0].transition))
+        return ToldContexts(
+            numbers, np.ones((modes, 1)), np.asarray(chains[0].initial), np.asarray(chains[0].transition)
+        )
     values, weights = np.zeros((1, 0)), np.ones(1)
     for memory in memories:
         more, chances = _find_quadrature(memory)
@@ -133,15 +135,15 @@ def _list_contexts(filter: ToldFilter) -> Contexts:
             raise fail("numbers told", f"at most {MOST} combinations of nodes", len(values) * len(more))
         values = np.concatenate([np.repeat(values, len(more), axis=0), np.tile(more, (len(values), 1))], axis=1)
         weights = np.outer(weights, chances).ravel()
-    return Contexts(values[None], weights[None], np.ones(1), np.ones((1, 1)))
+    return ToldContexts(values[None], weights[None], np.ones(1), np.ones((1, 1)))
 
 
 def _find_quadrature(memory: AbstractMemory) -> tuple[Float[np.ndarray, "nodes told"], Float[np.ndarray, " nodes"]]:
     """Return numbers that are drawn anew at each step, with their probabilities."""
     if isinstance(memory, FreshReading):
-        return reading_nodes(memory.law, float(memory.variance))
+        return reading_quadrature(memory.law, float(memory.variance))
     if isinstance(memory, FreshNumbers) and isinstance(memory.law, AbstractLaw) and memory.count == 1:
-        return gain_nodes(memory.law)
+        return gain_quadrature(memory.law)
     if isinstance(memory, FreshNumbers) and isinstance(memory.law, FiniteSupport):
         return np.asarray(memory.law.atoms), np.asarray(memory.law.probabilities)
     law = memory.law if isinstance(memory, FreshNumbers) else memory

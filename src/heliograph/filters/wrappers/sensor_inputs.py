@@ -23,7 +23,7 @@ from heliograph.model.channel import Channel
 from heliograph.model.estimate import Innovation
 from heliograph.model.over_time import at, at_each_step, first
 from heliograph.model.plant import AbstractPlant, AnyPlant
-from heliograph.model.premises.premise import believing
+from heliograph.model.premises.premise import on_premise
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.float64 import in_float64
@@ -94,7 +94,7 @@ class FilterOfInputs(AbstractWrapper):
         return filter
 
 
-def takes_sensor_inputs(make: Callable[P, F]) -> Callable[P, F]:
+def accept_sensor_inputs(make: Callable[P, F]) -> Callable[P, F]:
     """Let a function that makes a filter take sensors that depend on inputs, by a `FilterOfInputs` of what it makes.
 
     Args:
@@ -103,7 +103,7 @@ def takes_sensor_inputs(make: Callable[P, F]) -> Callable[P, F]:
     parameters = inspect.signature(make)
 
     @wraps(make)
-    def build(*args: P.args, **kwargs: P.kwargs) -> F:
+    def build_with_inputs(*args: P.args, **kwargs: P.kwargs) -> F:
         """Make the filter as it is, or one of inputs around it where the sensor depends on some."""
         given = parameters.bind(*args, **kwargs).arguments
         sensor = first(given.get("sensor"))
@@ -117,12 +117,12 @@ def takes_sensor_inputs(make: Callable[P, F]) -> Callable[P, F]:
             """Make the filter of this sensor and of all other arguments."""
             return make_any(plant=plant, sensor=typical, **given)
 
-        return cast(F, _build(plant, sensor, given.get("channel"), make_for))
+        return cast(F, _build_filter_of_inputs(plant, sensor, given.get("channel"), make_for))
 
-    return build
+    return build_with_inputs
 
 
-def _build(
+def _build_filter_of_inputs(
     plant: AnyPlant, sensor: AnySensor, channel: Channel | None, make: Callable[[AnySensor], AbstractFilter]
 ) -> FilterOfInputs:
     """Build the filter of a plant, of a sensor that depends on its inputs, and of a channel.
@@ -143,4 +143,4 @@ def _build(
         first(sensor).refuse_inputs(f"a {type(base).__name__}")
     filter = FilterOfInputs(base=base, plant=plant, sensor=sensor, **make_sizes(base.claim, base, base.received))
     premise = base.premise
-    return believing(filter, premise and premise.replaced(sensor=sensor))
+    return on_premise(filter, premise and premise.replaced(sensor=sensor))

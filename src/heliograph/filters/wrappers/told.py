@@ -23,7 +23,7 @@ from heliograph.model.channel import Channel
 from heliograph.model.estimate import Innovation, weakest
 from heliograph.model.over_time import at, at_each_step, first
 from heliograph.model.plant import AnyPlant
-from heliograph.model.premises.premise import believing
+from heliograph.model.premises.premise import on_premise
 from heliograph.model.sensor import AnySensor
 from heliograph.model.told import separate_told
 from heliograph.numerics.angle import Angles
@@ -33,7 +33,7 @@ from heliograph.numerics.traced import library
 from heliograph.numerics.types import ArrayLike, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.moments.second_moments import second_order
-from heliograph.random_affine.told import believe_told, give_law, made_certain, numbers_of_outputs, told_maps
+from heliograph.random_affine.told import believe_told, give_law, make_certain, numbers_of_outputs, told_maps
 
 ROUNDING = 1e-12  # share of squared gains: a spread below it is rounding
 
@@ -41,7 +41,7 @@ F = TypeVar("F", bound=AbstractFilter)
 P = ParamSpec("P")
 
 
-class MakeFilter(Module):
+class FilterMaker(Module):
     """A function that makes a filter, with all of its arguments but plant, sensor and channel."""
 
     function: Callable[..., AbstractFilter] = eqx.field(static=True)
@@ -72,7 +72,7 @@ class ToldFilter(AbstractWrapper):
     plant: AnyPlant
     sensor: AnySensor
     link: Channel
-    make: MakeFilter
+    make: FilterMaker
     values: tuple[int, ...] = eqx.field(static=True)
     numbers: tuple[int, ...] = eqx.field(static=True)
 
@@ -83,7 +83,7 @@ class ToldFilter(AbstractWrapper):
         filter, is_law = self._filter_given(numbers, k)
         after, innovation = filter.correct(state, values, k)
         # Numbers that give no law make the state NaN, so that the message is refused where it came in.
-        after = _spoil(after, ~is_law & ~jnp.all(jnp.isnan(values)))
+        after = _spoil_state(after, ~is_law & ~jnp.all(jnp.isnan(values)))
         return after, self._place_innovation(innovation)
 
     def _place_innovation(self, innovation: Innovation) -> Innovation:
@@ -164,7 +164,7 @@ class ToldFilter(AbstractWrapper):
         return self.make(self.plant, at(self.sensor, k), believe_told(link, complete)), give_law(link, complete)
 
 
-def _spoil(state: PyTree, spoilt: jax.Array) -> PyTree:
+def _spoil_state(state: PyTree, spoilt: jax.Array) -> PyTree:
     """Make all real numbers of a state NaN, or leave it as it is."""
 
     def spoil(leaf: jax.Array) -> jax.Array:
@@ -174,7 +174,7 @@ def _spoil(state: PyTree, spoilt: jax.Array) -> PyTree:
     return jax.tree.map(spoil, state)
 
 
-def build_told_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: MakeFilter) -> ToldFilter:
+def build_told_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: FilterMaker) -> ToldFilter:
     """Build a filter behind a channel that tells of its link from `make`, which builds one for a link of known law.
 
     Args:
@@ -186,7 +186,7 @@ def build_told_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, make
     Claim: that of the filter for typical numbers; "nominal" where the numbers depend on the state, or leave open
     what is not drawn anew with each message.
     """
-    link = at_each_step(lambda channel: made_certain(separate_told(channel).link), channel)
+    link = at_each_step(lambda channel: make_certain(separate_told(channel).link), channel)
     base = make(plant, sensor, at_each_step(believe_typical, link))
     claim = base.claim
     if any(affine.reservation for affine in told_maps(first(link))):
@@ -203,7 +203,7 @@ def build_told_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, make
         **make_sizes(claim, base, len(values) + len(numbers)),
     )
     premise = base.premise
-    return believing(filter, premise and premise.replaced(sensor=sensor, channel=channel))
+    return on_premise(filter, premise and premise.replaced(sensor=sensor, channel=channel))
 
 
 @in_float64
@@ -213,7 +213,7 @@ def believe_typical(link: PyTree) -> PyTree:
     return believe_told(link, library(typical).concatenate(typical))
 
 
-def takes_told(make: Callable[P, F]) -> Callable[P, F]:
+def accept_told_numbers(make: Callable[P, F]) -> Callable[P, F]:
     """Let a function that makes a filter take channels that tell of their links, by a `ToldFilter` of what it makes.
 
     To a type checker it returns what it makes: behind any other channel it does.
@@ -224,13 +224,13 @@ def takes_told(make: Callable[P, F]) -> Callable[P, F]:
     parameters = inspect.signature(make)
 
     @wraps(make)
-    def build(*args: P.args, **kwargs: P.kwargs) -> F:
+    def build_with_told(*args: P.args, **kwargs: P.kwargs) -> F:
         """Make the filter as it is, or one of told laws around it where the channel tells numbers."""
         given = parameters.bind(*args, **kwargs).arguments
         channel = given.get("channel")
         if not isinstance(first(channel), AbstractRandomAffine) or not separate_told(first(channel)).numbers:
             return make(*args, **kwargs)
         plant, sensor, link = (given.pop(name) for name in ("plant", "sensor", "channel"))
-        return cast(F, build_told_filter(plant, sensor, link, MakeFilter(make, given)))
+        return cast(F, build_told_filter(plant, sensor, link, FilterMaker(make, given)))
 
-    return build
+    return build_with_told

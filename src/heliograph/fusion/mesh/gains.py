@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import Columns, eliminate, square_root
+from heliograph.factors.columns import WeightedColumns, eliminate, square_root
 from heliograph.factors.gaussian import condition_on_observation, from_covariance
 from heliograph.numerics.linalg import psd_solve, symmetrize
 from heliograph.numerics.types import Array, Bool, Float
@@ -75,11 +75,11 @@ def gains_of(weights: NeighbourWeights, step: NodeStep) -> NodeGains:
     """Return gains of the step with these weights of the estimates: fuse what was believed, predict once, correct."""
     a = jnp.asarray(step.matrix)
     predicted = symmetrize(a @ weights.covariance @ a.T + step.noise)
-    corrected, innovation = correct(predicted, jnp.asarray(step.arrived))
+    corrected, innovation = correct_by_information(predicted, jnp.asarray(step.arrived))
     return NodeGains(innovation @ a @ weights.front, weights.parts, corrected, innovation, corrected)
 
 
-def correct(
+def correct_by_information(
     predicted: Float[jax.Array, "n n"], information: Float[jax.Array, "n n"]
 ) -> tuple[Float[jax.Array, "n n"], Float[jax.Array, "n n"]]:
     """Return P = (Pb^-1 + S)^-1 and F = I - P S of a predicted Pb, which may be singular, and of information S.
@@ -89,7 +89,7 @@ def correct(
     n, factors = len(predicted), eliminate(information)
     rows = jnp.diag(square_root(factors.weights)) @ factors.matrix.T  # diag(d)^1/2 L', of unit noise
     x = from_covariance(np.zeros(n), predicted)
-    after, _ = condition_on_observation(x, rows @ x.root, jnp.zeros(n), Columns(np.eye(n), jnp.ones(n)))
+    after, _ = condition_on_observation(x, rows @ x.root, jnp.zeros(n), WeightedColumns(np.eye(n), jnp.ones(n)))
     return after.covariance, np.eye(n) - after.covariance @ information
 
 

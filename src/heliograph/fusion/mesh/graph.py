@@ -145,7 +145,7 @@ def graph_of(neighbours: Mapping[str, Sequence[str]], nodes: Sequence[str]) -> G
     return Graph(tuple(nodes), senders, present)
 
 
-def upstream(graph: Graph) -> list[Int[np.ndarray, " senders"]]:
+def find_upstream_nodes(graph: Graph) -> list[Int[np.ndarray, " senders"]]:
     """Return, for each node, the places of the nodes from which a directed path leads to it, itself included.
 
     Nodes that are reached from the same ones, as those of one strongly connected component, share one array.

@@ -55,7 +55,7 @@ def scatter_blocks(
     )
 
 
-def joint_after(
+def propagate_joint_covariance(
     joint: Float[Array, "N N"], m: Any, f: Float[Array, "node n n"], noise: Float[Array, "n n"], ws: Any, w: Any
 ) -> Float[Array, "N N"]:
     """Return the joint covariance J+ of all nodes' errors after a step, symmetric, from J before it.

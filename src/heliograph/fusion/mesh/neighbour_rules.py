@@ -9,7 +9,13 @@ import numpy as np
 
 from heliograph.engine.choice import choose_code
 from heliograph.fusion.intersection import intersection_weights, trace_shares
-from heliograph.fusion.mesh.gains import NeighbourEstimates, NeighbourWeights, NodeGains, NodeStep, correct
+from heliograph.fusion.mesh.gains import (
+    NeighbourEstimates,
+    NeighbourWeights,
+    NodeGains,
+    NodeStep,
+    correct_by_information,
+)
 from heliograph.fusion.mesh.graph import Graph
 from heliograph.fusion.rules import AbstractFusion, AbstractIntersection, Covariances, Fused, Means
 from heliograph.model.estimate import Claim
@@ -125,7 +131,7 @@ class DiffusionWeights(_NeighbourRule):
         """Return the gains of a filter with all neighbours' measurements; each estimate's share where it arrived."""
         a = jnp.asarray(step.matrix)
         predicted = symmetrize(a @ believed.covariance @ a.T + step.noise)
-        corrected, innovation = correct(predicted, jnp.asarray(step.complete))
+        corrected, innovation = correct_by_information(predicted, jnp.asarray(step.complete))
         assert self.shares is not None
         shares = jnp.where(believed.present, jnp.asarray(self.shares), 0.0)
         # What arrived alone corrects.
@@ -168,14 +174,14 @@ class FrozenWeights(_NeighbourRule):
         """
         rows = np.moveaxis(np.asarray(self.blocks), -1, 0), np.swapaxes(arrived, 0, 1)
         with jax.enable_x64(True):
-            choice = choose_code(_weigh_row, (self.rule, *rows), (False, True, True))
+            choice = choose_code(_weigh_neighbours, (self.rule, *rows), (False, True, True))
             if choice.code is None:
                 return None
             weights: Ahead = jax.tree.map(lambda leaf: np.swapaxes(leaf, 0, 1), choice.results())
             return weights
 
 
-def _weigh_row(
+def _weigh_neighbours(
     rule: AbstractFusion, joint: Float[jax.Array, "degree n degree n"], arrived: Bool[jax.Array, "step degree"]
 ) -> tuple[jax.Array, jax.Array]:
     """Return the parts and covariances (step, ...) of one node's weights."""

@@ -1,23 +1,23 @@
 """Names that other folders take; the package loads them when first used."""
 
-from .data import Data as Data
+from .data import LikelihoodData as LikelihoodData
 from .data import gather_data as gather_data
 from .multistart import AWAY as AWAY
 from .multistart import FURTHER as FURTHER
+from .multistart import HighestPoint as HighestPoint
+from .multistart import MaximumSearch as MaximumSearch
 from .multistart import SPREAD as SPREAD
-from .multistart import Search as Search
-from .multistart import Top as Top
 from .objective import Form as Form
 from .objective import Objective as Objective
 from .objective import join_world as join_world
 from .objective import make_objectives as make_objectives
+from .predictive_density import ChannelDensities as ChannelDensities
 from .predictive_density import NODES as NODES
 from .predictive_density import Predictive as Predictive
-from .predictive_density import StackDensities as StackDensities
+from .predictive_density import evaluate_predictive as evaluate_predictive
 from .predictive_density import predictive as predictive
-from .predictive_density import score_signals as score_signals
 from .predictive_density import signal_filter as signal_filter
-from .surface import Surface as Surface
+from .surface import LikelihoodSurface as LikelihoodSurface
 from .transforms import link as link
 from .transforms import map_from_line as map_from_line
 from .transforms import map_to_line as map_to_line

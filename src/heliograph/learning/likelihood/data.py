@@ -16,7 +16,7 @@ from heliograph.simulation.network import Network
 FEWEST = 10  # numbers that arrived for each free one
 
 
-class Data(NamedTuple):
+class LikelihoodData(NamedTuple):
     """Recordings of one network, joined over its nodes and filled up with rows in which nothing arrived.
 
     Shapes: measurements (recordings, steps, received), inputs (recordings, steps, inputs), lengths (recordings,);
@@ -29,8 +29,8 @@ class Data(NamedTuple):
     truth: Float[np.ndarray, "recordings steps n"] | None = None
 
 
-def gather_data(network: Network, recording: object, inputs: Any, free: int, truth: Any = False) -> Data:
-    """Gather all recordings, checked against the network, as `Data`; with true states if they are needed.
+def gather_data(network: Network, recording: object, inputs: Any, free: int, truth: Any = False) -> LikelihoodData:
+    """Gather all recordings, checked against the network, as `LikelihoodData`; with true states if they are needed.
 
     Raises:
         ValueError: recordings of other shapes, too short, or without any change.
@@ -50,13 +50,13 @@ def gather_data(network: Network, recording: object, inputs: Any, free: int, tru
         network.check_horizon(len(z))
     longest = max(len(z) for z, _ in parts)
     true = [] if truth is False else _split_truth(network, several, truth, [len(z) for z, _ in parts])
-    data = Data(
+    data = LikelihoodData(
         measurements=np.stack([_pad_rows(z, longest, np.nan) for z, _ in parts]),
         inputs=np.stack([_pad_rows(u, longest, None) for _, u in parts]),
         lengths=tuple(len(z) for z, _ in parts),
         truth=np.stack([_pad_rows(x, longest, np.nan) for x in true]) if true else None,
     )
-    _check_enough(data, free)
+    _check_enough_data(data, free)
     return data
 
 
@@ -150,7 +150,7 @@ def _pad_rows(values: np.ndarray, length: int, filler: float | None) -> np.ndarr
     return np.concatenate([values, np.repeat(end, more, axis=0)]) if more else values
 
 
-def _check_enough(data: Data, free: int) -> None:
+def _check_enough_data(data: LikelihoodData, free: int) -> None:
     """Raise ValueError if recordings have fewer than FEWEST numbers for each free one, or nothing in them varies."""
     z = data.measurements if data.truth is None else data.truth
     count = int(np.count_nonzero(~np.isnan(z)))

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import choose_code
-from heliograph.learning.likelihood.data import Data
+from heliograph.learning.likelihood.data import LikelihoodData
 from heliograph.learning.likelihood.objective import Objective, filter_of
 from heliograph.numerics.density import differentiate_log_density
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
@@ -49,7 +49,7 @@ class Evaluation(NamedTuple):
 
 
 def evaluate_at_points(
-    objective: Objective, x: Float[np.ndarray, "points p"], data: Data, by_row: bool = False
+    objective: Objective, x: Float[np.ndarray, "points p"], data: LikelihoodData, by_row: bool = False
 ) -> Evaluation:
     """Return likelihood, scores and information at points: all side by side in native code, or one by one by XLA.
 
@@ -74,7 +74,7 @@ def evaluate_at_points(
     return Evaluation(*(np.concatenate(leaves) for leaves in zip(*(one for one in chunked if one), strict=True)))
 
 
-def _evaluate_in_chunks(objective: Objective, x: np.ndarray, data: Data, by_row: bool) -> Evaluation | None:
+def _evaluate_in_chunks(objective: Objective, x: np.ndarray, data: LikelihoodData, by_row: bool) -> Evaluation | None:
     """Evaluate one point by chunks of each recording; None where these are short, or cannot be divided."""
     kalman = _kalman_of(objective) if data.truth is None else None
     if kalman is None:
@@ -96,7 +96,7 @@ def _sum_rows(rows: Evaluation) -> Evaluation:
     return Evaluation(density, score, rows.halves)
 
 
-def _evaluate_side_by_side(objective: Objective, x: np.ndarray, data: Data) -> Evaluation:
+def _evaluate_side_by_side(objective: Objective, x: np.ndarray, data: LikelihoodData) -> Evaluation:
     """Evaluate all points and recordings row by row, side by side."""
     data_rows = [rows for rows in (data.measurements, data.inputs, data.truth) if rows is not None]
     count, copies = len(data.measurements), (len(x), 1, 1)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.learning.likelihood.surface import Surface
+from heliograph.learning.likelihood.surface import LikelihoodSurface
 from heliograph.learning.likelihood.trust_region import MOST_STEPS, NEAR, Maximum, maximise
 from heliograph.numerics.types import Bool, Float
 
@@ -26,7 +26,7 @@ SADDLE = -1e-3  # curvature in units of standard errors below which a point is n
 Watch = Callable[[Maximum], None]
 
 
-class Top(NamedTuple):
+class HighestPoint(NamedTuple):
     """The highest point that a search has found.
 
     Args:
@@ -57,7 +57,7 @@ class Top(NamedTuple):
 
 
 @dataclass
-class Search:
+class MaximumSearch:
     """Search for the maximum over a surface, which holds the best point so far at any moment.
 
     Args:
@@ -67,12 +67,12 @@ class Search:
         ends: log-likelihood at which the climb from each start ended, best first.
     """
 
-    surface: Surface
+    surface: LikelihoodSurface
     watch: Watch
-    best: Top | None = None
+    best: HighestPoint | None = None
     ends: Float[np.ndarray, " starts"] = field(default_factory=lambda: np.zeros(0))
 
-    def run(self, starts: Float[np.ndarray, "starts p"], seed: int) -> Top:
+    def run(self, starts: Float[np.ndarray, "starts p"], seed: int) -> HighestPoint:
         """Return the highest point that climbs reach, proved to be a maximum.
 
         Climbs begin at all starts, then at as many points around the best, then near each end of the domains. In a long
@@ -96,7 +96,7 @@ class Search:
         self.best, self.ends = top, -np.sort(-np.nan_to_num(ends, nan=-np.inf))
         return top
 
-    def _prove_maximum(self, climbed: Maximum) -> Top:
+    def _prove_maximum(self, climbed: Maximum) -> HighestPoint:
         """Return the best of some climbs, with numbers put at the ends of their domains, once it is a maximum.
 
         Else it climbs again, ROUNDS times at most, or says why it is none.
@@ -115,7 +115,7 @@ class Search:
             top = _take_best(self._climb(again, no_ends), no_ends)
         return top._replace(converged=False, reason="the search went to and fro between two points")
 
-    def _draw_around(self, top: Top, count: int, seed: int) -> Float[np.ndarray, "points p"]:
+    def _draw_around(self, top: HighestPoint, count: int, seed: int) -> Float[np.ndarray, "points p"]:
         """Return points around a maximum: logarithms and logits within SPREAD, real numbers some standard errors away.
 
         One more for each number that has an end of its domain begins near that end.
@@ -166,7 +166,7 @@ class Search:
         moving = np.repeat((ends == 0)[None], len(starts), axis=0)
         return maximise(self.surface.evaluate, starts, moving, keep_best, self.surface.domains, joining=True)
 
-    def _move_to_limits(self, top: Top) -> Top:
+    def _move_to_limits(self, top: HighestPoint) -> HighestPoint:
         """Put numbers that the data hardly see at the end of their domains, where the likelihood is the same."""
         domains, x, total, ends = self.surface.domains, top.x.copy(), top.total, top.ends.copy()
         information = np.diag(self.surface.evaluations(x[None]).information[0])
@@ -181,7 +181,7 @@ class Search:
             return top
         return _take_best(self._climb(x[None], ends), ends)
 
-    def _choose_restarts(self, top: Top) -> tuple[np.ndarray | None, str]:
+    def _choose_restarts(self, top: HighestPoint) -> tuple[np.ndarray | None, str]:
         """Return points from which to climb again where the end of a climb is no maximum; else None and why it is none.
 
         The reason is "" of a maximum. Along each number at the end of its domain the likelihood is looked at on the way
@@ -198,7 +198,7 @@ class Search:
             return None, f"a step by the Hessian promises {curvature.gain:.2g} of log-likelihood"
         return None, ""
 
-    def _explain_unbounded(self, top: Top) -> str:
+    def _explain_unbounded(self, top: HighestPoint) -> str:
         """Return a sentence where the likelihood has no maximum, as the network reproduces the data exactly; else "".
 
         A climb may end there all the same, where rounding is what is left. The log-likelihood for each number is about
@@ -210,19 +210,19 @@ class Search:
             return "the likelihood grows for ever as variances fall to 0, for the network reproduces the data exactly"
         return ""
 
-    def _look_inwards(self, top: Top, index: int) -> tuple[np.ndarray, np.ndarray]:
+    def _look_inwards(self, top: HighestPoint, index: int) -> tuple[np.ndarray, np.ndarray]:
         """Return points from the end of a number's domain inwards (INWARDS, p), and how much higher l is at each."""
         points = np.repeat(top.x[None], len(INWARDS), axis=0)
         points[:, index] -= top.ends[index] * INWARDS
         return points, np.nan_to_num(self.surface.evaluations(points).total - top.total, nan=-np.inf)
 
 
-def _take_best(climbed: Maximum, ends: np.ndarray) -> Top:
+def _take_best(climbed: Maximum, ends: np.ndarray) -> HighestPoint:
     """Return the best of the climbs, with why it stopped if it did not converge."""
     lane = int(climbed.order[0])
     converged, remaining = bool(climbed.converged[lane]), float(climbed.remaining[lane])
     reason = "" if converged else _explain_end(remaining)
-    return Top(climbed.x[lane].copy(), ends, float(climbed.total[lane]), converged, reason, climbed.steps)
+    return HighestPoint(climbed.x[lane].copy(), ends, float(climbed.total[lane]), converged, reason, climbed.steps)
 
 
 def _explain_end(remaining: float) -> str:

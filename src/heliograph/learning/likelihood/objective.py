@@ -17,9 +17,9 @@ from heliograph.model.estimate import Innovation
 from heliograph.model.over_time import at_each_step, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor, is_linear
-from heliograph.numerics.angle import nearest
+from heliograph.numerics.angle import wrap_near
 from heliograph.numerics.check import fail
-from heliograph.numerics.module import same
+from heliograph.numerics.module import are_same
 from heliograph.numerics.types import Array, PyTree
 from heliograph.random_affine.moments.second_moments import has_random_gain, second_order
 from heliograph.simulation.network import Network
@@ -71,7 +71,7 @@ class Objective:
     form: Form
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Objective) and same(self._list_distinctions(), other._list_distinctions())
+        return isinstance(other, Objective) and are_same(self._list_distinctions(), other._list_distinctions())
 
     def __hash__(self) -> int:
         return hash((_identity_of(self.description.build)[0], self.form))
@@ -109,7 +109,7 @@ class Objective:
             return jnp.asarray(estimate.mean), jnp.asarray(estimate.covariance)
 
         mean, covariance = filter.scan(z, u, claimed)
-        return nearest(jnp.asarray(truth), mean, angles) - mean, covariance
+        return wrap_near(jnp.asarray(truth), mean, angles) - mean, covariance
 
 
 def _identity_of(build: Build) -> tuple[object, ...]:

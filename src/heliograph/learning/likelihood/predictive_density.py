@@ -19,13 +19,13 @@ from heliograph.numerics.times.rows import check_rows
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
 from heliograph.random_affine.laws.law import AbstractLaw, Discrete
-from heliograph.random_affine.moments.components import Component
+from heliograph.random_affine.moments.components import AffineComponent
 
 REACH = 5.5  # standard deviations of the normal score: 4e-8 of a law lie beyond
 Map = TypeVar("Map", bound=AbstractRandomAffine)
 
 
-def law_nodes(law: AbstractLaw, count: int) -> Discrete:
+def approximate_law_by_nodes(law: AbstractLaw, count: int) -> Discrete:
     """Approximate a law by `count` gains with probabilities, far into its tails.
 
     int f(g) dF(g) = int f(F^-1(Phi(t))) phi(t) dt by the trapezoidal rule on |t| <= REACH, Phi the normal distribution
@@ -52,7 +52,9 @@ def discretise_laws(channel: Map, count: int) -> Map:
         return isinstance(leaf, AbstractLaw)
 
     def discretise(leaf: object) -> object:
-        return law_nodes(leaf, count) if isinstance(leaf, AbstractLaw) and leaf.constant is None else leaf
+        return (
+            approximate_law_by_nodes(leaf, count) if isinstance(leaf, AbstractLaw) and leaf.constant is None else leaf
+        )
 
     discrete: Map = jax.tree.map(discretise, channel, is_leaf=is_law)
     return discrete
@@ -147,10 +149,12 @@ def predictive(
         "inputs", np.zeros((len(z), 0)) if inputs is None else inputs, len(z), len(filter.inputs), missing=False
     )
     y, spread, near = filter.expect_signals(z, u)
-    return score_signals((np.asarray(y), np.asarray(spread), np.asarray(near)), StackDensities.of(received, nodes))
+    return evaluate_predictive(
+        (np.asarray(y), np.asarray(spread), np.asarray(near)), ChannelDensities.of(received, nodes)
+    )
 
 
-class StackDensity(NamedTuple):
+class StackPartDensity(NamedTuple):
     """Part of a stack as arrays over the combinations of its gains and noises: z = gain y + offset + noise in each.
 
     Shapes: log_weight (a,), gain (a, m, p), offset (a, m), noise (a, m, m).
@@ -162,24 +166,24 @@ class StackDensity(NamedTuple):
     noise: np.ndarray
 
 
-class StackDensities(tuple[StackDensity, ...]):
+class ChannelDensities(tuple[StackPartDensity, ...]):
     """Parts of a channel, from the first output to the last."""
 
     @staticmethod
-    def of(channel: AbstractRandomAffine, nodes: int) -> "StackDensities":
+    def of(channel: AbstractRandomAffine, nodes: int) -> "ChannelDensities":
         """Return the combinations of each part of a stack, of everything else as a whole."""
         parts = channel.in_parallel
-        return StackDensities(_stack_combinations(discretise_laws(affine, nodes).list_atoms()) for affine in parts)
+        return ChannelDensities(_stack_combinations(discretise_laws(affine, nodes).list_atoms()) for affine in parts)
 
 
-def _stack_combinations(components: list[Component]) -> StackDensity:
+def _stack_combinations(components: list[AffineComponent]) -> StackPartDensity:
     """Return combinations of a probability above zero as arrays."""
     possible = [component for component in components if component.weight > 0]
     weight, gain, offset, noise = (np.array(column) for column in zip(*possible, strict=True))
-    return StackDensity(np.log(weight), gain, offset, noise)
+    return StackPartDensity(np.log(weight), gain, offset, noise)
 
 
-def score_signals(expected: tuple[np.ndarray, np.ndarray, np.ndarray], parts: StackDensities) -> Predictive:
+def evaluate_predictive(expected: tuple[np.ndarray, np.ndarray, np.ndarray], parts: ChannelDensities) -> Predictive:
     """Return densities and probability integral transforms of measurements.
 
     Args:
@@ -195,7 +199,7 @@ def score_signals(expected: tuple[np.ndarray, np.ndarray, np.ndarray], parts: St
 
 
 def _score_block(
-    y: np.ndarray, spread: np.ndarray, z: np.ndarray, parts: StackDensities
+    y: np.ndarray, spread: np.ndarray, z: np.ndarray, parts: ChannelDensities
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return log-densities (steps,) and transforms (steps, m) of all parts of a stack, each given those before it."""
     total, pits, start = np.zeros(len(z)), [], 0
@@ -217,7 +221,7 @@ def _score_block(
 
 
 def _weigh_combinations(
-    y: np.ndarray, spread: np.ndarray, z: np.ndarray, law: StackDensity
+    y: np.ndarray, spread: np.ndarray, z: np.ndarray, law: StackPartDensity
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return log-weights of the combinations, and L^-1 (z - E z) of each, which is standard normal given those before.
 
@@ -238,7 +242,7 @@ def _weigh_combinations(
 
 
 def _correct_signal(
-    y: np.ndarray, spread: np.ndarray, z: np.ndarray, law: StackDensity, weight: np.ndarray
+    y: np.ndarray, spread: np.ndarray, z: np.ndarray, law: StackPartDensity, weight: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return mean (t, p) and covariance (t, p, p) of the signal given these components too.
 

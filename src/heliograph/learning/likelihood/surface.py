@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.learning.likelihood.data import Data
+from heliograph.learning.likelihood.data import LikelihoodData
 from heliograph.learning.likelihood.evaluation import Evaluation, evaluate_at_points
 from heliograph.learning.likelihood.objective import Objective
-from heliograph.learning.likelihood.trust_region import Domains, Evaluated, maximise
+from heliograph.learning.likelihood.trust_region import Evaluated, OpenEnds, maximise
 from heliograph.learning.likelihood.trust_region_step import FLAT
 from heliograph.learning.parameters import Parameter
 from heliograph.numerics.types import Bool, Float
@@ -33,29 +33,31 @@ class Curvature(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Surface:
+class LikelihoodSurface:
     """The likelihood of all recordings as a function of the free numbers; the last evaluation is cached for reuse."""
 
     objective: Objective
-    data: Data
+    data: LikelihoodData
     _last: list[tuple[np.ndarray, Evaluation]] = field(default_factory=list, repr=False, compare=False)
 
     @cached_property
-    def domains(self) -> Domains:
+    def domains(self) -> OpenEnds:
         """Return which coordinates are logarithms and logits, and at which side their domains end."""
         every = self.objective.description.parameters.every
         low, high = (np.concatenate(column) for column in zip(*map(_find_ends_at_infinity, every), strict=True))
         single = np.concatenate([np.full(number.size, number.domain.kind == "interval") for number in every])
-        return Domains(low, high, single & (low | high))
+        return OpenEnds(low, high, single & (low | high))
 
-    def of_first_rows(self) -> "Surface | None":
+    def of_first_rows(self) -> "LikelihoodSurface | None":
         """Return the likelihood of the first rows of long recordings alone; None where they are not long."""
         data = self.data
         if data.measurements.shape[1] < LONG:
             return None
         truth = None if data.truth is None else data.truth[:, :FIRST]
         lengths = tuple(min(length, FIRST) for length in data.lengths)
-        return Surface(self.objective, Data(data.measurements[:, :FIRST], data.inputs[:, :FIRST], lengths, truth))
+        return LikelihoodSurface(
+            self.objective, LikelihoodData(data.measurements[:, :FIRST], data.inputs[:, :FIRST], lengths, truth)
+        )
 
     def evaluations(self, x: Float[np.ndarray, "points p"]) -> Evaluation:
         """Return value, score and information at each point; those of the last points are kept."""

@@ -33,7 +33,7 @@ Evaluated = tuple[Float[np.ndarray, " lanes"], Float[np.ndarray, "lanes p"], Flo
 Evaluate = Callable[[Float[np.ndarray, "lanes p"]], Evaluated]
 
 
-class Domains(NamedTuple):
+class OpenEnds(NamedTuple):
     """Coordinates by which an end of a domain is at infinity.
 
     A variance of 0 is at minus infinity of its logarithm, probabilities of 0 and 1 are at both ends of their logit.
@@ -46,10 +46,10 @@ class Domains(NamedTuple):
     single: Bool[np.ndarray, " p"]
 
     @staticmethod
-    def unbounded(count: int) -> "Domains":
+    def unbounded(count: int) -> "OpenEnds":
         """Return the domains of so many real numbers, without ends."""
         none = np.zeros(count, dtype=bool)
-        return Domains(none, none, none)
+        return OpenEnds(none, none, none)
 
     @property
     def free(self) -> Bool[np.ndarray, " p"]:
@@ -108,7 +108,7 @@ def maximise(
     start: Float[np.ndarray, "lanes p"],
     active: Bool[np.ndarray, "lanes p"] | None = None,
     watch: Callable[[Maximum], None] | None = None,
-    domains: Domains | None = None,
+    domains: OpenEnds | None = None,
     close: float = CLOSE,
     joining: bool = False,
 ) -> Maximum:
@@ -133,7 +133,7 @@ def maximise(
     Gould and Toint, Trust-Region Methods (2000).
     """
     moving = np.ones(start.shape, dtype=bool) if active is None else active
-    domains = Domains.unbounded(start.shape[1]) if domains is None else domains
+    domains = OpenEnds.unbounded(start.shape[1]) if domains is None else domains
     with np.errstate(all="ignore"):
         state = _init_lanes(evaluate, start, moving, domains, close)
         for count in range(MOST_STEPS):
@@ -147,7 +147,7 @@ def maximise(
     return state.ends(MOST_STEPS)
 
 
-def _init_lanes(evaluate: Evaluate, start: np.ndarray, moving: np.ndarray, domains: Domains, close: float) -> _State:
+def _init_lanes(evaluate: Evaluate, start: np.ndarray, moving: np.ndarray, domains: OpenEnds, close: float) -> _State:
     """Return the state before the first step; lanes whose likelihood or slope is no number at the start are done."""
     total, gradient, information = evaluate(start)
     state = _State(
@@ -172,7 +172,7 @@ def _is_finite(total: np.ndarray, gradient: np.ndarray, information: np.ndarray,
     return np.asarray(np.isfinite(total) & derivatives & np.all(np.isfinite(information) | ~pairs, axis=(1, 2)))
 
 
-def _mark_arrived(state: _State, moving: np.ndarray, domains: Domains, close: float) -> _State:
+def _mark_arrived(state: _State, moving: np.ndarray, domains: OpenEnds, close: float) -> _State:
     """Return the state with lanes done that have arrived, or are stuck since rounding hides what is left to gain."""
     counting = moving & ~find_at_limits(state.x, state.gradient, domains)
     remaining = np.where(state.done, state.remaining, expected_gain(state.gradient, state.information, counting) / 2)
@@ -181,7 +181,7 @@ def _mark_arrived(state: _State, moving: np.ndarray, domains: Domains, close: fl
     return state._replace(remaining=remaining, done=state.done | stuck | arrived, converged=state.converged | arrived)
 
 
-def find_at_limits(x: np.ndarray, gradient: np.ndarray, domains: Domains) -> Bool[np.ndarray, "lanes p"]:
+def find_at_limits(x: np.ndarray, gradient: np.ndarray, domains: OpenEnds) -> Bool[np.ndarray, "lanes p"]:
     """Return the coordinates at an end of their domain: on the way there the log-likelihood gains less than AT_LIMIT.
 
     A number v = exp(x) has its end v = 0 at x = -inf (`low`), or v = inf at x = inf (`high`). To first order what is
@@ -192,7 +192,7 @@ def find_at_limits(x: np.ndarray, gradient: np.ndarray, domains: Domains) -> Boo
     return np.asarray((outward != 0) & (rise >= 0) & (rise < AT_LIMIT))
 
 
-def _step_lanes(evaluate: Evaluate, state: _State, moving: np.ndarray, domains: Domains, close: float) -> _State:
+def _step_lanes(evaluate: Evaluate, state: _State, moving: np.ndarray, domains: OpenEnds, close: float) -> _State:
     """Take one trust-region step in every lane: propose, evaluate, accept or not, then adapt radius and model."""
     going = ~state.done
     counting = moving & ~find_at_limits(state.x, state.gradient, domains)
@@ -226,7 +226,7 @@ def _step_lanes(evaluate: Evaluate, state: _State, moving: np.ndarray, domains: 
     return _mark_arrived(after, moving, domains, close)
 
 
-def _join_lanes(state: _State, moving: np.ndarray, domains: Domains) -> _State:
+def _join_lanes(state: _State, moving: np.ndarray, domains: OpenEnds) -> _State:
     """End each lane a that climbs to the same top as a lane b that is higher: it would learn nothing that b does not.
 
     By the information I of either, both are within JOINED standard errors of a top and of each other, and neighbours in
@@ -263,7 +263,7 @@ def _evaluate_lanes(evaluate: Evaluate, x: np.ndarray, going: np.ndarray, state:
 
 def _update_hessian(
     state: _State,
-    domains: Domains,
+    domains: OpenEnds,
     step: np.ndarray,
     gradient: np.ndarray,
     information: np.ndarray,

@@ -46,7 +46,7 @@ class HiddenModeLosses(AbstractLossLaw):
         parts = check_fates(fates)
         # log P(fates) - log P(chosen ends arrive).
         chosen = [keep_ends_only(fate) for fate in parts if fate[-1] == CHOSEN]
-        whole, ends = Runs.of([fill_ends(fate) for fate in parts]), Runs.of(chosen) if chosen else None
+        whole, ends = FateRuns.of([fill_ends(fate) for fate in parts]), FateRuns.of(chosen) if chosen else None
 
         def likelihood(x: np.ndarray) -> tuple[float, np.ndarray]:
             value, slope = whole.likelihood(x)
@@ -88,7 +88,7 @@ class HiddenModeLosses(AbstractLossLaw):
         return gilbert_elliott(good, bad, self.fail.estimate, self.recover.estimate)
 
 
-class Runs:
+class FateRuns:
     """Stretches as runs of equal fates, whose matrices are powers: the likelihood needs one product for each run.
 
     The likelihood of a stretch is 1' A_n T' A_(n-1) ... T' A_1 p, with A the diagonal of the fate's probabilities in
@@ -103,11 +103,11 @@ class Runs:
         self.places = {fate: (mask, *np.unique(length[mask], return_inverse=True)) for fate, mask in masks.items()}
 
     @staticmethod
-    def of(fates: Fates) -> "Runs":
+    def of(fates: Fates) -> "FateRuns":
         """Return the runs of stretches one after another, each behind a START."""
         code = np.concatenate([[START, *np.where(np.isnan(f), UNKNOWN, f).tolist()] for f in fates]).astype(int)
         first = np.flatnonzero(np.concatenate([[True], (np.diff(code) != 0) | (code[1:] == START)]))
-        return Runs(code[first], np.diff(np.append(first, len(code))))
+        return FateRuns(code[first], np.diff(np.append(first, len(code))))
 
     def likelihood(self, x: np.ndarray) -> tuple[float, np.ndarray]:
         """Return the log-likelihood at logits (loss when good, when bad, fail, recover), and its gradient (4,).

@@ -60,7 +60,7 @@ def _find_crossing(function: Slope, top: np.ndarray, level: float, i: int, side:
     others, near = np.delete(np.arange(len(top)), i), top.copy()
 
     @cache  # an end of a bracket keeps its value: from another start a search may end elsewhere
-    def above(x: float) -> float:
+    def height_above_level(x: float) -> float:
         """Return how far the profile is above the level where logit i is x and all others are the best."""
 
         def with_x(free: np.ndarray) -> tuple[float, np.ndarray]:
@@ -76,13 +76,13 @@ def _find_crossing(function: Slope, top: np.ndarray, level: float, i: int, side:
 
     # A bracket by doubled steps from the top, then Brent's method.
     inside, step = float(top[i]), 0.25
-    if above(inside) <= 0:
+    if height_above_level(inside) <= 0:
         return float(expit(inside))
-    if above(side * END) >= 0:
+    if height_above_level(side * END) >= 0:
         return 0.0 if side < 0 else 1.0
-    while above(outside := float(np.clip(inside + side * step, -END, END))) > 0:
+    while height_above_level(outside := float(np.clip(inside + side * step, -END, END))) > 0:
         inside, step = outside, 2 * step
-    return float(expit(brentq(above, inside, outside, xtol=1e-3)))
+    return float(expit(brentq(height_above_level, inside, outside, xtol=1e-3)))
 
 
 def logits(*shares: float) -> np.ndarray:

@@ -11,7 +11,13 @@ import numpy as np
 
 from heliograph.live.fleet import Fleet
 from heliograph.live.rows import BEFORE
-from heliograph.live.stored.old_layout import can_read, describe_old_layout, place_flags, relocate_parts, split_by_path
+from heliograph.live.stored.old_layout import (
+    can_read_layout,
+    describe_old_layout,
+    place_flags,
+    relocate_parts,
+    split_by_path,
+)
 from heliograph.live.stored.plant_codec import BEFORE_LEAP, PlantParts, pack_plant, unpack_plant
 from heliograph.live.stored.snapshot import Identity
 from heliograph.numerics.check import fail
@@ -145,7 +151,7 @@ class PlantMigration:
         """Return whether the filter of this name had a state before that can be read as its state now."""
         shapes_before = {path: shape for path, (shape, _, _) in self._old["filters"].get(name, {}).items()}
         shapes_now = {path: shape for path, (shape, _, _) in new.get(name, {}).items()}
-        return can_read(shapes_before, shapes_now)
+        return can_read_layout(shapes_before, shapes_now)
 
     def migrate(self, bodies: Mapping[str, bytes]) -> dict[str, bytes]:
         """Return the bytes of plants, by name, as this network stores them."""

@@ -27,7 +27,7 @@ def split_by_path(state: PyTree) -> dict[str, np.ndarray]:
     }
 
 
-def can_read(old: Shapes, new: Shapes) -> bool:
+def can_read_layout(old: Shapes, new: Shapes) -> bool:
     """Return whether a state of the layout `old` can be read as one of `new`.
 
     That is so if each part of `new` was there with its shape, or is a factor of a covariance that was there.
@@ -43,7 +43,7 @@ def relocate_parts(parts: Mapping[str, np.ndarray], new: Iterable[str]) -> dict[
     """Return the parts of a state that fits, under the paths `new`; shapes may have leading axes for several states."""
     results, places = dict(parts), _trace_paths(parts, new)
     for stem in _find_factored(parts, places.values()):
-        results[stem + LOWER], results[stem + VARIANCES] = factorise(results.pop(stem + COVARIANCE))
+        results[stem + LOWER], results[stem + VARIANCES] = factorise_covariance(results.pop(stem + COVARIANCE))
     return {path: results[place] for path, place in places.items()}
 
 
@@ -101,7 +101,7 @@ def place_flags(filters: Columns) -> dict[str, dict[str, list[Any]]]:
     return results
 
 
-def factorise(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def factorise_covariance(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the entries of L below its diagonal (..., n (n - 1) / 2), row by row, and of D (..., n), P = L D L'.
 
     By elimination of many covariances P (..., n, n) at once. A pivot of less than n eps of its variance is rounding,

@@ -11,7 +11,7 @@ import numpy as np
 
 import heliograph
 from heliograph.numerics.check import fail, show_value
-from heliograph.numerics.trees.program_text import short_name
+from heliograph.numerics.trees.program_text import hash_numbers
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.network import Network
 
@@ -39,13 +39,13 @@ def network_identity(network: Network, program: str, options: Mapping[str, objec
         "nodes": ", ".join(f"{name} ({node.received} received)" for name, node in network.nodes.items()),
         "filters": ", ".join(filters),
         **{f"option {name}": f"{value!r}" for name, value in options.items()},
-        "numbers of the plant": short_name(network.plant),
-        **{f"numbers of {name}": short_name(tree) for name, tree in parts.items()},
-        "what is computed": short_name(program),
+        "numbers of the plant": hash_numbers(network.plant),
+        **{f"numbers of {name}": hash_numbers(tree) for name, tree in parts.items()},
+        "what is computed": hash_numbers(program),
     }
 
 
-def check_same(
+def check_same_network(
     what: str, mine: Mapping[str, str], other: Mapping[str, str], kept: Sequence[str] = (), accept: bool = False
 ) -> None:
     """Raise ValueError, which names the differences, if the state of `other` is not one of `mine`.
@@ -77,7 +77,7 @@ def pack(head: Mapping[str, object], arrays: Mapping[str, np.ndarray]) -> bytes:
     return file.getvalue()
 
 
-def unpack(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def unpack_snapshot(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Return the head and the arrays, by name, of what `pack` wrote."""
     try:
         with np.load(BytesIO(data), allow_pickle=False) as file:

@@ -30,7 +30,7 @@ LOOSE = 100.0  # times the tolerances of eigenvalues: elimination rounds by more
 MatrixOfInputs = Callable[[Any, jax.Array], jax.Array]  # of a plant or a sensor, and its inputs
 
 
-class Fault(NamedTuple):
+class TimeStepFault(NamedTuple):
     """A row whose time step is none: its number from 0, what was expected, and what came."""
 
     row: int
@@ -38,7 +38,7 @@ class Fault(NamedTuple):
     came: str
 
 
-def find_time_step_fault(dt: Float[np.ndarray, " steps"]) -> Fault | None:
+def find_time_step_fault(dt: Float[np.ndarray, " steps"]) -> TimeStepFault | None:
     """Return the first time step that is none: one that goes backwards, a counter that wrapped, one beyond 2^53."""
     bad = ~np.asarray(_is_time_step(dt))
     if not bad.any():
@@ -46,13 +46,13 @@ def find_time_step_fault(dt: Float[np.ndarray, " steps"]) -> Fault | None:
     row = int(np.argmax(bad))
     got = f"{dt[row]:.10g}"
     if dt[row] < 0:
-        return Fault(row, "a time step that does not go backwards", got)
+        return TimeStepFault(row, "a time step that does not go backwards", got)
     if dt[row] > LONGEST:
-        return Fault(row, "a time step of at most 2^53 units, as far as a double counts", got)
+        return TimeStepFault(row, "a time step of at most 2^53 units, as far as a double counts", got)
     # In counts of the unit that it is nearest to 2^32 in.
     counts = min((1.0, *SMALLER), key=lambda counts: abs(dt[row] * counts - WRAPPED))
     below = f"{round(dt[row] * counts - WRAPPED)}" + (f" / {counts:g}" if counts > 1 else "")
-    return Fault(row, "a time step", f"{got}: {below} as a difference of unsigned counters of 32 bits")
+    return TimeStepFault(row, "a time step", f"{got}: {below} as a difference of unsigned counters of 32 bits")
 
 
 def check_time_step(names: Sequence[str], u: Float[np.ndarray, "... inputs"]) -> None:

@@ -75,7 +75,7 @@ def with_bias(
         if by_output:
             names = [rename(name, f"{name}_bias") for name in sensor.outputs]
         bias = _make_gauss_markov(plant, names, bias, time, dt)
-    return driven_by(plant, bias, drives), _append_to_sensor(sensor, seen, n)
+    return append_driving_plant(plant, bias, drives), _append_to_sensor(sensor, seen, n)
 
 
 def _make_gauss_markov(
@@ -106,7 +106,7 @@ def _make_gauss_markov(
     return LinearPlant(matrix_over, noise_over, center, start, states=names, inputs=[dt])
 
 
-class Driven(Module):
+class DrivenTransition(Module):
     """Transition (f(x, u) + E b, F b + B u) of the plant of [x; b], x+ = f(x, u) + E b + w and b+ = F b + B u + xi.
 
     Args:
@@ -128,7 +128,7 @@ class Driven(Module):
         return jnp.concatenate([moved, self.bias.transition(x[n:], u[np.array(self.places, int)])])
 
 
-def driven_by(plant: AbstractPlant, bias: LinearPlant, coupling: np.ndarray) -> LinearPlant | Plant:
+def append_driving_plant(plant: AbstractPlant, bias: LinearPlant, coupling: np.ndarray) -> LinearPlant | Plant:
     """Return the plant of [x; b]: x and b start independently of each other, and are driven by independent noises."""
     models = plant, bias
     if set(bias.inputs) - set(plant.inputs):
@@ -148,7 +148,7 @@ def driven_by(plant: AbstractPlant, bias: LinearPlant, coupling: np.ndarray) -> 
     all_inputs = tuple(range(len(plant.inputs)))
     noise = Independent(noises) if len(noises) == 2 else JointNoise(models, (all_inputs, places))
     if not isinstance(plant, LinearPlant):
-        move = Driven(plant, bias, coupling, places)
+        move = DrivenTransition(plant, bias, coupling, places)
         if np.any(np.asarray(coupling)[list(plant.manifold.rotations)]):
             raise fail("bias of a plant", "a coupling of 0 to attitudes, which have no sum", list(plant.attitude))
         return Plant(move, noise, center, start, states, plant.inputs, circular, plant.attitude, limits)
@@ -174,7 +174,7 @@ def _stack_blocks(plant: LinearPlant, bias: LinearPlant, coupling: np.ndarray, p
     return move, drive
 
 
-class Biased(Module):
+class BiasedMeasurement(Module):
     """Measurement h(x) + D b of the state [x; b], of which the first `states` are x."""
 
     sensor: AbstractSensor
@@ -189,7 +189,7 @@ class Biased(Module):
 def _append_to_sensor(sensor: AbstractSensor, loading: np.ndarray, states: int) -> LinearSensor | Sensor:
     """Return the sensor y = h(x) + D b + v of [x; b], D the loading and `states` the length of x."""
     if not isinstance(sensor, LinearSensor):
-        return Sensor(Biased(sensor, loading, states), sensor.noise, sensor.outputs, sensor.circular)
+        return Sensor(BiasedMeasurement(sensor, loading, states), sensor.noise, sensor.outputs, sensor.circular)
     stacked = library(sensor.matrix, loading).concatenate([sensor.matrix, loading], axis=1)
     return LinearSensor(stacked, sensor.noise, sensor.outputs, sensor.circular)
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.model.enlarged.bias import driven_by
+from heliograph.model.enlarged.bias import append_driving_plant
 from heliograph.model.plant import AbstractPlant, LinearPlant, Plant
 from heliograph.model.sensor import AbstractSensor, LinearSensor, check_sensor
 from heliograph.numerics.check import array, fail, function, instance, scalar, table
@@ -35,7 +35,7 @@ class Clock(NamedTuple):
     delay: float = 0.0
 
 
-class Stamped(AbstractSensor):
+class StampedSensor(AbstractSensor):
     """A sensor whose values are of the time that its clock shows: h(x(s - o)) = h(x) - o dh/dt to first order.
 
     `offset` is the place of o among the states, `states` the number of those that the sensor measures.
@@ -64,7 +64,7 @@ def with_clocks(
     clocks: "Mapping[str, Clock]",
     motion: "Motion | Float[ArrayLike, 'n n']",
     dt: "Float[ArrayLike, ''] | str",
-) -> "tuple[LinearPlant | Plant, dict[str, LinearSensor | Stamped]]":
+) -> "tuple[LinearPlant | Plant, dict[str, LinearSensor | StampedSensor]]":
     """Return the plant with an offset and a drift for each clock as states, and the sensors of all nodes for it.
 
     A node of `clocks` measures y at the true time t and stamps the value with its own clock, s = t + o, where the
@@ -95,7 +95,7 @@ def with_clocks(
     # States: those of the plant, then offset and drift of each clock.
     total = n + 2 * len(clocks)
     offsets = {name: n + 2 * i for i, name in enumerate(clocks)}
-    larger = driven_by(plant, _make_clocks(clocks, step), np.zeros((n, 2 * len(clocks))))
+    larger = append_driving_plant(plant, _make_clocks(clocks, step), np.zeros((n, 2 * len(clocks))))
     return larger, {
         name: _enlarge_sensor(sensor, moving, n, total, offsets.get(name)) for name, sensor in sensors.items()
     }
@@ -149,7 +149,7 @@ def _make_clocks(clocks: Mapping[str, Clock], dt: str | Any) -> LinearPlant:
 
 def _enlarge_sensor(
     sensor: AbstractSensor, motion: Motion, states: int, total: int, offset: int | None
-) -> LinearSensor | Stamped:
+) -> LinearSensor | StampedSensor:
     """Return the sensor for a state of `total` components, of which the first `states` are those that it measures.
 
     `offset`: the place of its clock's offset; None of a sensor whose clock is right.
@@ -157,7 +157,7 @@ def _enlarge_sensor(
     if offset is None and isinstance(sensor, LinearSensor):
         matrix = library(sensor.matrix).pad(sensor.matrix, ((0, 0), (0, total - states)))
         return LinearSensor(matrix, sensor.noise, sensor.outputs, sensor.circular)
-    return Stamped(
+    return StampedSensor(
         base=sensor,
         noise=sensor.noise,
         motion=motion if offset is not None else None,

@@ -21,7 +21,7 @@ from heliograph.model.premises.same_program import same_function
 from heliograph.model.sensor import AbstractSensor, LinearSensor
 from heliograph.model.trigger import AbstractTrigger, Periodic
 from heliograph.model.unknown_start import UnknownStart
-from heliograph.numerics.module import same
+from heliograph.numerics.module import are_same
 from heliograph.numerics.traced import EQUAL, equal_to_rounding, is_traced
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Series
@@ -45,10 +45,10 @@ def list_differences(believed: Premise, own: Premise) -> tuple[str, ...]:
         believed: what the filter was made for.
         own: plant, sensor, channel and trigger of the place where it stands, and limits of what it uses.
     """
-    order, own = believed.order, _enlarge_own(believed, own)
+    order, own = believed.order, _enlarge_world_by_past(believed, own)
     parts = [] if _test_all_steps(_same_plant, believed.plant, own.plant, order) else [PLANT]
     if own.relays is not None or believed.relays is not None:
-        agree = same(believed.relays, own.relays) and _same_gains(believed, own)
+        agree = are_same(believed.relays, own.relays) and _same_gains(believed, own)
         return (*parts, *([] if agree else [RELAYS]))
     if believed.sensor is None or believed.channel is None:  # a filter without measurements
         return tuple(parts)
@@ -58,7 +58,7 @@ def list_differences(believed: Premise, own: Premise) -> tuple[str, ...]:
         parts.append(TRIGGER)
     if own.range is not None:  # what is refused for its value tells of the state
         parts.append(RANGE)
-    if not same(believed.encoder, own.encoder):
+    if not are_same(believed.encoder, own.encoder):
         parts.append(ENCODER)
     sensors = _test_all_steps(_same_sensor, believed.sensor, own.sensor, order)
     channels = _same_channel(believed.channel, own.channel, order, believed.trigger is None)
@@ -70,7 +70,7 @@ def list_differences(believed: Premise, own: Premise) -> tuple[str, ...]:
     return tuple(parts + [part for part, agree in ((SENSOR, sensors), (CHANNEL, channels)) if not agree])
 
 
-def _enlarge_own(believed: Premise, own: Premise) -> Premise:
+def _enlarge_world_by_past(believed: Premise, own: Premise) -> Premise:
     """Return the world with past signals as states, where the filter was made for these: of them it tells the first."""
     if own.sensor is None or own.channel is None or not first(own.channel).past:
         return own
@@ -107,7 +107,7 @@ def part_of(premise: Premise, rows: Sequence[int]) -> Premise:
 
 def _test_all_steps(agree: Callable[..., bool], a: object, b: object, order: int | None) -> bool:
     """Decide whether two models agree at each step; one that does not vary is the same at all of them."""
-    if same(a, b):
+    if are_same(a, b):
         return True
     if steps_covered((a, b)) is None:
         return agree(a, b, order)
@@ -117,7 +117,7 @@ def _test_all_steps(agree: Callable[..., bool], a: object, b: object, order: int
 
 def _same_noise(a: AbstractNoise, b: AbstractNoise, order: int | None) -> bool:
     """Return whether noises agree in what a filter uses of them: all of their law, or mean and covariance."""
-    if same(a, b):
+    if are_same(a, b):
         return True
     if order != MEAN_AND_COVARIANCE or has_bounded_noise(a) != has_bounded_noise(b):
         return False
@@ -126,14 +126,14 @@ def _same_noise(a: AbstractNoise, b: AbstractNoise, order: int | None) -> bool:
 
 def _same_plant(a: AbstractPlant, b: AbstractPlant, order: int | None) -> bool:
     """Tell whether two plants agree in law, or in mean and covariance where the filter uses no more."""
-    if same(a, b):
+    if are_same(a, b):
         return True
     if any(isinstance(plant.initial_covariance, UnknownStart) or isinstance(plant, ModalPlant) for plant in (a, b)):
         return False  # of these, only the same is the same
     sizes = [(len(plant.states), len(plant.inputs), plant.manifold) for plant in (a, b)]
     if sizes[0] != sizes[1] or not equal_to_rounding(a.initial_mean, b.initial_mean):
         return False
-    if order != MEAN_AND_COVARIANCE and not same(a.deviation, b.deviation):
+    if order != MEAN_AND_COVARIANCE and not are_same(a.deviation, b.deviation):
         return False
     return (
         equal_to_rounding(a.initial_covariance, b.initial_covariance)
@@ -160,7 +160,7 @@ def _same_disturbance(a: AbstractPlant, b: AbstractPlant, order: int | None) -> 
 
 def _same_sensor(a: AbstractSensor, b: AbstractSensor, order: int | None) -> bool:
     """Tell whether two sensors measure the same, and with noise of the same moments up to `order`."""
-    if same(a, b):
+    if are_same(a, b):
         return True
     if isinstance(a, ModalSensor) or isinstance(b, ModalSensor):
         return False
@@ -225,7 +225,7 @@ def _same_trigger(believed: AbstractTrigger | None, own: AbstractTrigger | None)
     """Decide whether a filter knows why nothing came; what is not sent by a schedule is missing whatever its value."""
     if believed is None:
         return own is None or isinstance(own, Periodic)
-    return same(believed, own)
+    return are_same(believed, own)
 
 
 def _same_gains(believed: Premise, own: Premise) -> bool:
@@ -239,7 +239,7 @@ def _same_channel(a: Channel, b: Channel, order: int | None, loses: bool) -> boo
         return True
     if isinstance(a, AbstractRandomAffine) and isinstance(b, AbstractRandomAffine):
         return _same_map(drop_names(a), drop_names(b), order, loses)
-    if same(drop_names(a), drop_names(b)):
+    if are_same(drop_names(a), drop_names(b)):
         return True
     if first(a).remembers or first(b).remembers:
         return False
@@ -248,7 +248,7 @@ def _same_channel(a: Channel, b: Channel, order: int | None, loses: bool) -> boo
 
 def _same_map(a: AbstractRandomAffine, b: AbstractRandomAffine, order: int | None, loses: bool) -> bool:
     """Tell whether two channels have the same law, or moments as far as a filter uses them (`order`, known `loses`)."""
-    if same(a, b):
+    if are_same(a, b):
         return True
     if is_traced(a, b) or (a.outputs, a.inputs, a.past) != (b.outputs, b.inputs, b.past) or a.past:
         return False
@@ -270,7 +270,7 @@ def _same_map(a: AbstractRandomAffine, b: AbstractRandomAffine, order: int | Non
 def _same_given_arrival(a: AbstractRandomAffine, b: AbstractRandomAffine) -> bool:
     """Decide whether two maps are the same but for what is lost; False where losses depend on gains."""
     try:
-        return same(a.condition_on_arrival(), b.condition_on_arrival())
+        return are_same(a.condition_on_arrival(), b.condition_on_arrival())
     except ValueError:
         return False
 
@@ -284,7 +284,7 @@ def _same_moments(a: AbstractRandomAffine, b: AbstractRandomAffine) -> bool:
         return False
     believed, own = (_take_moments_by_arrival(channel) for channel in (a, b))
     whole = [moments for there, moments in believed if there.all()]
-    return bool(whole and own) and all(_agree(whole[0], moments, there) for there, moments in [*believed, *own])
+    return bool(whole and own) and all(_moments_agree(whole[0], moments, there) for there, moments in [*believed, *own])
 
 
 Moments = tuple[np.ndarray, np.ndarray]  # E[(G, n)] (m, p + 1) and the tensor of E[z z' | y] (m, m, p + 1, p + 1)
@@ -311,7 +311,7 @@ def _take_moments_by_arrival(channel: AbstractRandomAffine) -> list[tuple[np.nda
     return [(np.asarray(outcome.arrived), second_moments(outcome.map)) for outcome in parts]
 
 
-def _agree(a: Moments, b: Moments, there: np.ndarray) -> bool:
+def _moments_agree(a: Moments, b: Moments, there: np.ndarray) -> bool:
     """Decide whether moments of the components that are there are equal to rounding, each in units of its own size."""
     rows = np.ix_(there, there)
     power = [np.abs(np.einsum("iiaa->ia", second))[there] for _, second in (a, b)]

@@ -68,7 +68,7 @@ class Premise:
         return other
 
 
-class Kept:
+class StaticPremise:
     """A premise as a static field of a tree of arrays: all of them are equal, so that none decides what is compiled.
 
     lowered: whether the claim was lowered, since the filter stands in another world.
@@ -78,20 +78,20 @@ class Kept:
         self.premise, self.lowered = premise, lowered
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Kept)
+        return isinstance(other, StaticPremise)
 
     def __hash__(self) -> int:
-        return hash(Kept)
+        return hash(StaticPremise)
 
 
-NOTHING = Kept(None)
+NOTHING = StaticPremise(None)
 
 
 class Believing(Protocol):
     """A filter, a schedule or a linear system, which keeps what it was made for."""
 
     @property
-    def kept(self) -> Kept:
+    def kept(self) -> StaticPremise:
         """The premise as it is kept."""
 
 
@@ -99,7 +99,7 @@ B = TypeVar("B", bound=Believing)
 P = ParamSpec("P")
 
 
-def believing(made: B, premise: Premise | None) -> B:
+def on_premise(made: B, premise: Premise | None) -> B:
     """Return the filter, schedule or system with this premise, and the same numbers."""
     unknown = premise is not None and isinstance(first(premise.plant).initial_covariance, UnknownStart)
     if unknown and not getattr(made, "takes_unknown_start", False):
@@ -114,7 +114,7 @@ def believing(made: B, premise: Premise | None) -> B:
     if rates is not None and not getattr(made, "takes_rates", False):
         raise fail("plant", RATES_TAKEN_BY, "rates of switches")
     twin = copy(made)
-    object.__setattr__(twin, "kept", Kept(premise))
+    object.__setattr__(twin, "kept", StaticPremise(premise))
     return twin
 
 
@@ -141,6 +141,6 @@ def believes(make: Callable[P, B]) -> Callable[P, B]:
         premise = Premise(**{name: given[name] for name in parts if name in given})
         if premise.sensor is not None and premise.channel is None:
             premise.channel = perfect(len(first(premise.sensor).outputs))
-        return believing(make(*args, **kwargs), premise)
+        return on_premise(make(*args, **kwargs), premise)
 
     return build

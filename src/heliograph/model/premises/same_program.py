@@ -7,7 +7,7 @@ import jax
 import numpy as np
 from jax.extend import core
 
-from heliograph.numerics.module import same
+from heliograph.numerics.module import are_same
 
 ASIDE = ("name", "jvp_jaxpr_fun", "fwd_jaxpr_thunk", "bwd")  # labels, and rules of derivatives beside the program
 
@@ -20,7 +20,7 @@ def same_function(f: Callable[..., Any], g: Callable[..., Any], *shapes: tuple[i
         g: the other.
         shapes: of the arguments.
     """
-    if same(f, g):
+    if are_same(f, g):
         return True
     try:
         with jax.enable_x64(True):
@@ -33,12 +33,12 @@ def same_function(f: Callable[..., Any], g: Callable[..., Any], *shapes: tuple[i
 def _same_parameter(a: Any, b: Any) -> bool:
     """Tell whether parameters of two operations are the same: programs by what they compute, others by value."""
     if isinstance(a, core.ClosedJaxpr) and isinstance(b, core.ClosedJaxpr):
-        return same(list(a.consts), list(b.consts)) and _same_program(a.jaxpr, b.jaxpr)
+        return are_same(list(a.consts), list(b.consts)) and _same_program(a.jaxpr, b.jaxpr)
     if isinstance(a, core.Jaxpr) and isinstance(b, core.Jaxpr):
         return _same_program(a, b)
     if isinstance(a, tuple | list) and isinstance(b, tuple | list):
         return len(a) == len(b) and all(map(_same_parameter, a, b))
-    return same(a, b)
+    return are_same(a, b)
 
 
 def _same_program(a: core.Jaxpr, b: core.Jaxpr) -> bool:
@@ -72,7 +72,7 @@ def _same_atoms(names: tuple[dict[Any, int], dict[Any, int]], a: Sequence[Any], 
 def _same_atom(names: tuple[dict[Any, int], dict[Any, int]], x: Any, y: Any) -> bool:
     """Return whether operands are equal constants, or the same variables by the names of both programs."""
     if isinstance(x, core.Literal) and isinstance(y, core.Literal):
-        return same(np.asarray(x.val), np.asarray(y.val))
+        return are_same(np.asarray(x.val), np.asarray(y.val))
     if isinstance(x, core.Literal) or isinstance(y, core.Literal):
         return False
     return names[0][x] == names[1][y] and x.aval == y.aval

@@ -194,7 +194,7 @@ def _mix(state: np.ndarray) -> np.ndarray:
     return cast(np.ndarray, state ^ (state >> np.uint64(31)))
 
 
-class Reader(NamedTuple):
+class WordReader(NamedTuple):
     """How a receiver reads the bits of words that came: of each output of the channel its component, -1 of a flag."""
 
     places: tuple[int, ...]

@@ -11,7 +11,7 @@ import numpy as np
 
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import at_each_step, first
-from heliograph.model.words.encoder import Reader, Words
+from heliograph.model.words.encoder import WordReader, Words
 from heliograph.numerics.check import fail
 from heliograph.random_affine.base import AbstractRandomAffine, inner_maps, replace_inner_maps
 from heliograph.random_affine.combine import Series, Stack
@@ -26,14 +26,14 @@ FLAG = -1  # in the place of a component: a number that is no word
 Places = tuple[int, ...]  # of words: the component that each carries
 
 
-class Routed(NamedTuple):
+class RewrittenMap(NamedTuple):
     """A map of words in another form, and the components that stand at its outputs."""
 
     map: AbstractRandomAffine
     places: Places
 
 
-class Form(NamedTuple):
+class WordForm(NamedTuple):
     """How a link of words and a selection of words are written in another form."""
 
     flips: Callable[[Flips, Places], AbstractRandomAffine]
@@ -41,7 +41,7 @@ class Form(NamedTuple):
     size: int  # numbers that a word is written as
 
 
-def in_bits(encoder: Words, channel: Channel) -> Channel:
+def rewrite_in_bits(encoder: Words, channel: Channel) -> Channel:
     """Return the channel of the numbers by which the words are carried: their bits, and dithers that pass.
 
     Args:
@@ -50,7 +50,7 @@ def in_bits(encoder: Words, channel: Channel) -> Channel:
     """
     beside = encoder.carried - encoder.bits
     eye = np.eye(encoder.carried)
-    form = Form(
+    form = WordForm(
         flips=lambda link, places: link.on_bits(encoder.bits, beside),
         selection=lambda matrix: known(np.kron(matrix, eye)),
         size=encoder.carried,
@@ -59,7 +59,7 @@ def in_bits(encoder: Words, channel: Channel) -> Channel:
     return carried
 
 
-def about_centres(encoder: Words, channel: Channel) -> Channel:
+def rewrite_about_centres(encoder: Words, channel: Channel) -> Channel:
     """Return the channel of the words as numbers about the centres of their range.
 
     Args:
@@ -69,7 +69,7 @@ def about_centres(encoder: Words, channel: Channel) -> Channel:
 
     def convert(link: AbstractRandomAffine) -> AbstractRandomAffine:
         power = encoder.each(encoder.power, signal_size(link))
-        return route(link, Form(lambda flips, places: flips.about_centre(power[list(places)]), known, 1)).map
+        return route(link, WordForm(lambda flips, places: flips.about_centre(power[list(places)]), known, 1)).map
 
     numbers: Channel = at_each_step(convert, channel)
     return numbers
@@ -77,80 +77,80 @@ def about_centres(encoder: Words, channel: Channel) -> Channel:
 
 def find_places(channel: Channel) -> Places:
     """Return the component of y that each output of a channel of words carries, FLAG of a number that is no word."""
-    form = Form(lambda flips, places: known(np.eye(flips.dimension)), known, 1)
+    form = WordForm(lambda flips, places: known(np.eye(flips.dimension)), known, 1)
     return route(first(channel), form).places
 
 
-def reader_of(channel: Channel) -> Reader:
+def reader_of(channel: Channel) -> WordReader:
     """Return how the receiver behind a channel of words reads their bits."""
-    return Reader(find_places(channel))
+    return WordReader(find_places(channel))
 
 
-def route(channel: AbstractRandomAffine, form: Form) -> Routed:
+def route(channel: AbstractRandomAffine, form: WordForm) -> RewrittenMap:
     """Write a channel of words in another form.
 
     Raises:
         ValueError: a channel that does more with words than select, copy, flip, delay and lose them.
     """
     sent = tuple(range(signal_size(channel)))
-    return _route(channel, sent * (1 + channel.past), form)
+    return _rewrite_map(channel, sent * (1 + channel.past), form)
 
 
-def _route(link: AbstractRandomAffine, places: Places, form: Form) -> Routed:
+def _rewrite_map(link: AbstractRandomAffine, places: Places, form: WordForm) -> RewrittenMap:
     """Write a map of words in another form; `places`: the components that come in, word by word."""
     match link:
         case Flips():
-            return Routed(form.flips(link, places), places)
+            return RewrittenMap(form.flips(link, places), places)
         case GainAndNoise():
-            return _route_selection(link, places, form)
+            return _rewrite_selection(link, places, form)
         case ModeOutput():
-            return Routed(ModeOutput(link.memory, link.sent * form.size), (FLAG,) * link.outputs)
+            return RewrittenMap(ModeOutput(link.memory, link.sent * form.size), (FLAG,) * link.outputs)
         case Series():
-            return _route_series(link, places, form)
+            return _rewrite_series(link, places, form)
         case Stack():
-            parts = [_route(part, places, form) for part in link.maps]
+            parts = [_rewrite_map(part, places, form) for part in link.maps]
             together = tuple(p for part in parts for p in part.places)
-            return Routed(Stack([part.map for part in parts]), together)
+            return RewrittenMap(Stack([part.map for part in parts]), together)
         case AbstractUniform():
             return _route_choice(link, places, form)
         case Erasure() | DelayLine():
             (inner,) = inner_maps(link)
-            routed = _route(inner, places, form)
-            return Routed(replace_inner_maps(link, [routed.map]), routed.places)
+            routed = _rewrite_map(inner, places, form)
+            return RewrittenMap(replace_inner_maps(link, [routed.map]), routed.places)
         case Delayed() if not link.timestamped:
-            chosen = _route(link.delay, places, form)
-            routed = _route(link.link, chosen.places, form)
+            chosen = _rewrite_map(link.delay, places, form)
+            routed = _rewrite_map(link.link, chosen.places, form)
             maps = [chosen.map if inner is link.delay else routed.map for inner in inner_maps(link)]
-            return Routed(replace_inner_maps(link, maps), routed.places)
+            return RewrittenMap(replace_inner_maps(link, maps), routed.places)
     raise refuse_link(type(link).__name__)
 
 
-def _route_selection(link: GainAndNoise, places: Places, form: Form) -> Routed:
+def _rewrite_selection(link: GainAndNoise, places: Places, form: WordForm) -> RewrittenMap:
     """Return the route of a wire that selects components; words pass no other gain."""
     matrix, gain = np.asarray(link.matrix), link.law.constant
     is_noiseless = not np.any(np.asarray(link.noise.covariance)) and not np.any(np.asarray(link.noise.mean))
     selects_one_each = np.isin(matrix, (0, 1)).all() and (matrix.sum(axis=1) == 1).all()
     if gain is None or float(gain) != 1.0 or not is_noiseless or not selects_one_each:
         raise refuse_link(link.in_words() or "a gain")
-    return Routed(form.selection(matrix), tuple(places[int(np.argmax(row))] for row in matrix))
+    return RewrittenMap(form.selection(matrix), tuple(places[int(np.argmax(row))] for row in matrix))
 
 
-def _route_series(link: Series, places: Places, form: Form) -> Routed:
+def _rewrite_series(link: Series, places: Places, form: WordForm) -> RewrittenMap:
     """Return the route through maps one after another."""
     maps = []
     for part in link.maps:
-        routed = _route(part, places, form)
+        routed = _rewrite_map(part, places, form)
         places = routed.places
         maps.append(routed.map)
-    return Routed(Series(maps), places)
+    return RewrittenMap(Series(maps), places)
 
 
-def _route_choice(link: AbstractUniform, places: Places, form: Form) -> Routed:
+def _route_choice(link: AbstractUniform, places: Places, form: WordForm) -> RewrittenMap:
     """Return the route through one of several maps, all of which deliver the same components."""
-    parts = [_route(part, places, form) for part in link.maps]
+    parts = [_rewrite_map(part, places, form) for part in link.maps]
     if len({part.places for part in parts}) > 1:
         raise fail("channel of words", "choices and modes that deliver the same components", "others")
-    return Routed(replace_inner_maps(link, [part.map for part in parts]), parts[0].places)
+    return RewrittenMap(replace_inner_maps(link, [part.map for part in parts]), parts[0].places)
 
 
 def refuse_link(got: str) -> Exception:

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 
 
 @contextmanager
-def no_collector() -> Iterator[None]:
+def pause_collector() -> Iterator[None]:
     """Stop the collector of reference cycles within the block or the decorated function; then start it if it ran.
 
     It would look at all that lives again and again: a third of the time of importing JAX and of tracing a program.

@@ -14,7 +14,7 @@ IMPORTS = ExtensionFileLoader.exec_module.__code__.co_filename
 
 
 @contextmanager
-def handlers(handler: Callable[[int, FrameType | None], object]) -> Iterator[None]:
+def handle_stop_signals(handler: Callable[[int, FrameType | None], object]) -> Iterator[None]:
     """Handle the signals to stop so within a block of the main thread, but for those that the process ignores.
 
     A process in the background ignores SIGINT: nobody's Ctrl-C is meant for it. While a module in C is imported the
@@ -60,7 +60,7 @@ def hold_signals() -> Iterator[None]:
     if current_thread() is not main_thread():
         yield
         return
-    with handlers(lambda number, _: noted.append(number)):
+    with handle_stop_signals(lambda number, _: noted.append(number)):
         yield
     if noted:
         signal.raise_signal(noted[0])

@@ -10,7 +10,7 @@ R = TypeVar("R")
 ROOM = 2**16 + 1  # references: just above half a MB, so that CPython maps one, of which half is left for other frames
 
 
-def make_room(function: Callable[P, R]) -> Callable[P, R]:
+def reserve_stack(function: Callable[P, R]) -> Callable[P, R]:
     """Return the same function, called by a frame so large that the chunk it needs has room for those within it.
 
     CPython maps memory for its stack in chunks of 16 KB, and gives a chunk back as soon as no frame is in it. Tracing

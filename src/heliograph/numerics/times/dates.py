@@ -27,7 +27,7 @@ def looks_like_date(text: str) -> bool:
     return re.match(r"\d{4}-\d\d-|\d{8}[Tt]\d{4}", text) is not None or MONTH.fullmatch(text) is not None
 
 
-def dates(texts: Iterable[object], name: str) -> np.ndarray:
+def parse_dates(texts: Iterable[object], name: str) -> np.ndarray:
     """Return dates of ISO 8601 as datetime64[ns] in UTC, empty ones as NaT; one without a zone is taken as UTC."""
     results, zones = [], set()
     for row, element in enumerate(texts, 1):
@@ -37,7 +37,7 @@ def dates(texts: Iterable[object], name: str) -> np.ndarray:
             results.append(MISSING)
             continue
         # Nanoseconds since 1970 in UTC.
-        moment, zoned = moment_of(text, f"{name}, row {row}")
+        moment, zoned = parse_moment(text, f"{name}, row {row}")
         results.append(moment)
         # Local times and times with a zone cannot be compared.
         zones.add(zoned)
@@ -46,7 +46,7 @@ def dates(texts: Iterable[object], name: str) -> np.ndarray:
     return np.array(results, dtype=np.int64).view("datetime64[ns]")
 
 
-def moment_of(text: str, name: str) -> tuple[int, bool]:
+def parse_moment(text: str, name: str) -> tuple[int, bool]:
     """Return a date as nanoseconds since 1970 in UTC, and whether it has a zone; a month is its first day.
 
     So is a year or a quarter. A leap second (23:59:60 UTC at the end of a month) is the second after it, as clocks of
@@ -114,7 +114,7 @@ def _format_offset(zone: str | None) -> str:
     return "Z" if zone in (None, "Z", "UTC", "GMT") else str(zone).removeprefix("Z")
 
 
-def instant(text: str) -> datetime:
+def parse_instant(text: str) -> datetime:
     """Return a date of ISO 8601 with its zone, to the microsecond."""
     match, leap = _match_date(text)
     if match["zone"] is None:
@@ -192,7 +192,7 @@ def _parse_horizon(text: str) -> float | np.timedelta64 | np.datetime64:
     if span := SPAN.fullmatch(text):
         return np.timedelta64(round(float(span["count"]) * NANOSECONDS[span["unit"]]), "ns")
     if looks_like_date(text):
-        return np.datetime64(moment_of(text, "horizon")[0], "ns")
+        return np.datetime64(parse_moment(text, "horizon")[0], "ns")
     if re.fullmatch(r"\d+", text):
         return int(text)
     try:

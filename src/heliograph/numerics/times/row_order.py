@@ -36,7 +36,7 @@ def find_out_of_order(time: np.ndarray) -> Bool[np.ndarray, " rows"]:
     return out
 
 
-def find_astray(time: np.ndarray, year: float = YEAR) -> Bool[np.ndarray, " events"]:
+def find_unset_stamps(time: np.ndarray, year: float = YEAR) -> Bool[np.ndarray, " events"]:
     """Return the mask of the stamps, in the order of their messages, of a clock that was not set.
 
     They are more than a year outside of all others, and a stretch of fewer messages than those before and after it,

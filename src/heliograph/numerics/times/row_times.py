@@ -7,7 +7,7 @@ import numpy as np
 
 from heliograph.numerics.check import array, fail, show_value
 from heliograph.numerics.masked import fill_masked
-from heliograph.numerics.times.dates import YEARS, dates, looks_like_date
+from heliograph.numerics.times.dates import YEARS, looks_like_date, parse_dates
 from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import ArrayLike
 
@@ -73,7 +73,7 @@ def read_dates(name: str, value: object) -> np.ndarray | None:
     if not any(_is_date(part) for part in parts):
         return None
     moments = [part.to_timestamp() if hasattr(part, "to_timestamp") else part for part in parts]
-    return dates([str(_convert_unit(name, m)) if isinstance(m, np.datetime64) else m for m in moments], name)
+    return parse_dates([str(_convert_unit(name, m)) if isinstance(m, np.datetime64) else m for m in moments], name)
 
 
 def _list_elements(value: object) -> list[Any]:

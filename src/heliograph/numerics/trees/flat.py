@@ -9,7 +9,7 @@ import numpy as np
 from heliograph.numerics.types import PyTree
 
 
-class Flat(NamedTuple):
+class FlatLayout(NamedTuple):
     """Layout of a tree whose leaves are concatenated in a row of doubles; integers are exact up to 2^53."""
 
     structure: jax.tree_util.PyTreeDef
@@ -31,10 +31,10 @@ class Flat(NamedTuple):
         return self.structure.unflatten(parts)
 
 
-def flat_like(tree: PyTree) -> Flat:
+def flat_like(tree: PyTree) -> FlatLayout:
     """Return the layout of a tree of arrays."""
     leaves, structure = jax.tree.flatten(tree)
-    return Flat(structure, tuple(leaf.shape for leaf in leaves), tuple(str(leaf.dtype) for leaf in leaves))
+    return FlatLayout(structure, tuple(leaf.shape for leaf in leaves), tuple(str(leaf.dtype) for leaf in leaves))
 
 
 def row_of(tree: PyTree) -> jax.Array:

@@ -15,7 +15,7 @@ DIGITS = 16  # of a hash
 ADDRESS = re.compile(r" at 0x[0-9a-f]+")
 
 
-def short_name(numbers: PyTree) -> str:
+def hash_numbers(numbers: PyTree) -> str:
     """Hash all numbers in a tree, or a text."""
     if isinstance(numbers, str):
         return sha256(numbers.encode()).hexdigest()[:DIGITS]
@@ -32,10 +32,10 @@ def text_of(program: ClosedJaxpr) -> str:
 
     A lowered program says the same, and takes as long to write as half of the trace.
     """
-    return _Writer().lines(program.jaxpr, program.consts)
+    return _ProgramWriter().lines(program.jaxpr, program.consts)
 
 
-class _Writer:
+class _ProgramWriter:
     """Writer of programs, each once wherever it is called."""
 
     def __init__(self) -> None:
@@ -80,12 +80,12 @@ class _Writer:
             case jax.Array() if jax.numpy.issubdtype(value.dtype, jax.dtypes.prng_key):
                 return f"key {self._write_value(np.asarray(jax.random.key_data(value)))}"
             case jax.Array() | np.ndarray():
-                return f"{value.dtype}{value.shape} {short_name(np.asarray(value))}"
+                return f"{value.dtype}{value.shape} {hash_numbers(np.asarray(value))}"
         # A function makes a derivative, of which a step computes none; a type has its name.
         return getattr(value, "__name__", "") if callable(value) else ADDRESS.sub("", repr(value))
 
     def _hash(self, program: object, jaxpr: Jaxpr, consts: Sequence[Any]) -> str:
         """Return the hash of an inner program's text, written once."""
         if id(program) not in self._hashes:
-            self._hashes[id(program)] = program, short_name(self.lines(jaxpr, consts))
+            self._hashes[id(program)] = program, hash_numbers(self.lines(jaxpr, consts))
         return self._hashes[id(program)][1]

@@ -11,10 +11,17 @@ from heliograph.planning.budget import PowerLimits, check_budget, make_power_lim
 from heliograph.planning.network_of_design import repeat_network
 from heliograph.planning.numbers.problem import Build, NumberProblem, read_free_numbers
 from heliograph.planning.problem import Certificate, DesignProblem, PowerDesign
-from heliograph.planning.quadratic_programme import ACTIVE, Limits, Problem, Programme, Vector, search
+from heliograph.planning.quadratic_programme import (
+    ACTIVE,
+    DescentProblem,
+    PowerAndErrorLimits,
+    Programme,
+    Vector,
+    search_from_starts,
+)
 
 
-class Conditions(NamedTuple):
+class LagrangeConditions(NamedTuple):
     """Lagrange's conditions at a point: the value, what they leave of it, and a watt's worth.
 
     residual: the part of the value by which a linear model still sees it fall within the limits, over a step of the
@@ -44,7 +51,7 @@ def design_numbers(task: DesignProblem, build: Build) -> PowerDesign:
     draws = np.random.default_rng(seed)
     begin = [problem.numbers.start, *(problem.numbers.draw_start(draws) for _ in range(starts - 1))]
     descent = problem.descent_problem()
-    best = search(descent, limits, begin)
+    best = search_from_starts(descent, limits, begin)
     if best is None:
         raise _explain_unmet(descent, limits, begin)
     # The design, and what Lagrange's conditions say of it. The problem is not convex: there is no lower bound.
@@ -80,13 +87,13 @@ def _limit_powers(problem: NumberProblem, budget: object) -> PowerLimits:
     return limits
 
 
-def _make_limit_rows(allowed: PowerLimits, target: float | None) -> Limits:
+def _make_limit_rows(allowed: PowerLimits, target: float | None) -> PowerAndErrorLimits:
     """Return the finite limits of a budget as rows of all powers; peaks too, since powers are no free numbers here."""
     rows, most = allowed.rows()
     peak = allowed.peak.ravel()
     finite = np.isfinite(peak)
     peak_rows = (np.eye(peak.size) / np.where(finite, peak, 1.0)[:, None])[finite]
-    return Limits(
+    return PowerAndErrorLimits(
         rows=np.concatenate([peak_rows, rows]),
         most=np.concatenate([np.ones(len(peak_rows)), most]),
         target=target,
@@ -94,7 +101,7 @@ def _make_limit_rows(allowed: PowerLimits, target: float | None) -> Limits:
     )
 
 
-def _explain_unmet(problem: Problem, limits: Limits, begin: list[Vector]) -> ValueError:
+def _explain_unmet(problem: DescentProblem, limits: PowerAndErrorLimits, begin: list[Vector]) -> ValueError:
     """Return the error for limits that no start meets: it names the least error within them, or the least power.
 
     A programme's `size` is its value at its start, here the least that was found.
@@ -103,21 +110,21 @@ def _explain_unmet(problem: Problem, limits: Limits, begin: list[Vector]) -> Val
     # The target error may be what cannot be met: the least error within the limits of power.
     if limits.target is not None:
         no_target = limits._replace(target=None)
-        best = search(problem, no_target, begin)
+        best = search_from_starts(problem, no_target, begin)
         if best is not None:
             error = Programme(problem, no_target, sharpest, best).size
             return fail(
                 "target error", f"at least {error:.6g}, the least found from {starts} starts", f"{limits.target:.6g}"
             )
     # Else it is the power: the least total without limits of it (a target of infinity makes the power the value).
-    no_limit = Limits(rows=limits.rows[:0], most=limits.most[:0], target=np.inf, steps=limits.steps)
-    best = search(problem, no_limit, begin)
+    no_limit = PowerAndErrorLimits(rows=limits.rows[:0], most=limits.most[:0], target=np.inf, steps=limits.steps)
+    best = search_from_starts(problem, no_limit, begin)
     power = np.inf if best is None else Programme(problem, no_limit, sharpest, best).size
     expected = f"one that is met from some of {starts} starts (a total power of {power:.6g} is the least found)"
     return fail("budget", expected, "none that is")
 
 
-def check_lagrange_conditions(problem: Problem, limits: Limits, x: Vector) -> Conditions:
+def check_lagrange_conditions(problem: DescentProblem, limits: PowerAndErrorLimits, x: Vector) -> LagrangeConditions:
     """Return Lagrange's conditions at x: how far the gradient is from a sum of the reached limits' normals.
 
     The multipliers m >= 0 minimise |gradient - normals' m|; in a minimum nothing of the gradient is left.
@@ -138,7 +145,7 @@ def check_lagrange_conditions(problem: Problem, limits: Limits, x: Vector) -> Co
     if limits.target is not None:  # the value is the power: a watt's worth in units of the error
         power_per_error = multipliers[-1] * programme.size / limits.target
         worth = (worth + 1 / limits.steps) / power_per_error if power_per_error > 0 else np.zeros_like(worth)
-    return Conditions(
+    return LagrangeConditions(
         value=value * programme.size,
         residual=residual / max(value, 1e-300),
         worth=worth.reshape(limits.steps, -1),

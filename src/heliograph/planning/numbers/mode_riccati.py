@@ -90,7 +90,7 @@ def _solve_periodic(m: ModeSystem) -> tuple[Parts, np.ndarray]:
         before, parts = parts, _close_loop(m, gains).steady()
         if np.abs(parts - before).max() <= CONVERGED * np.abs(parts).max():
             break
-        gains = np.array([_update(m, k, parts[k - 1])[0] for k in range(len(parts))])
+        gains = np.array([_update_riccati(m, k, parts[k - 1])[0] for k in range(len(parts))])
     return parts, gains
 
 
@@ -101,13 +101,13 @@ def _run_riccati(m: ModeSystem, parts: Float[np.ndarray, "_ n n"]) -> tuple[Part
     """
     covariances, gains = [], []
     for k in range(len(m.law)):
-        gain, parts = _update(m, k, parts)
+        gain, parts = _update_riccati(m, k, parts)
         covariances.append(parts)
         gains.append(gain)
     return np.array(covariances), np.array(gains)
 
 
-def _update(m: ModeSystem, k: int, parts: Float[np.ndarray, "_ n n"]) -> tuple[np.ndarray, np.ndarray]:
+def _update_riccati(m: ModeSystem, k: int, parts: Float[np.ndarray, "_ n n"]) -> tuple[np.ndarray, np.ndarray]:
     """Return the best gain K_k,j (modes, n, m) of step k and X (modes, n, n) after it, from X before it."""
     law = m.law[k][:, None, None]
     prior = JumpSystem(m.chain[k], m.transition[k], law * m.process[k]).step(parts)

@@ -18,19 +18,19 @@ from heliograph.engine.choice import compile_on_call
 from heliograph.learning.description import Description, describe
 from heliograph.model.over_time import first
 from heliograph.numerics.check import InputError, array, fail, instance, items, table
-from heliograph.numerics.module import same
+from heliograph.numerics.module import are_same
 from heliograph.numerics.types import Array, Float
 from heliograph.planning.error import Criterion, Error
 from heliograph.planning.moments import check_stable
 from heliograph.planning.numbers.mode_riccati import ModeSolution, ModeSystem, lagrangian, solve_riccati
 from heliograph.planning.numbers.reception import (
-    check_time,
+    check_time_variation,
     list_sources,
+    make_mode_system,
     means_are_known,
-    mode_system,
     transmitters_of,
 )
-from heliograph.planning.quadratic_programme import Evaluation, Problem
+from heliograph.planning.quadratic_programme import DescentProblem, Evaluation
 from heliograph.simulation.network import Network
 
 Build = Callable[..., Network]
@@ -39,7 +39,7 @@ Vector = Float[np.ndarray, "x"]
 YOUNG = "young"  # the scalars in the bound of an uncertain mean gain
 
 
-class Number(NamedTuple):
+class FreeNumber(NamedTuple):
     """A free number or array of them: its start, and its least and largest values, of its shape."""
 
     start: np.ndarray
@@ -47,19 +47,19 @@ class Number(NamedTuple):
     high: np.ndarray
 
 
-def young_scalars(steps: int) -> Number:
+def young_scalars(steps: int) -> FreeNumber:
     """Return the scalar of Young's inequality for each step, or a single one of the steady bound.
 
     From 0.1, between 1e-6 and 1e3: beyond these one of the bound's factors 1 + b and 1 + 1 / b is a thousand or more.
     """
     shape = () if steps == 1 else (steps,)
-    return Number(start=np.full(shape, 0.1), low=np.full(shape, 1e-6), high=np.full(shape, 1e3))
+    return FreeNumber(start=np.full(shape, 0.1), low=np.full(shape, 1e-6), high=np.full(shape, 1e3))
 
 
-class Numbers(NamedTuple):
+class FreeNumbers(NamedTuple):
     """All free numbers as one vector."""
 
-    by_name: dict[str, Number]
+    by_name: dict[str, FreeNumber]
 
     @property
     def start(self) -> Vector:
@@ -92,7 +92,7 @@ class Numbers(NamedTuple):
         return np.where(between, within, np.clip(self.start * factor, self.low, self.high))
 
 
-def check_numbers(free: object) -> Numbers:
+def check_free_numbers(free: object) -> FreeNumbers:
     """Return the free numbers of {name: (start, low, high)}; a start may be an array, ends numbers or of its shape.
 
     Raises:
@@ -107,12 +107,12 @@ def check_numbers(free: object) -> Numbers:
         low, high = (_check_end(name, end, start.shape) for end in parts[1:])
         if not np.all((low <= start) & (start <= high)):
             raise fail(f"free number {name!r}", "a start between its ends", f"{parts[0]} of {parts[1]} to {parts[2]}")
-        numbers[name] = Number(start, low, high)
+        numbers[name] = FreeNumber(start, low, high)
     if YOUNG in numbers:
         raise fail("free", f"names other than {YOUNG!r}, which stands for a scalar of the bound", YOUNG)
     if not numbers:
         raise fail("free", "at least one number (name: (start, low, high))", "none: nothing is free")
-    return Numbers(numbers)
+    return FreeNumbers(numbers)
 
 
 def _check_end(name: str, end: object, shape: tuple[int, ...]) -> np.ndarray:
@@ -126,7 +126,7 @@ def _check_end(name: str, end: object, shape: tuple[int, ...]) -> np.ndarray:
     return value
 
 
-def read_free_numbers(build: Build, free: object) -> tuple[Build, Numbers]:
+def read_free_numbers(build: Build, free: object) -> tuple[Build, FreeNumbers]:
     """Return the function and its free numbers: {name: (start, low, high)}, or where None the marks `hg.free` in it.
 
     Raises:
@@ -138,15 +138,15 @@ def read_free_numbers(build: Build, free: object) -> tuple[Build, Numbers]:
     except TypeError as error:
         raise fail("free", "the arguments of the function, (start, low, high) by name", str(error)) from None
     if free is not None:
-        return build, check_numbers(free)
+        return build, check_free_numbers(free)
     description = describe(build)
     marks = {}
     for mark in description.parameters.every:
         if mark.domain.kind != "interval":
             raise fail(f"free number {mark.name!r}", "one between two limits", f"a {mark.domain.kind}")
         ends = (np.full(mark.start.shape, end) for end in (mark.domain.low, mark.domain.high))
-        marks[mark.name] = Number(np.asarray(mark.start), *ends)
-    return partial(_mark_powers, description), Numbers(marks)
+        marks[mark.name] = FreeNumber(np.asarray(mark.start), *ends)
+    return partial(_mark_powers, description), FreeNumbers(marks)
 
 
 def _mark_powers(description: Description, **values: object) -> Network:
@@ -160,7 +160,7 @@ LEAST_UNIT = 1e-12  # of a number whose range and start are less
 INSIDE = 1e-9  # of the way from an end to the start
 
 
-class Slopes(NamedTuple):
+class ErrorAndPowerSlopes(NamedTuple):
     """Derivatives of the error, and of what each transmitter sends at each step."""
 
     error: Float[np.ndarray, "x"]
@@ -176,13 +176,13 @@ class TracedNetwork:
     """
 
     build: Build
-    numbers: Numbers
+    numbers: FreeNumbers
     error: Error
     young: bool
     start: Network
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, TracedNetwork) and same(
+        return isinstance(other, TracedNetwork) and are_same(
             (self.build, self.start, self._shape()), (other.build, other.start, other._shape())
         )
 
@@ -203,9 +203,9 @@ class TracedNetwork:
         except UNTRACEABLE as error:
             expected = "operations of jax.numpy on its numbers, and no choice by their values"
             raise fail("network of free numbers", expected, type(error).__name__) from None
-        return mode_system(network, self.error, young)
+        return make_mode_system(network, self.error, young)
 
-    def slopes(self, x: Array, solution: ModeSolution) -> Slopes:
+    def slopes(self, x: Array, solution: ModeSolution) -> ErrorAndPowerSlopes:
         """Return the derivatives of error and powers by the numbers x, at the fixed X, K and L of the solution."""
         system, pull_back = jax.vjp(self.system, jnp.asarray(x))
         # Cotangents of the system: that of the error first, then a unit one for each power.
@@ -214,21 +214,23 @@ class TracedNetwork:
         of_powers = jax.tree.map(lambda leaf: jnp.zeros((size, *leaf.shape)), system)._replace(powers=unit)
         cotangents = jax.tree.map(lambda error, rest: jnp.concatenate([error[None], rest]), of_error, of_powers)
         slopes = jax.vmap(pull_back)(cotangents)[0]
-        return Slopes(error=slopes[0], powers=slopes[1:].reshape(*system.powers.shape, len(x)))
+        return ErrorAndPowerSlopes(error=slopes[0], powers=slopes[1:].reshape(*system.powers.shape, len(x)))
 
 
 @lru_cache(PROGRAMS)
-def programs(network: TracedNetwork) -> tuple[Callable[[Array], ModeSystem], Callable[[Array, ModeSolution], Slopes]]:
+def programs(
+    network: TracedNetwork,
+) -> tuple[Callable[[Array], ModeSystem], Callable[[Array, ModeSolution], ErrorAndPowerSlopes]]:
     """Return the compiled programs of a network's system and derivatives; equal networks share them."""
     return compile_on_call(network.system), compile_on_call(network.slopes)
 
 
-class Point(NamedTuple):
+class EvaluatedPoint(NamedTuple):
     """System, its solution and derivatives at a vector of numbers; the error is smoothed where it is an eigenvalue."""
 
     system: ModeSystem
     solution: ModeSolution
-    slopes: Slopes
+    slopes: ErrorAndPowerSlopes
     criterion: Criterion
 
     @property
@@ -250,16 +252,16 @@ class Point(NamedTuple):
 class NumberProblem:
     """A network that is a function of numbers, as a descent needs it; the last point is cached."""
 
-    def __init__(self, build: Build, numbers: Numbers, error: Error):
+    def __init__(self, build: Build, numbers: FreeNumbers, error: Error):
         self.build, self.numbers, self.error, self.young = build, numbers, error, False
         network = self.network(numbers.start)
-        check_time(network, error)
+        check_time_variation(network, error)
         sources = list_sources(network).items()
         if not all(means_are_known(name, first(source.channel)) for name, source in sources):
-            self.young, self.numbers = True, Numbers(numbers.by_name | {YOUNG: young_scalars(error.steps)})
+            self.young, self.numbers = True, FreeNumbers(numbers.by_name | {YOUNG: young_scalars(error.steps)})
         self.names, self.criterion = transmitters_of(network), error.criterion(network.states)
         self._system, self._slopes = programs(TracedNetwork(build, self.numbers, error, self.young, network))
-        self._last: dict[tuple[bytes, int | None], Point] = {}
+        self._last: dict[tuple[bytes, int | None], EvaluatedPoint] = {}
 
     def network(self, x: Vector) -> Network:
         """Return the network at these numbers."""
@@ -285,7 +287,7 @@ class NumberProblem:
                     what = f"{' '.join(str(end).split())}, where: {error}"
                     raise fail(f"ends of {name!r}", "numbers between which there is a network", what) from None
 
-    def at(self, x: Vector, criterion: Criterion | None = None) -> Point:
+    def at(self, x: Vector, criterion: Criterion | None = None) -> EvaluatedPoint:
         """Return system, solution and derivatives at x, for a criterion (that of the problem unless given).
 
         Raises:
@@ -300,8 +302,8 @@ class NumberProblem:
                 scale = np.sqrt(1 + np.ravel(self.numbers.named(x)[YOUNG])[0]) if self.young else 1.0
                 check_stable(system.transition[0] / scale)
             solution = solve_riccati(system, criterion)
-            slopes = Slopes(*(np.asarray(slope) for slope in self._slopes(np.asarray(x), solution)))
-            self._last = {key: Point(system, solution, slopes, criterion)}
+            slopes = ErrorAndPowerSlopes(*(np.asarray(slope) for slope in self._slopes(np.asarray(x), solution)))
+            self._last = {key: EvaluatedPoint(system, solution, slopes, criterion)}
         return self._last[key]
 
     def evaluate(self, x: Vector, sharpness: int | None) -> Evaluation | None:
@@ -317,11 +319,11 @@ class NumberProblem:
             power_slope=point.slopes.powers.reshape(-1, len(x)),
         )
 
-    def descent_problem(self) -> Problem:
+    def descent_problem(self) -> DescentProblem:
         """Return the problem of a descent, in units of the numbers' ranges, or of their starts where they have none."""
         low, high = self.numbers.low, self.numbers.high
         unit = np.maximum(np.where(np.isfinite(high - low), high - low, np.abs(self.numbers.start)), LEAST_UNIT)
-        return Problem(
+        return DescentProblem(
             low=low,
             high=high,
             unit=unit,

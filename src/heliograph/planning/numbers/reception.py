@@ -38,14 +38,14 @@ from heliograph.simulation.node import Node
 MOST_MODES = 64  # of all nodes together
 
 
-class Source(NamedTuple):
+class SensorAndChannel(NamedTuple):
     """A sensor and the channel behind it, each of one step or OverTime."""
 
     sensor: AnySensor
     channel: Channel
 
 
-class Received(NamedTuple):
+class NodeReception(NamedTuple):
     """Reception of one node.
 
     chain: [k, i, j] = P(mode j at step k | mode i at the step before). law: P(mode j) at step k. output, noise:
@@ -59,7 +59,7 @@ class Received(NamedTuple):
     powers: Float[Array, "time hops"]
 
 
-class _Modes(NamedTuple):
+class _ObservedModes(NamedTuple):
     """A channel by its observed modes.
 
     onward: [i, j] = P(mode j at the next step | mode i). initial: law of the first mode. maps: the channel in each
@@ -73,7 +73,7 @@ class _Modes(NamedTuple):
     forgets: bool
 
 
-def list_sources(network: Network) -> dict[str, Source]:
+def list_sources(network: Network) -> dict[str, SensorAndChannel]:
     """Return the sensors with their channels by node.
 
     Raises:
@@ -82,9 +82,9 @@ def list_sources(network: Network) -> dict[str, Source]:
     if network.relays is not None:
         raise fail("network of a design", "nodes that receive sensors through channels", "relays that filter")
     nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
-    sources = {name: Source(node.sensor, node.channel) for name, node in nodes.items()}
+    sources = {name: SensorAndChannel(node.sensor, node.channel) for name, node in nodes.items()}
     if network.common is not None:
-        sources["common"] = Source(network.common.sensor, network.common.channel)
+        sources["common"] = SensorAndChannel(network.common.sensor, network.common.channel)
     for name, source in sources.items():
         sensor, channel = first(source.sensor), first(source.channel)
         if not isinstance(sensor, LinearSensor) or channel.past:
@@ -102,7 +102,7 @@ def transmitters_of(network: Network) -> tuple[str, ...]:
     return tuple(f"{name}.{hop}" for name, source in sources for hop in transmitter_names(first(source.channel)))
 
 
-def check_time(network: Network, error: Error) -> None:
+def check_time_variation(network: Network, error: Error) -> None:
     """Raise ValueError unless all that varies over time in a network fits an error's horizon, or else its period."""
     check_design_plant(network.plant)
     covered = steps_covered((network.plant, list_sources(network)))
@@ -114,7 +114,7 @@ def check_time(network: Network, error: Error) -> None:
         raise fail("parts that are OverTime", f"as many steps as the error's period, {error.period}", covered)
 
 
-def mode_system(network: Network, error: Error, young: Array | None = None) -> ModeSystem:
+def make_mode_system(network: Network, error: Error, young: Array | None = None) -> ModeSystem:
     """Return the system of a network's best linear filter. Noises are exact, upper bounds of uncertain probabilities.
 
     `young` is the scalar b of each step, None where the mean gains are known.
@@ -149,7 +149,7 @@ def mode_system(network: Network, error: Error, young: Array | None = None) -> M
     )
 
 
-def _stack_nodes(nodes: list[Received]) -> tuple[Array, Array]:
+def _stack_nodes(nodes: list[NodeReception]) -> tuple[Array, Array]:
     """Return H and N of all nodes together, for every combination of a mode of each, the last node's fastest."""
     outputs, noises = [], []
     for modes in product(*(range(node.law.shape[1]) for node in nodes)):
@@ -161,8 +161,8 @@ def _stack_nodes(nodes: list[Received]) -> tuple[Array, Array]:
 
 
 def describe_reception(
-    name: str, source: Source, states: Float[Array, "time n1 n1"], forever: bool, young: Array | None
-) -> Received:
+    name: str, source: SensorAndChannel, states: Float[Array, "time n1 n1"], forever: bool, young: Array | None
+) -> NodeReception:
     """Describe a node's reception of states with E (x, 1)(x, 1)'; steps repeat `forever` or begin with the first.
 
     Raises:
@@ -187,7 +187,7 @@ def describe_reception(
         now = np.array(span)
         b = None if young is None else young[now]
         parts.append(_describe_steps(at(source.sensor, span[0]), channel, m, states[now], b, law[now]))
-    return Received(chain, law, *(jnp.concatenate(series) for series in zip(*parts, strict=True)))
+    return NodeReception(chain, law, *(jnp.concatenate(series) for series in zip(*parts, strict=True)))
 
 
 def means_are_known(name: str, channel: AbstractRandomAffine) -> bool:
@@ -195,16 +195,18 @@ def means_are_known(name: str, channel: AbstractRandomAffine) -> bool:
     return all(has_known_mean(second_order(mode_map)) for mode_map in _observe_modes(name, channel).maps)
 
 
-def _observe_modes(name: str, channel: AbstractRandomAffine) -> _Modes:
+def _observe_modes(name: str, channel: AbstractRandomAffine) -> _ObservedModes:
     """Return the modes of a channel that a filter is told, with what arrives in each, and whether they have memory."""
     if not memories(channel):
         cases = channel.list_outcomes()
         law = jnp.stack([jnp.asarray(case.probability) for case in cases])
         maps, arrived = [case.map for case in cases], [case.arrived for case in cases]
-        return _Modes(jnp.tile(law, (len(cases), 1)), law, maps, arrived, forgets=True)
+        return _ObservedModes(jnp.tile(law, (len(cases), 1)), law, maps, arrived, forgets=True)
     joint = _make_flagged_modes(name, channel)
     everything = np.ones(joint.maps[0].outputs, dtype=bool)
-    return _Modes(joint.transition, joint.initial, list(joint.maps), [everything] * len(joint.maps), forgets=False)
+    return _ObservedModes(
+        joint.transition, joint.initial, list(joint.maps), [everything] * len(joint.maps), forgets=False
+    )
 
 
 def _make_flagged_modes(name: str, channel: AbstractRandomAffine) -> JointModes:
@@ -237,7 +239,12 @@ def _propagate_laws(
 
 
 def _describe_steps(
-    sensor: LinearSensor, channel: AbstractRandomAffine, modes: _Modes, states: Array, young: Array | None, law: Array
+    sensor: LinearSensor,
+    channel: AbstractRandomAffine,
+    modes: _ObservedModes,
+    states: Array,
+    young: Array | None,
+    law: Array,
 ) -> tuple[Array, Array, Array]:
     """Return H (time, M, m, n), N (time, M, m, m) and powers (time, hops) over steps with one sensor and channel.
 

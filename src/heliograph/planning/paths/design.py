@@ -9,11 +9,23 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.types import Bool, Float, Int
 from heliograph.planning.budget import MET, PowerLimits, Powers
 from heliograph.planning.error import Criterion
-from heliograph.planning.paths.model import PathInformation, Paths, error_covariances, path_information, sensitivities
+from heliograph.planning.paths.model import (
+    PathInformation,
+    Paths,
+    error_covariances,
+    path_information,
+    path_sensitivities,
+)
 from heliograph.planning.paths.relaxation import SplitPaths, compute_envelope, split_paths
 from heliograph.planning.paths.water_filling import water_filling
 from heliograph.planning.problem import Certificate, DesignProblem, PowerDesign
-from heliograph.planning.quadratic_programme import Evaluation, Limits, Problem, Vector, search
+from heliograph.planning.quadratic_programme import (
+    DescentProblem,
+    Evaluation,
+    PowerAndErrorLimits,
+    Vector,
+    search_from_starts,
+)
 
 UNLIMITED = 1e13  # times alpha: more changes nothing but rounding
 REACHED = 1e-9  # relative: a target so near to what unlimited power leaves is not reached
@@ -50,7 +62,7 @@ class PathProblem(NamedTuple):
         information, slope = self.information(powers)
         p = error_covariances(self.paths, information)
         value, weights = self.criterion.smooth(p)
-        by_information = sensitivities(self.paths, information, p, weights)[:, self.path]
+        by_information = path_sensitivities(self.paths, information, p, weights)[:, self.path]
         return value, by_information, -by_information * slope
 
     def evaluate(self, x: Vector, sharpness: int | None) -> Evaluation:
@@ -89,7 +101,7 @@ class PathProblem(NamedTuple):
         """
         rows, most = self.limits.rows()
         peak = self.limits.peak
-        problem = Problem(
+        problem = DescentProblem(
             low=np.zeros(peak.size),
             high=peak.ravel(),
             unit=np.full(peak.size, self.scale),
@@ -97,7 +109,9 @@ class PathProblem(NamedTuple):
             evaluate=self.evaluate,
             restore=lambda x: self.limits.clip(x.reshape(peak.shape)).ravel(),
         )
-        best = search(problem, Limits(rows, most, target, len(peak)), [start.ravel() for start in starts])
+        best = search_from_starts(
+            problem, PowerAndErrorLimits(rows, most, target, len(peak)), [start.ravel() for start in starts]
+        )
         return None if best is None else np.maximum(best, 0.0).reshape(peak.shape)
 
 

@@ -32,7 +32,7 @@ CONVERGED = 1e-16  # relative change of the fixed point by a doubling: rounding
 Matrices = Float[np.ndarray, "time n n"]
 
 
-class Plants(NamedTuple):
+class PlantSteps(NamedTuple):
     """A and Q of each step; `start` is the error covariance before the first, None where the steps repeat for ever."""
 
     transition: Matrices
@@ -74,7 +74,7 @@ def solve_fixed_point(step: RiccatiMap) -> Float[np.ndarray, "n n"]:
     raise fail("steady error", "one that converges (the plant is unstable in a state that nobody receives)", "growth")
 
 
-def covariances(plants: Plants, information: Matrices) -> Matrices:
+def compute_covariances(plants: PlantSteps, information: Matrices) -> Matrices:
     """Return the posterior covariance P_k of each step under the information received at each step.
 
     Raises:
@@ -98,7 +98,7 @@ def covariances(plants: Plants, information: Matrices) -> Matrices:
     return np.array(posteriors)
 
 
-def adjoint(plants: Plants, information: Matrices, p: Matrices, weights: Matrices) -> Matrices:
+def adjoint(plants: PlantSteps, information: Matrices, p: Matrices, weights: Matrices) -> Matrices:
     """Return the adjoint L_k, the gradient of the cost with respect to P_k through all later steps."""
     phi = (np.eye(p.shape[-1]) - p @ information) @ plants.transition
     always = JumpSystem(np.ones((len(p), 1, 1)), phi[:, None], np.zeros_like(phi[:, None]))
@@ -120,7 +120,7 @@ class Paths(NamedTuple):
     path of each hop, in the order of the hops. kappa, alpha: of each hop. names: of the hops' transmitters.
     """
 
-    plants: Plants
+    plants: PlantSteps
     rows: Float[np.ndarray, "time path n"]
     second: PathValues
     signal: PathValues
@@ -195,7 +195,7 @@ def independent_paths(
     seconds = [steady_moment(plant)] * steps if start is None else moments_over(plant, steps)
     signal = np.einsum("in,tnm,im->ti", c, np.array(seconds)[:, :-1, :-1], c)
     return Paths(
-        plants=Plants(np.tile(a, (steps, 1, 1)), np.tile(q, (steps, 1, 1)), start),
+        plants=PlantSteps(np.tile(a, (steps, 1, 1)), np.tile(q, (steps, 1, 1)), start),
         rows=np.tile(c, (steps, 1, 1)),
         second=signal + r,
         signal=signal,
@@ -266,10 +266,10 @@ def information_matrix(paths: Paths, information: PathValues) -> Float[np.ndarra
 
 def error_covariances(paths: Paths, information: PathValues) -> Float[np.ndarray, "time n n"]:
     """Return the error covariance of the best linear filter after each step."""
-    return covariances(paths.plants, information_matrix(paths, information))
+    return compute_covariances(paths.plants, information_matrix(paths, information))
 
 
-def sensitivities(
+def path_sensitivities(
     paths: Paths,
     information: PathValues,
     p: Float[np.ndarray, "time n n"],

@@ -11,7 +11,7 @@ from heliograph.numerics.check import check_horizon, fail, instance
 from heliograph.numerics.types import Float
 from heliograph.planning.error import Error
 from heliograph.planning.moments import check_design_plant, measurement_moment, moments_over, steady_moment
-from heliograph.planning.paths.model import Paths, Plants
+from heliograph.planning.paths.model import Paths, PlantSteps
 from heliograph.planning.transmitters import compute_sent_powers
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Stack
@@ -23,7 +23,7 @@ from heliograph.simulation.node import Node
 UNCORRELATED = 1e-12  # relative: a covariance of noises that counts as none
 
 
-class Chain(NamedTuple):
+class HopChain(NamedTuple):
     """A chain of hops for one number: the combination of (outputs, 1) it carries, and kappa and alpha of the hops."""
 
     row: Float[np.ndarray, "m1"]
@@ -68,7 +68,7 @@ def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "
     described = [_build_step(nodes, k, np.asarray(second)) for k, second in enumerate(seconds)]
     plant_at = [at(plant, k) for k in range(steps)]
     paths = Paths(
-        plants=Plants(
+        plants=PlantSteps(
             transition=np.array([now.matrix for now in plant_at]),
             process=np.array([now.noise.covariance for now in plant_at]),
             start=start,
@@ -84,7 +84,7 @@ def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "
     return paths, np.array([step.powers for step in described])
 
 
-def chains_of(channel: AbstractRandomAffine, rows: Float[np.ndarray, "k m1"], prefix: str = "") -> list[Chain]:
+def find_chains(channel: AbstractRandomAffine, rows: Float[np.ndarray, "k m1"], prefix: str = "") -> list[HopChain]:
     """Return the chains of a channel that carries rows @ (y, 1), their hops' names beginning with `prefix`.
 
     Raises:
@@ -95,7 +95,7 @@ def chains_of(channel: AbstractRandomAffine, rows: Float[np.ndarray, "k m1"], pr
     while isinstance(head, GainAndNoise) and not head.transmits:
         rows = np.asarray(head.matrix) @ rows
         if not rest:
-            return [Chain(row, {}) for row in rows]
+            return [HopChain(row, {}) for row in rows]
         rows[:, -1] += np.asarray(head.noise.mean)
         head, *rest = rest
     if not isinstance(head, Stack):
@@ -103,10 +103,10 @@ def chains_of(channel: AbstractRandomAffine, rows: Float[np.ndarray, "k m1"], pr
     if rest:
         raise _unfit("a stack that is sent on")
     parts = enumerate(head.maps, 1)
-    return [chain for i, affine in parts for chain in chains_of(affine, rows, f"{prefix}part{i}.")]
+    return [chain for i, affine in parts for chain in find_chains(affine, rows, f"{prefix}part{i}.")]
 
 
-def _make_chain(parts: list[AbstractRandomAffine], rows: Float[np.ndarray, "k m1"], prefix: str) -> Chain:
+def _make_chain(parts: list[AbstractRandomAffine], rows: Float[np.ndarray, "k m1"], prefix: str) -> HopChain:
     """Return a series of maps as a path: the row of outputs that it carries, kappa and alpha of each hop.
 
     Raises:
@@ -144,7 +144,7 @@ def _make_chain(parts: list[AbstractRandomAffine], rows: Float[np.ndarray, "k m1
         hops[last] = (kappa * fading, alpha)
     elif fading > 1:
         raise _unfit("a wire that loses what it carries")
-    return Chain(row, hops)
+    return HopChain(row, hops)
 
 
 def _describe_hop(hop: GainAndNoise) -> tuple[float, float]:
@@ -181,7 +181,7 @@ def _unfit(got: str) -> ValueError:
     return fail("network", "independent paths, each a chain of hops for one number", got)
 
 
-class _Step(NamedTuple):
+class _PathsOfStep(NamedTuple):
     """Lists of one step, filled path by path.
 
     Of each path its row c, second = s = E y^2 and signal = t = s - Var v; of each hop kappa, alpha, the power that it
@@ -198,9 +198,9 @@ class _Step(NamedTuple):
     path: list[int]
 
 
-def _build_step(nodes: Mapping[str, Node], k: int, state: Float[np.ndarray, "n1 n1"]) -> _Step:
+def _build_step(nodes: Mapping[str, Node], k: int, state: Float[np.ndarray, "n1 n1"]) -> _PathsOfStep:
     """Describe the paths of all nodes at step k: what they carry, its powers, and the numbers of their hops."""
-    step = _Step([], [], [], [], [], [], [], [])
+    step = _PathsOfStep([], [], [], [], [], [], [], [])
     for name, node in nodes.items():
         if node.informed_by is not None:
             raise _unfit("a sensor with feedback, whose power depends on the error")
@@ -210,7 +210,7 @@ def _build_step(nodes: Mapping[str, Node], k: int, state: Float[np.ndarray, "n1 
         refuse_angles("design", sensor)
         # Chains, and what their transmitters send at present.
         y, noise = np.asarray(measurement_moment(sensor, state)), np.asarray(sensor.noise.covariance)
-        chains, sends = chains_of(channel, np.eye(len(sensor.outputs), len(y))), compute_sent_powers(channel, y, k)
+        chains, sends = find_chains(channel, np.eye(len(sensor.outputs), len(y))), compute_sent_powers(channel, y, k)
         _check_uncorrelated(name, np.array([chain.row[:-1] for chain in chains]), noise)
         # Each chain is a path: what it carries of the sensor's outputs, then its hops.
         for chain in chains:

@@ -26,7 +26,7 @@ LARGEST = 1e100  # powers and noises, whose squares doubles hold
 Hops = Float[np.ndarray, "time path hops"]
 
 
-class Split(NamedTuple):
+class PowerSplit(NamedTuple):
     """Powers of the hops of each path, information j of the path, and dj/dP."""
 
     powers: Hops
@@ -97,7 +97,7 @@ def check_hop_noises(alpha: ArrayLike) -> Float[np.ndarray, "H"]:
     return noise
 
 
-def split_power_over_hops(whole: SplitPaths, total: PathValues) -> Split:
+def split_power_over_hops(whole: SplitPaths, total: PathValues) -> PowerSplit:
     """Return the best split of each path's power `total` over its free hops, with the path's information and slope."""
     alpha, power = whole.alpha, np.where(total > 0, total, 1.0)[..., None]
     hops = (alpha > 0).sum(axis=-1)
@@ -123,7 +123,7 @@ def split_power_over_hops(whole: SplitPaths, total: PathValues) -> Split:
     slope = np.exp(log_l[..., 0]) * ratio * whole.full / below**2
     # Of no power: one hop begins with the slope 1 / (A alpha), several with none.
     slope_at_zero = np.divide(1.0, whole.full * alpha.sum(axis=-1), out=np.zeros_like(ratio), where=hops == 1)
-    return Split(
+    return PowerSplit(
         powers=np.where(sends[..., None], p, 0.0),
         information=np.where(sends, ratio / below, 0.0),
         slope=np.where(hops == 0, 0.0, np.where(sends, slope, slope_at_zero)),

@@ -23,7 +23,7 @@ PATIENCE, TRIES = 20, 12  # iterations that close the gap no further; points on 
 STEEPEST = 1e-9  # least a, of s kappa: below, a path that power makes free of noise is a little more than linear
 
 
-class Slopes(NamedTuple):
+class ErrorSlopes(NamedTuple):
     """Error at some powers, -d error / d j of each free hop's path, and d error / d p."""
 
     error: float
@@ -45,8 +45,8 @@ def water_filling(
     a = np.maximum(whole.full - whole.signal, STEEPEST * whole.full)
     b = whole.full * whole.alpha[..., 0]
 
-    def slopes_at(powers: Powers) -> Slopes:
-        return Slopes(*sensitivity(powers))
+    def slopes_at(powers: Powers) -> ErrorSlopes:
+        return ErrorSlopes(*sensitivity(powers))
 
     best = p = start
     smallest, idle = np.inf, 0
@@ -64,8 +64,8 @@ def water_filling(
 
 
 def _search_line(
-    slopes_at: Callable[[Powers], Slopes], p: Powers, slopes: Slopes, way: Powers
-) -> tuple[Powers, Slopes]:
+    slopes_at: Callable[[Powers], ErrorSlopes], p: Powers, slopes: ErrorSlopes, way: Powers
+) -> tuple[Powers, ErrorSlopes]:
     """Return a point of less error on the way from p to p + way, and its slopes.
 
     The end of the way, or where the slopes at both ends say that the error is least. Where rounding hides the way down,

@@ -16,7 +16,7 @@ from heliograph.numerics import check
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import array, fail, radii, scalar
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.module import Module, readable, same, unwritten
+from heliograph.numerics.module import Module, are_same, readable, unwritten
 from heliograph.numerics.traced import equal_to_rounding, is_traced, plain, stack_parts, within
 from heliograph.numerics.types import ArrayLike, Float
 
@@ -71,7 +71,7 @@ class AbstractLaw(Module):
 
     def covers(self, own: "AbstractLaw") -> bool:
         """Decide whether another law, with all that it may be, is one of those that this one may be."""
-        return same(self, own)
+        return are_same(self, own)
 
     def list_atoms(self) -> list[tuple[float | jax.Array, float | jax.Array]]:
         """Return probability and value of each of finitely many gains; by default a refusal."""
@@ -166,7 +166,7 @@ class Discrete(AbstractLaw):
     def covers(self, own: AbstractLaw) -> bool:
         """Decide whether another law has the same values, and its probabilities stay within the radius."""
         if not isinstance(own, Discrete) or not equal_to_rounding(self.values, own.values):
-            return same(self, own)
+            return are_same(self, own)
         return within(own.probabilities, own.radius, self.probabilities, self.radius)
 
     def list_atoms(self) -> list[tuple[float | jax.Array, float | jax.Array]]:

@@ -106,7 +106,7 @@ def _integrate_posterior(law: AbstractLaw, a: jax.Array, variance: jax.Array) ->
     # The part of these that does count: within NATS of the mode.
     mode = _find_mode(log_density, low, high)
     least = log_density(mode) - NATS
-    left, right = _find_end(log_density, low, mode, least), _find_end(log_density, high, mode, least)
+    left, right = _find_density_end(log_density, low, mode, least), _find_density_end(log_density, high, mode, least)
     # Weights p(t | a) dt at the nodes, normalised; the variance about the mean, so that nothing cancels.
     x, w = np.polynomial.legendre.leggauss(NODES)
     t = (left + right) / 2 + (right - left) / 2 * x
@@ -135,7 +135,7 @@ def _find_mode(log_density: LogDensity, low: jax.Array, high: jax.Array) -> jax.
     return middle
 
 
-def _find_end(log_density: LogDensity, outer: jax.Array, mode: jax.Array, least: jax.Array) -> jax.Array:
+def _find_density_end(log_density: LogDensity, outer: jax.Array, mode: jax.Array, least: jax.Array) -> jax.Array:
     """Return a place from which to `outer` the density is below `least`, and close to where it rises above it."""
     steps = np.linspace(0.0, 1.0, GRID)
 
@@ -151,7 +151,7 @@ def _find_end(log_density: LogDensity, outer: jax.Array, mode: jax.Array, least:
     return outside
 
 
-def gain_nodes(
+def gain_quadrature(
     law: AbstractLaw, count: int = GAINS
 ) -> tuple[Float[np.ndarray, "nodes 1"], Float[np.ndarray, " nodes"]]:
     """Return gains (nodes, 1) and weights (nodes,) by which a mean over a gain is a sum: those of Gauss and Legendre.
@@ -180,16 +180,16 @@ def gain_nodes(
     return g[:, None], weights / weights.sum()
 
 
-def reading_nodes(
+def reading_quadrature(
     law: AbstractLaw, variance: float
 ) -> tuple[Float[np.ndarray, "nodes 1"], Float[np.ndarray, " nodes"]]:
     """Return readings a = g + e (nodes, 1) and weights (nodes,) by which a mean over a reading is a sum.
 
     Args:
-        law: of the gain g, as `gain_nodes` takes it.
+        law: of the gain g, as `gain_quadrature` takes it.
         variance: of e, positive.
     """
-    gains, weights = gain_nodes(law)
+    gains, weights = gain_quadrature(law)
     x, w = np.polynomial.hermite_e.hermegauss(ERRORS)
     readings = gains + np.sqrt(variance) * x
     return readings.reshape(-1, 1), np.outer(weights, w / w.sum()).ravel()

@@ -7,7 +7,7 @@ from typing import NamedTuple, TypeAlias, TypeVar
 import jax
 import numpy as np
 
-from heliograph.factors.columns import Columns
+from heliograph.factors.columns import WeightedColumns
 from heliograph.numerics.check import fail
 from heliograph.numerics.traced import block_diagonal, library
 from heliograph.numerics.types import Array, Float
@@ -17,7 +17,7 @@ Number: TypeAlias = float | jax.Array
 Atom = TypeVar("Atom", bound=tuple[object, ...])
 
 
-class Component(NamedTuple):
+class AffineComponent(NamedTuple):
     """One combination of atoms of a map: with probability `weight`, z = gain x + offset + N(0, noise).
 
     Shapes: gain (m, n), offset (m,), noise (m, m).
@@ -28,16 +28,16 @@ class Component(NamedTuple):
     offset: Array
     noise: Array
 
-    def then(self, other: "Component") -> "Component":
+    def then(self, other: "AffineComponent") -> "AffineComponent":
         """Compose with a map after it: G_y (G_x s + c_x + n_x) + c_y + n_y."""
         weight, gain, offset, noise = other
         spread = gain @ self.noise @ gain.T + noise
-        return Component(self.weight * weight, gain @ self.gain, gain @ self.offset + offset, spread)
+        return AffineComponent(self.weight * weight, gain @ self.gain, gain @ self.offset + offset, spread)
 
-    def above(self, other: "Component") -> "Component":
+    def above(self, other: "AffineComponent") -> "AffineComponent":
         """Stack on another map of the same input."""
         gain, offset = _join_ends(self.gain, other.gain), _join_ends(self.offset, other.offset)
-        return Component(self.weight * other.weight, gain, offset, block_diagonal([self.noise, other.noise]))
+        return AffineComponent(self.weight * other.weight, gain, offset, block_diagonal([self.noise, other.noise]))
 
 
 class NoiseAtom(NamedTuple):
@@ -56,7 +56,7 @@ class NoiseAtom(NamedTuple):
         return NoiseAtom(self.weight * other.weight, value, block_diagonal([self.covariance, other.covariance]))
 
 
-def combine(parts: Sequence[list[Atom]], join: Callable[[Atom, Atom], Atom]) -> list[Atom]:
+def combine_atoms(parts: Sequence[list[Atom]], join: Callable[[Atom, Atom], Atom]) -> list[Atom]:
     """Combine every atom of each independent part with every one of the others.
 
     Raises:
@@ -77,7 +77,7 @@ def _join_ends(a: Array, b: Array) -> Array:
     return joined
 
 
-class Branches(NamedTuple):
+class GaussianBranches(NamedTuple):
     """Each component of a noise as a mixture of Gaussian branches about the mean of the noise.
 
     Shapes: log_share, mean, variance (n, branches); a branch that a component does not have has log_share -inf.
@@ -91,20 +91,20 @@ class Branches(NamedTuple):
 class SignalNoise(NamedTuple):
     """A noise beside a signal y: factors of what it adds to the error of y, and what to E y y' (n, n)."""
 
-    columns: Columns
+    columns: WeightedColumns
     covariance: Float[Array, "n n"]
 
 
-def stack_branches(parts: Sequence[Branches]) -> Branches:
+def stack_branches(parts: Sequence[GaussianBranches]) -> GaussianBranches:
     """Return the components of several laws one above the other, as many branches each as the one with most has."""
     xp, most = library(parts), max(law.mean.shape[1] for law in parts)
     fills = (-np.inf, 0.0, 1.0)
 
-    def padded(law: Branches) -> list[Array]:
+    def padded(law: GaussianBranches) -> list[Array]:
         more = ((0, 0), (0, most - law.mean.shape[1]))
         return [xp.pad(value, more, constant_values=fill) for value, fill in zip(law, fills, strict=True)]
 
-    return Branches(*(xp.concatenate(rows) for rows in zip(*map(padded, parts), strict=True)))
+    return GaussianBranches(*(xp.concatenate(rows) for rows in zip(*map(padded, parts), strict=True)))
 
 
 class NoiseWithoutOutliers(NamedTuple):

@@ -22,7 +22,7 @@ def multiply_matrices(second: Interval, first: Interval) -> Interval:
     return center - radius, center + radius
 
 
-def multiply_rows(a: Entries, first: int, b: Entries, second: int, variables: int) -> Entries:
+def multiply_interval_polynomials(a: Entries, first: int, b: Entries, second: int, variables: int) -> Entries:
     """Return the interval product of two polynomials: ends of the products of ends, summed over equal monomials.
 
     Shapes: a (ends, n), b (ends, m), with one pair of ends, or (n,) where they are one.

@@ -10,10 +10,10 @@ from heliograph.numerics.types import PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, check_maps
 from heliograph.random_affine.composite import AbstractMapWrapper
 from heliograph.random_affine.moments.monomials import (
-    Moments,
+    JointMoments,
     count_monomials,
     evaluate_monomials,
-    exponents,
+    list_exponents,
     position,
     refuse_if_too_large,
     symmetric_power,
@@ -56,15 +56,15 @@ class Lift(AbstractMapWrapper):
         state, h = self.base.draw(state, key)
         return state, jnp.asarray(symmetric_power(h, self.degree))
 
-    def moments(self, order: int) -> Moments:
+    def moments(self, order: int) -> JointMoments:
         """Return the rows and columns of E[Sym^(degree order)(H)], spread over the repeated products."""
         check_forgets("moments of a map", self)
         inner = self.base.moments(order * self.degree).matrix
-        rows = _products(self.base.outputs + 1, self.degree, order)
-        columns = _products(self.base.inputs + 1, self.degree, order)
+        rows = _find_product_positions(self.base.outputs + 1, self.degree, order)
+        columns = _find_product_positions(self.base.inputs + 1, self.degree, order)
         refuse_if_too_large(len(rows), len(columns), f"lifted moments of order {order}")
         repetitions = np.bincount(columns)
-        return Moments(inner[rows][:, columns] / repetitions[columns], self.outputs, self.inputs, order)
+        return JointMoments(inner[rows][:, columns] / repetitions[columns], self.outputs, self.inputs, order)
 
     def degree_in(self, identity: str) -> int:
         """Return `degree` times that of the map."""
@@ -76,13 +76,13 @@ class Lift(AbstractMapWrapper):
         return lifted
 
 
-def _products(variables: int, degree: int, order: int) -> np.ndarray:
+def _find_product_positions(variables: int, degree: int, order: int) -> np.ndarray:
     """Return the position of each product of `order` monomials of `degree` among the monomials of degree * order."""
-    parts = exponents(variables, degree)
+    parts = list_exponents(variables, degree)
     target = position(variables, degree * order)
     return np.array([
         target[tuple(sum(power * parts[i][v] for i, power in enumerate(powers) if power) for v in range(variables))]
-        for powers in exponents(len(parts), order)
+        for powers in list_exponents(len(parts), order)
     ])  # fmt: skip
 
 

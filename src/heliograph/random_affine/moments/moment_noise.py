@@ -15,7 +15,7 @@ import numpy as np
 from heliograph.numerics.check import array, check_count, fail, rank
 from heliograph.numerics.traced import is_traced, plain
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.moments.monomials import Exponents, exponents
+from heliograph.random_affine.moments.monomials import Exponents, list_exponents
 from heliograph.random_affine.noise import (
     AbstractNoise,
     FiniteSupport,
@@ -125,7 +125,7 @@ def recorded_noise(samples: "Float[ArrayLike, 'samples *components']", order: in
     absolute = np.abs(values)
     worst, where = 0.0, 1
     # The moment that is known worst, relative to its largest possible size, and its order.
-    for powers in (a for k in range(1, order + 1) for a in exponents(values.shape[1], k)):
+    for powers in (a for k in range(1, order + 1) for a in list_exponents(values.shape[1], k)):
         degree = sum(powers)
         # Standard error of the mean of n^a, and Hölder's bound of its size.
         error = np.std(np.prod(values ** np.array(powers), axis=1)) / np.sqrt(len(values))
@@ -142,7 +142,7 @@ def recorded_noise(samples: "Float[ArrayLike, 'samples *components']", order: in
     return FiniteSupport(values, np.full(len(values), 1 / len(values)))
 
 
-class AboutMean(AbstractNoise):
+class CentredNoise(AbstractNoise):
     """Noise n - E[n] of a law of any kind: its moments are sums of the law's own."""
 
     source: AbstractNoise
@@ -172,7 +172,7 @@ class AboutMean(AbstractNoise):
 @singledispatch
 def about_mean(law: AbstractNoise) -> AbstractNoise:
     """Return the law of n - E[n]; of the known kinds one of the same kind, so that nothing is subtracted twice."""
-    return AboutMean(law)
+    return CentredNoise(law)
 
 
 @about_mean.register

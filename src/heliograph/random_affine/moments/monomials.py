@@ -27,7 +27,7 @@ Numbers = Any  # NumPy's or JAX's, or a list of such
 
 
 @cache
-def exponents(variables: int, degree: int) -> tuple[Exponents, ...]:
+def list_exponents(variables: int, degree: int) -> tuple[Exponents, ...]:
     """Return the exponents of all monomials of total degree `degree`; degree 1 gives y_1, ..., y_p, 1."""
     monomials = []
     for choice in combinations_with_replacement(range(variables), degree):
@@ -40,8 +40,8 @@ def exponents(variables: int, degree: int) -> tuple[Exponents, ...]:
 
 @cache
 def position(variables: int, degree: int) -> dict[Exponents, int]:
-    """Return the position of each monomial in `exponents`."""
-    return {powers: i for i, powers in enumerate(exponents(variables, degree))}
+    """Return the position of each monomial in `list_exponents`."""
+    return {powers: i for i, powers in enumerate(list_exponents(variables, degree))}
 
 
 def count_monomials(variables: int, degree: int) -> int:
@@ -51,14 +51,14 @@ def count_monomials(variables: int, degree: int) -> int:
 
 @cache_arrays
 def factor_variables(variables: int, degree: int) -> np.ndarray:
-    """Return the variables that each monomial of `exponents` multiplies, in order: (count, degree)."""
+    """Return the variables that each monomial of `list_exponents` multiplies, in order: (count, degree)."""
     choices = combinations_with_replacement(range(variables), degree)
     flat = np.fromiter((variable for choice in choices for variable in choice), np.int64)
     return flat.reshape(count_monomials(variables, degree), degree)
 
 
-def place(chosen: np.ndarray, variables: int) -> np.ndarray:
-    """Return the position of each monomial in `exponents`, from the variables (..., degree) that it multiplies.
+def place_monomials(chosen: np.ndarray, variables: int) -> np.ndarray:
+    """Return the position of each monomial in `list_exponents`, from the variables (..., degree) that it multiplies.
 
     These may be in any order. Before variables s_1 <= s_2 <= ... stand, for each t, those with the same first ones and
     a smaller t-th.
@@ -85,7 +85,7 @@ def evaluate_monomials(y: Numbers, degree: int) -> Numbers:
     """Return all monomials of (y, 1) of total degree `degree`, for y of shape (p,)."""
     values: list[Numbers] = [*y, 1.0]
     terms = [prod((v**e for v, e in zip(values, powers, strict=True) if e), start=1.0)
-             for powers in exponents(len(values), degree)]  # fmt: skip
+             for powers in list_exponents(len(values), degree)]  # fmt: skip
     if isinstance(y, np.ndarray):
         return np.array(terms, dtype=np.float64)
     import jax.numpy as jnp
@@ -98,7 +98,7 @@ def _raise_table(variables: int, degree: int) -> np.ndarray:
     """Return at [i, c] the position at degree - 1 of monomial i over variable c; one past the end if it has no c."""
     lower = position(variables, degree - 1)
     table = np.full((count_monomials(variables, degree), variables), len(lower), dtype=np.int64)
-    for i, powers in enumerate(exponents(variables, degree)):
+    for i, powers in enumerate(list_exponents(variables, degree)):
         for c, power in enumerate(powers):
             if power:
                 table[i, c] = lower[(*powers[:c], power - 1, *powers[c + 1 :])]
@@ -109,7 +109,9 @@ def _raise_table(variables: int, degree: int) -> np.ndarray:
 def _last_factor(variables: int, degree: int) -> tuple[np.ndarray, np.ndarray]:
     """Return for each monomial a variable c that divides it, and the position of the quotient at degree - 1."""
     table = _raise_table(variables, degree)
-    divisor = np.array([max(c for c, power in enumerate(powers) if power) for powers in exponents(variables, degree)])
+    divisor = np.array(
+        [max(c for c, power in enumerate(powers) if power) for powers in list_exponents(variables, degree)]
+    )
     return divisor, table[np.arange(len(divisor)), divisor]
 
 
@@ -147,7 +149,7 @@ def product_table(variables: int, first: int, second: int) -> np.ndarray:
     a, b = factor_variables(variables, first), factor_variables(variables, second)
     shape = len(a), len(b)
     both = [np.broadcast_to(a[:, None], (*shape, first)), np.broadcast_to(b, (*shape, second))]
-    return place(np.concatenate(both, axis=-1), variables)
+    return place_monomials(np.concatenate(both, axis=-1), variables)
 
 
 def multiply_polynomials(a: Numbers, first: int, b: Numbers, second: int, variables: int) -> Numbers:
@@ -159,14 +161,14 @@ def multiply_polynomials(a: Numbers, first: int, b: Numbers, second: int, variab
 @cache_arrays
 def degrees(dimension: int, order: int) -> np.ndarray:
     """Return the degree of each monomial in the variables other than 1."""
-    return np.array([order - powers[-1] for powers in exponents(dimension + 1, order)])
+    return np.array([order - powers[-1] for powers in list_exponents(dimension + 1, order)])
 
 
 @cache_arrays
-def sum_plan(dimension: int, order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def plan_binomial_sums(dimension: int, order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return (y + n)^a = sum_b C(a, b) n^(a-b) y^b as four columns: place of a, of b, of a - b, and C(a, b)."""
     places, terms = position(dimension + 1, order), []
-    for row, powers in enumerate(exponents(dimension + 1, order)):
+    for row, powers in enumerate(list_exponents(dimension + 1, order)):
         a = powers[:-1]
         for b in product(*(range(x + 1) for x in a)):
             rest = tuple(x - y for x, y in zip(a, b, strict=True))
@@ -176,7 +178,7 @@ def sum_plan(dimension: int, order: int) -> tuple[np.ndarray, np.ndarray, np.nda
     return rows, columns, noises, weights
 
 
-class Moments(Module):
+class JointMoments(Module):
     """Joint moments of (G, n) of one order: the matrix E[Sym^k(H)].
 
     It takes the monomials of (y, 1) of degree k to the conditional expectations of those of (z, 1),
@@ -224,23 +226,23 @@ def _among(outputs: int, inputs: int, high: int, low: int) -> tuple[np.ndarray, 
 def times_one(variables: int, low: int, high: int) -> np.ndarray:
     """Return the positions at degree `high` of the monomials of degree `low` times powers of the last variable, 1."""
     chosen = factor_variables(variables, low)
-    return place(np.pad(chosen, ((0, 0), (0, high - low)), constant_values=variables - 1), variables)
+    return place_monomials(np.pad(chosen, ((0, 0), (0, high - low)), constant_values=variables - 1), variables)
 
 
-def give_sizes(written: Callable[[Any, int], Any]) -> Callable[[Any, int], Moments]:
-    """Return a map's method `moments`, which may give a matrix alone, as one that gives `Moments`.
+def give_moments(written: Callable[[Any, int], Any]) -> Callable[[Any, int], JointMoments]:
+    """Return a map's method `moments`, which may give a matrix alone, as one that gives `JointMoments`.
 
     Raises:
         ValueError: a matrix whose shape is not that of the map's monomials.
     """
 
     @wraps(written)
-    def moments(channel: Any, order: int) -> Moments:
+    def moments(channel: Any, order: int) -> JointMoments:
         result = written(channel, order)
-        if isinstance(result, Moments):
+        if isinstance(result, JointMoments):
             return result
         shape = count_monomials(channel.outputs + 1, order), count_monomials(channel.inputs + 1, order)
         matrix = array(f"moments({order}) of {type(channel).__name__}", result, shape)
-        return Moments(matrix, channel.outputs, channel.inputs, order)
+        return JointMoments(matrix, channel.outputs, channel.inputs, order)
 
     return moments

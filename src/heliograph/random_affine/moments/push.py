@@ -23,10 +23,10 @@ from heliograph.random_affine.moments.monomials import (
     Exponents,
     count_monomials,
     degrees,
-    exponents,
+    list_exponents,
+    plan_binomial_sums,
     position,
     product_table,
-    sum_plan,
     symmetric_power,
 )
 from heliograph.random_affine.noise import AbstractNoise, Number, noise_vector
@@ -47,11 +47,11 @@ def push_moments(channel: AbstractRandomAffine, order: int, moments: Array1) -> 
 
 
 @push_moments.register
-def _(channel: GainAndNoise, order: int, moments: Array1) -> Array1:
+def _push_through_hop(channel: GainAndNoise, order: int, moments: Array1) -> Array1:
     """Return (A y)^b, then E[g^|b|], then sum_b C(a, b) E[n^(a-b)] (A y)^b."""
-    known = push_known(affine_matrix(channel.matrix), order, _check_moments(channel, order, moments))
+    known = push_through_known_map(affine_matrix(channel.matrix), order, _check_moments(channel, order, moments))
     scaled = known * gain_moments(channel.law, order)[degrees(channel.outputs, order)]
-    row, column, noise, weight = sum_plan(channel.outputs, order)
+    row, column, noise, weight = plan_binomial_sums(channel.outputs, order)
     terms = weight * noise_vector(channel.noise, order)[noise] * scaled[column]
     if is_traced(terms):
         return jnp.bincount(row, terms, length=len(scaled))
@@ -59,17 +59,17 @@ def _(channel: GainAndNoise, order: int, moments: Array1) -> Array1:
 
 
 @push_moments.register
-def _(channel: Series, order: int, moments: Array1) -> Array1:
+def _push_through_series(channel: Series, order: int, moments: Array1) -> Array1:
     return reduce(lambda m, affine: push_moments(affine, order, m), channel.maps, moments)
 
 
 @push_moments.register
-def _(channel: Mixture, order: int, moments: Array1) -> Array1:
+def _push_through_mixture(channel: Mixture, order: int, moments: Array1) -> Array1:
     parts = [push_moments(affine, order, moments) for affine in channel.maps]
     return channel.choice.probabilities @ stack_parts(parts)
 
 
-def push_known(homogeneous: Array2, order: int, moments: Array1) -> Array1:
+def push_through_known_map(homogeneous: Array2, order: int, moments: Array1) -> Array1:
     """Return E[mono(z)] of z = A y + b with H = [[A, b], [0, 1]]: entries of Sym(H) E[Y Y'] Sym(H)' at half the order.
 
     Shapes: (z + 1, y + 1), (C(y + k, k),) -> (C(z + k, k),).
@@ -85,7 +85,7 @@ def push_known(homogeneous: Array2, order: int, moments: Array1) -> Array1:
     return propagated
 
 
-class Tabulated(AbstractNoise):
+class TabulatedNoise(AbstractNoise):
     """A noise whose moments up to an order were computed once, for models that read them at every step."""
 
     mean: Array1
@@ -108,7 +108,7 @@ class Tabulated(AbstractNoise):
 
 
 @noise_vector.register
-def _(noise: Tabulated, order: int) -> Array1:
+def _look_moments_up(noise: TabulatedNoise, order: int) -> Array1:
     return noise.table[_positions_of_lower_order(noise.dimension, order, noise.order)]
 
 
@@ -116,7 +116,7 @@ def _(noise: Tabulated, order: int) -> Array1:
 def _positions_of_lower_order(dimension: int, order: int, above: int) -> np.ndarray:
     """Return the positions of monomials of total degree `order` in (n, 1) among those of degree `above`."""
     places = position(dimension + 1, above)
-    return np.array([places[(*p[:-1], p[-1] + above - order)] for p in exponents(dimension + 1, order)])
+    return np.array([places[(*p[:-1], p[-1] + above - order)] for p in list_exponents(dimension + 1, order)])
 
 
 def products_of_monomials(moments: Array1, variables: int, degree: int) -> Array2:

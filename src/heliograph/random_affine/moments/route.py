@@ -9,42 +9,44 @@ import numpy as np
 from heliograph.numerics.check import fail
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array, Float, Scalar
-from heliograph.random_affine.moments.monomials import Moments
+from heliograph.random_affine.moments.monomials import JointMoments
 
 T = TypeVar("T")
 Second = Float[Array, "p p"]  # E (y, 1)(y, 1)'
 
 
-class Signal(NamedTuple):
+class SignalMoment(NamedTuple):
     """Second moment E (y, 1)(y, 1)' of what a map receives, and the probability that it arrives."""
 
     second: Second
     arrives: Scalar
 
 
-Visit = Callable[[str, Any, Signal | None], Any]  # of the name of a hop, the hop, and what it receives: another hop
+Visit = Callable[
+    [str, Any, SignalMoment | None], Any
+]  # of the name of a hop, the hop, and what it receives: another hop
 
 
-class Position(NamedTuple):
+class ChannelPosition(NamedTuple):
     """Position in a channel: prefix of names, number of hops before it along the chain, and the signal there."""
 
     prefix: str
     hops: int
-    signal: Signal | None
+    signal: SignalMoment | None
 
-    def number(self, maps: Sequence[T], word: str) -> "list[tuple[T, Position]]":
+    def number(self, maps: Sequence[T], word: str) -> "list[tuple[T, ChannelPosition]]":
         """Return maps side by side, each with its position: names begin with the word and the map's number."""
         at = [self._replace(prefix=f"{self.prefix}{word}{i}.", hops=0) for i in range(1, len(maps) + 1)]
         return list(zip(maps, at, strict=True))
 
-    def select(self, places: Sequence[int]) -> "Position":
+    def select(self, places: Sequence[int]) -> "ChannelPosition":
         """Return the position at a map that takes the components at these places."""
         if self.signal is None:
             return self
         chosen = np.array([*places, -1])
         return self._replace(signal=self.signal._replace(second=self.signal.second[chosen[:, None], chosen]))
 
-    def on_delay_line(self, times: int) -> "Position":
+    def on_delay_line(self, times: int) -> "ChannelPosition":
         """Return the position at a map of the line (y_k, y_{k-1}, ...) of so many signals.
 
         Each is as the present one; a delay chooses one of them, so no two meet.
@@ -57,7 +59,7 @@ class Position(NamedTuple):
         return self._replace(signal=self.signal._replace(second=line))
 
 
-def carry_by_moments(signal: Signal, moments: Moments) -> Signal:
+def carry_by_moments(signal: SignalMoment, moments: JointMoments) -> SignalMoment:
     """Return E h Y h' behind a random map h, by its second moments, and its mean."""
     second, tensor = signal.second, moments.second
     mean, xp = moments.mean[:-1] @ second[:, -1], library(tensor, second)

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from heliograph.factors.columns import Columns, columns_of
+from heliograph.factors.columns import WeightedColumns, columns_of
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import block_diagonal, is_traced, is_zero, library, scatter, stack_parts
@@ -15,7 +15,7 @@ from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, check_maps, count_corners
 from heliograph.random_affine.combine import Stack
 from heliograph.random_affine.moments.intervals import CORNERS
-from heliograph.random_affine.moments.monomials import MEMORY_LIMIT_ENTRIES, Moments
+from heliograph.random_affine.moments.monomials import MEMORY_LIMIT_ENTRIES, JointMoments
 from heliograph.random_affine.moments.quadratic_map import (
     QuadraticMap,
     add_maps,
@@ -60,7 +60,7 @@ class SecondOrder(Module):
     power: QuadraticMap
     nominal: QuadraticMap
     gain_spread: Tensor
-    noise: Columns
+    noise: WeightedColumns
     uncertain: bool = eqx.field(static=True)
 
 
@@ -72,7 +72,7 @@ def describe_second_moments(
     return SecondOrder(mean[:, :-1], mean[:, -1], spread, shift, power, nominal, gain, noise, uncertain)
 
 
-def split_off_noise(spread: Tensor) -> tuple[Tensor, Columns]:
+def split_off_noise(spread: Tensor) -> tuple[Tensor, WeightedColumns]:
     """Split the covariances of (A, n), (m, m, n + 1, n + 1) by output, into those of A and m columns of Cov n.
 
     Where A and n are correlated nothing is split: the covariances as they are, and columns of zero.
@@ -85,13 +85,13 @@ def split_off_noise(spread: Tensor) -> tuple[Tensor, Columns]:
     return spread - xp.where(uncorrelated, covariance, 0.0)[..., None, None] * corner, noise
 
 
-def _pad_columns(noise: Columns) -> Columns:
+def _pad_columns(noise: WeightedColumns) -> WeightedColumns:
     """Return the columns of a covariance, with columns of zeros to as many as it has rows."""
     xp, lacking = library(noise), len(noise.matrix) - noise.matrix.shape[1]
-    return Columns(xp.pad(noise.matrix, ((0, 0), (0, lacking))), xp.pad(noise.weights, (0, lacking)))
+    return WeightedColumns(xp.pad(noise.matrix, ((0, 0), (0, lacking))), xp.pad(noise.weights, (0, lacking)))
 
 
-def join_gain_and_noise(gain: Tensor, noise: Columns) -> Tensor:
+def join_gain_and_noise(gain: Tensor, noise: WeightedColumns) -> Tensor:
     """Join spread of the gain and noise columns to one spread: the inverse of `split_off_noise`."""
     xp = library(gain, noise)
     covariance = (noise.matrix * noise.weights[..., None, :]) @ xp.swapaxes(noise.matrix, -1, -2)
@@ -188,7 +188,7 @@ def _bound_moments(channel: AbstractRandomAffine) -> MomentBounds:
     if isinstance(channel, Stack):
         parts = _bound_stacked_maps(channel)
     elif listed:
-        laws = [Moments(corner, nominal.outputs, nominal.inputs, 2) for corner in channel.corner_moments(2)]
+        laws = [JointMoments(corner, nominal.outputs, nominal.inputs, 2) for corner in channel.corner_moments(2)]
         # One map above all laws for each of spread, shift and power.
         by_kind = zip(*(tensors_of_law(law, mean) for law in laws), strict=True)
         parts = [dominate(stack_parts(tensors), mean) for tensors in by_kind]

@@ -5,7 +5,7 @@ import numpy as np
 
 from heliograph.numerics.traced import library
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.moments.monomials import Moments
+from heliograph.random_affine.moments.monomials import JointMoments
 from heliograph.random_affine.moments.quadratic_map import QuadraticMap, stop_gradient
 from heliograph.random_affine.moments.tensors import (
     Matrix,
@@ -17,7 +17,7 @@ from heliograph.random_affine.moments.tensors import (
 PROPORTIONAL_TOLERANCE = 1e-12  # of each entry's own scale: two tensors from different sums are one's multiples
 
 
-def tensors_of_law(moments: Moments, mean: Matrix) -> tuple[Tensor, Tensor, Tensor]:
+def tensors_of_law(moments: JointMoments, mean: Matrix) -> tuple[Tensor, Tensor, Tensor]:
     """Return the spread about the nominal mean H0, shift of the mean, and power, all of one law."""
     raw = moments.second
     law_mean = moments.mean[:-1]
@@ -69,7 +69,7 @@ def _find_common_gain(tensors: Tensor, mean: Matrix) -> tuple[Tensor, np.ndarray
     return exact, holds & (xp.min(gaps, initial=0.0) >= -PROPORTIONAL_TOLERANCE)
 
 
-def bound_from_intervals(channel: AbstractRandomAffine, nominal: Moments, mean: Matrix) -> list[QuadraticMap]:
+def bound_from_intervals(channel: AbstractRandomAffine, nominal: JointMoments, mean: Matrix) -> list[QuadraticMap]:
     """Return bounds of spread, shift and power from the interval of each moment.
 
     With the nominal mean H0 and raw second moments and means m of any law the spread is raw - H0 m' - m H0' + H0 H0'.
@@ -77,8 +77,8 @@ def bound_from_intervals(channel: AbstractRandomAffine, nominal: Moments, mean: 
     low, high = channel.moment_interval(2)
     xp = library(low, high, mean)
     # Middle and half width of each moment.
-    middle = Moments((low + high) / 2, nominal.outputs, nominal.inputs, 2)
-    half = Moments((high - low) / 2, nominal.outputs, nominal.inputs, 2)
+    middle = JointMoments((low + high) / 2, nominal.outputs, nominal.inputs, 2)
+    half = JointMoments((high - low) / 2, nominal.outputs, nominal.inputs, 2)
     raw_radius = xp.abs(half.second)
     mean_radius = half.mean[:-1]
     spread, _, power = tensors_of_law(middle, mean)

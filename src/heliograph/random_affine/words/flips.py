@@ -16,7 +16,7 @@ from heliograph.random_affine.combine import Series, Stack
 from heliograph.random_affine.composite import percent_in_words
 from heliograph.random_affine.hop import GainAndNoise, known
 from heliograph.random_affine.laws.law import AbstractLaw, Constant, Discrete
-from heliograph.random_affine.moments.monomials import Moments
+from heliograph.random_affine.moments.monomials import JointMoments
 from heliograph.random_affine.noise import Gaussian
 
 MOST_ATOMS = 64  # of the error rate of a chain
@@ -73,7 +73,7 @@ class Flips(AbstractRandomAffine):
         """Return the map of words that are written as `bits` numbers of -1 or 1, and `beside` numbers that pass."""
         return BitFlips(self.error, self.dimension, self.per_message, bits, beside)
 
-    def moments(self, order: int) -> Moments:
+    def moments(self, order: int) -> JointMoments:
         """Refuse: what a flipped bit does depends on the words."""
         raise fail(
             "channel of words", "a filter that is given the encoder of the words (encoder=...)", "one that is not"

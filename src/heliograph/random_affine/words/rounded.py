@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import Columns, join_columns
+from heliograph.factors.columns import WeightedColumns, join_columns
 from heliograph.numerics.check import fail
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import Float, PyTree
-from heliograph.random_affine.moments.components import Branches, NoiseWithoutOutliers, SignalNoise
+from heliograph.random_affine.moments.components import GaussianBranches, NoiseWithoutOutliers, SignalNoise
 from heliograph.random_affine.moments.monomials import Exponents
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Number, Square, Vector
 
@@ -35,7 +35,7 @@ LARGEST = {  # whatever y is
 }
 
 
-class Rounded(AbstractNoise):
+class RoundedNoise(AbstractNoise):
     """Noise v + e of a measurement y that is rounded to steps of D: v the sensor's, e the error of rounding.
 
     Of the signal y - `centre`: its mean is E v - centre. By the dither, with f the place of y between two steps,
@@ -86,7 +86,7 @@ class Rounded(AbstractNoise):
         return covariance
 
     @property
-    def columns(self) -> Columns:
+    def columns(self) -> WeightedColumns:
         """Covariance as columns: those of v, then those of the rounding error e."""
         return self._with_error(LARGEST[self.dither].error * self.step**2)
 
@@ -160,11 +160,11 @@ class Rounded(AbstractNoise):
         """Length of v."""
         return self.source.dimension
 
-    def _with_error(self, variances: Vector) -> Columns:
+    def _with_error(self, variances: Vector) -> WeightedColumns:
         """Return the columns of v, then those of independent rounding errors of these variances."""
-        return join_columns(self.source.columns, Columns(np.eye(self.dimension), variances))
+        return join_columns(self.source.columns, WeightedColumns(np.eye(self.dimension), variances))
 
-    def branches(self) -> Branches:
+    def branches(self) -> GaussianBranches:
         """Return the branches of v, each with the variance of e more."""
         branches, error = self.source.branches(), LARGEST[self.dither].error * self.step**2
         return branches._replace(variance=branches.variance + error[:, None])
@@ -198,13 +198,13 @@ class Rounded(AbstractNoise):
         return mean[0] * mean[1] + self.covariance[places[0], places[1]]
 
 
-def find_rounded(*models: PyTree) -> Sequence[Rounded]:
+def find_rounded(*models: PyTree) -> Sequence[RoundedNoise]:
     """Return the noises of rounded measurements in these models."""
-    leaves = jax.tree.leaves(models, is_leaf=lambda leaf: isinstance(leaf, Rounded))
-    return [leaf for leaf in leaves if isinstance(leaf, Rounded)]
+    leaves = jax.tree.leaves(models, is_leaf=lambda leaf: isinstance(leaf, RoundedNoise))
+    return [leaf for leaf in leaves if isinstance(leaf, RoundedNoise)]
 
 
-def round_without_dither(noise: AbstractNoise, resolution: Float[np.ndarray, " m"]) -> Rounded:
+def round_without_dither(noise: AbstractNoise, resolution: Float[np.ndarray, " m"]) -> RoundedNoise:
     """Return the noise of a sensor that reports multiples of its resolution."""
     zero = np.zeros(noise.dimension)
-    return Rounded(noise, resolution, zero, zero, "none")
+    return RoundedNoise(noise, resolution, zero, zero, "none")

@@ -16,7 +16,7 @@ Value = float | str | bool | None
 
 
 @dataclass(frozen=True)
-class Quantity:
+class PlotColumn:
     """A column that can be plotted.
 
     Args:
@@ -33,7 +33,7 @@ class Quantity:
 
 
 @dataclass(frozen=True)
-class Explored:
+class ExploredTable:
     """A table by columns, and the first view of it. `name` distinguishes it from the others on the page.
 
     `dimensions` are the columns that identify a row, in the order in which they are offered; `x`, `panel` and `colour`
@@ -44,7 +44,7 @@ class Explored:
     name: str
     columns: Mapping[str, Sequence[Value]]
     dimensions: Sequence[str]
-    quantities: Sequence[Quantity]
+    quantities: Sequence[PlotColumn]
     x: str
     panel: str
     colour: str
@@ -52,7 +52,7 @@ class Explored:
     unordered: str
 
 
-def explore_html(page: Page, tables: Sequence[Explored]) -> str:
+def explore_html(page: Page, tables: Sequence[ExploredTable]) -> str:
     """Return the page with tables to explore before its sections, as HTML that loads nothing else."""
     data = json.dumps([asdict(table) for table in tables], ensure_ascii=False, separators=(",", ":"), allow_nan=False)
     return (

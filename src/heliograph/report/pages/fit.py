@@ -32,7 +32,7 @@ LOGARITHMIC = 10.0  # times the least of what is shown of a positive number: the
 
 
 @dataclass(frozen=True)
-class Learned:
+class FitResults:
     """Content of the report: the fit, from `learned` rows, and its effect on the `held_out` rows after them.
 
     Args:
@@ -62,7 +62,7 @@ class Learned:
         return dict(zip([e.name for e in parameters.entries], parameters.entries_at(parameters.start), strict=True))
 
 
-def draw_fit_figures(learned: Learned) -> dict[str, Figure]:
+def draw_fit_figures(learned: FitResults) -> dict[str, Figure]:
     """Return figures by file name: estimates; correlations of innovations before and after; PITs."""
     drawn = {"estimates": _draw_estimates(learned)}
     tested = [change for change in learned.changes if change.before.test and change.after.test][:MOST]
@@ -75,7 +75,7 @@ def draw_fit_figures(learned: Learned) -> dict[str, Figure]:
 
 
 @matplotlib.rc_context(STYLE)
-def _draw_estimates(learned: Learned) -> Figure:
+def _draw_estimates(learned: FitResults) -> Figure:
     """Draw a panel for each number, since units differ: start, estimates by both forms of the likelihood, intervals."""
     rows = learned.fit.rows()[:MOST]
     forms = [solution.form for solution in learned.fit.solutions]
@@ -142,7 +142,7 @@ def _draw_pits(received: list[Uniformity]) -> Figure:
     return figure
 
 
-def make_fit_page(learned: Learned, drawings: Mapping[str, bytes]) -> Page:
+def make_fit_page(learned: FitResults, drawings: Mapping[str, bytes]) -> Page:
     """Return the report; `drawings` holds each figure as SVG."""
     return Page(
         kicker="Heliograph fit",
@@ -161,13 +161,13 @@ def make_fit_page(learned: Learned, drawings: Mapping[str, bytes]) -> Page:
     )  # fmt: skip
 
 
-def _write_headline(learned: Learned) -> str:
+def _write_headline(learned: FitResults) -> str:
     """Return the title: how many numbers were learned."""
     rows = learned.fit.rows()
     return f"{sum(row.identified for row in rows)} of {len(rows)} free numbers learned from {learned.learned:,} rows"
 
 
-def _summarise_gain(learned: Learned) -> str:
+def _summarise_gain(learned: FitResults) -> str:
     """Return whether the first filter predicts the held-out rows better than before, and from what was learned."""
     source = f"From `{visible(learned.measurements)}`, for the network `{visible(learned.network)}`."
     gains = [(change, change.gain) for change in learned.changes if change.gain is not None]
@@ -185,7 +185,7 @@ def _summarise_gain(learned: Learned) -> str:
     )
 
 
-def _list_key_figures(learned: Learned) -> list[KeyFigures]:
+def _list_key_figures(learned: FitResults) -> list[KeyFigures]:
     """Return the numbers to remember: how many were learned, from how many rows, and the gain of the first filter."""
     identified = [row for row in learned.fit.rows() if row.identified]
     keys = [
@@ -200,7 +200,7 @@ def _list_key_figures(learned: Learned) -> list[KeyFigures]:
     return [KeyFigures(keys)]
 
 
-def _make_estimates_table(learned: Learned, drawings: Mapping[str, bytes]) -> list[Picture | Table]:
+def _make_estimates_table(learned: FitResults, drawings: Mapping[str, bytes]) -> list[Picture | Table]:
     """Return the figure of the estimates, and the table with start, estimate and interval of each number."""
     starts = learned.starts
     rows = [
@@ -225,7 +225,7 @@ def _make_estimates_table(learned: Learned, drawings: Mapping[str, bytes]) -> li
     return [picture, Table(["number", "start", "estimate", "95 %", "form"], rows, caption)]
 
 
-def _list_sentences(learned: Learned) -> list[Points | Text]:
+def _list_sentences(learned: FitResults) -> list[Points | Text]:
     """Return the fit's sentences, as points."""
     sentences = learned.fit.sentences
     if sentences:
@@ -233,7 +233,7 @@ def _list_sentences(learned: Learned) -> list[Points | Text]:
     return [Text(["All free numbers are identified, all starts ended at one maximum, and none is at a boundary."])]
 
 
-def _make_comparison_sections(learned: Learned, drawings: Mapping[str, bytes]) -> list[Section]:
+def _make_comparison_sections(learned: FitResults, drawings: Mapping[str, bytes]) -> list[Section]:
     """Return the sections on the held-out rows: each filter before and after, and whether the laws fit."""
     if not learned.changes:
         return []
@@ -254,7 +254,7 @@ def _make_comparison_sections(learned: Learned, drawings: Mapping[str, bytes]) -
     return sections
 
 
-def _make_changes_table(learned: Learned) -> Table:
+def _make_changes_table(learned: FitResults) -> Table:
     """Return each filter's gain of log-likelihood, and size and correlation of its innovations, before and after."""
     rows = []
     for change in learned.changes:
@@ -274,7 +274,7 @@ def _make_changes_table(learned: Learned) -> Table:
     return Table(headers, rows, caption)
 
 
-def _make_losses_section(learned: Learned) -> list[Section]:
+def _make_losses_section(learned: FitResults) -> list[Section]:
     """Return the section on the laws of lost measurements; none where none were lost."""
     # One row for each law of each node: its first four parameters, and gain on held-out packets.
     rows = []
@@ -294,7 +294,7 @@ def _make_losses_section(learned: Learned) -> list[Section]:
     return [Section("How measurements are lost", [table])] if rows else []
 
 
-def _make_delays_section(learned: Learned) -> list[Section]:
+def _make_delays_section(learned: FitResults) -> list[Section]:
     """Return the section on how late the measurements of events were; none without events."""
     rows = [
         [visible(node), f"{steps * delays.step:g}", f"{share.estimate:.3f}", f"{share.low:.3f} to {share.high:.3f}"]
@@ -309,6 +309,6 @@ def _make_delays_section(learned: Learned) -> list[Section]:
     return [Section("How late measurements are", [table])] if rows else []
 
 
-def pages(learned: Learned) -> "partial[Page]":
+def pages(learned: FitResults) -> "partial[Page]":
     """Return a function that makes the page of the drawn figures."""
     return partial(make_fit_page, learned)

@@ -145,7 +145,7 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Choice:
+class PictureChoice:
     """Pictures of which one is shown, chosen from a list; all of them in print and where no script runs.
 
     Args:
@@ -172,7 +172,7 @@ class Code:
     kind = "code"  # of block, for the template
 
 
-Block = TypeAliasType("Block", Text | Points | KeyFigures | Table | Statements | Picture | Choice | Code)
+Block = TypeAliasType("Block", Text | Points | KeyFigures | Table | Statements | Picture | PictureChoice | Code)
 
 
 @dataclass(frozen=True)

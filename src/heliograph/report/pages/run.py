@@ -29,11 +29,21 @@ from heliograph.report.innovations import (
 from heliograph.report.mode_probabilities import PREFIX, draw_modes_of_nodes
 from heliograph.report.outputs import compare_with_truth, round_to
 from heliograph.report.pages.links import draw_deliveries, make_links_blocks
-from heliograph.report.pages.page import Choice, KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
+from heliograph.report.pages.page import (
+    KeyFigure,
+    KeyFigures,
+    Page,
+    Picture,
+    PictureChoice,
+    Points,
+    Section,
+    Table,
+    Text,
+)
 from heliograph.report.pages.predicted import predicted_figures, predicted_sections
 from heliograph.report.pages.run_summary import run_summary
 from heliograph.report.position_map import coordinates_of, draw_position_map
-from heliograph.report.results import Json, Results, write_into
+from heliograph.report.results import Json, Results, write_into_folder
 from heliograph.simulation.network import Network
 from heliograph.simulation.results.record import Record
 
@@ -56,7 +66,7 @@ def make_results_of_plants(examined: Mapping[str, Health], network: str) -> Resu
         for plant, health in examined.items():
             subfolder = folder / folders[plant]
             subfolder.mkdir()
-            write_into(make_run_results(health, f"{network}, {plant}"), subfolder)
+            write_into_folder(make_run_results(health, f"{network}, {plant}"), subfolder)
 
     summary: dict[str, Json] = {plant: run_summary(health) for plant, health in examined.items()}
     return Results({}, lambda _: _make_overview(examined, network, folders), summary, write)
@@ -154,7 +164,7 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
     """
     instance("health", health, Health, "what examine returns")
     instance("name of the network", network, str, "a text")
-    record, doubts, drawings = health.record, health.warnings(), limit_size(drawings, PAGE)
+    record, doubts, drawings = health.record, health.warnings(), limit_size_of_drawings(drawings, PAGE)
     glance = [
         _make_key_figures(health, len(doubts)),
         *_list_doubts(doubts),
@@ -193,7 +203,7 @@ def _make_key_figures(health: Health, doubts: int) -> KeyFigures:
     )
 
 
-def limit_size(drawings: Mapping[str, bytes], limit: int) -> dict[str, bytes]:
+def limit_size_of_drawings(drawings: Mapping[str, bytes], limit: int) -> dict[str, bytes]:
     """Return the drawings that together have at most `limit` bytes, those of FIRST before others.
 
     In a page, as text, they take 4/3 of their bytes.
@@ -227,9 +237,9 @@ def _find_headline(health: Health) -> str:
     return f"{', '.join(numbers)} at the end, by {visible(name)}"
 
 
-def _list_pictures(health: Health, drawings: Mapping[str, bytes]) -> list[Picture | Choice | Text]:
+def _list_pictures(health: Health, drawings: Mapping[str, bytes]) -> list[Picture | PictureChoice | Text]:
     """Return the map of a position if there is one, the estimates by node, then the smoothed ones if there are any."""
-    pictures: list[Picture | Choice | Text] = []
+    pictures: list[Picture | PictureChoice | Text] = []
     for kind, record in _collect_estimates(health):
         added = ", given later data too" if kind == "smoothed" else ""
         if (name := _map_name(kind)) in drawings:

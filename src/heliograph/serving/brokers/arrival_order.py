@@ -8,7 +8,7 @@ from heapq import heappop, heappush, heappushpop
 import numpy as np
 
 from heliograph.numerics.check import fail
-from heliograph.numerics.times.row_order import SECOND, YEAR, find_astray
+from heliograph.numerics.times.row_order import SECOND, YEAR, find_unset_stamps
 from heliograph.serving.message import Message, NumberedMessage, Payload, UnreadMessage
 
 HELD = 250_000  # messages that wait for earlier ones
@@ -61,7 +61,7 @@ class ArrivalOrder:
             if known or (self._steps and not dated):
                 continue
             times = np.array([moment for moment, *_ in entries])
-            for i in np.flatnonzero(find_astray(times, YEAR / SECOND)):
+            for i in np.flatnonzero(find_unset_stamps(times, YEAR / SECOND)):
                 moment, number, message = entries[i]
                 time = getattr(message, "time", moment)
                 where, expected = f"{self._source}, {node}", "a time that was set, near the others in order"

@@ -13,7 +13,7 @@ from heliograph.files.messages.own import OwnReader, is_own
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, file_path, flag, instance
 from heliograph.serving.brokers.arrival_order import ArrivalOrder
-from heliograph.serving.brokers.table_lines import TableLineReader, read_own
+from heliograph.serving.brokers.table_lines import TableLineReader, read_own_event
 from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.message import LONGEST, Message, Payload, Read, UnreadMessage, read_messages
 from heliograph.simulation.network import Network
@@ -138,7 +138,7 @@ class LineReader:
         self._is_table = False
         if not isinstance(read, str | UnreadMessage):
             return [read]
-        payloads = read_own(self._own, message.where, message.content)
+        payloads = read_own_event(self._own, message.where, message.content)
         return payloads if any(isinstance(payload, Message) for payload in payloads) else [read]
 
 

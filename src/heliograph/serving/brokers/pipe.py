@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Protocol
 
-from heliograph.disk.whole_file import naming
+from heliograph.disk.whole_file import name_path_in_errors
 from heliograph.files.text.text_stream import TextStream
 from heliograph.serving.brokers.transport import LOG, Batch, nothing
 from heliograph.serving.message import LONGEST, Payload
@@ -21,7 +21,7 @@ MORE = 2  # milliseconds that we wait for more
 AT_ONCE = 4096  # bytes that a pipe takes without waiting, once it takes any
 
 
-class Reader(Protocol):
+class MessageReader(Protocol):
     """What makes messages of lines."""
 
     source: str
@@ -45,7 +45,7 @@ class Pipe:
         reader: what makes messages of lines; None takes every line for a message.
     """
 
-    def __init__(self, source: int = 0, target: int = 1, reader: Reader | None = None):
+    def __init__(self, source: int = 0, target: int = 1, reader: MessageReader | None = None):
         self.source, self.target, self._reader = source, target, reader
         self._rest, self._skipping, self._said = b"", False, False
         self._newline: bytes | None = None  # what ends a line; known once something follows one
@@ -58,7 +58,7 @@ class Pipe:
             data, ended = b"", False
             if not self._text.more:
                 await _wait_until_ready(self.source, loop.add_reader, loop.remove_reader)
-                with naming("standard input"):
+                with name_path_in_errors("standard input"):
                     data = self._read()
                 ended = not data
             lines = self._split_lines(self._text.feed(data, ended), ended and not self._text.more)
@@ -113,7 +113,7 @@ class Pipe:
         with _set_nonblocking(self.target) as (target, at_once):
             while rest:
                 await _wait_until_ready(target, loop.add_writer, loop.remove_writer)
-                with naming("standard output"), suppress(BlockingIOError):
+                with name_path_in_errors("standard output"), suppress(BlockingIOError):
                     rest = rest[os.write(target, rest[:at_once]) :]
 
     async def close(self) -> None:

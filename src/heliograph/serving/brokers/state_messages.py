@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from pydantic_core import from_json
 
-from heliograph.numerics.times.dates import instant
+from heliograph.numerics.times.dates import parse_instant
 from heliograph.numerics.types import unit_of
 from heliograph.serving.brokers.transport import encode_name
 
@@ -59,7 +59,7 @@ def make_state_messages(topic: str, states: Sequence[str], body: bytes) -> Itera
     """
     estimate = from_json(body)
     moment = estimate["time"]
-    time = instant(moment).timestamp() if isinstance(moment, str) else moment
+    time = parse_instant(moment).timestamp() if isinstance(moment, str) else moment
     dead = _read_dead(estimate)
     for place, i, message in _iterate_states(topic, states, estimate):
         covariance = message["covariance"]

@@ -11,9 +11,9 @@ from heliograph.files.messages.in_files import PAYLOAD, TOPIC, convert_row, type
 from heliograph.files.messages.own import NODE, OWN, SEQUENCE, OwnReader
 from heliograph.files.recording import RowReader
 from heliograph.files.sources.reading import Reading, Unread
-from heliograph.files.table import CsvColumns
-from heliograph.files.table_rows import Cells, join_cells
-from heliograph.files.text.csv_text import ANNOTATIONS, CsvRow, CsvText
+from heliograph.files.table import CsvColumnReader
+from heliograph.files.table_rows import RowsAsColumns, join_cells
+from heliograph.files.text.csv_text import ANNOTATIONS, CsvReader, CsvRow
 from heliograph.files.text.dialects import COMMENTS, names_in
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError
@@ -39,7 +39,7 @@ class TableLineReader:
     def __init__(self, network: Network, translator: Translator | None, path: Path | None, ignore_unknown: bool):
         self._network, self._translator, self._path, self._ignore = network, translator, path, ignore_unknown
         self._source = "standard input" if path is None else str(path)
-        self._text = CsvText(self._source, path, marked=translator is not None)
+        self._text = CsvReader(self._source, path, marked=translator is not None)
         self._reader: MessageRowReader | TimeRowReader | None = None
 
     def names_columns(self, line: str) -> bool:
@@ -76,7 +76,7 @@ class TableLineReader:
         """Return the reader of rows with these columns: events in our own form, rows that sources map, rows of time."""
         if {NODE, SEQUENCE} <= set(header):
             own = OwnReader(self._network, self._source, self._ignore, table=True)
-            return MessageRowReader(lambda row: read_own(own, row.where, typed_cells(row)))
+            return MessageRowReader(lambda row: read_own_event(own, row.where, typed_cells(row)))
         translator = self._translator
         if translator is not None:
             topic = translator.topic_of_rows(self._path, header)
@@ -104,16 +104,16 @@ class TimeRowReader:
     Those of a pipe are messages at once; those of a file at its end, when all rows can be put in order.
     """
 
-    def __init__(self, network: Network, header: list[str], text: CsvText, ignore_unknown: bool):
+    def __init__(self, network: Network, header: list[str], text: CsvReader, ignore_unknown: bool):
         self._network, self._steps = network, TIME_STEP not in network.inputs
         self._rows = RowReader(network, text.source, strict=False, ignore_unknown=ignore_unknown)
-        self._columns = CsvColumns(text.source, text.path, self._rows.only, strict=False)
+        self._columns = CsvColumnReader(text.source, text.path, self._rows.only, strict=False)
         self._columns.header = header
         self._given = [name for name in network.inputs if name != TIME_STEP]
         self._origin: np.datetime64 | None = None
         self._before: float | None = None  # time of the row before
         self._whole = text.path is not None
-        self._cells = list[Cells]()  # those of a file, until it ends
+        self._cells = list[RowsAsColumns]()  # those of a file, until it ends
 
     def read(self, rows: Sequence[CsvRow | InputError]) -> list[Payload]:
         """Return the messages of rows, as a replay of them has them, and why others cannot be read."""
@@ -160,7 +160,7 @@ class TimeRowReader:
         return np.asarray((time - self._origin) / SECOND)
 
 
-def read_own(reader: OwnReader, where: str, content: dict[str, object]) -> list[Payload]:
+def read_own_event(reader: OwnReader, where: str, content: dict[str, object]) -> list[Payload]:
     """Return the messages of an event in our own form, or why it cannot be read, with its count and time if known."""
     try:
         found = reader.read(where, content)

@@ -12,7 +12,7 @@ Name = tuple[str, str]  # of a filter: node and filter
 NEAR = 2.0  # deviations of a ratio within which no band ends
 
 
-class Doubt(NamedTuple):
+class FilterDoubt(NamedTuple):
     """A filter whose innovations are not what it claims: ratio, and the band in which it should be."""
 
     node: str
@@ -27,12 +27,12 @@ class Doubt(NamedTuple):
         return math.log(max(self.ratio / self.high, self.low / max(self.ratio, 1e-300), 1.0))
 
 
-class Wrong(NamedTuple):
+class PlantTroubles(NamedTuple):
     """What is wrong with a plant: dead senders by node, doubted filters, and messages that were refused, in words."""
 
     plant: str
     dead: tuple[str, ...]
-    doubts: tuple[Doubt, ...]
+    doubts: tuple[FilterDoubt, ...]
     refused: str
 
     @property
@@ -49,12 +49,12 @@ class Wrong(NamedTuple):
         return lines + [self.refused] * bool(self.refused)
 
 
-class Overview:
+class TroubleOverview:
     """Keeps what is wrong with each plant, found anew where a plant has had a message since the last look."""
 
     def __init__(self) -> None:
         self.touched = set[str]()  # since the last look
-        self._wrong: dict[str, Wrong] = {}
+        self._wrong: dict[str, PlantTroubles] = {}
 
     def touch(self, plant: str) -> None:
         """Note that a plant has had a message, or that its silence has changed."""
@@ -65,7 +65,7 @@ class Overview:
         tests: Mapping[str, Mapping[Name, RunningNis]],
         dead: Mapping[str, Sequence[str]],
         refused: Mapping[str, str],
-    ) -> list[Wrong]:
+    ) -> list[PlantTroubles]:
         """Return the plants with something wrong, the worst first.
 
         Args:
@@ -75,7 +75,7 @@ class Overview:
         """
         for plant in self.touched:
             doubts = tuple(find_doubts(tests.get(plant, {})))
-            wrong = Wrong(plant, tuple(dead.get(plant, ())), doubts, refused.get(plant, ""))
+            wrong = PlantTroubles(plant, tuple(dead.get(plant, ())), doubts, refused.get(plant, ""))
             if wrong.describe:
                 self._wrong[plant] = wrong
             else:
@@ -84,7 +84,7 @@ class Overview:
         return sorted(self._wrong.values(), key=lambda wrong: wrong.severity, reverse=True)
 
 
-def find_doubts(tests: Mapping[Name, RunningNis]) -> Iterable[Doubt]:
+def find_doubts(tests: Mapping[Name, RunningNis]) -> Iterable[FilterDoubt]:
     """Yield the doubted filters of a plant, the most doubted first."""
     doubts = []
     for (node, name), test in tests.items():
@@ -93,7 +93,7 @@ def find_doubts(tests: Mapping[Name, RunningNis]) -> Iterable[Doubt]:
             continue
         low, high = test.band()
         if test.doubt() is not None:
-            doubts.append(Doubt(node, name, test.ratio, low, high))
+            doubts.append(FilterDoubt(node, name, test.ratio, low, high))
     return sorted(doubts, key=lambda doubt: doubt.size, reverse=True)
 
 
@@ -120,7 +120,7 @@ that were refused.{more}</p></header>
 """
 
 
-def make_plants_page(title: str, plants: Collection[str], wrong: Sequence[Wrong], most: int) -> str:
+def make_plants_page(title: str, plants: Collection[str], wrong: Sequence[PlantTroubles], most: int) -> str:
     """Return the page of all plants, those with something wrong first, of `most` rows at most."""
     named = {item.plant for item in wrong}
     rows = [(item.plant, "<br>".join(escape(line) for line in item.describe), "doubt") for item in wrong]

@@ -19,11 +19,11 @@ from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.types import unit_of, units_in
 from heliograph.report.outputs import RecentOutputs, make_output_row
 from heliograph.serving.observation.last_answers import LastAnswers
-from heliograph.serving.observation.overview import Overview, Wrong
+from heliograph.serving.observation.overview import PlantTroubles, TroubleOverview
 from heliograph.serving.observation.running_nis import MEMORY, RunningNis, read_nis
 from heliograph.serving.observed_service import BatchTimes, ObservedService, WatchableService, WatchedPlant
 from heliograph.serving.output import Output
-from heliograph.serving.totals import FIELDS, Totals, counts_of
+from heliograph.serving.totals import FIELDS, CountTotals, counts_of
 from heliograph.simulation.network import Network
 
 T = TypeVar("T")
@@ -46,7 +46,7 @@ COUNTED: dict[str, str] = {  # of a node's messages
 }
 
 
-class Point(NamedTuple):
+class EstimatePoint(NamedTuple):
     """Estimates of a plant at one time: means and standard deviations by node and filter. `number` counts the points.
 
     A final point replaces the provisional ones of its time.
@@ -101,8 +101,8 @@ class Watch:
         # By plant, the oldest forgotten first: weighed outputs, tests, points, crossings of thresholds, senders.
         self._outputs: OrderedDict[str, RecentOutputs] = OrderedDict()
         self._tests: OrderedDict[str, dict[tuple[str, str], RunningNis]] = OrderedDict()
-        self._points: OrderedDict[str, deque[Point]] = OrderedDict()
-        self.totals, self._overview, self._dead_senders = Totals(), Overview(), dict[str, list[str]]()
+        self._points: OrderedDict[str, deque[EstimatePoint]] = OrderedDict()
+        self.totals, self._overview, self._dead_senders = CountTotals(), TroubleOverview(), dict[str, list[str]]()
         self._crossings: OrderedDict[str, dict[tuple[str, ...], Mapping[str, float]]] = OrderedDict()
         self._senders: OrderedDict[str, dict[str, dict[str, Any]]] = OrderedDict()
         # Metrics that are counted here; the page adds others to the registry.
@@ -175,7 +175,7 @@ class Watch:
             for node, filters in message["estimates"].items()
         }
         points = _move_to_newest(self._points, plant, lambda: deque(maxlen=POINTS))
-        points.append(Point(self._count, message["time"], message["kind"] == "final", estimates))
+        points.append(EstimatePoint(self._count, message["time"], message["kind"] == "final", estimates))
         if message.get("senders"):
             _move_to_newest(self._senders, plant, dict).update(message["senders"])
             self._dead_senders[plant] = [node for node, sender in message["senders"].items() if sender["dead"]]
@@ -225,7 +225,7 @@ class Watch:
         """Return counts by node with None for the lost messages of nodes that do not count theirs."""
         return {node: tally | ({"lost": None} if node in self.uncounted else {}) for node, tally in links.items()}
 
-    def worst(self) -> list[Wrong]:
+    def worst(self) -> list[PlantTroubles]:
         """Return the plants with something wrong, the worst first."""
         refused = dict[str, str]()
         for name, plant in self._iterate_plants(self._overview.touched):

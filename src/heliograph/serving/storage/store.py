@@ -11,7 +11,7 @@ from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import SQLAlchemyError
 
 from heliograph.live.stored.migration import DESCRIPTION, LISTED, PlantMigration, list_changes
-from heliograph.live.stored.snapshot import Identity, check_same, versions
+from heliograph.live.stored.snapshot import Identity, check_same_network, versions
 from heliograph.numerics.check import InputError, fail, table
 from heliograph.serving.output import Output
 from heliograph.serving.storage.database import is_away, open_database
@@ -104,7 +104,7 @@ class Store:
             more = f" and {len(differs) - LISTED} more" if len(differs) > LISTED else ""
             got = f"one that differs: {'; '.join(differs[:LISTED])}{more}"
             raise fail(f"store {self.name}", "the state of what is here", got)
-        check_same(f"store {self.name}", _strip_description(mine), _strip_description(self.identity))
+        check_same_network(f"store {self.name}", _strip_description(mine), _strip_description(self.identity))
 
     @contextmanager
     def _name_store_in_errors(self, expected: str) -> Iterator[None]:

@@ -1,21 +1,21 @@
 """Names that other folders take; the package loads them when first used."""
 
 from .blame import refuse_centrally as refuse_centrally
-from .centre import Centre as Centre
 from .centre import CentreFilter as CentreFilter
 from .centre import CentreState as CentreState
+from .centre import FusionCentre as FusionCentre
 from .centre import along_estimates as along_estimates
 from .centre import claim_of_informed as claim_of_informed
 from .centre import claim_of_reports as claim_of_reports
 from .fused_innovation import FusedInnovation as FusedInnovation
 from .fused_innovation import following_prior as following_prior
 from .fused_innovation import make_fused_innovations as make_fused_innovations
-from .fusions import Reporting as Reporting
+from .fusions import ReportFusion as ReportFusion
 from .fusions import StackedFusions as StackedFusions
 from .fusions import centres_of as centres_of
-from .fusions import fusions_of as fusions_of
-from .fusions import sources_of as sources_of
-from .linearised import Followed as Followed
+from .fusions import find_source_filters as find_source_filters
+from .fusions import list_stacked_fusions as list_stacked_fusions
+from .linearised import FollowedFusion as FollowedFusion
 from .linearised import LinearisedCentre as LinearisedCentre
 from .mesh import Mesh as Mesh
 from .mesh_building import DENSE as DENSE
@@ -26,7 +26,7 @@ from .mesh_check import mesh_claim as mesh_claim
 from .named_filter import find_filter_by_name as find_filter_by_name
 from .node_filter import NodeFilter as NodeFilter
 from .node_filter import node_network as node_network
-from .uplinks import Drawn as Drawn
 from .uplinks import SentReports as SentReports
 from .uplinks import Uplink as Uplink
+from .uplinks import UplinkDraws as UplinkDraws
 from .uplinks import uplinks_of as uplinks_of

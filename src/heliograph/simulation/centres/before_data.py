@@ -16,10 +16,10 @@ from heliograph.numerics.check import check_horizon, fail, instance
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float, PyTree
-from heliograph.simulation.arguments import inputs_of
+from heliograph.simulation.arguments import read_plant_inputs
 from heliograph.simulation.centres.observation_model import Together
 from heliograph.simulation.network import Network
-from heliograph.simulation.plan import plan
+from heliograph.simulation.plan import plan_filters
 from heliograph.simulation.stepping import AllFilters
 
 REGULAR = 1e-6  # least eigenvalue of the independent part of an error, relative to the error: then U has an inverse
@@ -187,13 +187,13 @@ def fused_covariances(
 def _plan_filters(network: Network, horizon: int, inputs: ArrayLike | None) -> tuple[AllFilters, np.ndarray]:
     """Return the filters, planned for the inputs, and the inputs (horizon, inputs); raise unless all need no data."""
     network.check_horizon(check_horizon(horizon))
-    u = inputs_of(network, inputs, horizon)
+    u = read_plant_inputs(network, inputs, horizon)
     filters = AllFilters(network)
     if not filters.centres:
         raise fail("fused covariances", "a fusion that knows the errors' joint covariance", "none in the network")
     if len(filters.informed) < len(filters.centres):
         raise fail("covariances before data", "filters whose gains depend on no data", "some whose gains do")
-    return plan(filters, u), u
+    return plan_filters(filters, u), u
 
 
 @quickly_compiled

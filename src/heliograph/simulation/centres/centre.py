@@ -24,8 +24,8 @@ from heliograph.fusion.cross_covariance import (
     ErrorStep,
     Motion,
     SourceFactors,
-    error_step,
     initial_errors,
+    make_error_step,
     propagate_errors_jointly,
     propagate_factors,
     propagate_state,
@@ -52,7 +52,7 @@ class CentreState(NamedTuple):
     rules: dict[str, PyTree]
 
 
-class Centre(Module):
+class FusionCentre(Module):
     """All informed fusions of one filter's estimates, at the nodes that have it.
 
     `sources`: (kind, number within the kind) of the stacked filters, one group of nodes after another; `order` brings
@@ -87,7 +87,7 @@ class Centre(Module):
         plant: LinearPlant = at(self.plant, k)
         motion = Motion(plant.transition_matrix(u), plant.shift(u), plant.noise_covariance(u))
         observation = self.observation_model.observe(*propagate_state(mean, covariance, motion), k)
-        return error_step(filters, motion, observation)
+        return make_error_step(filters, motion, observation)
 
     def factors(
         self,
@@ -231,13 +231,13 @@ class NodesFilters(Protocol):
     """The nodes' filters as their centre steps them: without data, on which their gains do not depend."""
 
     @property
-    def informed(self) -> tuple[Centre, ...]:
+    def informed(self) -> tuple[FusionCentre, ...]:
         """The centre of their errors' moments, alone."""
 
     def init(self) -> PyTree:
         """Return the states before the first step."""
 
-    def matrices(self, centre: Centre, states: PyTree, u: jax.Array, k: jax.Array) -> Sequence[PyTree]:
+    def matrices(self, centre: FusionCentre, states: PyTree, u: jax.Array, k: jax.Array) -> Sequence[PyTree]:
         """Return the matrices of the filters' next step."""
 
     def followed(self, states: PyTree, u: jax.Array, k: jax.Array) -> PyTree:

@@ -25,14 +25,14 @@ from heliograph.simulation.centres.uplinks import SentReports
 from heliograph.simulation.transmission.shared_fading import (
     ChannelGroup,
     channel_groups,
-    deliver,
+    deliver_signal,
     start,
 )
 
 Recorded = Mapping[str, SentReports | ArrayLike]
 
 
-class Edges(Module):
+class MeshEdges(Module):
     """All edges of a fusion between neighbours, by what arrives over them; without groups nothing is ever lost.
 
     `present` (node, degree): whether the node has a neighbour there, itself at 0. `slots` (edge,): where an edge lies
@@ -66,8 +66,8 @@ class Edges(Module):
                 def deliver_once(edge: ChannelGroup, state: PyTree, count: jax.Array) -> tuple[PyTree, jax.Array]:
                     """Send a message over one edge: the channel's next state, and the flag or age of what arrives."""
                     channel = at(edge.channel, k)
-                    state, z = deliver(channel, state, jnp.zeros(signal_size(channel)), key, count, edge.checksums,
-                                       edge.memories)  # fmt: skip
+                    state, z = deliver_signal(channel, state, jnp.zeros(signal_size(channel)), key, count,
+                                              edge.checksums, edge.memories)  # fmt: skip
                     arrives, late = ~jnp.any(jnp.isnan(z)), late_part(channel)
                     if not self.past:
                         return state, arrives
@@ -130,20 +130,20 @@ class Edges(Module):
         return flags
 
 
-def edges_of(fusion: Fusion, graph: Graph) -> Edges:
+def build_edges(fusion: Fusion, graph: Graph) -> MeshEdges:
     """Build the edges of a fusion between neighbours.
 
     Raises:
         ValueError: links of other edges, links that do more to a message than lose it, or of which nobody knows.
     """
     if fusion.link is None:
-        return Edges((), np.zeros(0, dtype=int), graph.present, fusion.rounds)
+        return MeshEdges((), np.zeros(0, dtype=int), graph.present, fusion.rounds)
     links = edge_links(fusion.link, graph)
     for name, channel in {id(c): (name, c) for name, c in links.items()}.values():
         check_edge(f"link {name!r}" if isinstance(fusion.link, Mapping) else "link between neighbours", channel)
     slots = np.flatnonzero(graph.present & (np.arange(graph.present.shape[1]) > 0))
     past = max(first(channel).past for channel in links.values())
-    return Edges(channel_groups(links), slots, graph.present, fusion.rounds, past)
+    return MeshEdges(channel_groups(links), slots, graph.present, fusion.rounds, past)
 
 
 def edge_links(link: Channel | Mapping[str, Channel], graph: Graph) -> dict[str, Channel]:
@@ -191,7 +191,7 @@ def arrival_chance(channel: Channel | None) -> float | None:
     return None if inside.erases else float(chance)
 
 
-def loss_rate(channel: Channel | None) -> float | None:
+def find_loss_decay(channel: Channel | None) -> float | None:
     """Return the factor by which each further loss in a row is less probable, in the long run.
 
     Of modes with loss probabilities l and transitions P it is the spectral radius of diag(l) P; without modes the

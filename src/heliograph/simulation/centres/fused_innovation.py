@@ -19,7 +19,7 @@ from heliograph.model.over_time import at
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
-from heliograph.simulation.centres.fusions import sources_of
+from heliograph.simulation.centres.fusions import find_source_filters
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.runs.side_by_side import StackedFilters
 
@@ -115,7 +115,7 @@ def make_fused_innovations(network: Network, alike: Sequence[StackedFilters]) ->
     claims = network.claims()
     for name, fusion in network.fused.items():
         if isinstance(fusion, Fusion) and claims[FUSED][name] != "none":
-            sources, _ = sources_of(network, places, network.nodes_with(fusion.filter), fusion.filter)
+            sources, _ = find_source_filters(network, places, network.nodes_with(fusion.filter), fusion.filter)
             beliefs = [eqx.filter_eval_shape(alike[kind].init) for kind, _ in sources]
             if all(isinstance(b, WHOLE) and gaussian_of(b).mean.shape[-1] == len(network.states) for b in beliefs):
                 start = in_float64(from_covariance)(

@@ -13,13 +13,13 @@ from heliograph.fusion.quantizer import widen
 from heliograph.fusion.rules import AbstractFusion
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.model.over_time import at, first, stack, structure
-from heliograph.numerics.angle import Angles, nearest, wrap_angles
+from heliograph.numerics.angle import Angles, wrap_angles, wrap_near
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, PyTree
-from heliograph.simulation.centres.centre import Centre, CentreFilter, along_estimates
+from heliograph.simulation.centres.centre import CentreFilter, FusionCentre, along_estimates
 from heliograph.simulation.centres.linearised import LinearisedCentre
 from heliograph.simulation.centres.observation_model import Apart, Together, describe_channel, stack_nodes
-from heliograph.simulation.centres.uplinks import Drawn, InFlight, Uplinks
+from heliograph.simulation.centres.uplinks import InFlight, UplinkDraws, Uplinks
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.runs.side_by_side import initial_state, map_all
@@ -67,7 +67,7 @@ class StackedFusions(Module):
             for i, name in enumerate(self.names):
                 uplinks[name] = {"saturated": sent.saturated[i], "symbols": sent.symbols[i]}
         # Angles near those of the first node, then the rules in parallel.
-        means = nearest(means, means[:, :1], self.angles)
+        means = wrap_near(means, means[:, :1], self.angles)
         combine = map_all(lambda rule, *parts: rule.combine(*parts), len(self.names))
         mean, covariance = combine(self.rules, means, covariances)
         mean = wrap_angles(mean, self.angles)
@@ -83,10 +83,10 @@ class StackedFusions(Module):
         return jnp.stack([values[order] for values, order in zip(joined, self.order, strict=True)])
 
 
-class Reporting(Module):
+class ReportFusion(Module):
     """A fusion by reports: their uplinks, and the filter at the centre.
 
-    `sources` and `order` as in `Centre`.
+    `sources` and `order` as in `FusionCentre`.
     """
 
     uplinks: Uplinks
@@ -100,7 +100,12 @@ class Reporting(Module):
         return self.uplinks.init(), initial_state(self.centre)
 
     def step(
-        self, state: tuple[InFlight, PyTree], estimates: Sequence[Estimate], drawn: Drawn, u: jax.Array, k: jax.Array
+        self,
+        state: tuple[InFlight, PyTree],
+        estimates: Sequence[Estimate],
+        drawn: UplinkDraws,
+        u: jax.Array,
+        k: jax.Array,
     ) -> tuple[tuple[InFlight, PyTree], Estimate, dict[str, jax.Array], tuple[jax.Array, Array]]:
         """Send the nodes' means as reports, and correct the centre's filter with those that arrive at step k.
 
@@ -114,7 +119,7 @@ class Reporting(Module):
         return (flying, known), estimate, traffic, (sent, drawn.delay)
 
 
-def fusions_of(network: Network) -> tuple[StackedFusions, ...]:
+def list_stacked_fusions(network: Network) -> tuple[StackedFusions, ...]:
     """Return the fusions of the network, those of one structure stacked."""
     alike: dict[object, list[str]] = {}
     for name, fusion in network.fused.items():
@@ -133,7 +138,7 @@ def _stack_fusions(
     sources, orders, quantizers = [], [], []
     for fusion in fusions:
         nodes = network.nodes_with(fusion.filter)
-        source, order = sources_of(network, places, nodes, fusion.filter)
+        source, order = find_source_filters(network, places, nodes, fusion.filter)
         sources.append(source)
         orders.append(order)
         quantizers.append(fusion.uplinks(nodes))
@@ -148,7 +153,7 @@ def _stack_fusions(
     )
 
 
-def centres_of(network: Network) -> tuple[Centre | LinearisedCentre, ...]:
+def centres_of(network: Network) -> tuple[FusionCentre | LinearisedCentre, ...]:
     """Return the centres of the network, one for the informed fusions of each filter."""
     rules: dict[str, dict[str, AbstractInformedFusion]] = {}
     for name, fusion in network.fused.items():
@@ -157,19 +162,21 @@ def centres_of(network: Network) -> tuple[Centre | LinearisedCentre, ...]:
     return tuple(_build_centre(network, name, rules_of_filter) for name, rules_of_filter in rules.items())
 
 
-def _build_centre(network: Network, name: str, rules: dict[str, AbstractInformedFusion]) -> Centre | LinearisedCentre:
+def _build_centre(
+    network: Network, name: str, rules: dict[str, AbstractInformedFusion]
+) -> FusionCentre | LinearisedCentre:
     """Build the centre for the nodes that have the filter `name`."""
     places, claims = network.places, network.claims()[FUSED]
     nodes = network.nodes_with(name)
     # Places of the nodes' filters, and the longest measurement.
-    sources, order = sources_of(network, places, nodes, name)
+    sources, order = find_source_filters(network, places, nodes, name)
     groups = [network.groups[network.kinds[kind].group] for kind, _ in sources]
     size = max(network.nodes[node].received for node in nodes)
     claim = claims[next(iter(rules))]
     # Gains that depend on data: moments along the estimates.
     if along_estimates(network.parts_of(name)):
         return LinearisedCentre(network.plant, rules, order, sources, size, claim)
-    return Centre(
+    return FusionCentre(
         plant=network.plant,
         observation_model=_model_measurements(network, nodes, groups, order, size),
         rules=rules,
@@ -180,7 +187,7 @@ def _build_centre(network: Network, name: str, rules: dict[str, AbstractInformed
     )
 
 
-def sources_of(
+def find_source_filters(
     network: Network, places: Mapping[tuple[str, str], tuple[int, int, int]], nodes: Sequence[str], name: str
 ) -> tuple[tuple[tuple[int, int], ...], np.ndarray]:
     """Return (kind, number within the kind) of the filters of this name at the nodes, and the nodes' order in them.

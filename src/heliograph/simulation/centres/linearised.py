@@ -27,7 +27,7 @@ from heliograph.numerics.types import PyTree
 from heliograph.simulation.centres.centre import gather_steps
 
 
-class Followed(NamedTuple):
+class FollowedFusion(NamedTuple):
     """State of one fusion: moments of the errors, its last estimate, and its rule's state."""
 
     errors: ErrorMoments
@@ -55,21 +55,21 @@ class LinearisedCentre(Module):
 
     read = staticmethod(linearise_step)
 
-    def init(self, starts: Sequence[jax.Array]) -> dict[str, Followed]:
+    def init(self, starts: Sequence[jax.Array]) -> dict[str, FollowedFusion]:
         """Return the state before the first step, from the initial means of each source's filters."""
         plant = at(self.plant, 0)
         errors = initial_errors(plant.initial_mean, plant.initial_covariance, jnp.concatenate(starts)[self.order])
         mean = jnp.asarray(plant.initial_mean)
-        return {name: Followed(errors, mean, rule.start(errors)) for name, rule in self.rules.items()}
+        return {name: FollowedFusion(errors, mean, rule.start(errors)) for name, rule in self.rules.items()}
 
     def step(
         self,
-        state: dict[str, Followed],
+        state: dict[str, FollowedFusion],
         parts: Sequence[Linearised],
         means: Sequence[jax.Array],
         u: jax.Array,
         k: jax.Array,
-    ) -> tuple[dict[str, Followed], dict[str, Estimate]]:
+    ) -> tuple[dict[str, FollowedFusion], dict[str, Estimate]]:
         """Return the next state, and estimates by fusion, from the sources' matrices and means after the step."""
         linear, reports = gather_steps(parts, self.order, self.size), jnp.concatenate(means)[self.order]
         # I - K_i C_i of all nodes.
@@ -89,7 +89,7 @@ class LinearisedCentre(Module):
                 drift = _compute_drift(before.rule, matrix, moved, keep, linear)
                 step = step._replace(shift=jnp.concatenate([motion.shift, drift.reshape(-1)]))
             known, (mean, covariance) = rule.fuse_step(before.rule, CentreStep(step, errors), reports)
-            following[name], results[name] = Followed(errors, mean, known), Estimate(mean, covariance, self.claim)
+            following[name], results[name] = FollowedFusion(errors, mean, known), Estimate(mean, covariance, self.claim)
         return following, results
 
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.limits import MESH
-from heliograph.fusion.cross_covariance import Motion, Observation, propagate_state
+from heliograph.fusion.cross_covariance import JointObservation, Motion, propagate_state
 from heliograph.fusion.intersection import invert
 from heliograph.fusion.mesh.gains import (
     NeighbourEstimates,
@@ -19,7 +19,13 @@ from heliograph.fusion.mesh.gains import (
     gains_of,
     information_of,
 )
-from heliograph.fusion.mesh.joint import blocks_of, error_transitions, joint_after, measurement_weights, scatter_blocks
+from heliograph.fusion.mesh.joint import (
+    blocks_of,
+    error_transitions,
+    measurement_weights,
+    propagate_joint_covariance,
+    scatter_blocks,
+)
 from heliograph.fusion.mesh.neighbour_rules import FrozenWeights
 from heliograph.fusion.quantizer import AbstractQuantizer
 from heliograph.fusion.rules import AbstractFusion
@@ -28,13 +34,13 @@ from heliograph.model.over_time import at, first
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, Bool, Float, PyTree
-from heliograph.simulation.centres.edges import Edges
+from heliograph.simulation.centres.edges import MeshEdges
 from heliograph.simulation.centres.messages import (
-    Messages,
-    OnTheWay,
+    ArrivingEstimates,
+    MessagesOnTheWay,
+    find_moved_beyond,
     gather_messages,
     step_messages_on_the_way,
-    test_moved_beyond,
 )
 from heliograph.simulation.centres.observation_model import Apart
 
@@ -55,17 +61,17 @@ class MeshState(NamedTuple):
     joint: Float[jax.Array, "node n node n"] | None
     plant: tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]
     sent: Float[jax.Array, "node degree n"] | None
-    way: OnTheWay | None
+    way: MessagesOnTheWay | None
 
 
-class Data(NamedTuple):
+class MeasurementInformation(NamedTuple):
     """Information in the measurements of one step, by the node j that took them, of components that are not missing.
 
     `observation`: z_j = H_j x + offset + noise of covariance R_j. `weighted`: H_j' R_j^-1 (node, n, m). `information`:
     S_j = H_j' R_j^-1 H_j (node, n, n). `complete`: S_j if no component were missing.
     """
 
-    observation: Observation
+    observation: JointObservation
     weighted: Float[jax.Array, "node n m"]
     information: Float[jax.Array, "node n n"]
     complete: Float[jax.Array, "node n n"]
@@ -81,12 +87,12 @@ class MeshStep(NamedTuple):
     motion: Motion
     plant: tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]
     exchanges: tuple[NeighbourWeights, ...]
-    data: Data
+    data: MeasurementInformation
     information: Float[jax.Array, "node n n"]
     gains: NodeGains
 
 
-class Rows(Module):
+class MeshRows(Module):
     """Some nodes of a mesh, of about as many neighbours, and the rule placed on them.
 
     `rows`: their numbers. `width`: the most messages that one of them receives, its own included.
@@ -106,9 +112,9 @@ class Mesh(Module):
     """
 
     plant: AnyPlant
-    buckets: tuple[Rows, ...]
+    buckets: tuple[MeshRows, ...]
     ranks: np.ndarray
-    edges: Edges
+    edges: MeshEdges
     observation_model: Apart
     senders: np.ndarray
     places: tuple[tuple[int, ...], ...] = eqx.field(static=True)
@@ -136,7 +142,7 @@ class Mesh(Module):
         way = None
         if self.edges.past or self.quantizer is not None:
             ages = self.edges.past
-            way = OnTheWay(jnp.tile(mean, (ages, nodes, 1)), jnp.tile(covariance, (ages, nodes, 1, 1)))
+            way = MessagesOnTheWay(jnp.tile(mean, (ages, nodes, 1)), jnp.tile(covariance, (ages, nodes, 1, 1)))
         return MeshState(
             mean=jnp.tile(mean, (nodes, 1)),
             covariance=jnp.tile(covariance, (nodes, 1, 1)),
@@ -189,7 +195,7 @@ class Mesh(Module):
             after = after._replace(way=under_way)
         return after, self._split_by_group(mean, claimed)
 
-    def _keep_messages(self, state: MeshState, arrived: jax.Array) -> Messages | None:
+    def _keep_messages(self, state: MeshState, arrived: jax.Array) -> ArrivingEstimates | None:
         """Return the messages that arrive, where they may be late or quantized; None where all are estimates of now."""
         if state.way is None:
             return None
@@ -197,7 +203,7 @@ class Mesh(Module):
         return gather_messages(state.mean, state.covariance, state.way, self.quantizer, self.senders, ages)
 
     def _send_estimates(
-        self, mean: jax.Array, state: MeshState, arrives: jax.Array, messages: Messages | None
+        self, mean: jax.Array, state: MeshState, arrives: jax.Array, messages: ArrivingEstimates | None
     ) -> Float[jax.Array, "node degree n"]:
         """Return the estimates that each node has of its neighbours: those of now, or what it received last or late."""
         if messages is not None:
@@ -207,13 +213,13 @@ class Mesh(Module):
             return now
         # With events: a node sends only where its estimate has moved beyond what somebody received last.
         information = jax.vmap(invert)(state.covariance)[self.senders]
-        moved = test_moved_beyond(self.alpha, now - state.sent, information, self.senders, self.edges.present)
+        moved = find_moved_beyond(self.alpha, now - state.sent, information, self.senders, self.edges.present)
         return jnp.where((arrives & moved[self.senders])[..., None], now, state.sent)
 
     def parts(
         self, covariance: Float[Array, "node n n"], blocks: Float[Array, "node degree n degree n"] | None,
         moments: tuple[Array, Array], there: Bool[Array, "node m"], arrived: Arrived, u: Array, k: Array,
-        ahead: Ahead = (), messages: Messages | None = None,
+        ahead: Ahead = (), messages: ArrivingEstimates | None = None,
     ) -> MeshStep:  # fmt: skip
         """Return all of step k but the estimates: models, moments of the plant, weights and gains.
 
@@ -261,14 +267,16 @@ class Mesh(Module):
         pull = jnp.einsum("idab,idb->ia", parts, difference) if is_matrix else jnp.sum(parts * difference, axis=1)
         return jnp.einsum("iab,ib->ia", front, pull)
 
-    def _exchange_measurements(self, observation: Observation, there: Bool[jax.Array, "node m"]) -> Data:
+    def _exchange_measurements(
+        self, observation: JointObservation, there: Bool[jax.Array, "node m"]
+    ) -> MeasurementInformation:
         """Return each node's information from what it measured, and from all of it if no component were missing."""
         # Rows of zeros without noise only pad a measurement.
         real = jnp.any(observation.gain != 0, axis=-1) | (jnp.einsum("imm->im", observation.noise) > 0)
         gain, noise = jnp.asarray(observation.gain), jnp.asarray(observation.noise)
         weighted, information = jax.vmap(information_of)(gain, noise, real & there)
         complete = jax.vmap(information_of)(gain, noise, real)[1]
-        return Data(observation, weighted, information, complete)
+        return MeasurementInformation(observation, weighted, information, complete)
 
     def _map_nodes(
         self,
@@ -340,7 +348,7 @@ class Mesh(Module):
         `_map_nodes`.
         """
 
-        def compute_gains(
+        def compute_node_gains(
             rule: AbstractFusion,
             belief: NeighbourEstimates,
             arrived: jax.Array,
@@ -353,7 +361,7 @@ class Mesh(Module):
                 return gains_of(NeighbourWeights(jnp.eye(len(motion.shift)), *known), step)
             return rule.neighbour_gains(belief, step)
 
-        gains: NodeGains = self._map_nodes(compute_gains, covariance, blocks, present, information, complete,
+        gains: NodeGains = self._map_nodes(compute_node_gains, covariance, blocks, present, information, complete,
                                          ahead=ahead, senders=senders)  # fmt: skip
         return gains
 
@@ -372,7 +380,7 @@ class Mesh(Module):
         measured = measurement_weights(gains.gain, present)
         blocks = error_transitions(gains, motion.matrix), measured @ parts.data.information[self.senders], measured
         m, ws, w = (scatter_blocks(jnp.asarray(each), self.senders, self.edges.present) for each in blocks)
-        after = joint_after(joint.reshape(size, size), m, gains.innovation, motion.noise, ws, w)
+        after = propagate_joint_covariance(joint.reshape(size, size), m, gains.innovation, motion.noise, ws, w)
         return jnp.asarray(after).reshape(joint.shape)
 
     def _split_by_group(self, mean: jax.Array, covariance: jax.Array) -> tuple[Estimate, ...]:

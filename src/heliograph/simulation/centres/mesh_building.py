@@ -5,8 +5,8 @@ import numpy as np
 from heliograph.fusion.mesh.graph import graph_of
 from heliograph.model.over_time import stack
 from heliograph.numerics.check import fail
-from heliograph.simulation.centres.edges import edges_of
-from heliograph.simulation.centres.mesh import Mesh, Rows
+from heliograph.simulation.centres.edges import build_edges
+from heliograph.simulation.centres.mesh import Mesh, MeshRows
 from heliograph.simulation.centres.observation_model import Apart, ObservationModel, stack_nodes
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
@@ -33,9 +33,9 @@ def build_mesh(network: Network, name: str) -> Mesh:
     kind_places = [tuple(index[node] for node in network.groups[kind.group]) for kind in kinds]
     return Mesh(
         plant=network.plant,
-        buckets=tuple(Rows(fusion.rule.placed(b), b.senders[:, 0], b.senders.shape[1]) for b in graph.buckets()),
+        buckets=tuple(MeshRows(fusion.rule.placed(b), b.senders[:, 0], b.senders.shape[1]) for b in graph.buckets()),
         ranks=np.argsort(np.concatenate([bucket.senders[:, 0] for bucket in graph.buckets()])),
-        edges=edges_of(fusion, graph),
+        edges=build_edges(fusion, graph),
         observation_model=Apart(
             groups=tuple(groups),
             order=np.array([group_places[node] for node in nodes]),

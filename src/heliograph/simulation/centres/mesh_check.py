@@ -7,7 +7,7 @@ import numpy as np
 import scipy
 
 from heliograph.factors.roots import covariance_of_root, observe_information, roots_of
-from heliograph.fusion.mesh.graph import Graph, graph_of, upstream
+from heliograph.fusion.mesh.graph import Graph, find_upstream_nodes, graph_of
 from heliograph.fusion.mesh.joint import scatter_blocks
 from heliograph.fusion.mesh.neighbour_rules import DiffusionWeights, FrozenWeights
 from heliograph.fusion.network_fusion import Fusion
@@ -20,7 +20,7 @@ from heliograph.model.sensor import LinearSensor, refuse_angles
 from heliograph.numerics.check import fail, instance, spread_over_names
 from heliograph.random_affine.moments.second_moments import second_order
 from heliograph.simulation.centres.centre import claim_of_informed
-from heliograph.simulation.centres.edges import arrival_chance, edge_links, edges_of, loss_rate
+from heliograph.simulation.centres.edges import arrival_chance, build_edges, edge_links, find_loss_decay
 from heliograph.simulation.node import HasNodes, Node
 
 MODE = 1e-6  # below 1: a mode is computed to half of the digits where it is a double one
@@ -60,9 +60,9 @@ def check_mesh(name: str, fusion: Fusion, network: HasNodes) -> None:
     _check_messages(what, fusion, network, graph)
     fusion.rule.placed(graph)
     mesh_claim(name, fusion, network)
-    _check_seen(what, name, fusion, network)
+    _check_detectability(what, name, fusion, network)
     _check_losses(what, fusion, network, graph)
-    _check_fixed(what, fusion, network, graph)
+    _check_fixed_shares(what, fusion, network, graph)
 
 
 def error_claim(name: str, fusion: Fusion, network: HasNodes) -> Claim:
@@ -116,7 +116,7 @@ def _check_rule(what: str, fusion: Fusion, network: HasNodes) -> None:
 
 def _check_messages(what: str, fusion: Fusion, network: HasNodes, graph: Graph) -> None:
     """Raise ValueError for links that do not serve, and for delays and quantizers with which no bound is known."""
-    past, kind = edges_of(fusion, graph).past, type(fusion.rule).__name__
+    past, kind = build_edges(fusion, graph).past, type(fusion.rule).__name__
     if not past and fusion.quantizer is None:
         return
     expected = f"a rule that intersects, where there are {'messages that come late' if past else 'quantizers'}"
@@ -132,7 +132,7 @@ def _check_messages(what: str, fusion: Fusion, network: HasNodes, graph: Graph) 
                      "was sent and lost before (UniformQuantizer)")  # fmt: skip
 
 
-def _check_seen(what: str, name: str, fusion: Fusion, network: HasNodes) -> None:
+def _check_detectability(what: str, name: str, fusion: Fusion, network: HasNodes) -> None:
     """Raise ValueError if neither a node nor one upstream of it observes an unstable mode; warn of decaying modes.
 
     Mode lambda is observed where rank [lambda I - A; H of all upstream and itself] = n. Not checked where plant,
@@ -177,7 +177,7 @@ def _check_losses(what: str, fusion: Fusion, network: HasNodes, graph: Graph) ->
     link, names = fusion.link, graph.nodes
     if link is None or len(names) > CUTS or isinstance(first(network.plant), OverTime):
         return
-    rates = [loss_rate(channel) for channel in edge_links(link, graph).values()]
+    rates = [find_loss_decay(channel) for channel in edge_links(link, graph).values()]
     if any(rate is None for rate in rates):
         return
     # Capacities -log p in whole units; those that are never cut get more than all others together.
@@ -216,7 +216,7 @@ def _list_unseeing_nodes(graph: Graph, a: np.ndarray, squares: np.ndarray) -> tu
     without_unstable, without_decaying = [], []
     values = np.linalg.eigvals(a)
     checked: dict[int, tuple[bool, bool]] = {}
-    for node, places in zip(graph.nodes, upstream(graph), strict=True):
+    for node, places in zip(graph.nodes, find_upstream_nodes(graph), strict=True):
         if id(places) not in checked:
             checked[id(places)] = _find_unseen(a, values, squares[places].sum(axis=0))
         unstable, decaying = checked[id(places)]
@@ -264,7 +264,7 @@ def _check_regular(where: str, noise: np.ndarray) -> None:
         raise fail(where, "measurement noise in every direction", "a singular covariance")
 
 
-def _check_fixed(what: str, fusion: Fusion, network: HasNodes, graph: Graph) -> None:
+def _check_fixed_shares(what: str, fusion: Fusion, network: HasNodes, graph: Graph) -> None:
     """Raise ValueError for fixed shares with which errors grow, where the plant does not decay and gains settle."""
     plant, link, names = network.plant, fusion.link, graph.nodes
     if not isinstance(fusion.rule, DiffusionWeights) or not isinstance(plant, LinearPlant) or len(names) > CUTS:

@@ -10,7 +10,13 @@ import numpy as np
 import scipy
 
 from heliograph.factors.roots import covariance_of_root, observe_information, roots_of
-from heliograph.fusion.mesh.joint import blocks_of, error_transitions, joint_after, measurement_weights, scatter_blocks
+from heliograph.fusion.mesh.joint import (
+    blocks_of,
+    error_transitions,
+    measurement_weights,
+    propagate_joint_covariance,
+    scatter_blocks,
+)
 from heliograph.fusion.mesh.neighbour_rules import FrozenWeights
 from heliograph.fusion.network_fusion import Fusion
 from heliograph.linear.jump_system import propagate_by_mode
@@ -19,8 +25,8 @@ from heliograph.numerics.check import check_count, fail, instance, is_whole
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Bool, Float, PyTree
-from heliograph.simulation.arguments import inputs_of, key_of
-from heliograph.simulation.centres.edges import Edges
+from heliograph.simulation.arguments import key_of, read_plant_inputs
+from heliograph.simulation.centres.edges import MeshEdges
 from heliograph.simulation.centres.mesh import Mesh, MeshStep
 from heliograph.simulation.centres.mesh_building import build_mesh
 from heliograph.simulation.centres.mesh_check import error_claim
@@ -69,14 +75,14 @@ def mesh_arrivals(network: Network, fusion: str, horizon: int, key: int | jax.Ar
     Raises:
         ValueError: no such fusion, no horizon.
     """
-    mesh = mesh_named(network, fusion)
+    mesh = find_mesh(network, fusion)
     steps = check_count("horizon", horizon)
     with jax.enable_x64(True):
         return np.asarray(_draw_arrivals(mesh.edges, key_of(key), np.arange(steps)))
 
 
 @quickly_compiled
-def _draw_arrivals(edges: Edges, key: jax.Array, steps: np.ndarray) -> jax.Array:
+def _draw_arrivals(edges: MeshEdges, key: jax.Array, steps: np.ndarray) -> jax.Array:
     """Draw what arrives by the edges alone, so that all rules share a program."""
 
     def draw_step(state: tuple[PyTree, ...], k: jax.Array) -> tuple[tuple[PyTree, ...], jax.Array]:
@@ -110,7 +116,7 @@ def mesh_errors(
 
     Source: Bar-Shalom, On the track-to-track correlation problem (1981), for all pairs of a graph.
     """
-    mesh = mesh_named(network, fusion)
+    mesh = find_mesh(network, fusion)
     if mesh.alpha is not None or mesh.quantizer is not None:
         by_data = (
             "a quantizer" if mesh.alpha is None else f"alpha {mesh.alpha:g}, by which it depends on data what is sent"
@@ -119,7 +125,7 @@ def mesh_errors(
                    by_data)  # fmt: skip
     flags = _check_arrivals(mesh, arrived)
     network.check_horizon(len(flags))
-    u = inputs_of(network, inputs, len(flags))
+    u = read_plant_inputs(network, inputs, len(flags))
     actual, claimed, last = [], [], np.zeros(())
     for joint, error, claim in errors_over_time(mesh, flags, u):
         actual.append(error)
@@ -181,7 +187,7 @@ def _propagate_joint(mesh: Mesh, joint: np.ndarray, parts: MeshStep, arrived: np
         senders = np.broadcast_to(np.arange(len(there)), there.shape)
     measured = measurement_weights(gains.gain, there)
     ws, w = (scatter_blocks(x, senders, there) for x in (measured @ parts.data.information[senders], measured))
-    return np.asarray(joint_after(joint, m, gains.innovation, parts.motion.noise, ws, w))
+    return np.asarray(propagate_joint_covariance(joint, m, gains.innovation, parts.motion.noise, ws, w))
 
 
 def best_possible(
@@ -204,15 +210,15 @@ def best_possible(
     Raises:
         ValueError: no such fusion, flags of another shape.
     """
-    mesh = mesh_named(network, fusion)
+    mesh = find_mesh(network, fusion)
     flags = _check_arrivals(mesh, arrived)
-    u = inputs_of(network, inputs, len(flags))
+    u = read_plant_inputs(network, inputs, len(flags))
     with jax.enable_x64(True):
         start = to_numpy(mesh.init())
         steps: list[MeshStep] = []
         moments = start.plant
         for k, u_k in enumerate(u):
-            steps.append(to_numpy(models(mesh, start.covariance, moments, u_k, np.asarray(k))))
+            steps.append(to_numpy(compute_full_step(mesh, start.covariance, moments, u_k, np.asarray(k))))
             moments = steps[-1].plant
     # Whose measurement of each age can have come, from the last step back.
     count = len(mesh.nodes)
@@ -220,7 +226,7 @@ def best_possible(
     information: list[np.ndarray] = []
     for k in reversed(range(len(u))):
         for number in reversed(range(mesh.edges.rounds)):
-            known = _extend_reach(known, mesh, flags[k, :, number])
+            known = _extend_known_data(known, mesh, flags[k, :, number])
         s = np.asarray(steps[k].data.information)
         information.append((known @ s.reshape(count, -1)).reshape(s.shape))
     # Riccati recursions of all nodes side by side, oldest measurement first.
@@ -233,7 +239,7 @@ def best_possible(
 
 
 @quickly_compiled
-def models(mesh: Mesh, covariance: np.ndarray, moments: PyTree, u: np.ndarray, k: np.ndarray) -> MeshStep:
+def compute_full_step(mesh: Mesh, covariance: np.ndarray, moments: PyTree, u: np.ndarray, k: np.ndarray) -> MeshStep:
     """Return the parts of a step at which everything arrives, for the models of plant and measurements in it."""
     lossless = mesh.edges.lossless()
     there = np.ones((len(mesh.senders), mesh.observation_model.size), dtype=bool)
@@ -244,7 +250,7 @@ def models(mesh: Mesh, covariance: np.ndarray, moments: PyTree, u: np.ndarray, k
     return mesh.parts(covariance, blocks, moments, there, lossless, u, k)
 
 
-def _extend_reach(known: Any, mesh: Mesh, present: np.ndarray) -> Any:
+def _extend_known_data(known: Any, mesh: Mesh, present: np.ndarray) -> Any:
     """Return whose data each node has if one more exchange, before all others, is counted.
 
     `known`: sparse (node, node), a one where the data of the column's node reach the row's.
@@ -279,14 +285,14 @@ def freeze(
     Raises:
         ValueError: no such fusion, one by another rule, more steps to average than there are.
     """
-    mesh = mesh_named(network, fusion)
+    mesh = find_mesh(network, fusion)
     old = network.meshes[fusion]
     if not old.rule.needs_joint:
         raise fail(f"fusion {fusion!r} to freeze", "best weights such as DiagonalWeights()", type(old.rule).__name__)
     flags = _check_arrivals(mesh, arrived)
     if check_count("last", last) > len(flags):
         raise fail("last", f"at most the {len(flags)} steps", last)
-    u = inputs_of(network, inputs, len(flags))
+    u = read_plant_inputs(network, inputs, len(flags))
     total: np.ndarray | None = None
     shape = (len(mesh.nodes), len(network.states)) * 2
     for k, (joint, _, _) in enumerate(errors_over_time(mesh, flags, u)):
@@ -299,7 +305,7 @@ def freeze(
     return Network(network.plant, network.nodes, {**network.fused, **network.meshes, fusion: frozen})
 
 
-def mesh_named(network: Network, fusion: str) -> Mesh:
+def find_mesh(network: Network, fusion: str) -> Mesh:
     """Return the fusion of this name between neighbours; raise if there is none, or if it has over 2,000 nodes."""
     instance("network", network, Network, "a Network")
     if not isinstance(fusion, str) or fusion not in network.meshes:

@@ -18,7 +18,13 @@ import numpy as np
 
 from heliograph.fusion.mesh.gains import NodeGains
 from heliograph.fusion.mesh.graph import graph_of
-from heliograph.fusion.mesh.joint import blocks_of, error_transitions, joint_after, measurement_weights, scatter_blocks
+from heliograph.fusion.mesh.joint import (
+    blocks_of,
+    error_transitions,
+    measurement_weights,
+    propagate_joint_covariance,
+    scatter_blocks,
+)
 from heliograph.fusion.mesh.neighbour_rules import FrozenWeights
 from heliograph.fusion.rules import AbstractFusion
 from heliograph.linear.jump_system import propagate_by_mode
@@ -26,17 +32,17 @@ from heliograph.model.channel import Channel
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.simulation.arguments import inputs_of
+from heliograph.simulation.arguments import read_plant_inputs
 from heliograph.simulation.centres.edges import arrival_chance, edge_links
-from heliograph.simulation.centres.mesh import Mesh, MeshStep, Rows
+from heliograph.simulation.centres.mesh import Mesh, MeshRows, MeshStep
 from heliograph.simulation.centres.mesh_check import error_claim
-from heliograph.simulation.centres.mesh_errors import MeshErrors, mesh_named, models
+from heliograph.simulation.centres.mesh_errors import MeshErrors, compute_full_step, find_mesh
 from heliograph.simulation.network import Network
 
 NODES, DEGREE = 200, 10  # most nodes and neighbours of one node whose patterns are listed: 2^degree rows a node
 
 
-class Patterns(NamedTuple):
+class ArrivalPatterns(NamedTuple):
     """All patterns of what may arrive at each node, one row each, node after node, with their probabilities.
 
     Shapes: node (row,), present (row, degree), probability (row,); start (node,): a node's first row.
@@ -67,14 +73,14 @@ def mean_mesh_errors(
             neighbours.
     """
     # Only gains that depend on what arrives at this step alone are independent of J.
-    mesh = mesh_named(network, fusion)
+    mesh = find_mesh(network, fusion)
     between = network.meshes[fusion]
     if not (between.rule.needs_joint or isinstance(between.rule, FrozenWeights)):
         expected = "best weights or diffusion (an intersection remembers losses: mesh_errors of drawn arrivals)"
         raise fail(f"mean errors of fusion {fusion!r}", expected, type(between.rule).__name__)
     # P(pattern) = prod_j p_ij over the edges that deliver, 1 - p_ij over those that do not.
     network.check_horizon(check_count("horizon", horizon))
-    u = inputs_of(network, inputs, horizon)
+    u = read_plant_inputs(network, inputs, horizon)
     names = mesh.nodes
     graph = graph_of(between.neighbours or {}, names)
     links = {} if between.link is None else edge_links(between.link, graph)
@@ -88,7 +94,7 @@ def mean_mesh_errors(
     errors = []
     for k, u_k in enumerate(u):
         with jax.enable_x64(True):
-            step = to_numpy(models(mesh, start.covariance, moments, u_k, np.asarray(k)))
+            step = to_numpy(compute_full_step(mesh, start.covariance, moments, u_k, np.asarray(k)))
             shape = (len(names), len(network.states)) * 2
             blocks = np.asarray(blocks_of(joint.reshape(shape), mesh.senders))
             gains = to_numpy(_compute_gains(rows, covariance, blocks, patterns, step))
@@ -105,17 +111,17 @@ def mean_mesh_errors(
     )
 
 
-def _repeat_by_pattern(mesh: Mesh, rule: AbstractFusion, patterns: Patterns) -> Mesh:
+def _repeat_by_pattern(mesh: Mesh, rule: AbstractFusion, patterns: ArrivalPatterns) -> Mesh:
     """Return the mesh with a row for each pattern of each node; `rule`: placed on the nodes, its arrays' last axis."""
     rule = jax.tree.map(lambda leaf: leaf[..., patterns.node] if eqx.is_array(leaf) else leaf, rule)
-    bucket = Rows(rule, np.arange(len(patterns.node)), mesh.senders.shape[1])
+    bucket = MeshRows(rule, np.arange(len(patterns.node)), mesh.senders.shape[1])
     repeated: Mesh = eqx.tree_at(lambda m: (m.senders, m.buckets), mesh, (mesh.senders[patterns.node], (bucket,)))
     return repeated
 
 
 @quickly_compiled
 def _compute_gains(
-    rows: Mesh, covariance: np.ndarray, blocks: np.ndarray, patterns: Patterns, step: MeshStep
+    rows: Mesh, covariance: np.ndarray, blocks: np.ndarray, patterns: ArrivalPatterns, step: MeshStep
 ) -> NodeGains:
     """Return the gains of each pattern: what arrives of information is summed, and weights are solved for it.
 
@@ -129,7 +135,7 @@ def _compute_gains(
 
 
 def _average_joint(
-    mesh: Mesh, joint: np.ndarray, blocks: np.ndarray, patterns: Patterns, gains: NodeGains, step: MeshStep
+    mesh: Mesh, joint: np.ndarray, blocks: np.ndarray, patterns: ArrivalPatterns, gains: NodeGains, step: MeshStep
 ) -> np.ndarray:
     """Return J+ (N, N): of two nodes by products of mean gains, of one node by the mean over its patterns."""
     count, degree = mesh.senders.shape
@@ -148,7 +154,7 @@ def _average_joint(
     scattered = [
         scatter_blocks(x, mesh.senders, mesh.edges.present) for x in (mean(m), mean_w @ s[mesh.senders], mean_w)
     ]
-    after = joint_after(joint, scattered[0], mean(f), q, *scattered[1:])
+    after = propagate_joint_covariance(joint, scattered[0], mean(f), q, *scattered[1:])
     # i = j: J_ii+ = E[M_r J M_r' + F_r Q F_r' + sum_l K_rl R_l K_rl'], with J of the neighbourhood of i.
     flat = m.swapaxes(1, 2).reshape(len(m), n, degree * n)
     inside = blocks.reshape(count, degree * n, degree * n)[patterns.node]
@@ -160,7 +166,7 @@ def _average_joint(
     return np.asarray(after)
 
 
-def _list_patterns(mesh: Mesh, chances: np.ndarray) -> Patterns:
+def _list_patterns(mesh: Mesh, chances: np.ndarray) -> ArrivalPatterns:
     """Return all patterns of what may arrive at every node, with their probabilities.
 
     `chances`: probability of arrival of every edge, receiver after receiver.
@@ -179,7 +185,7 @@ def _list_patterns(mesh: Mesh, chances: np.ndarray) -> Patterns:
             rows.append(i)
             present.append([True, *flags, *[False] * (mesh.senders.shape[1] - 1 - len(flags))])
             probability.append(float(np.prod(np.where(flags, of_node, 1 - of_node))))
-    return Patterns(np.array(rows), np.array(present), np.array(probability), np.array(start))
+    return ArrivalPatterns(np.array(rows), np.array(present), np.array(probability), np.array(start))
 
 
 def _get_known_probability(edge: str, link: Channel) -> float:

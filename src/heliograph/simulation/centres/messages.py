@@ -13,12 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.fusion.cross_covariance import Motion
-from heliograph.fusion.mesh.gains import correct
+from heliograph.fusion.mesh.gains import correct_by_information
 from heliograph.fusion.quantizer import AbstractQuantizer, widen
 from heliograph.numerics.types import Array, Bool, Float, Int
 
 
-class OnTheWay(NamedTuple):
+class MessagesOnTheWay(NamedTuple):
     """Estimates of the state now from messages that were sent 1, 2, ... steps ago and may still arrive, by sender.
 
     Shapes: mean (age, node, n), NaN of what saturated its quantizer; covariance (age, node, n, n).
@@ -28,7 +28,7 @@ class OnTheWay(NamedTuple):
     covariance: Float[jax.Array, "age node n n"]
 
 
-class Messages(NamedTuple):
+class ArrivingEstimates(NamedTuple):
     """Estimates that arrive in a step, one row each: the nodes' own, then those sent now, 1 step ago and so on.
 
     Shapes: mean (row, n), covariance (row, n, n). `senders` (node, degree): the row that each node has of itself, and
@@ -43,7 +43,7 @@ class Messages(NamedTuple):
     fresh: Bool[jax.Array, "node rounds degree"]
 
 
-def test_moved_beyond(
+def find_moved_beyond(
     alpha: Array, off: Float[jax.Array, "node degree n"], information: Float[jax.Array, "node degree n n"],
     senders: np.ndarray, present: np.ndarray,
 ) -> Bool[jax.Array, " node"]:  # fmt: skip
@@ -70,9 +70,9 @@ def quantize_estimate(
 
 
 def gather_messages(
-    mean: jax.Array, covariance: jax.Array, way: OnTheWay, quantizer: AbstractQuantizer | None, senders: np.ndarray,
-    ages: Int[jax.Array, "node rounds degree"],
-) -> Messages:  # fmt: skip
+    mean: jax.Array, covariance: jax.Array, way: MessagesOnTheWay, quantizer: AbstractQuantizer | None,
+    senders: np.ndarray, ages: Int[jax.Array, "node rounds degree"],
+) -> ArrivingEstimates:  # fmt: skip
     """Return the estimates that arrive at a step; `ages` of the messages, -1 where none does.
 
     Without a quantizer, estimates are sent as they are. One that saturates its quantizer never arrives; the
@@ -91,7 +91,7 @@ def gather_messages(
     # In place of an estimate that saturated, the receiver's own, which is a number.
     saturated = jnp.any(jnp.isnan(means), axis=1)[rows]
     rows = jnp.where(saturated, senders[:, :1], rows).at[:, 0].set(senders[:, 0])
-    return Messages(
+    return ArrivingEstimates(
         mean=means,
         covariance=covariances,
         senders=rows,
@@ -101,8 +101,13 @@ def gather_messages(
 
 
 def step_messages_on_the_way(
-    messages: Messages, way: OnTheWay, motion: Motion, common: jax.Array, weighted: jax.Array, information: jax.Array
-) -> OnTheWay:
+    messages: ArrivingEstimates,
+    way: MessagesOnTheWay,
+    motion: Motion,
+    common: jax.Array,
+    weighted: jax.Array,
+    information: jax.Array,
+) -> MessagesOnTheWay:
     """Return the estimates on the way after a step: those sent now join, corrected by the measurement sent with them.
 
     Shapes: common (n,); weighted (node, n), H_j' R_j^-1 (z_j - H_j common); information (node, n, n).
@@ -116,7 +121,7 @@ def step_messages_on_the_way(
 
     # What is sent now is corrected by the measurement that is sent with it; what was sent before is predicted.
     mean, before = predict(messages.mean[nodes : 2 * nodes], messages.covariance[nodes : 2 * nodes])
-    covariance, _ = jax.vmap(correct)(before, information)
+    covariance, _ = jax.vmap(correct_by_information)(before, information)
     innovation = weighted - jnp.einsum("iab,ib->ia", information, mean - common)
     mean = mean + jnp.einsum("iab,ib->ia", covariance, innovation)
     older = predict(*way) if ages else tuple(way)
@@ -125,4 +130,4 @@ def step_messages_on_the_way(
         """Put what is sent now before what is older, and drop the oldest."""
         return jnp.concatenate([now[None], old])[:ages].reshape(ages, count, *now.shape[1:])
 
-    return OnTheWay(first_ages(mean, older[0]), first_ages(covariance, older[1]))
+    return MessagesOnTheWay(first_ages(mean, older[0]), first_ages(covariance, older[1]))

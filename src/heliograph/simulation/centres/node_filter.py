@@ -17,16 +17,16 @@ from heliograph.fusion.mesh.graph import Graph, graph_of
 from heliograph.fusion.network_fusion import Fusion
 from heliograph.fusion.quantizer import AbstractQuantizer
 from heliograph.model.estimate import Estimate, Innovation
-from heliograph.model.premises.premise import believing
+from heliograph.model.premises.premise import on_premise
 from heliograph.numerics.check import fail, instance, text
 from heliograph.numerics.float64 import compile_in_float64, in_float64
 from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.types import Array, ArrayLike
-from heliograph.simulation.centres.edges import Edges
-from heliograph.simulation.centres.mesh import Mesh, MeshState, Rows
-from heliograph.simulation.centres.messages import OnTheWay, quantize_estimate
+from heliograph.simulation.centres.edges import MeshEdges
+from heliograph.simulation.centres.mesh import Mesh, MeshRows, MeshState
+from heliograph.simulation.centres.messages import MessagesOnTheWay, quantize_estimate
 from heliograph.simulation.centres.observation_model import Apart, stack_nodes
-from heliograph.simulation.claims import premise_at
+from heliograph.simulation.claims import find_premise
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node, ReceivingNode
 
@@ -65,7 +65,7 @@ class NodeFilter(AbstractSizedFilter):
         """Return the plant's initial law."""
         start = self.mesh.init()
         n, count = start.mean.shape[1], len(self.measured)
-        alone = start._replace(way=OnTheWay(jnp.zeros((0, count, n)), jnp.zeros((0, count, n, n))))
+        alone = start._replace(way=MessagesOnTheWay(jnp.zeros((0, count, n)), jnp.zeros((0, count, n, n))))
         return NodeState(alone, jnp.zeros(len(self.inputs)), alone)
 
     @predicts
@@ -133,7 +133,7 @@ def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
             whose steps are of any length.
     """
     between, nodes = network.meshes[fusion], network.mesh_nodes(fusion)
-    _check_alone(f"node {node!r} of fusion {fusion!r} by itself", network, between)
+    _check_can_filter_alone(f"node {node!r} of fusion {fusion!r} by itself", network, between)
     # The node's row of the graph: itself, then its neighbours.
     graph, neighbours = graph_of(between.neighbours or {}, nodes), between.neighbours or {}
     i, count = nodes.index(node), 1 + len(neighbours[node])
@@ -144,9 +144,9 @@ def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
     sizes = tuple(n.received for n in sensors)
     mesh = Mesh(
         plant=network.plant,
-        buckets=(Rows(between.rule.placed(row), np.zeros(1, dtype=int), count),),
+        buckets=(MeshRows(between.rule.placed(row), np.zeros(1, dtype=int), count),),
         ranks=np.zeros(1, dtype=int),
-        edges=Edges((), np.zeros(0, dtype=int), row.present, 1),
+        edges=MeshEdges((), np.zeros(0, dtype=int), row.present, 1),
         observation_model=Apart(tuple(models), np.arange(count), max(1, *sizes), (1,) * count),
         senders=np.arange(count)[None],
         places=((0,),),
@@ -167,10 +167,10 @@ def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
         received=sizes[0] + sum(_count_numbers(len(network.states), size) for size in sizes[1:]),
     )
     # The claim is that of the whole network, which stands here for the node's own part of it.
-    return believing(alone, premise_at(network, node))
+    return on_premise(alone, find_premise(network, node))
 
 
-def _check_alone(what: str, network: Network, between: Fusion) -> None:
+def _check_can_filter_alone(what: str, network: Network, between: Fusion) -> None:
     """Raise ValueError where a node cannot filter without knowledge of all others."""
     if between.rule.needs_joint:
         raise fail(what, "a rule that needs its neighbours' covariances alone (an intersection)",

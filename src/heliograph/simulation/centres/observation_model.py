@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.gaussian.signal import augmented_second_moment
-from heliograph.fusion.cross_covariance import Observation
+from heliograph.fusion.cross_covariance import JointObservation
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, at, at_each_step, stack
 from heliograph.model.sensor import AnySensor, LinearSensor, without_output_names
@@ -22,10 +22,10 @@ class ObservationModel(Module):
     sensor: AnySensor
     channel: SecondOrder | OverTime
 
-    def observe(self, mean: jax.Array, covariance: jax.Array, k: jax.Array, size: int) -> Observation:
+    def observe(self, mean: jax.Array, covariance: jax.Array, k: jax.Array, size: int) -> JointObservation:
         """Return the nodes' measurement models at step k for a plant with these moments, zero rows up to `size`."""
 
-        def observe_one(sensor: AnySensor, channel: SecondOrder | OverTime) -> Observation:
+        def observe_one(sensor: AnySensor, channel: SecondOrder | OverTime) -> JointObservation:
             """Return the measurement model of one node."""
             return _linearise_observation(at(sensor, k), at(channel, k), mean, covariance)
 
@@ -33,7 +33,7 @@ class ObservationModel(Module):
             self.sensor, self.channel
         )
         padding = (0, size - offset.shape[-1])
-        return Observation(
+        return JointObservation(
             jnp.pad(gain, ((0, 0), padding, (0, 0))),
             jnp.pad(offset, ((0, 0), padding)),
             jnp.pad(noise, ((0, 0), padding, padding)),
@@ -42,7 +42,7 @@ class ObservationModel(Module):
 
 def _linearise_observation(
     sensor: LinearSensor, channel: SecondOrder, mean: jax.Array, covariance: jax.Array
-) -> Observation:
+) -> JointObservation:
     """Return M, o and Cov(z - M x) of z = G (C x + v) + n, G a random gain, for a plant with these moments.
 
     M = E[G] C and o = E[G] E v + E n; the covariance is that of noise through the mean gain, and of the gain's spread.
@@ -52,7 +52,7 @@ def _linearise_observation(
     second = augmented_second_moment(c @ covariance @ c.T + noise + jnp.outer(signal, signal), signal, 1.0)
     gain = jnp.asarray(channel.mean_gain)
     spread = channel.nominal.middle(second, jnp.ones(len(gain), dtype=bool))
-    return Observation(gain @ c, gain @ sensor.noise.mean + channel.offset, gain @ noise @ gain.T + spread)
+    return JointObservation(gain @ c, gain @ sensor.noise.mean + channel.offset, gain @ noise @ gain.T + spread)
 
 
 class Apart(Module):
@@ -66,17 +66,17 @@ class Apart(Module):
     size: int = eqx.field(static=True)
     counts: tuple[int, ...] = eqx.field(static=True, default=())
 
-    def observe(self, mean: jax.Array, covariance: jax.Array, k: jax.Array) -> Observation:
+    def observe(self, mean: jax.Array, covariance: jax.Array, k: jax.Array) -> JointObservation:
         """Return the nodes' measurement models at step k, in the order of the nodes, for a plant with these moments."""
         m, n = self.size, len(mean)
         parts = []
         for i, group in enumerate(self.groups):
             if group is None:
                 shapes = (m, n), (m,), (m, m)
-                parts.append(Observation(*(jnp.zeros((self.counts[i], *shape)) for shape in shapes)))
+                parts.append(JointObservation(*(jnp.zeros((self.counts[i], *shape)) for shape in shapes)))
             else:
                 parts.append(group.observe(mean, covariance, k, m))
-        return Observation(*(jnp.concatenate(leaves)[self.order] for leaves in zip(*parts, strict=True)))
+        return JointObservation(*(jnp.concatenate(leaves)[self.order] for leaves in zip(*parts, strict=True)))
 
 
 class Together(Module):
@@ -89,13 +89,13 @@ class Together(Module):
     channel: SecondOrder | OverTime
     rows: np.ndarray
 
-    def observe(self, mean: jax.Array, covariance: jax.Array, k: jax.Array) -> Observation:
+    def observe(self, mean: jax.Array, covariance: jax.Array, k: jax.Array) -> JointObservation:
         """Return gain (node, size, n) and offset of each node, and the noise's covariance (node, size, node, size)."""
         gain, offset, noise = _linearise_observation(at(self.sensor, k), at(self.channel, k), mean, covariance)
         # A last row of zeros, which index -1 takes.
         gain, offset = jnp.pad(gain, ((0, 1), (0, 0))), jnp.pad(offset, (0, 1))
         noise = jnp.pad(noise, (0, 1))
-        return Observation(gain[self.rows], offset[self.rows], noise[self.rows[:, :, None, None], self.rows])
+        return JointObservation(gain[self.rows], offset[self.rows], noise[self.rows[:, :, None, None], self.rows])
 
 
 def stack_nodes(sensors: Sequence[AnySensor], channels: Sequence[Channel]) -> ObservationModel:

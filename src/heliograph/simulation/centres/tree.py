@@ -20,8 +20,8 @@ from heliograph.numerics.check import check_count, fail, function, instance
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
-from heliograph.simulation.arguments import inputs_of
-from heliograph.simulation.centres.centre import Centre
+from heliograph.simulation.arguments import read_plant_inputs
+from heliograph.simulation.centres.centre import FusionCentre
 from heliograph.simulation.centres.observation_model import Apart, ObservationModel, describe_channel
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node
@@ -111,7 +111,7 @@ def relay_tree(
         (name,) = leaf.filters
         alone = Network(plant, {"leaf": leaf}, {"all": Fusion(name, MatrixWeights())})
         alone.check_horizon(steps)
-        u = inputs_of(alone, inputs, steps)
+        u = read_plant_inputs(alone, inputs, steps)
         # Leaves in blocks, whole relays each: covariances, weights, and the relays as nodes.
         width = degree * max(BLOCK // degree, 1)
         blocks = [_slice(numbers, slice(i, i + width)) for i in range(0, count, width)]
@@ -144,7 +144,7 @@ def _propagate_leaves(
     channels = eqx.filter_vmap(lambda values: describe_channel(node(values).channel))(numbers)
     alike = StackedFilters(nodes.filters[name], 0, 1, count)
     size = nodes.filters[name].received
-    centre = Centre(
+    centre = FusionCentre(
         plant=plant,
         observation_model=Apart((ObservationModel(nodes.sensor, channels),), np.arange(count), size),
         rules={},

@@ -23,7 +23,7 @@ from heliograph.simulation.random_keys import CHANNEL, draw_key
 from heliograph.simulation.transmission.shared_fading import ChannelGroup, channel_groups
 
 
-class Drawn(NamedTuple):
+class UplinkDraws(NamedTuple):
     """Draws of the uplinks at one step: z = G m + n, NaN where lost, received `delay` steps later.
 
     Shapes: gain (node, m, n), offset (node, m), NaN in rows that a node lacks, delay (node,).
@@ -84,7 +84,7 @@ class Uplinks(Module):
         start = () if self.quantizers is None else begin(self.quantizers)
         return InFlight(values, jnp.zeros((ages - 1, nodes), dtype=int), start)
 
-    def draw(self, key: jax.Array, k: jax.Array) -> Drawn:
+    def draw(self, key: jax.Array, k: jax.Array) -> UplinkDraws:
         """Draw the uplinks of step k in the run with this key; the same for all fusions of the same nodes."""
         nodes, m, n = len(self.received), max(self.received), self.n
         # Lossless links, where nothing is random.
@@ -106,16 +106,16 @@ class Uplinks(Module):
             gain = gain.at[places, :size].set(h[:, :-1, :-1])
             offset = offset.at[places, :size].set(h[:, :-1, -1])
             delay = delay.at[places].set(late)
-        return Drawn(gain, offset, delay)
+        return UplinkDraws(gain, offset, delay)
 
-    def undrawn(self) -> Drawn:
+    def undrawn(self) -> UplinkDraws:
         """Return gains, offsets and delays of deterministic links."""
         nodes = len(self.received)
-        return Drawn(np.tile(np.eye(self.n), (nodes, 1, 1)), np.zeros((nodes, self.n)), self.fixed_delay)
+        return UplinkDraws(np.tile(np.eye(self.n), (nodes, 1, 1)), np.zeros((nodes, self.n)), self.fixed_delay)
 
     def recorded(
         self, name: str, nodes: Sequence[str], reports: Mapping[str, SentReports | ArrayLike] | None, steps: int
-    ) -> Drawn:
+    ) -> UplinkDraws:
         """Return gains, offsets and delays of each step from a recording; (time, node, ...).
 
         Raises:
@@ -124,7 +124,7 @@ class Uplinks(Module):
         """
         count, m = len(self.received), max(self.received)
         if reports is None and not self.groups:
-            return Drawn(*(np.broadcast_to(values, (steps, *np.shape(values))) for values in self.undrawn()))
+            return UplinkDraws(*(np.broadcast_to(values, (steps, *np.shape(values))) for values in self.undrawn()))
         if reports is None or set(reports) != set(nodes):
             got = "none" if reports is None else list(reports)
             raise fail(f"reports of fusion {name!r}", f"those of {list(nodes)}", got)
@@ -136,7 +136,7 @@ class Uplinks(Module):
                 delay[:, i] = self._check_delay(f"delays of node {node!r}", sent.delay, steps, i)
                 sent = sent.values
             values[:, i, :size] = array(f"reports of node {node!r}", sent, (steps, size), missing=True)
-        return Drawn(np.zeros((steps, count, m, self.n)), values, delay)
+        return UplinkDraws(np.zeros((steps, count, m, self.n)), values, delay)
 
     def _check_delay(self, name: str, value: ArrayLike, steps: int, node: int) -> np.ndarray:
         """Return the delays of a node's reports (steps,); raise at one that its uplink does not have."""
@@ -152,7 +152,7 @@ class Uplinks(Module):
         return jnp.argmax(jnp.asarray(self.delay), axis=1)
 
     def send(
-        self, state: InFlight, means: jax.Array, drawn: Drawn, k: jax.Array
+        self, state: InFlight, means: jax.Array, drawn: UplinkDraws, k: jax.Array
     ) -> tuple[InFlight, jax.Array, dict[str, jax.Array]]:
         """Send the reports of step k: next state, received values (node, m), whenever they arrive, and their traffic.
 
@@ -208,11 +208,11 @@ def _model_links(
     known: Sequence[SecondOrder | OverTime], received: Sequence[int], error: np.ndarray
 ) -> ReportModel | OverTime:
     """Return the model of the uplinks for a centre, at each step if any varies."""
-    model: ReportModel | OverTime = at_each_step(lambda *links: _read_links(links, received, error), *known)
+    model: ReportModel | OverTime = at_each_step(lambda *links: _gather_link_moments(links, received, error), *known)
     return model
 
 
-def _read_links(known: Sequence[PyTree], received: Sequence[int], error: np.ndarray) -> ReportModel:
+def _gather_link_moments(known: Sequence[PyTree], received: Sequence[int], error: np.ndarray) -> ReportModel:
     """Return the moments of all uplinks as arrays, with zeros for what a node receives less than others."""
     gains, offsets, spreads = [], [], []
     for link, size in zip(known, received, strict=True):

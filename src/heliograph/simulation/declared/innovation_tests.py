@@ -8,7 +8,7 @@ import scipy
 from heliograph.filters.wrappers.told import ToldFilter
 from heliograph.numerics.shares import average_correlated
 from heliograph.numerics.types import Float, Int
-from heliograph.simulation.declared.refit import Declared
+from heliograph.simulation.declared.refit import DeclaredRows
 from heliograph.simulation.results.whiteness import whitened_innovations
 
 LEVEL = 0.01  # of each test
@@ -32,7 +32,9 @@ class InnovationTests(NamedTuple):
         return self.p_value < LEVEL or any(not low <= nis <= high for nis, low, high in self.nis)
 
 
-def examine_innovations(declared: Declared, filter: ToldFilter, classes: Int[np.ndarray, " steps"]) -> InnovationTests:
+def examine_innovations(
+    declared: DeclaredRows, filter: ToldFilter, classes: Int[np.ndarray, " steps"]
+) -> InnovationTests:
     """Test the innovations of a filter: their mean squares by class, and their correlation over messages."""
     white = whitened_innovations(declared.z, filter, declared.u)[:, declared.place.values]
     # Two tails of each class, so that all classes together contradict a true claim with probability LEVEL.

@@ -19,11 +19,11 @@ from heliograph.numerics.types import Array, ArrayLike, Float, Int
 from heliograph.random_affine.told import AbstractTold
 from heliograph.simulation.declared.innovation_tests import LEVEL, InnovationTests, examine_innovations
 from heliograph.simulation.declared.refit import (
-    Declared,
-    Place,
+    DeclaredRows,
+    LinkPlace,
     Refit,
     declared_noises,
-    find_end,
+    find_interval_end,
     find_place,
     list_declaring,
     refit_filter,
@@ -206,7 +206,7 @@ def _judge_link(
     filter: ToldFilter, link: int, z: Float[np.ndarray, "steps received"], u: Float[np.ndarray, "steps inputs"]
 ) -> tuple[DeclaredJudgement | None, int]:
     """Return the judgement of one link, None where too few of its values came; and how many rows had some."""
-    declared, classes = _classify(filter, link, z, u)
+    declared, classes = _classify_rows(filter, link, z, u)
     heard = int(np.sum(classes >= 0))
     if heard < FEWEST:
         return None, heard
@@ -217,7 +217,7 @@ def _judge_link(
     refit = refit_scales(declared)
     after = examine_innovations(declared, refit_filter(declared, refit.logs), classes)
     bias = _find_bias(declared, refit) if after.p_value < LEVEL else None
-    low, high = ([find_end(declared, refit, c, sign) for c in range(declared.classes)] for sign in (-1, 1))
+    low, high = ([find_interval_end(declared, refit, c, sign) for c in range(declared.classes)] for sign in (-1, 1))
     scales = np.exp(refit.logs), np.exp(low), np.exp(high)
     return _make_judgement(declared, classes, (before, after), scales, bias), heard
 
@@ -232,7 +232,7 @@ class _DeclaredNoises(eqx.Module):
         return declared_noises(self.told.believed(numbers))
 
 
-def _declared_variances(place: Place, z: Float[np.ndarray, "steps received"]) -> Float[np.ndarray, "steps outputs"]:
+def _declared_variances(place: LinkPlace, z: Float[np.ndarray, "steps received"]) -> Float[np.ndarray, "steps outputs"]:
     """Return the variances that the message of each row declares, NaN where one of its numbers is missing.
 
     Typical numbers stand for missing ones meanwhile, so that the law has a variance for every row.
@@ -244,9 +244,9 @@ def _declared_variances(place: Place, z: Float[np.ndarray, "steps received"]) ->
     return np.asarray(np.where(complete, variances, np.nan))
 
 
-def _classify(
+def _classify_rows(
     filter: ToldFilter, link: int, z: Float[np.ndarray, "steps received"], u: Float[np.ndarray, "steps inputs"]
-) -> tuple[Declared, Int[np.ndarray, " steps"]]:
+) -> tuple[DeclaredRows, Int[np.ndarray, " steps"]]:
     """Divide a link's rows into classes of similar declared variances.
 
     Returns: the recording with the edges of the classes, and the class of each row, -1 of a row that is not used.
@@ -270,10 +270,10 @@ def _classify(
     outputs = variances.shape[1] if place.outputs is None else len(place.outputs)
     usual = np.sqrt(np.median(variances[heard], axis=0)) if heard.any() else np.ones(variances.shape[1])
     deviation = usual if len(usual) == outputs else np.full(outputs, np.exp(np.mean(np.log(usual))))
-    return Declared(filter, link, edges, deviation, z, u), np.where(heard, np.searchsorted(edges, log_size), -1)
+    return DeclaredRows(filter, link, edges, deviation, z, u), np.where(heard, np.searchsorted(edges, log_size), -1)
 
 
-def _find_bias(declared: Declared, scales: Refit) -> DeclaredBias | None:
+def _find_bias(declared: DeclaredRows, scales: Refit) -> DeclaredBias | None:
     """Return the bias of each output that fits beside the scales; None where it is not significant, at 1 %."""
     filter = declared.filter
     vary = not (isinstance(filter.plant, AbstractPlant) and isinstance(filter.sensor, AbstractSensor))
@@ -286,11 +286,11 @@ def _find_bias(declared: Declared, scales: Refit) -> DeclaredBias | None:
     # best.logs: scale of each class, then the bias's deviation over the root of its memory, then the memory.
     count = declared.classes
     rate, time = np.exp(best.logs[count:])
-    low, high = (float(np.exp(find_end(declared, best, count + 1, sign))) for sign in (-1, 1))
+    low, high = (float(np.exp(find_interval_end(declared, best, count + 1, sign))) for sign in (-1, 1))
     # A scale s = (white / declared deviation)^2: declared over white is s^-1/2, smallest for the largest s.
     largest, largest_end = (
         np.max(best.logs[:count]),
-        max(find_end(declared, best, number, 1) for number in range(count)),
+        max(find_interval_end(declared, best, number, 1) for number in range(count)),
     )
     return DeclaredBias(
         deviation=rate * np.sqrt(time) * declared.deviation,
@@ -304,7 +304,7 @@ def _find_bias(declared: Declared, scales: Refit) -> DeclaredBias | None:
 
 
 def _make_judgement(
-    declared: Declared,
+    declared: DeclaredRows,
     classes: Int[np.ndarray, " steps"],
     tested: tuple[InnovationTests, InnovationTests],
     scales: tuple[np.ndarray, np.ndarray, np.ndarray],

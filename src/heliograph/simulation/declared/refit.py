@@ -18,7 +18,7 @@ from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, Float
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.noise import AbstractNoise, Gaussian
-from heliograph.random_affine.told import AbstractTold, GainTold, Told, numbers_of_outputs, told_maps
+from heliograph.random_affine.told import AbstractTold, ToldGainHop, ToldMap, numbers_of_outputs, told_maps
 from heliograph.simulation.likelihood import log_likelihood
 from heliograph.simulation.runs.over_runs import over_runs
 
@@ -33,7 +33,7 @@ CLOSE = 0.05  # of a logarithm: as near as the end of an interval is found
 LOST = 1e12  # nats that numbers lose which give no likelihood
 
 
-class Declared(NamedTuple):
+class DeclaredRows(NamedTuple):
     """A filter of messages that declare noise, with what those of one link declared in the rows of a recording.
 
     Args:
@@ -58,12 +58,12 @@ class Declared(NamedTuple):
         return len(self.edges) + 1
 
     @property
-    def place(self) -> "Place":
+    def place(self) -> "LinkPlace":
         """Return where the link stands in what is received."""
         return find_place(self.filter, self.link)
 
 
-class Place(NamedTuple):
+class LinkPlace(NamedTuple):
     """Where a link that tells numbers stands in what is received, and which of the sensor's outputs it carries.
 
     Args:
@@ -79,7 +79,7 @@ class Place(NamedTuple):
     outputs: list[int] | None
 
 
-def find_place(filter: ToldFilter, link: int) -> Place:
+def find_place(filter: ToldFilter, link: int) -> LinkPlace:
     """Return the place of one of the links that tell numbers.
 
     Args:
@@ -92,7 +92,7 @@ def find_place(filter: ToldFilter, link: int) -> Place:
     of_link = np.flatnonzero(numbers_of_outputs(first(filter.link))[:, columns].any(axis=1)).tolist()
     whole = len(of_link) == len(filter.values)  # all that is received comes over this link
     outputs = list(range(len(sensor.outputs))) if whole else of_link
-    return Place(
+    return LinkPlace(
         told=maps[link],
         numbers=[filter.numbers[column] for column in columns],
         values=[filter.values[row] for row in of_link],
@@ -129,13 +129,13 @@ def declared_noises(link: AbstractRandomAffine) -> jax.Array:
 def list_declaring(filter: ToldFilter) -> list[int]:
     """Return the links, by number, whose messages tell the variances of Gaussian noise, which a scale may correct."""
     maps = told_maps(filter.link) if isinstance(filter.link, AbstractRandomAffine) else []
-    return [number for number, affine in enumerate(maps) if isinstance(affine, Told) and _declares(affine)]
+    return [number for number, affine in enumerate(maps) if isinstance(affine, ToldMap) and _declares_noise(affine)]
 
 
 @in_float64
-def _declares(affine: Told) -> bool:
+def _declares_noise(affine: ToldMap) -> bool:
     """Return whether a map takes its Gaussian noise from the number it is told: moving the number moves the noise."""
-    if isinstance(affine.make, GainTold):
+    if isinstance(affine.make, ToldGainHop):
         return False
     typical = np.asarray(affine.typical)
     noises, moved = (_list_noises(affine.believed(numbers)) for numbers in (typical, typical * (1 + ALMOST)))
@@ -152,7 +152,7 @@ def _is_noise(leaf: object) -> bool:
     return isinstance(leaf, AbstractNoise)
 
 
-def refit_filter(declared: Declared, logs: Array) -> ToldFilter:
+def refit_filter(declared: DeclaredRows, logs: Array) -> ToldFilter:
     """Return the filter with the link's noise scaled, and a bias of each of its outputs where two numbers describe one.
 
     Args:
@@ -165,12 +165,12 @@ def refit_filter(declared: Declared, logs: Array) -> ToldFilter:
 
     def rescale(leaf: object) -> object:
         """Return the judged link's map with its noise scaled; anything else as it is."""
-        if not isinstance(leaf, Told) or leaf.memory.identity != place.told.memory.identity:
+        if not isinstance(leaf, ToldMap) or leaf.memory.identity != place.told.memory.identity:
             return leaf
         scaled = ScaledNoise(leaf.make, declared.edges, numbers[: declared.classes])
         return eqx.tree_at(lambda affine: affine.make, leaf, scaled)
 
-    link = jax.tree.map(rescale, filter.link, is_leaf=lambda leaf: isinstance(leaf, Told))
+    link = jax.tree.map(rescale, filter.link, is_leaf=lambda leaf: isinstance(leaf, ToldMap))
     plant, sensor = filter.plant, filter.sensor
     if len(logs) > declared.classes:
         assert isinstance(plant, AbstractPlant) and isinstance(sensor, AbstractSensor)
@@ -181,10 +181,10 @@ def refit_filter(declared: Declared, logs: Array) -> ToldFilter:
     return filter.with_models(plant, sensor, link)
 
 
-class Likelihood(eqx.Module):
+class RefitLikelihood(eqx.Module):
     """The log-likelihood of a recording as a function of the numbers that `refit_filter` takes."""
 
-    declared: Declared
+    declared: DeclaredRows
 
     def __call__(self, logs: Array) -> Array:
         """Return the log-likelihood, in nats."""
@@ -204,26 +204,26 @@ class Refit(NamedTuple):
     likelihood: float
 
 
-def refit_scales(declared: Declared) -> Refit:
+def refit_scales(declared: DeclaredRows) -> Refit:
     """Fit the scale of each class, with everything else as the filter has it."""
-    return _maximise(declared, np.zeros(declared.classes))
+    return _maximise_likelihood(declared, np.zeros(declared.classes))
 
 
-def refit_with_bias(declared: Declared, scales: Refit) -> Refit:
+def refit_with_bias(declared: DeclaredRows, scales: Refit) -> Refit:
     """Fit the scales, and deviation and memory of a bias of each output, from scales without one."""
     step = usual_step(declared)
     white = scales.logs - np.log(4)  # the search begins with three quarters of the variance in the bias
     starts = [np.append(white, [(np.mean(scales.logs) - np.log(step)) / 2, np.log(time * step)]) for time in TIMES]
-    return max((_maximise(declared, start) for start in starts), key=lambda refit: refit.likelihood)
+    return max((_maximise_likelihood(declared, start) for start in starts), key=lambda refit: refit.likelihood)
 
 
-def usual_step(declared: Declared) -> float:
+def usual_step(declared: DeclaredRows) -> float:
     """Return the usual time of a step: 1 where the plant counts steps."""
     inputs = declared.filter.inputs
     return float(np.median(declared.u[:, inputs.index(TIME_STEP)])) if TIME_STEP in inputs else 1.0
 
 
-def find_end(declared: Declared, best: Refit, number: int, sign: int) -> float:
+def find_interval_end(declared: DeclaredRows, best: Refit, number: int, sign: int) -> float:
     """Return the end of the 95 % interval of the logarithm of a number; infinite where the likelihood never falls.
 
     There the likelihood, the other numbers at their best, is 1.92 nats below its maximum.
@@ -241,7 +241,7 @@ def find_end(declared: Declared, best: Refit, number: int, sign: int) -> float:
         nonlocal constrained  # each search starts from the last one's result
         start = constrained.logs.copy()
         start[number] = best.logs[number] + sign * distance
-        constrained = _maximise(declared, start, fixed=number)
+        constrained = _maximise_likelihood(declared, start, fixed=number)
         return best.likelihood - constrained.likelihood - REACH
 
     # Doubled until the end is passed, then halved.
@@ -256,7 +256,9 @@ def find_end(declared: Declared, best: Refit, number: int, sign: int) -> float:
     return float(best.logs[number] + sign * far)
 
 
-def _maximise(declared: Declared, start: Float[np.ndarray, " numbers"], fixed: int | None = None) -> Refit:
+def _maximise_likelihood(
+    declared: DeclaredRows, start: Float[np.ndarray, " numbers"], fixed: int | None = None
+) -> Refit:
     """Return the maximum of the likelihood found from a start.
 
     `start`: logarithms of each class's scale and, with a bias, its two, as of `refit_filter`. `fixed`: the index of one
@@ -268,7 +270,7 @@ def _maximise(declared: Declared, start: Float[np.ndarray, " numbers"], fixed: i
     if len(start) > declared.classes:
         step = usual_step(declared)
         low[-1], high[-1] = np.log(FAST * step), np.log(SLOW * len(declared.z) * step)
-    likelihood, steps = Likelihood(declared), DIFFERENCE * np.eye(len(start))[free]
+    likelihood, steps = RefitLikelihood(declared), DIFFERENCE * np.eye(len(start))[free]
 
     def compute_loss(logs: Float[np.ndarray, " free"]) -> tuple[float, Float[np.ndarray, " free"]]:
         """Return -l and its slope by central differences, all points in one call."""

@@ -16,7 +16,7 @@ from heliograph.random_affine.memory import memories
 from heliograph.simulation.claims import list_other_beliefs
 from heliograph.simulation.description.single import find_rounded_parts
 from heliograph.simulation.node import FUSED, HasNodes, Node
-from heliograph.simulation.transmission.shared_fading import memory_places
+from heliograph.simulation.transmission.shared_fading import number_memories
 
 
 class DiagramLine(NamedTuple):
@@ -82,7 +82,7 @@ def list_shared(network: HasNodes) -> list[str]:
     if network.common is not None:
         return [f"sensor and channel of all nodes: {link_in_words(network.common.channel)}"]
     channels = {name: node.channel for name, node in network.nodes.items() if isinstance(node, Node)}
-    places = memory_places(channels)
+    places = number_memories(channels)
     # Nodes of each memory.
     nodes: dict[int, list[str]] = {}
     names: dict[int, str] = {}
@@ -127,7 +127,7 @@ def _make_title(network: HasNodes) -> str:
     return f"Network of {len(network.nodes)} node{'s' * (len(network.nodes) > 1)}"
 
 
-def table_of(network: HasNodes) -> str:
+def write_html_table(network: HasNodes) -> str:
     """Return the diagram as an HTML table, for notebooks."""
     rows = (
         f'<tr><th style="text-align:left">{escape(line.name)}</th>'

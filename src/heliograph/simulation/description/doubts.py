@@ -23,7 +23,7 @@ from heliograph.random_affine.modes import redraw_modes_each_step
 from heliograph.random_affine.superposed import Superposed
 from heliograph.random_affine.told import told_maps
 from heliograph.simulation.boundedness import certify_boundedness
-from heliograph.simulation.claims import Belief, list_other_beliefs
+from heliograph.simulation.claims import OtherBelief, list_other_beliefs
 from heliograph.simulation.declared.refit import list_declaring
 from heliograph.simulation.description.diagram import list_rounded, list_shared
 from heliograph.simulation.description.fallbacks import list_fallbacks, list_sequential
@@ -195,7 +195,7 @@ def _find_reservations(network: Network) -> Iterator[Doubt]:
 
 def _find_other_beliefs(network: Network) -> Iterator[Doubt]:
     """Yield the filters that believe another world than that in which they stand, so that they claim nothing of it."""
-    alike: dict[tuple[bool, str, tuple[str, ...]], list[Belief]] = {}
+    alike: dict[tuple[bool, str, tuple[str, ...]], list[OtherBelief]] = {}
     forgetful = _list_forgetful_nodes(network)
     for belief in list_other_beliefs(network):
         if belief.parts == (CHANNEL,) and belief.node in forgetful.get(belief.filter, ()):

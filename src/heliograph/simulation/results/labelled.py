@@ -44,7 +44,7 @@ Shape = tuple[int, ...]
 Placed = tuple[Shape, T]  # where a value belongs, and the value
 
 
-class Field(NamedTuple):
+class VariableDescription(NamedTuple):
     """A variable of a dataset: its axes, of which "..." are those of rows (run, time), and what it means."""
 
     axes: str
@@ -52,37 +52,39 @@ class Field(NamedTuple):
 
 
 # Everything that datasets of records, and of statistics, hold.
-FIELDS = {
-    "truth": Field("... state", "true state"),
-    "measurement": Field("... node received", "what reached the node, NaN where nothing arrived and beyond its length"),
-    "length": Field("node", "how many numbers the node receives; -1: it is no place that receives"),
-    "mean": Field("... node filter state", "estimate of the state"),
-    "covariance": Field("... node filter state other", "covariance of the error as the filter claims it"),
-    "modes": Field("... node filter mode", "probability of each mode, NaN of a filter that weighs fewer or none"),
-    "attitude": Field("state", "place among the numbers of attitudes, three of each rotation vector; -1 if it is none"),
-    "claim": Field(
+_FIELDS = {
+    "truth": ("... state", "true state"),
+    "measurement": ("... node received", "what reached the node, NaN where nothing arrived and beyond its length"),
+    "length": ("node", "how many numbers the node receives; -1: it is no place that receives"),
+    "mean": ("... node filter state", "estimate of the state"),
+    "covariance": ("... node filter state other", "covariance of the error as the filter claims it"),
+    "modes": ("... node filter mode", "probability of each mode, NaN of a filter that weighs fewer or none"),
+    "attitude": ("state", "place among the numbers of attitudes, three of each rotation vector; -1 if it is none"),
+    "claim": (
         "node filter",
         "what the claimed covariance is: exact, upper, nominal or none; empty where there is no such filter",
     ),
-    "estimated": Field("node", "whether estimates are kept for the node"),
-    "saturated": Field(
+    "estimated": ("node", "whether estimates are kept for the node"),
+    "saturated": (
         "... fusion sender state",
         "whether a component was out of the quantizer's reach; in statistics, in which share of the runs",
     ),
-    "symbols": Field(
-        "... fusion sender state", "how many symbols were sent for a component; in statistics their mean over the runs"
+    "symbols": (
+        "... fusion sender state",
+        "how many symbols were sent for a component; in statistics their mean over the runs",
     ),
-    "place": Field("fusion sender", "place of the sender among those of the fusion; -1: it sends nothing to it"),
-    "runs": Field("batch", "number of runs in the batch"),
-    "errors": Field("batch ... node filter state other", "sum over the batch's runs of e_i e_j, e = truth - mean"),
-    "claimed": Field("batch ... node filter state other", "mean over the batch's runs of the claimed covariance"),
-    "nees": Field("batch ... node filter", "sum over the batch's runs of e' B^-1 e"),
-    "failed": Field("... node filter", "runs without a valid estimate at this step"),
-    "failed_runs": Field("node filter", "runs without a valid estimate at some step"),
-    "rmse": Field("... node filter state", "root mean square error"),
-    "deviation": Field("... node filter state", "root of the mean claimed variance"),
-    "nees_per_dimension": Field("... node filter", "mean of e' B^-1 e / n, 1 if the claim is exact"),
+    "place": ("fusion sender", "place of the sender among those of the fusion; -1: it sends nothing to it"),
+    "runs": ("batch", "number of runs in the batch"),
+    "errors": ("batch ... node filter state other", "sum over the batch's runs of e_i e_j, e = truth - mean"),
+    "claimed": ("batch ... node filter state other", "mean over the batch's runs of the claimed covariance"),
+    "nees": ("batch ... node filter", "sum over the batch's runs of e' B^-1 e"),
+    "failed": ("... node filter", "runs without a valid estimate at this step"),
+    "failed_runs": ("node filter", "runs without a valid estimate at some step"),
+    "rmse": ("... node filter state", "root mean square error"),
+    "deviation": ("... node filter state", "root of the mean claimed variance"),
+    "nees_per_dimension": ("... node filter", "mean of e' B^-1 e / n, 1 if the claim is exact"),
 }
+FIELDS = {name: VariableDescription(*parts) for name, parts in _FIELDS.items()}
 
 
 def axes_of(name: str, lead: Sequence[str]) -> list[str]:
@@ -199,8 +201,7 @@ class FilterLabels:
         """Return a dataset with a title, these fields, and names, times and units as coordinates."""
         import xarray as xr
 
-        # Fields, with their meaning in words.
-        lead = list(self.rows)
+        lead = list(self.rows)  # fields, with their meaning in words
         data = {name: (axes_of(name, lead), values, {"long_name": FIELDS[name].meaning})
                 for name, values in fields.items()}  # fmt: skip
         # Coordinates: names, time, units.
@@ -221,7 +222,7 @@ class FilterLabels:
         return xr.Dataset(data, coordinates, attributes)
 
 
-def each_filter(
+def iterate_filters(
     dataset: "xr.Dataset", names: Sequence[str], lead: Sequence[str]
 ) -> Iterator[tuple[str, str, Claim, dict[str, np.ndarray]]]:
     """Yield node, filter, claim, and copies of these fields without their axes (node, filter), of each filter there."""

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from heliograph.numerics.linalg import find_lost
+from heliograph.numerics.linalg import find_not_finite
 from heliograph.simulation.network import FUSED
 from heliograph.simulation.results.record import Record, describe_when
 
@@ -28,9 +28,9 @@ def warn_of_no_numbers(record: Record, complete: Iterable[str] = (), stacklevel:
             warnings.warn(f"{what}: no finite number {when}", stacklevel=stacklevel + 1)
     for node, filters in record.estimates.items():
         for name, estimate in filters.items():
-            bad = find_lost(np.asarray(estimate.mean), 1)
+            bad = find_not_finite(np.asarray(estimate.mean), 1)
             if estimate.claim != "none" and node != FUSED:  # there a quantizer may say that it knows no bound
-                bad |= find_lost(np.asarray(estimate.covariance), 2)
+                bad |= find_not_finite(np.asarray(estimate.covariance), 2)
             what = "mean" if estimate.claim == "none" else "covariance"
             for when in describe_when(bad):
                 warnings.warn(f"{node}/{name}: no valid {what} {when}", stacklevel=stacklevel + 1)

@@ -73,7 +73,7 @@ def draw_state(
     for number, (name, estimate) in enumerate(estimates.items()):
         mean, variance = np.asarray(estimate.mean)[run][..., i], np.asarray(estimate.covariance)[run][..., i, i]
         deviation = np.sqrt(np.where(variance >= 0, variance, np.nan))
-        shown, mean, band = part_at_wraps(time, mean, sigmas * deviation)
+        shown, mean, band = insert_gaps_at_wraps(time, mean, sigmas * deviation)
         panel.plot(shown, mean, color=colour_of(number), label=quote_for_figure(name))
         if estimate.claim != "none":
             panel.fill_between(shown, mean - band, mean + band, color=colour_of(number), alpha=0.2, linewidth=0)
@@ -81,7 +81,7 @@ def draw_state(
 
 def draw_truth(panel: "Axes", time: ArrayLike, truth: ArrayLike) -> None:
     """Draw one true state over time."""
-    panel.plot(*part_at_wraps(time, truth), color="0.25", linestyle=":", label="truth")
+    panel.plot(*insert_gaps_at_wraps(time, truth), color="0.25", linestyle=":", label="truth")
 
 
 def draw_modes(
@@ -120,7 +120,7 @@ def colour_of(number: int) -> str:
     return COLOURS[number % len(COLOURS)]
 
 
-def part_at_wraps(time: ArrayLike, mean: ArrayLike, *others: np.ndarray) -> tuple[np.ndarray, ...]:
+def insert_gaps_at_wraps(time: ArrayLike, mean: ArrayLike, *others: np.ndarray) -> tuple[np.ndarray, ...]:
     """Return what is drawn over time with a gap where an angle goes around: from near pi to near -pi, or back.
 
     Values that never leave +-pi, and of which two in a row are further apart than pi, are such an angle's.

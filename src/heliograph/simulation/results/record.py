@@ -23,7 +23,7 @@ from heliograph.simulation.results.labelled import (
     TIME,
     FilterLabels,
     check_title,
-    each_filter,
+    iterate_filters,
     modes_of,
     names_of,
     read_estimate,
@@ -265,7 +265,7 @@ class Record(Saved):
         estimated = np.flatnonzero(read_values(dataset, "estimated", lead))
         estimates: dict[str, dict[str, Estimate]] = {nodes[i]: {} for i in estimated}
         fields = ("mean", "covariance", *(["modes"] if "modes" in dataset else []))
-        for node, name, claim, values in each_filter(dataset, fields, lead):
+        for node, name, claim, values in iterate_filters(dataset, fields, lead):
             estimates[node][name] = read_estimate(dataset, claim, values)
         return cls(
             time=np.asarray(dataset[TIME].values),

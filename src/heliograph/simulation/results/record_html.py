@@ -16,7 +16,7 @@ WIDE, HIGH = 1000.0, 100.0  # the units of a drawing, which is as wide as there 
 LEAST = 1e-12  # the part of a value that is the least height of a panel
 
 
-class Trajectories(Protocol):
+class DrawableRecord(Protocol):
     """What is drawn of a record."""
 
     @property
@@ -43,11 +43,11 @@ class Trajectories(Protocol):
     def runs(self) -> int | None:
         """Return the number of Monte Carlo runs."""
 
-    def of_run(self, run: int) -> "Trajectories":
+    def of_run(self, run: int) -> "DrawableRecord":
         """Return one of the runs."""
 
 
-def draw_record(record: Trajectories) -> str:
+def draw_record(record: DrawableRecord) -> str:
     """Draw the estimates of the first node that has any: means with bands of two claimed deviations, and the truth.
 
     Args:
@@ -78,7 +78,7 @@ def draw_record(record: Trajectories) -> str:
     )
 
 
-def _make_legend(filters: Mapping[str, Estimate], record: Trajectories) -> str:
+def _make_legend(filters: Mapping[str, Estimate], record: DrawableRecord) -> str:
     """Return a line of the filters with their colours and claims, and of the truth where it is drawn."""
     entries = [
         (f"background:{colour}", f"{name} ({estimate.claim})")
@@ -93,7 +93,7 @@ def _make_legend(filters: Mapping[str, Estimate], record: Trajectories) -> str:
     return f"<div>{''.join(marks)}</div>"
 
 
-def _draw_panel(record: Trajectories, filters: Mapping[str, Estimate], state: int, chosen: np.ndarray) -> str:
+def _draw_panel(record: DrawableRecord, filters: Mapping[str, Estimate], state: int, chosen: np.ndarray) -> str:
     """Return one state: its name and last value, the range of its axis, and the drawing."""
     curves = [_read_curve(estimate, state, chosen) for estimate in filters.values()]
     truth = None if record.truth is None else np.asarray(record.truth)[chosen, state]

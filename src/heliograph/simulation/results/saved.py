@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from heliograph.disk.quoting import quote_for_file, unquote_file
-from heliograph.disk.whole_file import check_output, check_replaceable, whole_file, whole_folder
+from heliograph.disk.whole_file import check_replaceable, check_writable, whole_file, whole_folder
 from heliograph.numerics.check import fail, file_path
 from heliograph.simulation.results.labelled import check_units
 
@@ -109,7 +109,7 @@ def save(dataset: "xr.Dataset", path: str | Path) -> None:
             warnings.simplefilter("ignore")  # that the format's text does not have strings or consolidation yet
             plain.to_zarr(folder, mode="w", encoding=encoding)
         return
-    check_output(path, (NETCDF,))
+    check_writable(path, (NETCDF,))
     with whole_file(path) as partial:
         plain.to_netcdf(partial, engine="h5netcdf", encoding=encoding)
 

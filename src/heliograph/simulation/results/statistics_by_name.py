@@ -15,7 +15,7 @@ from heliograph.simulation.results.labelled import (
     TIME,
     FilterLabels,
     check_title,
-    each_filter,
+    iterate_filters,
     names_of,
     read_units,
     read_uplinks,
@@ -113,7 +113,7 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
         # Back to nodes and filters by name; of symmetric matrices the pairs i <= j.
         results: dict[str, dict[str, ErrorStatistics]] = {node: {} for node in names_of(dataset, "node")}
         sums = ("errors", "claimed", "nees", "failed", "failed_runs")
-        for node, name, claim, values in each_filter(dataset, sums, [TIME]):
+        for node, name, claim, values in iterate_filters(dataset, sums, [TIME]):
             results[node][name] = ErrorStatistics(
                 count=count.copy(),
                 pairs=values["errors"][..., *upper],

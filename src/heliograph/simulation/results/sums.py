@@ -24,7 +24,7 @@ from heliograph.simulation.results.statistics_by_name import StatisticsByName
 from heliograph.simulation.runs.over_runs import over_runs
 
 
-class Sums(NamedTuple):
+class RunSums(NamedTuple):
     """Sums over runs of all filters' estimates, which lie along one axis `part`; run r goes to batch r mod BATCHES.
 
     `runs` (batch,): their number. `pairs` (time, part, pair, batch): sums of e_i e_j, i <= j. `nees` (time, part,
@@ -78,7 +78,7 @@ class Statistics(AbstractReducer[StatisticsByName]):
         }
         return OfStep(sums=sums, ever=failed)
 
-    def summed(self, sums: OfStep, common: OfStep, count: np.ndarray) -> Sums:
+    def summed(self, sums: OfStep, common: OfStep, count: np.ndarray) -> RunSums:
         """Return the carry after all runs: filters with a covariance of their own in each run first, the others last.
 
         Args:
@@ -104,7 +104,7 @@ class Statistics(AbstractReducer[StatisticsByName]):
         steps, _, pairs, _ = totals["pairs"].shape
         by_run = [np.zeros((steps, 0, pairs, BATCHES)), *(claimed[i] for i in order if not is_shared[i])]
         of_all = [np.zeros((steps, 0, pairs)), *(claimed[i] * count.sum() for i in order if is_shared[i])]
-        return Sums(
+        return RunSums(
             runs=count,
             pairs=totals["pairs"][:, columns],
             nees=totals["nees"][:, columns],
@@ -117,11 +117,11 @@ class Statistics(AbstractReducer[StatisticsByName]):
             by_run=is_shared.count(False),
         )
 
-    def finish(self, carry: Sums, collected: PyTree, network: Network) -> StatisticsByName:
+    def finish(self, carry: RunSums, collected: PyTree, network: Network) -> StatisticsByName:
         """Make the statistics by node and filter."""
         # Sums by kind and fusion, then by name.
         all_kinds = network.kinds + network.mesh_kinds
-        count, parts = _split(carry, [(len(kind.filters), len(network.groups[kind.group])) for kind in all_kinds])
+        count, parts = _split_sums(carry, [(len(kind.filters), len(network.groups[kind.group])) for kind in all_kinds])
         of_kinds, of_fused = parts[: len(all_kinds)], parts[len(all_kinds) :]
         named = {"estimates": of_kinds, "fused": dict(zip(sorted(network.fused), of_fused, strict=True))}
         # Axis of the filters in pairs, NEES, claims, and the two of failures.
@@ -172,7 +172,7 @@ def _make_statistics(count: np.ndarray, sums: Sequence[np.ndarray], claim: Claim
     )
 
 
-def _split(carry: Sums, kinds: list[tuple[int, int]]) -> tuple[np.ndarray, list[tuple[np.ndarray, ...]]]:
+def _split_sums(carry: RunSums, kinds: list[tuple[int, int]]) -> tuple[np.ndarray, list[tuple[np.ndarray, ...]]]:
     """Return the runs by batch, and (pairs, NEES, mean claims, failures, failed runs) of each kind and fused estimate.
 
     `kinds`: numbers of filters and of nodes of each kind; estimates beyond them are fused ones. Axes (batch, time,
@@ -227,7 +227,7 @@ def error_statistics(record: Record, node: str, name: str) -> ErrorStatistics:
     sums, ever = jax.tree.map(_sum_batches, (step.sums, step.ever))
     count = np.bincount(np.arange(len(record.truth)) % BATCHES, minlength=BATCHES).astype(float)
     common = jax.tree.map(lambda leaf: False, OfStep(sums, ever))
-    count, (parts,) = _split(Statistics().summed(OfStep(sums, ever), common, count), [])
+    count, (parts,) = _split_sums(Statistics().summed(OfStep(sums, ever), common, count), [])
     sent = record.uplinks.get(name) if node == FUSED else None
     uplink = None if sent is None else Uplink(sent.nodes, sent.saturated.mean(axis=0), sent.symbols.mean(axis=0))
     return replace(_make_statistics(count, parts, estimate.claim), uplink=uplink)

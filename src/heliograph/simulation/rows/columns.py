@@ -9,13 +9,13 @@ import numpy as np
 
 from heliograph.model.estimate import Claim
 from heliograph.numerics.module import readable
-from heliograph.numerics.trees.flat import Flat
+from heliograph.numerics.trees.flat import FlatLayout
 from heliograph.numerics.types import Float, PyTree
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.results.by_name import collect_modes, split_by_name
 
 
-class JudgementAt(NamedTuple):
+class JudgementColumns(NamedTuple):
     """Columns of the parts of a judgement."""
 
     distance: int
@@ -24,7 +24,7 @@ class JudgementAt(NamedTuple):
     input: int
 
 
-class WeighedAt(NamedTuple):
+class WeighingColumns(NamedTuple):
     """Columns of what a filter that weighs made of each of its components."""
 
     value: tuple[int, ...]
@@ -32,7 +32,7 @@ class WeighedAt(NamedTuple):
     weight: tuple[int, ...]
 
 
-class TestedAt(NamedTuple):
+class TestColumns(NamedTuple):
     """Columns of a fused estimate's squared innovation, and of how many numbers arrived."""
 
     distance: int
@@ -61,9 +61,9 @@ class FilterColumns(NamedTuple):
     claim: Claim
     mean: int
     covariance: int
-    judgement: "JudgementAt | None"
-    weighed: "WeighedAt | None"
-    tested: "TestedAt | None"
+    judgement: "JudgementColumns | None"
+    weighed: "WeighingColumns | None"
+    tested: "TestColumns | None"
     modes: tuple[int, int] | None = None
 
     def probabilities(self, outputs: Float[np.ndarray, "... outputs"]) -> Float[np.ndarray, "... M"] | None:
@@ -71,14 +71,14 @@ class FilterColumns(NamedTuple):
         return None if self.modes is None else outputs[..., self.modes[0] : self.modes[1]]
 
 
-def columns_of(network: Network, outputs: Flat) -> tuple[FilterColumns, ...]:
+def find_filter_columns(network: Network, outputs: FlatLayout) -> tuple[FilterColumns, ...]:
     """Return the columns of each filter's outputs: a row of the column numbers, read by name as outputs are."""
     numbered = jax.tree.map(lambda leaf: leaf.astype(int), outputs.tree(np.arange(float(outputs.size))))
     mean = split_by_name(network, numbered, attrgetter("mean"), -3)
     covariance = split_by_name(network, numbered, attrgetter("covariance"), -4)
     judged, weighed = _collect_judgements(network, numbered), _collect_weights(network, numbered)
     modes = {name: (int(c[0]), int(c[-1]) + 1) for name, c in collect_modes(network, numbered).items()}
-    tested = {(FUSED, name): TestedAt(*map(int, columns)) for name, columns in numbered["tested"].items()}
+    tested = {(FUSED, name): TestColumns(*map(int, columns)) for name, columns in numbered["tested"].items()}
     return tuple(
         FilterColumns(
             node=node,
@@ -96,7 +96,7 @@ def columns_of(network: Network, outputs: Flat) -> tuple[FilterColumns, ...]:
     )
 
 
-def _collect_weights(network: Network, outcome: PyTree) -> dict[tuple[str, str], WeighedAt]:
+def _collect_weights(network: Network, outcome: PyTree) -> dict[tuple[str, str], WeighingColumns]:
     """Return the columns of what each filter that weighs made of its components, by node and filter."""
     parts = {
         name: [np.asarray(field)[f, i] for field in outcome["weighed"][kind]]
@@ -106,21 +106,22 @@ def _collect_weights(network: Network, outcome: PyTree) -> dict[tuple[str, str],
     centrally = outcome["weighed_centrally"].items()
     central = {(FUSED, name): list(columns) for name, columns in centrally if columns is not None}
     return {
-        name: WeighedAt(*(tuple(map(int, field)) for field in columns)) for name, columns in (parts | central).items()
+        name: WeighingColumns(*(tuple(map(int, field)) for field in columns))
+        for name, columns in (parts | central).items()
     }
 
 
-def _collect_judgements(network: Network, outcome: PyTree) -> dict[str, dict[str, JudgementAt]]:
+def _collect_judgements(network: Network, outcome: PyTree) -> dict[str, dict[str, JudgementColumns]]:
     """Return the columns of each part of a judgement, by node and filter."""
     judged = {"estimates": outcome["judged"], "fused": {}}
-    parts = [split_by_name(network, judged, partial(_read_field, i), -2) for i in range(len(JudgementAt._fields))]
+    parts = [split_by_name(network, judged, partial(_read_field, i), -2) for i in range(len(JudgementColumns._fields))]
     by_node = {
-        node: {name: JudgementAt(*(int(field[node][name]) for field in parts)) for name in filters}
+        node: {name: JudgementColumns(*(int(field[node][name]) for field in parts)) for name in filters}
         for node, filters in parts[0].items()
     }
     central = outcome["judged_centrally"]
     return by_node | {
-        FUSED: {name: JudgementAt(*(int(column) for column in columns)) for name, columns in central.items()}
+        FUSED: {name: JudgementColumns(*(int(column) for column in columns)) for name, columns in central.items()}
     }
 
 

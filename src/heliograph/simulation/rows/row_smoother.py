@@ -29,7 +29,7 @@ from heliograph.simulation.stepping import AllFilters
 NetworkSmootherStep: TypeAlias = "tuple[dict[int, SmootherStep], dict[str, SmootherStep]]"  # by kind, and by name
 
 
-class Sweep(Module):
+class BackwardSweep(Module):
     """What a sweep back over rows computes with: the filters that can be smoothed, by `kinds`, and their fusions."""
 
     network_step: NetworkStep
@@ -68,11 +68,11 @@ def _map_filters(function: Callable[..., object], steps: NetworkSmootherStep, *r
 
 
 StepOfRow: TypeAlias = "tuple[jax.Array, jax.Array]"  # a row, and a step at it or before it
-StepInto: TypeAlias = "Callable[[Sweep, RowHistory, StepOfRow], NetworkSmootherStep]"
+StepInto: TypeAlias = "Callable[[BackwardSweep, RowHistory, StepOfRow], NetworkSmootherStep]"
 
 
 @lru_cache
-def sweep_back(static: Static, dt: int | None) -> tuple[Callable[..., PyTree], Callable[..., PyTree]]:
+def make_backward_sweep(static: Static, dt: int | None) -> tuple[Callable[..., PyTree], Callable[..., PyTree]]:
     """Return (numbers, history, (begin, stop)) -> estimates after row `begin`, given the rows after it, up to `stop`.
 
     The function, and XLA's program of it.
@@ -81,12 +81,12 @@ def sweep_back(static: Static, dt: int | None) -> tuple[Callable[..., PyTree], C
     time counts steps; begin > 0.
     """
     # Continuous time: one step per row. Discrete time: also the steps between the rows.
-    step_into: StepInto = _step_into_step if dt is None else _make_step_into_row(dt)
+    step_into: StepInto = _make_smoother_step_into if dt is None else _make_step_into_row(dt)
     find_earlier = _find_earlier_step if dt is None else _find_earlier_row
 
     def run(numbers: list[jax.Array], history: RowHistory, span: jax.Array) -> PyTree:
         """Smooth rows `begin` to `stop` from the last one back; return the outputs of the first."""
-        sweep: Sweep = static.filled(numbers)
+        sweep: BackwardSweep = static.filled(numbers)
         begin, stop = span
         last = stop - 1, history.step[stop - 1]
         # Steps from the last row back to row `begin`.
@@ -116,7 +116,7 @@ def sweep_back(static: Static, dt: int | None) -> tuple[Callable[..., PyTree], C
 def _make_step_into_row(dt: int) -> StepInto:
     """Return the function that computes the smoother step into a row; `dt`: place of the time between rows in u."""
 
-    def step_into_row(sweep: Sweep, history: RowHistory, place: StepOfRow) -> NetworkSmootherStep:
+    def step_into_row(sweep: BackwardSweep, history: RowHistory, place: StepOfRow) -> NetworkSmootherStep:
         """Return the smoother step into a row from the state after the row before."""
         row, _ = place
         state, received = sweep.start(history, row - 1), history.parts(row)[0]
@@ -131,7 +131,7 @@ def _find_earlier_row(history: RowHistory, place: StepOfRow) -> StepOfRow:
     return row - 1, history.step[row - 1]
 
 
-def _step_into_step(sweep: Sweep, history: RowHistory, place: StepOfRow) -> NetworkSmootherStep:
+def _make_smoother_step_into(sweep: BackwardSweep, history: RowHistory, place: StepOfRow) -> NetworkSmootherStep:
     """Return the smoother step at step k, by way of the steps without measurements since the row before."""
     row, k = place
 
@@ -180,9 +180,9 @@ class RowSmoother:
         alone = Network(network.plant, network.nodes, central, network.relays, network.common)
         fusions = tuple(fusion for fusion in AllFilters(network).fusions if self._fuses(fusion, kinds))
         with jax.enable_x64(True):
-            self.sweep = Sweep(NetworkStep(network, AllFilters(alone, kinds)), fusions, kinds)
+            self.sweep = BackwardSweep(NetworkStep(network, AllFilters(alone, kinds)), fusions, kinds)
             self._numbers, static = cast(self.sweep)
-        self._run, self._by_xla = sweep_back(static, dt)
+        self._run, self._by_xla = make_backward_sweep(static, dt)
         self._programs = dict[tuple[int, str], Callable[[RowHistory, np.ndarray], PyTree]]()
 
     def _fuses(self, fusion: StackedFusions, kinds: tuple[int, ...]) -> bool:

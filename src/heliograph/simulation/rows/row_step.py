@@ -13,14 +13,14 @@ from heliograph.filters.remark import Remark
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.float64 import in_float64, in_haste, understood
 from heliograph.numerics.module import Module, readable
-from heliograph.numerics.trees.flat import Flat, flat_like, row_of
+from heliograph.numerics.trees.flat import FlatLayout, flat_like, row_of
 from heliograph.numerics.trees.program_text import text_of
 from heliograph.numerics.trees.static import Static, cast
 from heliograph.numerics.types import Float, PyTree
 from heliograph.simulation.description.remarks import find_remarking, list_remarks
 from heliograph.simulation.network import Network
 from heliograph.simulation.plausible_step import step_plausibly
-from heliograph.simulation.rows.columns import columns_of
+from heliograph.simulation.rows.columns import find_filter_columns
 from heliograph.simulation.rows.row_history import RowHistory
 from heliograph.simulation.stepping import AllFilters, initial_states
 
@@ -56,11 +56,11 @@ class NetworkStep(Module):
         return [received[np.array(columns, dtype=int)] for columns in self.places]  # of nodes without a sensor none
 
 
-class Layout(NamedTuple):
+class RowLayout(NamedTuple):
     """Structure of a network's step, and the columns of its rows: (state, received, inputs, step number)."""
 
     static: Static
-    state: Flat
+    state: FlatLayout
     received: int
     inputs: int
 
@@ -104,9 +104,9 @@ class RowStep:
         numbers, static = cast(NetworkStep(network, filters))
         self._shapes = tuple(_make_shape(leaf.shape, leaf.dtype) for leaf in numbers)
         self.state = flat_like(start)
-        self._layout = Layout(static, self.state, received, inputs)
+        self._layout = RowLayout(static, self.state, received, inputs)
         self.outputs = flat_like(_trace_step(self._layout, self._shapes).out_info[1])
-        self.columns = columns_of(network, self.outputs)
+        self.columns = find_filter_columns(network, self.outputs)
         self.start = np.concatenate([np.zeros(0), *(np.ravel(leaf).astype(float) for leaf in jax.tree.leaves(start))])
         # Native code with the network's numbers filled in, where it takes the step.
         self._numbers = [np.asarray(leaf) for leaf in numbers]
@@ -230,7 +230,7 @@ def _make_shape(shape: tuple[int, ...], dtype: Any) -> Any:
 
 
 @lru_cache
-def _make_step(layout: Layout) -> Any:
+def _make_step(layout: RowLayout) -> Any:
     """Return the function of one row to states and outputs, traced once for the outputs' layout, code and text."""
 
     def step(numbers: list[jax.Array], row: jax.Array) -> tuple[PyTree, PyTree]:
@@ -242,7 +242,7 @@ def _make_step(layout: Layout) -> Any:
 
 
 @lru_cache
-def _make_row_function(layout: Layout) -> Any:
+def _make_row_function(layout: RowLayout) -> Any:
     """Return the function of one row to another, the same one for layouts that are equal."""
 
     def step(numbers: list[jax.Array], row: jax.Array) -> jax.Array:
@@ -252,20 +252,20 @@ def _make_row_function(layout: Layout) -> Any:
     return step
 
 
-def _trace_step(layout: Layout, numbers: tuple[jax.ShapeDtypeStruct, ...]) -> Any:
+def _trace_step(layout: RowLayout, numbers: tuple[jax.ShapeDtypeStruct, ...]) -> Any:
     """Return the traced step of a row, which JAX holds for networks that differ in numbers alone."""
     with jax.enable_x64(True):
         return _make_step(layout).trace(list(numbers), _make_shape((layout.size,), np.float64))
 
 
 @lru_cache(TEXTS)
-def _text(layout: Layout, numbers: tuple[jax.ShapeDtypeStruct, ...]) -> str:
+def _text(layout: RowLayout, numbers: tuple[jax.ShapeDtypeStruct, ...]) -> str:
     """Return the step as text, once for networks that differ in numbers alone."""
     return text_of(_trace_step(layout, numbers).jaxpr)
 
 
 @lru_cache
-def _compile_xla(layout: Layout, outputs: Flat, width: int, together: int, is_long: bool) -> PyTree:
+def _compile_xla(layout: RowLayout, outputs: FlatLayout, width: int, together: int, is_long: bool) -> PyTree:
     """Return XLA's program (numbers, rows, turns) -> stepped rows: a loop, of whose turns each steps `together` rows.
 
     The number of turns is an argument, so that one program serves any number of rows up to `width`. `is_long`: rows so

@@ -1,18 +1,18 @@
 """Names that other folders take; the package loads them when first used."""
 
-from .by_run import each_run as each_run
+from .by_run import apply_to_each_run as apply_to_each_run
 from .by_run import read_by as read_by
 from .by_run import simulate_trajectories as simulate_trajectories
 from .compilation_cache import keep_compilations as keep_compilations
 from .lanes import LANES as LANES
 from .lanes import RunLanes as RunLanes
-from .lanes import Shared as Shared
+from .lanes import SharedResult as SharedResult
 from .lanes import added as added
 from .lanes import advance_in_chunks as advance_in_chunks
 from .lanes import batch_counts as batch_counts
 from .lanes import is_shared as is_shared
 from .lanes import one_processor as one_processor
-from .memory import Needed as Needed
+from .memory import NeededMemory as NeededMemory
 from .memory import check_memory as check_memory
 from .memory import explain_out_of_memory as explain_out_of_memory
 from .memory import size_of as size_of

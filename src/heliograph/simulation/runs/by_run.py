@@ -52,7 +52,7 @@ def simulate_trajectories(
     return jax.tree.unflatten(jax.tree.structure(shape[1]), outputs)
 
 
-def each_run(function: Callable[[PyTree], PyTree], values: PyTree) -> PyTree:
+def apply_to_each_run(function: Callable[[PyTree], PyTree], values: PyTree) -> PyTree:
     """Apply a function of one run's values to all runs: (run, ...), or (1, ...) where they share it, in and out.
 
     A result that depends on no value of single runs is computed once.

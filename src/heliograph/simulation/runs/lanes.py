@@ -97,7 +97,7 @@ class RunLanes:
             return to_numpy(reduce(added, lanes))
 
 
-class Shared(NamedTuple):
+class SharedResult(NamedTuple):
     """A result that all runs share, among sums over runs."""
 
     value: PyTree
@@ -105,7 +105,7 @@ class Shared(NamedTuple):
 
 def is_shared(leaf: PyTree) -> bool:
     """Test whether a part of the sums is common to all runs."""
-    return isinstance(leaf, Shared)
+    return isinstance(leaf, SharedResult)
 
 
 @partial(jax.jit, donate_argnums=0)

@@ -17,7 +17,7 @@ LESS = "a shorter horizon, or fewer nodes or filters at once"
 FEWER = f"fewer runs at once (`first_run` goes on from there), keep=Statistics(), or {LESS}"
 
 
-class Needed(NamedTuple):
+class NeededMemory(NamedTuple):
     """Bytes that runs hold at the same time.
 
     `collected` of single runs, `sums` over runs by step and batch, and `trajectories` of the runs in flight.
@@ -46,7 +46,7 @@ def find_available_memory() -> float | None:
         return None
 
 
-def check_memory(needed: Needed, runs: int, horizon: int) -> None:
+def check_memory(needed: NeededMemory, runs: int, horizon: int) -> None:
     """Refuse runs that need more memory than there is.
 
     Raises:

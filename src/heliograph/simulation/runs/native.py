@@ -23,10 +23,10 @@ from heliograph.simulation.network import Network
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Result
 from heliograph.simulation.results.statistics import BATCHES
 from heliograph.simulation.runs.lanes import LANES, Progress, advance_in_chunks
-from heliograph.simulation.runs.memory import Needed, check_memory
-from heliograph.simulation.runs.native_lanes import Native, NativeLanes
+from heliograph.simulation.runs.memory import NeededMemory, check_memory
+from heliograph.simulation.runs.native_lanes import NativeLanes, NativeProgram
 from heliograph.simulation.runs.node_parts import NODES, build_world, count_parts, is_apart, split_nodes
-from heliograph.simulation.smoothed import Recorded, SmoothedPart, Smoother, finish, reduce_run
+from heliograph.simulation.smoothed import NetworkSmoother, ReducedRuns, SmoothedPart, finish_result, reduce_run
 from heliograph.simulation.world import World
 from straightline import Unsupported, accumulate
 
@@ -41,10 +41,10 @@ def compile_runs(
     key: jax.Array,
     reducer: AbstractReducer[Any],
     runs: int,
-    later: Smoother | None = None,
+    later: NetworkSmoother | None = None,
     parts: int = 1,
     precision: Precision = "float64",
-) -> Native:
+) -> NativeProgram:
     """Compile the native code of a network's runs, of which a reducer collects the results of its `of_step`.
 
     `runs`: how many will follow. With `later`, the results are a pair: of filtered and of smoothed estimates; and sums
@@ -70,11 +70,11 @@ def compile_runs(
     lanes = min(LANES, -(-runs // BLOCK))
     collected, sums, variables = program.memory(runs, lanes, min(lanes, os.cpu_count() or 1))
     collected *= 2 if precision == "float32" else 1  # results are handed back in double precision
-    check_memory(Needed(parts * collected, sums, variables), runs, len(inputs))
-    return Native(program.begin([key, *arrays, *others], runs), form)
+    check_memory(NeededMemory(parts * collected, sums, variables), runs, len(inputs))
+    return NativeProgram(program.begin([key, *arrays, *others], runs), form)
 
 
-class _Known:
+class _KnownEntries:
     """Knowledge of an array when a program is made: its shape and type, zeros and ones, and all entries of integers."""
 
     def __init__(self, shape: tuple[int, ...], kind: str, known: bytes, values: bytes):
@@ -85,10 +85,10 @@ class _Known:
         return hash(self.key)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Known) and self.key == other.key
+        return isinstance(other, _KnownEntries) and self.key == other.key
 
     @classmethod
-    def of(cls, array: np.ndarray) -> "_Known":
+    def of(cls, array: np.ndarray) -> "_KnownEntries":
         """Describe an array: shape, type, which of its entries are known to a program, and their values."""
         known = _is_plain(array) if array.dtype.kind == "f" else np.full(array.shape, not _is_given(array))
         if array.size > FEW and _is_given(array):
@@ -127,7 +127,7 @@ class _Structure(NamedTuple):
     tree: Any
     fixed: tuple[Any, ...]
     is_fixed: tuple[bool, ...]
-    known: tuple[_Known, ...]
+    known: tuple[_KnownEntries, ...]
 
     def restore(self, arrays: Iterator[Any]) -> PyTree:
         """Return the tree with the next arrays in their places."""
@@ -141,7 +141,7 @@ def _describe(tree: PyTree) -> tuple[_Structure, tuple[np.ndarray, ...]]:
     is_fixed = tuple(not eqx.is_array(leaf) for leaf in leaves)
     fixed = tuple(leaf if f else None for leaf, f in zip(leaves, is_fixed, strict=True))
     arrays = tuple(np.asarray(leaf) for leaf, f in zip(leaves, is_fixed, strict=True) if not f)
-    return _Structure(structure, fixed, is_fixed, tuple(map(_Known.of, arrays))), arrays
+    return _Structure(structure, fixed, is_fixed, tuple(map(_KnownEntries.of, arrays))), arrays
 
 
 @cache_by_object
@@ -178,7 +178,7 @@ def _compile_program(of_world: _Structure, of_rest: _Structure, precision: Preci
         world, (later, inputs, reducer) = of_world.restore(items), of_rest.restore(items)
         run_key, u = jax.random.fold_in(key, number), jnp.asarray(inputs)
         if later is None:
-            reduced = _run(world, u, reducer, run_key)
+            reduced = _simulate_run(world, u, reducer, run_key)
         else:
             reduced = _collect_smoothed(world, later, u, reducer, run_key)
         summed = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=float), (reduced.sums, reduced.ever))
@@ -199,7 +199,7 @@ def _step_world(world: World, state: PyTree, key: jax.Array, row: tuple[jax.Arra
     return world.step(state, key, row)
 
 
-def _run(world: World, inputs: jax.Array, reducer: AbstractReducer[Any], key: jax.Array) -> OfStep:
+def _simulate_run(world: World, inputs: jax.Array, reducer: AbstractReducer[Any], key: jax.Array) -> OfStep:
     """Collect the results of a run: stacked over time, but for flags that hold if true at any step."""
 
     def step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, OfStep]:
@@ -212,7 +212,7 @@ def _run(world: World, inputs: jax.Array, reducer: AbstractReducer[Any], key: ja
 
 
 def _collect_smoothed(
-    world: World, later: Smoother, inputs: jax.Array, reducer: AbstractReducer[Any], key: jax.Array
+    world: World, later: NetworkSmoother, inputs: jax.Array, reducer: AbstractReducer[Any], key: jax.Array
 ) -> OfStep:
     """Collect the results of a run's filtered and smoothed estimates, from the whole run with its smoother steps."""
 
@@ -244,10 +244,12 @@ def simulate_natively(
     # Smoothing, few nodes, or nodes that share something: one program.
     is_whole = smoothing is not None or len(network.names) <= NODES or not is_apart(network)
     if is_whole or type(reducer).joined is AbstractReducer.joined:  # that of the base class cannot join parts
-        code = try_native(lambda: code_of_network(network, inputs, key, reducer, runs, smoothing, precision=precision))
+        code = try_native(
+            lambda: compile_network_runs(network, inputs, key, reducer, runs, smoothing, precision=precision)
+        )
         if code is None:
             return None
-        return finish(reducer, _run_chunks(code, first_run, runs, chunk, progress), network, smoothing)
+        return finish_result(reducer, _run_chunks(code, first_run, runs, chunk, progress), network, smoothing)
     # Many independent nodes: one program for a few of them, with other numbers.
     results, parts, memory = [], count_parts(network), list[list[np.ndarray]]()
     for number, (some, world) in enumerate(split_nodes(network)):
@@ -262,11 +264,11 @@ def simulate_natively(
                 progress((number * total + done) // parts, total)  # noqa: B023
 
         recorded = _run_chunks(code, first_run, runs, chunk, show_progress, memory)
-        results.append(finish(reducer, recorded, some, None))
+        results.append(finish_result(reducer, recorded, some, None))
     return reducer.joined(results, network)
 
 
-def code_of_network(
+def compile_network_runs(
     network: Network,
     inputs: np.ndarray,
     key: jax.Array,
@@ -274,7 +276,7 @@ def code_of_network(
     runs: int,
     smoothing: SmoothedPart | None = None,
     precision: Precision = "float64",
-) -> Native:
+) -> NativeProgram:
     """Make the native code of a network's runs, as `compile_runs` of its world; a part of it may be smoothed."""
     world = build_world(network, None if smoothing is None else smoothing.kinds)
     later = None if smoothing is None else smoothing.smoother(world.filters)
@@ -282,13 +284,13 @@ def code_of_network(
 
 
 def _run_chunks(
-    code: Native,
+    code: NativeProgram,
     first_run: int,
     runs: int,
     chunk: int,
     progress: Progress | None,
     memory: list[list[np.ndarray]] | None = None,
-) -> Recorded:
+) -> ReducedRuns:
     """Return the sums over all runs, and what is collected of them, chunk by chunk; `memory` as of `NativeLanes`."""
     lanes = NativeLanes(code, first_run, first_run + runs, [] if memory is None else memory)
     parts = advance_in_chunks(lanes.advance, LANES, False, (runs, chunk), progress)

@@ -10,10 +10,10 @@ from heliograph.engine.choice import threads
 from heliograph.engine.limits import BLOCK
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.runs.lanes import LANES, batch_counts
-from heliograph.simulation.smoothed import Recorded
+from heliograph.simulation.smoothed import ReducedRuns
 
 
-class Native(NamedTuple):
+class NativeProgram(NamedTuple):
     """A program begun with a network's numbers; `tree` is the structure of what is collected of a run."""
 
     begun: Any
@@ -27,7 +27,7 @@ class NativeLanes:
     those of a few nodes and runs would take as long as to compute them.
     """
 
-    def __init__(self, code: Native, first_run: int, stop: int, memory: list[list[np.ndarray]]):
+    def __init__(self, code: NativeProgram, first_run: int, stop: int, memory: list[list[np.ndarray]]):
         self.code, self.first_run, self.stop, self.memory = code, first_run, stop, memory
         self.sums: list[list[np.ndarray] | None] = [None] * LANES
 
@@ -56,7 +56,7 @@ class NativeLanes:
         runs = (self.first_run + BLOCK * blocks[:, None] + np.arange(BLOCK)).ravel()
         return runs[runs < self.stop]
 
-    def total(self) -> Recorded:
+    def total(self) -> ReducedRuns:
         """Return the sums over all runs, by batch, and give their memory back."""
         code = self.code.begun
         used = [sums for sums in self.sums if sums is not None]
@@ -69,7 +69,7 @@ class NativeLanes:
             leaves.append(by_batch if fixed is None else to_double(fixed))
             common.append(fixed is not None)
         sums, same = (jax.tree.unflatten(self.code.tree, x) for x in (leaves, common))
-        return Recorded(sums, same, batch_counts(self.first_run, self.stop), None)
+        return ReducedRuns(sums, same, batch_counts(self.first_run, self.stop), None)
 
     def joined(self, parts: Sequence[list[np.ndarray | None]]) -> PyTree:
         """Return the collected results of all runs, (run, ...); a view of one where they share it."""

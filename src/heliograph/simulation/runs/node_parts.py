@@ -13,7 +13,7 @@ from heliograph.numerics.frozen import FrozenMapping
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.memory import drop_identities
-from heliograph.simulation.index import Kind, places_of
+from heliograph.simulation.index import FilterKind, find_estimate_places
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.runs.side_by_side import StackedFilters
@@ -70,7 +70,7 @@ def _on_host(leaf: PyTree) -> PyTree:
 def _select_nodes(network: Network, names: tuple[str, ...]) -> Network:
     """Return the network of some nodes of one structure, unchecked, since the whole network is."""
     group = next(g for g, members in enumerate(network.groups) if names[0] in members)
-    kinds = tuple(Kind(0, kind.filters) for kind in network.kinds if kind.group == group)
+    kinds = tuple(FilterKind(0, kind.filters) for kind in network.kinds if kind.group == group)
     size = network.nodes[names[0]].received
     claimed = {(name, f): network.claimed[name, f] for name in names for f in network.nodes[name].filters}
     return _with_fields(
@@ -79,7 +79,7 @@ def _select_nodes(network: Network, names: tuple[str, ...]) -> Network:
         names=names,
         groups=(names,),
         kinds=kinds,
-        places=FrozenMapping(places_of((names,), kinds)),
+        places=FrozenMapping(find_estimate_places((names,), kinds)),
         rows=FrozenMapping({name: range(i * size, (i + 1) * size) for i, name in enumerate(names)}),
         claimed=FrozenMapping(claimed),
     )
@@ -102,11 +102,11 @@ def _select_rows(world: World, nodes: slice) -> World:
         return leaf[nodes] if eqx.is_array(leaf) else leaf
 
     medium = SeparateChannels(jax.tree.map(select, world.medium.groups))
-    alike = tuple(_select_of_kind(stacked, nodes) for stacked in world.filters.alike)
+    alike = tuple(_select_filters(stacked, nodes) for stacked in world.filters.alike)
     return World(world.plant, medium, _with_fields(world.filters, alike=alike))
 
 
-def _select_of_kind(stacked: StackedFilters, nodes: slice) -> StackedFilters:
+def _select_filters(stacked: StackedFilters, nodes: slice) -> StackedFilters:
     """Return the filters of some nodes; they are stacked filter by filter, node after node for each."""
     count = len(range(*nodes.indices(stacked.nodes)))
 

@@ -8,7 +8,7 @@ from heliograph.model.channel import Channel
 from heliograph.model.over_time import stack
 from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import AnySensor, without_output_names
-from heliograph.model.words.route import in_bits, reader_of
+from heliograph.model.words.route import reader_of, rewrite_in_bits
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.memory import drop_names, memories
 from heliograph.simulation.network import LOCAL, Network
@@ -18,12 +18,12 @@ from heliograph.simulation.transmission.reception import (
     AbstractMedium,
     CommonChannel,
     NodeGroup,
+    NoSensor,
     SeparateChannels,
-    Silent,
-    Slots,
+    SlottedRelays,
     find_hops_with_memory,
 )
-from heliograph.simulation.transmission.shared_fading import memory_places
+from heliograph.simulation.transmission.shared_fading import number_memories
 
 
 def make_reception(network: Network) -> AbstractMedium:
@@ -36,22 +36,22 @@ def make_reception(network: Network) -> AbstractMedium:
         return CommonChannel(network.common.sensor, network.common.channel, received)
     # A sensor and a channel for each node, stacked by group.
     nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
-    memories_of = memory_places({name: (node.sensor, node.channel) for name, node in nodes.items()}, network.plant)
+    memories_of = number_memories({name: (node.sensor, node.channel) for name, node in nodes.items()}, network.plant)
     groups = [[name for name in names if name in nodes] for names in network.groups]
     return SeparateChannels(tuple(
-        _stack_group(network, {name: nodes[name] for name in sensing}, memories_of) if sensing else Silent(len(names))
+        _stack_group(network, {name: nodes[name] for name in sensing}, memories_of) if sensing else NoSensor(len(names))
         for sensing, names in zip(groups, network.groups, strict=True)
     ))  # fmt: skip
 
 
-def _make_slots(network: Network, relays: RelayNetwork) -> Slots:
+def _make_slots(network: Network, relays: RelayNetwork) -> SlottedRelays:
     """Build the transmission through relays that send in slots."""
     listeners = {name: i for i, name in enumerate(relays.filters)}
-    return Slots(
+    return SlottedRelays(
         relays=relays,
         estimates_at=tuple(network.places[name, LOCAL] for name in relays.relays),
         groups=tuple(tuple(listeners[name] for name in names) for names in network.groups),
-        memories=memory_places({name: hop for name, (_, _, _, hop) in find_hops_with_memory(relays).items()}),
+        memories=number_memories({name: hop for name, (_, _, _, hop) in find_hops_with_memory(relays).items()}),
     )
 
 
@@ -89,7 +89,7 @@ def _stack_group(network: Network, nodes: Mapping[str, Node], memories_of: Mappi
 
 def _carrying_channel(node: Node) -> Channel:
     """Return the channel of the numbers by which a node's signal is carried: its words' bits where it sends words."""
-    return node.channel if node.encoder is None else in_bits(node.encoder, node.channel)
+    return node.channel if node.encoder is None else rewrite_in_bits(node.encoder, node.channel)
 
 
 def _split_places(observed: tuple[AnySensor, Channel], places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

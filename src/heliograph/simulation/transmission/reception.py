@@ -18,15 +18,15 @@ from heliograph.model.over_time import OverTime, at, first, over_time, structure
 from heliograph.model.relays import SENSOR as SENDER
 from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import AbstractSensor, AnySensor
-from heliograph.model.trigger import AbstractTrigger, Sender
-from heliograph.model.words.encoder import Reader, Words
+from heliograph.model.trigger import AbstractTrigger, SenderState
+from heliograph.model.words.encoder import WordReader, Words
 from heliograph.numerics.angle import wrap_angles
 from heliograph.numerics.module import Module, unwritten
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.memory import condition_on_memories
 from heliograph.simulation.random_keys import DITHER, SENSOR, TRIGGER, checksum, draw_key
 from heliograph.simulation.runs.side_by_side import map_all
-from heliograph.simulation.transmission.shared_fading import deliver, move_modes, start, start_modes
+from heliograph.simulation.transmission.shared_fading import deliver_signal, move_modes, start, start_modes
 
 Measurements = tuple[jax.Array, ...]  # (node, received) of each group
 
@@ -72,10 +72,10 @@ class NodeGroup(Module):
     trigger: AbstractTrigger | None
     encoder: Words | None
     informed_at: tuple[int, int] | None = eqx.field(static=True)
-    reader: Reader | None = eqx.field(static=True)
+    reader: WordReader | None = eqx.field(static=True)
 
 
-class Silent(Module):
+class NoSensor(Module):
     """Nodes without a sensor."""
 
     count: int = eqx.field(static=True)
@@ -87,14 +87,14 @@ class LinkState(NamedTuple):
 
     memory: PyTree
     feed_back: jax.Array | None
-    sender: Sender | None = None
+    sender: SenderState | None = None
     modes: tuple[jax.Array, ...] = ()  # of the sensor
 
 
 class SeparateChannels(AbstractMedium):
     """Nodes with a sensor and a channel each."""
 
-    groups: tuple[NodeGroup | Silent, ...]
+    groups: tuple[NodeGroup | NoSensor, ...]
 
     def init(self, key: jax.Array) -> PyTree:
         """Return states of the channels and of the feedback, by group, with a leading node axis."""
@@ -108,7 +108,7 @@ class SeparateChannels(AbstractMedium):
             return LinkState(start(group.channel, key, group.checksums, group.memories), feed_back, sender, modes)
 
         return tuple(
-            () if isinstance(group, Silent) else map_all(start_node, len(group.checksums))(group)
+            () if isinstance(group, NoSensor) else map_all(start_node, len(group.checksums))(group)
             for group in self.groups
         )
 
@@ -127,7 +127,7 @@ class SeparateChannels(AbstractMedium):
                 reference = group.reference_filter.reference(link.feed_back, u, k)
             if isinstance(group.reference_filter, FedBackFilter) and reference is not None:
                 y = y - reference
-            y, z, memory = _send(group, link.memory, y, key, k)
+            y, z, memory = _send_through_channel(group, link.memory, y, key, k)
             if group.trigger is None or link.sender is None:
                 return LinkState(memory, link.feed_back, modes=modes), z
             # The sender decides, by its own reference or the filter's prediction.
@@ -138,9 +138,9 @@ class SeparateChannels(AbstractMedium):
             sender, z = group.trigger.transmit(sender, y, z, drawn, k)
             return LinkState(memory, link.feed_back, sender, modes), z
 
-        def receive_group(group: NodeGroup | Silent, link: PyTree) -> tuple[PyTree, jax.Array]:
+        def receive_group(group: NodeGroup | NoSensor, link: PyTree) -> tuple[PyTree, jax.Array]:
             """Return the links of one group after the step, and what its nodes receive."""
-            if isinstance(group, Silent):
+            if isinstance(group, NoSensor):
                 return link, jnp.zeros((group.count, 0))
             return cast(tuple[PyTree, jax.Array], map_all(receive_one, len(group.checksums))(group, link))
 
@@ -150,7 +150,7 @@ class SeparateChannels(AbstractMedium):
     def feed_back(self, state: PyTree, estimates: Sequence[Estimate]) -> PyTree:
         """Feed the present estimate of each filter back to its sensor."""
 
-        def feed_group(group: NodeGroup | Silent, link: PyTree) -> PyTree:
+        def feed_group(group: NodeGroup | NoSensor, link: PyTree) -> PyTree:
             if group.informed_at is None:
                 return link
             kind, f = group.informed_at
@@ -164,15 +164,15 @@ class SeparateChannels(AbstractMedium):
         return {str(g): link.sender.last for g, link in links if link.sender is not None}
 
 
-def _send(
+def _send_through_channel(
     group: NodeGroup, memory: PyTree, y: jax.Array, key: jax.Array, k: jax.Array
 ) -> tuple[jax.Array, jax.Array, PyTree]:
     """Send y, or its words, through the channel: return what was sent, what is received, and the channel's memory."""
     if group.encoder is None or group.reader is None:
-        memory, z = deliver(group.channel, memory, y, key, k, group.checksums, group.memories)
+        memory, z = deliver_signal(group.channel, memory, y, key, k, group.checksums, group.memories)
         return y, z, memory
     words, numbers = group.encoder.send(y, draw_key(key, k, group.checksums, DITHER))
-    memory, received = deliver(group.channel, memory, numbers, key, k, group.checksums, group.memories)
+    memory, received = deliver_signal(group.channel, memory, numbers, key, k, group.checksums, group.memories)
     return words, group.reader.read(group.encoder, len(y), received), memory
 
 
@@ -203,18 +203,18 @@ class CommonChannel(AbstractMedium):
         """Measure x and deliver through the channel."""
         sensor, source = at(self.sensor, k), checksum(SENDER)
         y = measure(sensor, x, draw_key(key, k, source, SENSOR))
-        state, z = deliver(self.channel, state, y, key, k, source, ())
+        state, z = deliver_signal(self.channel, state, y, key, k, source, ())
         return state, tuple(z[rows] for rows in self.rows)
 
 
-class Relayed(NamedTuple):
+class RelayStates(NamedTuple):
     """Estimates that the relays will send, (relay, n), and the states of the hops with memory."""
 
     estimates: jax.Array
     hops: dict[str, PyTree]
 
 
-class Slots(AbstractMedium):
+class SlottedRelays(AbstractMedium):
     """Relays in turn: each sends C s with its estimate s of the step before; slots of one structure share a branch.
 
     A hop with memory moves on at every step, used or not; the same pair in another slot is another hop.
@@ -227,18 +227,18 @@ class Slots(AbstractMedium):
     groups: tuple[tuple[int, ...], ...] = eqx.field(static=True)  # listeners of each group
     memories: dict[str, np.ndarray]  # places of the memories of each hop that has some
 
-    def init(self, key: jax.Array) -> Relayed:
+    def init(self, key: jax.Array) -> RelayStates:
         """Return the initial mean as every relay's estimate, and the hops' initial states."""
         mean = jnp.asarray(at(self.relays.plant, 0).initial_mean)
         hops = {
             name: start(hop, key, checksum(f"{sender} to {listener}"), self.memories[name])
             for name, (_, listener, sender, hop) in find_hops_with_memory(self.relays).items()
         }
-        return Relayed(jnp.tile(mean, (len(self.estimates_at), 1)), hops)
+        return RelayStates(jnp.tile(mean, (len(self.estimates_at), 1)), hops)
 
     def receive(
-        self, state: Relayed, x: jax.Array, u: jax.Array, key: jax.Array, k: jax.Array
-    ) -> tuple[Relayed, Measurements]:
+        self, state: RelayStates, x: jax.Array, u: jax.Array, key: jax.Array, k: jax.Array
+    ) -> tuple[RelayStates, Measurements]:
         """Sum the hops of this step's slot, at each listener."""
         # Signals: of the sensor, and C s of each relay.
         sensor = at(self.relays.sensor, k)
@@ -250,15 +250,15 @@ class Slots(AbstractMedium):
         hops, slot = {}, k % len(self.relays.slots)
         for name, (number, listener, sender, hop) in find_hops_with_memory(self.relays).items():
             source = checksum(f"{sender} to {listener}")
-            hops[name], z = deliver(hop, state.hops[name], sent[sender], key, k, source, self.memories[name])
+            hops[name], z = deliver_signal(hop, state.hops[name], sent[sender], key, k, source, self.memories[name])
             received[listener] = received[listener] + jnp.where(slot == number, z, 0.0)
         order = [received[name] for name in self.relays.filters]
-        return Relayed(state.estimates, hops), tuple(jnp.stack([order[i] for i in group]) for group in self.groups)
+        return RelayStates(state.estimates, hops), tuple(jnp.stack([order[i] for i in group]) for group in self.groups)
 
-    def feed_back(self, state: Relayed, estimates: Sequence[Estimate]) -> Relayed:
+    def feed_back(self, state: RelayStates, estimates: Sequence[Estimate]) -> RelayStates:
         """Store the relays' estimates, to be sent at the next step."""
         means = [estimates[kind].mean[f, i] for kind, f, i in self.estimates_at]
-        return Relayed(jnp.stack(means) if means else state.estimates, state.hops)
+        return RelayStates(jnp.stack(means) if means else state.estimates, state.hops)
 
     def _sum_without_memory(self, k: jax.Array, sent: dict[str, jax.Array], key: jax.Array) -> dict[str, jax.Array]:
         """Return the sum at each listener through hops without memory; NaN where nobody transmits to it."""
@@ -310,7 +310,7 @@ def _receive_sum(
 ) -> jax.Array:
     """Return the sum of what arrives at a listener from all its senders; NaN where nobody sends to it."""
     parts = [
-        deliver(hop, (), sent[sender], key, k, checksum(f"{sender} to {listener}"), ())[1]
+        deliver_signal(hop, (), sent[sender], key, k, checksum(f"{sender} to {listener}"), ())[1]
         for sender, hop in hops.items()
         if not first(hop).remembers
     ]

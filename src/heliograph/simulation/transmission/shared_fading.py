@@ -33,7 +33,7 @@ Places = jax.Array | np.ndarray | tuple[()]  # uint32, one for each memory of a 
 PLANT = "plant"  # whose memories others may share, with a name or without
 
 
-def memory_places(channels: Mapping[str, PyTree], plant: PyTree = ()) -> dict[str, np.ndarray]:
+def number_memories(channels: Mapping[str, PyTree], plant: PyTree = ()) -> dict[str, np.ndarray]:
     """Return by channel the numbers that seed its memories' draws: equal ones for memories that are shared.
 
     They come from the memories' names, or from the channel's where these have none. A channel may be any tree of
@@ -81,7 +81,7 @@ class ChannelGroup(Module):
 
 def channel_groups(channels: Mapping[str, Channel]) -> tuple[ChannelGroup, ...]:
     """Return the channels by structure, those of one stacked with a row for each name; names of memories aside."""
-    listed, memories = list(channels.values()), list(memory_places(channels).values())
+    listed, memories = list(channels.values()), list(number_memories(channels).values())
     checksums = np.array([checksum(name) for name in channels], dtype=np.uint32)
     # Rows of each structure's channels by their identity: one object under many names is stacked once.
     unnamed = {key: drop_names(channel) for key, channel in {id(c): c for c in listed}.items()}
@@ -107,7 +107,7 @@ def channel_groups(channels: Mapping[str, Channel]) -> tuple[ChannelGroup, ...]:
     return tuple(groups)
 
 
-class Late(NamedTuple):
+class LateChannelState(NamedTuple):
     """State of a late channel: of the `channel` itself, and the `line` of signals sent before, the last first."""
 
     channel: PyTree
@@ -119,7 +119,7 @@ def start(channel: Channel, key: jax.Array, source: Number, shared: Places) -> P
     link, link_key = at(channel, 0), draw_key(key, 0, source, CHANNEL_START)
     keys = [draw_key(key, 0, memory, MEMORY_START) for memory in shared]
     state = init_with_shared_memories(link, link_key, keys) if len(shared) else link.init(link_key)
-    return Late(state, jnp.zeros(link.past * signal_size(link))) if link.past else state
+    return LateChannelState(state, jnp.zeros(link.past * signal_size(link))) if link.past else state
 
 
 def start_modes(models: PyTree, key: jax.Array, shared: Places) -> tuple[jax.Array, ...]:
@@ -137,7 +137,7 @@ def move_modes(
     return tuple(m.move(state, draw_key(key, k, place, MEMORY)) for m, state, place in moves)
 
 
-def deliver(
+def deliver_signal(
     channel: Channel, state: PyTree, y: jax.Array, key: jax.Array, k: jax.Array, source: Number, shared: Places
 ) -> tuple[PyTree, jax.Array]:
     """Draw the channel at step k and apply it to y, a late one to past signals too; return next state and output.
@@ -148,7 +148,7 @@ def deliver(
     if link.past:
         line = jnp.concatenate([y, state.line])
         after, h = _draw_link(link, state.channel, key, k, link_key, shared)
-        return Late(after, line[: -len(y)]), apply(h, line)
+        return LateChannelState(after, line[: -len(y)]), apply(h, line)
     state, h = _draw_link(link, state, key, k, link_key, shared)
     return state, apply(h, y)
 
