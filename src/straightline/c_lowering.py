@@ -25,7 +25,7 @@ VIEWS = frozenset(
 )
 
 
-class FiniteGraph(Graph):
+class ZeroFoldingGraph(Graph):
     """A graph that also simplifies products of zero with numbers that depend on finite `buffers` only.
 
     Another buffer may have NaN for what is missing: a number that depends on it counts as finite only after a
@@ -62,11 +62,11 @@ class FiniteGraph(Graph):
 
 
 class CLowering(Lowering):
-    """Lowering into a `FiniteGraph`: written out, with known arrays as tables that a step can index."""
+    """Lowering into a `ZeroFoldingGraph`: written out, with known arrays as tables that a step can index."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.graph: FiniteGraph = FiniteGraph()
+        self.graph: ZeroFoldingGraph = ZeroFoldingGraph()
 
     def equation(self, equation: JaxprEqn, inputs: list[Value]) -> Sequence[Value]:
         """Lower one operation; arithmetic is written out unless its arrays are too long."""
@@ -86,7 +86,7 @@ class CLowering(Lowering):
 
 def lower_for_c(
     program: ClosedJaxpr, finite: Collection[int], symmetric: Collection[int], short: bool = False
-) -> tuple[FiniteGraph, list[Buffer], list[np.ndarray]]:
+) -> tuple[ZeroFoldingGraph, list[Buffer], list[np.ndarray]]:
     """Return a traced program's graph, a buffer for each argument and the nodes of each result.
 
     `finite` arguments have no NaN; of `symmetric` ones the upper triangle alone is read. `short`: each loop stays one.

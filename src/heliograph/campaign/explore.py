@@ -161,7 +161,7 @@ NEES = PlotColumn("nees_per_dimension", "NEES / dim", "nees_error", 1.0)
 Look: TypeAlias = Callable[[Sequence[int], Sequence[int]], list[StateScore]]  # into the store: settings, steps
 
 
-def explore_results(results: str | Path, out: str | Path) -> Path:
+def write_explorer(results: str | Path, out: str | Path) -> Path:
     """Write out/explore.html, one self-contained page of the campaign in the folder `results`; return its path.
 
     Args:

@@ -38,9 +38,9 @@ def explore(
     out: Annotated[Path, path_option("Folder for explore.html.")],
 ) -> None:
     """Make one page of a campaign's results, to choose axes, settings, nodes and filters in; it works offline."""
-    from heliograph.campaign.explore import explore_results
+    from heliograph.campaign.explore import write_explorer
     from heliograph.disk.whole_file import check_folder_writable
 
     check_folder_writable(out)
-    page = explore_results(results, out)
+    page = write_explorer(results, out)
     rich.console.Console().print(f"Page: {page}", soft_wrap=True, highlight=False, markup=False)

@@ -53,7 +53,7 @@ def lock_folder(folder: Path) -> Iterator[bool]:
                 yield False
                 return
             # The path must still name the locked file: a holder before us may have removed the one that we opened.
-            if _names_open_file(path, handle):
+            if _is_path_of_handle(path, handle):
                 break
             os.close(handle)
         try:
@@ -67,7 +67,7 @@ def lock_folder(folder: Path) -> Iterator[bool]:
                 missing.rmdir()
 
 
-def _names_open_file(path: Path, handle: int) -> bool:
+def _is_path_of_handle(path: Path, handle: int) -> bool:
     """Return whether a path is that of an open file."""
     with suppress(FileNotFoundError):
         other = os.open(path, os.O_RDONLY)

@@ -262,7 +262,7 @@ class AbstractFilter(Module):
         """
         return self
 
-    def as_large_as(self, others: Sequence["AbstractFilter"]) -> "AbstractFilter":
+    def with_room_for_heartbeats_of(self, others: Sequence["AbstractFilter"]) -> "AbstractFilter":
         """Return the same filter with arrays as long as the longest of the others, so that one program steps all."""
         return self
 

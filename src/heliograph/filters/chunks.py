@@ -309,7 +309,7 @@ def _scan_all_chunks(recursion: Recursion, start: PyTree, rows: PyTree, programs
         joined = join_results(programs.settled, parts, [False, False, True, True, True, False])
         return None if joined is None else (settled.repeated(joined[0]), programs.complete(settled, joined[1]))
 
-    results = scan_chunks(begun, scan, scan_means)
+    results = scan_settled_by_means(begun, scan, scan_means)
     if results is None:
         return None
     rescan_wrong_starts(scan, begun.states, lambda results: results[0], results)  # changes the arrays of `results`
@@ -317,7 +317,7 @@ def _scan_all_chunks(recursion: Recursion, start: PyTree, rows: PyTree, programs
     return ScanResult(jax.tree.map(lambda leaf: leaf[-1, ...], last), outputs)
 
 
-def scan_chunks(
+def scan_settled_by_means(
     begun: ChunkStarts, scan: Callable[[PyTree, Which], PyTree], scan_means: Callable[[SettledState], PyTree]
 ) -> PyTree:
     """Scan all chunks: those that are settled by their means alone, the others in full; None without native code.

@@ -269,7 +269,7 @@ class Fleet:
         clock = ARRIVAL if given else clock or self._names[event.node_index]
         sure = (wall is not None and abs(said - wall) <= leap) or (given and abs(said - event.time) <= leap)
         if plant.leap is not None and event.time <= event.arrival + self.options.ahead:
-            plant.judge_clock(clock, said, leap, sure, self._names)
+            plant.undo_contradicted_leap(clock, said, leap, sure, self._names)
             if not given:
                 event = event._replace(arrival=max(plant.confirmed, event.time))
         rows, now = plant.rows, max(plant.confirmed, event.arrival)

@@ -102,7 +102,7 @@ class PlantState:
         """Set the newest arrival and the leap to what they were."""
         self.now, self.leap = clock
 
-    def judge_clock(self, clock: str, time: float, most: float, sure: bool, names: Sequence[str]) -> None:
+    def undo_contradicted_leap(self, clock: str, time: float, most: float, sure: bool, names: Sequence[str]) -> None:
         """Take back a leap that is contradicted by what a clock says.
 
         Args:

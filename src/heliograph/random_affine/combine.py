@@ -25,7 +25,7 @@ from heliograph.random_affine.base import (
 from heliograph.random_affine.composite import ARROW, AbstractComposite, list_in_words
 from heliograph.random_affine.hop import known
 from heliograph.random_affine.moments.components import AffineComponent, combine_atoms
-from heliograph.random_affine.moments.disturbed_gain import DisturbedGain, stack_gains
+from heliograph.random_affine.moments.disturbed_gain import DisturbedGain, stack_on_shared_inputs
 from heliograph.random_affine.moments.intervals import Interval, multiply_interval_polynomials, multiply_matrices
 from heliograph.random_affine.moments.monomials import (
     JointMoments,
@@ -286,7 +286,7 @@ class Stack(AbstractCombination):
 
     def disturb_gain(self) -> DisturbedGain:
         """Return the joint moments of the maps, one above another."""
-        return stack_gains([affine.disturb_gain() for affine in self.maps], self.inputs)
+        return stack_on_shared_inputs([affine.disturb_gain() for affine in self.maps], self.inputs)
 
     def in_words(self) -> str:
         """Return the maps in words, between bars."""

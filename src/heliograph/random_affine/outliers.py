@@ -132,7 +132,7 @@ class Contaminated(AbstractNoise):
     def __init__(self, covariance: ArrayLike, share: ArrayLike, outlier_covariance: ArrayLike, bias: ArrayLike = 0.0):
         inlier = check.covariance("covariance of contaminated noise", covariance, _size(covariance))
         n = inlier.shape[-1]
-        parts, several = _check_shares(share)
+        parts, several = _read_shares(share)
         outliers = _check_matrices("covariance of the outliers", outlier_covariance, len(parts), several)
         biases = _check_matrices("bias of the outliers", bias, len(parts), several)
         xp = library(inlier, parts, outliers, biases)
@@ -248,7 +248,7 @@ def _size(value: ArrayLike) -> int | None:
     return None if rank("covariance", value) else 1
 
 
-def _check_shares(share: ArrayLike) -> tuple[list[Number], bool]:
+def _read_shares(share: ArrayLike) -> tuple[list[Number], bool]:
     """Return the probabilities of the kinds of outliers, and whether a list of them was given."""
     if not rank("share of outliers", share):
         return [scalar("share of outliers", share, 0.0, 1.0)], False

@@ -82,11 +82,11 @@ class EstimateWriter:
     def _write_estimates(self, outputs: list[float]) -> dict[str, dict[str, object]]:
         """Return all filters' estimates after a row, by node and filter."""
         return {
-            node: {columns.filter: self._write_filter(columns, outputs) for columns in places}
+            node: {columns.filter: self._tabulate_estimate(columns, outputs) for columns in places}
             for node, places in self._nodes.items()
         }
 
-    def _write_filter(self, columns: FilterColumns, outputs: list[float]) -> dict[str, object]:
+    def _tabulate_estimate(self, columns: FilterColumns, outputs: list[float]) -> dict[str, object]:
         """Return one filter's estimate, its claim, and what it made of what arrived, as a table for JSON."""
         n, mean, begin, judged = self._n, columns.mean, columns.covariance, columns.judgement
         # Estimate, without a claim where it is no number.

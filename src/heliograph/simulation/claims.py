@@ -88,7 +88,9 @@ def nodes_alike(nodes: Mapping[str, Node | ReceivingNode]) -> dict[str, Node | R
     """Return the nodes with filters whose arrays are padded to the largest of all filters, so that they stack."""
     every = [filter for node in nodes.values() for filter in node.filters.values()]
     return {
-        name: _replace_filters(node, {f: filter.as_large_as(every) for f, filter in node.filters.items()})
+        name: _replace_filters(
+            node, {f: filter.with_room_for_heartbeats_of(every) for f, filter in node.filters.items()}
+        )
         for name, node in nodes.items()
     }
 

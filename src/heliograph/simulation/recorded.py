@@ -41,7 +41,7 @@ from heliograph.simulation.results.no_numbers import warn_of_no_numbers
 from heliograph.simulation.results.record import Record
 from heliograph.simulation.results.reducer import trajectories_record
 from heliograph.simulation.screened import screen_recording
-from heliograph.simulation.smoothed import SmoothedPart, add_truth, make_smoothed_record, select_smoothed_part
+from heliograph.simulation.smoothed import SmoothingPlan, add_truth, make_smoothed_record, select_smoothed_part
 from heliograph.simulation.stepping import AllFilters
 from heliograph.simulation.transmission.shared_dithers import refuse_shared_dithers
 from heliograph.smoothing.fixed_interval_lag_point import AbstractSmoothing
@@ -142,7 +142,7 @@ def _warn_of_record(network: Network, record: Record, state: PyTree) -> None:
     _warn_of_each((*doubts, *_describe_left_out(network, record), *say_remarks(network, state)))
 
 
-def _make_record(network: Network, smoothing: SmoothedPart | None, outputs: PyTree, clock: np.ndarray) -> Record:
+def _make_record(network: Network, smoothing: SmoothingPlan | None, outputs: PyTree, clock: np.ndarray) -> Record:
     """Return the record of what all filters made of the rows, with its smoothed part where there is one."""
     if smoothing is None:
         return trajectories_record(network, {"truth": None, **outputs}, clock)

@@ -115,7 +115,7 @@ def reduce_run(reducer: AbstractReducer[Result], later: NetworkSmoother | None, 
     )
 
 
-class SmoothedPart(NamedTuple):
+class SmoothingPlan(NamedTuple):
     """Smoothed part of a network: places of its kinds and groups among the network's, and the claims."""
 
     network: Network
@@ -129,7 +129,7 @@ class SmoothedPart(NamedTuple):
         return NetworkSmoother(self.smoothing, filters.fusions, self.kinds, self.groups)
 
 
-def select_smoothed_part(network: Network, smoothing: AbstractSmoothing, horizon: int) -> SmoothedPart:
+def select_smoothed_part(network: Network, smoothing: AbstractSmoothing, horizon: int) -> SmoothingPlan:
     """Select the part of a network that is smoothed: all its estimates; where relays run schedules, the receiver's.
 
     Raises:
@@ -157,7 +157,7 @@ def select_smoothed_part(network: Network, smoothing: AbstractSmoothing, horizon
         }
     groups = tuple(g for g, names in enumerate(network.groups) if set(names) & set(smoothed.names))
     kinds = tuple(k for k, kind in enumerate(network.kinds) if kind.group in groups)
-    return SmoothedPart(smoothed, smoothing, kinds, groups, claims)
+    return SmoothingPlan(smoothed, smoothing, kinds, groups, claims)
 
 
 def _find_claim_of_smoother(filter: AbstractFilter) -> Claim:
@@ -192,7 +192,7 @@ def _warn_of_inconsistency(network: Network, nis: PyTree) -> None:
         warn_if_inconsistent(f"{FUSED}/{name}", np.asarray(sums))
 
 
-def make_smoothed_record(network: Network, smoothing: SmoothedPart, outputs: PyTree, time: np.ndarray) -> Record:
+def make_smoothed_record(network: Network, smoothing: SmoothingPlan, outputs: PyTree, time: np.ndarray) -> Record:
     """Return the record of a recording with its smoothed part, by `NetworkSmoother`; warn of bad consistency."""
     _warn_of_inconsistency(smoothing.network, outputs["nis"])
     filtered = trajectories_record(network, {"truth": None, **outputs["filtered"]}, time)
@@ -231,7 +231,7 @@ class ReducedRuns(NamedTuple):
 
 
 def finish_result(
-    reducer: AbstractReducer[Result], recorded: ReducedRuns, network: Network, smoothing: SmoothedPart | None
+    reducer: AbstractReducer[Result], recorded: ReducedRuns, network: Network, smoothing: SmoothingPlan | None
 ) -> Result:
     """Make the result of a network, with that of its smoothed part; warn of filters that are not consistent."""
     sums, common, count, collected = recorded

@@ -14,7 +14,13 @@ import numpy as np
 
 from heliograph.engine.choice import choose_code
 from heliograph.factors.gaussian import Gaussian
-from heliograph.filters.chunks import ChunkStarts, find_chunk_starts, replace_chunk, rescan_wrong_starts, scan_chunks
+from heliograph.filters.chunks import (
+    ChunkStarts,
+    find_chunk_starts,
+    replace_chunk,
+    rescan_wrong_starts,
+    scan_settled_by_means,
+)
 from heliograph.filters.recursion import linear_start, scan_chunk
 from heliograph.filters.settled import SettledState
 from heliograph.filters.smoother_step import SmootherStep, gaussian_of
@@ -116,7 +122,7 @@ def _smooth_all(recursion: SmootherStepRecursion, begun: ChunkStarts, rows: PyTr
     # Settled chunks are those whose rows are complete, their own and those behind, of which none are beyond the end.
     whole = begun.complete.cover(begun.first, own + ahead) & (begun.first + own + ahead <= total)
     begun = begun._replace(covered=begun.covered & whole)
-    results = scan_chunks(begun, smooth_chunks_from, smooth_means)
+    results = scan_settled_by_means(begun, smooth_chunks_from, smooth_means)
     if results is None:
         return None
     rescan_wrong_starts(smooth_chunks_from, begun.states, lambda results: results.end, results)

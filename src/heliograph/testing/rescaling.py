@@ -14,7 +14,7 @@ from heliograph.filters.gaussian.belief import OpenLoop
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.gaussian.sequential import SequentialFilter
 from heliograph.filters.linear.linear import LinearFilter
-from heliograph.filters.linear.mean_before_data import MeanBeforeData
+from heliograph.filters.linear.mean_before_data import UnconditionalMean
 from heliograph.filters.linear.polynomial import PolynomialFilter
 from heliograph.filters.linear.scheduled import LinearSystemFilter
 from heliograph.filters.modes.additive import AdditiveModalFilter
@@ -267,7 +267,7 @@ def _rescale_combinations(components: AtomCombinations | OverTime, units: Units)
     return OverTime(scaled) if isinstance(components, OverTime) else scaled
 
 
-def _rescale_centre(centre: MeanBeforeData | None, units: Units) -> MeanBeforeData | None:
+def _rescale_centre(centre: UnconditionalMean | None, units: Units) -> UnconditionalMean | None:
     """Return the mean before data with state and measurements in other units."""
     if centre is None:
         return None
@@ -278,7 +278,7 @@ def _rescale_centre(centre: MeanBeforeData | None, units: Units) -> MeanBeforeDa
         return OverTime(factors * matrix.values) if isinstance(matrix, OverTime) else factors * matrix
 
     received = scaled(centre.received, units.received[:, None] / s)
-    return MeanBeforeData(
+    return UnconditionalMean(
         s * centre.start, scaled(centre.transition, s[:, None] / s), scaled(centre.drift, s), received
     )
 

@@ -83,7 +83,7 @@ def read_bag(
             raise fail(
                 f"{path}", f"a topic of the sources, {_join_names(sources.topics)}", f"only {_join_names(counts)}"
             )
-        _check_types(path, reader, sources)
+        _check_mapped_fields(path, reader, sources)
         # Messages become events, many at once where all of them can.
         total, done, decoder = sum(counts[topic] for topic in used), 0, Decoder(reader, sources)
         try:
@@ -249,7 +249,7 @@ def moment(nanoseconds: int) -> str:
     return f"{np.datetime64(nanoseconds, 'ns')}Z"
 
 
-def _check_types(path: Path, reader: "AnyReader", sources: Sources) -> None:
+def _check_mapped_fields(path: Path, reader: "AnyReader", sources: Sources) -> None:
     """Raise ValueError, before anything is read, at a mapped field that the type of its topic does not have."""
     for connection in reader.connections:
         fields = dict(list_fields(reader, connection.msgtype))

@@ -73,7 +73,7 @@ class EventFilter(AbstractSizedFilter):
         """True if the value that the sender compares with may be one that the filter never received."""
         return self.loses and self.trigger.reference == "sent"
 
-    def as_large_as(self, others: Sequence[AbstractFilter]) -> "EventFilter":
+    def with_room_for_heartbeats_of(self, others: Sequence[AbstractFilter]) -> "EventFilter":
         """Return the filter with room for the longest heartbeat of others that have one."""
         ages = max((other.ages for other in others if isinstance(other, EventFilter)), default=self.ages)
         if self.trigger.heartbeat is None or ages <= self.ages:

@@ -17,7 +17,7 @@ from heliograph.random_affine.noise import AbstractNoise, Gaussian
 T = TypeVar("T")
 
 
-class MeanBeforeData(Module):
+class UnconditionalMean(Module):
     """Mean of the state before any data, E[x_0] and E[x+] = A E[x] + b, and the matrix G C with which it is received.
 
     Shapes: start (n,), transition A (n, n), drift b (n,), received G C (m, n); each at every step, or constant.
@@ -30,7 +30,7 @@ class MeanBeforeData(Module):
 
 
 @in_float64
-def mean_before_data(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> MeanBeforeData | None:
+def mean_before_data(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> UnconditionalMean | None:
     """Return E[x_0], A_k, b_k and G_k C_k of a linear model, from which E x_k and E z_k follow before any data.
 
     None where E x is zero throughout, or a gain is random.
@@ -46,7 +46,7 @@ def mean_before_data(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> Me
     pairs = zip(_repeat(sensors, count), _repeat(channels, count), strict=False)
     # E z = E[G] C E x, without the channel's offset: its last row and column are left out.
     received = [np.asarray(c.moments(1).mean[:-1, :-1]) @ _matrix_of(s) for s, c in pairs]
-    return MeanBeforeData(
+    return UnconditionalMean(
         start=start,
         transition=_stack_over_time([_matrix_of(p) for p in plants]),
         drift=_stack_over_time(drifts),

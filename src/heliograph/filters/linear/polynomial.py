@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
-from heliograph.filters.linear.mean_before_data import MeanBeforeData, centre_plant, mean_before_data
+from heliograph.filters.linear.mean_before_data import UnconditionalMean, centre_plant, mean_before_data
 from heliograph.filters.linear.scheduled import LinearSystemFilter, ScheduledFilter, ScheduleState
 from heliograph.filters.modes.modal import claim_of_modes
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
@@ -59,11 +59,13 @@ class PolynomialFilter(AbstractSizedFilter):
     """
 
     inner: AbstractFilter
-    centre: MeanBeforeData | None
+    centre: UnconditionalMean | None
     degree: int = eqx.field(static=True)
     endless: bool = eqx.field(static=True)
 
-    def __init__(self, inner: AbstractFilter, degree: int, endless: bool = False, centre: MeanBeforeData | None = None):
+    def __init__(
+        self, inner: AbstractFilter, degree: int, endless: bool = False, centre: UnconditionalMean | None = None
+    ):
         instance("inner filter", inner, AbstractFilter, "a filter")
         check_count("degree of the filter", degree)
         self.inner, self.degree, self.endless, self.claim = inner, degree, endless, inner.claim
@@ -122,14 +124,14 @@ class PolynomialFilter(AbstractSizedFilter):
         return PolynomialFilter(self.inner.with_past(steps), self.degree, self.endless, self.centre)
 
 
-def _initial_mean(centre: MeanBeforeData | None, n: int) -> jax.Array:
+def _initial_mean(centre: UnconditionalMean | None, n: int) -> jax.Array:
     """Return the mean of the state at the start (n,), zeros where nothing is subtracted."""
     start = np.zeros(n) if centre is None else centre.start
     mean: jax.Array = library(start).asarray(start)
     return mean
 
 
-def _predict_mean(centre: MeanBeforeData | None, mean: Array, k: Step) -> Array:
+def _predict_mean(centre: UnconditionalMean | None, mean: Array, k: Step) -> Array:
     """Return E[x+] = A E[x] + b over step k."""
     if centre is None:
         return mean
@@ -138,7 +140,7 @@ def _predict_mean(centre: MeanBeforeData | None, mean: Array, k: Step) -> Array:
     return moved
 
 
-def _subtract_mean(centre: MeanBeforeData | None, z: ArrayLike, mean: Array, k: Step) -> jax.Array:
+def _subtract_mean(centre: UnconditionalMean | None, z: ArrayLike, mean: Array, k: Step) -> jax.Array:
     """Return z - G C E[x]."""
     return jnp.asarray(z) if centre is None else jnp.asarray(z) - at(centre, k).received @ mean
 
@@ -193,7 +195,7 @@ def polynomial_filter(
 
 def _lift_about_mean(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: int, horizon: int
-) -> tuple[MeanBeforeData | None, LinearSystem]:
+) -> tuple[UnconditionalMean | None, LinearSystem]:
     """Lift the model to monomials up to `degree`, about its mean where the gain is known."""
     check_model(plant, sensor, channel)
     centre = mean_before_data(plant, sensor, channel)
@@ -249,10 +251,10 @@ class MemoryFilter(AbstractSizedFilter):
 
     linear: ScheduledFilter
     products: ScheduledFilter
-    centre: MeanBeforeData | None
+    centre: UnconditionalMean | None
 
     def __init__(
-        self, linear: ScheduledFilter, products: ScheduledFilter, claim: Claim, centre: MeanBeforeData | None = None
+        self, linear: ScheduledFilter, products: ScheduledFilter, claim: Claim, centre: UnconditionalMean | None = None
     ):
         self.linear, self.products, self.claim, self.centre = linear, products, claim, centre
         self.states, self.inputs, self.received = linear.states, linear.inputs, linear.received

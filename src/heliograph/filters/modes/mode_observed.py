@@ -101,7 +101,7 @@ class ModeObservedFilter(AbstractSizedFilter):
             # The states that came are those of the step before: use them there first.
             redone = self._redo_last_step(state, modes, k)
             prior = jax.tree.map(lambda a, b: jnp.where(is_known & state.begun, a, b), redone, state.belief)
-            described = self._describe_next_mode(state.begun, modes, k)
+            described = self._describe_channel_after(state.begun, modes, k)
         else:
             prior, described = state.belief, _condition_channel(channel, modes)
         # Update with z, which is not used where a state is missing.
@@ -124,7 +124,7 @@ class ModeObservedFilter(AbstractSizedFilter):
         redone, _ = correct_linear(state.before, at(self.sensor, last), channel, Polytope(), state.z, start)
         return predict_belief(redone, state.move)
 
-    def _describe_next_mode(self, begun: jax.Array, modes: jax.Array, k: Step) -> SecondOrder:
+    def _describe_channel_after(self, begun: jax.Array, modes: jax.Array, k: Step) -> SecondOrder:
         """Return the channel's moments at step k given the modes of the step before; at the first step without them."""
         channel, last = at(self.channel, k), jnp.maximum(jnp.asarray(k) - 1, 0)
         following = _predict_channel(at(self.channel, last), channel, modes)

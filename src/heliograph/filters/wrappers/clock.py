@@ -151,7 +151,7 @@ class ClockFilter(AbstractWrapper):
         """
         plant, n = at(self.base.plant, k), len(self.states)
 
-        def add_derivative(
+        def add_step_to_gramian(
             carry: tuple[jax.Array, jax.Array], _: None
         ) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
             """Move one step on; the output is one step's part of O'O."""
@@ -160,7 +160,7 @@ class ClockFilter(AbstractWrapper):
             step = jax.jacfwd(lambda x: plant.transition(x, state.inputs))(x)
             return (plant.transition(x, state.inputs), step @ from_present), rows.T @ rows
 
-        _, squares = jax.lax.scan(add_derivative, (state.gaussian.mean, jnp.eye(n)), None, length=n)
+        _, squares = jax.lax.scan(add_step_to_gramian, (state.gaussian.mean, jnp.eye(n)), None, length=n)
         return jnp.stack([_compute_unexplained_share(jnp.sum(squares, axis=0), offset) for offset in self.offsets])
 
 

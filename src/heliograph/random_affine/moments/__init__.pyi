@@ -12,7 +12,7 @@ from .disturbed_gain import DisturbedGain as DisturbedGain
 from .disturbed_gain import disturb_hop as disturb_hop
 from .disturbed_gain import mix_gains as mix_gains
 from .disturbed_gain import noise_gain as noise_gain
-from .disturbed_gain import stack_gains as stack_gains
+from .disturbed_gain import stack_on_shared_inputs as stack_on_shared_inputs
 from .intervals import CORNERS as CORNERS
 from .intervals import Interval as Interval
 from .intervals import multiply_interval_polynomials as multiply_interval_polynomials

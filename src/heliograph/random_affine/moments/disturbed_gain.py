@@ -51,7 +51,9 @@ class DisturbedGain(NamedTuple):
     def then(self, other: "DisturbedGain") -> "DisturbedGain":
         """Return the moments of this map and one after it: [G2, N2] diag([G1, N1], I) = [G2 G1, G2 N1, N2]."""
         identity = np.eye(other.disturbances)
-        passed = stack_gains([self, DisturbedGain(identity, np.multiply.outer(identity, identity), 0)], shared=0)
+        passed = stack_on_shared_inputs(
+            [self, DisturbedGain(identity, np.multiply.outer(identity, identity), 0)], shared=0
+        )
         second = np.einsum("aicj,ibjd->abcd", other.second, passed.second)
         return DisturbedGain(other.mean @ passed.mean, second, self.inputs)
 
@@ -108,7 +110,7 @@ def _place_columns(gain: DisturbedGain, shared: int, parts: Sequence[DisturbedGa
     return DisturbedGain(mean, second, shared)
 
 
-def stack_gains(parts: Sequence[DisturbedGain], shared: int) -> DisturbedGain:
+def stack_on_shared_inputs(parts: Sequence[DisturbedGain], shared: int) -> DisturbedGain:
     """Return the moments of independent maps one above the other that share their first `shared` inputs.
 
     Between rows of two maps E[H_ab H_ij] is the product of the means.

@@ -27,7 +27,7 @@ LISTED = 3  # filters of which the page speaks before its table
 
 
 @dataclass(frozen=True)
-class Miss:
+class CoverageMiss:
     """An interval that held another share of what came than it claims, by more than chance explains."""
 
     score: "heliograph.forecasting.Score"
@@ -51,7 +51,7 @@ class FilterVerdict:
 
     name: str
     compared: int
-    misses: Sequence[Miss]
+    misses: Sequence[CoverageMiss]
 
     def summarise(self) -> str:
         """Say in a word whether its forecasts hold."""
@@ -90,7 +90,7 @@ def judge_filters(found: "heliograph.forecasting.Backtest") -> list[FilterVerdic
     verdicts = []
     for name in dict.fromkeys(f"{s.node}/{s.filter}" for s in found.scores):
         scores = [s for s in found.scores if f"{s.node}/{s.filter}" == name and s.compared]
-        intervals = [Miss(s, level) for s in scores for level in range(len(SHARES))]
+        intervals = [CoverageMiss(s, level) for s in scores for level in range(len(SHARES))]
         misses = [one for one in intervals if abs(one.excess) > FAR * one.score.coverage[one.level].error]
         verdicts.append(FilterVerdict(name, len(intervals), misses))
     return sorted(verdicts, key=lambda v: -len(v.misses) / max(v.compared, 1))

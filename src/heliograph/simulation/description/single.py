@@ -19,7 +19,7 @@ def find_rounded_parts(network: HasNodes) -> dict[tuple[float, float], list[str]
     """Return {(number as it was meant, as it is rounded): names of the parts of the network that hold it}."""
     parts: dict[tuple[float, float], list[str]] = {}
     seen: dict[int, tuple[float, float] | None] = {}  # of models, which nodes may share
-    for name, model, functions in _yield_models(network):
+    for name, model, functions in _yield_models_with_calls(network):
         if id(model) not in seen:
             seen[id(model)] = next(filter(None, map(find_rounded_to_single, _list_arrays(model, functions))), None)
         rounded = seen[id(model)]
@@ -28,7 +28,7 @@ def find_rounded_parts(network: HasNodes) -> dict[tuple[float, float], list[str]
     return parts
 
 
-def _yield_models(network: HasNodes) -> Iterator[tuple[str, object, list[Traced]]]:
+def _yield_models_with_calls(network: HasNodes) -> Iterator[tuple[str, object, list[Traced]]]:
     """Yield (name, model, its functions with arguments for each) of plant, sensors, channels and what is shared."""
     plant, x, u = first(network.plant), np.zeros(len(network.states)), np.zeros(len(network.inputs))
     yield "plant", network.plant, [(plant.transition, (x, u)), (plant.noise_covariance, (u,))]

@@ -26,7 +26,7 @@ from heliograph.simulation.runs.lanes import LANES, Progress, advance_in_chunks
 from heliograph.simulation.runs.memory import NeededMemory, check_memory
 from heliograph.simulation.runs.native_lanes import NativeLanes, NativeProgram
 from heliograph.simulation.runs.node_parts import NODES, build_world, count_parts, is_apart, split_nodes
-from heliograph.simulation.smoothed import NetworkSmoother, ReducedRuns, SmoothedPart, finish_result, reduce_run
+from heliograph.simulation.smoothed import NetworkSmoother, ReducedRuns, SmoothingPlan, finish_result, reduce_run
 from heliograph.simulation.world import World
 from straightline import Unsupported, accumulate
 
@@ -233,7 +233,7 @@ def simulate_natively(
     runs: int,
     chunk: int,
     progress: Progress | None,
-    smoothing: SmoothedPart | None = None,
+    smoothing: SmoothingPlan | None = None,
     precision: Precision = "float64",
 ) -> Result | None:
     """Simulate a network by native code and reduce its runs; a part of it is smoothed.
@@ -274,7 +274,7 @@ def compile_network_runs(
     key: jax.Array,
     reducer: AbstractReducer[Any],
     runs: int,
-    smoothing: SmoothedPart | None = None,
+    smoothing: SmoothingPlan | None = None,
     precision: Precision = "float64",
 ) -> NativeProgram:
     """Make the native code of a network's runs, as `compile_runs` of its world; a part of it may be smoothed."""
