@@ -139,7 +139,7 @@ def _write_integer(op: str, type: Type, arguments: Sequence[str]) -> str:
 
 
 def _write_conversion(source: Type, target: Type, name: str, real: Real) -> str:
-    """Return the expression of a number in another type; of a real one the nearest integer of the type, 0 of NaN."""
+    """Return the expression of a number in another type; of a real one truncated, within the type; 0 of NaN."""
     if target == "bool":
         return f"({name} != 0)"
     kind = c_type(target, real)

@@ -25,8 +25,12 @@ network = hg.Network(plant, {{"a": hg.Node(sensor, hg.erasure(channel, 0.9), fil
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A network file, what it measured with other numbers, and what the command found there."""
-    place = tmp_path_factory.mktemp("fit")
+    """A network file, what it measured with other numbers, and what the command found there.
+
+    The network lies in a folder whose name the file that the command writes has to quote.
+    """
+    place = tmp_path_factory.mktemp("fit") / 'it\'s a {"place"}'
+    place.mkdir()
     (place / "cart.py").write_text(SOURCE.format(plant=1.0, hop=1.0))
     (place / "truth.py").write_text(SOURCE.format(plant=0.2, hop=0.5))
     network = hg.files.load_network(str(place / "truth.py"))

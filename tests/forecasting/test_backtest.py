@@ -111,3 +111,5 @@ def test_refits_forecast_from_their_row_on():
 def test_a_refit_that_is_another_network_is_refused(refit):
     with pytest.raises(hg.InputError, match="refit from 10 rows: expected"):
         hg.backtest(world(), {"a": np.zeros(40)}, [1], refit=refit)
+    with pytest.raises(hg.InputError, match="skip: expected a positive whole number, got 0"):
+        hg.backtest(world(), {"a": np.zeros(40)}, [1], skip=0, refit=refit)

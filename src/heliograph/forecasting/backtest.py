@@ -156,7 +156,7 @@ def backtest(
         inputs: (steps, inputs); by default a plant without inputs is assumed.
         time: (steps,); 0, 1, ... by default.
         truth: true states (steps, n), NaN where they are not known; None by default.
-        skip: rows at the start from which nothing is forecast, while filters settle; 10 by default.
+        skip: rows at the start from which nothing is forecast, while filters settle; 10 by default, 1 or more to refit.
         refit: function of a number of rows that returns the network as it is known from these first rows alone, such as
             `lambda n: hg.fit(build, {"a": y[:n]}).network`; None by default: `network` throughout.
         every: rows between refits, the first behind the skipped rows; 50 by default.
@@ -170,7 +170,7 @@ def backtest(
     record = run(network, measurements, inputs, time, truth)
     rows = len(record.time)
     ahead = sorted({check_count("horizon", h) for h in items("horizons", horizons, "numbers of rows")})
-    first = check_count("skip", skip, 0)
+    first = check_count("skip", skip, 0 if refit is None else 1)
     if not ahead or ahead[-1] + first >= rows:
         raise fail("backtest", f"horizons that, behind {first} skipped rows, end within the {rows} rows of data", ahead)
     u = read_plant_inputs(network, inputs, rows)

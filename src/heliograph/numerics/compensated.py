@@ -167,9 +167,8 @@ class _Evaluation:
     def _sum(self, a: Compensated, axes: tuple[int, ...], **_: Any) -> Compensated:
         """Add the entries along axes, one after another."""
         for axis in sorted(axes, reverse=True):
-            if not jnp.shape(a.high)[axis]:
-                return Compensated(jnp.sum(a.high, axis=axes))
-            a = reduce(self._add, _take_apart(a, axis))
+            parts = _take_apart(a, axis)
+            a = reduce(self._add, parts) if parts else Compensated(jnp.sum(a.high, axis=axis))
         return a
 
     def _accumulate(self, a: Compensated, axis: int, reverse: bool) -> Compensated:

@@ -46,12 +46,15 @@ def called(done, total):
 
 @pytest.mark.parametrize("engine", ["native", pytest.param("xla", marks=pytest.mark.slow)])
 def test_kept_trajectories_are_counted_by_their_number(monkeypatch, engine):
-    """Truth, measurement, mean of each run are 2 + 1 + 2 doubles a step; covariances are common to all."""
+    """Truth, measurement, mean of each run are 2 + 1 + 2 doubles a step; covariances are common to all.
+
+    What is needed is told to three digits.
+    """
     monkeypatch.setenv("HELIOGRAPH_ENGINE", engine)
     few, many = (refusal(monkeypatch, 1e3, network(), 20, runs, 0, chunk=256)[0] for runs in (2560, 25600))
     copies = 2 if engine == "xla" else 1  # by chunk and joined
     least = copies * (25600 - 2560) * 20 * 5 * 8
-    assert least <= many - few <= 2 * least  # reports and flags beside
+    assert 0.995 * least <= many - few <= 2 * least  # reports and flags beside
 
 
 def test_independent_nodes_are_counted_together(monkeypatch):

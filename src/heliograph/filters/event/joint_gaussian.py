@@ -89,7 +89,7 @@ def condition_parts_on_received(
 ) -> GaussianSum:
     """Condition each Gaussian of (x, r, y) on z = G y + n, and multiply its weight by the density of z.
 
-    `m`: length of y. `delivers`: what arrives is y itself, so that y is known afterwards.
+    `m`: length of y. `delivers`: what arrives is y itself, all of it or nothing, so that y is known afterwards.
     """
     size = parts.gaussian.mean.shape[1]
 

@@ -83,7 +83,7 @@ class ClockFilter(AbstractWrapper):
     def init(self) -> ClockBelief:
         """Return the belief before any data."""
         start = self.base.init()
-        # No component counts before it arrives, and no clock has been observed.
+        # No component counts before it arrives, as after n steps of silence; and no clock has been observed.
         silence = jnp.full(self.received, len(self.states))
         observed = jnp.zeros(len(self.offsets), dtype=bool)
         return ClockBelief(start, jnp.zeros(len(self.inputs)), silence, observed)

@@ -102,7 +102,7 @@ def join_gain_and_noise(gain: Tensor, noise: WeightedColumns) -> Tensor:
 
 
 def has_random_gain(channel: AbstractRandomAffine, described: SecondOrder) -> bool:
-    """Return whether z depends on y through more than a known gain; a law with traced parameters counts as random."""
+    """Return whether z depends on y through more than a known gain; a traced law does where none is known."""
     if described.uncertain or is_traced(described.spread):
         return described.uncertain or not channel.has_known_gain
     block = np.abs(described.spread.center[..., :-1, :]) + np.abs(described.spread.radius[..., :-1, :])
