@@ -128,17 +128,22 @@ def draw_block_sums(scores: Scores, draws: int, seed: int) -> Float[np.ndarray, 
 def estimate_long_run_covariance(
     method: Method, scores: Scores, hessian: Float[np.ndarray, "p p"]
 ) -> LongRunCovariance:
-    """Return the covariance of the sum of scores by a method."""
+    """Return the covariance of the sum of scores by a method.
+
+    Of "hessian" and "profile" it is the Hessian of -l, as in a right model.
+    """
     match method:
         case "bootstrap":
-            return LongRunCovariance(np.atleast_2d(np.cov(draw_block_sums(scores, DRAWS, 0).T)), np.inf)
+            sums = draw_block_sums(scores, DRAWS, 0)
+            return LongRunCovariance(np.atleast_2d(np.cov(sums.T)), freedom=np.inf)
         case "cosines":
             return estimate_by_cosines(scores)
         case "bartlett":
             return estimate_by_bartlett(scores)
         case "white":
             return white(scores)
-    return LongRunCovariance(hessian, np.inf)
+        case "hessian" | "profile":
+            return LongRunCovariance(hessian, freedom=np.inf)
 
 
 def quantile(freedom: float, level: float = LEVEL) -> float:

@@ -30,14 +30,14 @@ class StepMaps(NamedTuple):
 
 
 def check_model(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> None:
-    """Raise ValueError unless plant and sensor are linear, fit the channel, and have noises with moments."""
-    start = first(plant)
+    """Raise ValueError unless plant and sensor are linear, without inputs, fit the channel, and have noise laws."""
+    first_plant = first(plant)
     check_linear("polynomial filter", plant, sensor)
-    check_link(first(sensor), first(channel), len(start.states))
-    if start.inputs:
+    check_link(first(sensor), first(channel), len(first_plant.states))
+    if first_plant.inputs:
         expected = "a plant without inputs (take the response to known inputs off the measurements first)"
-        raise fail("polynomial filter", expected, list(start.inputs))
-    if not isinstance(start.noise, AbstractNoise):
+        raise fail("polynomial filter", expected, list(first_plant.inputs))
+    if not isinstance(first_plant.noise, AbstractNoise):
         raise fail("polynomial filter", "process noise with a law", "a covariance that depends on inputs")
 
 

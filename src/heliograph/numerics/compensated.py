@@ -76,20 +76,20 @@ class _Evaluation:
 
     def inline(self, program: ClosedJaxpr, inputs: Sequence[Compensated]) -> list[Compensated]:
         """Return the results of a traced program."""
-        jaxpr, known = program.jaxpr, map(self._divide_known, program.consts)
+        jaxpr, known = program.jaxpr, map(self._split_known, program.consts)
         values: dict[Var, Compensated] = dict(zip(jaxpr.constvars, known, strict=True))
         values |= zip(jaxpr.invars, inputs, strict=True)
 
         def read(v: Any) -> Compensated:
             """Return the value of a variable or of a number in the program."""
-            return self._divide_known(v.val) if isinstance(v, Literal) else values[v]
+            return self._split_known(v.val) if isinstance(v, Literal) else values[v]
 
         for equation in jaxpr.eqns:
             values |= zip(equation.outvars, self._apply(equation, list(map(read, equation.invars))), strict=True)
         return list(map(read, jaxpr.outvars))
 
-    def _divide_known(self, number: Any) -> Compensated:
-        """Divide a known real number into what the precision holds of it and the rest."""
+    def _split_known(self, number: Any) -> Compensated:
+        """Split a known real number into what the precision holds of it and the rest."""
         if isinstance(number, jax.core.Tracer) or not np.issubdtype(np.asarray(number).dtype, np.floating):
             return Compensated(number)
         whole = np.asarray(number, np.float64)
@@ -98,7 +98,7 @@ class _Evaluation:
         return Compensated(high, rest if np.any(rest) else None)
 
     def _apply(self, equation: JaxprEqn, inputs: list[Compensated]) -> list[Compensated]:
-        """Return the results of one operation."""
+        """Return the results of one operation; of one without a rule f(high) + f'(high) rest."""
         name, params = equation.primitive.name, equation.params
         if (program := called_program(equation)) is not None:
             return self.inline(program, inputs)

@@ -201,6 +201,7 @@ class CertainChain(MarkovChain):
     """
 
     def __init__(self, chain: MarkovChain):
+        """Take over a chain, whose radius is that of certain transitions, 0."""
         if chain.is_uncertain:
             raise fail("transitions of a chain", "known ones, beside what a message tells", "uncertain ones")
         self.transition, self.initial, self.radius = chain.transition, chain.initial, chain.radius

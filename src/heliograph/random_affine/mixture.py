@@ -61,7 +61,8 @@ class Mixture(AbstractUniform, AbstractCombination):
         return JointMoments(matrix, self.outputs, self.inputs, order)
 
     def extremes(self) -> tuple[AbstractRandomAffine, ...]:
-        """Return the extreme weights combined with the extremes of each map."""
+        """Return the extreme weights combined with the extremes of each map: the law is linear in either."""
+        # Extreme laws of weights are weights; what else a choice names has none of its own.
         corners = [law for law in self.choice.extremes() if isinstance(law, Discrete)]
         return tuple(
             Mixture(parts, law.probabilities)

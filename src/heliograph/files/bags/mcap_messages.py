@@ -111,7 +111,10 @@ def read_mcap_messages(path: Path, sources: Sources | None = None) -> Iterator[F
 
 
 def _decode(where: str, channel: Channel, types: dict[int, Types], data: bytes) -> object:
-    """Return a message: in JSON its text, in Protocol Buffers its fields, in others None; or why it is none."""
+    """Return a message: in JSON its text, in Protocol Buffers its fields, in others None.
+
+    Why it is none is returned too, not raised: the reader counts it.
+    """
     if channel.encoding == JSON:
         return data.decode(errors="replace")
     if channel.encoding != PROTOBUF:

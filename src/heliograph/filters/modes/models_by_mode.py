@@ -23,10 +23,12 @@ def describe_modes(
 ) -> tuple[JointModes, SideInformation | OverTime]:
     """Return the modes of plant, sensor and links as one chain, and the channel by mode and arrivals, at each step."""
     steps = [joint_modes(c, nodes, beside=(plant, sensor)) for c in unstack(channel)]
-    no_flags = np.ones((len(steps[0].initial), 1))
-    parts = describe_by_pattern(steps, no_flags)
-    for step in parts if len(no_flags) > 1 else []:
-        _check_density(step)
+    modes = len(steps[0].initial)
+    parts = describe_by_pattern(steps, np.ones((modes, 1)))  # no flag tells the mode
+    if modes > 1:
+        for step in parts:
+            _check_density(step)
+    # The chain is the same at each step; what it does to the signal may differ.
     return steps[0], restack(parts, channel)
 
 

@@ -64,6 +64,7 @@ def _find_crossing(function: Slope, top: np.ndarray, level: float, i: int, side:
         """Return how far the profile is above the level where logit i is x and all others are the best."""
 
         def with_x(free: np.ndarray) -> tuple[float, np.ndarray]:
+            """Return value and slope by the free logits, those of `others`, where logit i is x."""
             whole = np.zeros(len(top))
             whole[i], whole[others] = x, free
             value, slope = function(whole)

@@ -307,7 +307,10 @@ class NumberProblem:
         return self._last[key]
 
     def evaluate(self, x: Vector, sharpness: int | None) -> Evaluation | None:
-        """Return the error, powers and derivatives; None where the error or the powers grow without limit."""
+        """Return the error, powers and derivatives; None where the error or the powers grow without limit.
+
+        `sharpness`: q, with which tr(S^q)^(1/q) stands for the largest eigenvalue; None for the trace.
+        """
         try:
             point = self.at(x, self.criterion._replace(sharpness=sharpness))
         except ValueError:
