@@ -213,7 +213,16 @@ async def drawn(url: str) -> str:
 
 
 SENDERS = {
-    "node 1": {"last": 290, "silent": 5, "provisional": 4, "missed": 0, "chance": 1.0, "dead": False, "reason": ""},
+    "node 1": {
+        "last": 290,
+        "silent": 5,
+        "provisional": 4,
+        "missed": 0,
+        "chance": 1.0,
+        "dead": False,
+        "reason": "",
+        "unit": "steps",
+    },
     "node 2": {
         "last": 3,
         "silent": 292,
@@ -222,6 +231,7 @@ SENDERS = {
         "chance": 1e-5,
         "dead": True,
         "reason": "9 heartbeats did not come, by chance once in 100,000",
+        "unit": "steps",
     },
 }
 
