@@ -94,7 +94,7 @@ def test_losses_are_averaged_over(network):
 
 
 def test_what_cannot_be_asked_is_said_in_one_line(network):
-    with pytest.raises(ValueError, match="sensor: expected one of the nodes gnss, wheel, got 'radar'"):
+    with pytest.raises(ValueError, match="nodes left out: expected some of the nodes gnss, wheel, got 'radar'"):
         worth_of_sensors(network, without=["radar"])
     with pytest.raises(ValueError, match="outage of 'gnss': expected at most the 50 steps of the run, got 60"):
         worth_of_sensors(network, 50, outages={"gnss": 60})

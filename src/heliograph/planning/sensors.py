@@ -166,9 +166,10 @@ def _list_cases(
     """Yield the cases: all nodes first, then each left out, each outage, each addition."""
     each = names if len(names) > 1 else []
     left = each if without is None else items("nodes left out", without, "names")
-    for name in (*left, *outages):
-        if name not in names:
-            raise fail("sensor", f"one of the nodes {', '.join(names)}", repr(name))
+    for what, asked in (("nodes left out", left), ("outages", outages)):
+        for name in asked:
+            if name not in names:
+                raise fail(what, f"some of the nodes {', '.join(names)}", repr(name))
     # Rows (steps, nodes) that are used: those of the network's nodes, not those of additions.
     base = np.tile(np.isin([*names, *added], names), (steps, 1))
     yield _SensorCase("all", base)

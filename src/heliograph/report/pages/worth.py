@@ -4,7 +4,7 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 from heliograph.disk.quoting import label_with_unit, quote_for_figure
 from heliograph.numerics.types import units_in
@@ -12,6 +12,7 @@ from heliograph.planning.sensors import SensorWorth
 from heliograph.report.figures import BLUE, GREEN, INK, STYLE, VERMILION, stacked_panels
 
 BAR = 0.6  # height of a bar
+NARROW = 4.0  # between the ends of an axis, below which 1, 2, 5, 10, ... would be one tick or two
 SPARE, ROOM = 0.05, 0.2  # share of the axis left free before all bars, and behind them for numbers
 
 
@@ -55,9 +56,10 @@ def _draw_state(axes: Axes, worth: SensorWorth, i: int, limits: tuple[float, flo
     axes.grid(visible=False, axis="y")
     axes.set_xscale("log")
     axes.set_xlim(*limits)
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    is_narrow = limits[1] < NARROW * limits[0]
+    axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]) if is_narrow else LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda times, _: f"{times:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.xaxis.set_minor_locator(NullLocator())
 
 
 def _find_limits(worth: SensorWorth) -> tuple[float, float]:
