@@ -73,6 +73,20 @@ def test_links_that_remember_and_losses_that_are_informed():
     assert check_scaling(hg.Network(plant, nodes), steps=3) <= 1
 
 
+@pytest.mark.parametrize("mean_gain", [True, False])
+def test_contradicting_certainties_are_compared_up_to_there(mean_gain):
+    """A noise-free output over two links: by the mean gain the second reading is impossible; rounding weighs both."""
+    plant = hg.LinearPlant([[0.27, 1.9], [0.26, 0.89]], np.diag([0.1, 0.02]), [1.0, -2.0], np.diag([1.0, 0.5]))
+    sensor = hg.LinearSensor([[1.0, -3.4], [-8.6, -1.8], [-8.6, -1.8]], np.diag([0.4, 0.0, 0.0]))
+    channel = hg.parallel([hg.hop(gain, 0.0) for gain in (1.0, hg.Discrete([0.5, 1.0], [0.5, 0.5]), 1.0)])
+    factory = hg.mean_gain_filter if mean_gain else hg.linear_filter
+    network = hg.Network(plant, {"node": hg.Node(sensor, channel, {"kalman": factory(plant, sensor, channel)})})
+    assert check_scaling(network, trials=5) <= 1
+    received = hg.monte_carlo(network, 5, 1, 0).measurements["node"][0]
+    filtered = network.nodes["node"].filters["kalman"].run(received)
+    assert np.any(np.isneginf(filtered.log_likelihoods)) == mean_gain
+
+
 @pytest.mark.slow
 def test_a_flag_has_no_unit():
     plant, sensor = hg.LinearPlant([[0.9]], 0.1, [1.0], 1.0), hg.LinearSensor([[1.0]], 0.1)
