@@ -20,7 +20,7 @@ import numpy as np
 
 import heliograph as hg
 from heliograph.engine.choice import choose_code
-from heliograph.learning.description import Build, describe
+from heliograph.learning.free_network import Build, describe
 from heliograph.learning.intervals import Method, estimate_long_run_covariance, quantile, sandwich
 from heliograph.learning.likelihood.evaluation import Evaluation, evaluate_recording
 from heliograph.learning.likelihood.objective import Form, Objective, make_objectives

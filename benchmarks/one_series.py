@@ -19,7 +19,7 @@ from peers.environments import python_of
 from peers.series import least
 
 import heliograph as hg
-from heliograph.learning.description import describe
+from heliograph.learning.free_network import describe
 from heliograph.learning.likelihood.data import gather_data
 from heliograph.learning.likelihood.evaluation import evaluate_at_points
 from heliograph.learning.likelihood.objective import make_objectives

@@ -143,7 +143,7 @@ from .simulation.results.consistency import (
 from .simulation.results.record import (
     Record as Record,
 )
-from .simulation.results.sums import (
+from .simulation.results.error_sums import (
     Statistics as Statistics,
 )
 from .forecasting.forecast import (
@@ -152,7 +152,7 @@ from .forecasting.forecast import (
 from .forecasting.backtest import (
     backtest as backtest,
 )
-from .learning.description import (
+from .learning.free_network import (
     free as free,
 )
 from .learning.fitting import (

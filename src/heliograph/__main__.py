@@ -27,7 +27,7 @@ def command() -> None:
             signal.signal(number, lambda number, _: os._exit(128 + number))  # while it is imported nothing is to undo
     gc.set_threshold(*RARELY)
     from heliograph.cli import SIGNALLED, main
-    from heliograph.numerics.process.stack import reserve_stack
+    from heliograph.numerics.process.interpreter_stack import reserve_stack
 
     try:
         code = reserve_stack(main)()

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from heliograph import cli
-from heliograph.campaign import work
+from heliograph.campaign import jobs
 from heliograph.campaign.engines import run_in_processes
+from heliograph.campaign.jobs import Job
 from heliograph.campaign.run import run_campaign
 from heliograph.campaign.summary import open_results, read_summary
-from heliograph.campaign.work import Job
 from tests.campaign.example import CAMPAIGN, CHUNKS, chunk_files, contents, write
 
 
@@ -18,14 +18,14 @@ def trouble(tmp_path, monkeypatch):
     """A file that makes the settings with gain 0.7 fail, in the way that is written in it."""
     path = tmp_path / "trouble"
     monkeypatch.setenv("TROUBLE", str(path))
-    work._build_network.cache_clear()
+    jobs._build_network.cache_clear()
     yield path
-    work._build_network.cache_clear()
+    jobs._build_network.cache_clear()
 
 
 def fail_chunk(monkeypatch, times: int) -> list[tuple[int, int]]:
     """Make chunk 1 of setting 4 fail so many times; returns what was tried."""
-    tried, compute = [], work.compute_chunk
+    tried, compute = [], jobs.compute_chunk
 
     def failing(campaign, network, chunk, store):
         tried.append((chunk.setting, chunk.number))

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 import heliograph as hg
+from heliograph.campaign.jobs import ErrorReducer
 from heliograph.campaign.run import run_campaign
 from heliograph.campaign.summary import _make_score, open_results, read_summary
-from heliograph.campaign.work import ErrorReducer
 from tests.campaign.example import CAMPAIGN, CHUNKS, NETWORK, chunk_files, contents, write
 
 

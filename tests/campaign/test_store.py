@@ -15,8 +15,8 @@ import pytest
 from heliograph import cli
 from heliograph.campaign import engines
 from heliograph.campaign.engines import run_in_processes
+from heliograph.campaign.jobs import Job
 from heliograph.campaign.run import run_campaign
-from heliograph.campaign.work import Job
 from heliograph.disk import lock_folder
 from heliograph.disk.whole_file import try_lock
 from tests.campaign.example import CAMPAIGN, CHUNKS, NETWORK, contents, write

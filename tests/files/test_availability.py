@@ -10,8 +10,8 @@ from heliograph import cli
 from heliograph.files.sources import Sources
 from heliograph.serving import LineReader
 from heliograph.serving.brokers.translator import Translator
+from heliograph.serving.device_status import LastWordsService
 from heliograph.serving.storage import Store
-from heliograph.serving.words import LastWordsService
 
 json_field, Available = hg.files.json_field, hg.files.Available
 NETWORK = """

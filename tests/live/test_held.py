@@ -100,7 +100,7 @@ def test_false_alarms_are_as_rare_as_stated(law, declared, monkeypatch):
 
     The law's bound is reached there by Gaussian noise, to the whole numbers of readings: the watch is not idle.
     """
-    monkeypatch.setattr("heliograph.live.held_watch.SELDOM", 1 / 200)
+    monkeypatch.setattr("heliograph.live.repeat_watch.SELDOM", 1 / 200)
     noise, draw = LAWS[law]
     rng, q, n = np.random.default_rng(3), 1.0, 20_000
     sensor = hg.LinearSensor([[1.0]], noise, **({"resolution": q} if declared else {}))

@@ -8,7 +8,7 @@ from scipy.special import erfcx, i0e
 
 import heliograph as hg
 from heliograph.random_affine import LogNormal, Nakagami, Rician
-from heliograph.random_affine.laws.reading import gain_given_reading
+from heliograph.random_affine.laws.gain_given_reading import gain_given_reading
 
 SCALE = 0.8
 

@@ -11,9 +11,9 @@ import time
 
 import pytest
 
-from heliograph.serving.patience import WaitingService, retry_while_away
 from heliograph.serving.service import Service
 from heliograph.serving.storage import AwayError, Store, identity, own_store
+from heliograph.serving.waiting_service import WaitingService, retry_while_away
 from tests.postgres import Postgres
 from tests.serving.worlds import fleet, lines, messages, stepping
 
@@ -79,7 +79,7 @@ class Away:
 
 
 def test_a_store_that_is_away_is_waited_for(monkeypatch, caplog):
-    monkeypatch.setattr("heliograph.serving.patience.FIRST", 0.01)
+    monkeypatch.setattr("heliograph.serving.waiting_service.FIRST", 0.01)
     service, stop = Away(2), asyncio.Event()
     patient = WaitingService(service, stop)
     assert patient.take(["a"]) == ["told late", "a"] and patient.take(["b"]) == ["b"]
@@ -97,7 +97,7 @@ def test_a_database_of_postgresql_has_one_owner_who_is_named():
 
 @pytest.mark.real("PostgreSQL")
 def test_a_server_that_is_gone_for_a_while_loses_and_doubles_nothing(tmp_path, monkeypatch):
-    monkeypatch.setattr("heliograph.serving.patience.FIRST", 0.05)
+    monkeypatch.setattr("heliograph.serving.waiting_service.FIRST", 0.05)
     network = stepping()
     mine, sent = identity(fleet(network)), lines(messages(2, 20, seed=6, whole=True))
     alone, results = Service(fleet(network), Store(str(tmp_path / "alone.db"), mine)), []

@@ -12,7 +12,7 @@ from heliograph.relays.design import local_error_design, receiver_behind_relays,
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.recorded import run
-from heliograph.simulation.results.sums import Statistics, error_statistics
+from heliograph.simulation.results.error_sums import Statistics, error_statistics
 from heliograph.simulation.simulate import monte_carlo
 from tests.relays.relay_problems import example, unusual
 

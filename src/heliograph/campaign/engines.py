@@ -20,7 +20,7 @@ from pathlib import Path
 from threading import Event, Thread, Timer
 from typing import Any
 
-from heliograph.campaign.work import Job, Reply, perform_job
+from heliograph.campaign.jobs import Job, Reply, perform_job
 from heliograph.numerics.check import fail
 
 Engine = Callable[[Iterable[Job]], Iterator[tuple[Job, Reply]]]

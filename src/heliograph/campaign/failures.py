@@ -5,8 +5,8 @@ import shlex
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from heliograph.campaign.jobs import Job, Reply
 from heliograph.campaign.plan import Campaign, Setting
-from heliograph.campaign.work import Job, Reply
 from heliograph.disk.whole_file import name_path_in_errors, replace
 
 FAILURES = "failures.json"

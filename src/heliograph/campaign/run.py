@@ -9,6 +9,7 @@ from typing_extensions import TypeAliasType
 
 from heliograph.campaign.engines import Engine, start_engine
 from heliograph.campaign.failures import Failure, describe_failure, write_failures
+from heliograph.campaign.jobs import Job, Reply
 from heliograph.campaign.plan import Campaign
 from heliograph.campaign.store import (
     STORE,
@@ -26,7 +27,6 @@ from heliograph.campaign.store import (
     write_claims,
 )
 from heliograph.campaign.summary import SUMMARY, write_summary
-from heliograph.campaign.work import Job, Reply
 from heliograph.disk.whole_file import check_folder_writable, check_replaceable, lock_folder, remove_leftover_folders
 from heliograph.numerics.check import check_count, check_progress, fail, file_path, instance
 from heliograph.numerics.module import readable

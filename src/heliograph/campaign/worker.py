@@ -20,7 +20,7 @@ def main() -> None:
     nothing = os.open(os.devnull, os.O_RDONLY)
     os.dup2(nothing, 0)  # nor may it read a job: it finds the end of its input
     os.close(nothing)
-    from heliograph.campaign.work import perform_job
+    from heliograph.campaign.jobs import perform_job
 
     # One answer for each job, in order.
     campaign, store = json.loads(requested.readline())

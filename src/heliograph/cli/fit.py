@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from heliograph.files.recording import Recording
     from heliograph.learning import Fit, Share
     from heliograph.learning.held_out import Change, Uniformity
-    from heliograph.learning.losses.fates import Fates
     from heliograph.learning.losses.losses import Losses
+    from heliograph.learning.losses.packet_fates import Fates
     from heliograph.report.pages.fit import FitResults
     from heliograph.report.progress import Advance
     from heliograph.report.results import Json, Results
@@ -90,7 +90,7 @@ def learn(
     advance("starting")
     from dataclasses import replace
 
-    from heliograph.files.fitted import NetworkAgain
+    from heliograph.files.fit_files import NetworkAgain
     from heliograph.learning.held_out import compare_filters, transform_held_out
     from heliograph.learning.sender_fit import has_deciding_sender
     from heliograph.numerics.check import fail
@@ -138,7 +138,7 @@ def _find_message_fates(network: "Network", recording: "Recording") -> "dict[str
     Left out are nodes of which nobody knows when a message is due: where rows are messages of any node, those without a
     rate of their own.
     """
-    from heliograph.learning.losses.fates import fates_of_measurements, fates_of_sequence
+    from heliograph.learning.losses.packet_fates import fates_of_measurements, fates_of_sequence
     from heliograph.report.arrivals import list_arrivals
 
     fates = fates_of_measurements(recording.measurements)
@@ -214,7 +214,7 @@ def _fit_with_progress(
 
 def collect_results_files(learned: "FitResults", out: Path, network: str) -> "Results":
     """Return the content of the results folder."""
-    from heliograph.files.fitted import as_json, write_fitted
+    from heliograph.files.fit_files import as_json, write_fitted
     from heliograph.report.pages.fit import draw_fit_figures, pages
     from heliograph.report.results import Results
 

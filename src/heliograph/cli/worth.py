@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import numpy as np
 
-    from heliograph.planning.sensors import SensorWorth
+    from heliograph.planning.sensor_worth import SensorWorth
     from heliograph.simulation.network import Network
     from heliograph.simulation.node import Node
 

@@ -15,8 +15,8 @@ import numpy as np
 from heliograph.engine.limits import SHORT
 from heliograph.numerics import float64
 from heliograph.numerics.check import fail, show_value
-from heliograph.numerics.process.collector import pause_collector
-from heliograph.numerics.process.stack import reserve_stack
+from heliograph.numerics.process.garbage_collector import pause_collector
+from heliograph.numerics.process.interpreter_stack import reserve_stack
 from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import PyTree
 from straightline import Unsupported, compile

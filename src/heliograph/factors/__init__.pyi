@@ -1,11 +1,5 @@
 """Names that other folders take; the package loads them when first used."""
 
-from .centred import SplitMeanGaussian as SplitMeanGaussian
-from .centred import center_gaussian as center_gaussian
-from .centred import center_known as center_known
-from .centred import centred_from_covariance as centred_from_covariance
-from .changes import settle as settle
-from .changes import unsettle as unsettle
 from .columns import WeightedColumns as WeightedColumns
 from .columns import below_diagonal as below_diagonal
 from .columns import columns_of as columns_of
@@ -53,9 +47,15 @@ from .gaussian import predict_affine as predict_affine
 from .gaussian import rts_step as rts_step
 from .gaussian import sum_unexplained as sum_unexplained
 from .gaussian import take_leading as take_leading
+from .gaussian_on_group import settle as settle
+from .gaussian_on_group import unsettle as unsettle
 from .repeated import rounding_of_products as rounding_of_products
 from .repeated import triangularise_noise as triangularise_noise
 from .roots import covariance_of_root as covariance_of_root
 from .roots import observe_information as observe_information
 from .roots import observe_root as observe_root
 from .roots import roots_of as roots_of
+from .two_part_mean import SplitMeanGaussian as SplitMeanGaussian
+from .two_part_mean import center_gaussian as center_gaussian
+from .two_part_mean import center_known as center_known
+from .two_part_mean import centred_from_covariance as centred_from_covariance

@@ -13,7 +13,7 @@ import numpy as np
 from heliograph.factors.columns import WeightedColumns, below_diagonal, decorrelate, reciprocal_or_zero, unit_lower
 from heliograph.factors.gaussian import BackwardGain, Gaussian
 from heliograph.factors.repeated import triangularise_noise
-from heliograph.numerics.density import LOG_TURN
+from heliograph.numerics.gaussian_density import LOG_TURN
 from heliograph.numerics.types import Float
 
 FALLEN = 1e-12  # of what a row had in infinite columns: less is rounding

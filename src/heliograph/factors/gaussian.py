@@ -39,7 +39,7 @@ from heliograph.factors.scalar_update import (
     measure_scalar_given_products,
     update_columns,
 )
-from heliograph.numerics.density import LOG_TURN
+from heliograph.numerics.gaussian_density import LOG_TURN
 from heliograph.numerics.linalg import OFF_SUPPORT, OFF_VALUE, PIVOT_TOLERANCE, rounding, symmetric
 from heliograph.numerics.short_programs import writes_short_programs
 from heliograph.numerics.traced import is_traced, library

@@ -17,7 +17,7 @@ from .estimates.table import (
 from .event_table import (
     EventTable as EventTable,
 )
-from .fitted import (
+from .fit_files import (
     load_fitted as load_fitted,
 )
 from .estimates.forecasts import (

@@ -12,7 +12,7 @@ import numpy as np
 from heliograph.files.network_file import load_function, load_network
 from heliograph.numerics.check import array, check_count, check_seed, fail, scalar
 from heliograph.planning.budget import Budget
-from heliograph.planning.error import Error
+from heliograph.planning.error_objective import Error
 from heliograph.planning.problem import DesignProblem
 from heliograph.simulation.network import Network
 

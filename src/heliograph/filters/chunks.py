@@ -29,7 +29,7 @@ from heliograph.filters.recursion import (
     state_after_rows,
     sum_chunk,
 )
-from heliograph.filters.settled import (
+from heliograph.filters.settled_covariance import (
     CompleteBlocks,
     SettledState,
     find_complete_blocks,

@@ -15,12 +15,12 @@ from heliograph.filters.chunks import ScanResult, filter_in_chunks
 from heliograph.model.checks.inputs import check_inputs
 from heliograph.model.checks.row_times import common_dates, judge_dates
 from heliograph.model.estimate import Claim, Estimate, Innovation
-from heliograph.model.origin import KeptOrigin, Origin, last_input, usual_months, usual_spacing
+from heliograph.model.forecast_origin import KeptOrigin, Origin, last_input, usual_months, usual_spacing
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.linalg import find_not_finite
 from heliograph.numerics.module import readable
-from heliograph.numerics.times.rows import check_rows
+from heliograph.numerics.times.data_rows import check_rows
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 
 Rows = np.ndarray  # an entry for each step along the first axis

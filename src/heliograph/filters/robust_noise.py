@@ -15,7 +15,7 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.traced import is_traced, library
 from heliograph.numerics.types import Array, Float
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.moments.components import GaussianBranches
+from heliograph.random_affine.moments.mixture_components import GaussianBranches
 from heliograph.random_affine.moments.second_moments import SecondOrder
 from heliograph.random_affine.noise import AbstractNoise, Independent
 from heliograph.random_affine.outliers import (

@@ -21,7 +21,7 @@ from .one_step import (
     predict_record as predict_record,
     predict_rows as predict_rows,
 )
-from .unexplained import (
+from .residual_tests import (
     Residuals as Residuals,
     record_residuals as record_residuals,
     residuals as residuals,

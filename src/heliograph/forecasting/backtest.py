@@ -22,7 +22,7 @@ from heliograph.forecasting.scores import (
     crps,
     log_score,
 )
-from heliograph.model.origin import Origin
+from heliograph.model.forecast_origin import Origin
 from heliograph.numerics.angle import wrap_angles
 from heliograph.numerics.check import check_count, fail, instance, items
 from heliograph.numerics.float64 import quickly_compiled

@@ -20,9 +20,9 @@ from heliograph.forecasting.outlook import (
     prediction_of,
 )
 from heliograph.forecasting.prediction import Forecast
-from heliograph.model.enlarged.joint import joint_sensor
+from heliograph.model.enlarged.joint_sensors import joint_sensor
 from heliograph.model.estimate import Estimate, weakest
-from heliograph.model.origin import Origin
+from heliograph.model.forecast_origin import Origin
 from heliograph.model.over_time import first
 from heliograph.model.plant import LinearPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor

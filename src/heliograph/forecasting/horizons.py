@@ -9,7 +9,7 @@ from typing_extensions import TypeAliasType
 
 from heliograph.forecasting.prediction import InputsAhead
 from heliograph.model.checks.inputs import check_inputs
-from heliograph.model.origin import Origin
+from heliograph.model.forecast_origin import Origin
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import array, check_count, fail, is_whole, rank, show_value
 from heliograph.numerics.types import ArrayLike, Float, units_in

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from heliograph.model.estimate import Estimate
-from heliograph.model.origin import HasOrigin, Origin
+from heliograph.model.forecast_origin import HasOrigin, Origin
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import PyTree
 

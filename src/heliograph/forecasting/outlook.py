@@ -17,7 +17,7 @@ from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
 from heliograph.filters.modes.mode_observed import ModeObservedFilter
 from heliograph.filters.modes.multiple_model import MultipleModelFilter
 from heliograph.filters.modes.side_information import SideInformationFilter
-from heliograph.filters.wrappers.limited import LimitedFilter
+from heliograph.filters.wrappers.state_limits import LimitedFilter
 from heliograph.forecasting.prediction import Prediction
 from heliograph.model.estimate import Claim, weakest
 from heliograph.model.over_time import at, first

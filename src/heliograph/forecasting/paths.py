@@ -10,8 +10,8 @@ from heliograph.filters.modes.multiple_model import ModalBeliefs, MultipleModelF
 from heliograph.forecasting.forecast import ForecastTarget, check_covered, find_target
 from heliograph.forecasting.horizons import Horizons, Inputs, check_ahead, find_rows_ahead
 from heliograph.forecasting.origins import origin_of
+from heliograph.model.forecast_origin import HasOrigin
 from heliograph.model.modes_of_motion import ModalPlant, ModalSensor, transition_over
-from heliograph.model.origin import HasOrigin
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor

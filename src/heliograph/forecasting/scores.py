@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtr
 
-from heliograph.numerics.density import LOG_TURN
+from heliograph.numerics.gaussian_density import LOG_TURN
 
 LEVELS = (0.5, 0.8, 0.95)  # probabilities of the central intervals whose coverage is counted
 BANDWIDTH = 1.3  # times the root of the number of rows

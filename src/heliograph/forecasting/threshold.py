@@ -6,7 +6,7 @@ import numpy as np
 
 from heliograph.forecasting.horizons import Horizons, Inputs
 from heliograph.forecasting.paths import DRAWS, draw_paths
-from heliograph.model.origin import HasOrigin
+from heliograph.model.forecast_origin import HasOrigin
 from heliograph.numerics.check import scalar
 from heliograph.numerics.module import readable
 

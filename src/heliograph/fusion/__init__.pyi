@@ -6,7 +6,7 @@ from .all_reports import (
 from .report_link import (
     EventSending as EventSending,
 )
-from .informed import (
+from .joint_covariance_fusion import (
     DiagonalWeights as DiagonalWeights,
     MatrixWeights as MatrixWeights,
     ScalarWeights as ScalarWeights,
@@ -31,7 +31,7 @@ from .quantizer import (
 from .quantizer import (
     EscapeQuantizer as EscapeQuantizer,
 )
-from .zoom import (
+from .zoom_quantizer import (
     ZoomQuantizer as ZoomQuantizer,
 )
 from .quantizer import (
@@ -48,6 +48,6 @@ from .rules import (
     WeightedFusion as WeightedFusion,
     fuse as fuse,
 )
-from .split import (
+from .split_intersection import (
     SplitIntersection as SplitIntersection,
 )

@@ -18,7 +18,7 @@ from heliograph.factors.columns import (
 from heliograph.factors.gaussian import Gaussian, correct_by_gain, from_columns, gain_of, predict_affine, take_leading
 from heliograph.filters.gaussian.signal import augmented_second_moment
 from heliograph.fusion.cross_covariance import ErrorMap, ErrorMoments
-from heliograph.fusion.informed import AbstractInformedFusion, CentreStep
+from heliograph.fusion.joint_covariance_fusion import AbstractInformedFusion, CentreStep
 from heliograph.fusion.quantizer import widen
 from heliograph.fusion.report_link import ReportModel
 from heliograph.fusion.rules import Fused, Means

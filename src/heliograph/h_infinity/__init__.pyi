@@ -20,7 +20,7 @@ from .growth_check import (
     GrowthFinding as GrowthFinding,
     check_growth as check_growth,
 )
-from .system import (
+from .error_system import (
     Growth as Growth,
     GrowthSystem as GrowthSystem,
     growth_system as growth_system,

@@ -3,8 +3,8 @@
 import numpy as np
 
 from heliograph.h_infinity.design import HInfinityDesign
+from heliograph.h_infinity.error_system import GrowthSystem
 from heliograph.h_infinity.step_inequality import StepMatrices, step_matrices
-from heliograph.h_infinity.system import GrowthSystem
 from heliograph.numerics.check import TINY, array, fail, instance, scalar
 from heliograph.numerics.types import ArrayLike, Float
 

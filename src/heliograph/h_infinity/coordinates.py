@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import block_diag
 
+from heliograph.h_infinity.error_system import GrowthSystem
 from heliograph.h_infinity.step_inequality import StepMatrices, Unknowns
-from heliograph.h_infinity.system import GrowthSystem
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import Float
 

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.h_infinity.coordinates import scale_steps
+from heliograph.h_infinity.error_system import LARGEST, GrowthSystem, symmetric_weight
 from heliograph.h_infinity.solver import (
     MARGIN,
     HorizonProblem,
@@ -28,7 +29,6 @@ from heliograph.h_infinity.step_inequality import (
     next_energy,
     step_matrices,
 )
-from heliograph.h_infinity.system import LARGEST, GrowthSystem, symmetric_weight
 from heliograph.numerics.check import TINY, array, fail, flag, instance, scalar
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float

@@ -8,7 +8,7 @@ import numpy as np
 
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
 from heliograph.h_infinity.design import HInfinityDesign
-from heliograph.h_infinity.system import GrowthSystem
+from heliograph.h_infinity.error_system import GrowthSystem
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AbstractPlant, AnyPlant

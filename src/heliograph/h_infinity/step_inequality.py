@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
-from heliograph.h_infinity.system import GrowthSystem
+from heliograph.h_infinity.error_system import GrowthSystem
 from heliograph.numerics.types import Float, Int
 
 

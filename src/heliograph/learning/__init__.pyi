@@ -19,10 +19,10 @@ from .losses.losses import (
     Losses as Losses,
     learn_losses as learn_losses,
 )
-from .losses.shares import (
+from .losses.probability_intervals import (
     Share as Share,
 )
-from .losses.fates import (
+from .losses.packet_fates import (
     fates_by_hop as fates_by_hop,
     fates_by_node as fates_by_node,
     fates_of_measurements as fates_of_measurements,
@@ -41,14 +41,14 @@ from .identification import (
 from .parameters import (
     Parameters as Parameters,
 )
-from .description import (
+from .free_network import (
     Description as Description,
     describe as describe,
 )
-from .solution import (
+from .likelihood_maximum import (
     Row as Row,
 )
-from .tell_apart import (
+from .samples_to_decide import (
     samples_to_tell as samples_to_tell,
 )
 from .sender_fit import (

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from heliograph.learning.solution import Solution
+from heliograph.learning.likelihood_maximum import Solution
 
 APART = 3.0  # standard errors between the two forms that suggest an error of the model
 

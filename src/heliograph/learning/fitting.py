@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.learning.description import Build, Description, describe
 from heliograph.learning.fit_sentences import describe_boundaries, describe_forms
+from heliograph.learning.free_network import Build, Description, describe
 from heliograph.learning.identification import Identifiability, identify_by_recording
 from heliograph.learning.inference import FitTest, Values, compare_likelihoods, information_criteria, wald_test
 from heliograph.learning.inference_data import make_inference_data
@@ -18,9 +18,9 @@ from heliograph.learning.likelihood.multistart import AWAY, SPREAD, MaximumSearc
 from heliograph.learning.likelihood.objective import Form, make_objectives
 from heliograph.learning.likelihood.surface import LikelihoodSurface
 from heliograph.learning.likelihood.trust_region import Maximum
+from heliograph.learning.likelihood_maximum import Row, Solution
 from heliograph.learning.losses.delays import Delays, DelaysByNode, learn_delays
 from heliograph.learning.sender_fit import SenderFit, fit_sender, has_deciding_sender
-from heliograph.learning.solution import Row, Solution
 from heliograph.numerics.check import check_count, check_progress, check_seed, fail, instance, scalar, show_value
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.learning.description import Build, describe
+from heliograph.learning.free_network import Build, describe
 from heliograph.learning.intervals import quantile
 from heliograph.learning.likelihood.data import LikelihoodData
 from heliograph.learning.likelihood.objective import Objective, join_world, make_objectives
@@ -34,7 +34,7 @@ from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.moments.second_moments import second_order
 
 if TYPE_CHECKING:
-    from heliograph.learning.solution import Solution
+    from heliograph.learning.likelihood_maximum import Solution
 
 POINTS = 3
 AROUND = 0.5  # how far from the start, in each coordinate
@@ -240,7 +240,7 @@ def _draw_expected(objective: Objective, x: Array, u: Array, key: jax.Array) -> 
 
 
 if TYPE_CHECKING:
-    from heliograph.learning.solution import Solution
+    from heliograph.learning.likelihood_maximum import Solution
 
 KINDS = ("mean gain", "gain variance", "noise")
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from heliograph.learning.intervals import Method
-from heliograph.learning.solution import Solution
+from heliograph.learning.likelihood_maximum import Solution
 from heliograph.numerics.check import check_count, check_seed, fail
 from heliograph.numerics.process.extras import check_installed
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import equinox as eqx
 import numpy as np
 
-from heliograph.linear.routes import StepMaps, check_model, make_step_maps
+from heliograph.linear.step_maps import StepMaps, check_model, make_step_maps
 from heliograph.linear.system import LinearSystem, Steps, repeat_last
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, first
@@ -25,7 +25,7 @@ from heliograph.random_affine.moments.monomials import (
     list_exponents,
     position,
 )
-from heliograph.random_affine.moments.push import products_of_monomials, push_moments, push_through_known_map
+from heliograph.random_affine.moments.pushed_moments import products_of_monomials, push_moments, push_through_known_map
 from heliograph.random_affine.noise import Gaussian, noise_vector
 
 EPS = float(np.finfo(np.float64).eps)

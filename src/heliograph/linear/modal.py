@@ -3,7 +3,7 @@
 import numpy as np
 
 from heliograph.linear.jump_system import mix_modes, propagate_by_mode
-from heliograph.linear.routes import each_step
+from heliograph.linear.step_maps import each_step
 from heliograph.linear.system import LinearSystem, Steps
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import first

@@ -15,7 +15,7 @@ from heliograph.linear.lift import (
     refuse_lift,
 )
 from heliograph.linear.recursion import lmmse
-from heliograph.linear.routes import check_model, make_step_maps
+from heliograph.linear.step_maps import check_model, make_step_maps
 from heliograph.linear.system import Gains, LinearSystem, Schedule, Steps, state_moments
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import first
@@ -30,7 +30,7 @@ from heliograph.random_affine.combine import Series, Stack
 from heliograph.random_affine.hop import GainAndNoise, known
 from heliograph.random_affine.laws.law import Constant
 from heliograph.random_affine.moments.monomials import list_exponents, symmetric_power
-from heliograph.random_affine.moments.push import (
+from heliograph.random_affine.moments.pushed_moments import (
     TabulatedNoise,
     products_of_monomials,
     push_moments,

@@ -7,19 +7,19 @@ from typing import NamedTuple
 
 import numpy as np
 
+from heliograph.live.clock_leap import ARRIVAL, Leap, find_leap
 from heliograph.live.event import INPUTS, OF_STEPS, CheckedEvent, Verdict
-from heliograph.live.held_watch import RepeatWatch
-from heliograph.live.leap import ARRIVAL, Leap, find_leap
 from heliograph.live.link_counts import ScreenedEvent
 from heliograph.live.network_program import NetworkProgram
 from heliograph.live.plant import PlantState, WithdrawnEvent
-from heliograph.live.pool import SlotTable, cut_into_legs, group_by_turn
-from heliograph.live.rows import BEFORE, HeldRow, SortedRows
+from heliograph.live.plant_table import SlotTable, cut_into_legs, group_by_turn
+from heliograph.live.repeat_watch import RepeatWatch
 from heliograph.live.sender_status import SenderStatus, SilenceRule
+from heliograph.live.sorted_rows import BEFORE, HeldRow, SortedRows
 from heliograph.model.checks.refusals import count_by_reason
 from heliograph.model.limits import Limits
 from heliograph.model.over_time import steps_covered
-from heliograph.model.stuck import Repeats
+from heliograph.model.repeated_readings import Repeats
 from heliograph.model.timeouts import name_unit
 from heliograph.numerics.check import TINY, check_count, fail, instance, scalar
 from heliograph.numerics.types import Float

@@ -6,7 +6,7 @@ from typing import Any
 
 from heliograph.live.fleet import Fleet
 from heliograph.live.plant import PlantState
-from heliograph.live.rows import HeldRow
+from heliograph.live.sorted_rows import HeldRow
 
 
 class FleetRemarks:

@@ -4,10 +4,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+from heliograph.live.clock_leap import Moments
 from heliograph.live.event import CheckedEvent, Verdict
-from heliograph.live.leap import Moments
 from heliograph.model.checks.refusals import Reason
-from heliograph.model.stuck import Repeats
+from heliograph.model.repeated_readings import Repeats
 
 NO_REPEATS, NONE = Repeats(), dict[Reason, int]()
 GAP = 1 << 14  # more messages in a row are not lost: the count began anew (LoRaWAN's MAX_FCNT_GAP)

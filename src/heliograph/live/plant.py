@@ -6,10 +6,10 @@ from datetime import datetime
 from math import inf
 from typing import NamedTuple, TypeAlias
 
+from heliograph.live.clock_leap import ARRIVAL, Leap, find_leap
 from heliograph.live.event import INPUTS, CheckedEvent
-from heliograph.live.leap import ARRIVAL, Leap, find_leap
 from heliograph.live.link_counts import LinkCounts
-from heliograph.live.rows import HeldRow, Key, SortedRows
+from heliograph.live.sorted_rows import HeldRow, Key, SortedRows
 
 
 class WithdrawnEvent(NamedTuple):

@@ -5,7 +5,7 @@ import numpy as np
 from heliograph.live.fleet import Fleet
 from heliograph.live.network_program import NetworkProgram
 from heliograph.model.estimate import Estimate, lower_unsound_claim
-from heliograph.model.origin import Origin
+from heliograph.model.forecast_origin import Origin
 from heliograph.model.over_time import first
 
 

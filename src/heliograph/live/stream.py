@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import Judgement
 from heliograph.live.filter_stepper import NativeFilterStepper, XlaFilterStepper, compile_native_step, compile_xla_step
-from heliograph.live.held_watch import RepeatWatch
+from heliograph.live.repeat_watch import RepeatWatch
 from heliograph.live.sender_status import LossChain, SenderStatus, SilenceRule
 from heliograph.live.stored.old_layout import can_read_layout, describe_old_layout, relocate_parts, split_by_path
 from heliograph.live.stored.snapshot import Identity, check_same_network, pack, unpack_snapshot, versions
@@ -21,10 +21,10 @@ from heliograph.model.checks.faults import find_function_fault
 from heliograph.model.checks.inputs import check_inputs
 from heliograph.model.checks.refusals import SCREENED, Reason, count_by_reason
 from heliograph.model.estimate import JudgedEstimate, lower_unsound_claim, weakest
+from heliograph.model.forecast_origin import Origin
 from heliograph.model.limits import LimitsLike, ScreenedReadings, make_limits
-from heliograph.model.origin import Origin
 from heliograph.model.over_time import first
-from heliograph.model.stuck import Repeats, StuckLike
+from heliograph.model.repeated_readings import Repeats, StuckLike
 from heliograph.model.trigger import AbstractTrigger
 from heliograph.numerics.caching import share_by_object
 from heliograph.numerics.check import fail

@@ -16,14 +16,14 @@ from heliograph.live.implausible_events import FleetAngles, JudgementReader
 from heliograph.live.link_counts import LinkCounts
 from heliograph.live.network_program import shared_program
 from heliograph.live.row_origin import estimates_by_name, make_row_origin
-from heliograph.live.rows import BEFORE, HeldRow
 from heliograph.live.sender_status import SenderStatus
+from heliograph.live.sorted_rows import BEFORE, HeldRow
 from heliograph.live.stored.migration import DESCRIPTION, SAME, PlantMigration, describe_network
 from heliograph.live.stored.plant_codec import pack_plant, unpack_plant
 from heliograph.live.stored.snapshot import check_same_network, pack, unpack_snapshot
 from heliograph.model.checks.refusals import SCREENED, Reason
 from heliograph.model.estimate import Estimate, JudgedEstimate
-from heliograph.model.origin import Origin
+from heliograph.model.forecast_origin import Origin
 from heliograph.numerics.check import check_count, fail, instance, scalar, show_value
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike

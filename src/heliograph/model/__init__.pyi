@@ -1,6 +1,6 @@
 """Public names of the room; the package loads them when first used."""
 
-from .centred import (
+from .centred_signal import (
     centred as centred,
     expected_signal as expected_signal,
 )
@@ -14,7 +14,7 @@ from .enlarged.clocks import (
     Clock as Clock,
     with_clocks as with_clocks,
 )
-from .enlarged.joint import (
+from .enlarged.joint_sensors import (
     joint_sensor as joint_sensor,
 )
 from .estimate import (
@@ -38,7 +38,7 @@ from .over_time import (
     steps_covered as steps_covered,
     OverTime as OverTime,
 )
-from .enlarged.past import (
+from .enlarged.past_outputs import (
     with_past as with_past,
 )
 from .relays import (
@@ -50,7 +50,7 @@ from .sensor import (
 from .enlarged.bias import (
     with_bias as with_bias,
 )
-from .told import (
+from .reported_numbers import (
     Pilot as Pilot,
     told as told,
 )

@@ -10,9 +10,9 @@ from typing_extensions import TypeAliasType
 from heliograph.model.modes_of_motion import models_of
 from heliograph.model.over_time import OverTime, at_each_step, first, unstack
 from heliograph.model.plant import AnyPlant
+from heliograph.model.reported_numbers import KnownGain, Pilot, build_with_told, stack_with_told, tell_gain
 from heliograph.model.sensor import AbstractSensor, AnySensor, check_sensor
-from heliograph.model.told import KnownGain, Pilot, build_with_told, stack_with_told, tell_gain
-from heliograph.model.turns import check_turns
+from heliograph.model.turn_invariance import check_turns
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import check_count, fail, instance, scalar
 from heliograph.numerics.manifold import Manifold

@@ -9,8 +9,8 @@ from typing_extensions import TypeAliasType
 from heliograph.model.channel import Channel
 from heliograph.model.checks.refusals import Reason, number_of
 from heliograph.model.intervals import read_intervals, read_numbers
+from heliograph.model.repeated_readings import Repeats, StuckLike, count_repeats, stuck_counts
 from heliograph.model.sensor import AnySensor
-from heliograph.model.stuck import Repeats, StuckLike, count_repeats, stuck_counts
 from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import ArrayLike, Bool, Float, Int

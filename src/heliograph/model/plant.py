@@ -11,7 +11,7 @@ from typing_extensions import TypeAliasType
 
 from heliograph.model.intervals import StateLimits, StateLimitsLike, read_state_limits
 from heliograph.model.over_time import OverTime, first
-from heliograph.model.turns import check_turns
+from heliograph.model.turn_invariance import check_turns
 from heliograph.model.unknown_start import DiffuseStart
 from heliograph.numerics.angle import Angles, angles_at, read_angles
 from heliograph.numerics.check import array, covariance, error_text, fail, function, instance, items, name_list, names

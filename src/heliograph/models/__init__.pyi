@@ -40,7 +40,7 @@ from .series import (
     trend as trend,
     trigonometric_seasonal as trigonometric_seasonal,
 )
-from .joined import (
+from .joined_plants import (
     Structural as Structural,
     join as join,
     structural as structural,

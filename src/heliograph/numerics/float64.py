@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.numerics.check import fail, show_value
-from heliograph.numerics.process.collector import pause_collector
+from heliograph.numerics.process.garbage_collector import pause_collector
 from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import PyTree
 

@@ -8,7 +8,7 @@ from typing import NoReturn
 
 import lazy_loader
 
-from heliograph.numerics.process.collector import pause_collector
+from heliograph.numerics.process.garbage_collector import pause_collector
 
 MOST = 3  # names that are offered
 ALIKE = 0.7  # as difflib measures it, so that neess offers nees and foo nothing

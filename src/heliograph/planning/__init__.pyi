@@ -12,10 +12,10 @@ from .comparisons import (
     error_over_sites as error_over_sites,
     worth_of_changes as worth_of_changes,
 )
-from .error import (
+from .error_objective import (
     Error as Error,
 )
-from .messages import (
+from .message_rates import (
     MessageRate as MessageRate,
     delta_for_rate as delta_for_rate,
     least_error as least_error,
@@ -39,7 +39,7 @@ from .network_of_design import (
 from .paths.relaxation import (
     split_power as split_power,
 )
-from .sensors import (
+from .sensor_worth import (
     ErrorWithout as ErrorWithout,
     SensorWorth as SensorWorth,
     worth_of_sensors as worth_of_sensors,

@@ -8,15 +8,15 @@ import numpy as np
 
 from heliograph.filters.linear.linear import linear_filter
 from heliograph.model.channel import Channel
-from heliograph.model.enlarged.joint import join_links
+from heliograph.model.enlarged.joint_sensors import join_links
 from heliograph.model.over_time import OverTime, at, first, over_time
 from heliograph.model.plant import AnyPlant
 from heliograph.numerics.check import array, fail, instance, table
 from heliograph.numerics.module import are_same
 from heliograph.numerics.types import Float
-from heliograph.planning.error import Error
-from heliograph.planning.moments import measurement_moment, moments_over, steady_moment
+from heliograph.planning.error_objective import Error
 from heliograph.planning.paths.model import require_at_least
+from heliograph.planning.plant_moments import measurement_moment, moments_over, steady_moment
 from heliograph.planning.transmitters import set_transmitter_powers, transmitter_names
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.simulation.network import Network

@@ -18,7 +18,7 @@ from heliograph.numerics.keys import seed_key
 from heliograph.numerics.lapack import spectral_radius
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, ArrayLike, Float
-from heliograph.planning.moments import measurement_moment, moments_over, steady_moment
+from heliograph.planning.plant_moments import measurement_moment, moments_over, steady_moment
 from heliograph.planning.transmitters import compute_sent_powers, steady_powers
 from heliograph.relays.design import given_design
 from heliograph.simulation.network import Network

@@ -11,7 +11,7 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.budget import Budget, check_budget
-from heliograph.planning.error import Error
+from heliograph.planning.error_objective import Error
 from heliograph.planning.network_of_design import designed_network
 from heliograph.planning.numbers.problem import Build
 from heliograph.planning.paths.model import Paths

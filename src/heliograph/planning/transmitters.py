@@ -20,7 +20,7 @@ from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.chain import stationary
 from heliograph.random_affine.hop import AbstractHop, GainAndNoise
 from heliograph.random_affine.modes import joint_modes
-from heliograph.random_affine.moments.route import ChannelPosition, Second, SignalMoment, Visit
+from heliograph.random_affine.moments.signal_path import ChannelPosition, Second, SignalMoment, Visit
 
 UNCHANGED = 1e-12  # change of a law in a step that counts as none
 

@@ -51,7 +51,7 @@ from .noise import (
 from .moments.second_moments import (
     second_order as second_order,
 )
-from .rotation import (
+from .phase_rotation import (
     Rotation as Rotation,
 )
 from .superposed import (

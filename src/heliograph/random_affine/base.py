@@ -18,11 +18,11 @@ from heliograph.random_affine.memory import (
     init_with_shared_memories,
     memories,
 )
-from heliograph.random_affine.moments.components import AffineComponent
 from heliograph.random_affine.moments.disturbed_gain import DisturbedGain
 from heliograph.random_affine.moments.intervals import CORNERS, Interval
+from heliograph.random_affine.moments.mixture_components import AffineComponent
 from heliograph.random_affine.moments.monomials import JointMoments, give_moments
-from heliograph.random_affine.moments.route import (
+from heliograph.random_affine.moments.signal_path import (
     ChannelPosition,
     SignalMoment,
     Visit,

@@ -24,9 +24,9 @@ from heliograph.random_affine.base import (
 )
 from heliograph.random_affine.composite import ARROW, AbstractComposite, list_in_words
 from heliograph.random_affine.hop import known
-from heliograph.random_affine.moments.components import AffineComponent, combine_atoms
 from heliograph.random_affine.moments.disturbed_gain import DisturbedGain, stack_on_shared_inputs
 from heliograph.random_affine.moments.intervals import Interval, multiply_interval_polynomials, multiply_matrices
+from heliograph.random_affine.moments.mixture_components import AffineComponent, combine_atoms
 from heliograph.random_affine.moments.monomials import (
     JointMoments,
     count_monomials,
@@ -35,7 +35,7 @@ from heliograph.random_affine.moments.monomials import (
     position,
     refuse_if_too_large,
 )
-from heliograph.random_affine.moments.route import ChannelPosition, SignalMoment, Visit
+from heliograph.random_affine.moments.signal_path import ChannelPosition, SignalMoment, Visit
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
 
 OUTCOME_LIMIT = 1024  # sets of losses that are listed

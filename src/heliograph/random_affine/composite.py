@@ -12,7 +12,7 @@ from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, inner_maps, replace_inner_maps
-from heliograph.random_affine.moments.route import ChannelPosition, Visit, refuse_gain_on_angles
+from heliograph.random_affine.moments.signal_path import ChannelPosition, Visit, refuse_gain_on_angles
 
 ARROW, DIRECT = " → ", "direct"  # between maps in series, and of one that only selects
 

@@ -23,7 +23,7 @@ from heliograph.random_affine.laws.law import Discrete
 from heliograph.random_affine.mixture import Mixture
 from heliograph.random_affine.modes import Modes
 from heliograph.random_affine.moments.monomials import JointMoments
-from heliograph.random_affine.moments.route import ChannelPosition, SignalMoment, Visit
+from heliograph.random_affine.moments.signal_path import ChannelPosition, SignalMoment, Visit
 
 # Steps; their law at each step; or a chain whose mode is the number of steps.
 Delay = TypeAliasType("Delay", int | Discrete | MarkovChain)

@@ -12,7 +12,7 @@ from heliograph.random_affine.base import AbstractRandomAffine, ArrivalOutcome, 
 from heliograph.random_affine.composite import DIRECT, AbstractMapWrapper, percent_in_words
 from heliograph.random_affine.hop import known
 from heliograph.random_affine.moments.monomials import JointMoments
-from heliograph.random_affine.moments.route import ChannelPosition, SignalMoment, Visit
+from heliograph.random_affine.moments.signal_path import ChannelPosition, SignalMoment, Visit
 
 
 class Erasure(AbstractMapWrapper):

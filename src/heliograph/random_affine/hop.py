@@ -12,9 +12,9 @@ from heliograph.numerics.traced import equal_to_rounding, is_traced, is_zero, li
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine, KnownGains, SameNoise
 from heliograph.random_affine.laws.law import AbstractLaw, Constant
-from heliograph.random_affine.moments.components import AffineComponent
 from heliograph.random_affine.moments.disturbed_gain import DisturbedGain, disturb_hop, noise_gain
 from heliograph.random_affine.moments.intervals import Interval
+from heliograph.random_affine.moments.mixture_components import AffineComponent
 from heliograph.random_affine.moments.monomials import (
     JointMoments,
     count_monomials,
@@ -23,7 +23,7 @@ from heliograph.random_affine.moments.monomials import (
     refuse_if_too_large,
     symmetric_power,
 )
-from heliograph.random_affine.moments.route import ChannelPosition, Visit, refuse_gain_on_angles
+from heliograph.random_affine.moments.signal_path import ChannelPosition, Visit, refuse_gain_on_angles
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Matrix, Vector, as_noise, noise_vector
 
 NOTHING_SENT = "nothing sent"  # in words

@@ -15,10 +15,10 @@ from heliograph.random_affine.combine import AbstractCombination, Corners
 from heliograph.random_affine.composite import DIRECT, AbstractUniform, percent_in_words
 from heliograph.random_affine.hop import NOTHING_SENT, GainAndNoise
 from heliograph.random_affine.laws.law import Constant, Discrete
-from heliograph.random_affine.moments.components import AffineComponent
 from heliograph.random_affine.moments.disturbed_gain import DisturbedGain, mix_gains
+from heliograph.random_affine.moments.mixture_components import AffineComponent
 from heliograph.random_affine.moments.monomials import JointMoments, product_table
-from heliograph.random_affine.moments.route import ChannelPosition, Visit
+from heliograph.random_affine.moments.signal_path import ChannelPosition, Visit
 from heliograph.random_affine.noise import Gaussian, Matrix
 
 

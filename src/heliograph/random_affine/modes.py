@@ -23,7 +23,7 @@ from heliograph.random_affine.laws.law import Constant
 from heliograph.random_affine.memory import condition_on_states, memories, select_alike
 from heliograph.random_affine.mixture import Mixture
 from heliograph.random_affine.moments.monomials import JointMoments
-from heliograph.random_affine.moments.route import ChannelPosition, Visit
+from heliograph.random_affine.moments.signal_path import ChannelPosition, Visit
 from heliograph.random_affine.noise import AbstractNoise, Matrix, as_noise
 
 MODES = 1024  # joint modes that are listed: a filter's matrices have as many blocks in a row

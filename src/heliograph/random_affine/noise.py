@@ -16,7 +16,7 @@ from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.traced import block_diagonal, is_traced, is_zero, library, plain, stack_parts
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.laws.law import draw_index
-from heliograph.random_affine.moments.components import (
+from heliograph.random_affine.moments.mixture_components import (
     GaussianBranches,
     NoiseAtom,
     NoiseWithoutOutliers,

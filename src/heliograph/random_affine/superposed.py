@@ -18,9 +18,9 @@ from heliograph.random_affine.composite import list_in_words
 from heliograph.random_affine.hop import GainAndNoise, known
 from heliograph.random_affine.laws.law import Constant
 from heliograph.random_affine.memory import memories
-from heliograph.random_affine.moments.components import AffineComponent
 from heliograph.random_affine.moments.disturbed_gain import DisturbedGain
 from heliograph.random_affine.moments.intervals import Interval
+from heliograph.random_affine.moments.mixture_components import AffineComponent
 from heliograph.random_affine.moments.monomials import (
     JointMoments,
     count_monomials,
@@ -32,7 +32,7 @@ from heliograph.random_affine.moments.monomials import (
     refuse_if_too_large,
     times_one,
 )
-from heliograph.random_affine.moments.route import ChannelPosition, Visit
+from heliograph.random_affine.moments.signal_path import ChannelPosition, Visit
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Matrix, as_noise, noise_vector
 
 Places = tuple[int, ...]  # of what a map takes, among the components of y

@@ -11,10 +11,10 @@ from scipy.special import ndtri
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.trigger import Periodic
 from heliograph.numerics.check import InputError
-from heliograph.numerics.shares import count_independent
+from heliograph.numerics.counted_shares import count_independent
 from heliograph.numerics.types import Bool, Float, Int
-from heliograph.report.pattern import Pattern, find_pattern
-from heliograph.report.rate import Rate, find_rate
+from heliograph.report.sending_pattern import Pattern, find_pattern
+from heliograph.report.sending_rate import Rate, find_rate
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 

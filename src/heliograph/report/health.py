@@ -10,7 +10,7 @@ from heliograph.model.checks.refusals import Reason
 from heliograph.model.plant import TIME_STEP
 from heliograph.model.timeouts import LongSilences, find_long_silences
 from heliograph.numerics.check import array, fail, instance
-from heliograph.numerics.shares import average_correlated
+from heliograph.numerics.counted_shares import average_correlated
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.report.arrivals import Arrivals, list_arrivals
 from heliograph.report.compared_nodes import compare_nodes
@@ -18,8 +18,8 @@ from heliograph.report.constant_error import ConstantError, find_constant_error
 from heliograph.report.doubts import say_apart, say_constant_error, say_memory, say_overconfident, say_underconfident
 from heliograph.report.expected_squares import compare_squares, expect_squares
 from heliograph.report.forecasts import Forecasts, Residuals
-from heliograph.report.held import HeldValue
 from heliograph.report.outputs import ListeningFilter, OutputHealth, judge_outputs_of_filter, list_listeners, weighs
+from heliograph.report.repeated_values import HeldValue
 from heliograph.report.time_unit import doubt_time_unit
 from heliograph.simulation.declared.judgement import DeclaredJudgement, judge_declared_links
 from heliograph.simulation.description.possible import doubt_estimates

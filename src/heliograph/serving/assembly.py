@@ -19,12 +19,12 @@ from heliograph.serving.brokers.pipe import Pipe
 from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.brokers.transport import LOG, WHOLE, Part, TakenOverError, Transport
 from heliograph.serving.brokers.url import Address
+from heliograph.serving.device_status import LastWordsService
 from heliograph.serving.loop import AbandonedError, BatchService, StoppableWork, serve_until, set_stop_on_signals
-from heliograph.serving.patience import WaitingService, retry_while_away
 from heliograph.serving.service import Service
 from heliograph.serving.settings import NOTHING, SHORTEST, ServiceSettings
 from heliograph.serving.storage.store_protocol import AwayError, InMemoryStore, StoreProtocol, identity, report_damage
-from heliograph.serving.words import LastWordsService
+from heliograph.serving.waiting_service import WaitingService, retry_while_away
 from heliograph.simulation.network import Network
 
 STANDARD_INPUT = 0

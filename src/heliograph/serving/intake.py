@@ -8,10 +8,10 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
+from heliograph.live.clock_leap import ARRIVAL, Leap, find_leap, make_first_leap
 from heliograph.live.event import INPUTS, CheckedEvent, Verdict
 from heliograph.live.fleet import Fleet
 from heliograph.live.implausible_events import Candidate, JudgementReader
-from heliograph.live.leap import ARRIVAL, Leap, find_leap, make_first_leap
 from heliograph.live.link_counts import LinkCounts
 from heliograph.live.plant import PlantState, WithdrawnEvent
 from heliograph.numerics.check import InputError

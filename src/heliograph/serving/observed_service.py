@@ -5,10 +5,10 @@ from contextlib import AbstractContextManager
 from threading import Lock
 from typing import Protocol
 
+from heliograph.serving.count_totals import LinkTotals
 from heliograph.serving.loop import BatchService
 from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
-from heliograph.serving.totals import LinkTotals
 
 
 class WatchedPlant(Protocol):

@@ -9,7 +9,7 @@ import numpy as np
 
 from heliograph.live.fleet import Fleet
 from heliograph.live.plant import PlantState
-from heliograph.live.rows import HeldRow
+from heliograph.live.sorted_rows import HeldRow
 from heliograph.serving.settings import SHORTEST
 
 MOVED = 0.1  # deviations by which a mean has to move to be published again, and share by which a deviation has to

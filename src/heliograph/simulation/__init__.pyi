@@ -74,7 +74,7 @@ from .centres.node_filter import (
     NodeFilter as NodeFilter,
     node_network as node_network,
 )
-from .centres.tree import (
+from .centres.relay_tree import (
     RelayTree as RelayTree,
     relay_tree as relay_tree,
 )
@@ -82,7 +82,7 @@ from .results.statistics import (
     ErrorStatistics as ErrorStatistics,
     pool as pool,
 )
-from .results.sums import (
+from .results.error_sums import (
     error_statistics as error_statistics,
 )
 from .results.statistics_by_name import (

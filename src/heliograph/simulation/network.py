@@ -10,7 +10,7 @@ import equinox as eqx
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.scheduled import ScheduledFilter
-from heliograph.fusion.informed import AbstractInformedFusion
+from heliograph.fusion.joint_covariance_fusion import AbstractInformedFusion
 from heliograph.fusion.network_fusion import Fusion
 from heliograph.linear.system import Schedule
 from heliograph.model.channel import Channel, check_link, find_received_angles
@@ -19,15 +19,16 @@ from heliograph.model.over_time import first, steps_covered
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.relays import RECEIVER, RelayNetwork
 from heliograph.model.sensor import AnySensor, without_output_names
-from heliograph.model.words.route import find_places
+from heliograph.model.words.word_channel import find_places
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import check_horizon, fail, table
-from heliograph.numerics.frozen import FrozenMapping
+from heliograph.numerics.frozen_mapping import FrozenMapping
 from heliograph.numerics.module import Module, readable
 from heliograph.random_affine.base import check_forgets
 from heliograph.random_affine.memory import drop_names, memories
 from heliograph.simulation.centres.centre import along_estimates, claim_of_informed, claim_of_reports
 from heliograph.simulation.centres.mesh_check import check_mesh, mesh_claim
+from heliograph.simulation.channel_flags import check_flags
 from heliograph.simulation.claims import (
     OtherBelief,
     judge_fused_standing,
@@ -39,8 +40,7 @@ from heliograph.simulation.claims import (
     nominal_nodes,
 )
 from heliograph.simulation.description.diagram import short_text_of, text_of, write_html_table
-from heliograph.simulation.flags import check_flags
-from heliograph.simulation.index import (
+from heliograph.simulation.network_index import (
     EstimatePlace,
     FilterKind,
     find_estimate_places,

@@ -14,19 +14,19 @@ from heliograph.model.limits import Limits, LimitsLike, make_limits
 from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.relays import RelayNetwork
+from heliograph.model.repeated_readings import StuckLike
+from heliograph.model.reported_numbers import name_received
 from heliograph.model.sensor import AbstractSensor, AnySensor
-from heliograph.model.stuck import StuckLike
-from heliograph.model.told import name_received
 from heliograph.model.trigger import AbstractTrigger
 from heliograph.model.words.encoder import Words
-from heliograph.model.words.route import FLAG, find_places
+from heliograph.model.words.word_channel import FLAG, find_places
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import TINY, fail, scalar, table
-from heliograph.numerics.frozen import FrozenMapping
+from heliograph.numerics.frozen_mapping import FrozenMapping
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.simulation.flags import check_flags
+from heliograph.simulation.channel_flags import check_flags
 from heliograph.simulation.sender_checks import (
     check_encoder,
     check_trigger,

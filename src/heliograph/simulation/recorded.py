@@ -10,14 +10,14 @@ from typing_extensions import TypeAliasType
 
 from heliograph.model.checks.refusals import number_of
 from heliograph.model.checks.row_times import common_dates, warn_of_unequal_steps
-from heliograph.model.origin import Origin, last_input, usual_months, usual_spacing
+from heliograph.model.forecast_origin import Origin, last_input, usual_months, usual_spacing
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import array, check_columns, fail, instance, rank, table
 from heliograph.numerics.float64 import refuse_forked_process
 from heliograph.numerics.times.row_times import check_times
 from heliograph.numerics.types import ArrayLike, PyTree, units_in
 from heliograph.simulation.arguments import read_measurements, read_plant_inputs
-from heliograph.simulation.centres.blame import refuse_centrally
+from heliograph.simulation.centres.implausible_node import refuse_centrally
 from heliograph.simulation.centres.uplinks import SentReports
 from heliograph.simulation.description.possible import doubt_estimates
 from heliograph.simulation.description.remarks import say_remarks

@@ -7,7 +7,7 @@ import numpy as np
 
 from heliograph.model.checks.refusals import Reason, count_by_reason, number_of
 from heliograph.model.limits import Limits
-from heliograph.model.stuck import Repeats
+from heliograph.model.repeated_readings import Repeats
 from heliograph.model.timeouts import find_long_silences
 from heliograph.numerics.types import Float, Int
 from heliograph.simulation.network import Network

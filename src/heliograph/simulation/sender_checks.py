@@ -11,7 +11,7 @@ from heliograph.model.over_time import first
 from heliograph.model.sensor import AbstractSensor
 from heliograph.model.trigger import AbstractTrigger, Periodic
 from heliograph.model.words.encoder import Words
-from heliograph.model.words.route import FLAG, find_places
+from heliograph.model.words.word_channel import FLAG, find_places
 from heliograph.numerics.check import fail, show_value
 from heliograph.random_affine.base import AbstractRandomAffine, all_inner_maps
 from heliograph.random_affine.words.flips import Flips

@@ -23,7 +23,7 @@ from heliograph.simulation.arguments import Precision, check_precision, key_of, 
 from heliograph.simulation.centres.mesh_building import build_meshes
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
-from heliograph.simulation.plan import has_plan, plan_filters
+from heliograph.simulation.precomputed_filters import has_plan, plan_filters
 from heliograph.simulation.results.no_numbers import warn_of_no_numbers
 from heliograph.simulation.results.record import Record
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Result, Trajectories
@@ -41,10 +41,10 @@ from heliograph.simulation.runs.lanes import (
 )
 from heliograph.simulation.runs.memory import NeededMemory, check_memory, explain_out_of_memory, size_of
 from heliograph.simulation.runs.native import simulate_natively
+from heliograph.simulation.simulation_step import World
 from heliograph.simulation.smoothed import NetworkSmoother, ReducedRuns, finish_result, reduce_run, select_smoothed_part
 from heliograph.simulation.stepping import AllFilters
 from heliograph.simulation.transmission.build_reception import make_reception
-from heliograph.simulation.world import World
 from heliograph.smoothing.fixed_interval_lag_point import AbstractSmoothing
 
 Progress = TypeAliasType("Progress", Callable[[int, int], None])

@@ -22,7 +22,7 @@ from heliograph.filters.chunks import (
     scan_settled_by_means,
 )
 from heliograph.filters.recursion import linear_start, scan_chunk
-from heliograph.filters.settled import SettledState
+from heliograph.filters.settled_covariance import SettledState
 from heliograph.filters.smoother_step import SmootherStep, gaussian_of
 from heliograph.filters.states import find_equal_states, select_state
 from heliograph.filters.windows import Which, take, take_windows

@@ -16,7 +16,7 @@ from heliograph.engine.choice import choose_code
 from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.chunks import ChunkStarts
 from heliograph.filters.recursion import Recursion
-from heliograph.filters.settled import SettledState, find_settled_state, scan_settled_rows, step_settled
+from heliograph.filters.settled_covariance import SettledState, find_settled_state, scan_settled_rows, step_settled
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, gaussian_of, make_smoother_step
 from heliograph.filters.states import means_of, with_means
 from heliograph.filters.windows import take

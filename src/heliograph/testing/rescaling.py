@@ -18,12 +18,12 @@ from heliograph.filters.linear.mean_before_data import UnconditionalMean
 from heliograph.filters.linear.polynomial import PolynomialFilter
 from heliograph.filters.linear.scheduled import LinearSystemFilter
 from heliograph.filters.modes.additive import AdditiveModalFilter
+from heliograph.filters.modes.arrival_patterns import SideInformation
 from heliograph.filters.modes.mixture import AtomCombinations, MixtureFilter
 from heliograph.filters.modes.modal import ChannelByMode, ModalFilter
 from heliograph.filters.modes.multiple_model import MultipleModelFilter
-from heliograph.filters.modes.patterns import SideInformation
 from heliograph.filters.modes.side_information import SideInformationFilter
-from heliograph.filters.modes.uncertain import UncertainModalFilter
+from heliograph.filters.modes.uncertain_chain import UncertainModalFilter
 from heliograph.filters.wrappers.fed_back import PredictionFilter
 from heliograph.linear.system import LinearSystem, Steps
 from heliograph.model.over_time import OverTime, at_each_step, first, stacked

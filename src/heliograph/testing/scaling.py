@@ -7,7 +7,7 @@ from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.gaussian.sequential import SequentialFilter
 from heliograph.filters.linear.linear import LinearFilter
 from heliograph.filters.wrappers.fed_back import PredictionFilter
-from heliograph.fusion.informed import ScalarWeights
+from heliograph.fusion.joint_covariance_fusion import ScalarWeights
 from heliograph.fusion.network_fusion import Fusion
 from heliograph.fusion.rules import CovarianceIntersection, InverseCovarianceIntersection
 from heliograph.model.channel import Channel

@@ -12,7 +12,7 @@ import numpy as np
 import heliograph as hg
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import Module
-from heliograph.random_affine.moments.route import apply
+from heliograph.random_affine.moments.signal_path import apply
 from heliograph_studies import Inline, Stages, Unlisted, check_fields
 from heliograph_studies.demo import robot
 from heliograph_studies.demo.learned import Learned, Score, learn, score

@@ -9,7 +9,7 @@ import numpy as np
 
 import heliograph as hg
 from heliograph.linear import CriticalArrival
-from heliograph.planning.moments import steady_covariance
+from heliograph.planning.plant_moments import steady_covariance
 from heliograph.random_affine import AbstractRandomAffine
 from heliograph.simulation import Boundedness
 from heliograph_studies import Sampled, Stages, Unlisted

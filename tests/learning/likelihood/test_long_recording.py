@@ -6,7 +6,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.filters import chunks
-from heliograph.learning.description import describe
+from heliograph.learning.free_network import describe
 from heliograph.learning.likelihood import LikelihoodData, LikelihoodSurface, make_objectives
 
 ROWS = 40_001  # a chunk that is not full at the end

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.learning.description import describe
+from heliograph.learning.free_network import describe
 from heliograph.learning.likelihood import LikelihoodData, LikelihoodSurface, make_objectives
 from heliograph.learning.likelihood.evaluation import _by_xla
 

@@ -13,9 +13,9 @@ from heliograph.numerics import seed_key
 from heliograph.relays.design import local_error_design
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Trajectories
 from heliograph.simulation.runs.native import compile_runs
+from heliograph.simulation.simulation_step import World
 from heliograph.simulation.stepping import AllFilters
 from heliograph.simulation.transmission.build_reception import make_reception
-from heliograph.simulation.world import World
 from straightline.nodes import Node, Unsupported
 from tests.relays.relay_problems import example
 from tests.simulation.both import Both

@@ -18,7 +18,7 @@ from heliograph.files.messages.in_files import (
     read_message_file,
     table_has_topics,
 )
-from heliograph.files.messages.own import NODE, SEQUENCE, OwnMessages, holds_events, is_own, is_table
+from heliograph.files.messages.own_form import NODE, SEQUENCE, OwnMessages, holds_events, is_own, is_table
 from heliograph.files.sources.fields import parse_arrival
 from heliograph.files.sources.reading import Unread
 from heliograph.files.sources.sources import Sources

@@ -32,9 +32,9 @@ from heliograph.filters.event.joint_gaussian import (
 from heliograph.filters.event.silent_region import SilentRegion
 from heliograph.filters.gaussian.belief import second_moments_at_start, smoother_step_by_transform
 from heliograph.filters.gaussian.transform import AbstractTransform
-from heliograph.filters.modes.patterns import SideInformation, pattern_of
+from heliograph.filters.modes.arrival_patterns import SideInformation, pattern_of
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
-from heliograph.model.centred import predict_signal
+from heliograph.model.centred_signal import predict_signal
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant

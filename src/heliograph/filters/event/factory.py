@@ -10,7 +10,7 @@ from heliograph.filters.event.ball import MOST_COMPONENTS
 from heliograph.filters.event.event_filter import EventFilter
 from heliograph.filters.event.stochastic import StochasticEventFilter
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
-from heliograph.filters.modes.patterns import SideInformation, describe_by_pattern
+from heliograph.filters.modes.arrival_patterns import SideInformation, describe_by_pattern
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, lower_by_noise
 from heliograph.model.fading import uncertain_chain

@@ -15,10 +15,10 @@ from heliograph.filters.event.gaussian_sum import FLOOR, GaussianSum, concatenat
 from heliograph.filters.gaussian.belief import predict_gaussian, second_moments_at_start, smoother_step_by_transform
 from heliograph.filters.gaussian.signal import Signal, factor_spread, signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform
+from heliograph.filters.modes.arrival_patterns import SideInformation, append_flag
 from heliograph.filters.modes.multiple_model import correct_in_every_mode, replicate
-from heliograph.filters.modes.patterns import SideInformation, append_flag
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
-from heliograph.model.centred import predict_signal
+from heliograph.model.centred_signal import predict_signal
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant

@@ -18,7 +18,7 @@ from heliograph.filters.base import (
 from heliograph.filters.gaussian.belief import second_moments_at_start
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.gaussian.robust import RobustFilter, predict_behind_channel, signal_without_noise
-from heliograph.filters.gaussian.scores import (
+from heliograph.filters.gaussian.robust_scores import (
     SMALLEST,
     AbstractWeights,
     PredictedMeasurement,
@@ -36,7 +36,7 @@ from heliograph.model.premises.premise import on_premise
 from heliograph.model.sensor import AbstractSensor
 from heliograph.numerics.angle import wrap_near
 from heliograph.numerics.check import TINY, fail, scalar
-from heliograph.numerics.density import log_density
+from heliograph.numerics.gaussian_density import log_density
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.moments.second_moments import SecondOrder
 

@@ -6,7 +6,6 @@ from typing import Protocol
 import jax
 import jax.numpy as jnp
 
-from heliograph.factors.changes import settle
 from heliograph.factors.columns import WeightedColumns, columns_of, join_columns, rounding_of, triangularise
 from heliograph.factors.gaussian import (
     Gaussian,
@@ -16,6 +15,7 @@ from heliograph.factors.gaussian import (
     predict_affine,
     sum_unexplained,
 )
+from heliograph.factors.gaussian_on_group import settle
 from heliograph.filters.base import (
     AbstractSizedFilter,
     FilterAngles,
@@ -28,7 +28,7 @@ from heliograph.filters.base import (
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, linear_image
 from heliograph.filters.innovation import no_innovation
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, gaussian_of, smoother_step_of
-from heliograph.filters.wrappers.limited import accept_limits
+from heliograph.filters.wrappers.state_limits import accept_limits
 from heliograph.model.estimate import Claim, Estimate, Innovation, lower_by_noise
 from heliograph.model.modes_of_motion import ModalPlant
 from heliograph.model.over_time import at, first

@@ -13,12 +13,12 @@ import numpy as np
 from heliograph.factors.columns import WeightedColumns, decorrelate, join_columns, reciprocal_or_zero
 from heliograph.factors.gaussian import Gaussian, condition_on_observation, from_columns
 from heliograph.factors.repeated import triangularise_noise
-from heliograph.filters.gaussian.scalars import (
+from heliograph.filters.gaussian.signal import ArrivedInnovation, Signal, augmented_second_moment, factor_spread
+from heliograph.filters.gaussian.young_scalars import (
     trace_minimising_scalars,
     young_fixed_point_map,
     zero_mean_fixed_point_map,
 )
-from heliograph.filters.gaussian.signal import ArrivedInnovation, Signal, augmented_second_moment, factor_spread
 from heliograph.numerics.check import array, fail, instance
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, PyTree

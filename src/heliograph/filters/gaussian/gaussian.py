@@ -4,11 +4,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from heliograph.factors.changes import settle
 from heliograph.factors.gaussian import Gaussian
+from heliograph.factors.gaussian_on_group import settle
 from heliograph.filters.base import AbstractFilter, FilterAngles, Step, corrects
 from heliograph.filters.gaussian.belief import AbstractBeliefFilter, second_moments_at_start
-from heliograph.filters.gaussian.centred import center_filter
 from heliograph.filters.gaussian.signal import (
     ArrivedInnovation,
     Signal,
@@ -16,6 +15,7 @@ from heliograph.filters.gaussian.signal import (
     make_received_noise,
     signal_of,
 )
+from heliograph.filters.gaussian.two_part_mean import center_filter
 from heliograph.filters.gaussian.update import AbstractUpdate
 from heliograph.filters.linear.plan import plan_filter
 from heliograph.model.channel import Channel, perfect

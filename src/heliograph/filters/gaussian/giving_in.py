@@ -20,7 +20,7 @@ from heliograph.filters.base import (
     predicts,
 )
 from heliograph.filters.gaussian.robust import Gate, RobustFilter
-from heliograph.filters.gaussian.scores import PredictedMeasurement
+from heliograph.filters.gaussian.robust_scores import PredictedMeasurement
 from heliograph.filters.remark import Remark
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import at

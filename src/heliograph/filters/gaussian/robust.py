@@ -14,8 +14,7 @@ from heliograph.filters.base import (
     corrects,
 )
 from heliograph.filters.gaussian.belief import AbstractBeliefFilter, second_moments_at_start
-from heliograph.filters.gaussian.centred import center_filter
-from heliograph.filters.gaussian.scores import (
+from heliograph.filters.gaussian.robust_scores import (
     AbstractWeights,
     PredictedMeasurement,
     ScoreUpdate,
@@ -26,6 +25,7 @@ from heliograph.filters.gaussian.scores import (
 )
 from heliograph.filters.gaussian.signal import Signal, make_received_noise, signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform
+from heliograph.filters.gaussian.two_part_mean import center_filter
 from heliograph.filters.robust_noise import ReceivedNoise
 from heliograph.model.estimate import Innovation
 from heliograph.model.over_time import OverTime, at, first
@@ -33,7 +33,7 @@ from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.numerics.angle import Angles, wrap_near
 from heliograph.numerics.check import TINY, check_count, scalar
-from heliograph.numerics.density import log_density
+from heliograph.numerics.gaussian_density import log_density
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.moments.second_moments import SecondOrder
 

@@ -17,18 +17,18 @@ from heliograph.filters.gaussian.signal import Signal, signal_size_at_start
 from heliograph.filters.gaussian.update import Polytope
 from heliograph.filters.linear.belief import LinearBelief, motion_of_plant, predict_belief, prior_belief
 from heliograph.filters.linear.given_record import LinearFilterOfRecord
+from heliograph.filters.linear.likelihood_scores import ScoreRecursion
 from heliograph.filters.linear.plan import plan_filter
-from heliograph.filters.linear.scores import ScoreRecursion
 from heliograph.filters.modes.additive import additive_modal_filter, independent_terms
 from heliograph.filters.modes.modal import modal_filter
 from heliograph.filters.modes.side_information import side_information_filter
-from heliograph.filters.modes.uncertain import uncertain_modal_filter
+from heliograph.filters.modes.uncertain_chain import uncertain_modal_filter
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
 from heliograph.filters.words.linear import build_behind_words
 from heliograph.filters.wrappers.delay import build_behind_delays, deliver_line_as_current
-from heliograph.filters.wrappers.limited import accept_limits
+from heliograph.filters.wrappers.reported_law import accept_told_numbers
 from heliograph.filters.wrappers.sensor_inputs import accept_sensor_inputs
-from heliograph.filters.wrappers.told import accept_told_numbers
+from heliograph.filters.wrappers.state_limits import accept_limits
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation, lower_by_noise
 from heliograph.model.fading import memory_matters, uncertain_chain, without_memory

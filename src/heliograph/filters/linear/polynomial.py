@@ -16,7 +16,7 @@ from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.linear.lift import lifted_system
 from heliograph.linear.polynomial import quadratic_system_with_linear_estimate
 from heliograph.linear.recursion import lmmse
-from heliograph.linear.routes import check_model
+from heliograph.linear.step_maps import check_model
 from heliograph.linear.system import LinearSystem
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, Innovation, lower_by_noise
@@ -26,8 +26,8 @@ from heliograph.model.plant import AnyPlant
 from heliograph.model.premises.premise import Premise, on_premise
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import check_count, fail, instance
-from heliograph.numerics.density import log_density
 from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.gaussian_density import log_density
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 from heliograph.random_affine.base import check_forgets, check_maps

@@ -28,8 +28,8 @@ from heliograph.filters.base import (
 from heliograph.filters.gaussian.belief import process_noise, second_moments_at_start
 from heliograph.filters.innovation import mixed_innovation, posterior_weights
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
-from heliograph.filters.wrappers.limited import accept_limits
-from heliograph.filters.wrappers.told import accept_told_numbers
+from heliograph.filters.wrappers.reported_law import accept_told_numbers
+from heliograph.filters.wrappers.state_limits import accept_limits
 from heliograph.model.channel import Channel, check_link, find_received_angles
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first, list_steps, restack, steps_covered
@@ -47,7 +47,7 @@ from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.laws.law import Constant
 from heliograph.random_affine.memory import memories
 from heliograph.random_affine.modes import JointModes, joint_modes
-from heliograph.random_affine.moments.components import COMPONENT_LIMIT
+from heliograph.random_affine.moments.mixture_components import COMPONENT_LIMIT
 
 
 class AtomCombinations(Module):

@@ -16,8 +16,8 @@ from heliograph.filters.gaussian.belief import second_moments_at_start
 from heliograph.filters.gaussian.update import Polytope
 from heliograph.filters.linear.belief import LinearBelief, PlantMotion, motion_of_plant, predict_belief, prior_belief
 from heliograph.filters.linear.linear import correct_linear
+from heliograph.filters.modes.arrival_patterns import append_flag
 from heliograph.filters.modes.modal import claim_of_modes
-from heliograph.filters.modes.patterns import append_flag
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Estimate, Innovation, lower_by_noise
 from heliograph.model.fading import uncertain_chain, with_flag

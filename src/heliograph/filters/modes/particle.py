@@ -22,14 +22,14 @@ from heliograph.filters.base import (
 from heliograph.filters.gaussian.belief import predict_gaussian, second_moments_at_start
 from heliograph.filters.gaussian.signal import signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform
+from heliograph.filters.modes.arrival_patterns import SideInformation
 from heliograph.filters.modes.models_by_mode import fields_of_mode_filters
 from heliograph.filters.modes.multiple_model import (
     align_angles,
     correct_in_every_mode,
     replicate,
 )
-from heliograph.filters.modes.patterns import SideInformation
-from heliograph.filters.particles.building import build_partly_drawn
+from heliograph.filters.particles.factory import build_partly_drawn
 from heliograph.filters.particles.partly_drawn import PartlyDrawnFilter
 from heliograph.filters.particles.resampling import (
     effective_number,
@@ -38,7 +38,7 @@ from heliograph.filters.particles.resampling import (
     resample_systematically,
 )
 from heliograph.filters.particles.state_particles import MANY, StateParticleFilter, build_state_particles
-from heliograph.filters.wrappers.limited import accept_limits
+from heliograph.filters.wrappers.state_limits import accept_limits
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.modes_of_motion import ModalPlant, ModalSensor

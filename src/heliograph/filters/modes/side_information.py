@@ -25,6 +25,7 @@ from heliograph.factors.gaussian import Innovations, from_covariance
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.gaussian.belief import second_moments_at_start
 from heliograph.filters.gaussian.signal import factor_spread, signal_size_at_start
+from heliograph.filters.modes.arrival_patterns import SideInformation, append_flag, describe_by_pattern, pattern_of
 from heliograph.filters.modes.linear_by_mode import centred_measurement, centred_transition, noise_in_mode
 from heliograph.filters.modes.modal import (
     concatenate_modes,
@@ -33,7 +34,6 @@ from heliograph.filters.modes.modal import (
     subtract_mean_output,
     sum_of_modes,
 )
-from heliograph.filters.modes.patterns import SideInformation, append_flag, describe_by_pattern, pattern_of
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Estimate, Innovation, lower_by_noise
 from heliograph.model.fading import uncertain_chain, with_flag

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from heliograph.filters.base import AbstractSizedFilter, FilterAngles, Step
 from heliograph.filters.chunks import ScanResult
-from heliograph.filters.particles.expected import find_reference
+from heliograph.filters.particles.expected_measurement import find_reference
 from heliograph.filters.particles.lanes import filter_particles
 from heliograph.filters.particles.moments import StateSums
 from heliograph.filters.particles.received_density import ReceivedDensity

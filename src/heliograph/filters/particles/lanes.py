@@ -15,7 +15,7 @@ import numpy as np
 
 from heliograph.engine.choice import choose_code, compute_once
 from heliograph.filters.chunks import ScanResult
-from heliograph.filters.particles.expected import find_reference
+from heliograph.filters.particles.expected_measurement import find_reference
 from heliograph.filters.particles.resampling import resample_concrete_weights
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.types import Array, PyTree

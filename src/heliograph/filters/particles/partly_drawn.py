@@ -19,7 +19,7 @@ from heliograph.factors.gaussian import Gaussian, condition_on_observation, from
 from heliograph.filters.base import Step, corrects, estimates, predicts
 from heliograph.filters.particles.base import AbstractStateParticleFilter, Weighed, keep_unused, relative_to_largest
 from heliograph.filters.particles.cloud import Cloud, PartlyDrawn, repeat_for_modes, sum_clouds, sum_clouds_apart
-from heliograph.filters.particles.draws import (
+from heliograph.filters.particles.drawn_states import (
     condition_on_draw,
     condition_on_leading_states,
     draw_index,

@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.modes.patterns import pattern_of
+from heliograph.filters.modes.arrival_patterns import pattern_of
 from heliograph.model.sensor import AbstractSensor
 from heliograph.numerics.angle import Angles, wrap_near
 from heliograph.numerics.check import fail
-from heliograph.numerics.density import LOG_TURN
+from heliograph.numerics.gaussian_density import LOG_TURN
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import Array, Bool, Float
@@ -18,7 +18,7 @@ from heliograph.random_affine.base import AbstractRandomAffine, ArrivalOutcome
 from heliograph.random_affine.combine import Series
 from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.laws.law import Constant
-from heliograph.random_affine.moments.components import AffineComponent
+from heliograph.random_affine.moments.mixture_components import AffineComponent
 
 CERTAIN = 1e-14  # of the largest eigenvalue of a noise's correlations: below it a combination has no noise
 

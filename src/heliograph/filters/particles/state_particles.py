@@ -10,7 +10,7 @@ from heliograph.engine.choice import compile_on_call
 from heliograph.factors.columns import WeightedColumns, columns_of, join_columns, square_root, triangularise
 from heliograph.filters.base import Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.particles.base import AbstractStateParticleFilter, Weighed, keep_unused, relative_to_largest
-from heliograph.filters.particles.expected import ExpectedMeasurement
+from heliograph.filters.particles.expected_measurement import ExpectedMeasurement
 from heliograph.filters.particles.moments import FirstSums, StateSums, first_sums, second_sums
 from heliograph.filters.particles.proposal import MoveLaw, noise_columns, propose_particles
 from heliograph.filters.particles.received_density import ReceivedAtoms, find_received_density

@@ -8,7 +8,7 @@ import numpy as np
 
 from heliograph.filters.base import AbstractFilter, make_sizes
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
-from heliograph.filters.words.received import describe_link, is_free_of_flips
+from heliograph.filters.words.bit_likelihoods import describe_link, is_free_of_flips
 from heliograph.filters.words.two_hypotheses import keep_two_hypotheses
 from heliograph.filters.words.word_filter import WordFilter
 from heliograph.filters.wrappers.delay import late_filter
@@ -19,7 +19,7 @@ from heliograph.model.plant import AnyPlant, check_plant
 from heliograph.model.premises.premise import Premise, on_premise
 from heliograph.model.sensor import AbstractSensor, AnySensor, check_sensor, refuse_angles
 from heliograph.model.words.encoder import Dither, Words
-from heliograph.model.words.route import FLAG, find_places, rewrite_about_centres
+from heliograph.model.words.word_channel import FLAG, find_places, rewrite_about_centres
 from heliograph.numerics.check import fail, instance, show_value
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Stack

@@ -14,8 +14,8 @@ from heliograph.filters.base import (
     make_sizes,
 )
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
+from heliograph.filters.words.bit_likelihoods import list_told_modes
 from heliograph.filters.words.overload import Overload, bound_overload, refuse_overload
-from heliograph.filters.words.received import list_told_modes
 from heliograph.filters.wrappers.wrapper import AbstractWrapper
 from heliograph.model.channel import Channel, check_sent
 from heliograph.model.estimate import Claim, Innovation, lower_by_noise, weakest
@@ -23,7 +23,7 @@ from heliograph.model.over_time import at_each_step, first, unstack
 from heliograph.model.plant import AnyPlant, check_plant
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.model.words.encoder import Words
-from heliograph.model.words.route import FLAG, find_places, rewrite_about_centres
+from heliograph.model.words.word_channel import FLAG, find_places, rewrite_about_centres
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.types import Array, ArrayLike, PyTree
 from heliograph.random_affine.moments.second_moments import has_random_gain, second_order

@@ -13,14 +13,14 @@ from heliograph.factors.repeated import triangularise_noise
 from heliograph.filters.base import Step, corrects
 from heliograph.filters.gaussian.belief import AbstractBeliefFilter, second_moments_at_start
 from heliograph.filters.gaussian.signal import Signal, innovation_covariance, signal_of
-from heliograph.filters.words.cells import WordEffect, effect_of_bits, effect_of_cell
-from heliograph.filters.words.received import LinkOfBits
-from heliograph.filters.words.sums import SignalPrior, WordGrid
+from heliograph.filters.words.bit_likelihoods import LinkOfBits
+from heliograph.filters.words.word_moments import WordEffect, effect_of_bits, effect_of_cell
+from heliograph.filters.words.word_sums import SignalPrior, WordGrid
 from heliograph.model.estimate import Innovation
 from heliograph.model.over_time import OverTime, at
 from heliograph.model.sensor import AnySensor
 from heliograph.model.words.encoder import Dither
-from heliograph.model.words.route import FLAG
+from heliograph.model.words.word_channel import FLAG
 from heliograph.numerics.types import Array, ArrayLike
 from heliograph.random_affine.moments.second_moments import SecondOrder
 from heliograph.random_affine.words.rounded import LARGEST

@@ -14,7 +14,7 @@ from heliograph.filters.gaussian.signal import signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
 from heliograph.filters.gaussian.update import AbstractUpdate, Polytope
 from heliograph.filters.wrappers.wrapper import AbstractWrapper
-from heliograph.model.centred import predict_signal
+from heliograph.model.centred_signal import predict_signal
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Innovation, lower_by_noise
 from heliograph.model.fading import memory_matters

@@ -12,10 +12,10 @@ from .graph import Neighbours as Neighbours
 from .graph import find_upstream_nodes as find_upstream_nodes
 from .graph import graph_of as graph_of
 from .graph import neighbours_of as neighbours_of
-from .joint import blocks_of as blocks_of
-from .joint import error_transitions as error_transitions
-from .joint import measurement_weights as measurement_weights
-from .joint import propagate_joint_covariance as propagate_joint_covariance
-from .joint import scatter_blocks as scatter_blocks
+from .joint_error_covariance import blocks_of as blocks_of
+from .joint_error_covariance import error_transitions as error_transitions
+from .joint_error_covariance import measurement_weights as measurement_weights
+from .joint_error_covariance import propagate_joint_covariance as propagate_joint_covariance
+from .joint_error_covariance import scatter_blocks as scatter_blocks
 from .neighbour_rules import DiffusionWeights as DiffusionWeights
 from .neighbour_rules import FrozenWeights as FrozenWeights

@@ -9,7 +9,7 @@ from heliograph.model.checks.inputs import check_inputs
 from heliograph.model.checks.row_times import judge_dates, warn_of_unequal_steps
 from heliograph.numerics.check import array, check_columns, fail, show_value
 from heliograph.numerics.masked import fill_masked
-from heliograph.numerics.times.rows import check_rows
+from heliograph.numerics.times.data_rows import check_rows
 from heliograph.numerics.types import Float
 from heliograph.simulation.network import Network
 

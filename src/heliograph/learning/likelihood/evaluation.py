@@ -10,8 +10,8 @@ import numpy as np
 from heliograph.engine.choice import choose_code
 from heliograph.learning.likelihood.data import LikelihoodData
 from heliograph.learning.likelihood.objective import Objective, filter_of
-from heliograph.numerics.density import differentiate_log_density
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
+from heliograph.numerics.gaussian_density import differentiate_log_density
 from heliograph.numerics.types import Array, Float
 
 

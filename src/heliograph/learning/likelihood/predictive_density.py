@@ -15,11 +15,11 @@ from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.module import readable
-from heliograph.numerics.times.rows import check_rows
+from heliograph.numerics.times.data_rows import check_rows
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
 from heliograph.random_affine.laws.law import AbstractLaw, Discrete
-from heliograph.random_affine.moments.components import AffineComponent
+from heliograph.random_affine.moments.mixture_components import AffineComponent
 
 REACH = 5.5  # standard deviations of the normal score: 4e-8 of a law lie beyond
 Map = TypeVar("Map", bound=AbstractRandomAffine)

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from heliograph.learning.losses.fates import CHOSEN, Fates, check_fates, fill_ends, keep_ends_only
 from heliograph.learning.losses.loss_law import AbstractLossLaw, Packets
-from heliograph.learning.losses.shares import Share, estimate_shares, logits, maximise_shares
+from heliograph.learning.losses.packet_fates import CHOSEN, Fates, check_fates, fill_ends, keep_ends_only
+from heliograph.learning.losses.probability_intervals import Share, estimate_shares, logits, maximise_shares
 from heliograph.model.channel import erasure
 from heliograph.model.fading import gilbert_elliott
 from heliograph.random_affine.base import AbstractRandomAffine

@@ -4,13 +4,13 @@ from typing import TypeVar
 
 import numpy as np
 
-from heliograph.learning.losses.fates import CHOSEN, Fates, check_fates, fill_ends, is_trial
-from heliograph.learning.losses.shares import estimate_shares, logits, maximise_shares
+from heliograph.learning.losses.packet_fates import CHOSEN, Fates, check_fates, fill_ends, is_trial
+from heliograph.learning.losses.probability_intervals import estimate_shares, logits, maximise_shares
 from heliograph.model.channel import erasure
 from heliograph.model.fading import gilbert_elliott, markov_fading
 from heliograph.numerics.check import check_count, fail
+from heliograph.numerics.counted_shares import Share, wilson
 from heliograph.numerics.module import Module, readable, unwritten
-from heliograph.numerics.shares import Share, wilson
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.chain import MarkovChain

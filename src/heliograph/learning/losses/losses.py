@@ -8,10 +8,10 @@ import scipy
 from scipy.special import expit, xlogy
 
 from heliograph.learning.intervals import mean_and_error
-from heliograph.learning.losses.fates import CheckedFates, Fates, check_fates, fill_ends, is_trial
 from heliograph.learning.losses.hidden_losses import HiddenModeLosses
 from heliograph.learning.losses.loss_law import AbstractLossLaw, IndependentLosses, MarkovLosses, Packets
-from heliograph.learning.losses.shares import Share, estimate_shares, logits, maximise_shares
+from heliograph.learning.losses.packet_fates import CheckedFates, Fates, check_fates, fill_ends, is_trial
+from heliograph.learning.losses.probability_intervals import Share, estimate_shares, logits, maximise_shares
 from heliograph.numerics.check import fail, scalar
 from heliograph.numerics.module import readable
 from heliograph.random_affine.base import AbstractRandomAffine

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from heliograph.live.fleet import Fleet
-from heliograph.live.rows import BEFORE
+from heliograph.live.sorted_rows import BEFORE
 from heliograph.live.stored.old_layout import (
     can_read_layout,
     describe_old_layout,

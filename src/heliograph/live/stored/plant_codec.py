@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from heliograph.live.clock_leap import Leap
 from heliograph.live.fleet import Fleet
-from heliograph.live.leap import Leap
 from heliograph.live.link_counts import LinkCounts
 from heliograph.live.plant import BeforeLeap, PlantState
-from heliograph.live.rows import HeldRow
+from heliograph.live.sorted_rows import HeldRow
 
 HEAD = struct.Struct("<4q")  # lengths: of the head in bytes, of rows, of events, of their values
 TYPES = ("<i8", "<i8", "<f8", "<f8", "<f8")  # of the parts after the head

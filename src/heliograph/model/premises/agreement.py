@@ -10,8 +10,8 @@ import jax
 import numpy as np
 
 from heliograph.model.channel import Channel
-from heliograph.model.enlarged.joint import JointSensor, join_links
-from heliograph.model.enlarged.past import with_past
+from heliograph.model.enlarged.joint_sensors import JointSensor, join_links
+from heliograph.model.enlarged.past_outputs import with_past
 from heliograph.model.fading import memory_matters, without_memory
 from heliograph.model.modes_of_motion import ModalPlant, ModalSensor
 from heliograph.model.over_time import at, at_each_step, first, steps_covered, unstack

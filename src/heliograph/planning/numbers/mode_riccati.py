@@ -20,7 +20,7 @@ from heliograph.factors.roots import observe_root, roots_of
 from heliograph.linear.jump_system import JumpSystem
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import Float
-from heliograph.planning.error import Criterion
+from heliograph.planning.error_objective import Criterion
 
 PLAIN, POLICIES = 400, 40  # iterations: of the recursion until its gains stabilise, of gains after that
 NEAR = 1e-4  # relative change of the recursion from which gains are improved

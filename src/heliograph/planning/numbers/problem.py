@@ -15,13 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.learning.description import Description, describe
+from heliograph.learning.free_network import Description, describe
 from heliograph.model.over_time import first
 from heliograph.numerics.check import InputError, array, fail, instance, items, table
 from heliograph.numerics.module import are_same
 from heliograph.numerics.types import Array, Float
-from heliograph.planning.error import Criterion, Error
-from heliograph.planning.moments import check_stable
+from heliograph.planning.error_objective import Criterion, Error
 from heliograph.planning.numbers.mode_riccati import ModeSolution, ModeSystem, lagrangian, solve_riccati
 from heliograph.planning.numbers.reception import (
     check_time_variation,
@@ -30,6 +29,7 @@ from heliograph.planning.numbers.reception import (
     means_are_known,
     transmitters_of,
 )
+from heliograph.planning.plant_moments import check_stable
 from heliograph.planning.quadratic_programme import DescentProblem, Evaluation
 from heliograph.simulation.network import Network
 

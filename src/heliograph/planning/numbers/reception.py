@@ -22,9 +22,9 @@ from heliograph.model.over_time import OverTime, at, first, steps_covered
 from heliograph.model.sensor import AnySensor, LinearSensor, refuse_angles
 from heliograph.numerics.check import check_horizon, fail
 from heliograph.numerics.types import Array, Bool, Float
-from heliograph.planning.error import Error
-from heliograph.planning.moments import check_design_plant, measurement_moment, moments_over, steady_moment
+from heliograph.planning.error_objective import Error
 from heliograph.planning.numbers.mode_riccati import ModeSystem
+from heliograph.planning.plant_moments import check_design_plant, measurement_moment, moments_over, steady_moment
 from heliograph.planning.transmitters import powers_of_law, transmitter_names
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.chain import stationary

@@ -8,7 +8,7 @@ import numpy as np
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import Bool, Float, Int
 from heliograph.planning.budget import MET, PowerLimits, Powers
-from heliograph.planning.error import Criterion
+from heliograph.planning.error_objective import Criterion
 from heliograph.planning.paths.model import (
     PathInformation,
     Paths,

@@ -23,8 +23,8 @@ from heliograph.model.plant import LinearPlant
 from heliograph.numerics.check import array, covariance, fail, instance, names, rank
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float, Int
-from heliograph.planning.error import Error
-from heliograph.planning.moments import moments_over, steady_moment
+from heliograph.planning.error_objective import Error
+from heliograph.planning.plant_moments import moments_over, steady_moment
 
 DOUBLINGS = 60
 CONVERGED = 1e-16  # relative change of the fixed point by a doubling: rounding

@@ -9,9 +9,9 @@ from heliograph.model.over_time import at, steps_covered
 from heliograph.model.sensor import LinearSensor, refuse_angles
 from heliograph.numerics.check import check_horizon, fail, instance
 from heliograph.numerics.types import Float
-from heliograph.planning.error import Error
-from heliograph.planning.moments import check_design_plant, measurement_moment, moments_over, steady_moment
+from heliograph.planning.error_objective import Error
 from heliograph.planning.paths.model import Paths, PlantSteps
+from heliograph.planning.plant_moments import check_design_plant, measurement_moment, moments_over, steady_moment
 from heliograph.planning.transmitters import compute_sent_powers
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Stack

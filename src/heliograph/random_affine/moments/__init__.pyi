@@ -1,13 +1,5 @@
 """Names that other folders take; the package loads them when first used."""
 
-from .components import AffineComponent as AffineComponent
-from .components import COMPONENT_LIMIT as COMPONENT_LIMIT
-from .components import GaussianBranches as GaussianBranches
-from .components import NoiseAtom as NoiseAtom
-from .components import NoiseWithoutOutliers as NoiseWithoutOutliers
-from .components import SignalNoise as SignalNoise
-from .components import combine_atoms as combine_atoms
-from .components import stack_branches as stack_branches
 from .disturbed_gain import DisturbedGain as DisturbedGain
 from .disturbed_gain import disturb_hop as disturb_hop
 from .disturbed_gain import mix_gains as mix_gains
@@ -17,6 +9,14 @@ from .intervals import CORNERS as CORNERS
 from .intervals import Interval as Interval
 from .intervals import multiply_interval_polynomials as multiply_interval_polynomials
 from .intervals import multiply_matrices as multiply_matrices
+from .mixture_components import AffineComponent as AffineComponent
+from .mixture_components import COMPONENT_LIMIT as COMPONENT_LIMIT
+from .mixture_components import GaussianBranches as GaussianBranches
+from .mixture_components import NoiseAtom as NoiseAtom
+from .mixture_components import NoiseWithoutOutliers as NoiseWithoutOutliers
+from .mixture_components import SignalNoise as SignalNoise
+from .mixture_components import combine_atoms as combine_atoms
+from .mixture_components import stack_branches as stack_branches
 from .moment_noise import about_mean as about_mean
 from .monomials import Exponents as Exponents
 from .monomials import JointMoments as JointMoments
@@ -35,18 +35,11 @@ from .monomials import product_table as product_table
 from .monomials import refuse_if_too_large as refuse_if_too_large
 from .monomials import symmetric_power as symmetric_power
 from .monomials import times_one as times_one
-from .push import TabulatedNoise as TabulatedNoise
-from .push import products_of_monomials as products_of_monomials
-from .push import push_moments as push_moments
-from .push import push_through_known_map as push_through_known_map
+from .pushed_moments import TabulatedNoise as TabulatedNoise
+from .pushed_moments import products_of_monomials as products_of_monomials
+from .pushed_moments import push_moments as push_moments
+from .pushed_moments import push_through_known_map as push_through_known_map
 from .quadratic_map import QuadraticMap as QuadraticMap
-from .route import ChannelPosition as ChannelPosition
-from .route import Second as Second
-from .route import SignalMoment as SignalMoment
-from .route import Visit as Visit
-from .route import apply as apply
-from .route import carry_by_moments as carry_by_moments
-from .route import refuse_gain_on_angles as refuse_gain_on_angles
 from .second_moments import SecondOrder as SecondOrder
 from .second_moments import describe_second_moments as describe_second_moments
 from .second_moments import has_known_mean as has_known_mean
@@ -55,4 +48,11 @@ from .second_moments import join_gain_and_noise as join_gain_and_noise
 from .second_moments import nominal_spread as nominal_spread
 from .second_moments import second_order as second_order
 from .second_moments import split_off_noise as split_off_noise
+from .signal_path import ChannelPosition as ChannelPosition
+from .signal_path import Second as Second
+from .signal_path import SignalMoment as SignalMoment
+from .signal_path import Visit as Visit
+from .signal_path import apply as apply
+from .signal_path import carry_by_moments as carry_by_moments
+from .signal_path import refuse_gain_on_angles as refuse_gain_on_angles
 from .tensors import symmetric_product as symmetric_product

@@ -12,7 +12,7 @@ from heliograph.factors.columns import WeightedColumns, join_columns
 from heliograph.numerics.check import fail
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import Float, PyTree
-from heliograph.random_affine.moments.components import GaussianBranches, NoiseWithoutOutliers, SignalNoise
+from heliograph.random_affine.moments.mixture_components import GaussianBranches, NoiseWithoutOutliers, SignalNoise
 from heliograph.random_affine.moments.monomials import Exponents
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Number, Square, Vector
 

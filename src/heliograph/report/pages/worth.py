@@ -8,7 +8,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocato
 
 from heliograph.disk.quoting import label_with_unit, quote_for_figure
 from heliograph.numerics.types import units_in
-from heliograph.planning.sensors import SensorWorth
+from heliograph.planning.sensor_worth import SensorWorth
 from heliograph.report.figures import BLUE, GREEN, INK, STYLE, VERMILION, stacked_panels
 
 BAR = 0.6  # height of a bar

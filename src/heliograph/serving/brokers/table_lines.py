@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from heliograph.files.messages.in_files import PAYLOAD, TOPIC, convert_row, typed_cells
-from heliograph.files.messages.own import NODE, OWN, SEQUENCE, OwnReader
+from heliograph.files.messages.own_form import NODE, OWN, SEQUENCE, OwnReader
 from heliograph.files.recording import RowReader
 from heliograph.files.sources.reading import Reading, Unread
 from heliograph.files.table import CsvColumnReader

@@ -18,12 +18,12 @@ from heliograph.model.estimate import Claim
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.types import unit_of, units_in
 from heliograph.report.outputs import RecentOutputs, make_output_row
+from heliograph.serving.count_totals import FIELDS, CountTotals, counts_of
 from heliograph.serving.observation.last_answers import LastAnswers
 from heliograph.serving.observation.overview import PlantTroubles, TroubleOverview
 from heliograph.serving.observation.running_nis import MEMORY, RunningNis, read_nis
 from heliograph.serving.observed_service import BatchTimes, ObservedService, WatchableService, WatchedPlant
 from heliograph.serving.output import Output
-from heliograph.serving.totals import FIELDS, CountTotals, counts_of
 from heliograph.simulation.network import Network
 
 T = TypeVar("T")

@@ -1,6 +1,5 @@
 """Names that other folders take; the package loads them when first used."""
 
-from .blame import refuse_centrally as refuse_centrally
 from .centre import CentreFilter as CentreFilter
 from .centre import CentreState as CentreState
 from .centre import FusionCentre as FusionCentre
@@ -15,6 +14,7 @@ from .fusions import StackedFusions as StackedFusions
 from .fusions import centres_of as centres_of
 from .fusions import find_source_filters as find_source_filters
 from .fusions import list_stacked_fusions as list_stacked_fusions
+from .implausible_node import refuse_centrally as refuse_centrally
 from .linearised import FollowedFusion as FollowedFusion
 from .linearised import LinearisedCentre as LinearisedCentre
 from .mesh import Mesh as Mesh

@@ -9,7 +9,7 @@ import numpy as np
 
 from heliograph.filters.linear.plan import LinearStep
 from heliograph.fusion.cross_covariance import ErrorSources, SourceFactors, initial_factors
-from heliograph.fusion.informed import MatrixWeights
+from heliograph.fusion.joint_covariance_fusion import MatrixWeights
 from heliograph.fusion.joint_covariance_weights import matrix_weights, solve_factored_weights
 from heliograph.fusion.network_fusion import Fusion
 from heliograph.numerics.check import check_horizon, fail, instance
@@ -19,7 +19,7 @@ from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.simulation.arguments import read_plant_inputs
 from heliograph.simulation.centres.observation_model import Together
 from heliograph.simulation.network import Network
-from heliograph.simulation.plan import plan_filters
+from heliograph.simulation.precomputed_filters import plan_filters
 from heliograph.simulation.stepping import AllFilters
 
 REGULAR = 1e-6  # least eigenvalue of the independent part of an error, relative to the error: then U has an inverse

@@ -30,7 +30,7 @@ from heliograph.fusion.cross_covariance import (
     propagate_factors,
     propagate_state,
 )
-from heliograph.fusion.informed import AbstractInformedFusion, CentreStep
+from heliograph.fusion.joint_covariance_fusion import AbstractInformedFusion, CentreStep
 from heliograph.fusion.network_fusion import Fusion
 from heliograph.fusion.report_link import ReportModel
 from heliograph.model.channel import Channel

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.fusion.informed import AbstractInformedFusion
+from heliograph.fusion.joint_covariance_fusion import AbstractInformedFusion
 from heliograph.fusion.network_fusion import Fusion
 from heliograph.fusion.quantizer import widen
 from heliograph.fusion.rules import AbstractFusion

@@ -18,7 +18,7 @@ from heliograph.fusion.cross_covariance import (
     initial_errors,
     propagate_errors_jointly,
 )
-from heliograph.fusion.informed import AbstractInformedFusion, CentreStep
+from heliograph.fusion.joint_covariance_fusion import AbstractInformedFusion, CentreStep
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.model.over_time import at
 from heliograph.model.plant import AnyPlant

@@ -19,7 +19,7 @@ from heliograph.fusion.mesh.gains import (
     gains_of,
     information_of,
 )
-from heliograph.fusion.mesh.joint import (
+from heliograph.fusion.mesh.joint_error_covariance import (
     blocks_of,
     error_transitions,
     measurement_weights,
@@ -34,8 +34,8 @@ from heliograph.model.over_time import at, first
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, Bool, Float, PyTree
-from heliograph.simulation.centres.edges import MeshEdges
-from heliograph.simulation.centres.messages import (
+from heliograph.simulation.centres.neighbour_edges import MeshEdges
+from heliograph.simulation.centres.neighbour_messages import (
     ArrivingEstimates,
     MessagesOnTheWay,
     find_moved_beyond,

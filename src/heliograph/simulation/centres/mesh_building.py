@@ -5,8 +5,8 @@ import numpy as np
 from heliograph.fusion.mesh.graph import graph_of
 from heliograph.model.over_time import stack
 from heliograph.numerics.check import fail
-from heliograph.simulation.centres.edges import build_edges
 from heliograph.simulation.centres.mesh import Mesh, MeshRows
+from heliograph.simulation.centres.neighbour_edges import build_edges
 from heliograph.simulation.centres.observation_model import Apart, ObservationModel, stack_nodes
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node

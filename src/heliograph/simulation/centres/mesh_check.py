@@ -8,7 +8,7 @@ import scipy
 
 from heliograph.factors.roots import covariance_of_root, observe_information, roots_of
 from heliograph.fusion.mesh.graph import Graph, find_upstream_nodes, graph_of
-from heliograph.fusion.mesh.joint import scatter_blocks
+from heliograph.fusion.mesh.joint_error_covariance import scatter_blocks
 from heliograph.fusion.mesh.neighbour_rules import DiffusionWeights, FrozenWeights
 from heliograph.fusion.network_fusion import Fusion
 from heliograph.fusion.quantizer import UniformQuantizer
@@ -20,7 +20,7 @@ from heliograph.model.sensor import LinearSensor, refuse_angles
 from heliograph.numerics.check import fail, instance, spread_over_names
 from heliograph.random_affine.moments.second_moments import second_order
 from heliograph.simulation.centres.centre import claim_of_informed
-from heliograph.simulation.centres.edges import arrival_chance, build_edges, edge_links, find_loss_decay
+from heliograph.simulation.centres.neighbour_edges import arrival_chance, build_edges, edge_links, find_loss_decay
 from heliograph.simulation.node import HasNodes, Node
 
 MODE = 1e-6  # below 1: a mode is computed to half of the digits where it is a double one

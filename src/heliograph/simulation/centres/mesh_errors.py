@@ -10,7 +10,7 @@ import numpy as np
 import scipy
 
 from heliograph.factors.roots import covariance_of_root, observe_information, roots_of
-from heliograph.fusion.mesh.joint import (
+from heliograph.fusion.mesh.joint_error_covariance import (
     blocks_of,
     error_transitions,
     measurement_weights,
@@ -26,10 +26,10 @@ from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Bool, Float, PyTree
 from heliograph.simulation.arguments import key_of, read_plant_inputs
-from heliograph.simulation.centres.edges import MeshEdges
 from heliograph.simulation.centres.mesh import Mesh, MeshStep
 from heliograph.simulation.centres.mesh_building import build_mesh
 from heliograph.simulation.centres.mesh_check import error_claim
+from heliograph.simulation.centres.neighbour_edges import MeshEdges
 from heliograph.simulation.network import Network
 
 SPARSE = 2000  # nodes whose joint covariance fits in memory

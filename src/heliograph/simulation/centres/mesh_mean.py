@@ -18,7 +18,7 @@ import numpy as np
 
 from heliograph.fusion.mesh.gains import NodeGains
 from heliograph.fusion.mesh.graph import graph_of
-from heliograph.fusion.mesh.joint import (
+from heliograph.fusion.mesh.joint_error_covariance import (
     blocks_of,
     error_transitions,
     measurement_weights,
@@ -33,10 +33,10 @@ from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.simulation.arguments import read_plant_inputs
-from heliograph.simulation.centres.edges import arrival_chance, edge_links
 from heliograph.simulation.centres.mesh import Mesh, MeshRows, MeshStep
 from heliograph.simulation.centres.mesh_check import error_claim
 from heliograph.simulation.centres.mesh_errors import MeshErrors, compute_full_step, find_mesh
+from heliograph.simulation.centres.neighbour_edges import arrival_chance, edge_links
 from heliograph.simulation.network import Network
 
 NODES, DEGREE = 200, 10  # most nodes and neighbours of one node whose patterns are listed: 2^degree rows a node

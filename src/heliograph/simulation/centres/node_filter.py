@@ -22,9 +22,9 @@ from heliograph.numerics.check import fail, instance, text
 from heliograph.numerics.float64 import compile_in_float64, in_float64
 from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.types import Array, ArrayLike
-from heliograph.simulation.centres.edges import MeshEdges
 from heliograph.simulation.centres.mesh import Mesh, MeshRows, MeshState
-from heliograph.simulation.centres.messages import MessagesOnTheWay, quantize_estimate
+from heliograph.simulation.centres.neighbour_edges import MeshEdges
+from heliograph.simulation.centres.neighbour_messages import MessagesOnTheWay, quantize_estimate
 from heliograph.simulation.centres.observation_model import Apart, stack_nodes
 from heliograph.simulation.claims import find_premise
 from heliograph.simulation.network import Network

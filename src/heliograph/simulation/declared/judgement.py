@@ -9,14 +9,14 @@ import scipy
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.filter_data import check_data
-from heliograph.filters.wrappers.told import ToldFilter
+from heliograph.filters.wrappers.reported_law import ToldFilter
 from heliograph.model.over_time import first
 from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor
 from heliograph.numerics.check import fail, instance, show_value
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, Int
-from heliograph.random_affine.told import AbstractTold
+from heliograph.random_affine.reported_law import AbstractTold
 from heliograph.simulation.declared.innovation_tests import LEVEL, InnovationTests, examine_innovations
 from heliograph.simulation.declared.refit import (
     DeclaredRows,

@@ -8,17 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 
-from heliograph.filters.wrappers.told import ToldFilter
+from heliograph.filters.wrappers.reported_law import ToldFilter
 from heliograph.model.enlarged.bias import with_bias
 from heliograph.model.over_time import first
 from heliograph.model.plant import TIME_STEP, AbstractPlant
+from heliograph.model.reported_numbers import LinkGivenNumbers
 from heliograph.model.sensor import AbstractSensor
-from heliograph.model.told import LinkGivenNumbers
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, Float
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.noise import AbstractNoise, Gaussian
-from heliograph.random_affine.told import AbstractTold, ToldGainHop, ToldMap, numbers_of_outputs, told_maps
+from heliograph.random_affine.reported_law import AbstractTold, ToldGainHop, ToldMap, numbers_of_outputs, told_maps
 from heliograph.simulation.likelihood import log_likelihood
 from heliograph.simulation.runs.over_runs import over_runs
 

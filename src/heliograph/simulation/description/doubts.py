@@ -10,18 +10,18 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.linear.linear import LinearFilter
 from heliograph.filters.words.linear import SEEN
-from heliograph.filters.wrappers.told import ToldFilter, believe_typical
+from heliograph.filters.wrappers.reported_law import ToldFilter, believe_typical
 from heliograph.model.fading import memory_matters
 from heliograph.model.over_time import at_each_step, first
 from heliograph.model.premises.agreement import CHANNEL, matrix_of
-from heliograph.model.told import separate_told
+from heliograph.model.reported_numbers import separate_told
 from heliograph.numerics.check import InputError, instance
 from heliograph.numerics.module import readable
 from heliograph.numerics.traced import DOUBLE
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.modes import redraw_modes_each_step
+from heliograph.random_affine.reported_law import told_maps
 from heliograph.random_affine.superposed import Superposed
-from heliograph.random_affine.told import told_maps
 from heliograph.simulation.boundedness import certify_boundedness
 from heliograph.simulation.claims import OtherBelief, list_other_beliefs
 from heliograph.simulation.declared.refit import list_declaring

@@ -12,7 +12,7 @@ from typing_extensions import TypeAliasType
 from heliograph.disk.quoting import label_with_unit
 from heliograph.filters.innovation import InnovationSummary, Weighed
 from heliograph.model.estimate import Estimate, is_sound
-from heliograph.model.origin import KeptOrigin, Origin
+from heliograph.model.forecast_origin import KeptOrigin, Origin
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import units_in

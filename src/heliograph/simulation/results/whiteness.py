@@ -13,10 +13,10 @@ from heliograph.filters.filter_data import check_data
 from heliograph.filters.innovation import HALF
 from heliograph.model.estimate import Innovation
 from heliograph.numerics.check import array, check_count, fail, instance, rank
+from heliograph.numerics.counted_shares import average_correlated
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.linalg import whiten
 from heliograph.numerics.module import readable
-from heliograph.numerics.shares import average_correlated
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 
 

@@ -26,8 +26,8 @@ from heliograph.simulation.runs.lanes import LANES, Progress, advance_in_chunks
 from heliograph.simulation.runs.memory import NeededMemory, check_memory
 from heliograph.simulation.runs.native_lanes import NativeLanes, NativeProgram
 from heliograph.simulation.runs.node_parts import NODES, build_world, count_parts, is_apart, split_nodes
+from heliograph.simulation.simulation_step import World
 from heliograph.simulation.smoothed import NetworkSmoother, ReducedRuns, SmoothingPlan, finish_result, reduce_run
-from heliograph.simulation.world import World
 from straightline import Unsupported, accumulate
 
 PROGRAMS = 64  # whose code is held at once

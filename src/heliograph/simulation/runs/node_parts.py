@@ -9,18 +9,18 @@ import numpy as np
 
 from heliograph.model.over_time import first
 from heliograph.numerics.caching import cache_by_object
-from heliograph.numerics.frozen import FrozenMapping
+from heliograph.numerics.frozen_mapping import FrozenMapping
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.memory import drop_identities
-from heliograph.simulation.index import FilterKind, find_estimate_places
 from heliograph.simulation.network import Network
+from heliograph.simulation.network_index import FilterKind, find_estimate_places
 from heliograph.simulation.node import Node
 from heliograph.simulation.runs.side_by_side import StackedFilters
+from heliograph.simulation.simulation_step import World
 from heliograph.simulation.stepping import AllFilters
 from heliograph.simulation.transmission.build_reception import make_reception
 from heliograph.simulation.transmission.reception import SeparateChannels
-from heliograph.simulation.world import World
 
 M = TypeVar("M", bound=Module)
 

@@ -8,7 +8,7 @@ from heliograph.model.channel import Channel
 from heliograph.model.over_time import stack
 from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import AnySensor, without_output_names
-from heliograph.model.words.route import reader_of, rewrite_in_bits
+from heliograph.model.words.word_channel import reader_of, rewrite_in_bits
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.memory import drop_names, memories
 from heliograph.simulation.network import LOCAL, Network

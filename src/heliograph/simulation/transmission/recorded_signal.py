@@ -12,7 +12,7 @@ from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.delay import Delayed
-from heliograph.random_affine.moments.route import apply
+from heliograph.random_affine.moments.signal_path import apply
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.random_keys import CHANNEL, CHANNEL_START, checksum, draw_key

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from heliograph.model.words.route import FLAG, find_places
+from heliograph.model.words.word_channel import FLAG, find_places
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import Float
 from heliograph.simulation.network import Network

@@ -16,7 +16,7 @@ from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.chain import AbstractMemory, unique_memories
 from heliograph.random_affine.delay import signal_size
 from heliograph.random_affine.memory import draw_with_shared_memories, drop_names, init_with_shared_memories, memories
-from heliograph.random_affine.moments.route import apply
+from heliograph.random_affine.moments.signal_path import apply
 from heliograph.simulation.random_keys import (
     CHANNEL,
     CHANNEL_START,

@@ -15,7 +15,7 @@ from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Series
 from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.laws.law import Constant
-from heliograph.random_affine.moments.push import TabulatedNoise
+from heliograph.random_affine.moments.pushed_moments import TabulatedNoise
 from heliograph.random_affine.noise import AbstractNoise
 from heliograph.random_affine.superposed import move_sensor_into_links
 

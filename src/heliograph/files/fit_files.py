@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from heliograph.files.network_file import load_network
-from heliograph.learning.description import describe
 from heliograph.learning.fitting import Fit
+from heliograph.learning.free_network import describe
 from heliograph.learning.losses.delays import Delays
 from heliograph.numerics.check import fail, file_path
 from heliograph.simulation.network import Network

@@ -9,8 +9,8 @@ import numpy as np
 import heliograph
 from heliograph.live.fleet import Fleet
 from heliograph.live.row_origin import make_row_origin
-from heliograph.live.rows import HeldRow
-from heliograph.model.origin import Origin
+from heliograph.live.sorted_rows import HeldRow
+from heliograph.model.forecast_origin import Origin
 from heliograph.numerics.check import fail, show_value
 from heliograph.serving.thresholds import Thresholds, check_threshold_names, find_crossings
 

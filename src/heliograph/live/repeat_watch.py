@@ -8,8 +8,8 @@ import numpy as np
 from heliograph.model.channel import Channel
 from heliograph.model.modes_of_motion import models_of
 from heliograph.model.over_time import unstack
+from heliograph.model.repeated_readings import LEAST, SELDOM, Repeats, bound_equal_readings, delivers_as_sent
 from heliograph.model.sensor import AbstractSensor, AnySensor
-from heliograph.model.stuck import LEAST, SELDOM, Repeats, bound_equal_readings, delivers_as_sent
 from heliograph.random_affine.noise import AbstractNoise
 from heliograph.simulation.node import Node
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.numerics.types import Bool, Float, Int
-from heliograph.report.pattern import CHANCE, LossLaw
+from heliograph.report.sending_pattern import CHANCE, LossLaw
 
 PEAKS = 8  # of the spectrum of arrivals that are looked at
 FEWEST = 8  # arrivals from which a rate is looked for

@@ -11,7 +11,7 @@ from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.hop import known
 from heliograph.random_affine.moments.monomials import JointMoments, list_exponents, symmetric_power
-from heliograph.random_affine.moments.route import ChannelPosition, Visit
+from heliograph.random_affine.moments.signal_path import ChannelPosition, Visit
 
 # (a, b, 1) to (w, its conjugate, 1) with w = a + i b.
 TO_COMPLEX = np.array([[1, 1j, 0], [1, -1j, 0], [0, 0, 1]])

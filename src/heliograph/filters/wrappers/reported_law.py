@@ -24,8 +24,8 @@ from heliograph.model.estimate import Innovation, weakest
 from heliograph.model.over_time import at, at_each_step, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.premises.premise import on_premise
+from heliograph.model.reported_numbers import separate_told
 from heliograph.model.sensor import AnySensor
-from heliograph.model.told import separate_told
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module
@@ -33,7 +33,7 @@ from heliograph.numerics.traced import library
 from heliograph.numerics.types import ArrayLike, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.moments.second_moments import second_order
-from heliograph.random_affine.told import believe_told, give_law, make_certain, numbers_of_outputs, told_maps
+from heliograph.random_affine.reported_law import believe_told, give_law, make_certain, numbers_of_outputs, told_maps
 
 ROUNDING = 1e-12  # share of squared gains: a spread below it is rounding
 

@@ -11,9 +11,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.event.truncated_normal import truncated_normal
-from heliograph.filters.words.edges import ADDED, ROOT_TWO_PI, SMOOTH, Smooth
-from heliograph.filters.words.merged import sum_merged, sum_overloads
-from heliograph.filters.words.sums import FINE, REACH, LikelihoodSums, SignalPrior, WordGrid, multiply_bits, tabulate
+from heliograph.filters.words.merged_words import sum_merged, sum_overloads
+from heliograph.filters.words.word_edges import ADDED, ROOT_TWO_PI, SMOOTH, Smooth
+from heliograph.filters.words.word_sums import (
+    FINE,
+    REACH,
+    LikelihoodSums,
+    SignalPrior,
+    WordGrid,
+    multiply_bits,
+    tabulate,
+)
 
 TABLE = 6  # bits of words that are all summed
 BLOCK = 3  # bits of neighbouring words whose likelihoods are those of the bits above times one table

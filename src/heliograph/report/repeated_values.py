@@ -6,7 +6,7 @@ import numpy as np
 from scipy.special import erf
 
 from heliograph.model.over_time import first
-from heliograph.model.stuck import delivers_as_sent, longest_by_chance
+from heliograph.model.repeated_readings import delivers_as_sent, longest_by_chance
 from heliograph.numerics.types import Float
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node

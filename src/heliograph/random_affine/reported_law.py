@@ -17,8 +17,8 @@ from heliograph.numerics.types import Array, Bool, Float
 from heliograph.random_affine.base import AbstractModal, AbstractRandomAffine, check_forgets
 from heliograph.random_affine.chain import AbstractMemory, CertainChain, MarkovChain, MemoryStates, identify_memory
 from heliograph.random_affine.hop import AbstractHop, GainAndNoise
+from heliograph.random_affine.laws.gain_given_reading import check_density, gain_given_reading
 from heliograph.random_affine.laws.law import AbstractLaw, CertainDiscrete, Constant, Discrete
-from heliograph.random_affine.laws.reading import check_density, gain_given_reading
 from heliograph.random_affine.noise import FACTOR_TOLERANCE, AbstractNoise, Matrix
 
 T = TypeVar("T")

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from heliograph.factors.columns import decorrelate, square_root
 from heliograph.factors.gaussian import Gaussian
 from heliograph.factors.repeated import rounding_of_products
-from heliograph.numerics.density import LOG_TURN
+from heliograph.numerics.gaussian_density import LOG_TURN
 
 
 def slopes_given_drawn(

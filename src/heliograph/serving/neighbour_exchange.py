@@ -7,7 +7,7 @@ from pydantic_core import to_json
 
 from heliograph.live.fleet import Fleet
 from heliograph.live.plant import PlantState
-from heliograph.live.rows import HeldRow
+from heliograph.live.sorted_rows import HeldRow
 from heliograph.serving.output import Output
 from heliograph.simulation.centres.node_filter import NodeFilter
 

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.centred import SplitMeanGaussian, center_gaussian, center_known
 from heliograph.factors.columns import unit_of
+from heliograph.factors.two_part_mean import SplitMeanGaussian, center_gaussian, center_known
 from heliograph.filters.base import AbstractFilter, Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.gaussian.belief import AbstractBeliefFilter
 from heliograph.filters.wrappers.wrapper import AbstractWrapper

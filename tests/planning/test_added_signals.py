@@ -89,7 +89,7 @@ def test_closed_forms_are_the_best_amplitudes(budget, options):
 
 def test_full_power_of_a_poor_transmitter_hurts():
     """b = (1, 1), D = diag(0.01, 10), N = 0.01; of x+ = 0.95 x + w, Var w = 0.1: 0.3696 at full power, 0.0170."""
-    from heliograph.planning.added import steady_error
+    from heliograph.planning.added_signals import steady_error
     from heliograph.planning.summed_links import SummedLinks, solve_closed_form
 
     links = SummedLinks(np.ones((2, 1)), np.diag([0.01, 10.0]), np.ones(2), 0.01, np.ones(2))

@@ -10,7 +10,7 @@ import numpy as np
 
 from heliograph.filters.smoother_step import gaussian_of
 from heliograph.fusion.cross_covariance import ErrorSources, initial_factors
-from heliograph.fusion.informed import MatrixWeights
+from heliograph.fusion.joint_covariance_fusion import MatrixWeights
 from heliograph.fusion.joint_covariance_weights import matrix_weights
 from heliograph.fusion.network_fusion import Fusion
 from heliograph.model.estimate import Claim

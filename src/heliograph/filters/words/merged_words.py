@@ -4,8 +4,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.words.edges import ROOT_TWO_PI, signed_tail_and_density
-from heliograph.filters.words.sums import FINE, REACH, LikelihoodSums, SignalPrior, WordGrid, multiply_bits, tabulate
+from heliograph.filters.words.word_edges import ROOT_TWO_PI, signed_tail_and_density
+from heliograph.filters.words.word_sums import (
+    FINE,
+    REACH,
+    LikelihoodSums,
+    SignalPrior,
+    WordGrid,
+    multiply_bits,
+    tabulate,
+)
 
 MERGED = 4  # bits of neighbouring cells whose likelihoods are those of the bits above times one table
 BLOCKS = 10  # of cells of an eighth to a quarter of a deviation within the reach, which may begin a block earlier

@@ -9,7 +9,7 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.model.estimate import Estimate
-from heliograph.model.stuck import Repeats
+from heliograph.model.repeated_readings import Repeats
 from heliograph.numerics.times.dates import seconds_between
 from heliograph.numerics.types import PyTree
 

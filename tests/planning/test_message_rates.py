@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.planning.messages import (
+from heliograph.planning.message_rates import (
     delta_for_rate,
     least_error,
     prediction_error_rate,

@@ -16,8 +16,13 @@ from heliograph.model.sensor import LinearSensor
 from heliograph.numerics.check import check_count, check_seed, fail, scalar
 from heliograph.numerics.types import Bool, Float
 from heliograph.planning.budget import PowerLimits, check_budget, make_power_limits, make_unlimited
-from heliograph.planning.moments import check_constant_noise, check_design_plant, measurement_moment, steady_moment
 from heliograph.planning.network_of_design import add_best_filter
+from heliograph.planning.plant_moments import (
+    check_constant_noise,
+    check_design_plant,
+    measurement_moment,
+    steady_moment,
+)
 from heliograph.planning.problem import Certificate, DesignProblem, PowerDesign
 from heliograph.planning.summed_links import ALIKE, HALVINGS, SummedLinks, Vector, solve_closed_form
 from heliograph.planning.transmitters import (

@@ -9,7 +9,7 @@ import numpy as np
 
 from heliograph.live.long_gap import LONG, TAIL, factors_in, pass_long_gap
 from heliograph.live.network_program import NetworkProgram
-from heliograph.live.rows import HeldRow
+from heliograph.live.sorted_rows import HeldRow
 from heliograph.numerics.types import Float, PyTree
 
 FEWEST = 1024  # rows of the table at first; it doubles when it is full

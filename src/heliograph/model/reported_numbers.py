@@ -18,7 +18,14 @@ from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.laws.law import AbstractLaw
 from heliograph.random_affine.modes import ModeOutput
 from heliograph.random_affine.noise import AbstractNoise
-from heliograph.random_affine.told import FreshNumbers, FreshReading, PilotedHop, ToldGainHop, ToldMap, told_maps
+from heliograph.random_affine.reported_law import (
+    FreshNumbers,
+    FreshReading,
+    PilotedHop,
+    ToldGainHop,
+    ToldMap,
+    told_maps,
+)
 
 M = TypeVar("M", bound=AbstractRandomAffine)
 
