@@ -149,10 +149,11 @@ def _stack_matrices(rows: list[list[np.ndarray]]) -> np.ndarray:
 
 
 def _rescale(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return matrices over their largest real part, so that products do not underflow, and its logarithm."""
-    size = np.max(matrix.real, axis=(-2, -1))
+    """Return matrices (..., 2, 2) over their largest real part, lest products underflow, and its logarithm."""
+    rows = np.maximum(matrix.real[..., 0, :], matrix.real[..., 1, :])
+    size = np.maximum(rows[..., 0], rows[..., 1])
     size = np.where(size > 0, size, 1.0)
-    return matrix / size[..., None, None], np.log(size)
+    return matrix * (1 / size)[..., None, None], np.log(size)  # a division by a real number would be a complex one
 
 
 def _raise_matrices(matrix: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
