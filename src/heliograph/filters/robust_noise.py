@@ -76,7 +76,8 @@ class ReceivedNoise(Module):
         gain, power, mean = self.gain[:, None], self.power[:, None], self.mean
         signal = (self.output @ sensed)[:, None]
         least = power * self.variance + self.late_variance
-        variance = least + (power - gain**2) * mean * (mean + 2 * signal)
+        spread, both = power - gain**2, mean + 2 * signal
+        variance = least + spread * mean * both
         return NoiseBranches(
             log_share=jnp.asarray(self.log_share),
             mean=jnp.asarray(gain * mean + self.late_mean),

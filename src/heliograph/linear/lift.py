@@ -108,7 +108,8 @@ def lift_modes(
         check_finite_moments(moments, k, 2 * degree)
         # Process noise: what the mode's draw adds, and the plant's.
         after, carried = products_of_monomials(moments, n + 1, degree), moved @ before @ moved.T
-        chosen = np.einsum("i,ij,ijl->jl", law, rows, np.eye(modes)[None] - rows[:, None, :])
+        unchosen = np.eye(modes)[None] - rows[:, None, :]
+        chosen = np.einsum("i,ij,ijl->jl", law, rows, unchosen)
         law = _keep_if_unchanged(law, law @ rows)
         process = np.kron(chosen, carried) + np.kron(np.diag(law), after - carried)
         noise, rounding_of_noise = _average_noise(law, lifts, moments)

@@ -24,6 +24,11 @@ def _library(*values: object) -> Any:
     return jnp if any(isinstance(value, jax.Array) for value in values) else np
 
 
+def _entries_of(q: Array) -> tuple[Any, Any, Any, Any]:
+    """Return w, x, y and z (...) of quaternions (..., 4), of the library that they are of."""
+    return q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+
+
 def quaternion_of(r: Array) -> Any:
     """Return the unit quaternion (..., 4), w first, of rotation vectors (..., 3)."""
     xp = _library(r)
@@ -52,8 +57,8 @@ def rotation_vector_of(q: Array) -> Any:
 def multiply_quaternions(q: Array, p: Array) -> Any:
     """Return the product of quaternions (..., 4): first the turn p, then q."""
     xp = _library(q, p)
-    a, b, c, d = (q[..., i] for i in range(4))
-    e, f, g, h = (p[..., i] for i in range(4))
+    a, b, c, d = _entries_of(q)
+    e, f, g, h = _entries_of(p)
     parts = [
         a * e - b * f - c * g - d * h,
         a * f + b * e + c * h - d * g,
@@ -76,8 +81,7 @@ def turn_between(r: Array, other: Array) -> Any:
 def matrix_of(r: Array) -> Any:
     """Return R (..., 3, 3), by which what the body sees is what the world sees, of rotation vectors (..., 3)."""
     xp = _library(r)
-    q = quaternion_of(r)
-    w, x, y, z = (q[..., i] for i in range(4))
+    w, x, y, z = _entries_of(quaternion_of(r))
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],

@@ -189,7 +189,8 @@ class Faded(AbstractHop, AbstractModal):
 
     def given(self, state: int | float | jax.Array | np.ndarray) -> GainAndNoise:
         """Return the map with the gain mean + deviation c."""
-        return GainAndNoise(Constant(self.mean + self.deviation * state), self.matrix, self.noise)
+        gain = self.mean + self.deviation * state
+        return GainAndNoise(Constant(gain), self.matrix, self.noise)
 
 
 class JointModes(Module):

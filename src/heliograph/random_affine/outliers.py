@@ -145,7 +145,8 @@ class Contaminated(AbstractNoise):
         self.covariances = xp.stack([inlier, *spreads])
         self.mean = self.shares @ self.means
         deviations = self.means - self.mean
-        second = self.covariances + deviations[:, :, None] * deviations[:, None]
+        between = deviations[:, :, None] * deviations[:, None]
+        second = self.covariances + between
         self.covariance = xp.einsum("j,jab->ab", self.shares, second)
         self.bounded = False
 

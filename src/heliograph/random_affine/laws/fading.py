@@ -75,7 +75,8 @@ class Rician(AbstractLaw):
 
     def bulk(self) -> tuple[Scalar | float, Scalar | float]:
         """Return the interval that holds nearly all of the law: within 9 scales of the line of sight."""
-        return library(self.sight, self.scale).maximum(self.sight - 9 * self.scale, 0.0), self.sight + 9 * self.scale
+        reach = 9 * self.scale
+        return library(self.sight, self.scale).maximum(self.sight - reach, 0.0), self.sight + reach
 
 
 def _evaluate_laguerre(order: int, x: Scalar) -> Scalar:
@@ -173,4 +174,5 @@ class LogNormal(AbstractLaw):
     def bulk(self) -> tuple[Scalar | float, Scalar | float]:
         """Return the interval that holds nearly all of the law: within 9 deviations of its logarithm."""
         xp = library(self.log_mean, self.log_deviation)
-        return xp.exp(self.log_mean - 9 * self.log_deviation), xp.exp(self.log_mean + 9 * self.log_deviation)
+        reach = 9 * self.log_deviation
+        return xp.exp(self.log_mean - reach), xp.exp(self.log_mean + reach)
