@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from math import nan
-from typing import TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,8 +23,13 @@ TRIES = 10  # to find the function of a filter that returned no number
 FLAGS = [Judgement._fields.index(name) for name in ("reason", "input")]
 
 
-# Number of a message, its plant, its event, which was used, and the row that this stands in.
-Candidate: TypeAlias = tuple[int, PlantState, CheckedEvent, HeldRow]
+class Candidate(NamedTuple):
+    """An event that was used and is to be judged: its message's number, its plant, itself, and the row it stands in."""
+
+    number: int
+    plant: PlantState
+    event: CheckedEvent
+    row: HeldRow
 
 
 class JudgementReader:
@@ -75,18 +80,18 @@ class JudgementReader:
             return {}
         # Most rows raise no flag: look at the parts of a judgement only where one is raised.
         pool = self.fleet.pool
-        slots = np.array([row.slot for *_, row in taken])
+        slots = np.array([candidate.row.slot for candidate in taken])
         flagged = (pool.table[slots[:, None], pool.outputs.start + self._all_columns[:, FLAGS].ravel()] > 0).any(axis=1)
         # Reasons by candidate; by plant the first of its implausible inputs.
         reasons, first_inputs = dict[int, str](), dict[str, int]()
         for i in np.flatnonzero(flagged).tolist():
-            (_, plant, event, _), outputs = taken[i], pool.table[slots[i], pool.outputs]
+            plant, event, outputs = taken[i].plant, taken[i].event, pool.table[slots[i], pool.outputs]
             why = None
             if event.node_index < 0:
                 why = self.why_inputs(outputs)
                 if why:
                     first = first_inputs.setdefault(plant.name, i)
-                    first_inputs[plant.name] = min(first, i, key=lambda j: taken[j][-1].key)
+                    first_inputs[plant.name] = min(first, i, key=lambda j: taken[j].row.key)
             elif _largest_number(event) >= 0:
                 why = Judgement.why_values(outputs[self._judgement_columns[event.node_index]])
             if why:
@@ -95,14 +100,13 @@ class JudgementReader:
         # Of one node in one row the event with the largest number.
         largest: dict[tuple[int, int], int] = {}
         for i in reasons:
-            _, _, event, row = taken[i]
-            node_of_row = row.slot, event.node_index
-            largest[node_of_row] = max(largest.get(node_of_row, i), i, key=lambda j: _largest_number(taken[j][2]))
+            node_of_row = taken[i].row.slot, taken[i].event.node_index
+            largest[node_of_row] = max(largest.get(node_of_row, i), i, key=lambda j: _largest_number(taken[j].event))
         # What came after implausible inputs of its plant was judged with these: it may be all right without them.
         return {
             i: why + self._name_faulty_function(taken[i])
             for i, why in reasons.items()
-            if i in largest.values() and first_inputs.get(taken[i][1].name, i) == i
+            if i in largest.values() and first_inputs.get(taken[i].plant.name, i) == i
         }
 
     def _name_faulty_function(self, candidate: Candidate) -> str:
@@ -111,11 +115,10 @@ class JudgementReader:
         A filter's fault, once found, is repeated without another search. A filter is searched at most TRIES times, for
         a plant may send implausible events for ever.
         """
-        # The event's row, the one before it, and what the filters estimated after each.
-        _, plant, event, row = candidate
-        pool, index = self.fleet.pool, plant.rows.index(row.key)
-        before, after = plant.rows.held[index - 1], pool.table[row.slot, pool.outputs]
-        estimated = pool.table[before.slot, pool.outputs]
+        # The event's row, what the filters said after it, and the row before it: the first that is held has no events.
+        rows, event, row = candidate.plant.rows, candidate.event, candidate.row
+        pool, before = self.fleet.pool, rows.held[rows.index(row.key) - 1]
+        after = pool.table[row.slot, pool.outputs]
         for place in self.fleet.program.places:
             # Filters that judged this row to be no number, of the event's node or of all nodes.
             filter = filter_of(self.fleet, place)
@@ -129,19 +132,20 @@ class JudgementReader:
             # Call the filter's functions from the estimate before the row: which of them returns no number?
             tried, said = self._faults.get((place.node, place.filter), (0, ""))
             if not said and tried < TRIES:
-                if before.key[1] == BEFORE:  # the prior, before all events: no estimate was computed there
-                    estimate = filter.estimate(filter.init())
-                else:
-                    n = len(filter.states)
-                    mean = estimated[place.mean : place.mean + n]
-                    covariance = estimated[place.covariance : place.covariance + n * n].reshape(n, n)
-                    estimate = Estimate(mean, covariance, place.claim)
                 inputs, step = pool.inputs_between(before.slot, row.slot)
-                said = find_function_fault(filter, estimate, inputs, step)
+                said = find_function_fault(filter, self._estimate_after(before, filter, place), inputs, step)
                 self._faults[place.node, place.filter] = tried + 1, said
             if said:
                 return f"; {said}"
         return ""
+
+    def _estimate_after(self, row: HeldRow, filter: AbstractFilter, place: FilterColumns) -> Estimate:
+        """Return what a filter estimated after a row, from its columns; before all events its initial estimate."""
+        if row.key[1] == BEFORE:  # no estimate was computed there
+            return filter.estimate(filter.init())
+        n, outputs = len(filter.states), self.fleet.pool.table[row.slot, self.fleet.pool.outputs]
+        covariance = outputs[place.covariance : place.covariance + n * n].reshape(n, n)
+        return Estimate(outputs[place.mean : place.mean + n], covariance, place.claim)
 
     def _drop_blameless(self, taken: Sequence[Candidate], reasons: dict[int, str]) -> None:
         """Leave in `reasons`, of several nodes' events that a central filter judged together, only the one to blame.
@@ -151,12 +155,12 @@ class JudgementReader:
         # Events of nodes without a filter of their own, by row.
         by_row: dict[int, list[int]] = {}
         for i in reasons:
-            if taken[i][2].node_index in self._judged_centrally:
-                by_row.setdefault(taken[i][-1].slot, []).append(i)
+            if taken[i].event.node_index in self._judged_centrally:
+                by_row.setdefault(taken[i].row.slot, []).append(i)
         for together in by_row.values():
-            if len({taken[i][2].node_index for i in together}) > 1:
+            if len({taken[i].event.node_index for i in together}) > 1:
                 culprit = Judgement.find_culprit(
-                    together, lambda i: _largest_number(taken[i][2]), lambda i: self._is_plausible_without(taken[i])
+                    together, lambda i: _largest_number(taken[i].event), lambda i: self._is_plausible_without(taken[i])
                 )
                 for i in together:
                     if i != culprit:
@@ -165,8 +169,8 @@ class JudgementReader:
     def _is_plausible_without(self, candidate: Candidate) -> bool:
         """Return whether the candidate's row is plausible without all that it has of the candidate's node."""
         # A copy of the row in a slot of its own, with NaN for the node's numbers.
-        _, plant, event, row = candidate
-        pool, rows = self.fleet.pool, plant.rows
+        event, row = candidate.event, candidate.row
+        pool, rows = self.fleet.pool, candidate.plant.rows
         trial = HeldRow(row.key, pool.take(), self.fleet.width)
         trial.numbers = row.numbers.copy()
         columns = rows.places[event.node_index]

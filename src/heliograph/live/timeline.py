@@ -12,7 +12,7 @@ from heliograph.live.event import INPUTS, VERDICTS, CheckedEvent, Verdict, check
 from heliograph.live.final_rows import FinalRows, GateCounts
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.fleet_remarks import FleetRemarks, FleetRepeatWatch
-from heliograph.live.implausible_events import FleetAngles, JudgementReader
+from heliograph.live.implausible_events import Candidate, FleetAngles, JudgementReader
 from heliograph.live.link_counts import LinkCounts
 from heliograph.live.network_program import shared_program
 from heliograph.live.row_origin import estimates_by_name, make_row_origin
@@ -189,7 +189,7 @@ class Timeline:
         """
         fleet, plant = self._fleet, self._plant
         fleet.step([plant])
-        why = self._judges.find_implausible([(0, plant, event, row)]).get(0)
+        why = self._judges.find_implausible([Candidate(0, plant, event, row)]).get(0)
         if why is None and event.node_index < 0 and self._program.dt is not None:
             after = fleet.pool.predict_outputs(np.array([row.slot]), np.full((1, self._program.given), np.nan), np.inf)
             why = self._judges.why_inputs(after[0])

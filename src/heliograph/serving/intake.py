@@ -82,14 +82,14 @@ class BatchIntake:
             self._before, self._taken = {}, []
             for i in waiting:
                 outcomes[i] = self._take_one(i, messages[i], wall)
-            self.fleet.step({plant.name: plant for _, plant, _, _ in self._taken}.values())
+            self.fleet.step({taken.plant.name: taken.plant for taken in self._taken}.values())
             implausible = self._judges.find_implausible(self._taken)
             # Plants that took an implausible message go back.
             restored = set()
             for i, why in implausible.items():
-                number, plant, event, _ = self._taken[i]
-                self._refused[number, event.node_index < 0] = why
-                restored.add(plant.name)
+                taken = self._taken[i]
+                self._refused[taken.number, taken.event.node_index < 0] = why
+                restored.add(taken.plant.name)
             for name in restored:
                 self._restore_plant(name)
             waiting = [i for i in waiting if plant_of(messages[i]) in restored]
@@ -249,7 +249,7 @@ class BatchIntake:
             for node, sequence, time in events:
                 plant.link(INPUTS if node < 0 else self.fleet.network.names[node]).count("future", sequence, time)
             self._before.pop(name, None)
-            self._taken = [taken for taken in self._taken if taken[1] is not old]
+            self._taken = [taken for taken in self._taken if taken.plant is not old]
             self.fleet.end(old)
         return plant
 
@@ -268,7 +268,7 @@ class BatchIntake:
         """
         verdict = self.fleet.take(plant, event, given, wall, clock)
         if verdict == "used":
-            self._taken.append((number, plant, event, plant.changes[-1][0]))
+            self._taken.append(Candidate(number, plant, event, plant.changes[-1][0]))
         return verdict
 
     def _restore_plant(self, name: str) -> None:

@@ -37,15 +37,35 @@ def trust_region_step(
         moving: which coordinates may move (lanes, p).
         free: which are no logarithms, and so not limited by LONGEST (p,).
     """
+    # g, D and B in standard errors; a coordinate that stays has a unit of 0, and 1 on the diagonals of D and B.
     unit, flat = find_flat_directions(information, moving)
     stays = unit == 0
     d = np.where(free | stays, 1.0, np.maximum(1.0, radius[:, None] * unit / LONGEST))
     g = np.nan_to_num(gradient) * unit
-    b = _scale_both_sides(model, unit)
-    sane = np.all(np.abs(b) < LARGEST, axis=(1, 2))  # NaN is not
-    b = np.where(sane[:, None, None], b, _scale_both_sides(information, unit))
+    b = _scale_model(model, information, unit)
     b = (b + b.swapaxes(1, 2)) / 2 + flat @ flat.swapaxes(1, 2) + np.eye(len(free)) * stays[:, :, None]
-    # s: none at first, or what makes the matrix positive.
+    # The point on or within the radius; one that is a hundredth beyond is drawn back to it.
+    step = _find_step_within(radius, g, b, d)
+    length = np.linalg.norm(d * step, axis=1)
+    inside = np.minimum(1.0, radius / np.where(length > 0, length, 1.0))
+    step, length = step * inside[:, None], length * inside
+    # What the model gains there: g' p - p' B p / 2.
+    foretold = np.sum(step * (g - multiply_lanes(b, step) / 2), axis=1)
+    return step * unit, length, foretold
+
+
+def _scale_model(model: np.ndarray, information: np.ndarray, unit: np.ndarray) -> np.ndarray:
+    """Return U B U of each lane's model B, and of the information where that is not finite or huge; U = diag(unit)."""
+    scaled = _scale_both_sides(model, unit)
+    sane = np.all(np.abs(scaled) < LARGEST, axis=(1, 2))  # NaN is not
+    return np.where(sane[:, None, None], scaled, _scale_both_sides(information, unit))
+
+
+def _find_step_within(radius: np.ndarray, g: np.ndarray, b: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """Return p = (B + s D^2)^-1 g (lanes, p) with the least shift s >= 0 that keeps |D p| within 1.01 of the radius.
+
+    `d`: the diagonal of D. Newton's method for 1 / |D p| = 1 / radius, from the least s that makes the matrix positive.
+    """
     least = np.linalg.eigvalsh(b / d[:, :, None] / d[:, None, :])[:, 0]
     shift = np.where(least > -ROUNDING, 0.0, -least * (1 + PAST))
     for _ in range(SECULAR_STEPS):
@@ -57,10 +77,7 @@ def trust_region_step(
         slope = np.sum(d * d * step * _solve_shifted(b, shift, d, d * d * step), axis=1)  # -|D p| d|D p| / ds
         newton = length**2 / np.where(beyond, slope, 1.0) * (length - radius) / radius
         shift = np.where(beyond, shift + newton, shift)
-    inside = np.minimum(1.0, radius / np.where(length > 0, length, 1.0))
-    step, length = step * inside[:, None], length * inside
-    foretold = np.sum(step * (g - multiply_lanes(b, step) / 2), axis=1)
-    return step * unit, length, foretold
+    return step
 
 
 def _solve_shifted(b: np.ndarray, shift: np.ndarray, d: np.ndarray, right: np.ndarray) -> np.ndarray:

@@ -6,7 +6,8 @@ Until version 0.3.0 a filter's state held a covariance, `.covariance` (..., n, n
 
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -60,6 +61,28 @@ def describe_old_layout(new: Shapes) -> dict[str, list[int]]:
     return results
 
 
+@dataclass
+class _Part:
+    """A part of a filter's state in the columns of a row: its shape, its first column, and the end of its columns."""
+
+    shape: Any
+    first: int
+    end: int
+
+    @property
+    def columns(self) -> range:
+        """Return its columns."""
+        return range(self.first, self.end)
+
+
+class _LostFlag(NamedTuple):
+    """A flag whose columns are not known: the end of the part before it, itself, and the parts after it."""
+
+    end_before: int
+    flag: _Part
+    after: list[_Part]
+
+
 def place_flags(filters: Columns) -> dict[str, dict[str, list[Any]]]:
     """Return the columns of a row's states with the true columns of each boolean part (flag).
 
@@ -67,38 +90,48 @@ def place_flags(filters: Columns) -> dict[str, dict[str, list[Any]]]:
     their order, and the same part of filters that share a program side by side: so flags stand in the columns that no
     other part has, in the order of the parts before them.
     """
-    results = {name: {path: list(part) for path, part in parts.items()} for name, parts in filters.items()}
-    # A flag whose place is not known: end of the part before it, the flag, and the parts after it; a part is [shape,
-    # first column, end].
-    lost: list[tuple[int, list[Any], list[list[Any]]]] = []
+    placed = {name: {path: _Part(*part) for path, part in parts.items()} for name, parts in filters.items()}
     taken: set[int] = set()
-
-    def take_columns(parts: list[list[Any]], end: int) -> None:
-        """Take the columns of a filter's parts in order, up to the first flag: its columns go back or are taken.
-
-        `end`: end of the part before them, 0 if they are the filter's first.
-        """
-        for i, part in enumerate(parts):
-            if part[2] > part[1] and (part[1] < end or (not end and part[1] in taken)):
-                # A flag that comes first is of the memory of fusions, which stands behind all filters.
-                end = end or sys.maxsize
-                lost.append((end, part, parts[i + 1 :]))
-                taken.update(*(range(*after[1:]) for after in parts[i + 1 :] if after[1] >= end))
-                return
-            taken.update(range(*part[1:]))
-            end = max(end, part[2])
-
-    for columns in results.values():
-        take_columns(list(columns.values()), 0)
+    found = [_take_columns(list(parts.values()), 0, taken) for parts in placed.values()]
+    lost = [each for each in found if each is not None]
     # The flag behind the earliest part stands in the first free column.
     while lost:
-        first = min(lost, key=lambda item: item[0])
+        first = min(lost, key=lambda each: each.end_before)
         lost.remove(first)
-        _, part, after = first
+        flag = first.flag
         begin = next(i for i in range(len(taken) + 1) if i not in taken)
-        part[1:] = begin, begin + part[2] - part[1]
-        take_columns([part, *after], begin)
-    return results
+        flag.first, flag.end = begin, begin + len(flag.columns)
+        if (following := _take_columns([flag, *first.after], begin, taken)) is not None:
+            lost.append(following)
+    return {
+        name: {path: [part.shape, part.first, part.end] for path, part in parts.items()}
+        for name, parts in placed.items()
+    }
+
+
+def _take_columns(parts: list[_Part], end: int, taken: set[int]) -> _LostFlag | None:
+    """Add the columns of a filter's parts to those taken, up to its first flag, which is returned; None without one.
+
+    A flag's columns begin before the end of the part before it, or, of a flag that comes first, are taken already.
+    What comes after the flag is taken too where it lies behind the part before it.
+
+    Args:
+        parts: of one filter, in their order.
+        end: end of the part before them, 0 if they are the filter's first.
+        taken: columns that are taken, to which those of the parts are added.
+    """
+    for i, part in enumerate(parts):
+        if part.columns and (part.first < end or (not end and part.first in taken)):
+            # A flag that comes first is of the memory of fusions, which stands behind all filters.
+            end = end or sys.maxsize
+            after = parts[i + 1 :]
+            for later in after:
+                if later.first >= end:
+                    taken.update(later.columns)
+            return _LostFlag(end, part, after)
+        taken.update(part.columns)
+        end = max(end, part.end)
+    return None
 
 
 def factorise_covariance(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
