@@ -281,15 +281,16 @@ OF_SUMS = ChunkPrograms(sum_chunk, sum_settled_rows, lambda settled, sums: sums)
 
 
 def _scan_all_chunks(recursion: Recursion, start: PyTree, rows: PyTree, programs: ChunkPrograms) -> ScanResult | None:
-    """Filter all chunks side by side, each from the state with which it is thought to begin.
+    """Filter all chunks side by side from guessed first states; return the last state and the outputs (chunks, ...).
 
-    Then filter again, in order, each chunk that began otherwise than the one before it ends. Outputs are by chunk
-    (chunks, ...). None where rows are few, where they forget too late, and without native code.
+    Then, in order, each chunk whose guess differs from the state in which the chunk before it ended is filtered again,
+    from that state. None where rows are few, where the filter forgets too late, and without native code.
     """
     begun = find_chunk_starts(recursion, start, rows)
     if begun is None:
         return None
     length, total = begun.lengths.chunk, np.asarray(len(jax.tree.leaves(rows)[0]))
+    # The lists of booleans below say which arguments of a program differ from chunk to chunk.
 
     def scan(states: PyTree, which: Which) -> PyTree:
         """Return the results of some chunks from these states, (chunk, ...)."""
@@ -300,7 +301,7 @@ def _scan_all_chunks(recursion: Recursion, start: PyTree, rows: PyTree, programs
         return join_results(programs.full, parts, [False, True, True, True, False])
 
     def scan_means(settled: SettledState) -> PyTree:
-        """Return the results of all chunks, as if they were settled but for the means."""
+        """Return the results of all chunks, with the covariances and gains of the settled state: only means differ."""
         means = means_of(begun.states)
         parts = [
             (recursion, settled, take(means, part), windows, first, total)

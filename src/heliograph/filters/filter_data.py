@@ -147,15 +147,17 @@ def run_over_data(filter: SteppedFilter, z: ArrayLike, u: ArrayLike | None, afte
     if before is not None and clock is not None:
         _check_later(before, clock)
     start = () if before is None else (before.state, np.asarray(begin))
-    whole = filter_in_chunks(filter, rows_z, rows_u, _collect_row, *start)
-    whole = whole or filter.filter_rows(rows_z, rows_u, *start)
-    state, outputs = whole or compute_once(_compute_filtered, _by_xla, (filter, rows_z, rows_u, *start))
+    # Three ways, the first that applies: chunks side by side, the filter's own native code for rows, one scan.
+    result = filter_in_chunks(filter, rows_z, rows_u, _collect_row, *start)
+    result = result or filter.filter_rows(rows_z, rows_u, *start)
+    state, outputs = result or compute_once(_compute_filtered, _by_xla, (filter, rows_z, rows_u, *start))
     mean, covariance, innovation, modes, counts = outputs
     lost = find_not_finite(mean, 1)
     if lost.any():
         row = begin + int(np.argmax(lost)) + 1
         said = f"{type(filter).__name__}: the estimate is no finite number from row {row} on"
         warnings.warn(f"{said}; hg.run leaves out what makes it so, and says which row and why", stacklevel=3)
+    # Where the record ends: state, number of rows, date and spacing, from which a later call goes on.
     end = begin + len(rows_z)
     last, spacing = (float(end - 1), np.nan) if clock is None else (clock[-1], usual_spacing(clock))
     months = 0 if clock is None else usual_months(clock)

@@ -210,7 +210,7 @@ def _summarise_output(value: Float[np.ndarray, " time"], variance: np.ndarray, w
     independent_ranks = count_independent(np.argsort(np.argsort(e)).astype(float))
     reach = NORMAL / (2 * np.sqrt(independent_ranks))
     low, median, high = np.quantile(e, [max(0.5 - reach, 0.0), 0.5, min(0.5 + reach, 1.0)])
-    # The same of being down-weighted.
+    # The number of independent values again, for the share that was down-weighted.
     independent = count_independent((w < HALF).astype(float))
     return InnovationSummary(
         expected=len(value),

@@ -186,6 +186,7 @@ def judge_step(
         states[0], states[1]
     )
     predicted |= spoilt
+    # The reason, later lines before earlier ones: prediction, then far, then unsound, then excluded.
     reason = jnp.where(of_value.far, Reason.FAR, jnp.where(of_value.excluded, Reason.EXCLUDED, Reason.PLAUSIBLE))
     reason = jnp.where(unsound & of_value.came & ~of_value.far, Reason.UNSOUND, reason)
     reason = jnp.where(predicted, Reason.PREDICTION, reason)

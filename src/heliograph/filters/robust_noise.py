@@ -115,6 +115,8 @@ def describe_outlier_noise(
 ) -> ReceivedNoise:
     """Return the noise as it arrives: the sensor's behind the channel `plain`, and `late`, that of the last hop.
 
+    Shapes: m received, p sent. `independent`: whether correlated components are refused.
+
     Raises:
         ValueError: components that are correlated where they may not be, or mixed; no noise that could be weighed.
     """

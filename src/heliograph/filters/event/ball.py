@@ -38,7 +38,8 @@ def ball_moments(centre: jax.Array, variance: jax.Array, radius: jax.Array, insi
     """
     if len(centre) == 1:
         return _join_pieces(_truncate_component(centre[0], variance[0], radius, inside))
-    # Where e_1 lies inside of the radius: the moments of the others at each node.
+    # e_1 = radius sin(t) inside of the radius, t only where e_1 has its probability: within REACH deviations of the
+    # point of [-radius, radius] that is nearest to its mean. At each node: the moments of the other components.
     first, deviation = centre[0], jnp.sqrt(variance[0])
     near = jnp.clip(first, -radius, radius)
     low, high = (jnp.arcsin(jnp.clip((near + side * REACH * deviation) / radius, -1.0, 1.0)) for side in (-1.0, 1.0))
@@ -53,7 +54,7 @@ def ball_moments(centre: jax.Array, variance: jax.Array, radius: jax.Array, insi
     pieces = BallMoments(weight + others.log_mass, mean, covariance)
     if inside:
         return _join_pieces(pieces)
-    # Where it does not: above and below, and the others anywhere.
+    # Outside also where |e_1| > radius, above or below (two Gaussians): there the others may lie anywhere.
     tails = _truncate_component(first, variance[0], radius, False)
     mean = jnp.concatenate([tails.mean, jnp.broadcast_to(centre[1:], (2, len(centre) - 1))], axis=1)
     free = jnp.broadcast_to(jnp.diag(variance), (2, *variance.shape * 2))

@@ -203,6 +203,10 @@ class EventFilter(AbstractSizedFilter):
             lost: whether the receiver was told of a loss, or how many; NaN where it was not.
             s: number of the sender.
             begun: whether the sender has something to compare with.
+
+        Returns:
+            The sum of (x, r), y taken off: first the Gaussians with a known reference, then those whose reference was
+            lost.
         """
         n, m, sender = len(self.states), self.outputs, self.senders[s]
         state_and_reference, label = np.r_[0 : n + m], augmented.label[:, s]

@@ -89,6 +89,7 @@ def event_filter(
         return on_premise(
             StochasticEventFilter(trigger=trigger, **shared, **make_sizes(claim, start, received)), premise
         )
+    # A threshold: a sum of Gaussians, by the value with which the sender compares.
     filter = EventFilter(
         trigger=_check_threshold_rule(trigger, lost if loses else None, outputs, first(channel).outputs, steps),
         known=known,

@@ -143,14 +143,18 @@ def reduce_parts(parts: GaussianSum, count: int, places: slice) -> GaussianSum:
 
 @partial(jax.jit, static_argnames="ends")
 def _merge_cheapest_pair(parts: GaussianSum, ends: tuple[int, int]) -> GaussianSum:
-    """Merge the pair of least cost: it stays at the first's place, and the last Gaussian moves to the second's."""
+    """Return the sum with the cheapest pair (a, b) merged into one Gaussian at a's place, the last one moved to b's.
+
+    Cost of a pair: w_a w_b / (w_a + w_b) sum_i (m_a - m_b)_i^2 / (v_a + v_b)_i over the components `ends`, m mean and v
+    variance. That is how much the merged Gaussian spreads more than its parts, in units of their variance.
+    """
     size, places = len(parts.log_weight), slice(*ends)
     pairs = list(combinations(range(size), 2))
     first, second = (jnp.asarray(column) for column in zip(*pairs, strict=True))
     top = jnp.max(parts.log_weight)
     weight = jnp.exp(parts.log_weight - jnp.where(jnp.isfinite(top), top, 0.0))
     centre, spread = parts.gaussian.mean[:, places], jax.vmap(lambda x: x.columns.diagonal)(parts.gaussian)[:, places]
-    # Cost of each pair, and the least.
+    # Cost of each pair, and the pair of least cost. A pair of no spread or no weight is divided by 1, not by 0.
     w1, w2 = weight[first], weight[second]
     both = spread[first] + spread[second]
     apart = (centre[first] - centre[second]) ** 2 / jnp.where(both > 0, both, 1.0)
@@ -159,7 +163,7 @@ def _merge_cheapest_pair(parts: GaussianSum, ends: tuple[int, int]) -> GaussianS
     chosen = jnp.arange(len(pairs)) == least
     is_first = jnp.stack([jnp.any(chosen & (first == i)) for i in range(size)])
     is_second = jnp.stack([jnp.any(chosen & (second == i)) for i in range(size)])
-    # The two joined; the others keep their places.
+    # The pair joined by its moments: a merge in which all others have no weight.
     merged = merge_groups(parts._replace(log_weight=jnp.where(is_first | is_second, parts.log_weight, -jnp.inf)))
 
     def replace_pair(values: jax.Array, joined: jax.Array) -> jax.Array:

@@ -97,8 +97,9 @@ class AdaptiveFilter(AbstractWrapper):
 
     @corrects
     def correct(self, state: AdaptiveBelief, z: ArrayLike, k: Step = 0) -> tuple[AdaptiveBelief, Innovation]:
-        """Use what arrived of z for the state and for the variances."""
-        # Moments of what arrives without its noise, and the noise's law.
+        """Correct the state and the law of the noise variances with what arrived of z."""
+        # Moments of what arrives without its noise, and how a robust base weighs outliers: by a rule, or by the law's
+        # Gaussian branches. Another base weighs nothing.
         base, belief, noise = self.base, state.gaussian, at(self.noise, k)
         sensor, plant = at(base.sensor, k), at(base.plant, k)
         signal = signal_without_noise(plant, sensor, base.transform, belief, second_moments_at_start(base.plant, base))
@@ -154,14 +155,21 @@ def _variational_update(
     rule: AbstractWeights | None,
     law: NoiseBranches | None,
 ) -> VariationalUpdate:
-    """Do one step of variational Bayes: alternate x given R = b / a and b given x, `ITERATIONS` times.
+    """Return the state x and the law of the noise variances R given z: x given R, then R given x, `ITERATIONS` times.
 
-    Each R_i has the law of an inverse gamma variable, R = b / a. Both parameters are forgotten towards the prior, a
-    grows by 1/2 for each value that arrived, and b by E[(z - t)^2] / 2 times its weight. The state is corrected with
-    the variances before the last b.
+    R_i is inverse gamma of shape a_i and scale b_i, used as R = b / a. Both are forgotten towards the prior, a grows by
+    1/2 for each value that arrived, and b by E[(z - t)^2] / 2 times its weight, t what would arrive without noise. The
+    state is corrected with the variances before the last b.
 
-    before: prediction of z without its noise; state: (a, b) before, (m,) each; center, variance: mean and nominal
-    variance of the noise; memory: share that is kept a step; rule or law: how a robust filter weighs outliers.
+    Args:
+        before: prediction of z without its noise.
+        state: (a, b) before, (m,) each.
+        z: what arrived, NaN where nothing did.
+        center: mean of the noise.
+        variance: nominal variance of the noise.
+        memory: share of a and b that is kept a step.
+        rule: how a robust filter weighs outliers; None for none, or with `law`.
+        law: the Gaussian branches of the noise, for the score update instead; None for none.
     """
     arrived = ~jnp.isnan(z)
     # Forget towards the prior, and count the new value.

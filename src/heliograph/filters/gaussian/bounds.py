@@ -89,7 +89,7 @@ def observe_by_young(signal: Signal, channel: SecondOrder, z: ArrivedInnovation,
 
 
 def observe_by_zero_mean(signal: Signal, channel: SecondOrder, z: ArrivedInnovation, scalar: Array) -> Gaussian:
-    """Update by `ZeroMean`, for an error of which the mean is zero and the correlation with the gain is not known.
+    """Return the state after z by `ZeroMean`: the prior error has mean zero, its correlation with the gain is unknown.
 
     For each beta > 0 the bound is P, updated by a measurement with the noise Omega - M H P H' M', plus beta C Pyy^+ C':
     Omega = power(Pyy) + spread(yhat yhat') + shift(Pyy) / beta, and C Pyy^+ C' is what the received components explain.

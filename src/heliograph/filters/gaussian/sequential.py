@@ -60,7 +60,7 @@ class SequentialFilter(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
-        """Correct with each node's measurement in turn."""
+        """Correct with each node's measurement in turn; z: those of all nodes, one behind the other."""
         z = jnp.asarray(z)
         # Filters of one structure: one correction compiled, run over the nodes.
         if all(alike(filter, self.filters[0]) for filter in self.filters):
@@ -68,8 +68,8 @@ class SequentialFilter(AbstractSizedFilter):
 
             def correct(belief: Gaussian, node: tuple[PyTree, jax.Array]) -> tuple[Gaussian, Innovation]:
                 """Correct with one node's measurement."""
-                numbers, measurement = node
-                filter_of_node: GaussianFilter = eqx.combine(numbers, rest)
+                arrays_of_node, measurement = node
+                filter_of_node: GaussianFilter = eqx.combine(arrays_of_node, rest)
                 return filter_of_node.correct(belief, measurement, k)
 
             state, innovation = jax.lax.scan(correct, state, (arrays, z.reshape(len(self.filters), -1)))

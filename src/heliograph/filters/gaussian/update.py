@@ -239,10 +239,11 @@ def _is_multiple_of_identity(matrix: jax.Array | np.ndarray) -> bool:
 
 
 def combine_hop_ranges(channel: AbstractRandomAffine, variance: Callable[[HopRange], float]) -> SecondOrder:
-    """Return the worst cases of a chain of hops, from the range of each.
+    """Return the worst-case second moments of a chain of hops, from the range of possible moments of each hop's gain.
 
-    Hop after hop: V <- var S + (|m| + r)^2 V for the spread, S <- s S for the power, N <- (a^2 s) N + Q for the noise,
-    s the largest E g^2. `variance` returns the bound on var g of a hop.
+    Hop i multiplies by a g: amplitude a, gain g of mean m up to +-r. Hop after hop, with s the largest E g^2:
+    V <- var S + (|m| + r)^2 V bounds the variance of the product of the gains g, S <- s S its power, and
+    N <- (a^2 s) N + Q the noise. `variance` returns the bound `var` on the variance of a hop's g.
     """
     hops = [_describe_hop(hop) for hop in channel.in_series]
     # The recursion over the hops.
@@ -251,7 +252,7 @@ def combine_hop_ranges(channel: AbstractRandomAffine, variance: Callable[[HopRan
         spread = variance(hop) * power + (abs(hop.mean) + hop.mean_radius) ** 2 * spread
         power *= hop.largest_second
         noise = hop.amplitude**2 * hop.largest_second * noise + hop.noise
-    # Shift of the mean gain: prod (|m| + r) - prod |m|.
+    # How far the mean of the product may lie from the nominal one: prod (|m| + r) - prod |m|.
     amplitude = float(np.prod([hop.amplitude for hop in hops]))
     nominal = float(np.prod([abs(hop.mean) for hop in hops]))
     shift = float(np.prod([abs(hop.mean) + hop.mean_radius for hop in hops])) - nominal

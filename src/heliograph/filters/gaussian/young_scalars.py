@@ -33,7 +33,7 @@ def trace_minimising_scalars(sweep: Sweep, given: Array, parts: Parts) -> jax.Ar
     step is too long the sweep itself is taken. The last step is taken outside the loop: its derivative is that of the
     root, by the implicit function theorem, in reverse mode too.
     """
-    # No derivatives inside the loop.
+    # No derivatives inside the loop; its unknown is t = log beta.
     fixed = jax.lax.stop_gradient(parts)
     free = jnp.isnan(given)
 

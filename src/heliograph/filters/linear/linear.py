@@ -217,7 +217,7 @@ def linear_filter(
     for moves, senses in product(models_of(first(plant)), models_of(first(sensor))):
         check_linear("linear filter", moves, senses)
         check_link(senses, first(channel), len(moves.states))
-    # Memory: the modes are estimated jointly with the state.
+    # Memory: the modes are estimated jointly with the state. A sensor that rounds may lower the claim.
     if first(channel).remembers or is_modal(first(plant)) or is_modal(first(sensor)):
         if update is not None:
             raise fail("update", "none behind a channel that remembers", type(update).__name__)

@@ -145,7 +145,10 @@ def plan_filter(
 
 
 def _record_matrices(filter: AbstractFilter, inputs: Array, projection: Array | None) -> PlannedFilter:
-    """Scan a filter over zeros and return the gains and covariances of every step as a `PlannedFilter`."""
+    """Return the gains and covariances of a filter at every step, recorded while it runs over data of zeros.
+
+    `inputs` (steps, inputs). `projection`: the covariances kept are those of this linear map of the state; None: all.
+    """
     # Complete data of zeros: the matrices do not depend on their values.
     zeros = jnp.zeros(filter.received)
 
@@ -159,7 +162,7 @@ def _record_matrices(filter: AbstractFilter, inputs: Array, projection: Array | 
     start = filter.init()
     start = jax.tree.map(jnp.asarray, start)
     _, (steps, covariances) = jax.lax.scan(record_step, start, (jnp.arange(len(inputs)), jnp.asarray(inputs)))
-    # Covariances in the order of `PlannedMean.stage`.
+    # Covariances in the order of `PlannedMean.stage`: at the start, then before and after correction of each step.
     in_order = covariances.reshape(-1, *covariances.shape[2:])
     by_stage = jnp.concatenate([_project_covariance(start, projection)[None], in_order])
     return PlannedFilter(

@@ -88,7 +88,7 @@ def true_error(
     begin, total = first(plant), len(first(plant).states)
     initial, world = channels_by_mode(channel)
     projection = np.eye(n) if planned.projection is None else np.asarray(planned.projection)
-    # N_j at the start, with r = (x, 1, s).
+    # N_j at the start, with r = (x, 1, s): P(j) E[r r'], where only x has a covariance; s is the planned start.
     mean = np.concatenate([begin.initial_mean, [1.0], planned.start])
     square = np.outer(mean, mean)
     square[:total, :total] += begin.initial_covariance
@@ -100,7 +100,9 @@ def true_error(
         moments = _propagate_moments(moments, at(plant, k), at(planned.steps, k), u[k], transition)
         moments = _correct_moments(moments, at(sensor, k), at(world, k), at(planned.steps, k))
         true.append(difference @ moments.sum(axis=0) @ difference.T)
-    return TrueError(start.states, np.asarray(planned.covariances)[2 : 2 * horizon + 1 : 2], np.array(true))
+    # Claimed covariances lie as start, then before and after correction of each step: every second one from the third.
+    claimed = np.asarray(planned.covariances)[2 : 2 * horizon + 1 : 2]
+    return TrueError(start.states, claimed, np.array(true))
 
 
 def _propagate_moments(

@@ -164,7 +164,11 @@ class AdditiveModalFilter(AbstractModalFilter):
         return predict_by_mode(state.gaussian.root, move, _function_transition(rows).T), noise
 
     def _measurement_model(self, state: AdditiveBelief, k: Step) -> MeasurementModel:
-        """Return z = common + H zeta + v, H from Hbar and the D_a, and columns of Cov v."""
+        """Return z = common + H zeta + v: H and `common` from Hbar and the D_a, and columns whose squares sum to Cov v.
+
+        Letters of the subscripts: a, b, c functions (1, phi_1, ...), m received, p + 1 sent and the 1, l received, j
+        modes of a link.
+        """
         terms: tuple[ChannelByMode, ...] = at(self.terms, k)
         sensor = at(self.sensor, k)
         # H: the gain of each function, times C~ of the centred state.

@@ -63,7 +63,11 @@ def _describe_step_by_pattern(
     before: JointModes,
     flags: Float[np.ndarray, "M F"],
 ) -> SideInformation:
-    """Return the channel of one step, from the outcomes of each mode; `before`: the modes of the step before."""
+    """Return the channel of one step by mode and pattern of arrivals, from the outcomes (what may arrive) of each mode.
+
+    `before` has the transition from the modes of the step before; `flags` is P(flag | mode). Moments are of (G, n), the
+    gain and offset: (modes, patterns, m, p), second ones (modes, patterns, m, m, p, p).
+    """
     m, p = outcomes[0][0].map.outputs, outcomes[0][0].map.inputs + 1
     shape = (len(outcomes), len(patterns))
     # Sums over the outcomes of each mode: P, P E[(G, n)] and P E[(G, n) x (G, n)].

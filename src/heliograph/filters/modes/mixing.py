@@ -187,13 +187,20 @@ def move_by_law(
     u: jax.Array,
     start: jax.Array,
 ) -> Gaussian:
-    """Mix Gaussians by weights (components, mixtures), and move them by the plants of modes.
+    """Return the Gaussians after a step: mixtures of `parts` by weights (components, mixtures), moved by modes' plants.
 
-    `moves`: of each component after the move the mixture that it was, and the mode that moves it. `plant_of`: which
-    plant each mode has. Where all have one, each mixture is moved once.
+    Args:
+        plants: the different plants.
+        plant_of: [j], number of the plant of mode j.
+        transform: of moments, for a nonlinear plant.
+        parts: Gaussians that are mixed, one a component.
+        weight: (components, mixtures).
+        moves: of each Gaussian after the step: number of the mixture that it was, and the mode that moves it.
+        u: input.
+        start: E[x_i^2] before any data (n,).
     """
     mixture_of, mode_of = moves
-    if len(plants) == 1:
+    if len(plants) == 1:  # each mixture is moved once, however many modes it has afterwards
         moved = mix_and_predict(plants[0], transform, parts, weight, u, start)
         in_order = np.array_equal(mixture_of, np.arange(weight.shape[1]))
         return moved if in_order else jax.tree.map(lambda leaf: leaf[mixture_of], moved)

@@ -121,8 +121,9 @@ class MixtureFilter(AbstractSizedFilter):
     @corrects
     def correct(self, state: MixtureBelief, z: ArrayLike, k: Step = 0) -> tuple[MixtureBelief, Innovation]:
         """Correct with z: one Kalman update per combination, weighted by its likelihood, then moment matching."""
-        c, z, x = at(self.components, k), jnp.asarray(z), state.gaussian
-        prior, size = state.law[c.mode] * jnp.asarray(c.weight), square_root(second_moments_at_start(self.plant))
+        c, z, x = at(self.components, k), jnp.asarray(z), state.gaussian  # c: gain, offset and noise by combination
+        prior = state.law[c.mode] * jnp.asarray(c.weight)
+        size = square_root(second_moments_at_start(self.plant))  # of the states, for the rounding of gain @ x
         present = ~jnp.isnan(z)
 
         def condition_on_combination(

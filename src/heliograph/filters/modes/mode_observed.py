@@ -90,7 +90,7 @@ class ModeObservedFilter(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: ModeObservedBelief, z: ArrayLike, k: Step = 0) -> tuple[ModeObservedBelief, Innovation]:
-        """Correct with z, given the received state of the memories."""
+        """Correct with z, given the memories' states that came with it: those of this step, or, `late`, of the last."""
         sensor, channel, observed = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
         # Received vector: z, then the states of the memories.
         m = channel.outputs

@@ -140,7 +140,10 @@ class ModalSmootherStep(SmootherStep):
         return self.law
 
     def back(self, later: ModalLaw) -> ModalLaw:  # type: ignore[override]
-        """Smooth the modes before the step from those after it, both given the same later data."""
+        """Return mode probabilities and Gaussians before the step, given all data, from those after it given all data.
+
+        `pairs`, `ways` and `weights` are by [i, j]: mode i before the step, mode j after it.
+        """
         near = wrap_near(later.gaussian.mean, self.known.mean, self.angles)
         observations = jax.vmap(divide_gaussians)(later.gaussian._replace(mean=near), self.known)
 
@@ -151,7 +154,7 @@ class ModalSmootherStep(SmootherStep):
             return after, jnp.asarray(innovation.log_likelihood)
 
         after, score = jax.vmap(jax.vmap(observe), in_axes=(0, None))(self.pairs, observations)
-        # P(i, j | all): of each later mode, the share of each mode before.
+        # P(i, j | all) = P(j | all) P(i | j, all): of each later mode j, the share of each mode i before.
         possible = self.weights > 0
         logs = jnp.where(possible, jnp.log(jnp.where(possible, self.weights, 1.0)) + score, -jnp.inf)
         most = jnp.max(logs, axis=0)

@@ -75,6 +75,7 @@ def correct_in_every_mode(
     """Correct each signal's prior in its mode; return posteriors, their weights, and the mixture's innovation.
 
     weight+ ~ weight P(what arrives | mode) N(z; ...): the likelihood of the innovation is that of z given what arrives.
+    `signal`, `mode` and `weight`: one entry for each Gaussian; `channel`: by mode and pattern of arrivals.
     """
     # Channel moments by mode, given which components arrived.
     kind = pattern_of(channel, ~jnp.isnan(z)) if len(channel.present) > 1 else 0

@@ -122,7 +122,11 @@ class SideInformationFilter(AbstractSizedFilter):
 
     @predicts
     def predict(self, state: SideInformationBelief, u: ArrayLike = (), k: Step = 0) -> SideInformationBelief:
-        """Predict s+ = F s; where the mode goes from i to j, e+ = F e + (1_j - p_i) x A~ x~ + 1_j x w~."""
+        """Predict s+ = F s; where the mode goes from i to j, e+ = F e + (1_j - p_i) x A~ x~ + 1_j x w~.
+
+        1_j is the unit vector of mode j, p_i row i of the transition matrix, A~ the plant about the centre, w~ its
+        noise; `x` between them is the Kronecker product.
+        """
         plant, channel = at(self.plant, k), at(self.channel, k)
         move, _, centre = centred_transition(plant, u, state.centre)
         modes, (errors, x, weights) = len(self.initial), _split_columns(state)
@@ -162,7 +166,7 @@ class SideInformationFilter(AbstractSizedFilter):
         flag_chance = jnp.where(flag_arrived, jnp.asarray(channel.flags)[:, number], 1.0)
         pattern = pattern_of(channel, arrived)
         weight = jnp.asarray(channel.chance)[:, pattern] * flag_chance
-        # Moments given the side information, then the projection.
+        # Moments given the side information: each mode's grow by weight = P(mode | it) / P(mode), `excess` is by what.
         _, x, weights = _split_columns(state)
         weight = weight / (weight @ _mode_probabilities(x, weights))
         prior = state._replace(variances=jnp.asarray(weight)[:, None] * state.variances)

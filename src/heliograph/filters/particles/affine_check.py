@@ -71,7 +71,7 @@ def _constant(value: Any) -> _TracedArray:
 
 
 def _degrees_of_operation(equation: Any, x: list[_TracedArray]) -> list[_TracedArray]:
-    """Return the degrees of the results of one operation on operands x."""
+    """Return the degrees of the results of one traced operation (a JAX equation), from its operands x."""
     name, params = equation.primitive.name, equation.params
 
     def compute(arrays: list[Any]) -> list[Any]:
@@ -97,7 +97,10 @@ def _degrees_of_operation(equation: Any, x: list[_TracedArray]) -> list[_TracedA
 
 
 def _degree_of_arithmetic(name: str, params: dict[str, Any], x: list[_TracedArray]) -> Any:
-    """Return the degrees of a sum, a product, a choice; OTHER of what is not linear."""
+    """Return the degrees, entry by entry, of the result of an operation on operands x; OTHER where it is not linear.
+
+    A degree is a number, KNOWN < GIVEN < AFFINE < OTHER: a sum has the larger one of its terms.
+    """
     match name:
         case "add" | "add_any" | "sub":
             return np.maximum(x[0].degree, x[1].degree)

@@ -121,7 +121,7 @@ def _compile_programs(
     """Return the code for a filter, for rows like these and their keys; None if there is none."""
     length = -(-filter.particles // GROUP) * GROUP
     numbers = np.arange(length, dtype=np.uint32)
-    # Programs share what of a row and of particles more than one reads.
+    # Arrays that several programs read, shared by them: the row, the particles, their weights.
     own, proposing = (np.zeros_like(part[0]) for part in keys)
     row = DataRow(np.zeros((), int), np.zeros_like(z[0]), np.zeros_like(u[0]), own, proposing, np.ones((), bool))
     log_weight, prior, weight = np.zeros((3, length))
@@ -225,7 +225,10 @@ def _unpack_sums(vector: Array, function: Call, *arguments: Any) -> Any:
 
 
 def _filter_rows(filter: Any, z: np.ndarray, u: np.ndarray, state: PyTree | None, begin: int) -> ScanResult | None:
-    """Filter rows of data, the first of number `begin` behind a state; None without native code."""
+    """Return last state and outputs of rows of data, the first with number `begin`; None without native code.
+
+    `state`: that after the row before; None at the start, where particles are drawn.
+    """
     key = None if state is None else np.asarray(state.key)
     of_start, start, last, own, proposing = compute_once(_draw_keys, _draw_keys_by_xla, (filter, z, key))
     k = begin + np.arange(len(z))
@@ -304,7 +307,7 @@ class _ParticleLoop:
             largest = self._advance(False)
         np.subtract(self.log_weight, largest, out=memory.log_weight)
         np.exp(memory.log_weight, out=memory.weight)
-        # First sums of all, then second sums about their means.
+        # weight = exp(log weight - largest). First sums of all groups, then second sums about the means.
         self._find_reference()
         programs.first()
         states = np.einsum("ij->j", programs.first.outputs[0], out=memory.states)  # in half of the time of add.reduce

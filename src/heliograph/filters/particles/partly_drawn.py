@@ -254,12 +254,14 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
             draw: standard normal numbers for d.
             uniform: three numbers, for prior or posterior, for the mode and for the atom of the noise.
         """
+        # Posterior of each mode by the linearised sensor, and alpha_j = log P(j) N_j(z); no mode, no posterior.
         share = self._prior_share(sensors, received)
         modes = jnp.arange(len(self.initial))
         posterior, alpha = jax.vmap(lambda j, x_j: self._linearised_posterior(sensors, received, j, x_j))(modes, x)
         alpha = jnp.where(jnp.isnan(alpha), -jnp.inf, alpha) + log_mode
         possible = jnp.max(alpha) > -jnp.inf
         log_posterior_mode = alpha - jnp.where(possible, jax.nn.logsumexp(alpha), 0.0)
+        # Draw j, then d given j: from the prior with probability `share`, else from the posterior.
         from_prior = (uniform[0] < share) | ~possible
         mode = draw_index(jnp.where(from_prior, log_mode, alpha)[None], uniform[1:2])[0]
         prior, linearised = (jax.tree.map(lambda leaf: leaf[mode], law) for law in (x, posterior))

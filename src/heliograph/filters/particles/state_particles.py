@@ -230,7 +230,7 @@ def _root_of(columns: WeightedColumns) -> jax.Array:
 def build_state_particles(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, particles: int, seed: int, proposal: str, resample: float
 ) -> StateParticleFilter:
-    """Return the particle filter of the state, as `particle_filter` takes what it is made of."""
+    """Return the particle filter that draws the whole state; arguments as those of `particle_filter`, checked here."""
     start, first_sensor = instance("plant", first(plant), AbstractPlant, "a plant"), first(sensor)
     instance("sensor", first_sensor, AbstractSensor, "a sensor")
     first_sensor.refuse_inputs("particle_filter")
@@ -240,6 +240,7 @@ def build_state_particles(
     if proposal == "optimal":
         for step in unstack(plant):
             _check_gaussian(step)
+    # The density of z given x, for each step that sensor or channel has of its own.
     steps = steps_covered((sensor, channel)) or 1
     by_step = zip(list_steps(sensor, steps), list_steps(channel, steps), strict=True)
     return StateParticleFilter(
