@@ -15,6 +15,7 @@ REQUIREMENTS = {
     "kalman-py": ("kalman-py[jax]==0.1.1",),
     "pykalman": ("pykalman==0.11.2",),
     "statsmodels": ("statsmodels==0.15.0",),
+    "torch-kf": ("torch-kf==0.4.3", "torch==2.13.0", "numpy"),
 }
 INSTALL = ("-m", "pip", "install", "--quiet", "--quiet", "--disable-pip-version-check")
 LONGEST = 600  # seconds for one environment

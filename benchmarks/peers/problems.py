@@ -53,6 +53,14 @@ def smoothing(runs: int = 10_000, steps: int = 100, gains_differ: bool = True) -
     return Problem(title, arrays, smoothed_mean_flops(4, 2), 8 * (2 + 4))
 
 
+def filtering_planned(runs: int = 10_000, steps: int = 100) -> Problem:
+    """The Kalman problem with all gains 1: covariances and gains are the same in every run."""
+    arrays = kalman(runs, steps).arrays
+    title = "Kalman filtering, 4 states, 2 measurements, gains that are the same in every run"
+    n, m = 4, 2
+    return Problem(title, arrays, 2 * n * n + 4 * n * m + m + n, 8 * (m + n))  # A m, z - C m, m + K e
+
+
 def smoothing_flops(n: int, m: int) -> int:
     """A sweep back in the form of Bryson and Frazier after a filter: adjoint vector and matrix, and their use."""
     half = n * (n + 1)

@@ -33,7 +33,7 @@ def fail_chunk(monkeypatch, times: int) -> list[tuple[int, int]]:
             raise RuntimeError("bad luck\nin two lines")
         compute(campaign, network, chunk, store)
 
-    monkeypatch.setattr(work, "compute_chunk", failing)
+    monkeypatch.setattr(jobs, "compute_chunk", failing)
     return tried
 
 

@@ -8,7 +8,7 @@ import pytest
 
 import heliograph as hg
 from heliograph import cli
-from heliograph.files.fit_files import load_fitted
+from heliograph.files.fitted import load_fitted
 from heliograph.files.recording import Recording, write_recording
 
 SOURCE = """

@@ -88,7 +88,7 @@ def backtest(
 
 def _make_refit(reference: str, recording: "Recording", advance: "Advance") -> "Callable[[int], Network]":
     """Return a function from a number of rows to the network, its free numbers fitted to the first rows so many."""
-    from heliograph.files.fit_files import NetworkAgain
+    from heliograph.files.fitted import NetworkAgain
 
     build, (z, u, _, _) = NetworkAgain(reference), recording
 

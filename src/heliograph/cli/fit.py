@@ -90,7 +90,7 @@ def learn(
     advance("starting")
     from dataclasses import replace
 
-    from heliograph.files.fit_files import NetworkAgain
+    from heliograph.files.fitted import NetworkAgain
     from heliograph.learning.held_out import compare_filters, transform_held_out
     from heliograph.learning.sender_fit import has_deciding_sender
     from heliograph.numerics.check import fail
@@ -214,7 +214,7 @@ def _fit_with_progress(
 
 def collect_results_files(learned: "FitResults", out: Path, network: str) -> "Results":
     """Return the content of the results folder."""
-    from heliograph.files.fit_files import as_json, write_fitted
+    from heliograph.files.fitted import as_json, write_fitted
     from heliograph.report.pages.fit import draw_fit_figures, pages
     from heliograph.report.results import Results
 

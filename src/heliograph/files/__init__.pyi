@@ -17,7 +17,7 @@ from .estimates.table import (
 from .event_table import (
     EventTable as EventTable,
 )
-from .fit_files import (
+from .fitted import (
     load_fitted as load_fitted,
 )
 from .estimates.forecasts import (

@@ -1,0 +1,7 @@
+"""torch-kf: filtering of all series at once, in double precision."""
+
+import torch
+from torch_batches import filtered, run
+
+if __name__ == "__main__":
+    run(filtered, torch.float64)
