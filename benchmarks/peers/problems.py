@@ -54,8 +54,8 @@ def smoothing(runs: int = 10_000, steps: int = 100, gains_differ: bool = True) -
 
 
 def filtering_planned(runs: int = 10_000, steps: int = 100) -> Problem:
-    """The Kalman problem with all gains 1: covariances and gains are the same in every run."""
-    arrays = kalman(runs, steps).arrays
+    """Filtering of the smoothing problem whose gains do not differ: one covariance for all runs, means for each."""
+    arrays = smoothing(runs, steps, gains_differ=False).arrays
     title = "Kalman filtering, 4 states, 2 measurements, gains that are the same in every run"
     n, m = 4, 2
     return Problem(title, arrays, 2 * n * n + 4 * n * m + m + n, 8 * (m + n))  # A m, z - C m, m + K e
