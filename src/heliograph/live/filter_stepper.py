@@ -5,31 +5,45 @@ leaves implausible measurements out and goes on, and takes many rows at once.
 """
 
 from collections.abc import Sequence
-from functools import lru_cache
-from typing import Any
+from functools import cached_property, lru_cache
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.stats import chi2
 
 from heliograph.engine.choice import read_setting, try_native
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import Judgement
+from heliograph.live.stored.old_layout import split_by_path
+from heliograph.live.stored.snapshot import Identity, versions
+from heliograph.model.channel import Channel
+from heliograph.model.estimate import JudgedEstimate
+from heliograph.model.over_time import first
+from heliograph.model.trigger import AbstractTrigger
+from heliograph.numerics.caching import share_by_object
 from heliograph.numerics.float64 import understood
-from heliograph.numerics.trees.static import Static
+from heliograph.numerics.trees.program_text import hash_numbers, text_of
+from heliograph.numerics.trees.static import Static, cast
 from heliograph.numerics.types import Float, PyTree
 from straightline import Unsupported, compile_one
 
 Leaves = list[np.ndarray]
 PARTS = len(Judgement._fields)
+RARE = 1e-4  # probability with which an honest filter sees what counts as unexpected
 
 
 class NativeFilterStepper:
     """One filter's step by native code, which reads and writes arrays that stay where they are."""
 
     def __init__(self, code: Any, numbers: Leaves, state: Leaves):
-        """Name the arrays of the code's arguments and results, which are those of `_compile_step`."""
+        """Start from the leaves `state`; `code` is what `compile_native_step` returns, `numbers` the filter's arrays.
+
+        The code reads and writes the same arrays at each call: here they get names.
+        """
         self._code = code.again(numbers)
+        # Arguments (numbers, state, z, u, k); results (judgement, flagged, state after, estimate, next state).
         arguments, results, n = self._code.inputs[len(numbers) :], self._code.outputs, len(state)
         self._state, (self._z, self._u, self._k) = arguments[:n], arguments[n:]
         self._judged: Float[np.ndarray, " parts"] = results[0]
@@ -39,7 +53,7 @@ class NativeFilterStepper:
 
     @property
     def judgement(self) -> Float[np.ndarray, " 4"]:
-        """Return the judgement of the step."""
+        """Return the parts of the newest step's `Judgement`, in the order of its fields."""
         return self._judged[:PARTS]
 
     @property
@@ -84,7 +98,7 @@ class XlaFilterStepper:
 
     @property
     def judgement(self) -> Float[np.ndarray, " 4"]:
-        """Return the judgement of the step."""
+        """Return the parts of the newest step's `Judgement`, in the order of its fields."""
         return self._judged[:PARTS]
 
     @property
@@ -126,9 +140,17 @@ class XlaFilterStepper:
 def _judge_step(
     static: Static, numbers: Sequence[jax.Array], state: PyTree, z: jax.Array, u: jax.Array, k: jax.Array
 ) -> tuple[jax.Array, jax.Array, list[jax.Array], list[jax.Array]]:
-    """Step a filter from its arrays; return judgement, whether to refuse, leaves of the state and of the estimate.
+    """Step a filter; return its judgement, whether to refuse the step, and leaves of the state and the estimate after.
 
-    The weights of a filter that weighs follow its judgement.
+    The weights of a filter that weighs what arrives follow its judgement, in one array.
+
+    Args:
+        static: the filter without its arrays.
+        numbers: these arrays.
+        state: the filter's state before the step.
+        z: measurement (received,), NaN where a component did not arrive.
+        u: inputs (inputs,).
+        k: step number.
     """
     filter: AbstractFilter = static.filled(numbers)
     after, estimate, judgement, innovation = filter.judge_step(state, z, u, k)
@@ -152,7 +174,17 @@ def compile_xla_step(static: Static) -> Any:
 
 
 def compile_native_step(static: Static, numbers: Sequence[jax.Array], state: PyTree, data: Sequence[np.ndarray]) -> Any:
-    """Compile native code with arguments (numbers, state, z, u, k), flattened; None if XLA has to step the filter."""
+    """Return a filter's step as native code; None if XLA has to step the filter.
+
+    Its arguments are (numbers, state, z, u, k), flattened; its results those of `_judge_step`, and the state again,
+    written over the argument: unchanged if the step was flagged.
+
+    Args:
+        static: the filter without its arrays.
+        numbers: these arrays.
+        state: a state of the filter, for its structure and shapes.
+        data: z, u and k, for their shapes.
+    """
     leaves, tree = jax.tree.flatten(state)
     shapes = tuple((np.shape(leaf), str(leaf.dtype)) for leaf in (*numbers, *leaves, *data))
     return _compile_step(static, shapes, (len(numbers), len(leaves)), tree, read_setting())
@@ -162,7 +194,9 @@ def compile_native_step(static: Static, numbers: Sequence[jax.Array], state: PyT
 def _compile_step(
     static: Static, shapes: tuple[tuple[tuple[int, ...], str], ...], counts: tuple[int, int], tree: Any, engine: str
 ) -> Any:
-    """Compile the native code, once for each structure, set of shapes and engine; None if XLA has to do it.
+    """Return a filter's step as native code (see `compile_native_step`); None if XLA has to step the filter.
+
+    It is compiled once for each structure, set of shapes and engine.
 
     Args:
         static: the filter without its arrays.
@@ -171,21 +205,103 @@ def _compile_step(
         tree: structure of the state.
         engine: the setting of the engine, by which results are kept apart.
     """
-    numbers, state = counts
+    number_count, state_count = counts
+    state_end = number_count + state_count
 
-    def step(*leaves: jax.Array) -> PyTree:
+    def step(*arguments: jax.Array) -> PyTree:
         """Return judgement, whether to refuse, state after, estimate, and what takes the state's place."""
-        before, (z, u, k) = leaves[numbers : numbers + state], leaves[numbers + state :]
-        # The step, and the state that replaces the old one: unchanged if the step was flagged.
-        judged, flagged, after, estimate = _judge_step(static, leaves[:numbers], tree.unflatten(before), z, u, k)
-        if any(a.shape != b.shape or a.dtype != b.dtype for a, b in zip(after, before, strict=True)):
+        numbers, before = arguments[:number_count], arguments[number_count:state_end]
+        z, u, k = arguments[state_end:]
+        judged, flagged, after, estimate = _judge_step(static, numbers, tree.unflatten(before), z, u, k)
+        if any(new.shape != old.shape or new.dtype != old.dtype for new, old in zip(after, before, strict=True)):
             raise Unsupported("a state whose shape or type changes")
-        placed = [jnp.where(flagged, b, a) for a, b in zip(after, before, strict=True)]
-        return judged, flagged, after, estimate, placed
+        # The state that replaces the old one: unchanged if the step was flagged.
+        next_state = [jnp.where(flagged, old, new) for new, old in zip(after, before, strict=True)]
+        return judged, flagged, after, estimate, next_state
 
     def compile_code() -> Any:
         # The last results are written over the arguments of the state: {number of the result: of the argument}.
-        in_place = {-state + i: numbers + i for i in range(state)}
+        in_place = {i - state_count: number_count + i for i in range(state_count)}
         return compile_one(step, *(np.zeros(shape, kind) for shape, kind in shapes), in_place=in_place)
 
     return try_native(compile_code)
+
+
+class DecidingSender(NamedTuple):
+    """A sender that decides when to send, as its filter believes it: its rule, its link, its number of outputs."""
+
+    trigger: AbstractTrigger
+    channel: Channel
+    outputs: int
+
+
+def find_deciding_sender(filter: AbstractFilter) -> DecidingSender | None:
+    """Return the sender of which a filter knows what its silence means; None of any other filter."""
+    world = filter.premise
+    if not filter.silence_tells or world is None or world.trigger is None:
+        return None
+    assert world.sensor is not None and world.channel is not None  # a sender has both
+    return DecidingSender(world.trigger, world.channel, len(first(world.sensor).outputs))
+
+
+class CompiledFilter:
+    """A filter's compiled step, with its arrays and the names of what goes in and comes out; streams share it.
+
+    Attributes:
+        horizon: how many steps the filter covers; None for all.
+        received, given: how many numbers a measurement and the inputs have.
+        values: how many of the received numbers are values of a sender that decides when to send; 0 if none does.
+        numbers: the filter's arrays.
+        state: structure of its state, to which leaves are put together; `layout`: {path of a leaf: its shape}.
+        estimate: structure of the estimate of a step.
+        rare: by count of numbers that arrived, what their nis exceeds with probability RARE.
+    """
+
+    def __init__(self, filter: AbstractFilter):
+        self.filter, self.horizon = filter, filter.horizon
+        self.received, self.given = filter.received, len(filter.inputs)
+        self.values = 0
+        if sender := find_deciding_sender(filter):  # behind its values come the numbers of lost ones
+            self.values = filter.received - sender.trigger.side_information(sender.outputs)
+        # The filter in double precision as arrays and the rest; its initial state.
+        with jax.enable_x64(True):
+            self.numbers, self._static = cast(filter)
+            self._start: PyTree = jax.device_put(jax.tree.map(np.asarray, filter.init()))  # no program for each shape
+        self.state: PyTree = jax.tree.structure(self._start)
+        self.layout = {path: part.shape for path, part in split_by_path(self._start).items()}
+        self._data = np.zeros(self.received), np.zeros(self.given), np.asarray(0)  # z, u, k: shapes to compile for
+        with jax.enable_x64(True):
+            modes = jax.eval_shape(filter.estimate, self._start).modes
+        self.estimate: PyTree = jax.tree.structure(
+            JudgedEstimate(np.zeros(()), np.zeros(()), filter.claim, modes, filter.attitude, 0.0, 0)
+        )
+        # With so many degrees of freedom nis is chi-square of an honest filter; nothing exceeds it where none arrived.
+        self.rare = [np.inf, *(float(chi2.isf(RARE, count)) for count in range(1, self.received + 1))]
+
+    def stepper(self) -> NativeFilterStepper | XlaFilterStepper:
+        """Return a new stepper whose state is the prior."""
+        code = compile_native_step(self._static, self.numbers, self._start, self._data)
+        if code is None:
+            return XlaFilterStepper(compile_xla_step(self._static), self.numbers, self._start)
+        leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(self._start)]
+        return NativeFilterStepper(code, [np.asarray(leaf) for leaf in self.numbers], leaves)
+
+    @cached_property
+    def identity(self) -> Identity:
+        """Return versions, names, numbers and a hash of the step's program, whichever engine runs it."""
+        with jax.enable_x64(True):
+            text = text_of(compile_xla_step(self._static).trace(self.numbers, self._start, *self._data).jaxpr)
+        filter = self.filter
+        return {
+            **versions(),
+            "precision": ", ".join(sorted({str(leaf.dtype) for leaf in self.numbers})),
+            "filter": type(filter).__name__,
+            "states": ", ".join(filter.states),
+            "inputs": ", ".join(filter.inputs),
+            "numbers received": str(filter.received),
+            "numbers": hash_numbers(self.numbers),
+            "what is computed": hash_numbers(text),
+        }
+
+
+compile_once = share_by_object(CompiledFilter)  # returns a filter's compiled program, made at the first call

@@ -11,11 +11,11 @@ from heliograph.live.clock_leap import ARRIVAL, Leap, find_leap
 from heliograph.live.event import INPUTS, OF_STEPS, CheckedEvent, Verdict
 from heliograph.live.link_counts import ScreenedEvent
 from heliograph.live.network_program import NetworkProgram
-from heliograph.live.plant import PlantState, WithdrawnEvent
+from heliograph.live.plant import FinalisedPlant, PlantState
 from heliograph.live.plant_table import SlotTable, cut_into_legs, group_by_turn
 from heliograph.live.repeat_watch import RepeatWatch
-from heliograph.live.sender_status import SenderStatus, SilenceRule
-from heliograph.live.sorted_rows import BEFORE, HeldRow, SortedRows
+from heliograph.live.sender_status import SenderStatus, count_values_before_losses, find_silence_rules
+from heliograph.live.sorted_rows import BEFORE, HeldRow, SortedRows, lay_side_by_side
 from heliograph.model.checks.refusals import count_by_reason
 from heliograph.model.limits import Limits
 from heliograph.model.over_time import steps_covered
@@ -23,7 +23,6 @@ from heliograph.model.repeated_readings import Repeats
 from heliograph.model.timeouts import name_unit
 from heliograph.numerics.check import TINY, check_count, fail, instance, scalar
 from heliograph.numerics.types import Float
-from heliograph.simulation.node import Node
 
 LAST_STEP = 2.0**53  # up to which numbers count steps one by one
 
@@ -46,24 +45,6 @@ class Options(NamedTuple):
     step: float | None = None
 
 
-class FinalisedPlant(NamedTuple):
-    """What `Fleet.finalise` made final of one plant.
-
-    Attributes:
-        plant: the plant.
-        final: rows that are final now, in order of time.
-        newest: its newest row.
-        left: slots to free once the rows have been read.
-        withdrawn: events that had been used, of a clock that has turned out wrong.
-    """
-
-    plant: PlantState
-    final: list[HeldRow]
-    newest: HeldRow
-    left: list[int]
-    withdrawn: list[WithdrawnEvent]
-
-
 class Fleet:
     """Plants of one network: events are taken one after another, and `step` computes the rows that they made due.
 
@@ -82,31 +63,24 @@ class Fleet:
         network = self.network = program.network
         self.options, self.program = _check_options(options), program
         self.pool = SlotTable(program, alone)
-        # Index and size of each node's measurement, and of the inputs; their columns in a row, in this order.
+        # By name of a node, then of the inputs: its index, -1 for the inputs, and how many numbers its events have.
         self.sizes = {name: (i, network.nodes[name].received) for i, name in enumerate(network.names)}
         self.sizes[INPUTS] = -1, self.program.given
-        sizes = [size for _, size in self.sizes.values()]
-        self._places = [slice(int(end) - size, int(end)) for end, size in zip(np.cumsum(sizes), sizes, strict=True)]
-        self.width = self._places[-1].stop
-        # Last step for which the network is defined; limits of the jumps in time.
+        # Columns of these numbers in a row, by that index; how many numbers a row has before its time.
+        self._columns = lay_side_by_side([size for _, size in self.sizes.values()])
+        self.width = self._columns[-1].stop
         covered = steps_covered(network)
-        self.end_step = np.inf if covered is None else covered - 1
+        self.end_step = np.inf if covered is None else covered - 1  # the last step for which the network is defined
         self._names = [*network.names, INPUTS]
-        self._joint = self.program.dt is None or network.common is not None
+        self._joint = self.program.dt is None or network.common is not None  # see `rows_are_joint`
+        # What a node refuses of its readings; what it watches for where it refuses none that repeat.
         self._limits = {name: node.limits for name, node in network.nodes.items() if node.limits is not None}
         self.held_watches = {n: watch for n, node in network.nodes.items() if (watch := RepeatWatch.of_node(node))}
         self.periods = dict[str, int]()  # after how many messages a node's count begins at 0 again, where it does
-        # Nodes of which silence says something, and of these the ones whose sender decides when to send.
-        nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
-        senders = {name: SilenceRule.of_node(node) for name, node in nodes.items()}
-        self.watched = {name: sender for name, sender in senders.items() if sender is not None}
-        self.deciding = {name: sender.trigger for name, sender in self.watched.items() if sender.trigger is not None}
-        # By index of a node whose messages are numbered, so that losses are known: how many values come first.
-        self._values_before_losses = {
-            network.names.index(name): nodes[name].received - trigger.side_information(len(nodes[name].outputs))
-            for name, trigger in self.deciding.items()
-            if trigger.losses == "numbered"
-        }
+        # Nodes whose silence says something; of these the ones whose sender decides when to send, by its trigger.
+        self.watched = find_silence_rules(network)
+        self.deciding = {name: rule.trigger for name, rule in self.watched.items() if rule.trigger is not None}
+        self._values_before_losses = count_values_before_losses(network, self.deciding)
         # A slot with the prior, for plants that have not begun.
         self._blank = self.pool.take()
         self.pool.write_prior(self._blank, -1.0)
@@ -121,17 +95,21 @@ class Fleet:
         """Return whether all events of one time form one row."""
         return self._joint
 
-    def begin(self, name: str, time: float, origin: datetime | None) -> PlantState:
-        """Return a new plant, whose continuous time starts at `time`; steps start at 0, and the prior is of step -1."""
+    def begin_plant(self, name: str, time: float, origin: datetime | None) -> PlantState:
+        """Return a new plant with the prior alone.
+
+        Continuous time starts at `time`, where the prior stands; steps start at 0, and the prior is of step -1.
+        `origin`: date from which times are counted, None if they are numbers.
+        """
         by_steps = self.program.dt is None
         prior_time = -1.0 if by_steps else time
         slot = self.pool.take()
         self.pool.write_prior(slot, prior_time)
         base = HeldRow((prior_time, BEFORE, 0), slot, self.width)
         base.numbers[-1] = prior_time
-        return PlantState(name, self.make_rows(base), 0.0 if by_steps else time, origin, begun=time)
+        return PlantState(name, self.make_rows(base), now=0.0 if by_steps else time, origin=origin, begun=time)
 
-    def end(self, plant: PlantState) -> None:
+    def end_plant(self, plant: PlantState) -> None:
         """Remove a plant and free its slots."""
         self.end_silence(plant)
         self.pool.give(plant.slots)
@@ -139,19 +117,19 @@ class Fleet:
     def pass_silence(self, plants: Iterable[tuple[PlantState, float]]) -> None:
         """Predict each plant to the step beside it, at which nothing came; `silence` of the plant becomes that row.
 
-        The row is none of the history: `take` drops it at the next event that is used. A later silence is predicted
-        from an earlier one, so that no step is computed twice.
+        The row is none of the history: `take_event` drops it at the next event that is used. A later silence is
+        predicted from an earlier one, so that no step is computed twice.
         """
         chains = []
         for plant, step in plants:
             before = plant.silence or plant.rows.held[-1]
-            if step <= before.key[0]:
+            if step <= before.key[0]:  # it is that far already
                 continue
             slot = plant.silence.slot if plant.silence is not None else self.pool.take()
             plant.silence = HeldRow((step, 0, 0), slot, self.width)
             self.pool.table[slot, self.pool.numbers] = plant.silence.numbers
             chains.append([before, plant.silence])
-        self._run(chains)
+        self._step_chains(chains)
 
     def end_silence(self, plant: PlantState) -> None:
         """Forget the silence of a plant."""
@@ -159,70 +137,77 @@ class Fleet:
             self.pool.give([plant.silence.slot])
             plant.silence = None
 
-    def size(self, node: int) -> int:
-        """Return how many numbers an event of the node with this index has."""
-        columns = self._places[node]
-        return columns.stop - columns.start
+    def count_values(self, node: int) -> int:
+        """Return how many numbers an event has of the node with this index, -1 for the inputs."""
+        columns = self._columns[node]
+        return int(columns.stop - columns.start)
 
     def make_rows(self, base: HeldRow) -> SortedRows:
         """Return the rows of a plant, of which so far there is only the one before all events, `base`."""
-        return SortedRows(base, self._joint, self._places, self.options.capacity)
+        return SortedRows(base, self._joint, self._columns, self.options.capacity)
 
     def convert_message(
         self, node: str, sequence: int, time: float, values: list[float | None], arrival: float
     ) -> CheckedEvent:
-        """Return a message as an event; raise ValueError unless its node, number of values and time are possible."""
+        """Return a message as an event; raise ValueError unless its node, number of values and time are possible.
+
+        A value that is None did not arrive; `time` and `arrival` are in steps or in the unit of dt.
+        """
         index, size = self.sizes.get(node, (0, -1))
         if size < 0:  # no such node
             raise fail("message, node", f"one of {', '.join(self.sizes)}", repr(node)[:60])
-        numbers = self.with_losses(node, [nan if value is None else value for value in values])
+        numbers = self.append_losses(node, [nan if value is None else value for value in values])
         if len(numbers) != size:
             raise fail(f"message of {node!r}, values", f"{size} numbers", len(values))
         self.check_step("message, time", time)
         return CheckedEvent(index, sequence, time, numbers, arrival)
 
-    def with_losses(self, node: str, values: list[float]) -> list[float]:
+    def append_losses(self, node: str, values: list[float]) -> list[float]:
         """Return a message's values, followed by NaN for each number of lost messages where these do not come with it.
 
-        `PlantState.take` writes the number that the running count of messages says in its place.
+        `PlantState.add_event` writes the number that the running count of messages says in its place.
 
         Raises:
             ValueError: values of a sender of single components, whose losses a count of messages does not say.
         """
-        (_, size), outputs = self.sizes[node], self.values_of(node)
+        (_, size), outputs = self.sizes[node], self.count_values_alone(node)
         if outputs is None:
             return values
         if len(values) == outputs:
             values = values + [nan] * (size - outputs)
+        # A sender of single components: behind each value that arrived (is not NaN) has to stand a number.
         by_component = self.deciding[node].region == "each" and len(values) == size
-        if by_component and any(a == a and b != b for a, b in zip(values[:outputs], values[outputs:], strict=True)):
+        if by_component and any(
+            value == value and lost != lost for value, lost in zip(values[:outputs], values[outputs:], strict=True)
+        ):
             expected = "behind each value how many of its component were lost since the last"
             raise fail(
                 f"message of {node!r}, values", expected, "none, and its count is of messages, not of components"
             )
         return values
 
-    def values_of(self, node: str) -> int | None:
-        """Return how many values an event has without the numbers of lost ones; None if it has no such numbers."""
+    def count_values_alone(self, node: str) -> int | None:
+        """Return how many values a node's event has without the numbers of lost ones; None if it has none of these."""
         return self._values_before_losses.get(self.sizes[node][0])
 
     def _find_lost_column(self, node: int) -> tuple[str, int] | None:
         """Return name and column of the number of lost messages that the node's running count says; None if none."""
         outputs = self._values_before_losses.get(node)
-        if outputs is None or self.size(node) != outputs + 1:
+        if outputs is None or self.count_values(node) != outputs + 1:
             return None
-        return self._names[node], self._places[node].start + outputs
+        return self._names[node], self._columns[node].start + outputs
 
     def check_step(self, name: str, time: float) -> None:
-        """Refuse a time that is no step of the network, where time counts steps."""
+        """Raise ValueError, which calls the time `name`, if it is no step of the network, where time counts steps."""
         if self.program.dt is None and not (0 <= time <= self.end_step and time == int(time)):
             end = "" if self.end_step == np.inf else f" to {self.end_step:g}"
             raise fail(name, f"a step, a whole number from 0{end}", f"{time} ({OF_STEPS})")
 
-    def screen(self, node: str, event: CheckedEvent, plant: PlantState | None) -> ScreenedEvent:
-        """Remove an event's values beyond the limits of its node, and those that repeat for too long.
+    def screen_event(self, node: str, event: CheckedEvent, plant: PlantState | None) -> ScreenedEvent:
+        """Return an event without the values that its node refuses: beyond its limits, or repeated for too long.
 
-        Readings repeat in the order in which they arrive; `plant` is None where it has not begun.
+        Readings repeat in the order in which they arrive. The runs that end with this event are returned as well; the
+        plant, None where it has not begun, stays as it is.
         """
         limits, watch = self._limits.get(node), self.held_watches.get(node)
         if limits is None and watch is None:
@@ -235,22 +220,22 @@ class Fleet:
             screened = screened._replace(repeats=watch.follow(screened.event.values, screened.repeats))
         return screened
 
-    def _screen_by_limits(self, limits: Limits, node: str, taken: ScreenedEvent) -> ScreenedEvent:
-        """Remove an event's values that its node refuses, given the runs of equal readings before it."""
-        event, values = taken.event, np.array(taken.event.values)
-        screened = limits.screen(values[None], taken.repeats)
+    def _screen_by_limits(self, limits: Limits, node: str, unscreened: ScreenedEvent) -> ScreenedEvent:
+        """Return an event without the values that a node's limits refuse; `repeats` are at first those before it."""
+        event, values = unscreened.event, np.array(unscreened.event.values)
+        screened = limits.screen(values[None], unscreened.repeats)
         if not screened.refused.any():
             return ScreenedEvent(event, repeats=screened.repeats)
-        said = limits.why(values, screened.refused[0], self.network.nodes[node].received_names)
-        left = event._replace(values=screened.values[0].tolist())
+        why = limits.why(values, screened.refused[0], self.network.nodes[node].received_names)
+        what_is_left = event._replace(values=screened.values[0].tolist())
         counts = {reason: int(count.sum()) for reason, count in count_by_reason(screened.refused).items()}
-        return ScreenedEvent(left, counts, said, screened.repeats)
+        return ScreenedEvent(what_is_left, counts, why, screened.repeats)
 
-    def take(
-        self, plant: PlantState, event: CheckedEvent, given: bool = False, wall: float | None = None,
+    def take_event(
+        self, plant: PlantState, event: CheckedEvent, arrival_known: bool = False, wall: float | None = None,
         clock: str | None = None,
     ) -> Verdict:  # fmt: skip
-        """Judge an event and hold it if it is used.
+        """Return the verdict on an event of a plant, and hold the event in its row if that is "used".
 
         An event more than `leap` after all before it is used, but nothing becomes final by it until another clock says
         the same; if the next goes on from before it, it is withdrawn (`Leap` says it in full).
@@ -258,67 +243,74 @@ class Fleet:
         Args:
             plant: the plant.
             event: the event.
-            given: whether its arrival is known, by another clock than the sender's.
+            arrival_known: whether its arrival was given, by another clock than the sender's.
             wall: time by the clock on the wall, if it is known.
             clock: name of the node by whose clock it is dated (None: its own).
         """
         if self.program.dt is None and event.time > LAST_STEP:
             return "future"
-        # `said`: what the clock of arrivals, or else the sender's, says; `sure`: another clock agrees.
-        leap, said = self.options.leap, event.arrival if given else event.time
-        clock = ARRIVAL if given else clock or self._names[event.node_index]
-        sure = (wall is not None and abs(said - wall) <= leap) or (given and abs(said - event.time) <= leap)
+        # The clock that says how late it is: that of arrivals where one was given, else the sender's.
+        longest_gap = self.options.leap
+        clock_time = event.arrival if arrival_known else event.time
+        clock_name = ARRIVAL if arrival_known else clock or self._names[event.node_index]
+        # A second clock may agree: the one on the wall, or the sender's with that of arrivals.
+        agreed = (wall is not None and abs(clock_time - wall) <= longest_gap) or (
+            arrival_known and abs(clock_time - event.time) <= longest_gap
+        )
+        # An event from the future will be refused, and takes back no leap.
         if plant.leap is not None and event.time <= event.arrival + self.options.ahead:
-            plant.undo_contradicted_leap(clock, said, leap, sure, self._names)
-            if not given:
+            plant.undo_contradicted_leap(clock_name, clock_time, longest_gap, agreed, self._names)
+            if not arrival_known:  # it arrives now, which may be earlier by now
                 event = event._replace(arrival=max(plant.confirmed, event.time))
-        rows, now = plant.rows, max(plant.confirmed, event.arrival)
-        key = rows.key(event)
-        verdict = rows.verdict(event, key, now - self.options.window, self.options.ahead)
-        if verdict != "used":
-            return verdict
-        self.end_silence(plant)
-        plant.take(event, key, self.pool.take, self.width, self._find_lost_column(event.node_index))
-        plant.pass_time(clock, said, now, leap, sure)
+        now = max(plant.confirmed, event.arrival)
+        key = plant.rows.make_key(event)
+        verdict = plant.rows.judge_event(event, key, now - self.options.window, self.options.ahead)
+        if verdict == "used":
+            self.end_silence(plant)
+            plant.add_event(event, key, self.pool.take, self.width, self._find_lost_column(event.node_index))
+            plant.pass_time(clock_name, clock_time, now, longest_gap, agreed)
         return verdict
 
-    def advance(self, plant: PlantState, now: float) -> None:
+    def advance_time(self, plant: PlantState, now: float) -> None:
         """Advance the time of a plant to `now` by a clock that is right; a leap that contradicts it is withdrawn."""
-        leap, most = plant.leap, self.options.leap
+        leap, longest_gap = plant.leap, self.options.leap
         if leap is not None:
-            found = find_leap(leap, plant.now, now, most)
-            if found is not None and found[0].now > -inf:
-                plant.undo_leap(found[0], most, self._names)
-            elif now >= leap.time - most:
+            found = find_leap(leap, plant.now, now, longest_gap)
+            if found is not None and found[0].now > -inf:  # not the leap with which the plant began
+                plant.undo_leap(found[0], longest_gap, self._names)
+            elif now >= leap.time - longest_gap:  # the right clock has come as far: it confirms the leap
                 plant.leap = None
         plant.now = max(plant.now, now)
 
-    def undo(self, plant: PlantState, clock: tuple[float, Leap | None]) -> None:
-        """Restore a plant, with its `clock`, to its state before the events taken since the last call of `finalise`."""
-        self.pool.give(plant.undo())
+    def undo_events(self, plant: PlantState, clock: tuple[float, Leap | None]) -> None:
+        """Restore a plant to its state before the events taken since it was last finalised; `clock`: its own then."""
+        self.pool.give(plant.undo_changes())
         plant.clock = clock
 
-    def finalise(self, touched: Iterable[PlantState], all_: bool = False) -> list[FinalisedPlant]:
-        """Step what is due, and let rows older than the window, or all, become final; return them by plant."""
+    def finalise_plants(self, touched: Iterable[PlantState], all_: bool = False) -> list[FinalisedPlant]:
+        """Step what is due, and let rows older than the window, or all, become final; return what did of each plant.
+
+        `touched`: the plants that have taken events, or whose time went on.
+        """
         plants, results = list(touched), []
         self.step(plants)
         for plant in plants:
             withdrawn, their_slots = plant.take_withdrawn()
             watermark = np.inf if all_ else plant.confirmed - self.options.window
-            final, left = plant.finalise(watermark, self.options.leap)
+            final, left = plant.finalise_rows(watermark, self.options.leap)
             results.append(FinalisedPlant(plant, final, plant.rows.held[-1], left + their_slots, withdrawn))
         return results
 
     def step(self, plants: Iterable[PlantState]) -> None:
-        """Step what is due, for all plants at once."""
+        """Step the rows that have changed, and all after them, for all plants at once; write them into the table."""
         chains = [chain for plant in plants if (chain := plant.take_dirty_rows())]
         if rows := [row for chain in chains for row in chain]:
             numbers = np.array([number for row in rows for number in row.numbers]).reshape(len(rows), -1)
             self.pool.table[[row.slot for row in rows], self.pool.numbers] = numbers
-        self._run(chains)
+        self._step_chains(chains)
 
-    def _run(self, chains: Sequence[list[HeldRow]]) -> None:
-        """Step along chains of rows, whose numbers stand in the table, from the first of each."""
+    def _step_chains(self, chains: Sequence[list[HeldRow]]) -> None:
+        """Step from the first row of each chain into the second, and so on; their numbers stand in the table."""
         walks = [cut_into_legs(chain, self.program.dt is None, self.end_step == np.inf) for chain in chains]
         # All chains up to their first long gap at once, over these one by one, and so on.
         while walks:
@@ -330,9 +322,9 @@ class Fleet:
             walks = [legs[1:] for legs in walks if len(legs) > 1]
 
     def step_row(self, before: HeldRow, row: HeldRow) -> None:
-        """Step from a row into another one, which is none of a plant's."""
+        """Step from the row `before` into `row`, which is none of a plant's, and write it into the table."""
         self.pool.table[row.slot, self.pool.numbers] = row.numbers
-        self._run([[before, row]])
+        self._step_chains([[before, row]])
 
     def predict_into(self, row: HeldRow, time: float, slot: int) -> None:
         """Predict from a row to a later time, into a slot that no row has."""
@@ -350,11 +342,11 @@ class Fleet:
         return self.pool.predict_outputs(np.array(slots), given, self.end_step)
 
     def outputs(self, slots: list[int]) -> Float[np.ndarray, "row outputs"]:
-        """Return the outputs of the filters after the rows in these slots."""
+        """Return the outputs of all filters (row, output) after the rows in these slots of the table."""
         return self.pool.table[np.array(slots, dtype=int), self.pool.outputs]
 
-    def senders(self, plant: PlantState, now: float = -inf) -> dict[str, SenderStatus]:
-        """Return the status of each sender of a plant of which silence says something, by now.
+    def find_sender_status(self, plant: PlantState, now: float = -inf) -> dict[str, SenderStatus]:
+        """Return {node whose silence says something: the status of its sender by now}.
 
         `now`: a moment that a clock says; if it is before the newest arrival, or the newest silent row, that counts.
         """
@@ -363,23 +355,24 @@ class Fleet:
         by_steps, watermark = self.program.dt is None, plant.confirmed - self.options.window
         final = ceil(max(watermark, -1.0)) - 1 if by_steps else max(watermark, plant.begun)
         now = floor(min(now, self.end_step)) if by_steps else now
-        statuses, dated = {}, "" if plant.origin is None else "s"  # dates are seconds apart
-        unit = name_unit(self.network.inputs) or dated
-        for name, sender in self.watched.items():
+        unit = name_unit(self.network.inputs) or ("" if plant.origin is None else "s")  # dates are seconds apart
+        statuses = {}
+        for name, rule in self.watched.items():
+            # When the newest value was measured that was used; no step is below 0.
             link = plant.links.get(name)
             last = None if link is None or not link.used else link.latest
             if by_steps and last is not None:
                 last = int(last) if last >= 0 else None
-            status = sender.status(last, plant.begun if sender.trigger is None else -1, final, now)
+            status = rule.find_status(last, plant.begun if rule.trigger is None else -1, final, now)
             refused = {} if link is None else link.refused
             statuses[name] = status._replace(refused=refused, unit=unit)
         return statuses
 
-    def count(self, plant: PlantState, node: str, screened: ScreenedEvent, verdict: Verdict) -> None:
+    def count_event(self, plant: PlantState, node: str, screened: ScreenedEvent, verdict: Verdict) -> None:
         """Count an event of a node by its verdict, what was screened of it, and the silence before it."""
-        link, event, sender = plant.link(node), screened.event, self.watched.get(node)
-        if sender is not None and sender.timeout is not None and verdict == "used":
-            link.count_timeout(event.time, plant.begun, sender.timeout)
+        link, event, rule = plant.link(node), screened.event, self.watched.get(node)
+        if rule is not None and rule.timeout is not None and verdict == "used":
+            link.count_timeout(event.time, plant.begun, rule.timeout)
         link.count(verdict, event.sequence, event.time, self.periods.get(node, 0))
         link.count_screened(screened, verdict)
 
@@ -390,7 +383,7 @@ class Fleet:
 
 
 def _check_options(options: Options) -> Options:
-    """Return the options as numbers of their kinds; raise at one that is out of range."""
+    """Return the options as numbers of their kinds; raise ValueError where one is out of range."""
     step = None if options.step is None else float(scalar("step", options.step, TINY))
     leap = options.leap if options.leap == np.inf else scalar("leap", options.leap, 0)
     window, ahead = (float(scalar(name, getattr(options, name), 0)) for name in ("window", "ahead"))

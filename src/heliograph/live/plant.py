@@ -32,7 +32,7 @@ class BeforeLeap(NamedTuple):
 
 
 class RowsOfLeap(NamedTuple):
-    """What taking back a leap removed from a plant, so that `PlantState.undo` can restore it.
+    """What taking back a leap removed from a plant, so that `PlantState.undo_changes` can restore it.
 
     Attributes:
         held: all rows held before.
@@ -62,11 +62,11 @@ class PlantState:
         dirty: index of the first row to step again; None if all are up to date.
         forced: number of rows that became final early, for lack of room.
         links: counts of the messages, by node.
-        changes: changes since the last finalisation, for `undo`.
+        changes: changes since the last finalisation, for `undo_changes`.
         leap: a leap in time that no other clock has confirmed; None if there is none.
         silence: row of the newest step at which nothing came, which is no row of the history; None if there is none.
         kept: row before a leap, after which all rows held are; None where that is among them, or there is no leap.
-        aside: what was taken back since the last finalisation, for `undo`.
+        aside: what was taken back since the last finalisation, for `undo_changes`.
         remarked: how often each filter's remark was said, by node and filter.
         begun: time of the message with which it began, from which on a node may be silent.
     """
@@ -102,88 +102,106 @@ class PlantState:
         """Set the newest arrival and the leap to what they were."""
         self.now, self.leap = clock
 
-    def undo_contradicted_leap(self, clock: str, time: float, most: float, sure: bool, names: Sequence[str]) -> None:
+    def undo_contradicted_leap(
+        self, clock: str, time: float, longest_gap: float, agreed: bool, names: Sequence[str]
+    ) -> None:
         """Take back a leap that is contradicted by what a clock says.
 
         Args:
             clock: name of the node that says so, or `ARRIVAL`.
             time: what it says.
-            most: longest gap that is no leap.
-            sure: whether another clock says the same.
+            longest_gap: longest gap in time that is no leap.
+            agreed: whether another clock says the same.
             names: names of the nodes in their order, then that of the inputs.
         """
-        found = find_leap(self.leap, self.now, time, most)
+        found = find_leap(self.leap, self.now, time, longest_gap)
         if self.leap is None or found is None:
             return
         leap, newest = found
-        if sure or leap.taken_back_by(clock, time, newest):
-            self.undo_leap(leap, most, names)
+        if agreed or leap.taken_back_by(clock, time, newest):
+            self.undo_leap(leap, longest_gap, names)
         elif clock == leap.clock:
             self.leap = self.leap.with_back(leap, time)
 
-    def pass_time(self, clock: str, time: float, now: float, most: float, sure: bool) -> None:
-        """Advance the time to `now` by an event that was used; more than `most` at once is a leap, unless it is sure.
+    def pass_time(self, clock: str, time: float, now: float, longest_gap: float, agreed: bool) -> None:
+        """Advance the time to `now` by an event that was used.
+
+        More than `longest_gap` at once is a leap, unless another clock agrees.
 
         Args:
             clock: name of the node whose event it is, or `ARRIVAL` if its arrival was given.
             time: what that clock says.
             now: its arrival.
-            most: longest gap that needs no other clock.
-            sure: whether another clock says the same.
+            longest_gap: longest gap that needs no other clock.
+            agreed: whether another clock says the same.
         """
-        leap, before = self.leap, self.now
-        if leap is not None and not sure:
-            # From before the leap, an event says nothing of the present; one of the leap's own message neither.
-            if time < leap.time - most or (time == leap.time and clock == leap.clock):
-                return
-            leap = self._confirm_leap(clock, leap, time, most)
-        elif sure:
+        leap, newest = self.leap, self.now
+        if agreed:
             leap = None
-        if now > before + most and not sure and (leap is None or leap.believed):
+        elif leap is not None:
+            # From before the leap, an event says nothing of the present; one of the leap's own message neither.
+            if time < leap.time - longest_gap or (time == leap.time and clock == leap.clock):
+                return
+            leap = self._confirm_leap(clock, leap, time, longest_gap)
+        # A new leap, unless one is open still that nothing has confirmed: this event then is of its far side.
+        if now > newest + longest_gap and not agreed and (leap is None or leap.believed):
             moments = {node: (link.at, link.latest) for node, link in self.links.items()}
-            leap = Leap(time, time, before, moments, clock, earlier=leap)
-        self.now, self.leap = max(before, now), leap
+            leap = Leap(time=time, since=time, now=newest, moments=moments, clock=clock, earlier=leap)
+        self.now, self.leap = max(newest, now), leap
 
-    def _confirm_leap(self, clock: str, leap: Leap, time: float, most: float) -> Leap | None:
-        """Return what is left of a leap after an event of its farther side: None once it is confirmed."""
+    def _confirm_leap(self, clock: str, leap: Leap, time: float, longest_gap: float) -> Leap | None:
+        """Return what is left of a leap after an event on its far side at `time` by `clock`: None once confirmed."""
         if clock != leap.clock:
             return None
         if leap.is_over(self.now):
             return leap.earlier
         others = (link.latest for node, link in self.links.items() if node not in (clock, INPUTS))
         # A second message by the same clock: believed, unless another node was heard shortly before, which can confirm.
-        if clock != ARRIVAL and any(latest >= max(leap.now - most, 0.0) for latest in others):
+        if clock != ARRIVAL and any(latest >= max(leap.now - longest_gap, 0.0) for latest in others):
             return leap
         return leap.as_believed()
 
-    def undo_leap(self, leap: Leap, most: float, names: Sequence[str]) -> bool:
+    def undo_leap(self, leap: Leap, longest_gap: float, names: Sequence[str]) -> bool:
         """Go back to before a leap in time: its rows go with the next finalisation, and time is what it was.
 
-        Returns False, and changes nothing, if the row before it is not known any more. `names`: those of the nodes in
-        their order, then that of the inputs.
+        Returns False, and changes nothing, if the row before it is not known any more.
+
+        Args:
+            leap: the leap, or one that it follows.
+            longest_gap: longest gap that is no leap: rows from so long before its far side on are of the leap.
+            names: those of the nodes in their order, then that of the inputs.
         """
-        held, cut = self.rows.held, self.rows.first_from(leap.time - most)
-        if cut == 0 and self.kept is None:
+        held, first_after = self.rows.held, self.rows.first_from(leap.time - longest_gap)
+        all_after = first_after == 0  # then only the row kept from before the leap can be gone back to
+        if all_after and self.kept is None:
             return False
         # The first row held is the base, whose events are final: they stay counted as used.
-        rows = held[max(cut, 1) :]
+        not_final = held[max(first_after, 1) :]
+        self._count_withdrawn(not_final, leap, names)
+        gone = held[first_after:]
+        self.aside.append(RowsOfLeap(held, self.kept, changes=len(self.changes), gone=gone, rows=not_final))
+        if all_after and self.kept is not None:
+            self.rows.hold([self.kept.row])  # the base again
+            self.kept = None
+        else:
+            self.rows.hold(held[:first_after])
+        if self.dirty is not None and self.dirty >= len(self.rows.held):
+            self.dirty = None
+        self.now, self.leap = leap.now, leap.earlier
+        return True
+
+    def _count_withdrawn(self, rows: Sequence[HeldRow], leap: Leap, names: Sequence[str]) -> None:
+        """Count the events of rows that a leap made as withdrawn, by node; `names`: those of nodes, then inputs."""
         counts: dict[str, int] = {}
         for row in rows:
             for node, _, _ in row.events:
                 counts[names[node]] = counts.get(names[node], 0) + 1
         for name, count in counts.items():
             self.link(name).count_withdrawn(count, leap.moments.get(name))
-        self.aside.append(RowsOfLeap(held, self.kept, changes=len(self.changes), gone=held[cut:], rows=rows))
-        # Where all rows held are from after the leap, the row kept from before it is the base again.
-        self.rows.hold([self.kept.row] if cut == 0 and self.kept is not None else held[:cut])
-        self.kept = self.kept if cut else None
-        self.dirty = None if self.dirty is None or self.dirty >= len(self.rows.held) else self.dirty
-        self.now, self.leap = leap.now, leap.earlier
-        return True
 
-    def holds(self, leap: Leap, time: float, most: float) -> bool:
+    def holds(self, leap: Leap, time: float, longest_gap: float) -> bool:
         """Return whether rows from before a leap are held, and `time` comes after the first of them."""
-        return self.rows.first_from(leap.time - most) > 0 and time > self.rows.keys[0][0]
+        return self.rows.first_from(leap.time - longest_gap) > 0 and time > self.rows.keys[0][0]
 
     def take_withdrawn(self) -> tuple[list[WithdrawnEvent], list[int]]:
         """Return the events of leaps that were taken back since the last call, and the slots of their rows."""
@@ -191,17 +209,17 @@ class PlantState:
         events = [WithdrawnEvent(*name) for leap in leaps for row in leap.rows for name in row.events]
         return events, [row.slot for leap in leaps for row in leap.gone]
 
-    def take(
-        self, event: CheckedEvent, key: Key, take_slot: Callable[[], int], width: int, numbered: tuple[str, int] | None
+    def add_event(
+        self, event: CheckedEvent, key: Key, take_slot: Callable[[], int], width: int, losses: tuple[str, int] | None
     ) -> None:
-        """Add an event to the row with its key, or to a new row; record the change for `undo`.
+        """Add an event to the row with its key, or to a new row; record the change for `undo_changes`.
 
         Args:
             event: the event.
             key: key of its row.
             take_slot: called for the slot of a new row.
             width: how many numbers a row has before its time.
-            numbered: name of the event's node and the column of the number of its lost messages, where its running
+            losses: name of the event's node and the column of the number of messages lost before it, where its running
                 count says this; else None.
         """
         index, row = self.rows.find(key)
@@ -213,26 +231,45 @@ class PlantState:
         else:
             change = row, (row.numbers.copy(), dict(row.events))
         self.rows.fill(row, event)
-        # NaN: the message itself does not say how many were lost before it.
-        if numbered is not None and row.numbers[numbered[1]] != row.numbers[numbered[1]]:
-            name, column = numbered
-            newest = self.links[name].newest if name in self.links else -1
-            row.numbers[column], others = self.rows.count_lost(index, event, column, newest)
-            for other, number in others:
-                self.changes.append((other, (other.numbers.copy(), dict(other.events))))
-                other.numbers[column] = number
+        if losses is not None:
+            self._write_lost(index, row, event, *losses)
         self.changes.append(change)  # last: that of the event itself
         self.dirty = index if self.dirty is None else min(self.dirty, index)
 
-    def undo(self) -> list[int]:
-        """Undo the recorded changes; return the slots that are free again. Rows that had been stepped become dirty."""
+    def _write_lost(self, index: int, row: HeldRow, event: CheckedEvent, node: str, column: int) -> None:
+        """Write how many messages were lost before an event, by the running count, unless the message says it itself.
+
+        That of the node's next event is written anew too, where there is one already.
+
+        Args:
+            index: index of the event's row.
+            row: this row.
+            event: the event.
+            node: name of its node.
+            column: column of the number in a row.
+        """
+        if row.numbers[column] == row.numbers[column]:  # not NaN: the message says it
+            return
+        newest = self.links[node].newest if node in self.links else -1
+        row.numbers[column], corrected = self.rows.count_lost(index, event, column, newest)
+        for later_row, number in corrected:
+            self.changes.append((later_row, (later_row.numbers.copy(), dict(later_row.events))))
+            later_row.numbers[column] = number
+
+    def undo_changes(self) -> list[int]:
+        """Undo the changes since the last finalisation; return the slots that are free again.
+
+        Rows that had been stepped since become dirty.
+        """
         slots, keys = list[int](), [row.key for row, _ in self.changes]
+        # Newest first: what changed after each leap that was taken back, then this itself.
         for leap in reversed(self.aside):
             slots += self._undo_since(leap.changes)
             self.rows.hold(leap.held)
             self.kept = leap.kept
         slots += self._undo_since(0)
         self.aside = []
+        # Step again from the first row that was changed, which is never the base.
         index = max(min(map(self.rows.index, keys), default=len(self.rows.held)), 1)
         self.dirty = index if index < len(self.rows.held) else None
         return slots
@@ -241,7 +278,7 @@ class PlantState:
         """Undo the changes after the first `count`, newest first; return the slots that are free again."""
         slots = []
         for row, before in reversed(self.changes[count:]):
-            if before is None:
+            if before is None:  # the row was new
                 self.rows.remove(self.rows.index(row.key))
                 slots.append(row.slot)
             else:
@@ -262,26 +299,35 @@ class PlantState:
         self.dirty = None
         return chain
 
-    def finalise(self, watermark: float, most: float) -> tuple[list[HeldRow], list[int]]:
-        """Make rows up to the watermark final; return them and the slots that are no longer needed.
+    def finalise_rows(self, watermark: float, longest_gap: float) -> tuple[list[HeldRow], list[int]]:
+        """Make rows before the watermark final; return them and the slots that are no longer needed.
 
-        `most`: longest gap that is no leap; of the rows before a leap the newest is kept.
+        `longest_gap`: longest gap that is no leap; of the rows before a leap the newest is kept.
         """
         self.changes = []
-        base, forced = self.rows.finalise(watermark)
-        self.forced += forced if base else 0
-        final, left = self.rows.drop(base) if base else ([], [])
+        base, forced = self.rows.find_base(watermark)
+        if not base:  # the base stays what it is: no row becomes final
+            return [], self._free_kept_row([], longest_gap)
+        self.forced += forced
+        final, left = self.rows.move_base(base)
+        return final, self._free_kept_row(left, longest_gap)
+
+    def _free_kept_row(self, left: list[HeldRow], longest_gap: float) -> list[int]:
+        """Keep the newest row before a leap, as long as the leap may be taken back; return the slots of all others.
+
+        `left`: rows that are not held any more.
+        """
         # The oldest leap that is not confirmed, other than the one with which the plant began.
         leaps = [] if self.leap is None else [leap for leap in self.leap.chain() if leap.now > -inf]
         leap = leaps[-1] if leaps else None
-        if self.kept is not None and (leap is None or leap.now != self.kept.now):
+        if self.kept is not None and (leap is None or leap.now != self.kept.now):  # it was of another leap
             left, self.kept = [*left, self.kept.row], None
-        if leap is not None and self.kept is None and left:
-            before = [row for row in left if row.key[0] < leap.time - most]
-            if before and self.rows.held[0].key[0] >= leap.time - most:
+        if leap is not None and self.kept is None:
+            before = [row for row in left if row.key[0] < leap.time - longest_gap]
+            if before and self.rows.held[0].key[0] >= leap.time - longest_gap:  # all rows held are after the leap
                 self.kept = BeforeLeap(before[-1], leap.now)
                 left = [row for row in left if row is not before[-1]]
-        return final, [row.slot for row in left]
+        return [row.slot for row in left]
 
     @property
     def slots(self) -> list[int]:
@@ -289,3 +335,21 @@ class PlantState:
         kept = [] if self.kept is None else [self.kept.row]
         gone = [row for leap in self.aside for row in leap.gone]
         return [row.slot for row in (*self.rows.held, *kept, *gone)]
+
+
+class FinalisedPlant(NamedTuple):
+    """What `Fleet.finalise_plants` made final of one plant.
+
+    Attributes:
+        plant: the plant.
+        final: rows that are final now, in order of time.
+        newest: its newest row.
+        left: slots to free once the rows have been read.
+        withdrawn: events that had been used, of a clock that has turned out wrong.
+    """
+
+    plant: PlantState
+    final: list[HeldRow]
+    newest: HeldRow
+    left: list[int]
+    withdrawn: list[WithdrawnEvent]

@@ -11,6 +11,7 @@ from heliograph.model.over_time import first
 from heliograph.model.timeouts import describe_silence
 from heliograph.model.trigger import AbstractTrigger, Periodic
 from heliograph.random_affine.modes import joint_modes
+from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
 NONE = dict[Reason, int]()
@@ -101,7 +102,7 @@ class SilenceRule(NamedTuple):
             return None if node.timeout is None else SilenceRule(None, None, node.timeout)
         return SilenceRule(node.trigger, LossChain.of_channel(node.channel), node.timeout)
 
-    def status(self, last: float | None, begun: float, final: float, now: float) -> SenderStatus:
+    def find_status(self, last: float | None, begun: float, final: float, now: float) -> SenderStatus:
         """Return the status where the newest value is of `last`, the newest final moment `final` and the present `now`.
 
         Before the first value the sender is silent since `begun`. All are steps where a trigger is, which begin at -1.
@@ -131,3 +132,21 @@ def count_missed_heartbeats(trigger: AbstractTrigger, last: int | None, silent: 
     if trigger.heartbeat is None:
         return first_due
     return first_due + (silent - first_due) // int(trigger.heartbeat)
+
+
+def find_silence_rules(network: Network) -> dict[str, SilenceRule]:
+    """Return {name of a node: its rule of silence} of the nodes that may not be silent for any time."""
+    rules = {name: SilenceRule.of_node(node) for name, node in network.nodes.items() if isinstance(node, Node)}
+    return {name: rule for name, rule in rules.items() if rule is not None}
+
+
+def count_values_before_losses(network: Network, deciding: Mapping[str, AbstractTrigger]) -> dict[int, int]:
+    """Return {index of a node whose losses are known, since its messages are numbered: how many values come first}.
+
+    `deciding`: the triggers of senders that decide when to send, by node.
+    """
+    return {
+        network.names.index(name): node.received - trigger.side_information(len(node.outputs))
+        for name, trigger in deciding.items()
+        if trigger.losses == "numbered" and isinstance(node := network.nodes[name], Node)
+    }

@@ -1,6 +1,11 @@
-"""Events in order of time: the rows that they form, which rows are final, and the verdict on a new event."""
+"""Events in order of time: the rows that they form, which rows are final, and the verdict on a new event.
+
+A row is the history's entry for one time, or one event. The watermark is the time before which rows are final; the base
+is the newest of these, from whose state later rows are stepped.
+"""
 
 from bisect import bisect_left
+from collections.abc import Sequence
 from math import inf, nan
 from typing import TypeAlias
 
@@ -13,7 +18,11 @@ BEFORE = -2  # the place of what stands before everything at its time
 
 
 class HeldRow:
-    """A row of the history: its slot, its numbers (measurements of all nodes, inputs, time), and its events."""
+    """A row of the history: its slot in the table, its numbers (measurements of all nodes, inputs, time), its events.
+
+    `events` has for each event (index of its node, running count, time) its values. At first there is none, and all of
+    the `size` numbers before the time are NaN.
+    """
 
     __slots__ = "events", "key", "numbers", "slot"
 
@@ -24,15 +33,18 @@ class HeldRow:
         self.events: dict[tuple[int, int, float], list[float]] = {}
 
     def has_data(self) -> bool:
-        """Return whether the row has an event of a node; its other events are inputs."""
+        """Return whether the row has an event of a node; its other events are inputs, of index -1."""
         return bool(self.events) and max(self.events)[0] >= 0
 
 
 class SortedRows:
-    """Sorted rows; the first is the base, of which only the state after it is needed.
+    """A plant's rows in order of their keys; the first is the base, of which only the state after it is needed.
 
-    `joint`: all events of one time form one row. `places` are the slices of each node's numbers in a row, the inputs'
-    last.
+    Args:
+        base: the base, which at first is the only row.
+        joint: whether all events of one time form one row.
+        places: columns of each node's numbers in a row, by its index, those of the inputs last.
+        capacity: greatest number of rows held behind the base.
     """
 
     def __init__(self, base: HeldRow, joint: bool, places: list[slice], capacity: int):
@@ -43,15 +55,15 @@ class SortedRows:
         """Replace all rows by these, in their order."""
         self.held, self.keys = rows, [row.key for row in rows]
 
-    def key(self, event: CheckedEvent) -> Key:
+    def make_key(self, event: CheckedEvent) -> Key:
         """Return the key of the row that an event belongs to."""
         return (event.time, 0, 0) if self.joint else (event.time, event.node_index, event.sequence)
 
-    def base(self, watermark: float) -> int:
-        """Return the index of the newest row older than the watermark, which becomes the base."""
+    def _find_last_before(self, watermark: float) -> int:
+        """Return the index of the newest row older than the watermark; 0 if there is none."""
         return max(bisect_left(self.keys, (watermark,)) - 1, 0)
 
-    def after(self, time: float) -> int:
+    def first_after(self, time: float) -> int:
         """Return the index of the first row after a time."""
         return bisect_left(self.keys, (time, inf))
 
@@ -59,7 +71,7 @@ class SortedRows:
         """Return the index of the first row from a time on."""
         return bisect_left(self.keys, (time,))
 
-    def verdict(self, event: CheckedEvent, key: Key, watermark: float, ahead: float) -> Verdict:
+    def judge_event(self, event: CheckedEvent, key: Key, watermark: float, ahead: float) -> Verdict:
         """Return the verdict on an event whose row has this key, where rows before the watermark are final.
 
         `ahead`: how much later than its arrival an event may be dated.
@@ -68,41 +80,43 @@ class SortedRows:
             return "future"
         if key > self.keys[-1]:  # as most are: nothing can be said against what is newest
             return "used"
-        base = self.finalise(watermark)[0]
+        base, _ = self.find_base(watermark)
         index, row = self.find(key)
-        held = None if row is None else row.events.get(event.name)
-        if index < base or (index == base and held is None):
+        values_held = None if row is None else row.events.get(event.name)
+        if index < base or (index == base and values_held is None):
             return "late"
         if row is None:
             return "used"
-        if held is not None:
-            return "duplicate" if np.array_equal(held, event.values, equal_nan=True) else "conflict"
-        # Two events of a node in one row are fine where they fill different components (no NaN is no equal to itself).
+        if values_held is not None:
+            return "duplicate" if np.array_equal(values_held, event.values, equal_nan=True) else "conflict"
+        # Two events of a node in one row are fine where they fill different components: NaN, which is not equal to
+        # itself, is nothing yet.
         there = row.numbers[self.places[event.node_index]]
-        return "conflict" if any(a == a and b == b for a, b in zip(there, event.values, strict=True)) else "used"
+        both = any(old == old and new == new for old, new in zip(there, event.values, strict=True))
+        return "conflict" if both else "used"
 
     def find(self, key: Key) -> tuple[int, HeldRow | None]:
         """Return the index of the row with this key, and the row if it exists."""
         if key > self.keys[-1]:
             return len(self.keys), None
         index = bisect_left(self.keys, key)
-        there = self.keys[index] == key
-        return index, self.held[index] if there else None
+        exists = self.keys[index] == key
+        return index, self.held[index] if exists else None
 
     def index(self, key: Key) -> int:
         """Return the index of the row with this key, or the index at which it would be inserted."""
         return bisect_left(self.keys, key)
 
     def remove(self, index: int) -> None:
-        """Remove a row."""
+        """Remove the row with this index."""
         del self.keys[index], self.held[index]
 
     def fill(self, row: HeldRow, event: CheckedEvent) -> None:
         """Write an event's values into its row; NaN is left out."""
-        at, values = self.places[event.node_index], event.values
+        columns, values = self.places[event.node_index], event.values
         if row.events:  # else nothing is there yet
-            values = [there if new != new else new for there, new in zip(row.numbers[at], values, strict=True)]
-        row.numbers[at] = values
+            values = [there if new != new else new for there, new in zip(row.numbers[columns], values, strict=True)]
+        row.numbers[columns] = values
         row.events[event.name] = event.values
 
     def count_lost(
@@ -143,14 +157,20 @@ class SortedRows:
                     return self.held[i], name[1]
         return None
 
-    def finalise(self, watermark: float) -> tuple[int, int]:
-        """Return the index of the new base, and how many rows become final early, for lack of room."""
-        by_time = self.base(watermark)
+    def find_base(self, watermark: float) -> tuple[int, int]:
+        """Return the index of the row that becomes the base, and how many rows become final early, for lack of room."""
+        by_time = self._find_last_before(watermark)
         base = max(by_time, len(self.held) - 1 - self.capacity)
         return base, base - by_time
 
-    def drop(self, base: int) -> tuple[list[HeldRow], list[HeldRow]]:
-        """Move the base; return the rows that are final now, and those that are no longer needed."""
+    def move_base(self, base: int) -> tuple[list[HeldRow], list[HeldRow]]:
+        """Make the row with index `base` the base; return the rows that are final now, and those held no longer."""
         final, left = self.held[1 : base + 1], self.held[:base]
         del self.held[:base], self.keys[:base]
         return final, left
+
+
+def lay_side_by_side(sizes: Sequence[int]) -> list[slice]:
+    """Return the columns of blocks of these sizes, one behind another from column 0."""
+    ends = np.cumsum(sizes)
+    return [slice(int(end) - size, int(end)) for end, size in zip(ends, sizes, strict=True)]

@@ -1,41 +1,33 @@
 """One filter on live data: push a measurement, read the estimate."""
 
+import math
 import warnings
 from dataclasses import replace
-from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
-import jax
 import numpy as np
-from scipy.stats import chi2
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import Judgement
-from heliograph.live.filter_stepper import NativeFilterStepper, XlaFilterStepper, compile_native_step, compile_xla_step
+from heliograph.live.filter_stepper import RARE, compile_once, find_deciding_sender
 from heliograph.live.repeat_watch import RepeatWatch
 from heliograph.live.sender_status import LossChain, SenderStatus, SilenceRule
-from heliograph.live.stored.old_layout import can_read_layout, describe_old_layout, relocate_parts, split_by_path
-from heliograph.live.stored.snapshot import Identity, check_same_network, pack, unpack_snapshot, versions
-from heliograph.model.channel import Channel
+from heliograph.live.stored.old_layout import can_read_layout, describe_old_layout, relocate_parts
+from heliograph.live.stored.snapshot import check_same_network, pack, unpack_snapshot
 from heliograph.model.checks.faults import find_function_fault
 from heliograph.model.checks.inputs import check_inputs
 from heliograph.model.checks.refusals import SCREENED, Reason, count_by_reason
 from heliograph.model.estimate import JudgedEstimate, lower_unsound_claim, weakest
 from heliograph.model.forecast_origin import Origin
 from heliograph.model.limits import LimitsLike, ScreenedReadings, make_limits
-from heliograph.model.over_time import first
 from heliograph.model.repeated_readings import Repeats, StuckLike
-from heliograph.model.trigger import AbstractTrigger
-from heliograph.numerics.caching import share_by_object
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import readable
-from heliograph.numerics.trees.program_text import hash_numbers, text_of
-from heliograph.numerics.trees.static import cast
-from heliograph.numerics.types import ArrayLike, PyTree
+from heliograph.numerics.types import ArrayLike
 from heliograph.simulation.description.wide_angles import WideAngles
 
 COUNTED: tuple[Reason, ...] = (*SCREENED, "gate")
-BEYOND, RARE = 10, 1e-4  # measurements in a row, each beyond what an honest filter sees so seldom
+BEYOND = 10  # measurements in a row, each beyond what an honest filter sees with probability RARE
 SAME = ("precision", "filter", "states", "inputs", "numbers received")  # what the state of a stream means
 
 
@@ -73,17 +65,25 @@ class Stream:
     ):
         if not isinstance(filter, AbstractFilter):
             raise fail("stream", "a filter", type(filter).__name__)
+        # The sensor and the channel that the filter believes in, where it says so.
         self.filter, world = filter, filter.premise
-        believed = (None, None) if world is None else (world.sensor, world.channel)
-        self.limits = make_limits(filter.received, limits, invalid, stuck, *believed)
+        sensor, channel = (None, None) if world is None else (world.sensor, world.channel)
+        # What is refused before the filter, and how many values of each component were.
+        self.limits = make_limits(filter.received, limits, invalid, stuck, sensor, channel)
         self.refused = {reason: np.zeros(filter.received, dtype=np.int64) for reason in COUNTED}
+        # Runs of equal readings; watched where no rule refuses them, and the sender does not decide when to send.
         self._repeats = Repeats()
-        refuses = self.limits is not None and self.limits.stuck is not None
-        self._watch = None if refuses or _sender_of(filter) else RepeatWatch.of(*believed, filter.received)
-        # Steps done; step of a sender's newest value; unexpected measurements in a row; remarks made.
-        self.steps, self._last, self._beyond, self._remarked = 0, -1, 0, 0
-        self._inputs = np.full(len(filter.inputs), np.nan)
-        self._compiled, self._angles = _compile_once(filter), WideAngles(filter)
+        has_rule = self.limits is not None and self.limits.stuck is not None
+        self._watch = (
+            None if has_rule or find_deciding_sender(filter) else RepeatWatch.of(sensor, channel, filter.received)
+        )
+        self.steps = 0  # done so far
+        self._last = -1  # the step of a sender's newest value
+        self._beyond = 0  # unexpected measurements in a row
+        self._remarked = 0  # remarks made of the filter's state
+        self._inputs = np.full(len(filter.inputs), np.nan)  # of the newest step
+        # The compiled step, with the state; what to warn of its angles.
+        self._compiled, self._angles = compile_once(filter), WideAngles(filter)
         self._stepper = self._compiled.stepper()
 
     @property
@@ -112,16 +112,10 @@ class Stream:
                 end of what varies over time, implausible values; the state stays unchanged.
         """
         compiled, k, stepper = self._compiled, self.steps, self._stepper
-        # Arrays of doubles of the right size pass at once; everything else is checked and converted.
-        z, screened = _as_doubles(measurement, compiled.received), None
-        if z is None or self.limits is not None:
-            z = np.asarray(self.filter.check_measurement(measurement))
-        u = _as_doubles(inputs, compiled.given)
-        if u is None:
-            u = np.asarray(self.filter.check_input(inputs))
-        if self.limits is not None:
-            # Values beyond the limits, or repeated for too long, count as not arrived.
-            screened = self.limits.screen(z[None], self._repeats)
+        z, u = self._convert_sample(measurement, inputs)
+        # Values beyond the limits, or repeated for too long, count as not arrived.
+        screened = None if self.limits is None else self.limits.screen(z[None], self._repeats)
+        if screened is not None:
             z = screened.values[0]
         if compiled.horizon is not None and k >= compiled.horizon:
             raise fail("step", f"one of the {compiled.horizon} that the filter covers, counted from 0", k)
@@ -129,25 +123,46 @@ class Stream:
         if not stepper.step(z, u, k):
             self._refuse_or_accept(z, u)
         self.steps, self._inputs = k + 1, u
+        # The newest step at which a value of a sender came that decides when to send.
         if compiled.values and not np.isnan(z[: compiled.values]).all():
             self._last = k
+        # What was refused, and warnings: of readings, of the filter's state, of angles. What is unexpected is counted.
         self._count_readings(screened, z)
         if self.filter.remarks:
             self._warn_of_remark()
-        # Count in how many steps in a row nis was over its quantile.
         nis, arrived = stepper.judgement[:2].tolist()
-        has_nis = nis == nis  # NaN if not
-        if arrived and has_nis:
+        if arrived and not math.isnan(nis):
             self._count_unexpected(nis > compiled.rare[int(arrived)])
         if self._angles.states or self._angles.received:
             self._warn_of_angles(z, k)
-        estimate: JudgedEstimate = compiled.estimate.unflatten([*stepper.estimate, nis, int(arrived)])
-        if len(weight := stepper.weight):
+        return self._make_estimate(nis, int(arrived))
+
+    def _convert_sample(self, measurement: ArrayLike, inputs: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+        """Return a measurement (received,) and inputs (inputs,) as doubles; raise ValueError unless they are such.
+
+        Arrays of doubles of the right size pass at once; everything else is checked and converted, and a measurement
+        also where there are limits.
+        """
+        z, u = _as_doubles(measurement, self._compiled.received), _as_doubles(inputs, self._compiled.given)
+        if z is None or self.limits is not None:
+            z = np.asarray(self.filter.check_measurement(measurement))
+        if u is None:
+            u = np.asarray(self.filter.check_input(inputs))
+        return z, u
+
+    def _make_estimate(self, nis: float, arrived: int) -> JudgedEstimate:
+        """Return the estimate after the step just done, and count the components that the filter weighed by 0.
+
+        `nis`: of the step's measurement, NaN where it has none; `arrived`: how many of its numbers arrived.
+        """
+        estimate: JudgedEstimate = self._compiled.estimate.unflatten([*self._stepper.estimate, nis, arrived])
+        if len(weight := self._stepper.weight):
             estimate = replace(estimate, weight=weight)
             self.refused["gate"] += weight == 0
+        # What limits refuse depends on the state: no claim stronger than "nominal" holds.
         if self.limits is not None and self.limits.bounded:
             estimate = replace(estimate, claim=weakest([estimate.claim, "nominal"]))
-        return estimate if has_nis else lower_unsound_claim(estimate)
+        return lower_unsound_claim(estimate) if math.isnan(nis) else estimate
 
     @property
     def origin(self) -> Origin:
@@ -168,12 +183,13 @@ class Stream:
             for reason, more in count_by_reason(screened.refused).items():
                 self.refused[reason] += more
             self._repeats = screened.repeats
-        before, watch = self._repeats.found, self._watch
+        # `found`: by component how many runs were too long so far; () before the first reading.
+        found_before, watch = self._repeats.found, self._watch
         if watch is None:
             return
         self._repeats = watch.follow(z.tolist(), self._repeats)
-        for i, count in enumerate(self._repeats.found if self._repeats.found != before else ()):
-            if count == 1 and not (before and before[i]):
+        for i, count in enumerate(self._repeats.found if self._repeats.found != found_before else ()):
+            if count == 1 and not (found_before and found_before[i]):
                 said = watch.describe(i, f"received number {i}", self._repeats)
                 warnings.warn(f"stream, step {self.steps - 1}: {said}", stacklevel=3)
 
@@ -197,13 +213,17 @@ class Stream:
             warnings.warn(f"stream, step {self.steps - 1}: {self.doubt}", stacklevel=3)
 
     def _refuse_or_accept(self, z: np.ndarray, u: np.ndarray) -> None:
-        """Raise ValueError at implausible values; accept the flagged step where only the filter is to blame."""
+        """Raise ValueError if the step's inputs u or measurement z are implausible; else accept the flagged step.
+
+        In this case only the filter is to blame. The state is that before the step.
+        """
+        # A step is flagged for infinite measurements and inputs that are no numbers too.
         self.filter.check_measurement(z)
         self.filter.check_input(u)
         stepper, (distance, _, reason, _) = self._stepper, self._stepper.judgement.tolist()
         if len(u) and (why := Judgement.why_inputs(stepper.judgement[None])):
             check_inputs(self.filter.inputs, u[None], self.filter, self.steps)
-            # Are inputs of zero implausible too? Then it is not the inputs that are wrong.
+            # Are inputs of zero implausible too, without a measurement? Then it is not the inputs that are wrong.
             state = stepper.state
             stepper.step(np.full(len(z), np.nan), np.zeros(len(u)), self.steps)
             why_zeros = Judgement.why_inputs(stepper.judgement[None])
@@ -232,10 +252,10 @@ class Stream:
         Raises:
             ValueError: a filter that is none of `event_filter`.
         """
-        if (sender := _sender_of(self.filter)) is None:
+        if (sender := find_deciding_sender(self.filter)) is None:
             raise fail("filter of a stream", "one of event_filter, whose sender decides", type(self.filter).__name__)
         last, now = None if self._last < 0 else self._last, self.steps - 1
-        return SilenceRule(sender.trigger, LossChain.of_channel(sender.channel), None).status(last, -1, now, now)
+        return SilenceRule(sender.trigger, LossChain.of_channel(sender.channel), None).find_status(last, -1, now, now)
 
     def save(self) -> bytes:
         """Return state and step number for `restore`: after it, the same pushes give the same bits."""
@@ -277,27 +297,27 @@ class Stream:
             ValueError: no snapshot, or one of another filter or version.
         """
         new, (head, arrays) = cls(filter, limits, invalid, stuck), unpack_snapshot(data)
-        mine, other = new._compiled.identity, head.get("of", {})
-        check_same_network("snapshot", mine, other, SAME, accept_changes)
-        new.steps = int(head["steps"])
-        # Until version 0.4.0 limits and codes together.
-        counted = head.get("refused") or {"limits": head["dropped"]}
-        new.refused |= {reason: np.array(counts, dtype=np.int64) for reason, counts in counted.items()}
-        new._repeats = Repeats(*map(tuple, head.get("repeats", ())))
-        new._last, new._beyond = int(head.get("last", -1)), int(head.get("beyond", 0))
-        held = head.get("inputs", [None] * len(filter.inputs))
-        new._inputs = np.array([np.nan if value is None else value for value in held], dtype=float)
-        # Parts by their paths, which a version before 0.3.0 did not write.
-        layout = new._compiled.layout
-        paths = head.get("paths", list(describe_old_layout(layout)))
-        leaves = [arrays[f"state.{i}"] for i in range(sum(name.startswith("state.") for name in arrays))]
-        old = dict(zip(paths, leaves, strict=False))
-        if len(paths) != len(leaves) or not can_read_layout({path: leaf.shape for path, leaf in old.items()}, layout):
-            expected = f"a state with the parts of {other['filter']} as it is here: {', '.join(layout)}"
-            raise fail("snapshot", expected, ", ".join(f"{path} {list(leaf.shape)}" for path, leaf in old.items()))
-        new._stepper.set_state(list(relocate_parts(old, layout).values()))
+        identity_saved = head.get("of", {})
+        check_same_network("snapshot", new._compiled.identity, identity_saved, SAME, accept_changes)
+        new._restore_counts(head)
+        new._stepper.set_state(_read_state(head, arrays, new._compiled.layout, identity_saved.get("filter", "")))
+        # Remarks on this state were made before it was saved.
         new._remarked = filter.remark(new._compiled.state.unflatten(new._stepper.state)).times
         return new
+
+    def _restore_counts(self, head: dict[str, Any]) -> None:
+        """Set the step number, the newest inputs and all counts to those in the head of a snapshot.
+
+        Earlier versions did not write all of them: what is missing begins anew.
+        """
+        self.steps = int(head["steps"])
+        # Until version 0.4.0 limits and codes together.
+        counted = head.get("refused") or {"limits": head["dropped"]}
+        self.refused |= {reason: np.array(counts, dtype=np.int64) for reason, counts in counted.items()}
+        self._repeats = Repeats(*map(tuple, head.get("repeats", ())))
+        self._last, self._beyond = int(head.get("last", -1)), int(head.get("beyond", 0))
+        inputs = head.get("inputs", [None] * len(self.filter.inputs))
+        self._inputs = np.array([np.nan if value is None else value for value in inputs], dtype=float)
 
     def __getstate__(self) -> dict[str, object]:
         """Return filter, step number and state, in double precision; compiled programs are left out."""
@@ -307,26 +327,33 @@ class Stream:
     def __setstate__(self, data: dict[str, Any]) -> None:
         state = data["state"]
         vars(self).update({name: value for name, value in data.items() if name != "state"})
-        self._compiled = _compile_once(self.filter)
+        self._compiled = compile_once(self.filter)
         self._stepper = self._compiled.stepper()
         self._stepper.set_state(state)
 
 
-class _Sender(NamedTuple):
-    """A sender that decides when to send, as its filter believes it: its rule, its link, its number of outputs."""
+def _read_state(
+    head: dict[str, Any], arrays: dict[str, np.ndarray], layout: dict[str, tuple[int, ...]], filter_name: str
+) -> list[np.ndarray]:
+    """Return the parts of a filter's state, in the order of its `layout`, from a snapshot.
 
-    trigger: AbstractTrigger
-    channel: Channel
-    outputs: int
+    Args:
+        head: the snapshot's head; its "paths" name the stored parts, in their order.
+        arrays: its arrays, of which "state.0", "state.1", ... are these parts.
+        layout: {path of a part: its shape} of the filter as it is here.
+        filter_name: the filter's class, for errors.
 
-
-def _sender_of(filter: AbstractFilter) -> _Sender | None:
-    """Return the sender of which a filter knows what its silence means; None of any other filter."""
-    world = filter.premise
-    if not filter.silence_tells or world is None or world.trigger is None:
-        return None
-    assert world.sensor is not None and world.channel is not None  # a sender has both
-    return _Sender(world.trigger, world.channel, len(first(world.sensor).outputs))
+    Raises:
+        ValueError: parts that cannot be read as those of this layout.
+    """
+    # A version before 0.3.0 wrote no paths: its parts are those of its layout.
+    paths = head.get("paths", list(describe_old_layout(layout)))
+    parts = [arrays[f"state.{i}"] for i in range(sum(name.startswith("state.") for name in arrays))]
+    stored = dict(zip(paths, parts, strict=False))
+    if len(paths) != len(parts) or not can_read_layout({path: part.shape for path, part in stored.items()}, layout):
+        expected = f"a state with the parts of {filter_name} as it is here: {', '.join(layout)}"
+        raise fail("snapshot", expected, ", ".join(f"{path} {list(part.shape)}" for path, part in stored.items()))
+    return list(relocate_parts(stored, layout).values())
 
 
 def _as_doubles(value: object, length: int) -> np.ndarray | None:
@@ -338,56 +365,3 @@ def _as_doubles(value: object, length: int) -> np.ndarray | None:
     except (TypeError, ValueError, OverflowError):  # rows of different lengths; traced numbers
         return None
     return row if row.shape == (length,) and row.dtype.char == "d" else None
-
-
-class _CompiledFilter:
-    """A compiled filter with its arrays, shared by all streams of the filter."""
-
-    def __init__(self, filter: AbstractFilter):
-        self.filter, self.horizon = filter, filter.horizon
-        self.received, self.given = filter.received, len(filter.inputs)
-        # How many of the received numbers are values of a sender that decides when to send; its losses follow them.
-        self.values = 0
-        if sender := _sender_of(filter):
-            self.values = filter.received - sender.trigger.side_information(sender.outputs)
-        with jax.enable_x64(True):
-            self.numbers, self._static = cast(filter)
-            self._start: PyTree = jax.device_put(jax.tree.map(np.asarray, filter.init()))  # no program for each shape
-        self.state: PyTree = jax.tree.structure(self._start)
-        self.layout = {path: part.shape for path, part in split_by_path(self._start).items()}
-        self._data = np.zeros(self.received), np.zeros(self.given), np.asarray(0)
-        with jax.enable_x64(True):
-            modes = jax.eval_shape(filter.estimate, self._start).modes
-        self.estimate: PyTree = jax.tree.structure(
-            JudgedEstimate(np.zeros(()), np.zeros(()), filter.claim, modes, filter.attitude, 0.0, 0)
-        )
-        # By count of numbers that arrived: what their nis exceeds with probability RARE, as chi-square with so many.
-        self.rare = [np.inf, *(float(chi2.isf(RARE, count)) for count in range(1, self.received + 1))]
-
-    def stepper(self) -> NativeFilterStepper | XlaFilterStepper:
-        """Return a new stepper whose state is the prior."""
-        code = compile_native_step(self._static, self.numbers, self._start, self._data)
-        if code is None:
-            return XlaFilterStepper(compile_xla_step(self._static), self.numbers, self._start)
-        leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(self._start)]
-        return NativeFilterStepper(code, [np.asarray(leaf) for leaf in self.numbers], leaves)
-
-    @cached_property
-    def identity(self) -> Identity:
-        """Return versions, names, numbers and a hash of the step's program, whichever engine runs it."""
-        with jax.enable_x64(True):
-            text = text_of(compile_xla_step(self._static).trace(self.numbers, self._start, *self._data).jaxpr)
-        filter = self.filter
-        return {
-            **versions(),
-            "precision": ", ".join(sorted({str(leaf.dtype) for leaf in self.numbers})),
-            "filter": type(filter).__name__,
-            "states": ", ".join(filter.states),
-            "inputs": ", ".join(filter.inputs),
-            "numbers received": str(filter.received),
-            "numbers": hash_numbers(self.numbers),
-            "what is computed": hash_numbers(text),
-        }
-
-
-_compile_once = share_by_object(_CompiledFilter)  # returns a filter's compiled program, made at the first call

@@ -87,7 +87,7 @@ class Timeline:
             warnings.warn(f"timeline: predictions depend on when others are asked for: {what}", stacklevel=2)
         # A fleet of one plant, and a slot to look ahead in.
         self._fleet = Fleet(self._program, Options(self.window, self.ahead, capacity=self.capacity), alone=True)
-        self._plant, self._spare = self._fleet.begin("", start, None), self._fleet.pool.take()
+        self._plant, self._spare = self._fleet.begin_plant("", start, None), self._fleet.pool.take()
         self._judges = JudgementReader(self._fleet)
         self.reasons: dict[str, str] = {}
         self._angles, self._remarks = FleetAngles(self._fleet), FleetRemarks(self._fleet)
@@ -163,21 +163,21 @@ class Timeline:
                 is counted, and everything stays as it was.
         """
         plant, before = self._plant, self._plant.clock
-        screened = self._fleet.screen(node, self._convert_event(node, sequence, time, values, arrival), plant)
+        screened = self._fleet.screen_event(node, self._convert_event(node, sequence, time, values, arrival), plant)
         event = screened.event
-        verdict = self._fleet.take(plant, event, arrival is not None)
+        verdict = self._fleet.take_event(plant, event, arrival is not None)
         if verdict == "used":
             why = screened.why if screened.is_empty else self._why_implausible(event, plant.changes[-1][0])
             if why is not None:
                 # As if it had never arrived.
                 verdict, self.reasons[node] = "implausible", why
-                self._fleet.undo(plant, before)
+                self._fleet.undo_events(plant, before)
                 self._fleet.step([plant])
             else:
                 for _, line in (*self._angles.find_new([plant]), *self._remarks.find_new([plant])):
                     warnings.warn(f"timeline, {line}", stacklevel=2)
                 self._finalise()
-        self._fleet.count(plant, node, screened, verdict)
+        self._fleet.count_event(plant, node, screened, verdict)
         for _, line in self._held.find_new([plant]):
             warnings.warn(f"timeline, {line}", stacklevel=2)
         return verdict
@@ -197,7 +197,7 @@ class Timeline:
 
     def advance(self, now: float) -> None:
         """Advance the time: what is older than the window becomes final."""
-        self._fleet.advance(self._plant, check_moment("now", now))
+        self._fleet.advance_time(self._plant, check_moment("now", now))
         self._finalise()
 
     def estimates(self) -> dict[str, dict[str, Estimate]]:
@@ -230,7 +230,7 @@ class Timeline:
         """
         if not self._fleet.watched:
             raise fail("senders", "a node with a trigger or a timeout", list(self.network.names))
-        return self._fleet.senders(self._plant)
+        return self._fleet.find_sender_status(self._plant)
 
     def _outputs_after(self, slots: int | list[int]) -> np.ndarray:
         """Return the outputs after the row in a slot, or after several."""
@@ -247,7 +247,7 @@ class Timeline:
             raise fail("lag", "one to a moment after what is final", f"{lag:g}, to {time:g}")
         # Slots of the row before that moment, of the moment itself, and of all later rows. Where no step has a row at
         # the moment, the spare slot takes a prediction to it.
-        after = rows.after(time)
+        after = rows.first_after(time)
         has_row = by_steps and rows.keys[after - 1][0] >= time
         slots = [row.slot for row in rows.held[after - 1 - has_row :]]
         if not has_row:
@@ -336,7 +336,7 @@ class Timeline:
         with warnings.catch_warnings():  # the warning was given when the timeline was made
             warnings.simplefilter("ignore")
             new = cls(network, window, ahead=ahead, capacity=capacity)
-        new._fleet.end(new._plant)
+        new._fleet.end_plant(new._plant)
         new._plant = unpack_plant("", arrays["plant"].tobytes(), new._fleet)
         new._remarks.note_said(new._plant)
         new._gates.unpack(head.get("gated", []))  # absent until version 0.4.0
@@ -354,13 +354,13 @@ class Timeline:
         at = check_moment(f"{name}, time", time)
         self._fleet.check_step(f"{name}, time", at)
         came = max(self._plant.confirmed, at) if arrival is None else check_moment(f"{name}, arrival", arrival)
-        given = check_numbers(name, values, size, self._fleet.values_of(node))
-        known = self._fleet.with_losses(node, given.tolist())
+        given = check_numbers(name, values, size, self._fleet.count_values_alone(node))
+        known = self._fleet.append_losses(node, given.tolist())
         return CheckedEvent(index, check_63_bits(f"{name}, sequence", sequence), at, known, came)
 
     def _finalise(self) -> None:
         """Move the base up to the watermark, and read the outputs of the rows that are final by it."""
-        results = self._fleet.finalise([self._plant])
+        results = self._fleet.finalise_plants([self._plant])
         read = [row for row in results[0].final if row.has_data()]
         if read:
             outputs = self._outputs_after([row.slot for row in read])

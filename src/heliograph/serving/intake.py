@@ -127,7 +127,7 @@ class BatchIntake:
         timed = self._read_events(message, plant, wall)
         at, arrival, event, inputs = timed.at, timed.arrival, timed.event, timed.inputs
         # Values beyond limits do not count as received; an event of such values only is implausible.
-        screened = self.fleet.screen(message.node, event, plant)
+        screened = self.fleet.screen_event(message.node, event, plant)
         event, why, why_inputs = screened.event, screened.why if screened.is_empty else "", None
         if self._refused:  # as most often nothing is
             why = self._refused.get((number, event.node_index < 0)) or why
@@ -152,7 +152,7 @@ class BatchIntake:
         verdict: Verdict = "implausible"
         if not why:
             verdict = self._give_to_plant(number, plant, event, given, timed.clock, message.node)
-        self.fleet.count(plant, message.node, screened, verdict)
+        self.fleet.count_event(plant, message.node, screened, verdict)
         if screened.why and verdict == "used":
             notes.append(f"{screened.why}; the rest is used")
         return plant, verdict, why, notes
@@ -240,7 +240,7 @@ class BatchIntake:
 
         Of one that begins anew the old is ended, and its events are counted as from the future.
         """
-        plant, old = self.fleet.begin(name, at, origin), self.plants.pop(name, None)
+        plant, old = self.fleet.begin_plant(name, at, origin), self.plants.pop(name, None)
         plant.now, plant.leap, plant.version = at, leap, self._anew.get(name, 0)
         if old is not None:
             plant.version = self._anew[name] = old.version
@@ -250,7 +250,7 @@ class BatchIntake:
                 plant.link(INPUTS if node < 0 else self.fleet.network.names[node]).count("future", sequence, time)
             self._before.pop(name, None)
             self._taken = [taken for taken in self._taken if taken.plant is not old]
-            self.fleet.end(old)
+            self.fleet.end_plant(old)
         return plant
 
     def _give_to_plant(
@@ -266,7 +266,7 @@ class BatchIntake:
             wall: time by the clock on the wall, None if it is not known.
             clock: name of the node by whose clock it is dated.
         """
-        verdict = self.fleet.take(plant, event, given, wall, clock)
+        verdict = self.fleet.take_event(plant, event, given, wall, clock)
         if verdict == "used":
             self._taken.append(Candidate(number, plant, event, plant.changes[-1][0]))
         return verdict
@@ -275,10 +275,10 @@ class BatchIntake:
         """Restore a plant to its state before the batch."""
         plant, (known, clock, links) = self.plants[name], self._before[name]
         if known:
-            self.fleet.undo(plant, clock)
+            self.fleet.undo_events(plant, clock)
             plant.links = {name: LinkCounts(*counts) for name, counts in links.items()}
         else:
-            self.fleet.end(self.plants.pop(name))
+            self.fleet.end_plant(self.plants.pop(name))
 
     def _choose_origin(self, message: AnyMessage) -> datetime | None:
         """Return midnight, UTC, before a plant's first message, or the date of step 0; None where times are numbers."""

@@ -10,13 +10,12 @@ from time import perf_counter
 from typing import NamedTuple
 
 from heliograph.live.event import INPUTS, Verdict
-from heliograph.live.fleet import FinalisedPlant
 from heliograph.live.fleet import Fleet as Fleet
 from heliograph.live.fleet import Options as Options
 from heliograph.live.fleet_remarks import FleetRemarks, FleetRepeatWatch
 from heliograph.live.implausible_events import FleetAngles
 from heliograph.live.network_program import NetworkProgram as NetworkProgram
-from heliograph.live.plant import PlantState, WithdrawnEvent
+from heliograph.live.plant import FinalisedPlant, PlantState, WithdrawnEvent
 from heliograph.live.sorted_rows import HeldRow
 from heliograph.live.stored.plant_codec import pack_plant, unpack_plant
 from heliograph.numerics.check import instance, show_value
@@ -143,8 +142,8 @@ class Service:
             return self._take_batch(steps) if steps else []
         due = self._silence.find_due(self.plants.values(), now)
         for plant, step in due:
-            self.fleet.advance(plant, step)
-        finalised = self.fleet.finalise(plant for plant, _ in due)
+            self.fleet.advance_time(plant, step)
+        finalised = self.fleet.finalise_plants(plant for plant, _ in due)
         changed = {each.plant.name: each.plant for each in finalised if each.left}
         entries = [entry for each in finalised for entry in self._write_withdrawn(each.plant, each.withdrawn)]
         entries += self._write_finals(finalised)
@@ -223,7 +222,7 @@ class Service:
     def finish(self, ended: bool) -> list[Output]:
         """Commit everything. Without a store, and if there will be no more messages, all rows become final."""
         last = list(self.plants.values()) if ended and not self.store.keeps else []
-        finalised = self.fleet.finalise(last, all_=True)
+        finalised = self.fleet.finalise_plants(last, all_=True)
         entries = self._write_finals(finalised)
         self.fleet.free_slots(finalised)
         return self._commit({}, entries, 0)
@@ -243,7 +242,7 @@ class Service:
         entries, malformed, known = self._refuse_unused(messages, payloads, outcomes)
         # Step what is due; estimates of final rows are committed, provisional ones and messages only published.
         sent = self._exchange.messages(touched.values())
-        finalised = self.fleet.finalise(touched.values())
+        finalised = self.fleet.finalise_plants(touched.values())
         withdrawn = [*self._intake.replaced, *((each.plant, each.withdrawn) for each in finalised)]
         entries += [entry for plant, events in withdrawn for entry in self._write_withdrawn(plant, events)]
         entries += self._write_finals(finalised)
@@ -322,7 +321,7 @@ class Service:
 
     def _forget_plant(self, name: str) -> None:
         """Let a plant leave the memory."""
-        self.fleet.end(self.plants.pop(name))
+        self.fleet.end_plant(self.plants.pop(name))
         self._silence.forget(name)
 
     def _load(self, names: Iterable[str]) -> None:
@@ -363,7 +362,7 @@ class Service:
                 body = b'%b,"forecast":%b}' % (body[:-1], encode_line(ahead))
             if self.fleet.watched:
                 senders = {name: status._asdict() | {"dead": status.dead, "reason": status.reason}
-                           for name, status in self.fleet.senders(plant).items()}  # fmt: skip
+                           for name, status in self.fleet.find_sender_status(plant).items()}  # fmt: skip
                 body = b'%b,"senders":%b}' % (body[:-1], encode_line(senders))
             outputs.append(Output(None, plant.name, "provisional", body))
         return outputs

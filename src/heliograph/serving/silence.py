@@ -118,7 +118,7 @@ class SilenceWatch:
 
     def _dead_senders(self, plant: PlantState, now: float = -inf) -> tuple[str, ...]:
         """Return the dead senders of a plant, by now."""
-        return tuple(name for name, status in self.fleet.senders(plant, now).items() if status.dead)
+        return tuple(name for name, status in self.fleet.find_sender_status(plant, now).items() if status.dead)
 
     def _told_dead(self, plant: PlantState) -> tuple[str, ...]:
         """Return the senders of a plant that were told to be dead."""
@@ -128,7 +128,7 @@ class SilenceWatch:
 def find_dead_senders(fleet: Fleet, plants: Mapping[str, PlantState]) -> dict[str, list[str]]:
     """Return the dead senders of each plant that has one."""
     dead = {
-        name: [node for node, status in fleet.senders(plant).items() if status.dead]
+        name: [node for node, status in fleet.find_sender_status(plant).items() if status.dead]
         for name, plant in (plants.items() if fleet.watched else ())
     }
     return {name: nodes for name, nodes in dead.items() if nodes}

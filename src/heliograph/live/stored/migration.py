@@ -2,13 +2,13 @@
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from itertools import count
 from math import prod
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
+from heliograph.live.event import INPUTS
 from heliograph.live.fleet import Fleet
 from heliograph.live.sorted_rows import BEFORE
 from heliograph.live.stored.old_layout import (
@@ -41,9 +41,9 @@ def describe_network(fleet: Fleet, covariances: bool = False) -> str:
     parts: dict[str, PyTree] = {"plant": network.plant}
     parts |= {f"node {name!r}": node for name, node in network.nodes.items()}
     parts |= {f"fusion {name!r}": fusion for name, fusion in (network.fused | network.meshes).items()}
-    filters, size = _filter_columns(fleet, covariances)
+    filters, size = _number_state_columns(fleet, covariances)
     # Before 0.3.0 no probabilities of modes were among the outputs.
-    outputs = fleet.pool.step_rows.outputs.size - (np.count_nonzero(_mode_columns(fleet)) if covariances else 0)
+    outputs = fleet.pool.step_rows.outputs.size - (np.count_nonzero(_find_mode_columns(fleet)) if covariances else 0)
     layout = {
         "nodes": {name: network.nodes[name].received for name in network.names},
         "given": fleet.program.given,
@@ -51,19 +51,19 @@ def describe_network(fleet: Fleet, covariances: bool = False) -> str:
         "outputs": int(outputs),
         "filters": filters,
     }
-    return json.dumps({"values": {name: _numbers_by_path(tree) for name, tree in parts.items()}, "layout": layout})
+    return json.dumps({"values": {name: _list_numbers_by_path(tree) for name, tree in parts.items()}, "layout": layout})
 
 
-def _mode_columns(fleet: Fleet) -> Bool[np.ndarray, " outputs"]:
-    """Return which of a network's outputs are probabilities of modes."""
+def _find_mode_columns(fleet: Fleet) -> Bool[np.ndarray, " outputs"]:
+    """Return the mask of a network's outputs that is true where an output is the probability of a mode."""
     results = np.zeros(fleet.pool.step_rows.outputs.size, bool)
     for place in fleet.program.places:
         results[slice(*(place.modes or (0, 0)))] = True
     return results
 
 
-def _numbers_by_path(tree: PyTree) -> dict[str, object]:
-    """Return the numbers of a tree by the path of their attributes."""
+def _list_numbers_by_path(tree: PyTree) -> dict[str, object]:
+    """Return {path of a tree's leaf: its numbers as nested lists}; of more than MOST numbers only how many they are."""
     results: dict[str, object] = {}
     for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
         if isinstance(leaf, jax.Array | np.ndarray | np.generic | int | float):
@@ -72,41 +72,59 @@ def _numbers_by_path(tree: PyTree) -> dict[str, object]:
     return results
 
 
-def _filter_columns(fleet: Fleet, covariances: bool) -> tuple[dict[str, dict[str, list[Any]]], int]:
-    """Return {name of filter: {path of leaf: [shape, first column, end]}}, and how many columns the states have.
+class _ColumnCounter:
+    """Counts the columns of a row's states, one part after another, and notes which each part of a filter takes.
+
+    Args:
+        covariances: whether parts are as before version 0.3.0, when states held covariances, not their factors.
+
+    Attributes:
+        filters: {name of filter: {path of a part of its state: [shape, first column, end]}}.
+        count: how many columns have been counted so far, which is also the next free one.
+    """
+
+    def __init__(self, covariances: bool):
+        self._covariances = covariances
+        self.filters: dict[str, dict[str, list[Any]]] = {}
+        self.count = 0
+
+    def number_parts(self, state: PyTree) -> dict[str, np.ndarray]:
+        """Return {path of a part: the numbers of its columns, in the part's shape}, counted from the next free one."""
+        shapes: Mapping[str, Sequence[int]] = {path: part.shape for path, part in split_by_path(state).items()}
+        columns = {}
+        for path, shape in (describe_old_layout(shapes) if self._covariances else shapes).items():
+            size = prod(shape)
+            columns[path] = np.arange(self.count, self.count + size).reshape(shape)
+            self.count += size
+        return columns
+
+    def note_part(self, filter_name: str, path: str, columns: np.ndarray) -> None:
+        """Note the columns of a filter's part, which stand side by side; `columns` has the part's shape."""
+        first = int(columns.flat[0]) if columns.size else 0
+        self.filters.setdefault(filter_name, {})[path] = [list(columns.shape), first, first + columns.size]
+
+
+def _number_state_columns(fleet: Fleet, covariances: bool) -> tuple[dict[str, dict[str, list[Any]]], int]:
+    """Return {name of filter: {path of a part: [shape, first column, end]}}, and how many columns the states have.
 
     `covariances`: as before version 0.3.0, when states held covariances.
     """
-    network, flat, free = fleet.network, fleet.pool.step_rows.state, count()
-    by_kind, central, *rest = flat.tree(np.zeros(flat.size))
-    results: dict[str, dict[str, list[Any]]] = {}
-
-    def number_columns(state: PyTree) -> dict[str, np.ndarray]:
-        """Return the numbers of the next free columns, in the shape of each leaf, by its path."""
-        shapes: Mapping[str, Sequence[int]] = {path: part.shape for path, part in split_by_path(state).items()}
-        shapes = describe_old_layout(shapes) if covariances else shapes
-        return {
-            path: np.array([next(free) for _ in range(prod(shape))]).reshape(shape) for path, shape in shapes.items()
-        }
-
-    def note(name: str, path: str, columns: np.ndarray) -> None:
-        """Add a leaf to the results; its columns stand side by side."""
-        begin = int(columns.flat[0]) if columns.size else 0
-        results.setdefault(name, {})[path] = [list(columns.shape), begin, begin + columns.size]
-
-    # Filters of nodes stand by kind, (filter x node, ...); central ones by name.
-    for (group, filters), state in zip(network.kinds, by_kind, strict=True):
+    network, flat, counter = fleet.network, fleet.pool.step_rows.state, _ColumnCounter(covariances)
+    # A row's state has the filters of nodes by kind, the central ones by name, then what fusions remember.
+    states_by_kind, central, *memory = flat.tree(np.zeros(flat.size))
+    # Filters of one kind stand side by side: the leading axis of each part is (filter x node).
+    for (group, filters), state in zip(network.kinds, states_by_kind, strict=True):
         names = [f"{node}/{name}" for name in filters for node in network.groups[group]]
-        for path, leaf in number_columns(state).items():
-            for name, of_filter in zip(names, leaf, strict=True):
-                note(name, path, np.asarray(of_filter))
+        for path, columns in counter.number_parts(state).items():
+            for name, columns_of_filter in zip(names, columns, strict=True):
+                counter.note_part(name, path, np.asarray(columns_of_filter))
     for name, state in sorted(central.items()):
-        for path, leaf in number_columns(state).items():
-            note(f"{Network.FUSED}/{name}", path, leaf)
+        for path, columns in counter.number_parts(state).items():
+            counter.note_part(f"{Network.FUSED}/{name}", path, columns)
     # What centres and neighbours remember goes on only if the nodes are the same, which are part of its name.
-    for path, leaf in number_columns(rest).items():
-        note(f"memory of the fusions of {', '.join(network.names)}", path, leaf)
-    return results, next(free)
+    for path, columns in counter.number_parts(memory).items():
+        counter.note_part(f"memory of the fusions of {', '.join(network.names)}", path, columns)
+    return counter.filters, counter.count
 
 
 class PlantMigration:
@@ -124,10 +142,14 @@ class PlantMigration:
 
     def __init__(self, fleet: Fleet, mine: Identity, say: Callable[[str], None]):
         self.fleet, self.mine, self._say = fleet, mine, say
-        self._old: dict[str, Any] = {}
+        self._old: dict[str, Any] = {}  # "layout" of the network that is stored, as `describe_network` writes it
 
     def begin(self, what: str, other: Identity) -> None:
-        """Report what has changed since the identity `other` of the store `what`.
+        """Read the layout of the network whose plants are stored, and report each change since; called once, first.
+
+        Args:
+            what: name of the store, which stands before each line.
+            other: identity of the network that is stored.
 
         Raises:
             ValueError: other states, inputs or precision, or a store that does not say what it holds.
@@ -154,15 +176,15 @@ class PlantMigration:
         return can_read_layout(shapes_before, shapes_now)
 
     def migrate(self, bodies: Mapping[str, bytes]) -> dict[str, bytes]:
-        """Return the bytes of plants, by name, as this network stores them."""
-        plants = {name: unpack_plant(name, self._translate(body), self.fleet) for name, body in bodies.items()}
+        """Return {name of a plant: its bytes as this network stores them}, from the bytes that are stored."""
+        plants = {name: unpack_plant(name, self._translate_plant(body), self.fleet) for name, body in bodies.items()}
         # All rows after the base are stepped with what the network is now.
         for plant in plants.values():
             plant.dirty = 1 if len(plant.rows.held) > 1 else None
         self.fleet.step(plants.values())
         results = {name: pack_plant(plant, self.fleet) for name, plant in plants.items()}
         for plant in plants.values():
-            self.fleet.end(plant)
+            self.fleet.end_plant(plant)
         return results
 
     def migrate_outputs(self, rows: Float[np.ndarray, "row output"]) -> Float[np.ndarray, "row output"] | None:
@@ -170,7 +192,7 @@ class PlantMigration:
 
         Before 0.3.0 outputs had no probabilities of modes: these become NaN.
         """
-        new, without_modes = json.loads(self.mine[DESCRIPTION])["layout"], ~_mode_columns(self.fleet)
+        new, without_modes = json.loads(self.mine[DESCRIPTION])["layout"], ~_find_mode_columns(self.fleet)
         if any(list(self._old[part]) != list(new[part]) for part in ("nodes", "filters")):
             return None
         if rows.shape[1] == len(without_modes):
@@ -181,86 +203,131 @@ class PlantMigration:
         results[:, without_modes] = rows
         return results
 
-    def _translate(self, body: bytes) -> bytes:
-        """Return a plant's bytes with the columns, places of nodes and counts of this network; rows not stepped."""
-        old = self._old
-        nodes_before, network = old["nodes"], self.fleet.network
-        same = [
+    def _translate_plant(self, stored: bytes) -> bytes:
+        """Return a stored plant's bytes with the columns, node indices and counts of this network; no row is stepped.
+
+        Rows, events and counts of a node that is gone, or that receives another number of values now, are left out.
+        """
+        network, sizes_before = self.fleet.network, self._old["nodes"]  # {node: how many numbers it received}
+        kept = [
             name
-            for name, received in nodes_before.items()
+            for name, received in sizes_before.items()
             if name in network.nodes and network.nodes[name].received == received
         ]
-        new_index = {i: network.names.index(name) for i, name in enumerate(nodes_before) if name in same} | {-1: -1}
-        width = old["state"] + old["outputs"] + 2 * old["given"] + sum(nodes_before.values()) + 2
-        parts = PlantParts.of(body, width)
-        rows = self._translate_keys(parts, new_index)
-        number = {row.number_before: i for i, row in enumerate(rows)}
-        table = self._translate_rows(parts.table[[row.number_before for row in rows]], new_index)
+        index_here = {i: network.names.index(name) for i, name in enumerate(sizes_before) if name in kept}
+        index_here[-1] = -1  # the inputs
+        parts = PlantParts.of(stored, self._count_columns_before())
+        rows = self._select_rows(parts, index_here)
+        table = self._translate_table(parts.table[[row.number_before for row in rows]], index_here)
         assert table.shape[1] == self.fleet.pool.table.shape[1]
-        # Events (row, node, count), in the order of their rows; their values stand one after another.
-        sizes = [old["given"] if node < 0 else list(nodes_before.values())[node] for _, node, _ in parts.events]
-        values = np.split(parts.values, np.cumsum(sizes)[:-1]) if len(parts.events) else []
-        stay = [i for i, (row, node, _) in enumerate(parts.events) if int(node) in new_index and int(row) in number]
-        events = [(number[int(row)], new_index[int(node)], int(count)) for row, node, count in parts.events[stay]]
-        links = {name: link for name, link in parts.head["links"].items() if name in (*same, "inputs")}
+        events, times, values = self._translate_events(parts, rows, index_here)
+        links = {name: link for name, link in parts.head["links"].items() if name in (*kept, INPUTS)}
         return PlantParts(
             head=parts.head | {"links": links},
             keys=np.array([(row.node, row.sequence) for row in rows]),
-            events=np.array(events, dtype=np.int64),
+            events=events,
             table=table,
-            times=parts.times[stay],
-            values=np.concatenate([np.zeros(0), *(values[i] for i in stay)]),
+            times=times,
+            values=values,
         ).to_bytes()
 
-    def _translate_keys(self, parts: PlantParts, new_index: Mapping[int, int]) -> list["_MovedRow"]:
+    def _count_columns_before(self) -> int:
+        """Return how many columns the other network's table has.
+
+        They are (state, outputs, inputs held, step number, measurements by node, inputs, time).
+        """
+        old = self._old
+        return int(old["state"] + old["outputs"] + 2 * old["given"] + sum(old["nodes"].values()) + 2)
+
+    def _select_rows(self, parts: PlantParts, index_here: Mapping[int, int]) -> list["_MovedRow"]:
         """Return the rows that stay, in the order of their keys here; the row of a node that is gone goes with it.
 
-        First stands the base, or a row kept from before a leap and then the base: these stay in any case.
+        First stands the base, or a row kept from before a leap and then the base: these stay in any case. `index_here`:
+        index of a node in this network, by that in the other one; -1 for the inputs.
         """
-        joint, first = self.fleet.rows_are_joint, 1 + (parts.head.get(BEFORE_LEAP) is not None)
+        joint, always_kept = self.fleet.rows_are_joint, 1 + (parts.head.get(BEFORE_LEAP) is not None)
         rows = []
         for i, (node, sequence) in enumerate(parts.keys.tolist()):
-            if i < first or joint or node in new_index:
-                node_here = node if joint or node == BEFORE else new_index.get(node, BEFORE)
+            if i < always_kept or joint or node in index_here:
+                node_here = node if joint or node == BEFORE else index_here.get(node, BEFORE)
                 rows.append(_MovedRow(float(parts.table[i, -1]), node_here, sequence, i))
-        return [*rows[:first], *sorted(rows[first:])]
+        return [*rows[:always_kept], *sorted(rows[always_kept:])]
 
-    def _translate_rows(self, table: np.ndarray, new_index: Mapping[int, int]) -> np.ndarray:
-        """Return rows of another network's table with this network's columns.
+    def _translate_events(
+        self, parts: PlantParts, rows: Sequence["_MovedRow"], index_here: Mapping[int, int]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the events of nodes and rows that stay: (row, node, count) of each, their times, and all their values.
 
-        A row has (state, outputs, inputs held, step number, measurements by node, inputs, time). States of filters with
-        a counterpart are copied, of others the start; outputs stay 0 until the next step.
+        Shapes: (events, 3), (events,), and (numbers,), the values of one event after those of another. `rows` are the
+        rows that stay, `index_here` the index of a node in this network by that in the other one.
+        """
+        row_here = {row.number_before: i for i, row in enumerate(rows)}
+        # An event of the inputs, node -1, has as many values as there are inputs; another as many as its node receives.
+        received, stored = list(self._old["nodes"].values()), parts.events.tolist()
+        sizes = [self._old["given"] if node < 0 else received[node] for _, node, _ in stored]
+        values = np.split(parts.values, np.cumsum(sizes)[:-1]) if sizes else []
+        stay = [i for i, (row, node, _) in enumerate(stored) if node in index_here and row in row_here]
+        events = [(row_here[row], index_here[node], count) for row, node, count in (stored[i] for i in stay)]
+        kept_values = np.concatenate([np.zeros(0), *(values[i] for i in stay)])
+        return np.array(events, dtype=np.int64), parts.times[stay], kept_values
+
+    def _translate_table(self, table: np.ndarray, index_here: Mapping[int, int]) -> np.ndarray:
+        """Return rows of the other network's table with this network's columns.
+
+        A row has (state, outputs, inputs held, step number, measurements by node, inputs, time). Outputs stay 0 until
+        the next step.
 
         Args:
-            table: rows of the other network.
-            new_index: index here of each node that is here too, by its index there.
+            table: rows of the other network, (row, column there).
+            index_here: index of a node in this network, by that in the other one; -1 for the inputs.
         """
-        old, pool, program = self._old, self.fleet.pool, self.fleet.program
-        given, state = old["given"], old["state"]
+        old, pool = self._old, self.fleet.pool
         translated = np.zeros((len(table), pool.table.shape[1]))
-        translated[:, pool.state] = pool.step_rows.start
-        filters = json.loads(self.mine[DESCRIPTION])["layout"]["filters"]
-        for name, new in filters.items():
-            if self._has_counterpart(name, filters):
-                parts = {path: table[:, begin:end].reshape(len(table), *shape)
-                         for path, (shape, begin, end) in old["filters"][name].items()}  # fmt: skip
-                for path, part in relocate_parts(parts, new).items():
-                    _, begin, end = new[path]
-                    translated[:, begin:end] = part.reshape(len(table), -1) if end > begin else 0.0
-        # Inputs held and step number.
-        held = state + old["outputs"]
-        step = held + given
-        translated[:, pool.held], translated[:, pool.at] = table[:, held:step], table[:, [step]]
-        # Measurements by node, NaN of nodes that were not there; inputs and time. `numbers` is a view of a slice.
-        numbers, numbers_before = translated[:, pool.numbers], table[:, step + 1 :]
-        numbers[:] = np.nan
-        numbers[:, program.received :] = numbers_before[:, numbers_before.shape[1] - given - 1 :]
-        starts_before = np.cumsum([0, *old["nodes"].values()])
-        starts = np.cumsum([0, *(self.fleet.network.nodes[name].received for name in self.fleet.network.names)])
-        for i, j in new_index.items():
-            if i >= 0:  # a node; -1 stands for the inputs
-                numbers[:, starts[j] : starts[j + 1]] = numbers_before[:, starts_before[i] : starts_before[i + 1]]
+        translated[:, pool.state] = self._translate_states(table)
+        # First columns there of the inputs held, of the step number, and of what was measured and given.
+        held = old["state"] + old["outputs"]
+        step = held + old["given"]
+        measured = step + 1
+        translated[:, pool.held], translated[:, pool.at] = table[:, held:step], table[:, step:measured]
+        translated[:, pool.numbers] = self._translate_numbers(table[:, measured:], index_here)
         return translated
+
+    def _translate_states(self, table: np.ndarray) -> np.ndarray:
+        """Return the states (row, column here) of rows of the other network's table (row, column there).
+
+        A filter with a counterpart there has the state that this had; any other begins with the initial law.
+        """
+        states = np.tile(self.fleet.pool.step_rows.start, (len(table), 1))
+        filters = json.loads(self.mine[DESCRIPTION])["layout"]["filters"]
+        for name, parts_here in filters.items():
+            if not self._has_counterpart(name, filters):
+                continue
+            parts = {
+                path: table[:, begin:end].reshape(len(table), *shape)
+                for path, (shape, begin, end) in self._old["filters"][name].items()
+            }
+            for path, part in relocate_parts(parts, parts_here).items():
+                _, begin, end = parts_here[path]
+                if end > begin:  # a part may have no number at all
+                    states[:, begin:end] = part.reshape(len(table), -1)
+        return states
+
+    def _translate_numbers(self, numbers_before: np.ndarray, index_here: Mapping[int, int]) -> np.ndarray:
+        """Return (row, measurements by node, inputs, time) in this network's order, NaN of nodes that were not there.
+
+        `numbers_before`: the same of the other network. `index_here`: index of a node here by that there.
+        """
+        given, received, network = self._old["given"], self.fleet.program.received, self.fleet.network
+        numbers = np.full((len(numbers_before), received + given + 1), np.nan)
+        # Inputs and time come last in both.
+        numbers[:, received:] = numbers_before[:, numbers_before.shape[1] - given - 1 :]
+        # Node i there, j here: its first column and that of the node behind it.
+        starts_before = np.cumsum([0, *self._old["nodes"].values()])
+        starts = np.cumsum([0, *(network.nodes[name].received for name in network.names)])
+        for i, j in index_here.items():
+            if i >= 0:  # -1 stands for the inputs
+                numbers[:, starts[j] : starts[j + 1]] = numbers_before[:, starts_before[i] : starts_before[i + 1]]
+        return numbers
 
 
 class _MovedRow(NamedTuple):
@@ -277,31 +344,43 @@ def list_changes(mine: Identity, other: Identity) -> list[str]:
 
     These are options and versions, nodes and filters, numbers of the parts, and functions where nothing else has.
     """
+    # Entries of the identities that are words as they stand: options, versions, nodes, filters.
+    not_words = (DESCRIPTION, "what is computed", "layout of the store")
     lines = [
         f"{name}: {other.get(name, 'none')} -> {mine.get(name, 'none')}"
         for name in {**mine, **other}
-        if mine.get(name) != other.get(name)
-        and not name.startswith("numbers of ")
-        and name not in (DESCRIPTION, "what is computed", "layout of the store")
+        if mine.get(name) != other.get(name) and not name.startswith("numbers of ") and name not in not_words
     ]
-    # Numbers of the parts that are in both; of long arrays only a hash is known, and of functions the program. What
-    # only one of two versions keeps is derived from the others.
+    # Numbers of the parts (plant, nodes, fusions) that are in both.
     here, there = (json.loads(identity[DESCRIPTION])["values"] for identity in (mine, other))
-    same = mine.get("heliograph") == other.get("heliograph")
+    same_version = mine.get("heliograph") == other.get("heliograph")
     for name in here:
         if name in there:
-            lines += [
-                f"{name}{path}: {line}"
-                for path in {**there[name], **here[name]}
-                if not path.endswith(".factor")  # of a covariance, which is there too
-                and (same or path in there[name].keys() & here[name].keys())
-                for line in _describe_changes(there[name].get(path), here[name].get(path))
-            ]
+            lines += _list_changed_numbers(name, there[name], here[name], same_version)
+            # Of an array longer than MOST only a hash is known.
             if not lines and mine.get(f"numbers of {name}") != other.get(f"numbers of {name}"):
                 lines.append(f"{name}: numbers of a long array")
+    # Of a function only the program is known that it is compiled to.
     if not lines and mine.get("what is computed") != other.get("what is computed"):
         lines.append("functions of the network")
     return lines
+
+
+def _list_changed_numbers(
+    name: str, before: Mapping[str, object], after: Mapping[str, object], same_version: bool
+) -> list[str]:
+    """Return a line for each number of the part `name` of a network that has changed.
+
+    `before` and `after` are {path of an attribute: its numbers}. A path that only one of two versions keeps is derived
+    from others, and passed over.
+    """
+    return [
+        f"{name}{path}: {line}"
+        for path in {**before, **after}
+        if not path.endswith(".factor")  # of a covariance, which is there too
+        and (same_version or (path in before and path in after))
+        for line in _describe_changes(before.get(path), after.get(path))
+    ]
 
 
 def _describe_changes(before: object, after: object) -> list[str]:

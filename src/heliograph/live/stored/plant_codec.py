@@ -63,31 +63,30 @@ class PlantParts(NamedTuple):
 
 
 def pack_plant(plant: PlantState, fleet: Fleet) -> bytes:
-    """Serialise a plant that has no pending changes."""
+    """Return a plant as bytes, which `unpack_plant` reads; it must have no changes that could still be undone."""
+    head = {
+        "now": plant.now,
+        "forced": plant.forced,
+        BEGUN: plant.begun,
+        "origin": None if plant.origin is None else plant.origin.isoformat(),
+        "links": {node: list(vars(link).values()) for node, link in plant.links.items()},
+        "leap": None if plant.leap is None else _pack_leap(plant.leap),
+        BEFORE_LEAP: None if plant.kept is None else plant.kept.now,
+    }
+    # The row kept from before a leap stands first, where there is one.
     rows = [*([] if plant.kept is None else [plant.kept.row]), *plant.rows.held]
-    origin = None if plant.origin is None else plant.origin.isoformat()
-    links = {node: list(vars(link).values()) for node, link in plant.links.items()}
-    names = [(i, *name) for i, row in enumerate(rows) for name in row.events]
-    return _pack_parts(
-        {
-            "now": plant.now,
-            "forced": plant.forced,
-            BEGUN: plant.begun,
-            "origin": origin,
-            "links": links,
-            "leap": None if plant.leap is None else _pack_leap(plant.leap),
-            BEFORE_LEAP: None if plant.kept is None else plant.kept.now,
-        },
-        [number for row in rows for number in row.key[1:]],
-        [number for i, node, sequence, _ in names for number in (i, node, sequence)],
-        fleet.pool.table[[row.slot for row in rows]].ravel(),
-        [time for *_, time in names],
-        [value for row in rows for values in row.events.values() for value in values],
-    )
+    # Of each row (node, sequence), of each event (row, node, sequence), one after another; times stand apart.
+    keys = [number for row in rows for number in row.key[1:]]
+    names = [(i, node, sequence, time) for i, row in enumerate(rows) for node, sequence, time in row.events]
+    events = [number for i, node, sequence, _ in names for number in (i, node, sequence)]
+    table = fleet.pool.table[[row.slot for row in rows]].ravel()
+    times = [time for *_, time in names]
+    values = [value for row in rows for values in row.events.values() for value in values]
+    return _pack_parts(head, keys, events, table, times, values)
 
 
 def _pack_parts(head: dict[str, Any], *flat: Sequence[float] | np.ndarray) -> bytes:
-    """Serialise the head and the flat parts (keys, events, table, times, values) behind the lengths of all."""
+    """Return as bytes the lengths of all parts, the head, and the flat parts (keys, events, table, times, values)."""
     # Numbers of rows, events and values, from keys (rows, 2), events (events, 3) and values.
     counts = len(flat[0]) // 2, len(flat[1]) // 3, len(flat[4])
     arrays = [np.array(a, dtype=kind) for a, kind in zip(flat, TYPES, strict=True)]
@@ -112,37 +111,53 @@ def _unpack_table(data: bytes, at: int, size: int, kept: int) -> tuple[np.ndarra
 
 
 def unpack_plant(name: str, data: bytes, fleet: Fleet) -> PlantState:
-    """Restore a plant from bytes, with its rows in slots of the fleet's table."""
-    head, keys, events, table, times, values = PlantParts.of(data, fleet.pool.table.shape[1])
-    # Rows, each in a new slot; then their events.
+    """Return the plant `name` from what `pack_plant` returned, with its rows in new slots of the fleet's table."""
+    parts = PlantParts.of(data, fleet.pool.table.shape[1])
+    head, rows = parts.head, _make_rows_with_events(parts, fleet)
+    # Where the head says when the last moment before a leap was, the first row is the one kept from before it.
+    moment_before = head.get(BEFORE_LEAP)
+    kept = None if moment_before is None else BeforeLeap(rows.pop(0), moment_before)
+    base = rows[0]
+    sorted_rows = fleet.make_rows(base)
+    sorted_rows.hold(rows)
+    return PlantState(
+        name=name,
+        rows=sorted_rows,
+        now=head["now"],
+        origin=head["origin"] and datetime.fromisoformat(head["origin"]),
+        forced=head["forced"],
+        links={node: LinkCounts(*numbers) for node, numbers in head["links"].items()},
+        leap=None if head["leap"] is None else _unpack_leap(head["leap"]),
+        kept=kept,
+        begun=head.get(BEGUN, max(base.key[0], 0.0)),
+    )
+
+
+def _make_rows_with_events(parts: PlantParts, fleet: Fleet) -> list[HeldRow]:
+    """Return the stored rows, each in a new slot of the fleet's table, with their events."""
     rows = [
         _make_held_row(fleet, numbers, node, sequence)
-        for numbers, (node, sequence) in zip(table, keys.tolist(), strict=True)
+        for numbers, (node, sequence) in zip(parts.table, parts.keys.tolist(), strict=True)
     ]
+    # The values of all events stand one after another, as many of each as its node sends.
     begin = 0
-    for time, (i, node, sequence) in zip(times.tolist(), events.tolist(), strict=True):
-        end = begin + fleet.size(node)
-        rows[i].events[node, sequence, time] = values[begin:end].tolist()
+    for time, (i, node, sequence) in zip(parts.times.tolist(), parts.events.tolist(), strict=True):
+        end = begin + fleet.count_values(node)
+        rows[i].events[node, sequence, time] = parts.values[begin:end].tolist()
         begin = end
-    before = head.get(BEFORE_LEAP)
-    kept = None if before is None else BeforeLeap(rows.pop(0), before)
-    held = fleet.make_rows(rows[0])
-    held.hold(rows)
-    links = {node: LinkCounts(*numbers) for node, numbers in head["links"].items()}
-    origin = head["origin"] and datetime.fromisoformat(head["origin"])
-    leap = None if head["leap"] is None else _unpack_leap(head["leap"])
-    begun = head.get(BEGUN, max(rows[0].key[0], 0.0))
-    state = {"forced": head["forced"], "links": links, "leap": leap, "kept": kept, "begun": begun}
-    return PlantState(name, held, head["now"], origin, **state)
+    return rows
 
 
 def _pack_leap(leap: Leap) -> dict[str, Any]:
-    """Return a leap as a table of its parts."""
+    """Return {field of a leap: its value}, of which JSON can be written."""
     return leap._asdict() | {"earlier": None if leap.earlier is None else _pack_leap(leap.earlier)}
 
 
 def _unpack_leap(parts: Any) -> Leap:
-    """Read a leap; until version 0.3.0 it was a list: its time, the arrival before it, five numbers of each node."""
+    """Return the leap that `_pack_leap` packed, or a version until 0.3.0.
+
+    Such a version wrote a list: its time, the arrival before it, and five numbers of each node.
+    """
     if isinstance(parts, list):
         time, now, links = parts
         return Leap(time, time, now, {node: (numbers[2], numbers[4]) for node, numbers in links.items()})
