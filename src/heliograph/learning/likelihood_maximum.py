@@ -158,10 +158,11 @@ class Solution:
 
     @cached_property
     def hessian(self) -> Float[np.ndarray, "r r"]:
-        """Hessian of -l along the identified directions."""
+        """Hessian of -l along the r identified directions (`basis`); the information where it is not positive."""
         observed = self.surface.hessian(self.top.x, self.active)[np.ix_(self.active, self.active)]
         reduced = self._reduce(observed)
-        if np.linalg.eigvalsh(reduced)[:1].sum() > 0:
+        least_eigenvalue = np.linalg.eigvalsh(reduced)[:1].sum()  # 0 where there is no direction
+        if least_eigenvalue > 0:
             return reduced
         information = self.surface.evaluations(self.top.x[None]).information[0]
         return self._reduce(information[np.ix_(self.active, self.active)])
@@ -185,9 +186,10 @@ class Solution:
         return np.asarray(few[self.active])
 
     def covariance(self, method: Method = "cosines") -> tuple[Float[np.ndarray, "active active"], float]:
-        """Return the covariance of the active coordinates along the identified directions, and degrees of freedom.
+        """Return the covariance of the active coordinates, along the identified directions, and its degrees of freedom.
 
-        Of numbers of which a few stretches of the data tell the scores' covariance is the model's.
+        It is H^-1 J H^-1 with the Hessian H of -l and J the covariance of the sum of scores, estimated by `method`. Of
+        numbers that a few stretches of the data tell, J is what the model says.
         """
         scores, by_model = self.scores, np.zeros((len(self.few), len(self.few)))
         if self.few.any():
@@ -214,6 +216,7 @@ class Solution:
     def describe_with_cheap_errors(self) -> list[str]:
         """Return a line for each number: its estimate, and an interval by the expected information at the maximum."""
         active, values = self.active, self.parameters.entries_at(self.x)
+        # Variances g' I^-1 g, with the derivatives g of each number by the active coordinates, on the line.
         information = self.surface.evaluations(self.top.x[None]).information[0][np.ix_(active, active)]
         inverse = np.linalg.pinv(information, hermitian=True)
         slopes = self.parameters.slopes(self.top.x)[:, active]
@@ -225,7 +228,10 @@ class Solution:
         ]
 
     def _describe_entry(self, entry: TableEntry, value: float, slope: np.ndarray, error: float) -> str:
-        """Return an estimate and its interval by a standard error on the scale where the domain is symmetric."""
+        """Return in words an estimate `value` and its interval, symmetric on the line, by a standard error there.
+
+        `slope`: derivative of the number by the active coordinates, which tells whether it is identified.
+        """
         if entry.coordinate is not None and not self.active[entry.coordinate]:
             return f"{value:>10.4g}  (at the end of its domain)"
         if not self.identifies(slope):
@@ -238,8 +244,9 @@ class Solution:
         return f"{row.value:>10}  (about {row.interval})"
 
     def _make_rows(self, method: Method, level: float) -> tuple[Row, ...]:
-        """Return one row for each entry: at a boundary, not identified, or with an interval by this method."""
+        """Return a row for each number of the table: at a boundary, not identified, or with an interval by `method`."""
         covariance, freedom = self.covariance("hessian" if method == "profile" else method)
+        # The estimates, and their derivatives by the active coordinates, on the line.
         values, slopes = self.parameters.entries_at(self.x), self.parameters.slopes(self.top.x)[:, self.active]
         rows = []
         for entry, value, slope in zip(self.parameters.entries, values, slopes, strict=True):
@@ -247,7 +254,7 @@ class Solution:
             if entry.coordinate is not None and not self.active[entry.coordinate]:
                 rows.append(self._make_boundary_row(entry, float(value), level))
             elif not self.identifies(slope):
-                rows.append(Row(entry.name, float(value), np.nan, np.nan, np.nan, self.form, False, False))
+                rows.append(_make_unidentified_row(entry, float(value), self.form))
             else:
                 ends = self._compute_interval(entry, float(value), slope, error, freedom, method, level)
                 rows.append(self._make_row(entry, float(value), error, ends))
@@ -263,66 +270,115 @@ class Solution:
         method: Method,
         level: float,
     ) -> tuple[float, float]:
-        """Return the ends of an interval on the scale where the domain is symmetric.
+        """Return the ends of the interval of a number of the table, on the line, where its domain is symmetric.
 
-        A logarithm or a logit that is hardly known has no symmetric interval: it is cut out of the likelihood.
+        By `method`: estimate +- quantile x standard error, or quantiles of a bootstrap, or where the profile of the
+        likelihood has fallen. A logarithm or a logit that is hardly known (by less than a factor of e) has no symmetric
+        interval: it is cut out of the profile whatever the method.
+
+        Args:
+            entry: the number.
+            value: its estimate.
+            slopes: its derivative, on the line, by each active coordinate (active,).
+            error: its standard error on the line.
+            freedom: degrees of freedom with which the error is known.
+            method: of `Fit.rows`.
+            level: probability with which the interval holds the number.
         """
-        wide = entry.coordinate is not None and self.surface.domains.single[entry.coordinate] and error > WIDE
-        if entry.coordinate is not None and (wide or method == "profile"):
-            first = min(error, WIDE) * np.array([-2.0, 2.0])
-            low, high = self._cut_profile(entry.coordinate, first, allowed_fall(level))
-            return low, high
+        coordinate = entry.coordinate  # None of numbers of a simplex or a covariance, which have none of their own
+        is_told_by_few = False
+        if coordinate is not None:
+            hardly_known = self.surface.domains.single[coordinate] and error > WIDE
+            if hardly_known or method == "profile":
+                first = min(error, WIDE) * np.array([-2.0, 2.0])  # where the search for either end begins
+                low, high = self._cut_profile(coordinate, first, allowed_fall(level))
+                return low, high
+            is_told_by_few = bool(self.few[np.count_nonzero(self.active[:coordinate])])
         center = float(link(entry.domain, value))
-        few = entry.coordinate is not None and self.few[np.count_nonzero(self.active[: entry.coordinate])]
-        if method == "bootstrap" and not few:
+        # Blocks drawn anew say nothing of numbers of which a few stretches of the data tell all.
+        if method == "bootstrap" and not is_told_by_few:
             low, high = center + self._draw_ends(slopes, level)
             return low, high
         half = quantile(freedom, level) * error
         return center - half, center + half
 
     def _make_row(self, entry: TableEntry, value: float, error: float, ends: tuple[float, float]) -> Row:
-        """Return the row of an identified number, with its interval."""
+        """Return the row of an identified number, by its standard error and both ends of its interval on the line."""
         least, most = sorted(float(unlink(entry.domain, end)) for end in ends)
         slope = abs(float(unlink_slope(entry.domain, link(entry.domain, value))))
         return Row(entry.name, value, least, most, error * slope, self.form, False, True)
 
     def identifies(self, slopes: Float[np.ndarray, " active"]) -> bool:
-        """Return whether the data identify a function with this derivative by coordinate: it has none along ridges."""
+        """Return whether the data identify a function of the numbers, which it is if it does not change along ridges.
+
+        `slopes`: its derivatives by the active coordinates (active,).
+        """
         along = self.rank.unit * slopes
         size = np.linalg.norm(along)
         return bool(size > 0 and np.linalg.norm(along @ self.rank.flat) <= ALONG * size)
 
     def _draw_ends(self, slopes: np.ndarray, level: float) -> np.ndarray:
-        """Return the ends of an interval, relative to the estimate, by sums of blocks of scores drawn anew."""
+        """Return both ends of an interval, relative to the estimate, by sums of blocks of scores that are drawn anew.
+
+        `slopes`: derivative of the number by the active coordinates (active,); a draw moves the maximum by H^-1 times
+        the sum.
+        """
         drawn = np.linalg.solve(self.hessian, draw_block_sums([s @ self.basis for s in self.scores], DRAWS, 0).T)
         ends: np.ndarray = np.quantile(slopes @ self.basis @ drawn, [(1 - level) / 2, (1 + level) / 2])
         return ends
 
     def _make_boundary_row(self, entry: TableEntry, value: float, level: float) -> Row:
-        """Return the row of a number at the end of its domain: from there to where the profile has fallen so far.
+        """Return the row of a number at an end of its domain: the interval is from there to where the profile fell.
 
-        The square root of the fall is half of a normal variable, so that a level of 95 % is the quantile of 90 %.
+        There the square root of the fall is half of a normal variable, so that a level of 95 % is the quantile of 90 %.
         """
         assert entry.coordinate is not None
-        outward = self.top.ends[entry.coordinate]
+        outward = self.top.ends[entry.coordinate]  # -1 or 1
         (end,) = self._cut_profile(entry.coordinate, np.array([-outward * FURTHER]), allowed_fall(2 * level - 1))
         limit = float(unlink(entry.domain, end)) if np.isfinite(end) else float(unlink(entry.domain, -outward * np.inf))
-        return Row(entry.name, value, min(value, limit), max(value, limit), np.nan, self.form, True, True)
+        return Row(
+            name=entry.name,
+            estimate=value,
+            low=min(value, limit),
+            high=max(value, limit),
+            standard_error=np.nan,
+            form=self.form,
+            boundary=True,
+            identified=True,
+        )
 
     def _cut_profile(self, coordinate: int, first: np.ndarray, drop: float) -> Float[np.ndarray, " sides"]:
-        """Return where the profile of a coordinate has fallen by `drop`; `first`: signed distances to look at first."""
+        """Return where the profile of a coordinate has fallen by `drop` nats, one end for each of `first`.
+
+        `first`: signed distances from the maximum at which the search for each end begins.
+        """
         furthest = REAL_END * np.abs(first).max() if self.surface.domains.free[coordinate] else END
         return self.surface.crossings(self.top.x, self.total, coordinate, first, furthest, drop, self.active)
 
 
+def _make_unidentified_row(entry: TableEntry, value: float, form: Form) -> Row:
+    """Return the row of a number that the data do not identify: where the search ended, without an interval."""
+    return Row(
+        name=entry.name,
+        estimate=value,
+        low=np.nan,
+        high=np.nan,
+        standard_error=np.nan,
+        form=form,
+        boundary=False,
+        identified=False,
+    )
+
+
 def rank_of_late_rows(late: Float[np.ndarray, "p p"], ridges: int) -> InformationRank:
-    """Return the rank of the second half's information, with as many flat directions as there are ridges.
+    """Return the rank of the information of a recording's second half (p, p), with `ridges` flat directions.
 
     What is known before the first step pins a ridge weakly; that does not grow with the data, and is not used.
     """
     rank = rank_of_information(late)
     if rank.flat.shape[1] == ridges:
         return rank
+    # The directions of the least eigenvalues, in units of each coordinate's standard error, are the flat ones.
     diagonal = np.diag(late)
     unit = np.where(diagonal > 0, 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0)), 1.0)
     _, vectors = np.linalg.eigh(late * unit[:, None] * unit)

@@ -28,11 +28,11 @@ HORIZON, RUNS = 500, 32  # steps and runs that are simulated under each law
 
 @readable
 class SamplesToTell(NamedTuple):
-    """Number of steps that the likelihood ratio needs, and what it gains in each.
+    """Number of steps that the likelihood ratio needs to decide between two laws, and what it gains in each.
 
     samples: steps after which both errors are at most `error`; infinite where the laws look alike. information: mean
-    of log p_true - log p_other per step under the first law and under the second, nats; deviation: of that, in the long
-    run.
+    of log p_true - log p_other per step where the first law is true, and where the second is, nats. deviation: of the
+    sum of these over n steps, over sqrt(n), for many steps.
     """
 
     samples: float
@@ -76,23 +76,26 @@ def samples_to_tell(
     if level in (0.0, 0.5):
         raise fail("error", "a number between 0 and 0.5", level)
     name, node = _find_only_node(network)
-    count = HORIZON if inputs is None else len(np.asarray(inputs))
-    # Mean and long-run deviation of the ratio under each law.
+    steps = HORIZON if inputs is None else len(np.asarray(inputs))
+    u = np.zeros((steps, len(network.inputs))) if inputs is None else np.asarray(inputs, dtype=float)
+    # Mean I and long-run deviation sqrt V of the log-likelihood ratio per step, where either law is true.
     channels = [_replace_law(node.channel, (law_a, law_b), law) for law in (law_a, law_b)]
-    of_laws = []
-    for channel, alternative in (channels, channels[::-1]):
-        ratio = _draw_likelihood_ratios(network, name, node, channel, alternative, inputs, count, seed, nodes)
-        deviation = np.sqrt(np.mean([long_run_deviation(r) ** 2 for r in ratio]))
-        of_laws.append((float(ratio.mean()), float(deviation)))
-    (gain_a, deviation_a), (gain_b, deviation_b) = of_laws
-    # n = (z (sqrt V_a + sqrt V_b) / (I_a + I_b))^2
-    gain = gain_a + gain_b
-    needed = (scipy.stats.norm.isf(level) * (deviation_a + deviation_b) / gain) ** 2 if gain > 0 else np.inf
-    return SamplesToTell(float(needed), (gain_a, gain_b), (deviation_a, deviation_b))
+    means, deviations = list[float](), list[float]()
+    for true, other in (channels, channels[::-1]):
+        world = Network(network.plant, {name: Node(node.sensor, true, {"open_loop": open_loop_filter(network.plant)})})
+        z = monte_carlo(world, steps, RUNS, seed, inputs=inputs).measurements[name]
+        log_densities = [_predict_densities(network, node, channel, z, u, nodes) for channel in (true, other)]
+        ratio = np.asarray(log_densities[0] - log_densities[1])  # (runs, steps)
+        means.append(float(ratio.mean()))
+        deviations.append(float(np.sqrt(np.mean([long_run_deviation(run) ** 2 for run in ratio]))))
+    # n = (z (sqrt V_a + sqrt V_b) / (I_a + I_b))^2; no number of steps is enough where the laws look alike.
+    gain = sum(means)
+    needed = (scipy.stats.norm.isf(level) * sum(deviations) / gain) ** 2 if gain > 0 else np.inf
+    return SamplesToTell(float(needed), (means[0], means[1]), (deviations[0], deviations[1]))
 
 
 def _find_only_node(network: Network) -> tuple[str, Node]:
-    """Return the network's only node, which receives its sensor through a channel."""
+    """Return name and node of the network's only node, which receives a sensor through a channel; refuse all others."""
     instance("network", network, Network, "a Network")
     received = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     if len(received) != 1 or len(network.nodes) != 1:
@@ -101,59 +104,51 @@ def _find_only_node(network: Network) -> tuple[str, Node]:
 
 
 def _replace_law(channel: object, pair: tuple[AbstractLaw, AbstractLaw], law: AbstractLaw) -> AbstractRandomAffine:
-    """Return the channel with `law` in place of its gain in question: the one whose law is of the pair, or its only."""
+    """Return the channel with `law` as the law of the gains in question, for which the `pair` is compared.
+
+    They are those whose law is one of the pair; where there is none, all random gains, if they have one law.
+
+    Raises:
+        ValueError: a channel that varies over time, or with no random gain, or with several laws, none of the pair.
+    """
     single = instance("channel", channel, AbstractRandomAffine, "one channel, that does not vary over time")
-    leaves = jax.tree.leaves(single, is_leaf=_is_law_leaf)
-    laws = [leaf for leaf in leaves if _is_law_leaf(leaf) and leaf.constant is None]
-    of_pair = [leaf for leaf in laws if any(are_same(leaf, law) for law in pair)]
-    chosen = of_pair or [leaf for leaf in laws if are_same(leaf, laws[0])]
-    if not of_pair and not 0 < len(chosen) == len(laws):
-        raise fail("network", "gains of one law, or some whose law is one of the two", f"{len(laws)} random gains")
+    leaves = jax.tree.leaves(single, is_leaf=_is_law)
+    random_gains = [leaf for leaf in leaves if _is_law(leaf) and leaf.constant is None]
+    of_pair = [gain for gain in random_gains if any(are_same(gain, law) for law in pair)]
+    like_first = [gain for gain in random_gains if are_same(gain, random_gains[0])]
+    if not of_pair and not 0 < len(like_first) == len(random_gains):
+        expected = "gains of one law, or some whose law is one of the two"
+        raise fail("network", expected, f"{len(random_gains)} random gains")
+    replaced = of_pair or like_first
 
     def replace_if_chosen(leaf: object) -> object:
-        return law if any(leaf is gain for gain in chosen) else leaf
+        return law if any(leaf is gain for gain in replaced) else leaf
 
-    changed: AbstractRandomAffine = jax.tree.map(replace_if_chosen, single, is_leaf=_is_law_leaf)
+    changed: AbstractRandomAffine = jax.tree.map(replace_if_chosen, single, is_leaf=_is_law)
     return changed
 
 
-def _is_law_leaf(leaf: object) -> bool:
-    """Test whether a leaf of a tree is a law of a number."""
+def _is_law(leaf: object) -> bool:
+    """Return whether a leaf of a channel's tree is the law of a gain, rather than a number."""
     return isinstance(leaf, AbstractLaw)
 
 
-def _draw_likelihood_ratios(
-    network: Network,
-    name: str,
-    node: Node,
-    true: AbstractRandomAffine,
-    other: AbstractRandomAffine,
-    inputs: ArrayLike | None,
-    count: int,
-    seed: int,
-    nodes: int,
+def _predict_densities(
+    network: Network, node: Node, channel: AbstractRandomAffine, z: np.ndarray, u: np.ndarray, nodes: int
 ) -> np.ndarray:
-    """Return log p_true - log p_other (runs, steps) of data that a network of this node alone draws by the true law.
+    """Return log p of each measurement given those before it, (runs, steps), if it came through this channel.
 
     Args:
-        network: its plant and inputs.
-        name: name of the node.
+        network: gives the plant.
         node: gives the sensor.
-        true: the channel by which data are drawn.
-        other: the channel with the other law.
-        inputs: of the plant (count, inputs); None for 0.
-        count: number of steps.
-        seed: seed of the simulation.
-        nodes: number of values that stand for each law.
+        channel: with the law of gains that is judged.
+        z: measurements (runs, steps, received).
+        u: inputs of the plant (steps, inputs).
+        nodes: number of values that stand for the law.
     """
-    plain = Node(node.sensor, true, {"open_loop": open_loop_filter(network.plant)})
-    world = Network(network.plant, {name: plain})
-    z = monte_carlo(world, count, RUNS, seed, inputs=inputs).measurements[name]
-    u = np.zeros((count, len(network.inputs))) if inputs is None else np.asarray(inputs, dtype=float)
-    log_densities = []
-    for channel in (true, other):
-        received = channel.condition_on_arrival()
-        filter, parts = signal_filter(network.plant, node.sensor, received), ChannelDensities.of(received, nodes)
-        y, spread, near = (np.asarray(a).reshape(-1, *a.shape[2:]) for a in filter.expect_signals(z, u))
-        log_densities.append(evaluate_predictive((y, spread, near), parts).log_likelihood.reshape(z.shape[:2]))
-    return np.asarray(log_densities[0] - log_densities[1])
+    received = channel.condition_on_arrival()
+    filter, parts = signal_filter(network.plant, node.sensor, received), ChannelDensities.of(received, nodes)
+    # Mean and covariance of the expected signal, and the measurement, with all steps of all runs in one axis.
+    expected = filter.expect_signals(z, u)
+    y, covariance, measured = (np.asarray(array).reshape(-1, *array.shape[2:]) for array in expected)
+    return evaluate_predictive((y, covariance, measured), parts).log_likelihood.reshape(z.shape[:2])

@@ -104,11 +104,19 @@ def fit_sender(
     starts: int,
     seed: int,
 ) -> SenderFit:
-    """Return the maximum of the likelihood of `event_filter`, with its silences, and its profile for each number.
+    """Return the estimates of a sender's free numbers by the likelihood of `event_filter`, which counts silence too.
 
-    In delta the likelihood has steps, where a value that came would have been silent: so it is searched without
-    derivatives (Nelder and Mead), from the start and from others around it. The interval of a number is where twice
-    the log-likelihood, largest over all others, is within 3.84 of its maximum. Ctrl-C returns the best so far.
+    In delta, the threshold of the sender, the likelihood has steps, where a value that came would have been silent: so
+    it is searched without derivatives (Nelder and Mead), from the start and from others around it. The interval of a
+    number is where twice the log-likelihood, largest over all others, is within 3.84 of its maximum. Ctrl-C returns the
+    best so far.
+
+    Args:
+        description: the network with its free numbers.
+        recording: one recording or several, as `hg.fit` takes them.
+        inputs: of the plant (steps, inputs), or a list of one array for each recording; None if there are none.
+        starts: number of starts of the search.
+        seed: seed of those that are drawn.
 
     Raises:
         KeyboardInterrupt: before there was a first point.
@@ -126,52 +134,56 @@ def fit_sender(
     def likelihood(x: Float[np.ndarray, " p"]) -> float:
         """Return the log-likelihood of all recordings at a point of the line; -1e300 where they are impossible."""
         filter = filter_at(description.at_point(x))
-        rows = zip(data.measurements, data.inputs, data.lengths, strict=True)
-        total = sum(float(log_likelihood(filter, z[:n], u[:n])) for z, u, n in rows)
+        recordings = zip(data.measurements, data.inputs, data.lengths, strict=True)
+        total = sum(float(log_likelihood(filter, z[:steps], u[:steps])) for z, u, steps in recordings)
         return total if np.isfinite(total) else -1e300
 
-    # The best of several starts, and the profile of each number.
+    # The maximum: from the start, and from others drawn within one unit of each logarithm or logit.
     random = np.random.default_rng(seed)
     points = [parameters.start, *(parameters.start + random.uniform(-1, 1, (starts - 1, len(parameters.start))))]
-    x, total, converged, stopped = _search_starts(likelihood, points)
-    rows = list[Row]()
+    top = _search_starts(likelihood, points)
+    # An interval for each number, as far as Ctrl-C lets the search come.
+    rows, stopped = list[Row](), top.stopped
     for i in range(len(parameters.entries)):
-        row = _row_without_ends(description, x, i)
+        row = _row_without_ends(description, top.x, i)
         try:
-            rows.append(row if stopped else _make_row(row, description, likelihood, x, total, i))
+            rows.append(row if stopped else _add_interval(row, description, likelihood, top, i))
         except KeyboardInterrupt:
             stopped = True
             rows.append(row)
-    return SenderFit(description, x, total, tuple(rows), converged, stopped)
+    return SenderFit(description, top.x, top.total, tuple(rows), top.converged, stopped)
 
 
-def _search_starts(
-    likelihood: Likelihood, points: Sequence[Float[np.ndarray, " p"]]
-) -> tuple[Float[np.ndarray, " p"], float, bool, bool]:
-    """Return the best point of several starts, its likelihood, whether it converged and whether it was stopped.
+def _search_starts(likelihood: Likelihood, points: Sequence[Float[np.ndarray, " p"]]) -> "_Top":
+    """Return the best end of searches from several starts; after Ctrl-C the best point at which the likelihood was.
+
+    Args:
+        likelihood: the log-likelihood at a point of the line (p,).
+        points: where the searches begin.
 
     Raises:
         KeyboardInterrupt: before there was a first point.
     """
-    best: tuple[Float[np.ndarray, " p"], float] | None = None
+    best: _Top | None = None  # of all evaluations
 
     def evaluate(x: Float[np.ndarray, " p"]) -> float:
-        """Return the likelihood at a point, and keep the best one so far."""
+        """Return the log-likelihood at a point, and keep the best point so far."""
         nonlocal best
         total = likelihood(x)
-        if best is None or total > best[1]:
-            best = x.copy(), total
+        if best is None or total > best.total:
+            best = _Top(x.copy(), total, converged=False, stopped=True)
         return total
 
-    ends = list[tuple[Float[np.ndarray, " p"], float, bool]]()
+    ends = list[_Top]()
     try:
         for point in points:
-            ends.append(_climb_simplex(evaluate, np.asarray(point)))
+            x, total, converged = _climb_simplex(evaluate, np.asarray(point))
+            ends.append(_Top(x, total, converged, stopped=False))
     except KeyboardInterrupt:
         if best is None:
             raise
-        return *best, False, True
-    return *max(ends, key=lambda end: end[1]), False
+        return best
+    return max(ends, key=lambda end: end.total)
 
 
 def filter_at(network: Network) -> AbstractFilter:
@@ -189,35 +201,35 @@ def _climb_simplex(
     size: float = 0.2,
     digits: float = DIGITS,
 ) -> tuple[Float[np.ndarray, " p"], float, bool]:
-    """Return (point, likelihood, whether it converged) of a search by Nelder and Mead from `start`.
+    """Return (point, log-likelihood, whether it converged) of a search by Nelder and Mead from `start`.
 
     Args:
-        likelihood: what is maximised.
+        likelihood: the log-likelihood at a point, which is maximised.
         start: the first corner of the simplex, (p,).
-        enough: the search ends at the first point above it.
-        size: edges of the simplex.
-        digits: size at which the simplex is small enough.
+        enough: log-likelihood above which any point will do: the search ends at the first one.
+        size: edges of the first simplex.
+        digits: edges at which the simplex is small enough; values at its corners then differ by ten times as much.
     """
-    first = likelihood(start)
-    if not len(start) or first > enough:
-        return start, first, True
+    at_start = likelihood(start)
+    if not len(start) or at_start > enough:
+        return start, at_start, True
     simplex = start + size * np.concatenate([np.zeros((1, len(start))), np.eye(len(start))])
     options: Any = {"initial_simplex": simplex, "xatol": digits, "fatol": 10 * digits, "maxfev": 200 * len(start)}
     climb: Any = minimize  # its types do not know an initial simplex
 
-    def stop(intermediate_result: Any) -> None:
+    def stop_above_enough(intermediate_result: Any) -> None:
         if -intermediate_result.fun > enough:
             raise StopIteration
 
     def negative_likelihood(x: Float[np.ndarray, " p"]) -> float:
-        return -first if np.array_equal(x, start) else -likelihood(x)  # at the start it is known already
+        return -at_start if np.array_equal(x, start) else -likelihood(x)  # at the start it is known already
 
-    optimum = climb(negative_likelihood, start, method="Nelder-Mead", options=options, callback=stop)
+    optimum = climb(negative_likelihood, start, method="Nelder-Mead", options=options, callback=stop_above_enough)
     return np.asarray(optimum.x), -float(optimum.fun), bool(optimum.success)
 
 
 def _row_without_ends(description: Description, x: Float[np.ndarray, " p"], index: int) -> Row:
-    """Return the row of the estimate of a number, without an interval."""
+    """Return the table's row of free number `index` at the maximum x (p,), without an interval and standard error."""
     return Row(
         name=description.parameters.entries[index].name,
         estimate=float(description.parameters.entries_at(x)[index]),
@@ -230,58 +242,36 @@ def _row_without_ends(description: Description, x: Float[np.ndarray, " p"], inde
     )
 
 
-def _make_row(
-    row: Row, description: Description, likelihood: Likelihood, x: Float[np.ndarray, " p"], total: float, index: int
-) -> Row:
-    """Return the row of an estimate, with how far its profile stays near its maximum to either side.
+def _add_interval(row: Row, description: Description, likelihood: Likelihood, top: "_Top", index: int) -> Row:
+    """Return the row of an estimate with its interval, and a standard error that fits the interval's width.
 
     Args:
         row: the row without an interval.
         description: the network with its free numbers.
         likelihood: log-likelihood at a point of the line.
-        x: the maximum (p,).
-        total: log-likelihood there.
+        top: the maximum.
         index: number of the entry of the table.
     """
     entry = description.parameters.entries[index]
     coordinate = index if entry.coordinate is None else entry.coordinate
-    least = total - allowed_fall(LEVEL)
-
-    def is_inside(value: float, start: "_ProfilePoint") -> tuple[bool, "_ProfilePoint"]:
-        """Return whether the profile at a value is within the fall, searched from a point of it nearby; and its point.
-
-        The simplex is as large as the two values are apart.
-        """
-        size = float(np.clip(abs(value - start.value), 10 * NEAR, 0.2))
-        others, top, _ = _climb_simplex(
-            lambda others: likelihood(np.insert(others, coordinate, value)), start.others, least, size, NEAR
-        )
-        return top > least, _ProfilePoint(value, others)
-
-    def entry_at(value: float) -> float:
-        """Return the entry of the table where its coordinate has a value."""
-        point = x.copy()
-        point[coordinate] = value
-        return float(description.parameters.entries_at(point)[index])
-
-    # Doubled steps until the profile is below, then bisection.
+    profile = _Profile(likelihood, coordinate, top.total - allowed_fall(LEVEL))
     ends = []
-    for sign in (-1.0, 1.0):
-        inside, outside, last = 0.0, 0.05, _ProfilePoint(x[coordinate], np.delete(x, coordinate))
-        while outside < FURTHEST:
-            within, last = is_inside(x[coordinate] + sign * outside, last)
-            if not within:
-                break
-            inside, outside = outside, 2 * outside
-        for _ in range(HALVINGS):
-            middle = (inside + outside) / 2
-            within, last = is_inside(x[coordinate] + sign * middle, last)
-            inside, outside = (middle, outside) if within else (inside, middle)
-            if outside - inside < NEAR:
-                break
-        ends.append(entry_at(x[coordinate] + sign * outside))
+    for side in (-1.0, 1.0):
+        # The entry of the table where its coordinate is at the end.
+        point = top.x.copy()
+        point[coordinate] += side * profile.find_reach(top.x, side)
+        ends.append(float(description.parameters.entries_at(point)[index]))
     low, high = sorted(ends)
     return row._replace(low=low, high=high, standard_error=(high - low) / (2 * 1.96))
+
+
+class _Top(NamedTuple):
+    """Best point of a search: x on the line (p,), its log-likelihood, and how the search ended."""
+
+    x: Float[np.ndarray, " p"]
+    total: float
+    converged: bool
+    stopped: bool
 
 
 class _ProfilePoint(NamedTuple):
@@ -289,3 +279,49 @@ class _ProfilePoint(NamedTuple):
 
     value: float
     others: Float[np.ndarray, " others"]
+
+
+class _Profile(NamedTuple):
+    """Profile of a coordinate: the log-likelihood, largest over all other coordinates, by its value.
+
+    level: log-likelihood down to which a value belongs to the interval of the coordinate.
+    """
+
+    likelihood: Likelihood
+    coordinate: int
+    level: float
+
+    def find_reach(self, top: Float[np.ndarray, " p"], side: float) -> float:
+        """Return how far from the maximum `top` the profile falls to the level, to one side (-1.0 or 1.0).
+
+        Twice as far each time until the profile is below it, then by bisection.
+        """
+        inside, outside = 0.0, 0.05
+        nearby = _ProfilePoint(top[self.coordinate], np.delete(top, self.coordinate))
+        while outside < FURTHEST:
+            is_above, nearby = self.is_above_level(top[self.coordinate] + side * outside, nearby)
+            if not is_above:
+                break
+            inside, outside = outside, 2 * outside
+        for _ in range(HALVINGS):
+            middle = (inside + outside) / 2
+            is_above, nearby = self.is_above_level(top[self.coordinate] + side * middle, nearby)
+            inside, outside = (middle, outside) if is_above else (inside, middle)
+            if outside - inside < NEAR:
+                break
+        return outside
+
+    def is_above_level(self, value: float, nearby: _ProfilePoint) -> tuple[bool, _ProfilePoint]:
+        """Return whether the profile at a value is above the level, and its point there, searched from one nearby.
+
+        The first simplex is as large as the two values are apart.
+        """
+        size = float(np.clip(abs(value - nearby.value), 10 * NEAR, 0.2))
+        others, highest, _ = _climb_simplex(
+            lambda others: self.likelihood(np.insert(others, self.coordinate, value)),
+            nearby.others,
+            enough=self.level,
+            size=size,
+            digits=NEAR,
+        )
+        return highest > self.level, _ProfilePoint(value, others)

@@ -46,7 +46,12 @@ class InformationRank(NamedTuple):
 
 
 def rank_of_information(information: Float[np.ndarray, "p p"]) -> InformationRank:
-    """Return the rank of I_ij / sqrt(I_ii I_jj); a coordinate of which nothing is known is a direction by itself."""
+    """Return the flat and the other directions of information I (p, p), in units 1 / sqrt(I_ii) of each coordinate.
+
+    A direction is flat where the eigenvalue of I_ij / sqrt(I_ii I_jj) is below NOTHING; a coordinate of which nothing
+    is
+    known is one by itself.
+    """
     diagonal = np.diag(information)
     known = diagonal > 0
     unit = np.where(known, 1 / np.sqrt(np.where(known, diagonal, 1.0)), 1.0)
@@ -61,27 +66,28 @@ def find_confounded(
 ) -> list[Confounded]:
     """Return the groups of coordinates that the data do not separate at any of the points, with what they identify.
 
-    Only points with the fewest flat directions count. The flat directions of coordinates become those of the numbers
+    Only points with the fewest flat directions count. The flat directions of coordinates x become those of the numbers
     v themselves, and of log |v|: sums of v, or products, are identified where they do not change along these.
+
+    Args:
+        parameters: the free numbers.
+        points: points of the line (p,).
+        ranks: the rank of the information at each of them.
     """
-    count = min(rank.flat.shape[1] for rank in ranks)
-    if not count:
+    fewest = min(rank.flat.shape[1] for rank in ranks)
+    if not fewest:
         return []
-    used = [(x, rank) for x, rank in zip(points, ranks, strict=True) if rank.flat.shape[1] == count]
-    scales = [_differentiate_coordinates(parameters, x) for x, _ in used]
-    logs = [
-        _orthonormalise(log[:, None] * rank.unit[:, None] * rank.flat)
-        for (_, rank), (_, log) in zip(used, scales, strict=True)
-    ]
-    plain = [
-        _orthonormalise(slopes[:, None] * rank.unit[:, None] * rank.flat)
-        for (_, rank), (slopes, _) in zip(used, scales, strict=True)
-    ]
-    return [_make_confounded(group, logs, plain) for group in _group_connected(logs)]
+    of_logs, of_numbers = [], []  # flat directions at each point, in columns
+    for x, rank in zip(points, ranks, strict=True):
+        if rank.flat.shape[1] == fewest:
+            slopes, log_slopes = _differentiate_coordinates(parameters, x)
+            of_logs.append(_orthonormalise(log_slopes[:, None] * rank.unit[:, None] * rank.flat))
+            of_numbers.append(_orthonormalise(slopes[:, None] * rank.unit[:, None] * rank.flat))
+    return [_make_confounded(group, of_logs, of_numbers) for group in _group_connected(of_logs)]
 
 
 def _differentiate_coordinates(parameters: Parameters, x: Float[np.ndarray, " p"]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the derivatives dv/dx and d log|v|/dx of each coordinate that is a number itself; 1 for the others."""
+    """Return dv/dx and d log|v|/dx (p,) of each coordinate that is a number v of the table, at x (p,); 1 of others."""
     slopes, log = np.ones(len(x)), np.ones(len(x))
     for entry, row, value in zip(parameters.entries, parameters.jacobian(x), parameters.entries_at(x), strict=True):
         if entry.coordinate is not None:
@@ -97,65 +103,76 @@ def _orthonormalise(vectors: np.ndarray) -> np.ndarray:
 
 
 def _group_connected(bases: list[np.ndarray]) -> list[tuple[int, ...]]:
-    """Return the groups of coordinates that a flat direction at any point connects; `bases`: of each point, columns."""
+    """Return the groups of coordinates that a flat direction at any point connects.
+
+    `bases`: orthonormal flat directions at each point, in columns.
+    """
     joined = np.max([np.abs(b @ b.T) for b in bases], axis=0) > SAME
     count, labels = connected_components(joined, directed=False)
     groups = [tuple(np.flatnonzero(labels == i).tolist()) for i in range(count)]
     return [group for group in groups if joined[group, group].any()]
 
 
-def _make_confounded(group: tuple[int, ...], logs: list[np.ndarray], plain: list[np.ndarray]) -> Confounded:
+def _make_confounded(group: tuple[int, ...], of_logs: list[np.ndarray], of_numbers: list[np.ndarray]) -> Confounded:
     """Return a group, with what the data do identify: products of whole powers if those fit all points, else sums.
 
     Args:
         group: the coordinates.
-        logs: flat directions of the logarithms of numbers at each point, in columns.
-        plain: flat directions of the numbers at each point, in columns.
+        of_logs: flat directions of the logarithms of numbers at each point, in columns.
+        of_numbers: flat directions of the numbers at each point, in columns.
     """
     places = list(group)
-    unknown = int(max(np.linalg.matrix_rank(b[places], tol=SAME) for b in logs))
+    unknown = int(max(np.linalg.matrix_rank(basis[places], tol=SAME) for basis in of_logs))
     no_rows = np.zeros((0, len(group)))
-    powers = _find_known_rows([b[places] for b in logs])
+    powers = _find_known_rows([basis[places] for basis in of_logs])
     if len(powers):
         # In each row the least exponent becomes 1.
         powers = powers / np.min(np.abs(np.where(powers == 0, np.inf, powers)), axis=1, keepdims=True)
-        if np.all(np.abs(powers - np.round(powers)) < WHOLE) and np.max(np.abs(powers)) <= LARGEST + WHOLE:
+        are_whole = np.all(np.abs(powers - np.round(powers)) < WHOLE)
+        if are_whole and np.max(np.abs(powers)) <= LARGEST + WHOLE:
             return Confounded(group, exponents=np.round(powers), weights=no_rows, fix=unknown)
-    return Confounded(group, no_rows, weights=_find_known_rows([b[places] for b in plain]), fix=unknown)
+    sums = _find_known_rows([basis[places] for basis in of_numbers])
+    return Confounded(group, exponents=no_rows, weights=sums, fix=unknown)
 
 
 def _find_known_rows(bases: list[np.ndarray]) -> np.ndarray:
-    """Return the combinations, in rows, that no flat direction of any point changes, in row echelon form."""
+    """Return the combinations, in rows, that no flat direction of any point changes, in reduced row echelon form.
+
+    `bases`: flat directions at each point, in columns; the combinations are orthogonal to all of these.
+    """
     _, size, right = np.linalg.svd(np.concatenate(bases, axis=1).T)
     rank = int(np.count_nonzero(size > SAME))
     return _reduce_to_echelon(right[rank:])
 
 
 def _reduce_to_echelon(rows: np.ndarray) -> np.ndarray:
-    """Return the row echelon form, leading entries 1."""
-    reduced, lead, pivot = rows.copy(), 0, 0
+    """Return the reduced row echelon form of a matrix of independent rows, by Gauss-Jordan elimination.
+
+    The leading entry of each row is 1, and the only one of its column; entries below SAME become 0.
+    """
+    reduced, column = rows.copy(), 0
     for row in range(len(reduced)):
-        # Pivot: the largest entry of the next column that has one.
-        while lead < reduced.shape[1]:
-            pivot = row + int(np.argmax(np.abs(reduced[row:, lead])))
-            if abs(reduced[pivot, lead]) > SAME:
+        # The pivot is the largest entry from this row on, in the next column that has one above zero.
+        while column < reduced.shape[1]:
+            pivot = row + int(np.argmax(np.abs(reduced[row:, column])))
+            if abs(reduced[pivot, column]) > SAME:
                 break
-            lead += 1
-        if lead == reduced.shape[1]:
+            column += 1
+        else:
             break
-        # Swap, scale, eliminate.
+        # Bring it to this row, make it 1, and eliminate its column from all other rows.
         reduced[[row, pivot]] = reduced[[pivot, row]]
-        reduced[row] /= reduced[row, lead]
+        reduced[row] /= reduced[row, column]
         for other in range(len(reduced)):
             if other != row:
-                reduced[other] -= reduced[other, lead] * reduced[row]
-        lead += 1
+                reduced[other] -= reduced[other, column] * reduced[row]
+        column += 1
     reduced[np.abs(reduced) < SAME] = 0.0
     return reduced
 
 
 def product_text(names: list[str], exponents: Float[np.ndarray, " places"]) -> str:
-    """Return the text of a product: a * b^2 / c."""
+    """Return the text of a product of powers, such as "a * b^2 / c"."""
     above = [_format_power(n, e) for n, e in zip(names, exponents, strict=True) if e > 0]
     below = [_format_power(n, -e) for n, e in zip(names, exponents, strict=True) if e < 0]
     top = " * ".join(above) or "1"
@@ -163,7 +180,7 @@ def product_text(names: list[str], exponents: Float[np.ndarray, " places"]) -> s
 
 
 def format_sum(names: list[str], weights: Float[np.ndarray, " places"]) -> str:
-    """Return the text of a sum: a + 0.64 b."""
+    """Return the text of a weighted sum, such as "a + 0.64 b"."""
     text = ""
     for name, weight in zip(names, weights, strict=True):
         if weight:
@@ -177,5 +194,5 @@ def format_sum(names: list[str], weights: Float[np.ndarray, " places"]) -> str:
 
 
 def _format_power(name: str, exponent: float) -> str:
-    """Return a factor of a product as text: a, a^2, a^0.5."""
+    """Return the text of a power, such as "a", "a^2", "a^0.5"."""
     return name if exponent == 1 else f"{name}^{exponent:g}"

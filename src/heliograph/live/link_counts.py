@@ -111,32 +111,46 @@ class LinkCounts:
         self._follow_sequence(None, sequence, time, period)
 
     def _follow_sequence(self, verdict: Verdict | None, sequence: int, time: float, period: int) -> None:
-        """Update `first`, `newest`, `at` and `lost` by a message's running count; None: it has no verdict."""
+        """Update `first`, `newest`, `at` and `lost` from the running count that one message carries.
+
+        Args:
+            verdict: what became of the message; None where only its count and time could be read.
+            sequence: the running count as sent.
+            time: when the message was measured.
+            period: after how many messages the sender counts from 0 again; 0 if it never does.
+        """
         sequence = self._unwrap_count(sequence, time, period)
         if verdict == "used":
             self.latest = time if self.used == 1 else max(self.latest, time)
-            if sequence - 1 == self.newest >= 0 and time >= self.at:  # the next, as most are
+            # The number after the newest, as of nearly all messages: nothing was lost.
+            if sequence - 1 == self.newest >= 0 and time >= self.at:
                 self.newest, self.at = sequence, time
                 return
+        # A second copy of a message says nothing that the first did not.
         if verdict in ("duplicate", "conflict"):
             return
-        if verdict in ("future", "implausible", None):  # its time may be wrong: it says nothing of the order
+        # A time that may be wrong says nothing of the order: take that of the newest, so that it means no restart.
+        if verdict in ("future", "implausible", None):
             time = self.at
-        # First message, or the node was restarted: count from here.
+        # The first message; or a smaller number at a later time, since the sender was restarted: count from here.
         if self.newest < 0 or (sequence < self.newest and time > self.at):
             self.first, self.newest, self.at = sequence, sequence, time
-        # A gap above the newest count: its messages are lost, until they arrive.
+        # Above the newest: the numbers between are lost until they arrive. A larger number at an earlier time is from
+        # before a restart, and left out, unless it is the very next one: then the clock was set back.
         elif sequence > self.newest:
-            if time >= self.at or sequence - 1 == self.newest:  # the next in any case, if its clock was set back
+            if time >= self.at or sequence - 1 == self.newest:
                 self.lost += sequence - self.newest - 1
                 self.newest, self.at = sequence, max(time, self.at)
+        # Below the newest only a used message fills a gap: any other may have been counted when it first arrived.
         elif verdict != "used":
-            return  # it may have been counted when it first came
+            return
+        # Before the first: the numbers between these two are lost until they arrive.
         elif sequence < self.first:
             self.lost += self.first - sequence - 1
             self.first = sequence
+        # Between the first and the newest: it was not lost, others had overtaken it.
         elif sequence < self.newest:
-            self.lost -= self.lost > 0  # it had only been overtaken
+            self.lost = max(self.lost - 1, 0)
 
     def _unwrap_count(self, sequence: int, time: float, period: int) -> int:
         """Return a count that goes on where the node's own begins at 0 again after `period` messages.

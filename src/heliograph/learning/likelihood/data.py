@@ -13,7 +13,7 @@ from heliograph.numerics.times.data_rows import check_rows
 from heliograph.numerics.types import Float
 from heliograph.simulation.network import Network
 
-FEWEST = 10  # numbers that arrived for each free one
+FEWEST = 10  # least count of numbers that arrived for each free number
 
 
 class LikelihoodData(NamedTuple):
@@ -30,7 +30,15 @@ class LikelihoodData(NamedTuple):
 
 
 def gather_data(network: Network, recording: object, inputs: Any, free: int, truth: Any = False) -> LikelihoodData:
-    """Gather all recordings, checked against the network, as `LikelihoodData`; with true states if they are needed.
+    """Return all runs of all recordings, checked against the network and filled up to one length.
+
+    Args:
+        network: whose nodes received the measurements.
+        recording: one recording, or a list of several; what `hg.fit` takes.
+        inputs: of the plant (steps, inputs), or a list of one array for each recording; None for those of the
+            recordings themselves.
+        free: how many numbers are to be learned, for which there must be data enough.
+        truth: the true states (steps, n), or a list of them; True for those in the recordings; False where not needed.
 
     Raises:
         ValueError: recordings of other shapes, too short, or without any change.
@@ -40,28 +48,30 @@ def gather_data(network: Network, recording: object, inputs: Any, free: int, tru
         several = recording
     if not len(several):
         raise fail("recordings", "at least one", "none")
-    # Every run of every recording, then all filled up to the longest.
-    parts = [
+    # Measurements z (steps, received) and inputs u (steps, inputs) of every run of every recording.
+    runs = [
         run
         for i, single in enumerate(several)
         for run in _split_runs(network, single, _pick_inputs(inputs, i, several))
     ]
-    for z, _ in parts:
+    for z, _ in runs:
         network.check_horizon(len(z))
-    longest = max(len(z) for z, _ in parts)
-    true = [] if truth is False else _split_truth(network, several, truth, [len(z) for z, _ in parts])
+    lengths = [len(z) for z, _ in runs]
+    true_states = [] if truth is False else _split_truth(network, several, truth, lengths)
+    # All filled up to the longest: nothing arrives in the rows that are added, the last inputs go on.
+    longest = max(lengths)
     data = LikelihoodData(
-        measurements=np.stack([_pad_rows(z, longest, np.nan) for z, _ in parts]),
-        inputs=np.stack([_pad_rows(u, longest, None) for _, u in parts]),
-        lengths=tuple(len(z) for z, _ in parts),
-        truth=np.stack([_pad_rows(x, longest, np.nan) for x in true]) if true else None,
+        measurements=np.stack([_pad_rows(z, longest, np.nan) for z, _ in runs]),
+        inputs=np.stack([_pad_rows(u, longest, None) for _, u in runs]),
+        lengths=tuple(lengths),
+        truth=np.stack([_pad_rows(x, longest, np.nan) for x in true_states]) if true_states else None,
     )
     _check_enough_data(data, free)
     return data
 
 
 def _pick_inputs(inputs: object, index: int, several: Sequence[object]) -> object:
-    """Return the inputs of one recording of several: those in its place in a list, or the common ones."""
+    """Return the inputs of recording number `index` of several: its own where `inputs` is a list, else those of all."""
     if not isinstance(inputs, list | tuple):
         return inputs
     if len(inputs) != len(several):
@@ -94,73 +104,94 @@ def _split_truth(network: Network, several: Sequence[object], truth: Any, steps:
 
 
 def _split_runs(network: Network, recording: Any, inputs: Any) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return the measurements (steps, received) and inputs (steps, inputs) of each run of a recording.
+    """Return measurements (steps, received) and inputs (steps, inputs) of each run of a recording, checked.
 
-    The same inputs led to every run; those of the recording count unless others are given.
+    Columns of the nodes stand side by side in the network's order. The same inputs led to every run.
+
+    Args:
+        network: whose nodes received the measurements.
+        recording: measurements by node, or of the only node; or an object with `measurements`, `inputs`, `time`.
+        inputs: (steps, inputs); None for those of the recording, if it has any.
     """
     held = getattr(recording, "measurements", recording)
     given_inputs = getattr(recording, "inputs", None) if inputs is None else inputs
-    # Measurements by node.
+    by_node = _name_nodes(network, recording, held)
+    # The times of the rows are those that the recording holds, or the dates in the index of its tables.
+    clock = getattr(recording, "time", None)
+    if isinstance(clock, np.ndarray):
+        warn_of_unequal_steps(network.inputs, clock)
+    else:
+        tables = {f"measurements of {name!r}": z for name, z in by_node.items()} | {"inputs": given_inputs}
+        judge_dates(network.inputs, tables)
+    for name, z in by_node.items():
+        check_columns(f"measurements of {name!r}", z, network.nodes[name].received_names)
+    runs = _list_runs([np.asarray(fill_masked(by_node[name])) for name in network.names])
+    return [_join_nodes(network, run, given_inputs) for run in runs]
+
+
+def _name_nodes(network: Network, recording: Any, held: Any) -> Mapping[str, Any]:
+    """Return the measurements `held` by a recording as {node: measurements}; a plain array is the only node's.
+
+    Raises:
+        ValueError: an array where there are several nodes, or other nodes than the network's.
+    """
     if not isinstance(held, Mapping):
         if len(network.names) > 1:
             raise fail("recording", f"measurements by node, of {list(network.names)}", show_value(recording))
         held = {network.names[0]: held}
     if set(held) != set(network.names):
         raise fail("recording", f"measurements of the nodes {list(network.names)}", list(held))
-    # Times of its rows: those that it holds, or the dates in the index of its tables.
-    clock = getattr(recording, "time", None)
-    if isinstance(clock, np.ndarray):
-        warn_of_unequal_steps(network.inputs, clock)
-    else:
-        tables = {f"measurements of {name!r}": z for name, z in held.items()} | {"inputs": given_inputs}
-        judge_dates(network.inputs, tables)
-    # Each run: the nodes' columns side by side, and the inputs.
-    for name, z in held.items():
-        check_columns(f"measurements of {name!r}", z, network.nodes[name].received_names)
-    runs = _list_runs([np.asarray(fill_masked(held[name])) for name in network.names])
-    results = []
-    for run in runs:
-        columns: list[np.ndarray] = []
-        for name, z in zip(network.names, run, strict=True):
-            length = len(columns[0]) if columns else None  # that of the first node
-            measured = check_rows(f"measurements of {name!r}", z, length, network.nodes[name].received, missing=True)
-            columns.append(np.asarray(measured))
-        steps, count = len(columns[0]), len(network.inputs)
-        if given_inputs is None and count:
-            raise fail("inputs", f"an array ({steps}, {count}) of {list(network.inputs)}", "none")
-        u = np.zeros((steps, 0))
-        if given_inputs is not None:
-            u = np.array(check_rows("inputs", given_inputs, steps, count, False, network.inputs))
-        check_inputs(network.inputs, u, (network.plant, network.nodes, network.fused))
-        results.append((np.concatenate(columns, axis=1), u))
-    return results
+    return held
+
+
+def _join_nodes(network: Network, run: list[np.ndarray], inputs: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return the nodes' measurements in one run side by side (steps, received), and its inputs (steps, inputs).
+
+    `run`: an array (steps, received by it) for each node, in the network's order; `inputs`: None if there are none.
+    """
+    columns: list[np.ndarray] = []
+    for name, z in zip(network.names, run, strict=True):
+        length = len(columns[0]) if columns else None  # that of the first node
+        measured = check_rows(f"measurements of {name!r}", z, length, network.nodes[name].received, missing=True)
+        columns.append(np.asarray(measured))
+    steps, count = len(columns[0]), len(network.inputs)
+    if inputs is None and count:
+        raise fail("inputs", f"an array ({steps}, {count}) of {list(network.inputs)}", "none")
+    u = np.zeros((steps, 0))
+    if inputs is not None:
+        u = np.array(check_rows("inputs", inputs, steps, count, False, network.inputs))
+    check_inputs(network.inputs, u, (network.plant, network.nodes, network.fused))
+    return np.concatenate(columns, axis=1), u
 
 
 def _list_runs(values: list[np.ndarray]) -> list[list[np.ndarray]]:
-    """Return the arrays of all nodes by run: (runs, steps, received) are cut into runs, a recording is one run."""
+    """Return the arrays of all nodes by run: arrays (runs, steps, received) are cut into runs, others are one run."""
     if all(value.ndim == 3 for value in values):
         return [list(run) for run in zip(*values, strict=True)]
     return [values]
 
 
 def _pad_rows(values: np.ndarray, length: int, filler: float | None) -> np.ndarray:
-    """Return the array with rows added up to a length: of a filler, or copies of the last one."""
-    more = length - len(values)
+    """Return the array (rows, columns) with rows added up to a length: of `filler`, or if None copies of the last."""
+    missing = length - len(values)
     end = values[-1:] if filler is None else np.full((1, values.shape[1]), filler)
-    return np.concatenate([values, np.repeat(end, more, axis=0)]) if more else values
+    return np.concatenate([values, np.repeat(end, missing, axis=0)]) if missing else values
 
 
 def _check_enough_data(data: LikelihoodData, free: int) -> None:
-    """Raise ValueError if recordings have fewer than FEWEST numbers for each free one, or nothing in them varies."""
-    z = data.measurements if data.truth is None else data.truth
-    count = int(np.count_nonzero(~np.isnan(z)))
+    """Raise ValueError if the data have fewer than FEWEST numbers for each of `free` ones, or nothing in them varies.
+
+    What counts are the true states where these are learned from, else the measurements that arrived.
+    """
+    counted = data.measurements if data.truth is None else data.truth
+    count = int(np.count_nonzero(~np.isnan(counted)))
     if count < FEWEST * free:
         known = "that arrived" if data.truth is None else "of the truth"
         raise fail("recording", f"at least {FEWEST * free} numbers {known} for {free} free ones", count)
-    z = data.measurements
-    flat = z.reshape(-1, z.shape[-1])
-    received = [column[~np.isnan(column)] for column in flat.T]
-    constant = [i for i, column in enumerate(received) if len(column) and np.ptp(column) == 0]
-    if constant and len(constant) == sum(len(column) > 0 for column in received):
-        value = array("m", received[constant[0]], (None,))[0]
+    # By component what arrived of it in all recordings, of those of which something did.
+    components = data.measurements.reshape(-1, data.measurements.shape[-1]).T
+    arrived = [values[~np.isnan(values)] for values in components]
+    arrived = [values for values in arrived if len(values)]
+    if arrived and all(np.ptp(values) == 0 for values in arrived):
+        value = array("m", arrived[0], (None,))[0]
         raise fail("recording", "measurements that vary", f"{value:g} throughout")

@@ -51,96 +51,137 @@ class Evaluation(NamedTuple):
 def evaluate_at_points(
     objective: Objective, x: Float[np.ndarray, "points p"], data: LikelihoodData, by_row: bool = False
 ) -> Evaluation:
-    """Return likelihood, scores and information at points: all side by side in native code, or one by one by XLA.
+    """Return log-likelihoods, scores and information of all recordings at each of several points.
 
-    Long recordings are taken one by one, in chunks side by side, where the filter forgets how it began.
+    Where a long recording can be divided, it is taken in chunks side by side, point by point. All other points are
+    taken side by side in native code, or one by one by XLA.
 
     Args:
-        objective: the likelihood.
-        x: the points.
+        objective: makes the filter from the free numbers.
+        x: the points (points, p), coordinates on the line.
         data: the recordings.
         by_row: whether densities and scores of each row are needed; else there may be sums over all rows.
     """
     with jax.enable_x64(True):
-        chunked = [_evaluate_in_chunks(objective, point, data, by_row) for point in x]
-        rest = [i for i, one in enumerate(chunked) if one is None]
-        if len(rest) == len(x):
+        # By chunks; None at points where that cannot be done.
+        evaluations = [_evaluate_in_chunks(objective, point, data, by_row) for point in x]
+        remaining = [i for i, evaluation in enumerate(evaluations) if evaluation is None]
+        if len(remaining) == len(x):
             return _evaluate_side_by_side(objective, x, data)
-        if rest:
-            whole = _evaluate_side_by_side(objective, x[rest], data)
+        # The remaining points row by row, summed as the others are.
+        if remaining:
+            whole = _evaluate_side_by_side(objective, x[remaining], data)
             whole = whole if by_row else _sum_rows(whole)
-            for n, i in enumerate(rest):
-                chunked[i] = Evaluation(*(leaf[n : n + 1] for leaf in whole))
-    return Evaluation(*(np.concatenate(leaves) for leaves in zip(*(one for one in chunked if one), strict=True)))
+            for n, i in enumerate(remaining):
+                evaluations[i] = Evaluation(*(leaf[n : n + 1] for leaf in whole))
+    by_field = zip(*(evaluation for evaluation in evaluations if evaluation), strict=True)
+    return Evaluation(*(np.concatenate(leaves) for leaves in by_field))
 
 
 def _evaluate_in_chunks(objective: Objective, x: np.ndarray, data: LikelihoodData, by_row: bool) -> Evaluation | None:
-    """Evaluate one point by chunks of each recording; None where these are short, or cannot be divided."""
+    """Return the evaluation at one point x (p,), each recording in chunks side by side; None where that cannot be done.
+
+    It cannot where recordings are short, true states are learned from, or the filter's gains are random.
+    """
     kalman = _kalman_of(objective) if data.truth is None else None
     if kalman is None:
         return None
-    rows, parts = kalman.score_rows(objective.filter, x, np.asarray(data.measurements.shape[1] // 2)), []
+    recursion = kalman.score_rows(objective.filter, x, np.asarray(data.measurements.shape[1] // 2))
+    by_recording = []
     for z, u in zip(data.measurements, data.inputs, strict=True):
-        kept = rows.scan_long(z, u) if by_row else rows.sum_long(z, u)
-        if kept is None:
+        evaluated = recursion.scan_long(z, u) if by_row else recursion.sum_long(z, u)
+        if evaluated is None:
             return None
-        parts.append(kept)
-    density, score, halves = (np.stack(leaves) for leaves in zip(*parts, strict=True))
+        by_recording.append(evaluated)
+    density, score, halves = (np.stack(leaves) for leaves in zip(*by_recording, strict=True))
+    # A leading axis for the one point; sums over all rows count as one row.
     whole = Evaluation(density[None], score[None], halves.sum(axis=0)[None])
     return whole if by_row else whole._replace(density=density[None, :, None], score=score[None, :, None])
 
 
 def _sum_rows(rows: Evaluation) -> Evaluation:
-    """Return the same by sums over all rows."""
+    """Return the evaluation with densities and scores summed over all rows, which then count as one row."""
     density, score = (leaf.sum(axis=2, keepdims=True) for leaf in (rows.density, rows.score))
     return Evaluation(density, score, rows.halves)
 
 
 def _evaluate_side_by_side(objective: Objective, x: np.ndarray, data: LikelihoodData) -> Evaluation:
-    """Evaluate all points and recordings row by row, side by side."""
+    """Return the evaluation of all recordings, row by row, at all points x (points, p): each pair side by side."""
     data_rows = [rows for rows in (data.measurements, data.inputs, data.truth) if rows is not None]
+    # Each point with each recording: points in the outer loop, recordings in the inner one.
     count, copies = len(data.measurements), (len(x), 1, 1)
-    runs = np.repeat(x, count, axis=0), *(np.tile(data_row, copies) for data_row in data_rows)
-    choice = choose_code(evaluate_recording, (objective, *runs), [False, *(True for _ in runs)])
+    pairs = np.repeat(x, count, axis=0), *(np.tile(rows, copies) for rows in data_rows)
+    choice = choose_code(evaluate_recording, (objective, *pairs), [False, *(True for _ in pairs)])
     if choice.code is not None:
         results = choice.results()
     else:
-        parts = [to_numpy(_by_xla(objective, *run)) for run in zip(*runs, strict=True)]
+        parts = [to_numpy(_by_xla(objective, *pair)) for pair in zip(*pairs, strict=True)]
         results = jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
     density, score, halves = (leaf.reshape(len(x), count, *leaf.shape[1:]) for leaf in results)
     return Evaluation(density, score, halves.sum(axis=1))
 
 
 def evaluate_recording(objective: Objective, x: Array, z: Array, u: Array, truth: Array | None = None) -> Evaluation:
-    """Evaluate one recording: density (steps,), score (steps, p) and information (2, p, p); derivatives run forward.
+    """Return each row's log-likelihood and score in one recording, and the information of its two halves.
 
-    With the true states e is the error of the estimates and S what they claim.
+    Row k has the log density log N(e_k; 0, S_k), with the filter's innovation e_k and its covariance S_k; with `truth`
+    the error of the filter's estimate and the covariance that the filter claims. The score is its derivative in the p
+    free numbers, the information that of Gauss and Newton. Information is summed over each half of the rows apart,
+    because what is known of the initial state adds to the first half alone: the second shows what data identify.
+
+    Args:
+        objective: makes the filter from the free numbers.
+        x: the free numbers as coordinates on the line (p,).
+        z: measurements (steps, received), NaN where nothing arrived.
+        u: inputs of the plant (steps, inputs).
+        truth: true states (steps, n), NaN where unknown; None for the likelihood of the measurements.
+
+    Returns:
+        `Evaluation` of shapes: density (steps,), score (steps, p), halves (2, p, p).
     """
     half = jnp.asarray(len(z) // 2)
+    # A linear filter with known gains has a recursion of its own for these derivatives.
     kalman = _kalman_of(objective) if truth is None else None
     if kalman is not None:
         return Evaluation(*kalman.score_rows(objective.filter, x, half).scan(z, u))
+    e, s, de, ds = _differentiate_errors(objective, x, z, u, truth)
 
-    def along(x: Array) -> tuple[jax.Array, jax.Array]:
-        return objective.innovations(x, z, u) if truth is None else objective.errors(x, z, u, truth)
-
-    (e, s), (de, ds) = jax.vmap(lambda axis: jax.jvp(along, (x,), (axis,)), out_axes=(None, 1))(jnp.eye(len(x)))
-
-    def judge(halves: jax.Array, row: tuple[jax.Array, ...]) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-        k, e, s, de, ds, z = row
-        size = jnp.abs(z[: len(e)]) + jnp.abs(z[: len(e)] - e)
+    def add_row(halves: jax.Array, row: tuple[jax.Array, ...]) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+        """Return the halves' information with that of a row added, and the row's log density and score."""
+        k, e, s, de, ds, compared = row
+        # e is the difference of `compared` and its prediction; z may end in the modes of a channel, not predicted.
+        compared = compared[: len(e)]
+        size = jnp.abs(compared) + jnp.abs(compared - e)
         density, score, information = differentiate_log_density(e, s, (de, ds), size, ~jnp.isnan(e))
-        within = jnp.stack([k < half, k >= half])
-        return halves + jnp.where(within[:, None, None], information, 0.0), (density, score)
+        is_in_half = jnp.stack([k < half, k >= half])
+        return halves + jnp.where(is_in_half[:, None, None], information, 0.0), (density, score)
 
     rows = jnp.arange(len(z)), e, s, de, ds, jnp.asarray(z if truth is None else truth)
-    halves, (density, score) = jax.lax.scan(judge, jnp.zeros((2, len(x), len(x))), rows)
+    halves, (density, score) = jax.lax.scan(add_row, jnp.zeros((2, len(x), len(x))), rows)
     return Evaluation(density, score, halves)
+
+
+def _differentiate_errors(
+    objective: Objective, x: Array, z: Array, u: Array, truth: Array | None
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """Return e (steps, m), its covariance S (steps, m, m), and their derivatives in the p numbers x.
+
+    e: innovations, or with `truth` errors of the estimates. de (steps, p, m), dS (steps, p, m, m), by forward mode.
+    """
+
+    def errors_at(x: Array) -> tuple[jax.Array, jax.Array]:
+        return objective.innovations(x, z, u) if truth is None else objective.errors(x, z, u, truth)
+
+    def differentiate_along(axis: jax.Array) -> tuple[tuple[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
+        return jax.jvp(errors_at, (x,), (axis,))
+
+    (e, s), (de, ds) = jax.vmap(differentiate_along, out_axes=(None, 1))(jnp.eye(len(x)))
+    return e, s, de, ds
 
 
 @lru_cache
 def _kalman_of(objective: Objective) -> Any:
-    """Return the filter at the start where it is a linear one behind a known gain; None of others."""
+    """Return the filter at the objective's start if it is linear with known gains (it has `score_rows`); else None."""
     start = filter_of(objective.description.start, objective.form)
     return start if start.has_known_gain else None
 

@@ -18,7 +18,7 @@ DIFFERENCE = 1e-3  # standard errors over which scores are differenced
 CUTS = 40  # of a profile at most
 EXACT = 1e-3  # of the root of a fall
 ENOUGH = 1e-6  # nats that may remain to be gained on a profile
-HALVINGS = 8  # of the way to a possible point
+HALVINGS = 8  # of the way to a point at which the likelihood is finite
 FIRST = 1 << 14  # rows of a long recording that say where climbs from drawn starts begin
 LONG = 1 << 17  # rows
 TINY = 1e-300
@@ -34,7 +34,10 @@ class Curvature(NamedTuple):
 
 @dataclass(frozen=True)
 class LikelihoodSurface:
-    """The likelihood of all recordings as a function of the free numbers; the last evaluation is cached for reuse."""
+    """The log-likelihood l of all recordings as a function of the free numbers; the last evaluation is cached.
+
+    A point is a vector x (p,) of the free numbers as coordinates on the line, where each is unbounded.
+    """
 
     objective: Objective
     data: LikelihoodData
@@ -60,7 +63,7 @@ class LikelihoodSurface:
         )
 
     def evaluations(self, x: Float[np.ndarray, "points p"]) -> Evaluation:
-        """Return value, score and information at each point; those of the last points are kept."""
+        """Return l, scores and information at each point (points, p); the result for the last points is kept."""
         if not (self._last and np.array_equal(self._last[0][0], x)):
             self._last[:] = [(np.array(x), evaluate_at_points(self.objective, np.asarray(x), self.data))]
         return self._last[0][1]
@@ -73,38 +76,44 @@ class LikelihoodSurface:
         return evaluate_at_points(self.objective, np.asarray(x), self.data, by_row=True)
 
     def evaluate(self, x: Float[np.ndarray, "points p"]) -> Evaluated:
-        """Return the likelihood, gradient and information at points."""
+        """Return l (points,), its gradient (points, p) and its Gauss-Newton information (points, p, p) at points."""
         evaluation = self.evaluations(x)
         return evaluation.total, evaluation.gradient, evaluation.information
 
     def hessian(self, x: Float[np.ndarray, " p"], active: Bool[np.ndarray, " p"]) -> Float[np.ndarray, "p p"]:
-        """Return the Hessian of -l, by central differences of scores; the information for coordinates not active."""
+        """Return the Hessian of -l at x (p, p), by central differences of gradients.
+
+        Rows and columns of coordinates that are not `active` (p,), or of which the data know nothing, are those of the
+        information.
+        """
         information: np.ndarray = self.evaluations(x[None]).information[0]
+        # Each coordinate is moved by DIFFERENCE standard errors to either side.
         diagonal = np.diag(information)
         width = np.where(diagonal > 0, DIFFERENCE / np.sqrt(np.where(diagonal > 0, diagonal, 1.0)), 0.0)
         moving = np.flatnonzero(active & (diagonal > 0))
-        shifts = np.zeros((len(moving), len(x)))
-        shifts[np.arange(len(moving)), moving] = width[moving]
         if not len(moving):
             return information
+        shifts = np.zeros((len(moving), len(x)))
+        shifts[np.arange(len(moving)), moving] = width[moving]
         gradient = self.evaluations(np.concatenate([x + shifts, x - shifts])).gradient
-        hessian: np.ndarray = information.copy()
         forward, backward = gradient[: len(moving)], gradient[len(moving) :]
         block = (-(forward - backward) / (2 * width[moving][:, None]))[:, moving]
+        # Made symmetric, as rounding leaves it almost.
+        hessian: np.ndarray = information.copy()
         hessian[np.ix_(moving, moving)] = (block + block.T) / 2
         return hessian
 
     def information_by_row(self, x: Float[np.ndarray, " p"], places: np.ndarray) -> list[Float[np.ndarray, "steps k"]]:
-        """Return for each recording the information of each row on some coordinates, -ds_k/dx_k, (steps, k).
+        """Return for each recording each row's observed information on k coordinates, -d(score_k)/dx_k, (steps, k).
 
-        By central differences; `places`: the coordinates.
+        By central differences at the point x (p,); `places`: indices of the coordinates.
         """
         deviation = self.standard_errors(x)[places]
         width = DIFFERENCE * np.where(np.isfinite(deviation), deviation, 0.0)
         shifts = np.zeros((len(places), len(x)))
         shifts[np.arange(len(places)), places] = width
         score = self.evaluate_rows(np.concatenate([x + shifts, x - shifts])).score
-        # Of the point moved along coordinate k the scores in k, (recordings, steps, k).
+        # From the points moved along coordinate k only the scores in k are taken: (recordings, steps, k).
         forward, backward = (
             np.stack([scores[..., k] for scores, k in zip(half, places, strict=True)], axis=-1)
             for half in (score[: len(places)], score[len(places) :])
@@ -113,24 +122,30 @@ class LikelihoodSurface:
         return [rows[:steps] for rows, steps in zip(information, self.data.lengths, strict=True)]
 
     def standard_errors(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
-        """Return the standard error of each number at a point, were the others known; infinite if nothing tells it."""
+        """Return each coordinate's standard error at x if the others were known, (p,); infinite if nothing tells it."""
         information: np.ndarray = np.diag(self.evaluations(x[None]).information[0])
         return np.where(information > 0, 1 / np.sqrt(np.where(information > 0, information, 1.0)), np.inf)
 
     def possible(
         self, points: Float[np.ndarray, "points p"], near: Float[np.ndarray, " p"]
     ) -> Float[np.ndarray, "points p"]:
-        """Return the points; those where the likelihood is not finite halfway to `near`, where it is, and so on."""
+        """Return the points with finite l, and others moved towards `near` (p,), where it is finite, until it is.
+
+        Each turn moves them halfway; after HALVINGS turns they are returned where they are.
+        """
         points = points.copy()
         for _ in range(HALVINGS):
-            wrong = ~np.isfinite(self.evaluations(points).total)
-            if not wrong.any():
+            is_impossible = ~np.isfinite(self.evaluations(points).total)
+            if not is_impossible.any():
                 break
-            points[wrong] = (points[wrong] + near) / 2
+            points[is_impossible] = (points[is_impossible] + near) / 2
         return points
 
     def curvature(self, x: Float[np.ndarray, " p"], active: Bool[np.ndarray, " p"]) -> Curvature:
-        """Return the curvature of -l along the directions that are identified, in standard errors, at a point (p,)."""
+        """Return the least curvature of -l at x, its direction, and what a step by the Hessian would gain.
+
+        Among `active` coordinates (p,), along directions that the data identify, in units of standard errors.
+        """
         evaluation, places = self.evaluations(x[None]), np.flatnonzero(active)
         information = evaluation.information[0][np.ix_(places, places)]
         gradient = evaluation.gradient[0][places]
@@ -140,15 +155,17 @@ class LikelihoodSurface:
         basis = unit[:, None] * directions[:, eigenvalues > FLAT]
         if not basis.size:
             return Curvature(least=np.inf, direction=np.zeros(len(x)), gain=0.0)
+        # The Hessian along these; where it is not finite nothing is known of the gain.
         observed = basis.T @ self.hessian(x, active)[np.ix_(places, places)] @ basis
         if not np.isfinite(observed).all():
             return Curvature(least=np.inf, direction=np.zeros(len(x)), gain=np.inf)
-        values, vectors = np.linalg.eigh(observed)
+        curvatures, vectors = np.linalg.eigh(observed)
         direction = np.zeros(len(x))
         direction[places] = basis @ vectors[:, 0]
+        # g' |H|^-1 g / 2, in the Hessian's eigenvectors.
         slopes = vectors.T @ basis.T @ gradient
-        gain = float(np.sum(slopes**2 / np.maximum(np.abs(values), FLAT)) / 2)
-        return Curvature(float(values[0]), direction, gain)
+        gain = float(np.sum(slopes**2 / np.maximum(np.abs(curvatures), FLAT)) / 2)
+        return Curvature(float(curvatures[0]), direction, gain)
 
     def crossings(
         self,
@@ -160,50 +177,71 @@ class LikelihoodSurface:
         drop: float,
         active: Bool[np.ndarray, " p"],
     ) -> Float[np.ndarray, " lanes"]:
-        """Return where the log-likelihood, with its other active coordinates at their best, is `drop` below `top`.
+        """Return the values of a coordinate at which the profile of the log-likelihood l has fallen by `drop`.
 
-        Newton's method for h = sqrt(2 (top - l)), which is linear where l is quadratic, between what is known to be
-        inside and outside; dl/dx of the profile is the score of the coordinate alone.
+        The profile at a value is l with all other active coordinates at their best. Its fall is f = sqrt(2 (top - l)),
+        linear in the distance t from the maximum where l is quadratic: so t is found by Newton's method for
+        f(t) = sqrt(2 drop), kept between a distance known to be inside and one known to be outside.
 
         Args:
             x: the maximum (p,).
-            top: the log-likelihood there.
-            coordinate: the one that is cut.
-            first: signed distances at which to begin, to either side.
-            furthest: distance at which a likelihood that has not fallen is taken never to: the end is infinite.
-            drop: fall at the ends.
+            top: l there.
+            coordinate: index of the coordinate whose profile is followed.
+            first: signed distances at which to begin, one for each end that is sought (lanes,).
+            furthest: distance at which a profile that has not fallen is taken never to: the end is infinite.
+            drop: fall of l at the ends, in nats.
             active: coordinates that are inside their domains (p,).
+
+        Returns:
+            The ends, one for each of `first` (lanes,).
         """
-        others = active & (np.arange(len(x)) != coordinate)
-        moving, points = np.repeat(others[None], len(first), axis=0), np.repeat(x[None], len(first), axis=0)
-        side, target, at = np.sign(first), np.sqrt(2 * drop), np.abs(first)
+        moving = np.repeat((active & (np.arange(len(x)) != coordinate))[None], len(first), axis=0)
+        points = np.repeat(x[None], len(first), axis=0)  # where climbs of the other coordinates begin
+        side, target, distance = np.sign(first), np.sqrt(2 * drop), np.abs(first)
         inside, outside = np.zeros(len(first)), np.full(len(first), np.inf)
-        # Distances `inside` where the likelihood has not fallen so far, and `outside` where it has fallen further.
         for _ in range(CUTS):
-            points[:, coordinate] = x[coordinate] + side * at
+            # The profile at these distances: l with the other coordinates at their best.
+            points[:, coordinate] = x[coordinate] + side * distance
             climbed = maximise(self.evaluate, points, moving, None, self.domains, ENOUGH)
-            # dh/dt = -side dl/dx / h for the distance t, so that Newton's t+ is t + (target - h) h / (-side dl/dx).
-            with np.errstate(all="ignore"):
-                fallen = np.sqrt(2 * np.maximum(top - np.nan_to_num(climbed.total, nan=-np.inf), 0.0))
-                newton = at + (target - fallen) * fallen / (-side * climbed.gradient[:, coordinate])
-            is_there = np.abs(fallen - target) < EXACT * target
-            beyond = fallen > target
-            inside, outside = np.where(beyond, inside, at), np.where(beyond, at, outside)
-            points = np.where(beyond[:, None], points, climbed.x)
-            never_falls = ~beyond & (at >= furthest)
+            with np.errstate(over="ignore"):  # of an infinite fall
+                fall = np.sqrt(2 * np.maximum(top - np.nan_to_num(climbed.total, nan=-np.inf), 0.0))
+            # Narrow the bracket: `inside` has not fallen to the target, `outside` has fallen further.
+            is_beyond = fall > target
+            inside, outside = np.where(is_beyond, inside, distance), np.where(is_beyond, distance, outside)
+            points = np.where(is_beyond[:, None], points, climbed.x)
+            # Done where the fall is the target, the bracket is closed, or the profile has not fallen at `furthest`.
+            is_there = np.abs(fall - target) < EXACT * target
+            never_falls = ~is_beyond & (distance >= furthest)
             done = is_there | never_falls | (outside - inside < EXACT * EXACT * outside)
             if done.all():
-                return np.asarray(x[coordinate] + side * np.where(never_falls & ~is_there, np.inf, at))
-            # Within the bracket; where nothing is outside yet, at most three times as far.
-            most = np.minimum(np.where(np.isfinite(outside), outside, 3 * at), furthest)
-            within = np.isfinite(newton) & (newton > inside) & (newton < most)
-            middle = np.where(np.isfinite(outside), (inside + most) / 2, most)
-            at = np.where(done, at, np.where(within, newton, middle))
-        return np.asarray(x[coordinate] + side * at)  # the last points, after CUTS rounds
+                return np.asarray(x[coordinate] + side * np.where(never_falls & ~is_there, np.inf, distance))
+            # Newton's next distance: df/dt = -side dl/dx / f, and dl/dx of the profile is that of l.
+            with np.errstate(all="ignore"):
+                newton = distance + (target - fall) * fall / (-side * climbed.gradient[:, coordinate])
+            distance = np.where(done, distance, _choose_distance(newton, distance, inside, outside, furthest))
+        return np.asarray(x[coordinate] + side * distance)  # the last points, after CUTS rounds
+
+
+def _choose_distance(
+    newton: np.ndarray, distance: np.ndarray, inside: np.ndarray, outside: np.ndarray, furthest: float
+) -> np.ndarray:
+    """Return the distances to look at next (lanes,): Newton's where it lies inside the bracket, else its middle.
+
+    Where no `outside` is known yet (infinite), the bracket ends at three times the last `distance`, which is taken in
+    place of a middle; nothing is further than `furthest`.
+    """
+    is_closed = np.isfinite(outside)
+    most = np.minimum(np.where(is_closed, outside, 3 * distance), furthest)
+    is_within = np.isfinite(newton) & (newton > inside) & (newton < most)
+    return np.where(is_within, newton, np.where(is_closed, (inside + most) / 2, most))
 
 
 def _find_ends_at_infinity(parameter: Parameter) -> tuple[Bool[np.ndarray, " size"], Bool[np.ndarray, " size"]]:
-    """Return which coordinates of a number have an end of its domain at minus infinity, and which at infinity."""
+    """Return which coordinates of a free number reach an end of its domain at minus infinity, and which at infinity.
+
+    Logits, as of probabilities, have both ends, logarithms the first; a covariance has those of its diagonal's
+    logarithms.
+    """
     domain, none = parameter.domain, np.zeros(parameter.size, dtype=bool)
     if domain.kind == "simplex":
         return ~none, ~none

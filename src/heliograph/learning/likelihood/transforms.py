@@ -11,7 +11,7 @@ from heliograph.numerics.types import Array, Float, PyTree
 
 
 def map_to_line(name: str, domain: Domain, value: Float[np.ndarray, "..."]) -> Float[np.ndarray, " size"]:
-    """Return the start of a free number as unbounded coordinates.
+    """Return the start `value` of the free number `name` as unbounded coordinates (size,).
 
     Intervals: v, log(v - low) or logit. Simplexes: log p_i / p_last. Covariances: the entries of Cholesky's factor row
     by row, those on the diagonal by their logarithms.
@@ -34,34 +34,40 @@ def map_to_line(name: str, domain: Domain, value: Float[np.ndarray, "..."]) -> F
 
 
 def map_from_line(domain: Domain, shape: tuple[int, ...], x: Array) -> Array:
-    """Return the number that has the coordinates x, as `map_to_line` makes them; JAX can trace it.
+    """Return the number, of this shape, whose coordinates on the line are x (size,), as `map_to_line` makes them.
 
-    Of an interval plain coordinates give a plain number.
+    JAX can trace it; plain coordinates of an interval give a plain number.
     """
-    # p_i = exp(x_i) / sum exp(x_j), of which the last has x = 0.
     if domain.kind == "simplex":
-        rows = jnp.reshape(x, (*shape[:-1], shape[-1] - 1))
-        weights = jnp.concatenate([rows, jnp.zeros((*shape[:-1], 1))], axis=-1)
-        weights = jnp.exp(weights - jnp.max(weights, axis=-1, keepdims=True))
-        return weights / jnp.sum(weights, axis=-1, keepdims=True)
+        return _map_to_simplex(shape, x)
+    # A covariance L L', with the entries of L row by row, those on its diagonal by their logarithms.
     if domain.kind == "covariance":
         factor = jnp.zeros(shape).at[np.tril_indices(shape[0])].set(x)
         factor = jnp.where(np.eye(shape[0], dtype=bool), jnp.exp(jnp.diag(jnp.diag(factor))), factor)
         return factor @ factor.T
-    # Intervals.
+    # An interval: by the logistic function between two ends, an exponential from one, as it is without ends.
     xp = library(x)
-    value: Array = xp.reshape(x, shape)
-    if np.isfinite(domain.low) and np.isfinite(domain.high):
-        return domain.low + (domain.high - domain.low) * (expit if xp is np else jax.nn.sigmoid)(value)
+    coordinates: Array = xp.reshape(x, shape)
+    has_low, has_high = np.isfinite(domain.low), np.isfinite(domain.high)
+    if has_low and has_high:
+        return domain.low + (domain.high - domain.low) * (expit if xp is np else jax.nn.sigmoid)(coordinates)
+    if not (has_low or has_high):
+        return coordinates
     with np.errstate(over="ignore"):
-        power: Array = xp.exp(value)
-    if np.isfinite(domain.low):
-        return domain.low + power
-    return domain.high - power if np.isfinite(domain.high) else value
+        distance: Array = xp.exp(coordinates)
+    return domain.low + distance if has_low else domain.high - distance
+
+
+def _map_to_simplex(shape: tuple[int, ...], x: Array) -> Array:
+    """Return probabilities p_i = exp(x_i) / sum_j exp(x_j) over the last axis, of which the last has x = 0."""
+    rows = jnp.reshape(x, (*shape[:-1], shape[-1] - 1))
+    logs = jnp.concatenate([rows, jnp.zeros((*shape[:-1], 1))], axis=-1)
+    weights = jnp.exp(logs - jnp.max(logs, axis=-1, keepdims=True))  # the largest is 1, so that none overflows
+    return weights / jnp.sum(weights, axis=-1, keepdims=True)
 
 
 def link(domain: Domain, value: PyTree) -> PyTree:
-    """Return a number of an interval on the line: its logit, logarithm, or itself; intervals are symmetric there."""
+    """Return a number of an interval on the line: as logit, logarithm or itself, by the ends that the interval has."""
     if np.isfinite(domain.low) and np.isfinite(domain.high):
         return np.log((value - domain.low) / (domain.high - value))
     if np.isfinite(domain.low):
@@ -70,7 +76,7 @@ def link(domain: Domain, value: PyTree) -> PyTree:
 
 
 def unlink(domain: Domain, value: PyTree) -> PyTree:
-    """Return the number that `link` puts at a value of the line; infinite values give the ends of the interval."""
+    """Return the number of the interval that `link` maps to this value; of infinite values an end of the interval."""
     with np.errstate(over="ignore"):
         if np.isfinite(domain.low) and np.isfinite(domain.high):
             return domain.low + (domain.high - domain.low) / (1 + np.exp(-value))
@@ -80,7 +86,7 @@ def unlink(domain: Domain, value: PyTree) -> PyTree:
 
 
 def unlink_slope(domain: Domain, value: PyTree) -> PyTree:
-    """Return the derivative d unlink / d value."""
+    """Return the derivative of `unlink` at a value of the line."""
     if np.isfinite(domain.low) and np.isfinite(domain.high):
         return (domain.high - domain.low) / (2 * np.cosh(value / 2)) ** 2
     if np.isfinite(domain.low):
@@ -89,7 +95,7 @@ def unlink_slope(domain: Domain, value: PyTree) -> PyTree:
 
 
 def slope(domain: Domain, value: PyTree) -> PyTree:
-    """Return the derivative d link / d value."""
+    """Return the derivative of `link` at a number of the interval."""
     if np.isfinite(domain.low) and np.isfinite(domain.high):
         return (domain.high - domain.low) / ((value - domain.low) * (domain.high - value))
     if np.isfinite(domain.low):
@@ -98,7 +104,7 @@ def slope(domain: Domain, value: PyTree) -> PyTree:
 
 
 def size(domain: Domain, shape: tuple[int, ...]) -> int:
-    """Return how many coordinates a number of a shape has."""
+    """Return how many coordinates on the line a number of this domain and shape has."""
     count = int(np.prod(shape))
     if domain.kind == "simplex":
         return count - count // shape[-1]
@@ -106,7 +112,7 @@ def size(domain: Domain, shape: tuple[int, ...]) -> int:
 
 
 def _factorise_start(name: str, value: np.ndarray) -> np.ndarray:
-    """Return L of a start L L'; raise if it is not positive definite."""
+    """Return Cholesky's factor L of the start L L' of the free number `name`; raise if it is not positive definite."""
     try:
         return np.linalg.cholesky(value)
     except np.linalg.LinAlgError:

@@ -58,7 +58,10 @@ class OpenEnds(NamedTuple):
 
 
 class Maximum(NamedTuple):
-    """Ends of the searches: point, likelihood, whether it converged, what a full step would still gain, and the steps.
+    """Ends of the searches, one a lane.
+
+    x: the points. total: log-likelihood there; gradient: its derivatives. remaining: what a full step would still gain.
+    steps: number of steps that were taken.
 
     Shapes: x, gradient (lanes, p), total, converged, remaining (lanes,).
     """
@@ -77,10 +80,12 @@ class Maximum(NamedTuple):
 
 
 class _State(NamedTuple):
-    """Lanes of a search: B is the model of the Hessian of -l, radius that of the trust region.
+    """Lanes (searches side by side) between two steps.
 
-    remaining: g' I^-1 g / 2. done: lanes that go no further. joined: the lane that one of them has joined, itself if
-    none.
+    x: points (lanes, p). total: log-likelihood l there (lanes,), gradient (lanes, p), information I (lanes, p, p).
+    model: B, a model of minus the Hessian of l (lanes, p, p). radius: of the trust region (lanes,). remaining: what a
+    full step would gain, g' I^-1 g / 2. done: lanes that go no further. joined: the lane that each one has joined,
+    itself if none.
     """
 
     x: np.ndarray
@@ -95,7 +100,7 @@ class _State(NamedTuple):
     joined: np.ndarray
 
     def ends(self, steps: int) -> Maximum:
-        """Return where lanes are, those that have joined another where that one is."""
+        """Return where the lanes are after so many steps; one that has joined another is where that one is."""
         lane = self.joined
         for _ in range(len(lane)):  # a lane may join one that joins a third
             lane = lane[lane]
@@ -112,23 +117,24 @@ def maximise(
     close: float = CLOSE,
     joining: bool = False,
 ) -> Maximum:
-    """Search from each start: the step maximises g' p - p' B p / 2 over |D p| <= radius, in units of standard errors.
+    """Return where climbs of the log-likelihood l end, one climb (a lane) from each start, all side by side.
 
-    B is the Gauss-Newton information I, or I corrected by what steps taught of its error (SR1),
-    whichever foretold the last gain better. A step is taken where the likelihood rises by a share of what was
-    foretold; else the radius falls. So the likelihood never falls, and the units of the numbers do not matter.
+    Each step p of a lane maximises the model g' p - p' B p / 2 of the gain over |D p| <= radius: g is the gradient of
+    l, and D scales p to standard errors. B is the Gauss-Newton information I, or I corrected by what steps taught of
+    its error (SR1), whichever foretold the last gain better. A step is taken where l rises by a share of what was
+    foretold; else the radius falls. So l never falls, and the units of the numbers do not matter.
 
-    A lane has converged when g' I^-1 g, of the step without bounds, is nothing: less than rounding sees. Coordinates
-    whose domain ends where the likelihood still rises, by no more than AT_LIMIT in all, do not count.
+    A lane has converged when g' I^-1 g, twice the gain of the step without bounds, is nothing: less than rounding sees.
+    Coordinates whose domain ends where l still rises, by no more than AT_LIMIT in all, do not count.
 
     Args:
-        evaluate: likelihood, gradient and information at points.
+        evaluate: l (lanes,), its gradient (lanes, p) and information (lanes, p, p) at points (lanes, p).
         start: points at which to begin (lanes, p).
         active: coordinates that move, the others stay (lanes, p); all unless given.
         watch: called with the best so far before each step.
-        domains: what the coordinates are; plain real numbers unless given.
+        domains: coordinates whose domains end at infinity; plain real numbers unless given.
         close: g' I^-1 g at which a lane has arrived.
-        joining: whether a lane that has come so near another that both have one top before them is left to it.
+        joining: whether a lane ends where another, higher one climbs to the same top.
     Source: Moré and Sorensen (1983) for the step; Dennis, Gay and Welsch (1981) for the choice of the model; Conn,
     Gould and Toint, Trust-Region Methods (2000).
     """
@@ -148,7 +154,11 @@ def maximise(
 
 
 def _init_lanes(evaluate: Evaluate, start: np.ndarray, moving: np.ndarray, domains: OpenEnds, close: float) -> _State:
-    """Return the state before the first step; lanes whose likelihood or slope is no number at the start are done."""
+    """Return the state of all lanes before the first step, at the points `start` (lanes, p).
+
+    A lane is done from the beginning where the log-likelihood, or a derivative in a coordinate that moves (`moving`,
+    (lanes, p)), is not finite there. For `domains` and `close` see `maximise`.
+    """
     total, gradient, information = evaluate(start)
     state = _State(
         x=start.copy(),
@@ -166,26 +176,40 @@ def _init_lanes(evaluate: Evaluate, start: np.ndarray, moving: np.ndarray, domai
 
 
 def _is_finite(total: np.ndarray, gradient: np.ndarray, information: np.ndarray, moving: np.ndarray) -> np.ndarray:
-    """Return for each lane whether likelihood, and gradient and information of what moves, are finite, (lanes,)."""
+    """Return for each lane (lanes,) whether log-likelihood, gradient and information are finite, by what moves alone.
+
+    `total` (lanes,), `gradient` and `moving` (lanes, p), `information` (lanes, p, p).
+    """
     pairs = moving[:, :, None] & moving[:, None, :]
     derivatives = np.all(np.isfinite(gradient) | ~moving, axis=1)
     return np.asarray(np.isfinite(total) & derivatives & np.all(np.isfinite(information) | ~pairs, axis=(1, 2)))
 
 
 def _mark_arrived(state: _State, moving: np.ndarray, domains: OpenEnds, close: float) -> _State:
-    """Return the state with lanes done that have arrived, or are stuck since rounding hides what is left to gain."""
+    """Return the state with those lanes done that have arrived, or whose radius has become as small as rounding.
+
+    Twice what is left to gain, g' I^-1 g, is less than `close` in a lane that has arrived. Where the radius is so
+    small rounding hides the gain, and NEAR is close enough to count as converged.
+    """
     counting = moving & ~find_at_limits(state.x, state.gradient, domains)
     remaining = np.where(state.done, state.remaining, expected_gain(state.gradient, state.information, counting) / 2)
-    stuck = state.radius < SMALLEST_RADIUS
-    arrived = ~state.done & (2 * remaining < np.where(stuck, NEAR, close))
-    return state._replace(remaining=remaining, done=state.done | stuck | arrived, converged=state.converged | arrived)
+    is_stuck = state.radius < SMALLEST_RADIUS
+    has_arrived = ~state.done & (2 * remaining < np.where(is_stuck, NEAR, close))
+    return state._replace(
+        remaining=remaining, done=state.done | is_stuck | has_arrived, converged=state.converged | has_arrived
+    )
 
 
 def find_at_limits(x: np.ndarray, gradient: np.ndarray, domains: OpenEnds) -> Bool[np.ndarray, "lanes p"]:
-    """Return the coordinates at an end of their domain: on the way there the log-likelihood gains less than AT_LIMIT.
+    """Return which coordinates are at an end of their domain, (lanes, p): on the way there l gains less than AT_LIMIT.
 
-    A number v = exp(x) has its end v = 0 at x = -inf (`low`), or v = inf at x = inf (`high`). To first order what is
-    left to gain is l(0) - l(v) = -v l'(v) = -dl/dx.
+    A number v = exp(x) has its end v = 0 at x = -inf (`low`); where `high` too, as of a logit, its other end is at
+    x = inf. To first order what the log-likelihood l has left to gain is l(0) - l(v) = -v l'(v) = -dl/dx.
+
+    Args:
+        x: points (lanes, p).
+        gradient: of l there (lanes, p).
+        domains: coordinates whose domains end at infinity.
     """
     outward = np.where(domains.high & (x > 0), 1.0, np.where(domains.low, -1.0, 0.0))
     rise = outward * gradient
@@ -193,116 +217,180 @@ def find_at_limits(x: np.ndarray, gradient: np.ndarray, domains: OpenEnds) -> Bo
 
 
 def _step_lanes(evaluate: Evaluate, state: _State, moving: np.ndarray, domains: OpenEnds, close: float) -> _State:
-    """Take one trust-region step in every lane: propose, evaluate, accept or not, then adapt radius and model."""
+    """Return the state after one step in each lane that is not done: propose, evaluate, accept or reject, adapt.
+
+    Args:
+        evaluate: log-likelihood (lanes,), gradient (lanes, p) and information (lanes, p, p) at points (lanes, p).
+        state: the lanes before the step.
+        moving: coordinates that move (lanes, p).
+        domains: coordinates whose domains end at infinity.
+        close: g' I^-1 g at which a lane has arrived.
+    """
     going = ~state.done
+    # The best step by the quadratic model; coordinates that are at an end of their domain stay.
     counting = moving & ~find_at_limits(state.x, state.gradient, domains)
     step, length, foretold = trust_region_step(
         state.gradient, state.information, state.model, state.radius, counting, domains.free
     )
     tried = np.where(going[:, None], state.x + step, state.x)
     total, gradient, information = _evaluate_lanes(evaluate, tried, going, state)
-    # Taken where the likelihood rises by a share of the foretold gain; where rounding hides that, if the gradient falls
-    # or the step crosses a plateau.
-    gain = total - state.total
-    sound = going & _is_finite(total, gradient, information, moving)
-    far = length > 0.9 * state.radius
-    hidden = foretold < NOISE * np.abs(state.total)
-    fell = expected_gain(gradient, information, counting) < expected_gain(state.gradient, state.information, counting)
-    taken = sound & np.where(hidden, (fell | far) & (gain >= -NOISE * np.abs(total)), gain > TAKEN * foretold)
-    # The radius by how well the gain was foretold.
-    well = taken & ((gain > 0.75 * foretold) | hidden)
-    badly = going & ~(sound & ((gain > 0.25 * foretold) | (hidden & taken)))
-    wider = np.where(well & far, WIDER * state.radius, state.radius)
-    radius = np.where(badly, NARROWER * np.minimum(length, state.radius), wider)
-    model = _update_hessian(state, domains, step, gradient, information, gain, sound, taken)
+    # Accept it or not, and adapt the radius, by how well the gain was foretold.
+    is_finite = going & _is_finite(total, gradient, information, moving)
+    gradient_fell = expected_gain(gradient, information, counting) < expected_gain(
+        state.gradient, state.information, counting
+    )
+    accepted, radius = _judge_step(state, total, length, foretold, is_finite, gradient_fell)
+    model = _update_model(state, step, total - state.total, gradient, information, is_finite, accepted, domains.free)
     after = state._replace(
-        x=np.where(taken[:, None], tried, state.x),
-        total=np.where(taken, total, state.total),
-        gradient=np.where(taken[:, None], gradient, state.gradient),
-        information=np.where(taken[:, None, None], information, state.information),
+        x=np.where(accepted[:, None], tried, state.x),
+        total=np.where(accepted, total, state.total),
+        gradient=np.where(accepted[:, None], gradient, state.gradient),
+        information=np.where(accepted[:, None, None], information, state.information),
         model=model,
         radius=radius,
     )
     return _mark_arrived(after, moving, domains, close)
 
 
+def _judge_step(
+    state: _State,
+    total: np.ndarray,
+    length: np.ndarray,
+    foretold: np.ndarray,
+    is_finite: np.ndarray,
+    gradient_fell: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return which lanes accept their step, and the radius for the next one, (lanes,) each.
+
+    A step is accepted where the log-likelihood l rises by a share of the gain that the model foretold. Where that gain
+    is below the rounding of l, the gradient decides: the step is accepted if it fell, or if the step went to the edge
+    of the region, as across a plateau, and l did not fall by more than rounding.
+
+    Args:
+        state: the lanes before the step.
+        total: l at the end of the step.
+        length: of the step in the units of the radius.
+        foretold: gain of l by the model.
+        is_finite: whether l and its derivatives are finite at the end of the step; false of lanes that are done.
+        gradient_fell: whether g' I^-1 g is less there than before.
+    """
+    gain = total - state.total
+    at_edge = length > 0.9 * state.radius
+    is_hidden = foretold < NOISE * np.abs(state.total)
+    accepted_if_hidden = (gradient_fell | at_edge) & (gain >= -NOISE * np.abs(total))
+    accepted = is_finite & np.where(is_hidden, accepted_if_hidden, gain > TAKEN * foretold)
+    # Wider after a step to the edge that gained three quarters of what was foretold; narrower below one quarter.
+    foretold_well = accepted & ((gain > 0.75 * foretold) | is_hidden)
+    foretold_badly = ~state.done & ~(is_finite & ((gain > 0.25 * foretold) | (is_hidden & accepted)))
+    widened = np.where(foretold_well & at_edge, WIDER * state.radius, state.radius)
+    return accepted, np.where(foretold_badly, NARROWER * np.minimum(length, state.radius), widened)
+
+
 def _join_lanes(state: _State, moving: np.ndarray, domains: OpenEnds) -> _State:
-    """End each lane a that climbs to the same top as a lane b that is higher: it would learn nothing that b does not.
+    """Return the state in which each lane a is ended that climbs to the same top as a higher lane b: b is enough.
 
     By the information I of either, both are within JOINED standard errors of a top and of each other, and neighbours in
-    every logarithm and logit. On the way d from a to b the likelihood rises as the slopes at both ends say,
+    every logarithm and logit. On the way d from a to b the log-likelihood rises as the gradients g at both ends say,
     (g_a + g_b)' d / 2, exact of a quadratic, and bends down, (g_a - g_b)' d, by BENT of d' I d at least: between them
-    is no saddle.
+    is no saddle. `moving`: coordinates that move (lanes, p).
     """
     lanes, g = np.arange(len(state.x)), np.nan_to_num(state.gradient)
-    d = state.x[None, :] - state.x[:, None]  # (a, b, p)
-    both = np.einsum("abi,cij,abj->cab", d, np.nan_to_num(state.information), d)
-    apart = np.maximum(both[lanes, lanes, :], both[lanes, :, lanes].T)  # d' I d by the information of a, and of b
+    d = state.x[None, :] - state.x[:, None]  # [a, b]: from lane a to lane b, (a, b, p)
+    # d' I d: the greater of those by the information of a and of b; `squared` is [c, a, b], by that of lane c.
+    squared = np.einsum("abi,cij,abj->cab", d, np.nan_to_num(state.information), d)
+    distance = np.maximum(squared[lanes, lanes, :], squared[lanes, :, lanes].T)
+    # Gain and bend on the way from a to b, [a, b].
     gain = state.total[None] - state.total[:, None]
     foretold = np.einsum("abi,abi->ab", d, g[:, None] + g[None]) / 2
     bend = np.einsum("abi,abi->ab", d, g[:, None] - g[None])
-    # Both are before a top, and before the same one.
-    before = (2 * state.remaining < JOINED**2) & (state.joined == lanes)
-    beside = np.all(domains.free | (np.abs(d) < NEIGHBOURS), axis=2) & np.all(moving[:, None] == moving[None], axis=2)
-    smooth = (np.abs(gain - foretold) <= ALIKE * gain + NOISE * np.abs(state.total)) & (bend >= BENT * apart)
-    same = before[:, None] & before[None] & beside & (apart < JOINED**2) & smooth
+    # Both lanes are close to a top, and it is the same one.
+    near_top = (2 * state.remaining < JOINED**2) & (state.joined == lanes)
+    neighbours = np.all(domains.free | (np.abs(d) < NEIGHBOURS), axis=2)
+    neighbours &= np.all(moving[:, None] == moving[None], axis=2)
+    no_saddle = (np.abs(gain - foretold) <= ALIKE * gain + NOISE * np.abs(state.total)) & (bend >= BENT * distance)
+    same_top = near_top[:, None] & near_top[None] & neighbours & (distance < JOINED**2) & no_saddle
     # The higher one goes on; of two that are as high the first.
-    higher = same & ((gain > 0) | ((gain == 0) & (lanes[None] < lanes[:, None])))
-    joins = ~state.done & np.any(higher, axis=1)
-    best = np.argmax(np.where(higher, state.total[None], -np.inf), axis=1)
+    is_higher = same_top & ((gain > 0) | ((gain == 0) & (lanes[None] < lanes[:, None])))
+    joins = ~state.done & np.any(is_higher, axis=1)
+    best = np.argmax(np.where(is_higher, state.total[None], -np.inf), axis=1)
     return state._replace(joined=np.where(joins, best, state.joined), done=state.done | joins)
 
 
 def _evaluate_lanes(evaluate: Evaluate, x: np.ndarray, going: np.ndarray, state: _State) -> Evaluated:
-    """Return likelihood, gradient and information at x in the lanes that go on, and as they were in the others."""
+    """Return log-likelihood, gradient and information at x (lanes, p) in lanes `going` on; in others the last ones."""
     values = state.total.copy(), state.gradient.copy(), state.information.copy()
     for value, new in zip(values, evaluate(x[going]), strict=True):
         value[going] = new
     return values
 
 
-def _update_hessian(
+def _update_model(
     state: _State,
-    domains: OpenEnds,
     step: np.ndarray,
+    gain: np.ndarray,
     gradient: np.ndarray,
     information: np.ndarray,
-    gain: np.ndarray,
-    sound: np.ndarray,
-    taken: np.ndarray,
+    is_finite: np.ndarray,
+    accepted: np.ndarray,
+    free: np.ndarray,
 ) -> np.ndarray:
-    """Return the model B of minus the Hessian after a step p, in each lane.
+    """Return the model B of minus the Hessian of the log-likelihood l for the next step, (lanes, p, p).
 
-    Of the information and the last model, corrected by the step (SR1), it is the one that would have foretold the gain
-    g' p - p' B p / 2 better.
+    It is the information, or the last B corrected by this step: whichever would have foretold the gain of the step p,
+    g' p - p' B p / 2, better. The last B stays where l is not finite at the end of the step.
 
     Args:
-        state: before the step.
-        domains: of the numbers.
-        step: p (lanes, numbers).
-        gradient: at the end of the step.
-        information: at the end of the step.
-        gain: of the log-likelihood by the step.
-        sound: whether what was found there is finite.
-        taken: whether the step is.
+        state: the lanes before the step: g, the gradient of l, the information and B.
+        step: p (lanes, p).
+        gain: of l by the step (lanes,).
+        gradient: of l at the end of the step (lanes, p).
+        information: there (lanes, p, p).
+        is_finite: whether l and its derivatives are finite there (lanes,).
+        accepted: whether the lane moves to the end of the step (lanes,).
+        free: coordinates that are plain real numbers, no logarithms or logits (p,).
     """
-    # B+ = B + r r' / r' p with r = y - B p, so that B+ p = y, y the gradient before less that after the step.
-    base = np.nan_to_num(state.model)
-    residual = np.where(sound[:, None], np.nan_to_num(state.gradient - gradient), 0.0) - multiply_lanes(base, step)
-    diagonal = np.diagonal(state.information, axis1=1, axis2=2)
-    residual = np.where(domains.free | (diagonal > INVISIBLE), residual, 0.0)  # elsewhere y is but rounding
-    along = np.sum(residual * step, axis=1)
-    unit, _ = find_flat_directions(state.information, step != 0)
-    size = np.sqrt(np.sum((residual * unit) ** 2, axis=1) * np.sum((step / np.where(unit > 0, unit, 1.0)) ** 2, axis=1))
-    # r' p must be more than rounding of |r| |p|, both in standard errors.
-    is_defined = sound & (np.abs(along) > DEFINED * size)
-    update = residual[:, :, None] * residual[:, None, :] / np.where(is_defined, along, 1.0)[:, None, None]
-    secant = base + np.where(is_defined[:, None, None], update, 0.0)
-    # Of the two the one that would have foretold this gain.
+    last_model, last_information = np.nan_to_num(state.model), np.nan_to_num(state.information)
+    # The gain that either would have foretold.
     slope = np.sum(state.gradient * step, axis=1)
-    by_model = slope - np.sum(step * multiply_lanes(base, step), axis=1) / 2
-    by_information = slope - np.sum(step * multiply_lanes(np.nan_to_num(state.information), step), axis=1) / 2
-    current_information = np.where(taken[:, None, None], information, state.information)
-    model_is_better = sound & (np.abs(gain - by_model) <= np.abs(gain - by_information))
-    corrected = np.where(sound[:, None, None], secant, base)
-    return np.where((model_is_better | ~sound)[:, None, None], corrected, current_information)
+    by_model = slope - np.sum(step * multiply_lanes(last_model, step), axis=1) / 2
+    by_information = slope - np.sum(step * multiply_lanes(last_information, step), axis=1) / 2
+    keeps_model = ~is_finite | (np.abs(gain - by_model) <= np.abs(gain - by_information))
+    corrected = _correct_by_secant(last_model, step, state, gradient, is_finite, free)
+    current_information = np.where(accepted[:, None, None], information, state.information)
+    return np.where(keeps_model[:, None, None], corrected, current_information)
+
+
+def _correct_by_secant(
+    model: np.ndarray,
+    step: np.ndarray,
+    state: _State,
+    gradient: np.ndarray,
+    is_finite: np.ndarray,
+    free: np.ndarray,
+) -> np.ndarray:
+    """Return B + r r' / (r' p) with r = y - B p (the symmetric rank-one update, SR1), (lanes, p, p).
+
+    It maps the step p to y, the gradient before the step less that after it, as minus the Hessian does along p. B stays
+    where the gradient after the step is not finite, or r' p is rounding.
+
+    Args:
+        model: B (lanes, p, p).
+        step: p (lanes, p).
+        state: the lanes before the step, with gradient and information.
+        gradient: after the step (lanes, p).
+        is_finite: whether it is finite (lanes,).
+        free: coordinates that are plain real numbers, no logarithms or logits (p,).
+    """
+    y = np.where(is_finite[:, None], np.nan_to_num(state.gradient - gradient), 0.0)
+    r = y - multiply_lanes(model, step)
+    # The likelihood hardly depends on a logarithm or logit with so little information: y is but rounding there.
+    diagonal = np.diagonal(state.information, axis1=1, axis2=2)
+    r = np.where(free | (diagonal > INVISIBLE), r, 0.0)
+    # r' p counts where it is more than rounding of |r| |p|, both in units of standard errors.
+    r_times_step = np.sum(r * step, axis=1)
+    unit, _ = find_flat_directions(state.information, step != 0)
+    squared_r, squared_step = (r * unit) ** 2, (step / np.where(unit > 0, unit, 1.0)) ** 2
+    size = np.sqrt(np.sum(squared_r, axis=1) * np.sum(squared_step, axis=1))
+    is_defined = is_finite & (np.abs(r_times_step) > DEFINED * size)
+    update = r[:, :, None] * r[:, None, :] / np.where(is_defined, r_times_step, 1.0)[:, None, None]
+    return model + np.where(is_defined[:, None, None], update, 0.0)

@@ -21,51 +21,58 @@ def trust_region_step(
     moving: np.ndarray,
     free: np.ndarray,
 ) -> tuple[Float[np.ndarray, "lanes p"], Float[np.ndarray, " lanes"], Float[np.ndarray, " lanes"]]:
-    """Return the maximiser p of g' p - p' B p / 2 over |D p| <= radius, |D p|, and the gain that B foretells.
+    """Return the step p that maximises g' p - p' B p / 2 over |D p| <= radius, its length |D p|, and the gain at p.
 
-    It is (B + s D^2)^-1 g with the least s >= 0 for which B + s D^2 is not indefinite and |D p| <= radius: Newton's
-    method for 1 / |D p| = 1 / radius, from below. All in units u of standard errors, in which B is of order 1 and
-    D = max(1, radius u / LONGEST) where a logarithm moves, else 1: matrices scaled by a diagonal are solved as exactly
-    as without. To B is added v v' for each direction v that is not identified, whose gradient is but rounding.
+    p = (B + s D^2)^-1 g with the least s >= 0 for which B + s D^2 is not indefinite and |D p| <= radius, by Newton's
+    method for 1 / |D p| = 1 / radius. All is computed in units u of standard errors, in which B is of order 1:
+    D = max(1, radius u / LONGEST) where a logarithm moves, so that it moves by LONGEST at most, else D = 1. A matrix
+    that is scaled by a diagonal is solved as exactly as without. To B is added v v' for each direction v that is not
+    identified, whose gradient is but rounding.
 
     Args:
         gradient: g (lanes, p).
-        information: its diagonal gives the standard errors.
-        model: B, minus the Hessian or near it; it may be indefinite. Where it is not finite, or huge, the information
-            takes its place.
+        information: its diagonal gives the standard errors (lanes, p, p).
+        model: B, minus the Hessian or near it; it may be indefinite (lanes, p, p). Where it is not finite, or huge, the
+            information takes its place.
         radius: of the trust region (lanes,).
         moving: which coordinates may move (lanes, p).
-        free: which are no logarithms, and so not limited by LONGEST (p,).
+        free: which are no logarithms or logits, and so not limited by LONGEST (p,).
+
+    Returns:
+        p (lanes, p), |D p| (lanes,) and g' p - p' B p / 2 (lanes,).
     """
-    # g, D and B in standard errors; a coordinate that stays has a unit of 0, and 1 on the diagonals of D and B.
+    # g, D and B in standard errors; a coordinate that stays has a unit of 0, and 1 on the diagonals of D and B. Columns
+    # of `flat` are the directions that are not identified, in these units.
     unit, flat = find_flat_directions(information, moving)
     stays = unit == 0
     d = np.where(free | stays, 1.0, np.maximum(1.0, radius[:, None] * unit / LONGEST))
     g = np.nan_to_num(gradient) * unit
     b = _scale_model(model, information, unit)
     b = (b + b.swapaxes(1, 2)) / 2 + flat @ flat.swapaxes(1, 2) + np.eye(len(free)) * stays[:, :, None]
-    # The point on or within the radius; one that is a hundredth beyond is drawn back to it.
+    # The step on or within the radius; one that is up to a hundredth longer is shortened to it.
     step = _find_step_within(radius, g, b, d)
     length = np.linalg.norm(d * step, axis=1)
-    inside = np.minimum(1.0, radius / np.where(length > 0, length, 1.0))
-    step, length = step * inside[:, None], length * inside
+    shortened = np.minimum(1.0, radius / np.where(length > 0, length, 1.0))
+    step, length = step * shortened[:, None], length * shortened
     # What the model gains there: g' p - p' B p / 2.
     foretold = np.sum(step * (g - multiply_lanes(b, step) / 2), axis=1)
     return step * unit, length, foretold
 
 
 def _scale_model(model: np.ndarray, information: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """Return U B U of each lane's model B, and of the information where that is not finite or huge; U = diag(unit)."""
+    """Return U B U (lanes, p, p) of each model B, U = diag(unit); of the information where B is huge or not finite."""
     scaled = _scale_both_sides(model, unit)
-    sane = np.all(np.abs(scaled) < LARGEST, axis=(1, 2))  # NaN is not
+    sane = np.all(np.abs(scaled) < LARGEST, axis=(1, 2))  # neither huge nor NaN
     return np.where(sane[:, None, None], scaled, _scale_both_sides(information, unit))
 
 
 def _find_step_within(radius: np.ndarray, g: np.ndarray, b: np.ndarray, d: np.ndarray) -> np.ndarray:
     """Return p = (B + s D^2)^-1 g (lanes, p) with the least shift s >= 0 that keeps |D p| within 1.01 of the radius.
 
-    `d`: the diagonal of D. Newton's method for 1 / |D p| = 1 / radius, from the least s that makes the matrix positive.
+    `radius` (lanes,), g (lanes, p), b: B (lanes, p, p), d: the diagonal of D (lanes, p). Newton's method for
+    1 / |D p| = 1 / radius, from the least s that makes the matrix positive.
     """
+    # D^-1 B D^-1 + s I is positive for s above minus the least eigenvalue.
     least = np.linalg.eigvalsh(b / d[:, :, None] / d[:, None, :])[:, 0]
     shift = np.where(least > -ROUNDING, 0.0, -least * (1 + PAST))
     for _ in range(SECULAR_STEPS):
@@ -81,7 +88,10 @@ def _find_step_within(radius: np.ndarray, g: np.ndarray, b: np.ndarray, d: np.nd
 
 
 def _solve_shifted(b: np.ndarray, shift: np.ndarray, d: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return (B + s D^2)^-1 g of each lane; nothing along directions in which the matrix is singular."""
+    """Return (B + s D^2)^-1 r of each lane (lanes, p); 0 along directions in which the matrix is singular.
+
+    `b`: B (lanes, p, p); `shift`: s (lanes,); `d`: the diagonal of D (lanes, p); `right`: r (lanes, p).
+    """
     matrix = b + (shift[:, None] * d * d)[:, :, None] * np.eye(b.shape[1])
     try:
         return np.asarray(np.linalg.solve(matrix, right[..., None])[..., 0])
@@ -92,7 +102,10 @@ def _solve_shifted(b: np.ndarray, shift: np.ndarray, d: np.ndarray, right: np.nd
 def expected_gain(
     gradient: np.ndarray, information: np.ndarray, counting: Bool[np.ndarray, "lanes p"]
 ) -> Float[np.ndarray, " lanes"]:
-    """Return g' I^-1 g of the coordinates that count, along directions that are identified: squared standard errors."""
+    """Return g' I^-1 g (lanes,), twice what a full step gains, by gradient g (lanes, p) and information (lanes, p, p).
+
+    Only coordinates that are `counting` (lanes, p), and directions that are identified, add to it.
+    """
     unit, _ = find_flat_directions(information, counting)
     scaled = _scale_both_sides(information, unit)
     values, vectors = np.linalg.eigh((scaled + scaled.swapaxes(1, 2)) / 2)
@@ -101,9 +114,10 @@ def expected_gain(
 
 
 def find_flat_directions(information: np.ndarray, moving: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the standard error of each coordinate alone (lanes, p), and the directions without information.
+    """Return each coordinate's standard error if the others were known, (lanes, p), and directions without information.
 
-    The errors are 0 of coordinates that stay; directions stand in columns (lanes, p, p), the others are zeros.
+    The errors are 0 of coordinates that stay (not `moving`). Directions are columns (lanes, p, p), in units of these
+    errors; the other columns are zeros.
     """
     diagonal = np.diagonal(information, axis1=1, axis2=2)
     informed = moving & (diagonal > LEAST) & np.isfinite(diagonal)
@@ -114,11 +128,11 @@ def find_flat_directions(information: np.ndarray, moving: np.ndarray) -> tuple[n
 
 
 def _scale_both_sides(matrix: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """Return U A U with U = diag(unit); 0 for coordinates that stay, whatever A has there."""
+    """Return U A U (lanes, p, p), U = diag(unit), `unit` (lanes, p); 0 in rows and columns whose unit is 0."""
     stays = (unit == 0)[:, :, None] | (unit == 0)[:, None, :]
     return np.where(stays, 0.0, matrix * unit[:, :, None] * unit[:, None, :])
 
 
 def multiply_lanes(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Return A x of each lane."""
+    """Return the product A x of each lane, (lanes, p), of matrices A (lanes, p, p) and vectors x (lanes, p)."""
     return np.asarray(np.einsum("lij,lj->li", matrix, vector))

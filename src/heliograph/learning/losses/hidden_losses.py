@@ -43,17 +43,17 @@ class HiddenModeLosses(AbstractLossLaw):
         Raises:
             ValueError: what is no fates.
         """
-        parts = check_fates(fates)
-        # log P(fates) - log P(chosen ends arrive).
-        chosen = [keep_ends_only(fate) for fate in parts if fate[-1] == CHOSEN]
-        whole, ends = FateRuns.of([fill_ends(fate) for fate in parts]), FateRuns.of(chosen) if chosen else None
+        stretches = check_fates(fates)
+        # Of stretches that were chosen for ends that arrived: log P(fates) - log P(ends arrive).
+        chosen = [keep_ends_only(fate) for fate in stretches if fate[-1] == CHOSEN]
+        whole, ends = FateRuns.of([fill_ends(fate) for fate in stretches]), FateRuns.of(chosen) if chosen else None
 
         def likelihood(x: np.ndarray) -> tuple[float, np.ndarray]:
-            value, slope = whole.likelihood(x)
+            value, gradient = whole.likelihood(x)
             if ends is None:
-                return value, slope
-            value_of_ends, slope_of_ends = ends.likelihood(x)
-            return value - value_of_ends, slope - slope_of_ends
+                return value, gradient
+            value_of_ends, gradient_of_ends = ends.likelihood(x)
+            return value - value_of_ends, gradient - gradient_of_ends
 
         top, value = maximise_shares(likelihood, [*STARTS])
         good, bad, fails, recovers = estimate_shares(likelihood, top, value, intervals)
@@ -94,62 +94,74 @@ class FateRuns:
     The likelihood of a stretch is 1' A_n T' A_(n-1) ... T' A_1 p, with A the diagonal of the fate's probabilities in
     each mode, T the transition and p its stationary law. Between stretches stands p 1', which starts anew; one more T'
     after the last A changes nothing, 1' T' = 1', so that each A is followed by one.
+
+    Args:
+        kind: of each run: 0 arrived, 1 lost, UNKNOWN, or START before a stretch (runs,).
+        length: number of packets in each run (runs,).
     """
 
     def __init__(self, kind: np.ndarray, length: np.ndarray):
-        """Take kind and length of each run; by kind keep its runs, their distinct lengths, and which each one has."""
+        """Keep by kind which runs are of it, their distinct lengths, and which of these each run has."""
         self.kind = kind
         masks = {int(fate): kind == fate for fate in np.unique(kind)}
-        self.places = {fate: (mask, *np.unique(length[mask], return_inverse=True)) for fate, mask in masks.items()}
+        self.runs_by_kind = {
+            fate: (mask, *np.unique(length[mask], return_inverse=True)) for fate, mask in masks.items()
+        }
 
     @staticmethod
     def of(fates: Fates) -> "FateRuns":
-        """Return the runs of stretches one after another, each behind a START."""
+        """Return the runs of stretches of fates (packets,), one after another, each behind a START."""
         code = np.concatenate([[START, *np.where(np.isnan(f), UNKNOWN, f).tolist()] for f in fates]).astype(int)
         first = np.flatnonzero(np.concatenate([[True], (np.diff(code) != 0) | (code[1:] == START)]))
         return FateRuns(code[first], np.diff(np.append(first, len(code))))
 
     def likelihood(self, x: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the log-likelihood at logits (loss when good, when bad, fail, recover), and its gradient (4,).
+        """Return the log-likelihood l at logits x of (loss when good, when bad, fail, recover), and its gradient (4,).
 
         By complex steps: the imaginary part of l(x + i h) is h dl/dx.
         """
+        # Rows 0 to 3 have a step in one logit each, row 4 none.
         shifted = np.broadcast_to(x, (5, 4)).astype(complex)
         shifted[np.arange(4), np.arange(4)] += 1j * STEP
         total = self._compute_log_likelihoods(1 / (1 + np.exp(-shifted)))
         return float(total[4].real), np.asarray(total[:4].imag / STEP)
 
     def _compute_log_likelihoods(self, shares: np.ndarray) -> np.ndarray:
-        """Return the log-likelihoods for several sets of shares (sets, 4)."""
+        """Return the log-likelihood of all stretches for several sets of shares, (sets,).
+
+        `shares`: (sets, 4), in each the losses when good and when bad, and the probabilities to fail and to recover. It
+        is log of 1' (T' A)^n ... (T' A)^m p, a product over runs, with the matrices that the class defines.
+        """
         good, bad, fails, recovers = shares.T
         ones = np.ones_like(good)
-        # T' and A of each fate, and the stationary law p.
-        moved = _stack_matrices([[1 - fails, recovers], [fails, 1 - recovers]])  # T', columns from the present mode
-        emitted = {0: [1 - good, 1 - bad], 1: [good, bad], UNKNOWN: [ones, ones]}
+        # T', with columns from the present mode; the diagonal of A for each fate; p 1' with the stationary law p.
+        transposed = _stack_matrices([[1 - fails, recovers], [fails, 1 - recovers]])
+        probabilities = {0: [1 - good, 1 - bad], 1: [good, bad], UNKNOWN: [ones, ones]}
         away = fails + recovers
-        start = _stack_matrices([[recovers / away] * 2, [fails / away] * 2])  # p 1'
-        parts = np.zeros((len(shares), len(self.kind), 2, 2), dtype=complex)
+        start = _stack_matrices([[recovers / away] * 2, [fails / away] * 2])
+        # (T' A)^length of each run, as a matrix and the logarithm of its scale, computed once for each length.
+        matrices = np.zeros((len(shares), len(self.kind), 2, 2), dtype=complex)
         scales = np.zeros((len(shares), len(self.kind)), dtype=complex)
-        # (T' A)^length of each run, computed once for each length, and their product.
-        for kind, (runs, lengths, position) in self.places.items():
+        for kind, (runs, lengths, length_of_run) in self.runs_by_kind.items():
             if kind == START:
-                parts[:, runs] = start[:, None]
+                matrices[:, runs] = start[:, None]
                 continue
-            step = moved * np.stack(emitted[kind], axis=-1)[:, None, :]  # T' A
+            step = transposed * np.stack(probabilities[kind], axis=-1)[:, None, :]  # T' A
             power, scale = _raise_matrices(step, lengths)
-            parts[:, runs], scales[:, runs] = power[:, position], scale[:, position]
-        product, scale = _multiply_runs(parts)
-        probability = product.sum(axis=-2)[..., 0]  # 1' (...): all columns of what starts with p 1' agree
+            matrices[:, runs], scales[:, runs] = power[:, length_of_run], scale[:, length_of_run]
+        product, scale = _multiply_runs(matrices)
+        # The first run is a START, so that the product is (...) p 1', whose columns agree: 1' (...) p is their sum.
+        probability = product.sum(axis=-2)[..., 0]
         return np.asarray(np.log(probability) + scale + scales.sum(axis=1))
 
 
 def _stack_matrices(rows: list[list[np.ndarray]]) -> np.ndarray:
-    """Return rows of entries (sets,) as matrices (sets, 2, 2)."""
+    """Return 2 x 2 matrices (sets, 2, 2) from rows of entries, each an array (sets,)."""
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def _rescale(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return matrices (..., 2, 2) over their largest real part, lest products underflow, and its logarithm."""
+    """Return matrices (..., 2, 2) over their largest real part, lest products underflow, and its logarithm (...)."""
     rows = np.maximum(matrix.real[..., 0, :], matrix.real[..., 1, :])
     size = np.maximum(rows[..., 0], rows[..., 1])
     size = np.where(size > 0, size, 1.0)
@@ -157,16 +169,17 @@ def _rescale(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _raise_matrices(matrix: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return matrix^length for each length, (sets, lengths, 2, 2), rescaled, and the logarithms of the scales.
+    """Return each matrix (sets, 2, 2) to the power of each length, (sets, lengths, 2, 2), and logarithms of scales.
 
-    By the binary digits of the lengths: `square` is the matrix to the power 1, 2, 4, ...
+    A power is the returned matrix times its scale. By the binary digits of the lengths: `square` is the matrix to the
+    power 1, 2, 4, ...
     """
     shape = (len(matrix), len(lengths))
     power = np.broadcast_to(np.eye(2, dtype=complex), (*shape, 2, 2))
     scale, (square, square_scale) = np.zeros(shape), _rescale(matrix)
     digits = lengths.copy()
     while np.any(digits):
-        odd = (digits & 1).astype(bool)
+        odd = (digits & 1).astype(bool)  # lengths that have this binary digit
         power = np.where(odd[:, None, None], square[:, None] @ power, power)
         power, more = _rescale(power)
         scale = scale + more + np.where(odd, square_scale[:, None], 0.0)
@@ -177,9 +190,9 @@ def _raise_matrices(matrix: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray
 
 
 def _multiply_runs(parts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the product of (sets, runs, 2, 2) over runs, the last one leftmost, rescaled, and the scale's logarithm.
+    """Return the product of matrices (sets, runs, 2, 2) over runs, the last leftmost, and the logarithm of its scale.
 
-    Pair by pair: each turn halves the number of matrices.
+    The product is the returned matrix (sets, 2, 2) times its scale (sets,). Pair by pair: each turn halves the number.
     """
     scale = np.zeros(len(parts))
     while parts.shape[1] > 1:

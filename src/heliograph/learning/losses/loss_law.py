@@ -1,6 +1,6 @@
 """Laws of losses: the probability that a packet is lost, given what became of those before it."""
 
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -57,7 +57,11 @@ class AbstractLossLaw(Module):
         return np.concatenate([self._score_stretch(stretch) for stretch in parts])
 
     def _score_stretch(self, fate: Packets) -> Packets:
-        """Return the log-likelihood of each packet of one stretch; of chosen ends, given that the last one arrived."""
+        """Return log P(fate | those before) of each packet of a stretch (packets,); NaN where the fate is unknown.
+
+        Of a stretch that was chosen for its ends the last one has log P(arrived | those before) - log P(arrived | the
+        first), so that the sum is the log-likelihood given both ends.
+        """
         p = self.predicted(fill_ends(fate))
         with np.errstate(divide="ignore"):
             logs: Packets = np.where(is_trial(fate), np.where(fate == 1, np.log(p), np.log1p(-p)), np.nan)
@@ -133,13 +137,13 @@ class MarkovLosses(AbstractLossLaw):
         if check_count("order", order) > 12:
             raise fail("order", "at most 12 packets back", order)
         counts = np.zeros((2**order, 2))
-        parts = check_fates(fates)
-        for stretch in parts:
+        stretches = check_fates(fates)
+        for stretch in stretches:
             past, length = _number_last_fates(fill_ends(stretch), order)
-            # Where a chain is counted given its end, the step to the end counts as well.
+            # Of order 1 the chain is taken given its end, so that the step to the end counts as well.
             counted = (length == order) & (~np.isnan(stretch) if order == 1 else is_trial(stretch))
             np.add.at(counts, (past[counted], fill_ends(stretch)[counted].astype(int)), 1.0)
-        spans = _measure_spans(parts)
+        spans = _measure_spans(stretches)
         return _condition_on_ends(counts, spans, intervals) if order == 1 and len(spans) else MarkovLosses(counts)
 
     @property
@@ -148,9 +152,10 @@ class MarkovLosses(AbstractLossLaw):
         return len(self.counts).bit_length() - 1
 
     def shares(self) -> dict[str, Share]:
-        """Return P(lost | arrived) and P(arrived | lost) with Wilson's intervals; of a higher order P(lost | past).
+        """Return P(lost | arrived) as "fail" and P(arrived | lost) as "recover" with Wilson's intervals.
 
-        Between ends that arrived for being ends the intervals are the likelihood's.
+        Of a higher order P(lost | past) of each past. Between ends that were chosen for arriving the intervals are the
+        likelihood's.
         """
         if self.given_ends is not None:
             return dict(zip(("fail", "recover"), self.given_ends, strict=True))
@@ -161,29 +166,38 @@ class MarkovLosses(AbstractLossLaw):
         return {name: wilson(row[1], row.sum()) for name, row in zip(names, self.counts, strict=True)}
 
     def predicted(self, fate: Packets) -> Packets:
-        """Return the probability (k + 1/2) / (n + 1) of each loss after the past, as far as it is known."""
+        """Return the probability (k + 1/2) / (n + 1) of each loss: k losses of n packets had the same past.
+
+        The past are the last fates, at most `order`, as many as are known without a gap.
+        """
         past, length = _number_last_fates(fate, self.order)
         probabilities = np.zeros(len(fate))
         for known in range(self.order + 1):
-            counts = self.counts.reshape(-1, 2**known, 2).sum(axis=0)  # over fates further back
+            # (arrived, lost) after the last `known` fates (2^known, 2), summed over fates further back.
+            counts = self.counts.reshape(-1, 2**known, 2).sum(axis=0)
             p = (counts[:, 1] + 0.5) / (counts.sum(axis=1) + 1)
             selected = length == known
             probabilities[selected] = p[past[selected] & (2**known - 1)]
         return probabilities
 
     def _arrives_again(self, steps: int) -> float:
-        """Return P(arrived after so many steps | arrived now), in closed form for order one."""
+        """Return P(arrived after so many steps | arrived now), whatever became of the packets between.
+
+        Of order 1 in closed form, (b + a (1 - a - b)^steps) / (a + b) with a = P(lost | arrived), b = P(arrived |
+        lost).
+        """
         if self.order > 1:
             return super()._arrives_again(steps)
         a, b = self.predicted(np.array([0.0, np.nan]))[1], 1 - self.predicted(np.array([1.0, np.nan]))[1]
         return float((b + a * (1 - a - b) ** steps) / (a + b))
 
     def channel(self, link: AbstractRandomAffine) -> AbstractRandomAffine:
-        """Return the link in modes that are the last fates; a past that was never seen is taken for even odds."""
+        """Return the link in modes that are the last fates; after a past that was never seen a loss has even odds."""
         arrives, lost = erasure(link, 1.0), erasure(link, 0.0)
         if self.order == 1:
             shares = self.shares()
             return gilbert_elliott(arrives, lost, shares["fail"].estimate, shares["recover"].estimate)
+        # P(lost | past) for each past, a number whose bits are the last fates, the latest one lowest.
         total = self.counts.sum(axis=1)
         p = np.where(total > 0, self.counts[:, 1], 0.5) / np.where(total > 0, total, 1.0)
         # The next past has the new fate as its lowest bit, and drops the oldest.
@@ -195,53 +209,80 @@ class MarkovLosses(AbstractLossLaw):
 
 
 def _measure_spans(parts: Fates) -> np.ndarray:
-    """Return the steps from the first to the last packet of each stretch whose ends are chosen, (stretches,)."""
+    """Return the steps from the first to the last packet of each stretch that was chosen for its ends, (stretches,)."""
     return np.array([len(fate) - 1 for fate in parts if fate[-1] == CHOSEN and len(fate) > 1])
 
 
 def _condition_on_ends(counts: np.ndarray, spans: np.ndarray, intervals: bool) -> MarkovLosses:
-    """Return the Markov law of order 1, by the most likely fail a and recover b of chains known to end arrived.
+    """Return the Markov law of order 1 that is most likely if each stretch was chosen for ending with an arrival.
 
-    l = sum n log p - sum_spans log P_m, P_m = (b + a (1 - a - b)^m) / (a + b) the probability to arrive again after m
-    steps. Its counts have these shares; a count in all is p (1 - p) / variance of p: as many packets as would know as
-    much alone.
+    Its `counts` have the shares of the maximum, not those that were counted: after either fate as many packets as would
+    tell its share p as well if all were trials, n = 1 / (p (1 - p) Var(logit p)), at most those that were counted.
+
+    Args:
+        counts: (arrived, lost) after an arrival and after a loss (2, 2).
+        spans: steps from the first to the last packet of each such stretch (stretches,).
+        intervals: whether the intervals of the two probabilities are computed too.
+    """
+    likelihood = _LikelihoodBetweenEnds(counts, spans)
+    top, value = maximise_shares(likelihood, [logits(0.1, 0.5), logits(0.3, 0.3), logits(0.02, 0.9)])
+    # Variances of the logits, the diagonal of the Hessian's inverse, from differences of the gradient. What a
+    # difference over this width leaves out is 1e-8 of it, and its rounding 1e-12.
+    width = 1e-4
+    shifts = width * np.eye(2)
+    hessian = np.stack([likelihood(top - shift)[1] - likelihood(top + shift)[1] for shift in shifts]) / (2 * width)
+    variances = np.diag(np.linalg.pinv((hessian + hessian.T) / 2))
+    # The number of packets that tell as much, and their fates in these shares.
+    fail, recover = shares = 1 / (1 + np.exp(-top))
+    packets = np.clip(1 / np.maximum(variances * shares * (1 - shares), 1e-300), 0.0, counts.sum(axis=1))
+    equivalent = packets[:, None] * np.array([[1 - fail, fail], [recover, 1 - recover]])
+    share_of_fail, share_of_recover = estimate_shares(likelihood, top, value, intervals)
+    if not counts[1].any():  # without losses nothing tells how they end
+        share_of_recover = wilson(0, 0)
+    return MarkovLosses(np.asarray(equivalent), (share_of_fail, share_of_recover))
+
+
+class _LikelihoodBetweenEnds(NamedTuple):
+    """Log-likelihood of a Markov law of order 1 for stretches that were chosen for ending with an arrival.
+
+    Args:
+        counts: (arrived, lost) after an arrival and after a loss (2, 2).
+        spans: steps m from the first to the last packet of each stretch (stretches,).
     """
 
-    def likelihood(x: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return l at the logits x of (a, b), and its slope in them."""
-        # P_m = again / total; power = (1 - a - b)^m, slope its derivative in a and in b.
+    counts: np.ndarray
+    spans: np.ndarray
+
+    def __call__(self, x: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return l = sum n log p - sum_spans log P_m, and its gradient (2,), at the logits x (2,) of (a, b).
+
+        a: P(lost | arrived before), b: P(arrived | lost before). P_m = (b + a (1 - a - b)^m) / (a + b): the probability
+        to arrive again after m steps. It is divided by since arriving at the end is why the stretch ends there.
+        """
         a, b = shares = 1 / (1 + np.exp(-x))
+        # P_m = again / total, with power = (1 - a - b)^m, whose derivative in a, and in b, is `slope`.
         kept = 1 - a - b
-        power, slope = kept**spans, -spans * kept ** (spans - 1.0)
+        power, slope = kept**self.spans, -self.spans * kept ** (self.spans - 1.0)
         again, total = b + a * power, a + b
-        by_a = (power + a * slope) / again - 1 / total
-        by_b = (1 + a * slope) / again - 1 / total
-        (stayed, failed), (recovered, lost) = counts
+        by_a = (power + a * slope) / again - 1 / total  # d log P_m / da
+        by_b = (1 + a * slope) / again - 1 / total  # d log P_m / db
+        (stayed, failed), (recovered, lost) = self.counts
         value = stayed * np.log1p(-a) + failed * np.log(a) + recovered * np.log(b) + lost * np.log1p(-b)
         score = np.array([failed / a - stayed / (1 - a) - by_a.sum(), recovered / b - lost / (1 - b) - by_b.sum()])
+        # By the logits: dp / d logit p = p (1 - p).
         return float(value - np.sum(np.log(again / total))), score * shares * (1 - shares)
-
-    top, value = maximise_shares(likelihood, [logits(0.1, 0.5), logits(0.3, 0.3), logits(0.02, 0.9)])
-    shares = 1 / (1 + np.exp(-top))
-    # Variances of the logits, 1 / (n p (1 - p)) of n packets alone, from differences of the score.
-    width = 1e-4  # of a logit: what a difference leaves out is 1e-8 of it, and its rounding 1e-12
-    steps = width * np.eye(2)
-    hessian = np.stack([likelihood(top - step)[1] - likelihood(top + step)[1] for step in steps]) / (2 * width)
-    variances = np.diag(np.linalg.pinv((hessian + hessian.T) / 2))
-    size = np.clip(1 / np.maximum(variances * shares * (1 - shares), 1e-300), 0.0, counts.sum(axis=1))
-    fails, recovers = shares
-    alone = size[:, None] * np.array([[1 - fails, fails], [recovers, 1 - recovers]])
-    fail, recover = estimate_shares(likelihood, top, value, intervals)
-    recover = recover if counts[1].any() else wilson(0, 0)  # without losses nothing tells how they end
-    return MarkovLosses(np.asarray(alone), (fail, recover))
 
 
 def _number_last_fates(fate: Packets, order: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the last fates as a number, the latest lowest, and how many are known without a gap, `order` at most."""
-    past, length = np.zeros(len(fate), dtype=int), np.zeros(len(fate), dtype=int)
+    """Return the last fates before each packet as a number, and how many are known without a gap, (packets,) each.
+
+    The number's lowest bit is the latest fate, 1 for lost; it has as many bits as are known, `order` at most.
+    """
+    number, length = np.zeros(len(fate), dtype=int), np.zeros(len(fate), dtype=int)
     for back in range(1, order + 1):
-        before = np.concatenate([np.full(back, np.nan), fate])[: len(fate)]
-        unbroken = (length == back - 1) & ~np.isnan(before)
-        past += np.where(unbroken, np.nan_to_num(before).astype(int) << (back - 1), 0)
-        length += unbroken
-    return past, length
+        # The fate `back` packets ago counts where all later ones are known too.
+        earlier = np.concatenate([np.full(back, np.nan), fate])[: len(fate)]
+        is_unbroken = (length == back - 1) & ~np.isnan(earlier)
+        number += np.where(is_unbroken, np.nan_to_num(earlier).astype(int) << (back - 1), 0)
+        length += is_unbroken
+    return number, length

@@ -83,27 +83,39 @@ def fates_of_sequence(
         raise fail("sequence numbers", "whole numbers, at least one", "none" if not len(numbers) else "fractions")
     if np.max(np.abs(numbers)) > MOST:
         raise fail("sequence numbers", "numbers up to 2^53", f"{numbers[np.argmax(np.abs(numbers))]:g}")
-    # In the order of sending where it is known.
-    received = numbers.astype(np.int64)
+    # In the order of sending where it is known: by time, then by number; equal pairs are copies, of which one stays.
+    ordered = numbers.astype(np.int64)
     if sent is not None:
-        when = array("times of sending", sent, received.shape)
-        received = np.unique(np.stack([when, numbers]), axis=1)[1].astype(np.int64)  # by time, then by number
-    # A new stretch at each restart, copies dropped. `again`: numbers at the begin of a rising run that came before.
+        times = array("times of sending", sent, ordered.shape)
+        ordered = np.unique(np.stack([times, numbers]), axis=1)[1].astype(np.int64)
+    stretches = _split_at_restarts(ordered, jump, may_be_copies=sent is None)
+    return [_mark_gaps(np.array(stretch)) for stretch in stretches]
+
+
+def _split_at_restarts(received: np.ndarray, jump: int, may_be_copies: bool) -> list[list[int]]:
+    """Return the sequence numbers (packets,) in rising stretches, each from one start of the sender to the next.
+
+    Args:
+        received: sequence numbers in order.
+        jump: leap ahead that means a restart.
+        may_be_copies: whether numbers that come again may be copies, which are dropped, and no restart.
+    """
     stretches: list[list[int]] = [[]]
     for run in _split_rising(received):
+        # Numbers at the begin of a rising run that are not above the last one.
         again = [number for number in run if stretches[-1] and number <= stretches[-1][-1]]
-        if again and not (sent is None and _are_copies(again, run, stretches[-1])):
+        if again and not (may_be_copies and _are_copies(again, run, stretches[-1])):
             stretches.append([])
             again = []
         for number in run[len(again) :]:
             if stretches[-1] and number - stretches[-1][-1] >= jump:
                 stretches.append([])
             stretches[-1].append(number)
-    return [_mark_gaps(np.array(numbers)) for numbers in stretches if numbers]
+    return [stretch for stretch in stretches if stretch]
 
 
 def _split_rising(received: np.ndarray) -> list[list[int]]:
-    """Return the numbers in runs that rise, cut where they fall back; of equal ones in a row one stays."""
+    """Return the numbers (packets,) in rising runs, cut where they fall back; of equal ones in a row one stays."""
     numbers = received[np.concatenate([[True], np.diff(received) != 0])]
     return [run.tolist() for run in np.split(numbers, np.flatnonzero(np.diff(numbers) < 0) + 1)]
 
@@ -124,10 +136,13 @@ def _are_copies(again: list[int], run: list[int], stretch: list[int]) -> bool:
 
 
 def _mark_gaps(received: np.ndarray) -> BetweenArrivals:
-    """Return the fates of the packets from the first number to the last: those that are missing were lost."""
-    lost = np.ones(received[-1] - received[0] + 1)
-    lost[received - received[0]] = 0.0
-    return BetweenArrivals.of(lost)
+    """Return the fates of all packets from the first received number to the last: the missing ones were lost.
+
+    `received`: rising sequence numbers.
+    """
+    fates = np.ones(received[-1] - received[0] + 1)
+    fates[received - received[0]] = 0.0
+    return BetweenArrivals.of(fates)
 
 
 def fates_by_node(
@@ -135,7 +150,7 @@ def fates_by_node(
     sequence: "Float[ArrayLike, ' packets']",
     sent: "Float[ArrayLike, ' packets'] | None" = None,
 ) -> dict[str, Fates]:
-    """Return the fates of the packets of each sender of a log, by the sender's name.
+    """Return {sender: fates of its packets} of the packets of a log, as `fates_of_sequence` finds them.
 
     Args:
         node: sender of each packet (packets,).
@@ -156,12 +171,12 @@ def fates_by_node(
 
 
 def fates_by_hop(arrived: "Mapping[str, Float[ArrayLike, ' packets']]") -> dict[str, Fates]:
-    """Return the fates at each hop of a route, from which packets arrived behind each, in the order of the route.
+    """Return {hop: fates (packets,)} of the packets of a route, by which of them arrived behind each of its hops.
 
-    A packet that was lost says nothing of the hops that it did not reach.
+    A packet that was lost says nothing of the hops that it did not reach: its fate is NaN there.
 
     Args:
-        arrived: {hop: (packets,)}, true or 1 where the packet arrived behind this hop.
+        arrived: {hop: (packets,)} in the order of the route, true or 1 where the packet arrived behind this hop.
 
     Raises:
         ValueError: no hops, other values, a packet that arrived behind a hop but not before it.
@@ -169,20 +184,20 @@ def fates_by_hop(arrived: "Mapping[str, Float[ArrayLike, ' packets']]") -> dict[
     if not table("arrivals by hop", arrived, "arrays"):
         raise fail("arrivals by hop", "at least one hop", "none")
     by_hop: dict[str, Fates] = {}
-    before: np.ndarray | None = None
+    reached: np.ndarray | None = None  # 1 of packets that passed the hop before; None at the first hop, all of them
     for name, value in arrived.items():
-        received = array(f"arrivals behind {name!r}", value, (None if before is None else len(before),))
-        if np.any((received != 0) & (received != 1)):
+        passed = array(f"arrivals behind {name!r}", value, (None if reached is None else len(reached),))
+        if np.any((passed != 0) & (passed != 1)):
             raise fail(f"arrivals behind {name!r}", "0 and 1, or truth values", "other numbers")
-        # A packet has a fate at a hop if it passed the hop before.
-        before = np.ones(len(received)) if before is None else before
-        if np.any(received > before):
-            packet = int(np.argmax(received > before))
+        reached = np.ones(len(passed)) if reached is None else reached
+        if np.any(passed > reached):
+            packet = int(np.argmax(passed > reached))
             raise fail(
                 f"arrivals behind {name!r}", "packets that passed the hop before", f"packet {packet}, which did not"
             )
-        by_hop[name] = [np.where(before == 1, 1.0 - received, np.nan)]
-        before = received
+        # A packet has a fate at a hop if it reached it.
+        by_hop[name] = [np.where(reached == 1, 1.0 - passed, np.nan)]
+        reached = passed
     return by_hop
 
 
@@ -211,21 +226,22 @@ def fates_of_measurements(measurements: "Mapping[str, Float[ArrayLike, 'steps *r
 
 
 def check_fates(value: object) -> Fates:
-    """Return stretches of fates, checked, from one or several; ends that are no trials are marked by CHOSEN.
+    """Return fates, checked, as a list of stretches (packets,) without empty ones.
+
+    Ends that were chosen for having arrived (`BetweenArrivals`), and so are no trials, become CHOSEN.
+
+    Args:
+        value: one stretch of 0 (arrived), 1 (lost) and NaN (unknown), or a sequence of several.
 
     Raises:
         ValueError: anything but 0, 1 and NaN, or nothing that is known.
     """
     if isinstance(value, CheckedFates):
         return value
-    # One stretch, of numbers, or several of them.
-    is_sequence = isinstance(value, Sequence) or rank("fates", value) > 0
-    members: list[Any] = list(cast(Sequence[Any], value)) if is_sequence else [value]
-    several = len(members) > 0 and all(rank("fates", member) == 1 for member in members)
-    stretches: list[Any] = members if several else [value]
+    stretches = _list_stretches(value)
     parts = [array("fates", cast(ArrayLike, stretch), (None,), missing=True) for stretch in stretches]
-    for stretch in parts:
-        if np.any((stretch != 0) & (stretch != 1) & ~np.isnan(stretch)):
+    for fate in parts:
+        if np.any((fate != 0) & (fate != 1) & ~np.isnan(fate)):
             raise fail(
                 "fates", "0 for a packet that arrived, 1 for a lost one, NaN for an unknown one", "other numbers"
             )
@@ -238,8 +254,16 @@ def check_fates(value: object) -> Fates:
     return fates
 
 
+def _list_stretches(value: object) -> list[Any]:
+    """Return the stretches of `value`: its members if all of them have one axis, else itself as the only one."""
+    is_sequence = isinstance(value, Sequence) or rank("fates", value) > 0
+    members: list[Any] = list(cast(Sequence[Any], value)) if is_sequence else [value]
+    are_stretches = len(members) > 0 and all(rank("fates", member) == 1 for member in members)
+    return members if are_stretches else [value]
+
+
 def _mark_ends(fate: np.ndarray) -> Float[np.ndarray, " packets"]:
-    """Return the fates with CHOSEN for the first and the last."""
+    """Return the fates (packets,) with CHOSEN for the first and the last."""
     ends = np.zeros(len(fate), dtype=bool)
     ends[[0, -1]] = True
     return np.where(ends, CHOSEN, fate)
