@@ -10,8 +10,8 @@ from heliograph.learning.intervals import (
     draw_block_sums,
     estimate_by_bartlett,
     estimate_by_cosines,
+    estimate_if_white,
     find_numbers_told_by_few,
-    white,
 )
 from heliograph.learning.likelihood.trust_region import maximise
 from heliograph.learning.unidentified import find_confounded, format_sum, product_text, rank_of_information
@@ -62,7 +62,7 @@ def test_long_run_covariances_of_an_autoregression():
     whole = runs * steps
     spread = 4 * 4 * np.sqrt(2 / (runs * 0.4 * steps ** (2 / 3)))  # four standard errors
     assert estimate_by_cosines(scores).covariance[0, 0] / whole == pytest.approx(4.0, abs=spread)
-    assert white(scores).covariance[0, 0] / whole == pytest.approx(4 / 3, rel=0.05)
+    assert estimate_if_white(scores).covariance[0, 0] / whole == pytest.approx(4 / 3, rel=0.05)
     assert (
         3.2 < estimate_by_bartlett(scores).covariance[0, 0] / whole < 4.2
     )  # its weights take off lag / (L + 1), L = 13
@@ -140,5 +140,5 @@ def test_of_a_true_model_the_parts_of_scores_add_up_to_its_information():
     lower = np.array([[1.0, 0.0, 0.0], [0.7, 1.2, 0.0], [-0.4, 0.3, 0.8]])
     rows = np.linalg.qr(np.random.default_rng(1).normal(size=(50, 3)))[0] @ lower.T
     rest, known = covariance_by_model([rows], lower @ lower.T, np.array([False, True, False]))
-    np.testing.assert_allclose(white(rest).covariance + known, lower @ lower.T, atol=1e-14)
+    np.testing.assert_allclose(estimate_if_white(rest).covariance + known, lower @ lower.T, atol=1e-14)
     np.testing.assert_allclose(rest[0][:, 1], 0.0, atol=1e-15)

@@ -1,19 +1,45 @@
-"""Sentences of a fit: on numbers at the end of their domain, and on forms of the likelihood that disagree."""
+"""Sentences of a fit: on climbs that ended early or apart, numbers at the end of their domain, forms that disagree."""
 
 import numpy as np
 
 from heliograph.learning.likelihood_maximum import Solution
+from heliograph.numerics.types import Float
 
+ELSEWHERE = 0.01  # of the log-likelihood: a start that ends so far below the best ended elsewhere
 APART = 3.0  # standard errors between the two forms that suggest an error of the model
 
 
+def describe_climb(solutions: tuple[Solution, ...], ends: Float[np.ndarray, " starts"], stopped: bool) -> list[str]:
+    """Return the sentences on climbs that were stopped, did not converge, or ended below the best.
+
+    Args:
+        solutions: the maximum of each form.
+        ends: log-likelihood at which the climb of the first form from each start ended (starts,); NaN where nowhere.
+        stopped: whether the search was interrupted.
+    """
+    sentences = []
+    if stopped:
+        sentences.append("Stopped before the end: this is the best so far.")
+    for solution in solutions:
+        if not solution.converged and not stopped:
+            why = f"The {solution.form} form did not converge: {solution.top.reason}."
+            sentences.append(f"{why} The estimates are the best point found.")
+    # How far below the best each start ended; those within ELSEWHERE ended at the same maximum.
+    below = solutions[0].total - ends
+    lower = np.count_nonzero(~(below < ELSEWHERE))
+    if lower and not stopped:
+        least = np.nanmin(np.where(below < ELSEWHERE, np.nan, below))
+        sentences.append(f"Best of {len(below)} starts, of which {lower} ended lower, by {least:.3g} or more.")
+    return sentences
+
+
 def describe_boundaries(best: Solution) -> list[str]:
-    """Return the sentences on numbers at the end of their domain."""
+    """Return a sentence on each number whose estimate is the end of its domain."""
     return [f"{row.name}: {row.value}, {row.interval} (95 %)." for row in best.rows() if row.boundary]
 
 
 def describe_forms(solutions: tuple[Solution, ...]) -> list[str]:
-    """Return sentences on numbers on which the two forms of the likelihood disagree beyond their errors."""
+    """Return a sentence on each number on which the two forms of the likelihood disagree beyond their errors."""
     if len(solutions) < 2:
         return []
     sentences = []

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.learning.fit_sentences import describe_boundaries, describe_forms
+from heliograph.learning.fit_sentences import describe_boundaries, describe_climb, describe_forms
 from heliograph.learning.free_network import Build, Description, describe
 from heliograph.learning.identification import Identifiability, identify_by_recording
 from heliograph.learning.inference import FitTest, Values, compare_likelihoods, information_criteria, wald_test
@@ -26,7 +26,6 @@ from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.simulation.network import Network
 
-ELSEWHERE = 0.01  # of the log-likelihood: a start that ends so far below the best ended elsewhere
 CHEAP_ERRORS = "Errors by the expected information; `rows()` has intervals by the scores, and at the ends of domains."
 
 Progress = TypeAliasType("Progress", Callable[[str], None])
@@ -214,7 +213,7 @@ class Fit:
     def sentences(self) -> tuple[str, ...]:
         """Sentences on starts, boundaries, forms that disagree, and what the data cannot identify."""
         return (
-            *_describe_climb(self),
+            *describe_climb(self.solutions, self.ends, self.stopped),
             *describe_boundaries(self.best),
             *describe_forms(self.solutions),
             *self.identified.sentences,
@@ -224,7 +223,10 @@ class Fit:
         """Return the table of estimates: with intervals if `rows` computed them, else with cheap standard errors."""
         delay_lines = [f"{node}: {found}" for node, found in self.delays.items()]
         if not self.best.has_rows:
-            sentences = (*_describe_climb(self), *self.identified.sentences)  # those that need no interval
+            sentences = (
+                *describe_climb(self.solutions, self.ends, self.stopped),
+                *self.identified.sentences,
+            )  # those that need no interval
             return "\n".join([*self.best.describe_with_cheap_errors(), *delay_lines, *sentences, CHEAP_ERRORS])
         width = max(len(row.name) for row in self.table)
         lines = [f"{row.name:{width}}  {row.value:>10}  ({row.interval})  ({row.form})" for row in self.table]
@@ -283,25 +285,35 @@ def fit(
             raise fail("truth", "none behind a sender that decides when to send", "one")
         return replace(fit_sender(description, recording, inputs, starts, check_seed("seed", seed)), delays=delays)
     data = gather_data(description.start, recording, inputs, description.parameters.size, truth)
-    # each form's likelihood over the free numbers, and the starts
+    # The likelihood over the free numbers in each form, where to begin, and what the data identify at all.
     surfaces = [LikelihoodSurface(objective, data) for objective in make_objectives(description, truth is not False)]
     points = _choose_starts(surfaces[0], starts, check_seed("seed", seed))
     identified = identify_by_recording(surfaces[-1], points[0], seed)
-    solutions, ends, stopped = _search_forms(surfaces, points, seed, identified.ridges, progress or (lambda line: None))
+    # The maximum of each form, and the estimates and intervals in the sentences on what is identified.
+    report = progress or (lambda line: None)
+    solutions, ends, stopped = _maximise_forms(surfaces, points, seed, identified.ridges, report)
     try:
         identified = identified.at(solutions[-1])
-    except KeyboardInterrupt:  # what is left out are the intervals in its sentences
+    except KeyboardInterrupt:  # without these intervals the fit is whole
         stopped = True
     return Fit(description, tuple(solutions), identified, ends, stopped, delays)
 
 
-def _search_forms(
+def _maximise_forms(
     surfaces: list[LikelihoodSurface], points: np.ndarray, seed: int, ridges: int, progress: Progress
 ) -> tuple[list[Solution], Float[np.ndarray, " starts"], bool]:
-    """Maximise each form, from the best end of the one before.
+    """Return the maximum of each form of the likelihood; the first is searched from all starts, the next from its best.
+
+    Args:
+        surfaces: the likelihood in each form.
+        points: the starts (starts, p).
+        seed: of further starts.
+        ridges: number of directions in which the likelihood does not change.
+        progress: called with a line of text at each step.
 
     Returns:
-        The solutions, log-likelihoods at the ends of the first form's starts, and whether Ctrl-C stopped it.
+        The solutions, log-likelihoods at the ends of the first form's climbs, and whether Ctrl-C stopped the search:
+        then the last solution is the best point so far.
 
     Raises:
         KeyboardInterrupt: before there was a first point.
@@ -317,7 +329,8 @@ def _search_forms(
             if search.best is None:  # the form before has the best so far
                 return solutions, ends, True
             top, stopped = search.best, True
-        ends = ends if len(ends) else search.ends
+        if not len(ends):
+            ends = search.ends
         solutions.append(Solution(surface, top, ridges))
         if stopped:
             return solutions, ends, True
@@ -326,32 +339,35 @@ def _search_forms(
 
 
 def _convert_event_tables(recording: Any) -> tuple[object, dict[str, Delays]]:
-    """Return recordings with tables of events turned into rows, and the laws of their delays by node."""
+    """Return recordings with tables of events turned into rows, and {node: law of its delays} of these tables."""
     several = recording if isinstance(recording, list) else [recording]
     tables = [table for table in several if hasattr(table, "lateness")]
     if not tables:
         return recording, {}
     # Of several tables the measurements of a node are counted together, in steps of the first that has any.
     steps = {name: law.step for table in reversed(tables) for name, law in table.delays().items()}
-    late = [table.lateness() for table in tables]
-    delays = {name: learn_delays(np.concatenate([lateness[name] for lateness in late if name in lateness]), step)
-              for name, step in steps.items()}  # fmt: skip
+    by_table = [table.lateness() for table in tables]  # seconds by node
+    delays = {}
+    for name, step in steps.items():
+        lateness = [by_node[name] for by_node in by_table if name in by_node]
+        delays[name] = learn_delays(np.concatenate(lateness), step)
     return [table.recording() if table in tables else table for table in several], delays
 
 
 def _choose_starts(surface: LikelihoodSurface, count: int, seed: int) -> Float[np.ndarray, "starts p"]:
-    """Return the starts at which the likelihood is finite: the given one, and others around it.
+    """Return `count` starts at which the likelihood is finite: the given one, and others drawn around it.
 
     Raises:
         ValueError: a start that is impossible, or a number on which nothing depends.
     """
     parameters = surface.objective.description.parameters
     start, rng = parameters.start, np.random.default_rng(seed)
-    first = surface.evaluations(start[None])
-    if not np.isfinite(first.total[0]):
-        step = int(np.argmax(~np.isfinite(surface.evaluate_rows(start[None]).density[0].sum(axis=0))))
-        raise fail("start of the fit", "numbers under which the recording is possible",
-                   f"a log-likelihood of {first.total[0]} from step {step} on")  # fmt: skip
+    total = surface.evaluations(start[None]).total[0]
+    if not np.isfinite(total):
+        by_row = surface.evaluate_rows(start[None]).density[0].sum(axis=0)
+        step = int(np.argmax(~np.isfinite(by_row)))
+        expected = "numbers under which the recording is possible"
+        raise fail("start of the fit", expected, f"a log-likelihood of {total} from step {step} on")
     # Others are drawn uniformly around it: logarithms and logits within SPREAD, real numbers within half their size or
     # AWAY standard errors, whichever is more.
     free, deviation = surface.domains.free, surface.standard_errors(start)
@@ -363,7 +379,7 @@ def _choose_starts(surface: LikelihoodSurface, count: int, seed: int) -> Float[n
 
 
 def _check_dependence(surface: LikelihoodSurface, points: np.ndarray) -> None:
-    """Raise ValueError at a free number of which the data have no information at any of the points."""
+    """Raise ValueError at a free number of which the data have no information at any of the points (points, p)."""
     largest = np.nanmax(np.diagonal(surface.evaluations(points).information, axis1=1, axis2=2), axis=0)
     names = surface.objective.description.parameters.coordinates
     without = [name for name, information in zip(names, largest, strict=True) if not information > 0]
@@ -372,7 +388,7 @@ def _check_dependence(surface: LikelihoodSurface, points: np.ndarray) -> None:
 
 
 def _report_climbs(surface: LikelihoodSurface, say: Progress) -> Callable[[Maximum], None]:
-    """Return what says after each step of a search how far it is."""
+    """Return the function that reports, after each step of a search, how many climbs are done and how high they are."""
     form = surface.objective.form
 
     def report(now: Maximum) -> None:
@@ -380,21 +396,3 @@ def _report_climbs(surface: LikelihoodSurface, say: Progress) -> Callable[[Maxim
         say(f"{form}: step {now.steps}, {int(now.converged.sum())} of {len(now.x)} starts done, {best:.6g}")
 
     return report
-
-
-def _describe_climb(fitted: Fit) -> list[str]:
-    """Return the sentences on searches that were stopped, did not converge, or ended below the best."""
-    sentences = []
-    if fitted.stopped:
-        sentences.append("Stopped before the end: this is the best so far.")
-    for solution in fitted.solutions:
-        if not solution.converged and not fitted.stopped:
-            why = f"The {solution.form} form did not converge: {solution.top.reason}."
-            sentences.append(f"{why} The estimates are the best point found.")
-    # How far below the best each start ended (NaN: nowhere); those within ELSEWHERE ended at the same maximum.
-    below = fitted.solutions[0].total - fitted.ends
-    lower = np.count_nonzero(~(below < ELSEWHERE))
-    if lower and not fitted.stopped:
-        least = np.nanmin(np.where(below < ELSEWHERE, np.nan, below))
-        sentences.append(f"Best of {len(below)} starts, of which {lower} ended lower, by {least:.3g} or more.")
-    return sentences

@@ -87,7 +87,7 @@ _reader: ContextVar[_FreeNumberReader | None] = ContextVar("reader of free numbe
 
 @contextmanager
 def answering_free_by(reader: _FreeNumberReader) -> Iterator[None]:
-    """Have `free` answer as this reader does, inside the block."""
+    """Let `reader` answer all calls of `free` inside the block."""
     token = _reader.set(reader)
     try:
         yield
@@ -165,7 +165,7 @@ class ValueReader:
 
 
 def _make_distinct(name: str, taken: set[str]) -> str:
-    """Return a name, with a number behind it if it is taken."""
+    """Return a name that is not `taken`: the name itself, or with the first free number behind it."""
     if name not in taken:
         return name
     return next(f"{name} {i}" for i in range(2, 10_000) if f"{name} {i}" not in taken)
@@ -206,7 +206,7 @@ class Description:
         return self.at({parameter.name: plain_number(parameter.start) for parameter in self.parameters.every})
 
     def at_point(self, x: Float[np.ndarray, " p"]) -> Network:
-        """Return the network at a point (p,) of the line, of plain numbers."""
+        """Return the network, of plain numbers, at a point x (p,) of the line."""
         return self.at(self.parameters.known(x))
 
 

@@ -91,7 +91,12 @@ def compare_filters(
 ) -> list[Change]:
     """Return how each filter that claims a covariance predicts the rows from `cut` on, before and after learning.
 
-    The filters run over all rows.
+    Args:
+        before: the network before learning.
+        after: the same with the numbers learned.
+        measurements: by node (rows, received); the filters run over all rows.
+        inputs: of the plant (rows, inputs).
+        cut: number of the first row that was not learned from.
     """
     results = []
     for name, z in measurements.items():
@@ -111,7 +116,11 @@ def compare_filters(
 def transform_held_out(
     network: Network, outcome: list[Change], measurements: dict[str, np.ndarray], inputs: np.ndarray, cut: int
 ) -> list[Uniformity]:
-    """Return the probability integral transforms of each node: by its laws where known, else by its first filter."""
+    """Return the probability integral transforms of each node's rows from `cut` on.
+
+    By the laws of its gains and noise where known, else by the Gaussian predictions of its first filter (`outcome`).
+    `measurements`: by node (rows, received); `inputs`: (rows, inputs).
+    """
     uniform = []
     for name, z in measurements.items():
         of_node, node = [change for change in outcome if change.node == name], network.nodes[name]
@@ -124,9 +133,9 @@ def transform_held_out(
 
 
 def _transform_by_laws(network: Network, node: Node, z: np.ndarray, inputs: np.ndarray) -> np.ndarray | None:
-    """Return P(z_k <= what came | rows before) of each measurement, by the node's laws of gain and noise.
+    """Return P(z_k <= what came | rows before) of each measurement (rows, received), by the node's laws.
 
-    None where such laws have no nodes to sum over, vary over time, or remember.
+    Those of gain and noise. None where they have no nodes to sum over, vary over time, or remember.
     """
     parts = (network.plant, node.sensor, node.channel)
     if any(isinstance(model, OverTime) for model in parts) or first(node.channel).remembers:
@@ -138,7 +147,7 @@ def _transform_by_laws(network: Network, node: Node, z: np.ndarray, inputs: np.n
 
 
 def _predict_rows(filter: AbstractFilter, z: np.ndarray, u: np.ndarray, cut: int) -> PredictedRows:
-    """Return a filter's predictions of the rows from `cut` on; it runs over all rows."""
+    """Return a filter's predictions of the rows from `cut` on, by measurements z and inputs u of all rows."""
     likelihood, white = (np.asarray(values)[cut:] for values in score_innovations(filter, z, u))
     lags = min(LAGS, len(white) // 10)
     has_enough = lags > 0 and np.count_nonzero(~np.isnan(white)) > LAGS
@@ -169,7 +178,7 @@ def compare_laws(a: Predictive, b: Predictive) -> Comparison:
 
 
 def compare_mean(differences: Float[np.ndarray, " steps"]) -> Comparison:
-    """Return the test of whether the mean of differences (steps,) is zero."""
+    """Return the test of whether the mean of differences (steps,), correlated over time, is zero."""
     mean, error = mean_and_error(differences)
     z = mean / error if error > 0 else 0.0
     return Comparison(mean, error, float(z), float(2 * scipy.stats.norm.sf(abs(z))))

@@ -126,7 +126,7 @@ def _choose_points(start: np.ndarray, seed: int) -> list[np.ndarray]:
 def _judge_identifiability(
     parameters: Parameters, points: list[np.ndarray], ranks: list[InformationRank]
 ) -> Identifiability:
-    """Return the identifiability by the ranks of the information at several points, with its sentences."""
+    """Return the identifiability by the ranks of the information at several points (p,), with its sentences."""
     groups = tuple(find_confounded(parameters, points, ranks))
     ridges = min(rank.flat.shape[1] for rank in ranks)
     weakest = max(rank.weakest for rank in ranks)
@@ -135,7 +135,10 @@ def _judge_identifiability(
 
 
 def describe_unidentified(identifiability: Identifiability, solution: "Solution | None") -> tuple[str, ...]:
-    """Return the sentences on what is not identified, and on what is in its place."""
+    """Return the sentences on numbers that are not identified, and on what is in their place.
+
+    `solution`: the maximum, whose estimates and intervals they have; None where there is none yet.
+    """
     names = identifiability.parameters.coordinates
     lines = [_describe_group(identifiability.parameters, group, solution) for group in identifiability.groups]
     if solution is not None and any(
@@ -151,22 +154,26 @@ def describe_unidentified(identifiability: Identifiability, solution: "Solution 
 
 
 def _describe_group(parameters: Parameters, group: Confounded, solution: "Solution | None") -> str:
-    """Return one sentence on a group of confounded numbers: which sums or products of them the data do tell."""
+    """Return one sentence on a group of confounded numbers: which sums or products of them the data do tell.
+
+    Such as "Of a and b only the product a * b (0.48, 95 % 0.44..0.53) is identified; fix one." The interval needs a
+    `solution`, the maximum of the likelihood.
+    """
     names = [parameters.coordinates[i] for i in group.places]
-    fix = "fix one" if group.fix == 1 else f"fix {group.fix} of them"
-    # Directions that are identified besides the products and sums that have a name.
-    unnamed = len(names) - group.fix - len(group.exponents) - len(group.weights)
     if group.fix == len(names):
         return f"Nothing in the data tells {_join_names(names)}."
+    fix = "fix one" if group.fix == 1 else f"fix {group.fix} of them"
     # Products x^a y^b and sums a x + b y that are identified, each with its interval.
     combinations = []
     for row in group.exponents:
         combinations.append(product_text(names, row) + _format_interval(parameters, group, row, solution, log=True))
     for row in group.weights:
         combinations.append(format_sum(names, row) + _format_interval(parameters, group, row, solution, log=False))
+    # Of n numbers, of which k must be fixed, n - k combinations are identified; some are neither product nor sum.
+    unnamed = len(names) - group.fix - len(combinations)
     if not combinations:
         return f"The data tell only {_count_in_words(unnamed, 'combination')} of {_join_names(names)}; {fix}."
-    kind = "product" if np.all(group.exponents >= 0) else "combination"
+    kind = "product" if np.all(group.exponents >= 0) else "combination"  # a / b is no product
     if len(group.weights):
         kind = "sum"
     kind += "s" if len(combinations) > 1 else ""
@@ -176,7 +183,7 @@ def _describe_group(parameters: Parameters, group: Confounded, solution: "Soluti
 
 
 def _count_in_words(count: int, what: str) -> str:
-    """Return a count of something, "one" in words, with its plural."""
+    """Return a count of things as text: "one combination", "3 combinations"."""
     return f"one {what}" if count == 1 else f"{count} {what}s"
 
 
@@ -215,17 +222,21 @@ def _join_names(names: list[str]) -> str:
 
 
 def _draw_data(objective: Objective, x: np.ndarray, u: np.ndarray, seed: int) -> Float[np.ndarray, "steps m"]:
-    """Return measurements drawn as the filter at the point x expects them, Gaussian given those before them."""
+    """Return measurements (steps, received) drawn as the filter at x (p,) expects them, with inputs u.
+
+    Each row is Gaussian given those before it.
+    """
     with jax.enable_x64(True):
         return np.asarray(_draw_expected(objective, x, u, jax.random.key(seed)))
 
 
 @quickly_compiled
 def _draw_expected(objective: Objective, x: Array, u: Array, key: jax.Array) -> jax.Array:
-    """Return a recording drawn from the filter itself: each z from N(E z, S) given those before it."""
+    """Return measurements (steps, received) drawn from the filter itself, each from N(E z, S) given those before."""
     filter = objective.filter(jnp.asarray(x))
 
     def draw_row(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, jax.Array]:
+        """Return the filter's state after row k, and the measurement drawn for it."""
         k, u_k, noise = row
         prior = filter.predict(state, u_k, k)
         # The innovation of z = 0 is -E z, with covariance S.
@@ -246,32 +257,36 @@ KINDS = ("mean gain", "gain variance", "noise")
 
 
 def describe_identified_links(solution: "Solution") -> list[str]:
-    """Return sentences on the identified mean gain, gain variance and noise of each output, the sensor's included."""
+    """Return a sentence on each output of which the data identify mean gain, gain variance or noise.
+
+    Such as "The received y has mean gain 0.8 (0.7 .. 0.9), 95 %, the sensor's noise included." There is none where the
+    sensor or channel varies over time, or depends on inputs or the past.
+    """
     description = solution.surface.objective.description
     _, sensor, channel = join_world(description.start)
     if isinstance(sensor, OverTime) or not _is_route_constant(sensor, channel):
         return []
 
-    def measure_at(x: Array) -> jax.Array:
-        """Return mean gain, gain variance and noise of each output at a point, (outputs, 3)."""
+    def compute_moments_at(x: Array) -> jax.Array:
+        """Return mean gain, gain variance and noise of each output at a point x (p,) of the line, (outputs, 3)."""
         _, sensor, channel = join_world(description.at(description.parameters.values(x)))
         return _compute_link_moments(first(sensor), first(channel))
 
     with jax.enable_x64(True):
         x = jnp.asarray(solution.x)
-        values, slopes = np.asarray(measure_at(x)), np.asarray(jax.jacfwd(measure_at)(x))
-    # Intervals by the derivatives g, of variance g' C g, for what is identified.
+        moments = np.asarray(compute_moments_at(x))  # (outputs, 3)
+        slopes = np.asarray(jax.jacfwd(compute_moments_at)(x))[:, :, solution.active]  # (outputs, 3, active)
+    # Intervals of what is identified: a function with the derivatives g has the variance g' C g.
     covariance, freedom = solution.covariance()
+    names = sensor.outputs if len(sensor.outputs) == len(moments) else [f"z{i}" for i in range(len(moments))]
     lines = []
-    has_names = len(sensor.outputs) == len(values)
-    for i in range(len(values)):
+    for name, values, gradients in zip(names, moments, slopes, strict=True):
         found = []
-        for kind, value, gradient in zip(KINDS, values[i], slopes[i][:, solution.active], strict=True):
+        for kind, value, gradient in zip(KINDS, values, gradients, strict=True):
             if solution.identifies(gradient):
                 reach = quantile(freedom) * float(np.sqrt(max(gradient @ covariance @ gradient, 0.0)))
                 found.append(f"{kind} {value:.3g} ({value - reach:.3g} .. {value + reach:.3g})")
         if found:
-            name = sensor.outputs[i] if has_names else f"z{i}"
             lines.append(f"The received {name} has {', '.join(found)}, 95 %, the sensor's noise included.")
     return lines
 

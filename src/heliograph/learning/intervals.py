@@ -36,22 +36,23 @@ class LongRunCovariance(NamedTuple):
 
 
 def count_cosines(steps: int) -> int:
-    """Return the number of cosines, nu = floor(0.4 T^(2/3))."""
+    """Return the number of cosines by which the scores of so many steps are judged, nu = floor(0.4 T^(2/3))."""
     return max(int(0.4 * steps ** (2 / 3)), 1)
 
 
 def find_numbers_told_by_few(information: list[Float[np.ndarray, "steps k"]]) -> Bool[np.ndarray, " k"]:
-    """Return which numbers (k,) have their information in a few of the nu stretches of the data.
+    """Return which of k numbers have their information in a few of the nu stretches of the data, (k,).
 
-    (sum_b V_b)^2 / sum_b V_b^2, of V_b in stretch b, is the number of stretches if all tell the same, and 1 if one
-    tells all. Scores vary over time only where they are told of: cosines that hardly change there see next to nothing.
+    `information`: of each recording that of each row on each number (steps, k). (sum_b V_b)^2 / sum_b V_b^2, of V_b in
+    stretch b, is the number of stretches if all tell the same, and 1 if one tells all. Scores vary over time only where
+    they are told of: cosines that hardly change there see next to nothing.
     """
-    by_stretch = []
+    by_recording = []
     for rows in information:
         count = count_cosines(len(rows))
         begins = np.arange(count) * len(rows) // count
-        by_stretch.append(np.add.reduceat(rows, begins, axis=0))
-    stretches = np.maximum(np.concatenate(by_stretch), 0.0)
+        by_recording.append(np.add.reduceat(rows, begins, axis=0))
+    stretches = np.maximum(np.concatenate(by_recording), 0.0)  # V, (stretches, k)
     return np.asarray(stretches.sum(axis=0) ** 2 < FEW * len(stretches) * np.sum(stretches**2, axis=0))
 
 
@@ -60,54 +61,59 @@ def covariance_by_model(
 ) -> tuple[Scores, Float[np.ndarray, "p p"]]:
     """Return scores less what the scores of a few numbers K predict of them, and the covariance of that prediction.
 
-    s - H_.K H_KK^-1 s_K and H_.K H_KK^-1 H_K., with K the numbers of the mask `few`: where the model is true the two
-    parts are uncorrelated, and the covariances of their sums add up to H.
+    s - H_.K H_KK^-1 s_K and H_.K H_KK^-1 H_K., with the scores s of each step, the Hessian H of minus the
+    log-likelihood and K the numbers of the mask `few`: where the model is true the two parts are uncorrelated, and the
+    covariances of their sums add up to H.
     """
-    shares = np.linalg.solve(hessian[np.ix_(few, few)], hessian[few])
-    return [s - s[:, few] @ shares for s in scores], hessian[:, few] @ shares
+    coefficients = np.linalg.solve(hessian[np.ix_(few, few)], hessian[few])  # (few, p)
+    return [s - s[:, few] @ coefficients for s in scores], hessian[:, few] @ coefficients
 
 
 def estimate_by_cosines(scores: Scores) -> LongRunCovariance:
     """Return the long-run covariance (T/nu) sum_j G_j G_j' of scores, summed over series, with its degrees of freedom.
 
-    G_j = sqrt(2/T) sum_t s_t cos(pi j (t + 1/2)/T), j = 1..nu, nu = floor(0.4 T^(2/3)).
+    G_j = sqrt(2/T) sum_t s_t cos(pi j (t + 1/2)/T), j = 1..nu, nu = floor(0.4 T^(2/3)), of each series s of T steps.
 
     Source: Müller, HAC corrections for strongly autocorrelated time series (2014); Lazarus, Lewis, Stock and Watson,
     HAR inference (2018).
     """
-    parts, weights = [], []
+    covariances, steps_and_cosines = [], []
     for s in scores:
         steps = len(s)
         count = count_cosines(steps)
-        g = np.sqrt(1 / (2 * steps)) * scipy.fft.dct(s, axis=0)[1 : count + 1]
-        parts.append(steps / count * g.T @ g)
-        weights.append((steps, count))
-    total = sum(steps for steps, _ in weights)
-    return LongRunCovariance(np.sum(parts, axis=0), total**2 / sum(steps**2 / count for steps, count in weights))
+        g = np.sqrt(1 / (2 * steps)) * scipy.fft.dct(s, axis=0)[1 : count + 1]  # SciPy's sum has the factor 2
+        covariances.append(steps / count * g.T @ g)
+        steps_and_cosines.append((steps, count))
+    # Each series has nu degrees of freedom; those of the sum by Satterthwaite's rule, with variances as the steps.
+    total = sum(steps for steps, _ in steps_and_cosines)
+    freedom = total**2 / sum(steps**2 / count for steps, count in steps_and_cosines)
+    return LongRunCovariance(np.sum(covariances, axis=0), freedom)
 
 
 def estimate_by_bartlett(scores: Scores) -> LongRunCovariance:
     """Return the long-run covariance of scores with Bartlett's weights, summed over series.
 
-    sum_|l|<=L (1 - |l|/(L + 1)) sum_t s_t s_(t-l)', L = ceil(4 (T/100)^(2/9)).
+    sum_|l|<=L (1 - |l|/(L + 1)) sum_t s_t s_(t-l)', L = ceil(4 (T/100)^(2/9)), of each series s of T steps.
 
     Source: Newey and West (1987).
     """
-    results = []
+    covariances = []
     for s in scores:
         lags = int(np.ceil(4 * (len(s) / 100) ** (2 / 9)))
         products = [s[lag:].T @ s[: len(s) - lag] * (1 - lag / (lags + 1)) for lag in range(min(lags + 1, len(s)))]
-        results.append(products[0] + sum(product + product.T for product in products[1:]))
-    return LongRunCovariance(np.sum(results, axis=0), freedom=np.inf)
+        covariances.append(products[0] + sum(product + product.T for product in products[1:]))
+    return LongRunCovariance(np.sum(covariances, axis=0), freedom=np.inf)
 
 
-def white(scores: Scores) -> LongRunCovariance:
-    """Return the covariance of the sum of scores that are uncorrelated over time, sum_t s_t s_t'."""
+def estimate_if_white(scores: Scores) -> LongRunCovariance:
+    """Return the covariance of the sum of scores, sum_t s_t s_t', taken for uncorrelated over time (white)."""
     return LongRunCovariance(np.sum([s.T @ s for s in scores], axis=0), freedom=np.inf)
 
 
 def draw_block_sums(scores: Scores, draws: int, seed: int) -> Float[np.ndarray, "draws p"]:
     """Return sums of scores over blocks of 2 T^(1/3) steps drawn with replacement, less their mean, (draws, p).
+
+    Of each series of T steps about T blocks' worth of steps is drawn, and the sums of all series are added.
 
     Source: Künsch (1989) for blocks; Hu and Kalbfleisch (2000) for drawing scores in place of data.
     """
@@ -128,7 +134,7 @@ def draw_block_sums(scores: Scores, draws: int, seed: int) -> Float[np.ndarray, 
 def estimate_long_run_covariance(
     method: Method, scores: Scores, hessian: Float[np.ndarray, "p p"]
 ) -> LongRunCovariance:
-    """Return the covariance of the sum of scores by a method.
+    """Return the covariance of the sum of scores by a method of `Fit.rows`, with its degrees of freedom.
 
     Of "hessian" and "profile" it is the Hessian of -l, as in a right model.
     """
@@ -141,13 +147,13 @@ def estimate_long_run_covariance(
         case "bartlett":
             return estimate_by_bartlett(scores)
         case "white":
-            return white(scores)
+            return estimate_if_white(scores)
         case "hessian" | "profile":
             return LongRunCovariance(hessian, freedom=np.inf)
 
 
 def quantile(freedom: float, level: float = LEVEL) -> float:
-    """Return the number of standard errors that an interval reaches to each side."""
+    """Return how many standard errors an interval of this level reaches to each side: a quantile of Student's law."""
     return float(scipy.stats.t.ppf((1 + level) / 2, freedom))
 
 

@@ -33,7 +33,7 @@ class Parameter:
 
     @property
     def entries(self) -> tuple[str, ...]:
-        """Return the names of its entries, of a covariance those on and below the diagonal."""
+        """Return the names of its entries in the table; of a covariance those on and below the diagonal."""
         if self.start.ndim == 0:
             return (self.name,)
         indices = np.ndindex(self.start.shape)
@@ -42,16 +42,16 @@ class Parameter:
         return tuple(f"{self.name}[{','.join(map(str, index))}]" for index in shown)
 
     def read(self, value: Array) -> Array:
-        """Return the vector of the entries of a value."""
+        """Return the entries (entries,) of the table from a value of the free number."""
         return value[np.tril_indices(len(value))] if self.domain.kind == "covariance" else value.reshape(-1)
 
     def values(self, x: Float[np.ndarray, " size"]) -> Float[np.ndarray, " entries"]:
-        """Return the entries at a point of the line."""
+        """Return the entries (entries,) of the table at a point x (size,) of the line."""
         with jax.enable_x64(True):
             return np.asarray(self._read_at(np.asarray(x)))
 
     def derivatives(self, x: Float[np.ndarray, " size"]) -> Float[np.ndarray, "entries size"]:
-        """Return the derivatives of the entries at a point of the line."""
+        """Return the derivatives (entries, size) of the entries at a point x (size,) of the line."""
         if self.domain.kind == "interval":
             return np.diag(unlink_slope(self.domain, x))
         with jax.enable_x64(True):
@@ -123,7 +123,7 @@ class Parameters:
         )
 
     def values(self, x: Array) -> dict[str, Array]:
-        """Return the numbers at a point of the line, by name."""
+        """Return the free numbers at a point x (p,) of the line, {name: number}, in operations that JAX traces."""
         ends = np.cumsum([0, *(parameter.size for parameter in self.every)])
         return {
             parameter.name: map_from_line(parameter.domain, parameter.start.shape, x[a:b])
@@ -136,20 +136,20 @@ class Parameters:
             return {name: plain_number(value) for name, value in self.values(np.asarray(x)).items()}
 
     def entries_at(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, " entries"]:
-        """Return the values of the entries."""
+        """Return the values of all entries of the table (entries,) at a point x (p,) of the line."""
         return np.concatenate([parameter.values(single) for parameter, single in self._parts(x)])
 
     def jacobian(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, "entries p"]:
-        """Return the derivatives of the entries."""
+        """Return the derivatives of all entries of the table by the coordinates x (entries, p)."""
         return np.asarray(block_diag(*(parameter.derivatives(single) for parameter, single in self._parts(x))))
 
     def _parts(self, x: np.ndarray) -> list[tuple[Parameter, np.ndarray]]:
-        """Return each free number with its coordinates at a point."""
+        """Return each free number with its own coordinates (size,) at a point x (p,)."""
         ends = np.cumsum([parameter.size for parameter in self.every])
         return list(zip(self.every, np.split(x, ends[:-1]), strict=True))
 
     def slopes(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, "entries p"]:
-        """Return the derivatives of the entries, each on the scale where its interval is symmetric."""
+        """Return the derivatives (entries, p) of the entries, mapped to the line by `link`, by the coordinates x."""
         pairs = zip(self.entries, self.entries_at(x), self.jacobian(x), strict=True)
         with np.errstate(all="ignore"):
             return np.stack([slope(entry.domain, value) * row for entry, value, row in pairs])

@@ -135,13 +135,12 @@ def _name_nodes(network: Network, recording: Any, held: Any) -> Mapping[str, Any
     Raises:
         ValueError: an array where there are several nodes, or other nodes than the network's.
     """
-    if not isinstance(held, Mapping):
-        if len(network.names) > 1:
-            raise fail("recording", f"measurements by node, of {list(network.names)}", show_value(recording))
-        held = {network.names[0]: held}
-    if set(held) != set(network.names):
-        raise fail("recording", f"measurements of the nodes {list(network.names)}", list(held))
-    return held
+    if not isinstance(held, Mapping) and len(network.names) > 1:
+        raise fail("recording", f"measurements by node, of {list(network.names)}", show_value(recording))
+    by_node: Mapping[str, Any] = held if isinstance(held, Mapping) else {network.names[0]: held}
+    if set(by_node) != set(network.names):
+        raise fail("recording", f"measurements of the nodes {list(network.names)}", list(by_node))
+    return by_node
 
 
 def _join_nodes(network: Network, run: list[np.ndarray], inputs: Any) -> tuple[np.ndarray, np.ndarray]:

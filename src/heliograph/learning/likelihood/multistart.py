@@ -97,12 +97,13 @@ class MaximumSearch:
         return top
 
     def _prove_maximum(self, climbed: Maximum) -> HighestPoint:
-        """Return the best of some climbs, with numbers put at the ends of their domains, once it is a maximum.
+        """Return the best of some climbs, once it is a maximum, with numbers put at the ends of their domains.
 
-        Else it climbs again, ROUNDS times at most, or says why it is none.
+        While it is none it climbs again, ROUNDS times at most; then the point says why it is none.
 
-        A maximum: g' H^-1 g is nothing with the Hessian H of -l, which is not indefinite, among the numbers inside
-        their domains; at an end the likelihood does not rise inwards.
+        A maximum: g' H^-1 g is nothing, with the gradient g of the log-likelihood l and the Hessian H of -l, which is
+        not
+        indefinite, among the numbers inside their domains; at an end l does not rise inwards.
         """
         no_ends = np.zeros(climbed.x.shape[1])
         top = _take_best(climbed, no_ends)
@@ -116,28 +117,33 @@ class MaximumSearch:
         return top._replace(converged=False, reason="the search went to and fro between two points")
 
     def _draw_around(self, top: HighestPoint, count: int, seed: int) -> Float[np.ndarray, "points p"]:
-        """Return points around a maximum: logarithms and logits within SPREAD, real numbers some standard errors away.
+        """Return `count` points drawn around a maximum, and one more near each end of a domain.
 
-        One more for each number that has an end of its domain begins near that end.
+        Logarithms and logits are within SPREAD of it, real numbers some standard errors away.
         """
         deviation = self.surface.standard_errors(top.x)
         spread = np.where(self.surface.domains.free, AWAY * np.where(np.isfinite(deviation), deviation, 0.0), SPREAD)
-        lowered = np.flatnonzero(self.surface.domains.single)
-        drawn = np.random.default_rng([seed, 2]).uniform(-1.0, 1.0, (count + len(lowered), len(top.x)))
+        with_ends = np.flatnonzero(self.surface.domains.single)
+        drawn = np.random.default_rng([seed, 2]).uniform(-1.0, 1.0, (count + len(with_ends), len(top.x)))
         # A number at an end is drawn around the point furthest inside at which the likelihood has not fallen by SEEN.
         centre = top.x.copy()
         for index in np.flatnonzero(top.ends):
             _, rise = self._look_inwards(top, int(index))
             centre[index] -= top.ends[index] * INWARDS[np.flatnonzero(rise > -SEEN)[-1]]
         points = centre + drawn * spread
-        points[count + np.arange(len(lowered)), lowered] -= LOWERED
+        points[count + np.arange(len(with_ends)), with_ends] -= LOWERED
         return (self.surface.of_first_rows() or self.surface).possible(points, top.x)
 
     def _climb_by_first_rows(self, starts: np.ndarray, ends: np.ndarray, own: int) -> Maximum:
-        """Maximise from each start as `_climb` does, of long recordings from where their first rows lead.
+        """Return the ends of climbs as `_climb` does; in a long recording its first rows lead them most of the way.
 
-        Start number `own` climbs by all rows from where it is, since the first ones may know nothing of what comes
-        later; those that the first rows lead to one point climb together from there.
+        Starts that the first rows lead to one point climb by all rows together from there.
+
+        Args:
+            starts: where to begin (starts, p).
+            ends: -1 or 1 where a coordinate is held at an end of its domain, else 0 (p,).
+            own: number of the start that climbs by all rows from where it is, since the first ones may know nothing of
+                what comes later.
         """
         short = self.surface.of_first_rows() if len(starts) > 1 else None
         if short is None:
@@ -146,16 +152,20 @@ class MaximumSearch:
         moving = np.repeat((ends == 0)[None], len(starts) - 1, axis=0)
         led = maximise(short.evaluate, starts[others], moving, None, self.surface.domains, joining=True)
         x[others] = led.x
-        # Of each start the first one that is at the same point.
+        # Of each start the first one that is at the same point, to AT_ONE_POINT standard errors.
         error = short.standard_errors(led.x[led.order[0]])
-        within = AT_ONE_POINT * np.where(np.isfinite(error), error, 0.0)
-        same = np.all(np.abs(x[:, None] - x[None]) <= within, axis=2)
-        lanes, places = np.unique(np.argmax(same, axis=1), return_inverse=True)
+        reach = AT_ONE_POINT * np.where(np.isfinite(error), error, 0.0)
+        are_same = np.all(np.abs(x[:, None] - x[None]) <= reach, axis=2)
+        lanes, lane_of_start = np.unique(np.argmax(are_same, axis=1), return_inverse=True)
         climbed = self._climb(self.surface.possible(x[lanes], starts[own]), ends)
-        return Maximum(**{name: leaf if name == "steps" else leaf[places] for name, leaf in climbed._asdict().items()})
+        by_start = {name: leaf if name == "steps" else leaf[lane_of_start] for name, leaf in climbed._asdict().items()}
+        return Maximum(**by_start)
 
     def _climb(self, starts: np.ndarray, ends: np.ndarray) -> Maximum:
-        """Maximise from each start, coordinates at an end held there, and keep the best point seen so far."""
+        """Return the ends of climbs from all starts (starts, p), coordinates at an end (not 0 in `ends`) held there.
+
+        The best point so far is kept at each step.
+        """
 
         def keep_best(now: Maximum) -> None:
             top = _take_best(now, ends)
@@ -167,11 +177,15 @@ class MaximumSearch:
         return maximise(self.surface.evaluate, starts, moving, keep_best, self.surface.domains, joining=True)
 
     def _move_to_limits(self, top: HighestPoint) -> HighestPoint:
-        """Put numbers that the data hardly see at the end of their domains, where the likelihood is the same."""
+        """Return the point with those numbers at an end of their domain that the data hardly see, climbed anew.
+
+        A number is put there if the likelihood is the same there as where the climb ended.
+        """
         domains, x, total, ends = self.surface.domains, top.x.copy(), top.total, top.ends.copy()
         information = np.diag(self.surface.evaluations(x[None]).information[0])
         for index in np.flatnonzero(top.active & domains.single & (information < HARDLY_SEEN)):
-            moved, side = x.copy(), 1.0 if domains.high[index] and x[index] > 0 else -1.0
+            side = 1.0 if domains.high[index] and x[index] > 0 else -1.0
+            moved = x.copy()
             moved[index] += side * FURTHER
             there = self.surface.evaluations(moved[None])
             is_finite = np.isfinite(there.gradient).all() and np.isfinite(there.information).all()
@@ -182,10 +196,11 @@ class MaximumSearch:
         return _take_best(self._climb(x[None], ends), ends)
 
     def _choose_restarts(self, top: HighestPoint) -> tuple[np.ndarray | None, str]:
-        """Return points from which to climb again where the end of a climb is no maximum; else None and why it is none.
+        """Return points from which to climb again if `top` is no maximum, or None; and why it is none, else "".
 
-        The reason is "" of a maximum. Along each number at the end of its domain the likelihood is looked at on the way
-        back inside; at a saddle the climbs begin to both sides of it.
+        A maximum has neither points nor a reason. Along each number at the end of its domain the likelihood is looked
+        at on
+        the way back inside; at a saddle climbs begin to both sides of it.
         """
         for index in np.flatnonzero(top.ends):
             points, rise = self._look_inwards(top, int(index))
@@ -211,14 +226,20 @@ class MaximumSearch:
         return ""
 
     def _look_inwards(self, top: HighestPoint, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return points from the end of a number's domain inwards (INWARDS, p), and how much higher l is at each."""
+        """Return points from the end of a number's domain inwards (INWARDS, p), and how much higher l is there.
+
+        `index`: coordinate of the number; `top`: the point at the end.
+        """
         points = np.repeat(top.x[None], len(INWARDS), axis=0)
         points[:, index] -= top.ends[index] * INWARDS
         return points, np.nan_to_num(self.surface.evaluations(points).total - top.total, nan=-np.inf)
 
 
 def _take_best(climbed: Maximum, ends: np.ndarray) -> HighestPoint:
-    """Return the best of the climbs, with why it stopped if it did not converge."""
+    """Return the best of the climbs, with why it stopped if it did not converge.
+
+    `ends`: -1 or 1 where a coordinate was held at an end of its domain, else 0 (p,).
+    """
     lane = int(climbed.order[0])
     converged, remaining = bool(climbed.converged[lane]), float(climbed.remaining[lane])
     reason = "" if converged else _explain_end(remaining)
@@ -226,7 +247,7 @@ def _take_best(climbed: Maximum, ends: np.ndarray) -> HighestPoint:
 
 
 def _explain_end(remaining: float) -> str:
-    """Return why a climb ended that did not converge, by what a further step promises."""
+    """Return in words why a climb ended that did not converge, by what a further step still promises in nats."""
     if not np.isfinite(remaining):
         return "the likelihood has no finite derivatives there"
     return f"after {MOST_STEPS} steps a further one promises {remaining:.2g} of log-likelihood"

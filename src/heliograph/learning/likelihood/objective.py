@@ -27,7 +27,7 @@ from heliograph.simulation.node import Node
 
 
 def join_world(network: Network) -> tuple[AnyPlant, AnySensor, Channel]:
-    """Return the plant, sensor and channel of all nodes together, in their order, as if no observed loss ever happened.
+    """Return the plant, and sensor and channel of all nodes together, in their order, given that all packets arrive.
 
     Raises:
         ValueError: relays that filter and forward.
@@ -35,17 +35,20 @@ def join_world(network: Network) -> tuple[AnyPlant, AnySensor, Channel]:
     if network.relays is not None:
         raise fail("network to be learned", "nodes that receive sensors through channels", "relays that filter")
     if network.common is not None:
-        return network.plant, network.common.sensor, _join_channels(network.common.channel)
+        return network.plant, network.common.sensor, _condition_on_arrivals(network.common.channel)
     nodes = [node for name in network.names if isinstance(node := network.nodes[name], Node)]
-    channels = [_join_channels(node.channel) for node in nodes]
+    channels = [_condition_on_arrivals(node.channel) for node in nodes]
     if len(nodes) == 1:
         return network.plant, nodes[0].sensor, channels[0]
     sensors = {name: node.sensor for name, node in zip(network.names, nodes, strict=True)}
     return network.plant, *join_links(sensors, channels)
 
 
-def _join_channels(channel: Channel) -> Channel:
-    """Return the channel without observed losses, which leave rows out; with memory losses tell the modes, and stay."""
+def _condition_on_arrivals(channel: Channel) -> Channel:
+    """Return the channel given that packets arrive, since lost rows are left out; one with memory as it is.
+
+    With memory a loss tells the mode of the channel.
+    """
     if first(channel).remembers or not first(channel).erases:
         return channel
     complete: Channel = at_each_step(lambda step: step.condition_on_arrival(), channel)
@@ -82,26 +85,32 @@ class Objective:
         return self.form, _identity_of(description.build), description.parameters, description.named, description.start
 
     def filter(self, x: Array) -> AbstractFilter:
-        """Filter at a point of the line."""
+        """Return the filter of this form at a point x (p,) of the line."""
         return filter_of(self.description.at(self.description.parameters.values(x)), self.form)
 
     def innovations(self, x: Array, z: Array, u: Array) -> tuple[jax.Array, jax.Array]:
         """Return the innovations (steps, m), NaN where nothing arrived, and their covariances (steps, m, m).
 
-        Where the estimate is no number the covariance is none, so that no likelihood is taken for that of silence.
+        Of the filter at x (p,), with measurements z (steps, received) and inputs u (steps, inputs). Where the estimate
+        is no number the innovation is 0 and its covariance NaN, so that the likelihood is NaN there, and not that of a
+        row in which nothing arrived.
         """
         filter = self.filter(x)
 
         def judged(state: PyTree, innovation: Innovation, k: jax.Array) -> tuple[jax.Array, jax.Array]:
-            lost = jnp.any(jnp.isnan(jnp.asarray(filter.estimate(state).mean)))
+            is_lost = jnp.any(jnp.isnan(jnp.asarray(filter.estimate(state).mean)))
             value, covariance = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
-            return jnp.where(lost, 0.0, value), jnp.where(lost, jnp.nan, covariance)
+            return jnp.where(is_lost, 0.0, value), jnp.where(is_lost, jnp.nan, covariance)
 
         innovations: tuple[jax.Array, jax.Array] = filter.scan(z, u, judged)
         return innovations
 
     def errors(self, x: Array, z: Array, u: Array, truth: Array) -> tuple[jax.Array, jax.Array]:
-        """Return the estimates' errors (steps, n), NaN where no truth is known, and what is claimed (steps, n, n)."""
+        """Return the estimates' errors (steps, n), NaN where no truth is known, and the covariances they claim.
+
+        Of the filter at x (p,), with measurements z (steps, received), inputs u (steps, inputs) and true states (steps,
+        n).
+        """
         filter, angles = self.filter(x), first(self.description.start.plant).angles
 
         def claimed(state: PyTree, innovation: Innovation, k: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -113,7 +122,7 @@ class Objective:
 
 
 def _identity_of(build: Build) -> tuple[object, ...]:
-    """Return what makes functions the same: their code and all that they close over; of another callable itself."""
+    """Return what makes two functions the same, their code and all that they close over; of another callable itself."""
     if not isinstance(build, FunctionType):
         return (build,)
     cells = [cell.cell_contents for cell in build.__closure__ or ()]
@@ -121,7 +130,7 @@ def _identity_of(build: Build) -> tuple[object, ...]:
 
 
 def make_objectives(network: Description, by_truth: bool = False) -> list[Objective]:
-    """Return objectives that the network allows, the linear one first; `by_truth` the density of the true states alone.
+    """Return the objectives that the network allows, the linear one first; `by_truth` the density of true states alone.
 
     Linear: the spread of a random gain by the state's unconditional moments, for linear plants; its score has mean zero
     whatever the laws. Conditional: by the state's moments given data, for channels without memory or delay. Without a
@@ -138,26 +147,27 @@ def make_objectives(network: Description, by_truth: bool = False) -> list[Object
 
 @lru_cache
 def _reuse_equal(objective: Objective) -> Objective:
-    """Return the first one equal to this: to find its program again, it need not be compared."""
+    """Return the first objective that equals this one, so that its compiled program is found without a comparison."""
     return objective
 
 
 def list_forms(network: Network) -> list[Form]:
-    """Return the forms that a network allows."""
+    """Return the forms of the likelihood that a network allows, "linear" before "conditional"."""
     plant, sensor, channel = join_world(network)
     link = first(channel)
-    plain = not link.remembers and not link.past
     if not is_linear(plant, sensor) or first(plant).circular or first(sensor).circular:
         if link.past:
             raise fail("network to be learned", "a linear plant and sensor behind links that are late", "others")
         return ["conditional"]
-    if not plain or link.has_known_gain or not has_random_gain(link, second_order(link)):
+    # Without a random gain both forms are the same; behind memory or delay there is no conditional one.
+    has_linear_alone = link.remembers or link.past or link.has_known_gain
+    if has_linear_alone or not has_random_gain(link, second_order(link)):
         return ["linear"]
     return ["linear", "conditional"]
 
 
 def filter_of(network: Network, form: Form) -> AbstractFilter:
-    """Filter of all that the network's nodes receive, whose likelihood is of this form; "truth": the network's own."""
+    """Return the filter of all that a network receives with a likelihood of this form; "truth": the network's own."""
     if form == "truth":
         return find_sole_filter(network)
     plant, sensor, channel = join_world(network)

@@ -26,7 +26,7 @@ Map = TypeVar("Map", bound=AbstractRandomAffine)
 
 
 def approximate_law_by_nodes(law: AbstractLaw, count: int) -> Discrete:
-    """Approximate a law by `count` gains with probabilities, far into its tails.
+    """Return a law of `count` gains with probabilities that approximates this one, far into its tails.
 
     int f(g) dF(g) = int f(F^-1(Phi(t))) phi(t) dt by the trapezoidal rule on |t| <= REACH, Phi the normal distribution
     function: its error falls as exp(-2 pi^2 / h^2) with the distance h of the nodes. A law of finitely many values is
@@ -40,9 +40,8 @@ def approximate_law_by_nodes(law: AbstractLaw, count: int) -> Discrete:
         return Discrete(law.values, law.probabilities)
     if law.constant is not None:
         return Discrete([float(law.constant)], [1.0])
-    # F^-1(Phi(t)) at the nodes
-    points, weights = _normal_nodes(count)
-    return Discrete(law.quantile(points), weights)
+    probabilities, weights = _normal_nodes(count)
+    return Discrete(law.quantile(probabilities), weights)
 
 
 def discretise_laws(channel: Map, count: int) -> Map:
@@ -62,7 +61,7 @@ def discretise_laws(channel: Map, count: int) -> Map:
 
 @cache
 def _normal_nodes(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the values of Phi(t) at the nodes, and their weights."""
+    """Return Phi(t), the normal distribution function, at `count` nodes t of equal distance, and their weights."""
     t = np.linspace(-REACH, REACH, count)
     weights = np.exp(-(t**2) / 2)
     return np.asarray(ndtr(t)), weights / weights.sum()
@@ -141,17 +140,17 @@ def predictive(
     instance("sensor", sensor, AbstractSensor, "one sensor, that does not vary over time")
     instance("channel", channel, AbstractRandomAffine, "one channel, that does not vary over time")
     check_forgets("channel of a predictive likelihood", channel)
+    # Given that something arrived, as the rows in which nothing did say nothing.
     received = channel.condition_on_arrival()
     filter = signal_filter(plant, sensor, received)
     judge_dates(filter.inputs, {"measurements": measurements, "inputs": inputs})
     z = check_rows("measurements", measurements, None, filter.received, missing=True)
-    u = check_rows(
-        "inputs", np.zeros((len(z), 0)) if inputs is None else inputs, len(z), len(filter.inputs), missing=False
-    )
-    y, spread, near = filter.expect_signals(z, u)
-    return evaluate_predictive(
-        (np.asarray(y), np.asarray(spread), np.asarray(near)), ChannelDensities.of(received, nodes)
-    )
+    given_inputs = np.zeros((len(z), 0)) if inputs is None else inputs
+    u = check_rows("inputs", given_inputs, len(z), len(filter.inputs), missing=False)
+    # Mean and covariance of the sensor's signal before each step, and z with angles in the turn next to their mean.
+    y, covariance, measured = filter.expect_signals(z, u)
+    expected = np.asarray(y), np.asarray(covariance), np.asarray(measured)
+    return evaluate_predictive(expected, ChannelDensities.of(received, nodes))
 
 
 class StackPartDensity(NamedTuple):
@@ -177,7 +176,7 @@ class ChannelDensities(tuple[StackPartDensity, ...]):
 
 
 def _stack_combinations(components: list[AffineComponent]) -> StackPartDensity:
-    """Return combinations of a probability above zero as arrays."""
+    """Return the combinations of gains and noises with a probability above zero as arrays, one axis over them."""
     possible = [component for component in components if component.weight > 0]
     weight, gain, offset, noise = (np.array(column) for column in zip(*possible, strict=True))
     return StackPartDensity(np.log(weight), gain, offset, noise)
@@ -201,12 +200,15 @@ def evaluate_predictive(expected: tuple[np.ndarray, np.ndarray, np.ndarray], par
 def _score_block(
     y: np.ndarray, spread: np.ndarray, z: np.ndarray, parts: ChannelDensities
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return log-densities (steps,) and transforms (steps, m) of all parts of a stack, each given those before it."""
+    """Return log-densities (steps,) and transforms (steps, m) of all parts of a stack, each given those before it.
+
+    y, spread: mean (steps, p) and covariance (steps, p, p) of the signal before each step; z: measurements (steps, m).
+    """
     total, pits, start = np.zeros(len(z)), [], 0
     for i, law in enumerate(parts):
         stop = start + law.gain.shape[1]
         log_weight, error = _weigh_combinations(y, spread, z[:, start:stop], law)
-        # P(less than what came) = sum_a P(a | components before) Phi(error of the component in combination a).
+        # The transform: P(less than what came) = sum_a P(a | components before) Phi(error of it in combination a).
         for j in range(stop - start):
             weight = np.exp(log_weight[..., j] - logsumexp(log_weight[..., j], axis=1, keepdims=True))
             pits.append(np.where(np.isnan(z[:, start + j]), np.nan, np.sum(weight * ndtr(error[..., j]), axis=1)))
@@ -223,10 +225,17 @@ def _score_block(
 def _weigh_combinations(
     y: np.ndarray, spread: np.ndarray, z: np.ndarray, law: StackPartDensity
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return log-weights of the combinations, and L^-1 (z - E z) of each, which is standard normal given those before.
+    """Return log-weights of combinations of gains, and the errors L^-1 (z - E z), standard normal given those before.
 
-    Of shapes (t, a, m + 1), before each component and after the last, and (t, a, m), for step t and combination a. With
-    the covariance L L' = G P_y G' + N of z, components that did not arrive stand apart with variance 1.
+    Log-weights (t, a, m + 1) before each component and after the last, and errors (t, a, m), for step t and combination
+    a: log of its probability and of the density of the components so far. L L' = G P_y G' + N is the covariance of z;
+    components that did not arrive stand apart with variance 1.
+
+    Args:
+        y: mean of the signal (t, p).
+        spread: P_y, its covariance (t, p, p).
+        z: measured components of this part (t, m), NaN where none arrived.
+        law: gain G, offset and noise N of each combination.
     """
     present = ~np.isnan(z)[:, None]
     both = present[..., None] & present[..., None, :]
@@ -244,17 +253,25 @@ def _weigh_combinations(
 def _correct_signal(
     y: np.ndarray, spread: np.ndarray, z: np.ndarray, law: StackPartDensity, weight: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean (t, p) and covariance (t, p, p) of the signal given these components too.
+    """Return mean (t, p) and covariance (t, p, p) of the signal given the components of this part too.
 
-    They are those of the mixture over the combinations, of probabilities `weight` (t, a): each is a Kalman update, and
-    the covariance is sum_a w_a (P_a + (m_a - m) (m_a - m)').
+    They are those of the mixture over the combinations a: each is a Kalman update with mean m_a and covariance P_a, and
+    the mixture has the mean m = sum_a w_a m_a and the covariance sum_a w_a (P_a + (m_a - m) (m_a - m)').
+
+    Args:
+        y: mean of the signal (t, p).
+        spread: its covariance (t, p, p).
+        z: measured components (t, m), NaN where none arrived.
+        law: gain, offset and noise of each combination.
+        weight: w, the probability of each combination given z (t, a).
     """
     present = ~np.isnan(z)[:, None, :, None]
     value = np.where(present[..., 0], z[:, None] - np.einsum("amp,tp->tam", law.gain, y) - law.offset, 0.0)
     gain, noise = (np.where(present, rows, 0.0) for rows in (law.gain, roots_of(law.noise)))
-    after = observe_root(roots_of(spread)[:, None], gain, noise)
-    moved = np.einsum("tapm,tam->tap", after.gain, value)
-    shift = np.einsum("ta,tap->tp", weight, moved)
+    updated = observe_root(roots_of(spread)[:, None], gain, noise)
+    # m_a - y of each combination, and m - y.
+    moves = np.einsum("tapm,tam->tap", updated.gain, value)
+    mean_move = np.einsum("ta,tap->tp", weight, moves)
     # A column more in the root adds the square of the distance from the mean.
-    with_distance = np.append(after.root, (moved - shift[:, None])[..., None], axis=-1)
-    return y + shift, np.einsum("ta,tapq->tpq", weight, covariance_of_root(with_distance))
+    with_distance = np.append(updated.root, (moves - mean_move[:, None])[..., None], axis=-1)
+    return y + mean_move, np.einsum("ta,tapq->tpq", weight, covariance_of_root(with_distance))

@@ -224,7 +224,7 @@ def _condition_on_ends(counts: np.ndarray, spans: np.ndarray, intervals: bool) -
         spans: steps from the first to the last packet of each such stretch (stretches,).
         intervals: whether the intervals of the two probabilities are computed too.
     """
-    likelihood = _LikelihoodBetweenEnds(counts, spans)
+    likelihood = _LikelihoodBetweenEnds(counts, spans).evaluate
     top, value = maximise_shares(likelihood, [logits(0.1, 0.5), logits(0.3, 0.3), logits(0.02, 0.9)])
     # Variances of the logits, the diagonal of the Hessian's inverse, from differences of the gradient. What a
     # difference over this width leaves out is 1e-8 of it, and its rounding 1e-12.
@@ -253,7 +253,7 @@ class _LikelihoodBetweenEnds(NamedTuple):
     counts: np.ndarray
     spans: np.ndarray
 
-    def __call__(self, x: np.ndarray) -> tuple[float, np.ndarray]:
+    def evaluate(self, x: np.ndarray) -> tuple[float, np.ndarray]:
         """Return l = sum n log p - sum_spans log P_m, and its gradient (2,), at the logits x (2,) of (a, b).
 
         a: P(lost | arrived before), b: P(arrived | lost before). P_m = (b + a (1 - a - b)^m) / (a + b): the probability

@@ -67,9 +67,10 @@ class LossMemory(NamedTuple):
             ValueError: what is no fates (see `heliograph.learning`).
         Source: Anderson and Goodman (1957); Wald and Wolfowitz (1940), given the losses of each unbroken stretch.
         """
+        # The likelihood ratio of a chain of order one and independent losses.
         counts = MarkovLosses.fit(fates, intervals=False).counts
         both = counts.sum(axis=0)
-        ratio = max(2 * (_likelihood(counts) - _likelihood(both[None])), 0.0)
+        ratio = max(2 * (_maximum_log_likelihood(counts) - _maximum_log_likelihood(both[None])), 0.0)
         # Wald and Wolfowitz: the number of runs less its mean 1 + 2 n1 n0 / n, given n1 losses of n, and its variance.
         excess, variance = 0.0, 0.0
         for stretch in check_fates(fates):
@@ -80,7 +81,12 @@ class LossMemory(NamedTuple):
                 excess += 1 + np.sum(np.diff(lost) != 0) - (1 + pairs / n)
                 variance += pairs * (pairs - n) / (n**2 * (n - 1)) if n > 1 else 0.0
         z = float(excess / np.sqrt(variance)) if variance > 0 else 0.0
-        return cls(float(ratio), float(scipy.stats.chi2.sf(ratio, 1)), z, float(2 * scipy.stats.norm.sf(abs(z))))
+        return cls(
+            likelihood_ratio=float(ratio),
+            likelihood_p=float(scipy.stats.chi2.sf(ratio, 1)),
+            runs_z=z,
+            runs_p=float(2 * scipy.stats.norm.sf(abs(z))),
+        )
 
 
 @readable
@@ -144,7 +150,7 @@ def learn_losses(fates: object, held_out: float = 1 / 3) -> Losses:
 
 
 def _find_significant_laws(laws: dict[str, AbstractLossLaw], parts: Fates) -> set[str]:
-    """Return the laws that a likelihood ratio test prefers to independent losses, at LEVEL for all of them together."""
+    """Return the names of laws that a likelihood ratio test prefers to independent losses, at LEVEL for all of them."""
     level = LEVEL / (len(laws) - 1)
     total = {name: float(np.nansum(law.log_likelihoods(parts))) for name, law in laws.items()}
     significant = set[str]()
@@ -156,7 +162,7 @@ def _find_significant_laws(laws: dict[str, AbstractLossLaw], parts: Fates) -> se
 
 
 def _choose_law(significant: set[str], held_out: dict[str, HeldOutScores]) -> str:
-    """Return the law of the largest held-out likelihood among these and independent losses.
+    """Return the law of the largest held-out likelihood, by name, among the significant ones and independent losses.
 
     Without scores it is "hidden" where that is significant.
     """
@@ -178,9 +184,9 @@ def _fit_laws(parts: Fates, intervals: bool) -> dict[str, AbstractLossLaw]:
 
 
 def _score_held_out(parts: Fates, known: np.ndarray, cut: int) -> dict[str, HeldOutScores]:
-    """Return the scores of the laws, fitted to the first `cut` known packets, on the others, each given all before it.
+    """Return by name the scores of the laws on later packets, each given all before it, when fitted to the first `cut`.
 
-    `known`: which packets are trials, of all stretches one after another.
+    `parts`: stretches of fates; `known`: which packets are trials, of all stretches one after another.
     """
     everything = np.concatenate(parts)
     late = known & (np.cumsum(known) > cut)
@@ -195,14 +201,14 @@ def _score_held_out(parts: Fates, known: np.ndarray, cut: int) -> dict[str, Held
     return scores
 
 
-def _likelihood(counts: np.ndarray) -> float:
-    """Return the log-likelihood sum n_ab log(n_ab / n_a)."""
+def _maximum_log_likelihood(counts: np.ndarray) -> float:
+    """Return the maximum of the log-likelihood of counts n_ab (past a, fate b): sum n_ab log(n_ab / n_a)."""
     rows = counts.sum(axis=1, keepdims=True)
     return float(np.sum(xlogy(counts, counts / np.where(rows > 0, rows, 1.0))))
 
 
 def _split_at_unknown(fate: np.ndarray) -> list[np.ndarray]:
-    """Return the parts of a stretch without an unknown fate."""
+    """Return the parts of a stretch of fates between unknown ones (NaN), without these."""
     edges = np.flatnonzero(np.isnan(fate))
     return [stretch[~np.isnan(stretch)] for stretch in np.split(fate, edges) if np.any(~np.isnan(stretch))]
 
@@ -236,7 +242,8 @@ class RunningRateLosses(AbstractLossLaw):
         trials, parts = [is_trial(stretch) for stretch in parts], [fill_ends(stretch) for stretch in parts]
 
         def likelihood(x: np.ndarray) -> tuple[float, np.ndarray]:
-            # Over the logits of the shares p, of which the derivative is p (1 - p).
+            """Return the log-likelihood at the logits x (3,) of base, weight and step, and its gradient (3,)."""
+            # A share p has the derivative p (1 - p) by its logit.
             share = expit(x)
             total, gradient = 0.0, np.zeros(len(x))
             for stretch, trial_mask in zip(parts, trials, strict=True):
@@ -260,22 +267,26 @@ class RunningRateLosses(AbstractLossLaw):
 
 
 def _predict_losses(lost: Packets, base: float, weight: float, step: float) -> tuple[Packets, Packets]:
-    """Return P(lost) of each packet, and its derivatives in base, weight and step (3, packets).
+    """Return P(lost) of each packet by the running rate r, and its derivatives in base, weight and step (3, packets).
 
-    With d = r - base: d+ = (1 - step) d + step (lost - base), and so its derivatives by recursions of the same kind.
+    With d = r - base: P(lost) = base + weight d, and d+ = (1 - step) d + step (lost - base) from d = 0 on; so its
+    derivatives are recursions of the same kind, run as linear filters. `lost`: the fates, 1 where a packet was lost.
     """
-    before = np.concatenate([[0.0], lost - base])[:-1] if len(lost) else lost
+    last_fate = np.concatenate([[0.0], lost - base])[:-1] if len(lost) else lost
     keep = [1.0, step - 1.0]
-    rate = scipy.signal.lfilter([step], keep, before)  # r - base, which starts at 0
+    d = scipy.signal.lfilter([step], keep, last_fate)
     by_base = scipy.signal.lfilter([step], keep, np.concatenate([[0.0], -np.ones(len(lost))])[: len(lost)])
-    by_step = scipy.signal.lfilter([1.0], keep, np.concatenate([[0.0], (lost - base - rate)])[: len(lost)])
-    return base + weight * rate, np.stack([1 + weight * by_base, rate, weight * by_step])
+    by_step = scipy.signal.lfilter([1.0], keep, np.concatenate([[0.0], (lost - base - d)])[: len(lost)])
+    return base + weight * d, np.stack([1 + weight * by_base, d, weight * by_step])
 
 
 def _sum_log_probabilities(
     lost: Packets, predictions: tuple[Packets, Packets], trials: np.ndarray
 ) -> tuple[float, np.ndarray]:
-    """Return the log-likelihood of the trials under predictions (P(lost), its derivatives), and its gradient (3,)."""
+    """Return the log-likelihood of the fates `lost` that are trials, and its gradient in base, weight and step (3,).
+
+    `predictions`: P(lost) of each packet, and its derivatives (3, packets).
+    """
     p, slope = predictions
     p = np.clip(p, 1e-300, 1 - 1e-16)  # so that both logarithms are numbers
     logs, score = np.where(lost == 1, np.log(p), np.log1p(-p)), (lost - p) / (p * (1 - p))
