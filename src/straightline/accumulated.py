@@ -154,7 +154,10 @@ class BegunProgram:
         return collected
 
     def total(self, parts: Sequence[Sequence[np.ndarray]]) -> list[np.ndarray]:
-        """Return the sums (..., batch) of several sums, of each summed result that runs do not share."""
+        """Return the sums (..., batch) of several sums, of each summed result that runs do not share.
+
+        The first of them is overwritten.
+        """
         return [fold_rows(_add_in_order(sums), self.program.summed.batches) for sums in zip(*parts, strict=True)]
 
     def _outputs(self) -> list[tuple[Any, bool]]:
@@ -211,9 +214,8 @@ def accumulate(
 
 
 def _add_in_order(sums: Sequence[np.ndarray]) -> np.ndarray:
-    """Add arrays in order, all in the memory of one: to allocate more would take longer than to add."""
-    first, *others = sums
-    total = first.copy()
+    """Add arrays in order, in the memory of the first: to allocate more would take longer than to add."""
+    total, *others = sums
     for other in others:
         total += other
     return total

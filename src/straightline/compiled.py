@@ -360,6 +360,8 @@ def counted(code: Compiled) -> str:
 
 def memory_of(x: Any, dtype: Any) -> np.ndarray:
     """Return numbers as contiguous memory; a key of random numbers as its words."""
+    if type(x) is np.ndarray and x.dtype == dtype and x.flags.c_contiguous:
+        return x
     if isinstance(x, jax.Array) and jax.numpy.issubdtype(x.dtype, jax.dtypes.prng_key):
         x = jax.random.key_data(x)
     array = np.asarray(x)

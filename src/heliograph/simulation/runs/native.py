@@ -42,20 +42,17 @@ def compile_runs(
     reducer: AbstractReducer[Any],
     runs: int,
     later: NetworkSmoother | None = None,
-    parts: int = 1,
     precision: Precision = "float64",
 ) -> NativeProgram:
     """Compile the native code of a network's runs, of which a reducer collects the results of its `of_step`.
 
     `runs`: how many will follow. With `later`, the results are a pair: of filtered and of smoothed estimates; and sums
-    of the NIS. `parts`: of a network, of which this is one, whose results are held together.
+    of the NIS.
 
     Raises:
         Unsupported: a program that native code does not support.
-        ValueError: more memory than is available.
     """
-    if str(key.dtype) != "key<fry>":
-        raise Unsupported(f"keys of type {key.dtype}")
+    words = _read_key(key)
     # One program for networks of one structure: arrays are its arguments.
     (of_world, arrays), (of_rest, others) = _describe_world(world), _describe((later, inputs, reducer))
     try:
@@ -67,11 +64,33 @@ def compile_runs(
     if isinstance(compiled, Unsupported):
         raise Unsupported(compiled.operation, compiled.where)
     program, form = compiled
+    return NativeProgram(program.begin([words, *arrays, *others], runs), form)
+
+
+def check_memory_of_parts(code: NativeProgram, parts: int, runs: int, horizon: int, precision: Precision) -> None:
+    """Refuse runs that need more memory than there is; the results of all parts of a network are held together.
+
+    `code`: of the first part; the others are no larger.
+
+    Raises:
+        ValueError: more memory than is available.
+    """
     lanes = min(LANES, -(-runs // BLOCK))
-    collected, sums, variables = program.memory(runs, lanes, min(lanes, os.cpu_count() or 1))
+    collected, sums, variables = code.begun.program.memory(runs, lanes, min(lanes, os.cpu_count() or 1))
     collected *= 2 if precision == "float32" else 1  # results are handed back in double precision
-    check_memory(NeededMemory(parts * collected, sums, variables), runs, len(inputs))
-    return NativeProgram(program.begin([key, *arrays, *others], runs), form)
+    check_memory(NeededMemory(parts * collected, sums, variables), runs, horizon)
+
+
+@cache_by_object
+def _read_key(key: jax.Array) -> np.ndarray:
+    """Return the words of a key of JAX's own hash (2,), read once for all parts of a network.
+
+    Raises:
+        Unsupported: a key of another hash.
+    """
+    if str(key.dtype) != "key<fry>":
+        raise Unsupported(f"keys of type {key.dtype}")
+    return np.asarray(jax.random.key_data(key))
 
 
 class _KnownEntries:
@@ -249,14 +268,17 @@ def simulate_natively(
         )
         if code is None:
             return None
+        check_memory_of_parts(code, 1, runs, len(inputs), precision)
         return finish_result(reducer, _run_chunks(code, first_run, runs, chunk, progress), network, smoothing)
     # Many independent nodes: one program for a few of them, with other numbers.
     results, parts, memory = [], count_parts(network), list[list[np.ndarray]]()
     for number, (some, world) in enumerate(split_nodes(network)):
-        make = partial(compile_runs, world, inputs, key, reducer, runs, parts=parts, precision=precision)
+        make = partial(compile_runs, world, inputs, key, reducer, runs, precision=precision)
         code = try_native(make)
         if code is None:
             return None
+        if number == 0:
+            check_memory_of_parts(code, parts, runs, len(inputs), precision)
 
         def show_progress(done: int, total: int) -> None:
             """Show the progress of this part as that of the whole."""
