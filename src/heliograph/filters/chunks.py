@@ -193,17 +193,21 @@ class WarmUp(NamedTuple):
         """Rows of a block."""
         return self.complete.size
 
-    def states_before(self, places: Int[np.ndarray, " n"], starts: PyTree, begun: bool = False) -> PyTree | None:
-        """Return the states before the rows `places`, from states `ahead` rows earlier; None without native code.
+    def states_before(self, rows: Int[np.ndarray, " n"], starts: PyTree, one_start_each: bool = False) -> PyTree | None:
+        """Return the states (n, ...) before these rows, from states `ahead` rows earlier; None without native code.
 
-        `starts` has a state for every `ahead` rows of the recording; where `begun`, one for each of `places` instead.
+        Args:
+            rows: numbers of the rows.
+            starts: states at the rows 0, `ahead`, 2 `ahead`, ...; where `one_start_each`, (n, ...), `ahead` rows before
+                each of `rows`.
+            one_start_each: which of the two `starts` are.
         """
-        first = places - self.ahead
+        first = rows - self.ahead
         windows = take_windows(self.rows, first, self.ahead)
-        states = starts if begun else jax.tree.map(lambda leaf: leaf[first // self.ahead], starts)
+        states = starts if one_start_each else jax.tree.map(lambda leaf: leaf[first // self.ahead], starts)
         if self.settled is None:
-            return self._pass(states, windows, first)
-        # Complete windows begin settled, and stay so; the others are passed as they are.
+            return self._filter_windows(states, windows, first)
+        # Complete windows begin settled, and stay so; the others are filtered in full.
         arguments = self.recursion, self.settled, means_of(states), windows, first
         choice = choose_code(means_after_settled_rows, arguments, [False, False, True, True, True])
         if choice.code is None:
@@ -211,11 +215,15 @@ class WarmUp(NamedTuple):
         results = self.settled.repeated(choice.results())
         others = np.flatnonzero(~self.complete.cover(first, self.ahead))
         if len(others):
-            replace_chunk(results, others, self._pass(take(states, others), take(windows, others), first[others]))
+            filtered = self._filter_windows(take(states, others), take(windows, others), first[others])
+            replace_chunk(results, others, filtered)
         return results
 
-    def _pass(self, states: PyTree, windows: PyTree, first: Int[np.ndarray, " n"]) -> PyTree | None:
-        """Return the states after windows of rows, row by row; None without native code."""
+    def _filter_windows(self, states: PyTree, windows: PyTree, first: Int[np.ndarray, " n"]) -> PyTree | None:
+        """Return the states (n, ...) after windows of rows (n, ahead, ...), from those before them.
+
+        `first`: number of each window's first row. None without native code.
+        """
         choice = choose_code(state_after_rows, (self.recursion, states, windows, first), [False, True, True, True])
         return None if choice.code is None else choice.results()
 
@@ -238,15 +246,16 @@ def _find_start_states(reach: WarmUp, start: PyTree, first: Int[np.ndarray, " ch
 
 
 def _start_is_forgotten(reach: WarmUp, starts: PyTree, first: Int[np.ndarray, " chunks"]) -> bool | None:
-    """Return whether at most of some joints the start is forgotten `ahead` rows later; None without native code.
+    """Return whether a wrong start is forgotten `ahead` rows later, at most of PROBES rows; None without native code.
 
-    It is where a state begun `ahead` rows before agrees with one begun twice as many rows before.
+    It is forgotten where the state computed from a start `ahead` rows before agrees with that from a start 2 `ahead`
+    rows before. `starts`: one for every `ahead` rows; `first`: first rows of chunks, from which the probes are taken.
     """
     probes = first[:: -(-len(first) // PROBES)]
-    once, early = (reach.states_before(places, starts) for places in (probes, probes - reach.ahead))
+    once, early = (reach.states_before(rows, starts) for rows in (probes, probes - reach.ahead))
     if once is None:
         return None
-    twice = reach.states_before(probes, early, begun=True)
+    twice = reach.states_before(probes, early, one_start_each=True)
     among = jax.tree.map(lambda *leaves: np.concatenate(leaves), take(starts, slice(0, 1)), twice)
     return bool(np.mean(find_equal_states(once, twice, among=among)) > 0.5)
 
@@ -285,15 +294,22 @@ def _scan_all_chunks(recursion: Recursion, start: PyTree, rows: PyTree, programs
 
     Then, in order, each chunk whose guess differs from the state in which the chunk before it ended is filtered again,
     from that state. None where rows are few, where the filter forgets too late, and without native code.
+
+    Args:
+        recursion: steps a state over a row.
+        start: state before the first row.
+        rows: data, each array (rows, ...).
+        programs: compiled functions that filter one chunk, in full or by its means alone (`ChunkPrograms`).
     """
     begun = find_chunk_starts(recursion, start, rows)
     if begun is None:
         return None
     length, total = begun.lengths.chunk, np.asarray(len(jax.tree.leaves(rows)[0]))
-    # The lists of booleans below say which arguments of a program differ from chunk to chunk.
+    # Results of chunks are pairs (state after the last row, outputs), each array (chunk, ...). The lists of booleans
+    # below say which arguments of a program differ from chunk to chunk.
 
     def scan(states: PyTree, which: Which) -> PyTree:
-        """Return the results of some chunks from these states, (chunk, ...)."""
+        """Return the results of the chunks `which`, filtered in full from these states."""
         parts = [
             (recursion, take(states, part), windows, first, total)
             for part, first, windows in take_windows_in_parts(rows, begun.first[which], length)
@@ -313,7 +329,7 @@ def _scan_all_chunks(recursion: Recursion, start: PyTree, rows: PyTree, programs
     results = scan_settled_by_means(begun, scan, scan_means)
     if results is None:
         return None
-    rescan_wrong_starts(scan, begun.states, lambda results: results[0], results)  # changes the arrays of `results`
+    rescan_wrong_starts(scan, begun.states, lambda pair: pair[0], results)  # changes the arrays of `results` in place
     last, outputs = results
     return ScanResult(jax.tree.map(lambda leaf: leaf[-1, ...], last), outputs)
 

@@ -117,13 +117,19 @@ def scan_with_last_state(
     state: PyTree | None = None,
     begin: Array | int = 0,
 ) -> tuple[PyTree, PyTree]:
-    """Step a filter over rows like `scan_inside_jit`; return its last state too, before the outputs.
+    """Step a filter over rows; return its state after the last row, and the outputs of all rows, stacked.
 
-    It begins with `state`, that before any row unless given, at the row of number `begin`.
+    Args:
+        filter: the filter.
+        z: measurements, NaN for what did not arrive.
+        u: inputs.
+        output: what is kept of a row, of its state after the row, its innovation and the row's number k.
+        state: before the first row; by default that before any data.
+        begin: number of the first row.
     """
 
     def step(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:
-        """Predict and correct over one row."""
+        """Predict and correct over one row (number, measurement, input); return the state after it, and its output."""
         k, z_k, u_k = row
         after, innovation = filter.correct(filter.predict(state, u_k, k), z_k, k)
         return after, output(after, innovation, k)
@@ -137,31 +143,26 @@ def scan_with_last_state(
 def run_over_data(filter: SteppedFilter, z: ArrayLike, u: ArrayLike | None, after: Filtered | None = None) -> Filtered:
     """Run a filter over rows of data, by native code where the filter has it; return estimates and innovations.
 
-    The rows are the first ones, or those `after` an earlier result.
+    Args:
+        filter: the filter.
+        z: measurements (rows, received), an array or a table; NaN for what did not arrive.
+        u: inputs (rows, inputs); None of a filter without any.
+        after: result of the rows before these, from whose last state the filter goes on; None for the first rows.
     """
     before = None if after is None else _find_origin(filter, after)
     begin = 0 if before is None else int(before.step)
     rows_z, rows_u = check_data(filter, z, u, begin)
-    clock = common_dates(_tables(z, u))
-    clock = None if clock is None or not len(clock) else clock  # a table without rows says no time
-    if before is not None and clock is not None:
-        _check_later(before, clock)
+    dates = common_dates(_tables(z, u))
+    dates = None if dates is None or not len(dates) else dates  # a table without rows says no time
+    if before is not None and dates is not None:
+        _check_later(before, dates)
     start = () if before is None else (before.state, np.asarray(begin))
     # Three ways, the first that applies: chunks side by side, the filter's own native code for rows, one scan.
     result = filter_in_chunks(filter, rows_z, rows_u, _collect_row, *start)
     result = result or filter.filter_rows(rows_z, rows_u, *start)
     state, outputs = result or compute_once(_compute_filtered, _by_xla, (filter, rows_z, rows_u, *start))
     mean, covariance, innovation, modes, counts = outputs
-    lost = find_not_finite(mean, 1)
-    if lost.any():
-        row = begin + int(np.argmax(lost)) + 1
-        said = f"{type(filter).__name__}: the estimate is no finite number from row {row} on"
-        warnings.warn(f"{said}; hg.run leaves out what makes it so, and says which row and why", stacklevel=3)
-    # Where the record ends: state, number of rows, date and spacing, from which a later call goes on.
-    end = begin + len(rows_z)
-    last, spacing = (float(end - 1), np.nan) if clock is None else (clock[-1], usual_spacing(clock))
-    months = 0 if clock is None else usual_months(clock)
-    origin = Origin(filter, state, end, last_input(np.asarray(rows_u)), last, spacing, months=months)
+    _warn_of_lost_estimate(filter, mean, begin)
     if counts is not None:
         _warn_of_particles(counts, innovation.log_likelihood, begin)
     return Filtered(
@@ -172,14 +173,38 @@ def run_over_data(filter: SteppedFilter, z: ArrayLike, u: ArrayLike | None, afte
         log_likelihoods=innovation.log_likelihood,
         claim=filter.claim,
         weights=innovation.weight,
-        origin=origin,
+        origin=_describe_end(filter, state, begin + len(rows_z), rows_u, dates),
         modes=modes,
         effective_numbers=counts,
     )
 
 
+def _describe_end(filter: SteppedFilter, state: PyTree, end: int, u: Array, dates: np.ndarray | None) -> Origin:
+    """Return where a record ends, from which a later call or a forecast goes on.
+
+    Args:
+        filter: the filter.
+        state: its state after the last row.
+        end: number of the row after the last one.
+        u: inputs (rows, inputs).
+        dates: of the rows; None where they have none, and their numbers are their times.
+    """
+    last, spacing = (float(end - 1), np.nan) if dates is None else (dates[-1], usual_spacing(dates))
+    months = 0 if dates is None else usual_months(dates)
+    return Origin(filter, state, end, last_input(np.asarray(u)), last, spacing, months=months)
+
+
+def _warn_of_lost_estimate(filter: SteppedFilter, mean: np.ndarray, begin: int) -> None:
+    """Warn where means (rows, n) are no finite numbers, from which row on; `begin` rows were before."""
+    lost = find_not_finite(mean, 1)
+    if lost.any():
+        row = begin + int(np.argmax(lost)) + 1
+        said = f"{type(filter).__name__}: the estimate is no finite number from row {row} on"
+        warnings.warn(f"{said}; hg.run leaves out what makes it so, and says which row and why", stacklevel=4)
+
+
 def _find_origin(filter: SteppedFilter, after: Filtered) -> Origin:
-    """Return the state after earlier rows; raise of what is no result of such a filter."""
+    """Return where an earlier result of this filter ended; raise ValueError unless it is one, with its last state."""
     expected = "what `run` of this filter returned for the rows before"
     origin = instance("after", after, Filtered, expected).origin
     if origin is None:
@@ -189,10 +214,10 @@ def _find_origin(filter: SteppedFilter, after: Filtered) -> Origin:
     return origin
 
 
-def _check_later(before: Origin, clock: np.ndarray) -> None:
+def _check_later(before: Origin, dates: np.ndarray) -> None:
     """Check that dates of rows are behind that of the last row before them, where it has one."""
-    if isinstance(before.time, np.datetime64) and not clock[0] > before.time:
-        raise fail("measurements", f"rows behind {before.time}, the last one before them", str(clock[0]))
+    if isinstance(before.time, np.datetime64) and not dates[0] > before.time:
+        raise fail("measurements", f"rows behind {before.time}, the last one before them", str(dates[0]))
 
 
 def _warn_of_particles(counts: Array, log_likelihoods: Array, begin: int) -> None:

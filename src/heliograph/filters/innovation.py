@@ -196,7 +196,13 @@ class InnovationSummary(NamedTuple):
 
 
 def _summarise_output(value: Float[np.ndarray, " time"], variance: np.ndarray, weight: np.ndarray) -> InnovationSummary:
-    """Summarise one output's innovations (time,): counts, down-weighted share and median, each with its interval."""
+    """Return counts, down-weighted share and median of one output's innovations, the latter two with their intervals.
+
+    Args:
+        value: innovations (time,), NaN where none arrived.
+        variance: their variances under the filter's model (time,).
+        weight: of each in the update (time,); below HALF it counts as down-weighted.
+    """
     arrived = np.isfinite(value)
     e, w, squares = value[arrived], weight[arrived], value[arrived] ** 2 / variance[arrived]
     down, count = int(np.sum(w < HALF)), len(e)

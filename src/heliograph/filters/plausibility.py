@@ -175,26 +175,35 @@ def judge_step(
     smaller one takes the mean to where it has more digits, so that an estimate which is far off can return. It is
     excluded where all of it is determined and differs from the model, or where no atom of a mixture produces it. A
     state is unsound where the one before it was not: a mean or variance that is no finite number, a negative variance,
-    an infinite number in it. So is a prediction; `spoilt` says that its inputs already were none.
+    an infinite number in it. So is a prediction.
+
+    Args:
+        claim: of the filter; "none" where it claims no covariance, and nothing is judged by one.
+        states: of the filter, before the step, after its prediction and after its correction.
+        estimates: of these states.
+        innovation: of the measurement.
+        z: the measurement (m,), NaN for what did not arrive.
+        of_atoms: whether the filter is a mixture, of which no atom may produce z.
+        spoilt: whether the inputs of the prediction were no numbers already.
     """
-    before, prior, after = estimates
+    (state_before, state_prior, state_after), (before, prior, after) = states, estimates
     of_value = _judge_value(innovation, z, of_atoms)
     # States that stop being numbers, by the correction or already by the prediction.
-    sound = _is_sound_correction(after, claim, prior)
-    unsound = (_is_sound_correction(prior, claim, before) & ~sound) | _overflows(states[1], states[2])
-    predicted = (_is_finite_number(before, claim) & ~_is_sound_prediction(prior, claim)) | _overflows(
-        states[0], states[1]
-    )
-    predicted |= spoilt
+    is_sound = _is_sound_correction(after, claim, prior)
+    loses_soundness = _is_sound_correction(prior, claim, before) & ~is_sound
+    by_correction = loses_soundness | _overflows(state_prior, state_after)
+    loses_soundness = _is_finite_number(before, claim) & ~_is_sound_prediction(prior, claim)
+    by_prediction = loses_soundness | _overflows(state_before, state_prior) | spoilt
     # The reason, later lines before earlier ones: prediction, then far, then unsound, then excluded.
     reason = jnp.where(of_value.far, Reason.FAR, jnp.where(of_value.excluded, Reason.EXCLUDED, Reason.PLAUSIBLE))
-    reason = jnp.where(unsound & of_value.came & ~of_value.far, Reason.UNSOUND, reason)
-    reason = jnp.where(predicted, Reason.PREDICTION, reason)
+    reason = jnp.where(by_correction & of_value.came & ~of_value.far, Reason.UNSOUND, reason)
+    reason = jnp.where(by_prediction, Reason.PREDICTION, reason)
     # Inputs that move the mean to where its deviation is below its rounding.
     distance, count = of_value.distance, of_value.arrived
-    digits = jnp.any(_mask_rounded_away(prior) & ~_mask_rounded_away(before)).astype(count.dtype)
-    input_verdict = jnp.nan if claim == "none" else digits
-    distance = jnp.where((count > 0) & (sound | (reason > 0)), distance, jnp.nan)
+    loses_digits = jnp.any(_mask_rounded_away(prior) & ~_mask_rounded_away(before)).astype(count.dtype)
+    input_verdict = jnp.nan if claim == "none" else loses_digits
+    # No distance where nothing arrived, and from an estimate that was no number before.
+    distance = jnp.where((count > 0) & (is_sound | (reason > 0)), distance, jnp.nan)
     return Judgement(distance, count, reason.astype(count.dtype), jnp.asarray(input_verdict))
 
 
@@ -212,7 +221,11 @@ class _JudgedValue(NamedTuple):
 
 
 def _judge_value(innovation: Innovation, z: Float[Array, " m"], of_atoms: bool) -> _JudgedValue:
-    """Judge a value by its innovation; far and excluded are as `judge_step` says."""
+    """Judge a measurement z (m,) by its innovation e = z - expected and its covariance S.
+
+    Far: components with |z| > |expected| whose squared distance e' S^-1 e exceeds `greatest_distance`. Excluded: every
+    component is determined by the model (no variance), and one of them differs; or, `of_atoms`, no atom produces z.
+    """
     value, covariance, z = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance), jnp.asarray(z)
     z = z if len(z) == len(value) else jnp.full_like(value, jnp.nan)  # a filter without measurements
     # Squared distance of each component given those before it, and which are determined.

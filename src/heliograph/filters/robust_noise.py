@@ -113,22 +113,29 @@ def separate_outlier_noise(
 def describe_outlier_noise(
     sensed: AbstractNoise, late: AbstractNoise | None, plain: SecondOrder, independent: bool
 ) -> ReceivedNoise:
-    """Return the noise as it arrives: the sensor's behind the channel `plain`, and `late`, that of the last hop.
+    """Return the noise that may hold outliers, as it arrives in m received numbers.
 
-    Shapes: m received, p sent. `independent`: whether correlated components are refused.
+    Args:
+        sensed: noise of the sensor's p outputs.
+        late: noise of the last hop; None where that has no outliers.
+        plain: moments of the channel without the noise of the last hop.
+        independent: whether correlated components are refused.
 
     Raises:
         ValueError: components that are correlated where they may not be, or mixed; no noise that could be weighed.
     """
     m, p = plain.mean_gain.shape
+    # xp: numpy, or jax.numpy for numbers that are traced.
     rows, xp = np.arange(m), library(plain.power.center, sensed, late)
     squares = xp.stack([xp.diagonal(plain.power.center[i, i]) for i in range(m)])[:, :p]  # E[G_ia^2]
     # Moments of the noise without its outliers, as it arrives.
-    base, last = sensed.without_outliers(), late.without_outliers() if late is not None else None
-    source = _find_noisy_outputs(squares, base.covariance, plain)
+    base = sensed.without_outliers()
     covariance = xp.einsum("ijab,ab->ij", plain.power.center[..., :p, :p], base.covariance)
     center = plain.mean_gain @ base.mean
-    if last is not None:
+    # The output whose noise each received number brings (m,).
+    source = _find_noisy_outputs(squares, base.covariance, plain)
+    if late is not None:
+        last = late.without_outliers()
         covariance, center = covariance + last.covariance, center + last.mean
     _check_weighable(covariance, independent)
     # Branches of the sensor's noise, and their pairs with those of the last hop's.

@@ -33,16 +33,21 @@ def take_windows(rows: PyTree, begin: Int[np.ndarray, " n"], length: int) -> PyT
     """Return windows of rows (n, length, ...), the last row repeated behind the end of the data.
 
     They are views where they follow one another from the first row on and end within the data.
+
+    Args:
+        rows: arrays (rows, ...).
+        begin: number of the first row of each window (n,).
+        length: rows of a window.
     """
     total = len(jax.tree.leaves(rows)[0])
-    within = not np.any(begin % length) and bool(np.all(begin + length <= total))
-    one_by_one = within and np.array_equal(begin, np.arange(len(begin)) * length)
+    are_blocks = not np.any(begin % length) and bool(np.all(begin + length <= total))
+    are_first_blocks = are_blocks and np.array_equal(begin, np.arange(len(begin)) * length)
 
     def take_from(leaf: np.ndarray) -> np.ndarray:
-        """Return the windows of one array."""
-        if one_by_one:
+        """Return the windows of one array: a view, blocks of rows, or copied one by one."""
+        if are_first_blocks:
             return leaf[: len(begin) * length].reshape(len(begin), length, *leaf.shape[1:])
-        if within:
+        if are_blocks:
             blocks = leaf[: total // length * length].reshape(total // length, length, *leaf.shape[1:])
             return np.asarray(blocks[begin // length])
         windows: np.ndarray = np.empty((len(begin), length, *leaf.shape[1:]), leaf.dtype)

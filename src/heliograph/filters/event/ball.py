@@ -28,60 +28,86 @@ class BallMoments(NamedTuple):
 
 
 def ball_moments(centre: jax.Array, variance: jax.Array, radius: jax.Array, inside: bool) -> BallMoments:
-    """Return the moments of independent e_i ~ N(centre_i, variance_i) where |e| <= radius, or where not.
+    """Return log probability, mean and covariance of independent e_i ~ N(centre_i, variance_i) in a ball or outside.
 
-    Slices: given e_1 = radius sin(t) the others lie in a ball of radius cos(t) times as large, whose moments are those
-    of fewer components; the last is a truncated normal. 32 Gauss-Legendre nodes in t where e_1 has its probability. As
-    means and covariances of a mixture, so that no variance is negative.
+    By recursion on the components. Given e_1 = radius sin(t), the others lie in (or outside) a ball of the radius
+    radius cos(t): the same problem with one component less, of which the last is a truncated normal number. The
+    integral over t is a sum over 32 Gauss-Legendre nodes. Its terms are joined as a mixture is, from their means and
+    covariances, so that no variance is negative.
 
-    Shapes: centre and variance (m,), variance positive; radius ().
+    Args:
+        centre: means (m,).
+        variance: variances (m,), positive.
+        radius: of the ball about 0, ().
+        inside: |e| <= radius; else |e| > radius.
     """
     if len(centre) == 1:
         return _join_pieces(_truncate_component(centre[0], variance[0], radius, inside))
-    # e_1 = radius sin(t) inside of the radius, t only where e_1 has its probability: within REACH deviations of the
-    # point of [-radius, radius] that is nearest to its mean. At each node: the moments of the other components.
+    pieces = _slice_by_first_component(centre, variance, radius, inside)
+    if not inside:
+        pieces = _append_outer_tails(pieces, centre, variance, radius)
+    return _join_pieces(pieces)
+
+
+def _slice_by_first_component(centre: jax.Array, variance: jax.Array, radius: jax.Array, inside: bool) -> BallMoments:
+    """Return the moments at each node e_1 = radius sin(t), (node, ...), with the log of the node's share of the mass.
+
+    Arguments as `ball_moments`. |e_1| <= radius at all nodes.
+    """
+    # t only where e_1 has its probability: within REACH deviations of the point of [-radius, radius] that is nearest to
+    # its mean.
     first, deviation = centre[0], jnp.sqrt(variance[0])
     near = jnp.clip(first, -radius, radius)
     low, high = (jnp.arcsin(jnp.clip((near + side * REACH * deviation) / radius, -1.0, 1.0)) for side in (-1.0, 1.0))
     angle = low + (high - low) * NODES
     e = radius * jnp.sin(angle)
+    # The other components, given e_1.
     others = jax.lax.map(lambda r: ball_moments(centre[1:], variance[1:], r, inside), radius * jnp.cos(angle))
     # log of the node's weight in t, of de_1 / dt = radius cos(t), and of the density of e_1.
     weight = jnp.log(WEIGHTS * (high - low) * radius * jnp.cos(angle) / deviation) - np.log(2 * np.pi) / 2
     weight = weight - ((e - first) / deviation) ** 2 / 2
     mean = jnp.concatenate([e[:, None], others.mean], axis=1)
     covariance = jnp.zeros((len(e), *variance.shape * 2)).at[:, 1:, 1:].set(others.covariance)
-    pieces = BallMoments(weight + others.log_mass, mean, covariance)
-    if inside:
-        return _join_pieces(pieces)
-    # Outside also where |e_1| > radius, above or below (two Gaussians): there the others may lie anywhere.
-    tails = _truncate_component(first, variance[0], radius, False)
+    return BallMoments(weight + others.log_mass, mean, covariance)
+
+
+def _append_outer_tails(pieces: BallMoments, centre: jax.Array, variance: jax.Array, radius: jax.Array) -> BallMoments:
+    """Append two pieces, e_1 < -radius and e_1 > radius: there the other components may lie anywhere."""
+    tails = _truncate_component(centre[0], variance[0], radius, inside=False)
     mean = jnp.concatenate([tails.mean, jnp.broadcast_to(centre[1:], (2, len(centre) - 1))], axis=1)
     free = jnp.broadcast_to(jnp.diag(variance), (2, *variance.shape * 2))
     wide = BallMoments(tails.log_mass, mean, free.at[:, 0, 0].set(tails.covariance[:, 0, 0]))
-    return _join_pieces(BallMoments(*(jnp.concatenate(both) for both in zip(pieces, wide, strict=True))))
+    return BallMoments(*(jnp.concatenate(both) for both in zip(pieces, wide, strict=True)))
 
 
 def truncate_to_ball(parts: GaussianSum, directions: jax.Array, radius: jax.Array, inside: bool) -> GaussianSum:
-    """Return each Gaussian cut to |D x| <= radius (`inside`), or to where it is more, with the moments kept.
+    """Return the sum with each Gaussian x of N components cut to |D x| <= radius, or to |D x| > radius.
 
-    With Cov(D x) = V diag(s) V', e = V' D x has independent components. Of those that are known to vary, x is given
-    exactly, and then E e and Cov e enter with K = Cov(x, e) diag(s)^-1: mean m + K (E e - V' D m), and columns K more.
+    A cut Gaussian is replaced by the Gaussian of the same mean and covariance, and its weight is multiplied by the
+    probability of the region. With Cov(D x) = V diag(s) V', e = V' D x has independent components with moments E e and
+    Cov e in the region, and x = m + K (e - V' D m) + rest, K = Cov(x, e) diag(s)^-1, the rest independent of e. So
+    the mean becomes m + K (E e - V' D m), and the covariance Cov(x | e) + K Cov(e) K'.
 
-    Shapes: directions (m, N).
+    Args:
+        parts: the sum of K Gaussians.
+        directions: D (m, N).
+        radius: of the ball, ().
+        inside: |D x| <= radius; else |D x| > radius.
     """
 
     def truncate_one(x: Gaussian) -> tuple[jax.Array, Gaussian]:
-        """Truncate one Gaussian: diagonalise what is seen, take its moments in the ball, carry them to all of x."""
+        """Return the log probability of the region under one Gaussian, and the Gaussian cut to it."""
+        # e = V' D x: rows of its slopes, means and variances.
         rows, centre = directions @ x.root, directions @ x.mean
         variance, turn = eigh(WeightedColumns(rows, x.variances).covariance)
-        # What has no variance lies where it is.
+        # Components without variance, up to rounding, stay where they are.
         least = CERTAIN**0.5 * (radius**2 + jnp.sum(centre**2))
         rows, centre = turn.T @ rows, turn.T @ centre
         size = jnp.maximum(variance, least)
         moments = ball_moments(centre, size, radius, inside)
         varies = (variance > least) & jnp.isfinite(moments.log_mass)
         gain = jnp.where(varies, (x.root * x.variances) @ rows.T / size, 0.0)
+        # x given e, without noise; then what e itself still varies in the region.
         given, _ = condition_on_observation(x, rows, jnp.zeros(len(rows)), zero_covariance(len(rows)), varies)
         mean = x.mean + gain @ jnp.where(varies, moments.mean - centre, 0.0)
         spread = eliminate(moments.covariance).through(gain)
@@ -92,7 +118,7 @@ def truncate_to_ball(parts: GaussianSum, directions: jax.Array, radius: jax.Arra
 
 
 def _truncate_component(centre: jax.Array, variance: jax.Array, radius: jax.Array, inside: bool) -> BallMoments:
-    """Return the moments of one component within the radius, (1, ...), or below and above it, (2, ...)."""
+    """Return the moments of e ~ N(centre, variance) in [-radius, radius], (1, ...), or below and above it, (2, ...)."""
     deviation = jnp.sqrt(variance)
     edge = jnp.array([-1.0, 1.0]) * radius
     if inside:
@@ -107,7 +133,7 @@ def _truncate_component(centre: jax.Array, variance: jax.Array, radius: jax.Arra
 
 
 def _join_pieces(pieces: BallMoments) -> BallMoments:
-    """Return the moments of the mixture of pieces, (piece, ...)."""
+    """Return the moments of the mixture of pieces (piece, ...), each weighted by its mass; log of their whole mass."""
     # Masses relative to the largest one; where none has any, equal shares.
     top = jnp.max(pieces.log_mass)
     top = jnp.where(jnp.isfinite(top), top, 0.0)

@@ -29,6 +29,7 @@ from heliograph.filters.event.joint_gaussian import (
     predict_with_reference,
     set_known_components,
 )
+from heliograph.filters.event.sender_labels import SilentLabels, relabel_sent
 from heliograph.filters.event.silent_region import SilentRegion
 from heliograph.filters.gaussian.belief import second_moments_at_start, smoother_step_by_transform
 from heliograph.filters.gaussian.transform import AbstractTransform
@@ -149,31 +150,40 @@ class EventFilter(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: EventBelief, z: ArrayLike, k: Step = 0) -> tuple[EventBelief, Innovation]:
-        """Correct with the values that came, and with the silence of the senders from which none came."""
+        """Correct with the values that came, and with the silence of the senders from which none came.
+
+        z: the values of all senders, NaN where none came, then what is reported of each one's losses, if anything.
+        """
         plant, sensor, channel, z = at(self.plant, k), at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
         count = self.received - self.trigger.side_information(self.outputs)
         values, losses = z[:count], z[count:]
         parts, begun, start = state.parts, state.begun, second_moments_at_start(self.plant)
-        total, value, covariance = jnp.zeros(()), [], []
-        # Senders one after the other, each with its value or its silence.
+        log_likelihood, differences, covariances = jnp.zeros(()), [], []
+        # Senders one after the other, each with its value or its silence, given the senders before it.
         for s, components in enumerate(self.senders):
             received = values[components] if len(self.senders) > 1 else values
             lost = losses[s] if len(losses) else jnp.asarray(jnp.nan)
             augmented = augment_by_signal(plant, sensor, self.transform, parts, start)
             arrived = jnp.any(~jnp.isnan(received))
             after, expected, spread = self._condition_on_sender(augmented, channel, received, lost, s, begun[s])
-            log_likelihood = log_total(after.log_weight)
-            total, parts = total + log_likelihood, after.scale_weights(-log_likelihood)
+            log_likelihood_of_sender = log_total(after.log_weight)
+            log_likelihood += log_likelihood_of_sender
+            parts = after.scale_weights(-log_likelihood_of_sender)
+            # From now on the sender has a reference; where it is acknowledged, once a value arrived.
             begun = begun.at[s].set(begun[s] | (arrived if self.trigger.reference == "acknowledged" else True))
-            value.append(received - expected)
-            covariance.append(spread)
-        innovation = Innovation(*_append_losses(jnp.concatenate(value), covariance, losses), total)
+            differences.append(received - expected)
+            covariances.append(spread)
+        innovation = Innovation(*_append_losses(jnp.concatenate(differences), covariances, losses), log_likelihood)
         return EventBelief.of(parts, begun, state.moved), innovation
 
     def _condition_on_sender(
         self, augmented: GaussianSum, channel: SideInformation, z: jax.Array, lost: jax.Array, s: int, begun: jax.Array
     ) -> tuple[GaussianSum, jax.Array, jax.Array]:
-        """Condition on a sender's value or silence; return the sum, and mean and covariance predicted of a value."""
+        """Condition the sum over (x, r, y) on what came from sender s, a value z or nothing (z all NaN).
+
+        Arguments as of `_condition_on_silence`, and z, the sender's part of what is received. Returns the sum over
+        (x, r), and the mean and covariance that were predicted of a value, zero where none came.
+        """
 
         def update_by_silence(augmented: GaussianSum) -> tuple[GaussianSum, jax.Array, jax.Array]:
             """Update by silence; no value is expected."""
@@ -208,86 +218,111 @@ class EventFilter(AbstractSizedFilter):
             The sum of (x, r), y taken off: first the Gaussians with a known reference, then those whose reference was
             lost.
         """
-        n, m, sender = len(self.states), self.outputs, self.senders[s]
-        state_and_reference, label = np.r_[0 : n + m], augmented.label[:, s]
-        # Labels of what is silent unless |y - r| > delta; of what was sent for that and lost; of what was due and lost.
-        waiting, due = self._label_sending(label, begun)
+        # Why it may be silent, as labels (K, M, A, C) of each Gaussian: link mode, steps since the last transmission,
+        # transmissions lost.
+        unsent, due = self._label_sending(augmented.label[:, s], begun)
         loss = self._loss_probability(channel, s)[:, None, None]
-        dropped, forced = (_relabel_sent(sent * loss, lost=True) for sent in (waiting, due))
-        if self.trigger.losses == "known":
-            waiting = jnp.where(lost > 0, 0.0, waiting)
+        dropped, forced = (relabel_sent(sent * loss, lost=True) for sent in (unsent, due))
+        if self.trigger.losses == "known":  # told of a loss: it was sent; told of none: it was not
+            unsent = jnp.where(lost > 0, 0.0, unsent)
             dropped, forced = (jnp.where(lost > 0, label, 0.0) for label in (dropped, forced))
+        truncate = (
+            self._truncate_with_lost_references if self.reference_may_be_lost else self._truncate_with_known_reference
+        )
+        return self._keep_if_impossible(truncate(augmented, s, SilentLabels(unsent, dropped, forced)), augmented)
 
-        # Known reference: every Gaussian cut to each part of the line, and joined part by part.
-        if not self.reference_may_be_lost:
-            inside = augmented.relabel_sender(s, waiting + forced if self.loses else waiting)
-            slots, _ = self.region.truncate_inside(inside, inside.take(0, 0), sender)
-            if self.loses:
-                outside = self.region.truncate_outside(augmented.relabel_sender(s, dropped + forced), sender, 1.0)
-                slots = concatenate([slots, merge_groups(outside, self.region.outside_parts(sender))])
-            return self._keep_if_impossible(slots.select_components(state_and_reference), augmented)
+    def _truncate_with_known_reference(self, augmented: GaussianSum, s: int, labels: SilentLabels) -> GaussianSum:
+        """Return the sum over (x, r) given silence of sender s, where r is known however many values were lost.
 
-        # Reference that may be a value that was lost: not sent, with the reference as it was ...
-        unsent = augmented.relabel_sender(s, waiting)
-        slots, others = self.region.truncate_inside(unsent.take(0, self.known), unsent.take(self.known), sender)
-        # ... or sent and lost, with y as the new reference: above, below, or anywhere where it was due.
+        Every Gaussian is cut to each piece of |y - r| <= delta, and of |y - r| > delta if values may be lost; those of
+        the same piece are joined.
+        """
+        sender, state_and_reference = self.senders[s], np.arange(len(self.states) + self.outputs)
+        inside = augmented.relabel_sender(s, labels.unsent + labels.forced if self.loses else labels.unsent)
+        pieces, _ = self.region.truncate_inside(inside, inside.take(0, 0), sender)
+        if self.loses:
+            sent = augmented.relabel_sender(s, labels.dropped + labels.forced)
+            outside = self.region.truncate_outside(sent, sender, 1.0)
+            pieces = concatenate([pieces, merge_groups(outside, self.region.outside_parts(sender))])
+        return pieces.select_components(state_and_reference)
+
+    def _truncate_with_lost_references(self, augmented: GaussianSum, s: int, labels: SilentLabels) -> GaussianSum:
+        """Return the sum over (x, r) given silence of sender s, where a value that was lost is the next reference.
+
+        First the Gaussians of known reference, joined piece by piece, then at most `lost` whose reference was lost.
+        """
+        n, sender = len(self.states), self.senders[s]
+        state_and_reference = np.arange(n + self.outputs)
+        # Not sent: the reference as it was.
+        unsent = augmented.relabel_sender(s, labels.unsent)
+        known, others = self.region.truncate_inside(unsent.take(0, self.known), unsent.take(self.known), sender)
+        # Sent and lost: y is the new reference, outside of the region, or anywhere where a heartbeat was due.
         outside = merge_groups(
-            self.region.truncate_outside(augmented.relabel_sender(s, dropped), sender, 1.0),
+            self.region.truncate_outside(augmented.relabel_sender(s, labels.dropped), sender, 1.0),
             self.region.outside_parts(sender),
         )
-        fresh = concatenate([outside, merge_groups(augmented.relabel_sender(s, forced))]).select_components(
-            self._find_new_reference(sender)
-        )
+        anywhere = merge_groups(augmented.relabel_sender(s, labels.forced))
+        fresh = concatenate([outside, anywhere]).select_components(self._find_new_reference(sender))
+        # Of all with a lost reference the pairs nearest in r are joined.
         few = reduce_parts(
             concatenate([others.select_components(state_and_reference), fresh]),
             self.lost,
             slice(n + sender.start, n + sender.stop),
         )
-        return self._keep_if_impossible(concatenate([slots.select_components(state_and_reference), few]), augmented)
+        return concatenate([known.select_components(state_and_reference), few])
 
     def _condition_on_value(
         self, augmented: GaussianSum, channel: SideInformation, z: jax.Array, lost: jax.Array, s: int, begun: jax.Array
     ) -> tuple[GaussianSum, jax.Array, jax.Array]:
-        """Condition on a value: a Kalman update of each Gaussian, weighed by its density and by why it was sent.
+        """Condition on a value z: a Kalman update of each Gaussian, weighed by its density and by why it was sent.
 
-        Returns the sum, and mean and covariance predicted of a value that comes; arguments as `_condition_on_silence`.
+        Returns the sum over (x, r), one Gaussian padded with others of no weight, and the mean and covariance predicted
+        of a value that comes; arguments as of `_condition_on_silence`.
         """
-        # Probability that this pattern of values arrives, by mode.
+        # Probability that this pattern of values arrives, by mode of the link.
         sender, arrived = self.senders[s], ~jnp.isnan(z)
         pattern = arrived if len(self.senders) == 1 else jnp.ones(self.outputs, dtype=bool)
         kind = pattern_of(channel, pattern) if len(channel.present) > 1 else 0
         chance = jnp.asarray(channel.chance)[:, kind]
         arrives = chance if len(self.senders) == 1 else 1 - self._loss_probability(channel, s)
         label = augmented.label[:, s] * arrives[:, None, None]
-        if self.trigger.losses == "numbered":
+        if self.trigger.losses == "numbered":  # the sender's counter says how many were lost before
             number = jnp.clip(jnp.where(jnp.isnan(lost), 0.0, lost).astype(int), 0, COUNTED - 1)
             label = label * (jnp.isnan(lost) | (jnp.arange(COUNTED) == number))
-        # Each mode's Gaussians, updated by the value, and after them as they were.
-        used, before, links = [], [], []
+        # For each mode the Gaussians before the value and updated by it; for all modes at once where their law is one.
+        updated, before, links = [], [], []
         for j in range(1 if self.alike else label.shape[1]):
-            only = label if self.alike else jnp.zeros_like(label).at[:, j].set(label[:, j])
+            label_of_mode = label if self.alike else jnp.zeros_like(label).at[:, j].set(label[:, j])
             mode = jnp.argmax(chance > 0) if self.alike else j
             moments = channel.mean, channel.gain_spread, channel.noise
-            links.append(LinkMoments(*jax.tree.map(lambda part, at=(mode, kind): jnp.asarray(part)[at], moments)))
-            before.append(augmented.relabel_sender(s, only))
-            used.append(
-                condition_parts_on_received(before[-1], z, arrived, links[-1], sender, self.outputs, self.delivers)
-            )
-        # Restricted to where the sender had to send.
+            link = LinkMoments(*jax.tree.map(lambda part, at=(mode, kind): jnp.asarray(part)[at], moments))
+            prior = augmented.relabel_sender(s, label_of_mode)
+            links.append(link)
+            before.append(prior)
+            updated.append(condition_parts_on_received(prior, z, arrived, link, sender, self.outputs, self.delivers))
+        # Restricted to where the sender had to send. The result holds several such blocks [updated, before] one after
+        # the other, each in blocks of `size` by mode: they are sorted by mode again.
         count, size = len(links), len(label)
-        selected = self._select_sent(concatenate([*used, *before]), s, begun)
-        pieces = [selected.take(start, start + size) for start in range(0, len(selected.log_weight), size)]
+        sent = self._select_sent(concatenate([*updated, *before]), s, begun)
+        pieces = [sent.take(start, start + size) for start in range(0, len(sent.log_weight), size)]
         by_mode = [concatenate(pieces[j :: 2 * count]) for j in range(2 * count)]
-        # What was to be expected of a value that comes.
-        signals = []
-        for sent, link in zip(map(merge_groups, by_mode[count:]), links, strict=True):
-            received = predict_received(sent.gaussian, link, sender, self.outputs)
-            signals.append(GaussianSum(sent.log_weight, received, jnp.zeros((1, 1))))
+        sent_updated, sent_before = by_mode[:count], by_mode[count:]
         # One Gaussian again, with a new reference.
-        merged = merge_groups(concatenate(by_mode[:count]).select_components(self._find_new_reference(sender)))
-        merged = merged.relabel_sender(s, _relabel_sent(merged.label[:, s], lost=False))
-        signal = merge_groups(concatenate(signals)).gaussian
+        merged = merge_groups(concatenate(sent_updated).select_components(self._find_new_reference(sender)))
+        merged = merged.relabel_sender(s, relabel_sent(merged.label[:, s], lost=False))
+        signal = self._predict_sent_value(sent_before, links, sender)
         return self._pad_sum(merged), signal.mean[0], signal.covariance[0]
+
+    def _predict_sent_value(self, sent: Sequence[GaussianSum], links: Sequence[LinkMoments], sender: slice) -> Gaussian:
+        """Return the Gaussian (1, ...) of a value that arrives, from the sums over (x, r, y) where it is sent.
+
+        `sent`, `links`: the sum and the link's moments of each mode.
+        """
+        signals = []
+        for sum_of_mode, link in zip(map(merge_groups, sent), links, strict=True):
+            received = predict_received(sum_of_mode.gaussian, link, sender, self.outputs)
+            signals.append(GaussianSum(sum_of_mode.log_weight, received, jnp.zeros((1, 1))))
+        return merge_groups(concatenate(signals)).gaussian
 
     def _select_sent(self, used: GaussianSum, s: int, begun: jax.Array) -> GaussianSum:
         """Restrict each Gaussian to where its sender must send: |y - r| > delta, or anywhere at a heartbeat.
@@ -324,7 +359,7 @@ class EventFilter(AbstractSizedFilter):
         return places
 
     def _keep_if_impossible(self, parts: GaussianSum, before: GaussianSum) -> GaussianSum:
-        """Return the updated sum; where all its weights are 0, the sum `before`, with FLOOR as likelihood."""
+        """Return the updated sum `parts`; where all its weights are 0, the sum `before` with FLOOR as likelihood."""
         stays = before.select_components(np.arange(parts.gaussian.mean.shape[1]))
         stays = stays._replace(log_weight=stays.log_weight + np.log(FLOOR))
         forbidden = ~jnp.isfinite(log_total(parts.log_weight))
@@ -346,17 +381,6 @@ class EventFilter(AbstractSizedFilter):
         merged = take_leading(merge_groups(state.parts).gaussian, len(self.states))  # a stack of one
         only: Gaussian = jax.tree.map(lambda leaf: leaf[0], merged)
         return only
-
-
-def _relabel_sent(label: jax.Array, lost: bool) -> jax.Array:
-    """Relabel a sender (K, M, A, C) after a transmission: no step since then, and one more lost or none."""
-    label = jnp.zeros_like(label).at[:, :, 0].set(jnp.sum(label, axis=2))
-    if label.shape[-1] == 1:
-        return label
-    if not lost:
-        return jnp.zeros_like(label).at[..., 0].set(jnp.sum(label, axis=-1))
-    more = jnp.concatenate([jnp.zeros_like(label[..., :1]), label[..., :-1]], axis=-1)
-    return more.at[..., -1].add(label[..., -1])
 
 
 def _append_losses(value: jax.Array, blocks: list[jax.Array], losses: jax.Array) -> tuple[jax.Array, jax.Array]:

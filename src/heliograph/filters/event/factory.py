@@ -82,14 +82,15 @@ def event_filter(
         "plant": plant, "sensor": sensor, "channel": described, "initial": initial, "transform": rule,
         "loses": loses, "outputs": outputs,
     }  # fmt: skip
-    # A random trigger: one Gaussian is enough.
+    # A random trigger: one Gaussian is enough. The claim rests on the laws of noises, not on their moments alone.
     premise = Premise(plant, sensor, channel, trigger, order=None)
     if isinstance(trigger, StochasticTrigger | Periodic):
         claim = _decide_claim(plant, sensor, channel, trigger)
         return on_premise(
             StochasticEventFilter(trigger=trigger, **shared, **make_sizes(claim, start, received)), premise
         )
-    # A threshold: a sum of Gaussians, by the value with which the sender compares.
+    # A threshold: a sum of Gaussians, by the value with which the sender compares. Ages of that value are counted up to
+    # the heartbeat.
     filter = EventFilter(
         trigger=_check_threshold_rule(trigger, lost if loses else None, outputs, first(channel).outputs, steps),
         known=known,
@@ -114,7 +115,10 @@ def _describe_channel(channel: Channel) -> tuple[SideInformation | OverTime, np.
 
 
 def _decide_claim(plant: AnyPlant, sensor: AnySensor, channel: Channel, trigger: StochasticTrigger | Periodic) -> Claim:
-    """Return the claim of the one-Gaussian filter: exact if it is the posterior (by schedule: its moments)."""
+    """Return the claim of the one-Gaussian filter: "exact" if it is the posterior, else "nominal".
+
+    Behind a schedule (`Periodic`) its mean and covariance need to be the posterior's only.
+    """
     steps = unstack(_describe_channel(channel)[0])
     if not is_linear(plant, sensor) or uncertain_chain(channel) or not all(_has_known_gain(step) for step in steps):
         return "nominal"

@@ -143,10 +143,11 @@ def reduce_parts(parts: GaussianSum, count: int, places: slice) -> GaussianSum:
 
 @partial(jax.jit, static_argnames="ends")
 def _merge_cheapest_pair(parts: GaussianSum, ends: tuple[int, int]) -> GaussianSum:
-    """Return the sum with the cheapest pair (a, b) merged into one Gaussian at a's place, the last one moved to b's.
+    """Return a sum of one Gaussian fewer: the cheapest pair (a, b) merged at a's place, the last one moved to b's.
 
-    Cost of a pair: w_a w_b / (w_a + w_b) sum_i (m_a - m_b)_i^2 / (v_a + v_b)_i over the components `ends`, m mean and v
-    variance. That is how much the merged Gaussian spreads more than its parts, in units of their variance.
+    Cost of a pair: w_a w_b / (w_a + w_b) sum_i (m_a - m_b)_i^2 / (v_a + v_b)_i, w weight, m mean and v variance, over
+    the components i from ends[0] to ends[1] - 1. It is how much the merged Gaussian spreads more than its parts, in
+    units of their variance.
     """
     size, places = len(parts.log_weight), slice(*ends)
     pairs = list(combinations(range(size), 2))

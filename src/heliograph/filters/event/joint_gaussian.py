@@ -72,7 +72,11 @@ def predict_with_reference(
 
 
 def set_known_components(x: Gaussian, places: np.ndarray, values: jax.Array) -> Gaussian:
-    """Return the Gaussian with the components at `places` replaced by known values, of variance zero."""
+    """Return the Gaussian with the components at `places` replaced by known values, of variance zero.
+
+    Covariance: root diag(variances) root'. A known component is a column of its own, of variance 0: its row of the root
+    is the row of the identity.
+    """
     root = x.root.at[places].set(np.eye(len(x.mean))[places])
     variances = x.variances.at[places].set(0.0)
     return Gaussian(x.mean.at[places].set(values), below_diagonal(root), variances)
@@ -87,9 +91,16 @@ def condition_parts_on_received(
     m: int,
     delivers: bool,
 ) -> GaussianSum:
-    """Condition each Gaussian of (x, r, y) on z = G y + n, and multiply its weight by the density of z.
+    """Return each Gaussian of (x, r, y) given z = G y + n, its weight multiplied by the density of z.
 
-    `m`: length of y. `delivers`: what arrives is y itself, all of it or nothing, so that y is known afterwards.
+    Args:
+        parts: the sum over state x, reference r and signal y of the sender.
+        z: what was received from the sender.
+        arrived: which components of z arrived.
+        link: moments of G and n.
+        sender: components of y that the sender sends.
+        m: length of y.
+        delivers: what arrives is y itself, all of it or nothing, so that y is known afterwards.
     """
     size = parts.gaussian.mean.shape[1]
 

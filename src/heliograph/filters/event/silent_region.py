@@ -48,9 +48,19 @@ class SilentRegion(NamedTuple):
     def truncate_inside(
         self, known: GaussianSum, unknown: GaussianSum, sender: slice
     ) -> tuple[GaussianSum, GaussianSum]:
-        """Truncate to |y - r| <= delta: `known` piece by piece of the interval, then merged; `unknown` as a whole."""
+        """Truncate Gaussians of (x, r, y) to |y - r| <= delta, in the components that a sender sends.
+
+        Args:
+            known: Gaussians with a known reference r. Each is cut to every piece of the interval of the sender's first
+                component, and those of the same piece are merged.
+            unknown: Gaussians whose reference was lost, each cut to the region as a whole.
+            sender: components of y.
+
+        Returns:
+            The Gaussians of known reference, one for each piece, and those of unknown reference.
+        """
         (direction, delta), *rest = self._error_directions(sender)
-        # Each known Gaussian once for each piece [low, high] of the first component's interval, piece after piece.
+        # Each known Gaussian once for each piece [low, high], piece after piece, in units of delta.
         size, edges = len(known.log_weight), np.linspace(-1.0, 1.0, self.known + 1)
         low, high = (np.repeat(ends, size) for ends in (edges[:-1], edges[1:]))
         cut = concatenate([known] * self.known)
@@ -59,6 +69,7 @@ class SilentRegion(NamedTuple):
                 cut = truncate_between(cut, direction, low * delta, high * delta)
             cut = self._truncate_to_ball(concatenate([cut, unknown]), sender, 1.0, inside=True)
         else:
+            # The unknown ones from -delta to delta; then all by the interval of each other component.
             ones = np.ones(len(unknown.log_weight))
             low, high = np.append(low, -ones), np.append(high, ones)
             cut = truncate_between(concatenate([cut, unknown]), direction, low * delta, high * delta)

@@ -87,37 +87,42 @@ class StochasticEventFilter(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: StochasticBelief, z: ArrayLike, k: Step = 0) -> tuple[StochasticBelief, Innovation]:
-        """Correct with the value that came, or with the silence if none did."""
+        """Correct with the value that came, or with the silence if none did.
+
+        z: the value, NaN where none came; then, of a trigger whose losses are known, a flag: 1 if the link was down.
+        """
         plant, sensor, channel, z = at(self.plant, k), at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
         count = self.received - self.trigger.side_information(self.outputs)
         values, down = z[:count], z[count:]
         prior = state.gaussian
         signal = signal_of(plant, sensor, self.transform, prior, second_moments_at_start(self.plant))
 
-        # A value: each mode's update, joined.
+        # A value: the update in each mode of the link, joined.
         modes = len(state.law)
         signals = replicate(signal, modes)
         posteriors, weight, innovation = correct_in_every_mode(signals, channel, jnp.arange(modes), state.law, values)
         by_value = merge_groups(GaussianSum(safe_log(weight), posteriors, jnp.eye(len(weight))[:, None]))
-        # Nothing: silence, or a link that is down.
+        # No value: silence, or a link that is down.
         log_silent, given_silence = self._condition_on_silence(prior, signal, state.reference, k)
         silent = _sum_of_one_gaussian(log_silent, given_silence, state.law)
-        by_nothing = self._mix_silence_and_outage(prior, silent, state.law, channel, down)
-        # Which of the two it is, with its likelihood.
+        by_silence = self._mix_silence_and_outage(prior, silent, state.law, channel, down)
+        # Of a value: that it was sent says something too, behind a trigger that sends by chance.
         if isinstance(self.trigger, StochasticTrigger):
             link = self._average_link(channel, state.law)
             innovation = self._condition_on_sending(innovation, link, signal, state.reference, log_silent)
+        # Which of the two it is, with its likelihood; silence that the rule forbids has the likelihood FLOOR.
         arrived = jnp.any(~jnp.isnan(values))
-        log_nothing = jnp.maximum(by_nothing.log_weight[0], np.log(FLOOR))  # of what the rule forbids
-        after = jax.tree.map(lambda a, b: jnp.where(arrived, a, b), by_value, by_nothing)
+        log_silence = jnp.maximum(by_silence.log_weight[0], np.log(FLOOR))
+        after = jax.tree.map(lambda a, b: jnp.where(arrived, a, b), by_value, by_silence)
+        log_likelihood = jnp.where(arrived, innovation.log_likelihood, log_silence)
         value, covariance = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
-        total = jnp.where(arrived, innovation.log_likelihood, log_nothing)
         if len(down):
             flag_innovation, covariance = append_flag(covariance, down[0])
             value = jnp.append(value, flag_innovation)
+        # The sum's one Gaussian, and the law of the link's modes, which is its label.
         x: Gaussian = jax.tree.map(lambda leaf: leaf[0], after.gaussian)
         following = StochasticBelief(x, after.label[0, 0], state.reference, state.moved)
-        return following, Innovation(value, covariance, total)
+        return following, Innovation(value, covariance, log_likelihood)
 
     def _condition_on_sending(
         self,
@@ -127,7 +132,15 @@ class StochasticEventFilter(AbstractSizedFilter):
         reference: jax.Array,
         log_silent: jax.Array,
     ) -> Innovation:
-        """Return a value's innovation given that it was sent, where no component of it is missing."""
+        """Return a value's innovation given that it was sent; as it is where a component of the value is missing.
+
+        Args:
+            innovation: of the value, as if it were sent always.
+            link: mean gain and spread, as `_average_link` returns.
+            signal: moments of y before the value.
+            reference: r, with which the sender compares y (m,).
+            log_silent: log P(silent) before the value.
+        """
         value, covariance = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
         is_complete = ~jnp.any(jnp.isnan(value))
         shift, change = self._change_by_sending(link, signal, reference, log_silent)
@@ -237,7 +250,7 @@ class StochasticEventFilter(AbstractSizedFilter):
 
 
 def _law_of_signal(signal: Signal) -> Gaussian:
-    """Return the Gaussian of the signal y itself, before z."""
+    """Return the Gaussian of the signal y before z: mean, slopes on the state's columns, and the noise beside them."""
     return from_columns(signal.mean, join_columns(WeightedColumns(signal.slopes, signal.prior.variances), signal.noise))
 
 

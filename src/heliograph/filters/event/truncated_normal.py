@@ -65,7 +65,8 @@ def truncated_normal(lower: jax.Array, upper: jax.Array) -> TruncatedNormal:
     a, b = jnp.where(turned, -upper, lower), jnp.where(turned, -lower, upper)
     t = jnp.maximum(a, 0.0)
 
-    # The part that counts, in u = x - t: sqrt(t^2 + 74) - t = 74 / (sqrt(t^2 + 74) + t), without cancellation.
+    # The part that counts, in u = x - t: sqrt(t^2 + 74) - t = 74 / (sqrt(t^2 + 74) + t), without cancellation; the root
+    # as far sqrt((t / far)^2 + 74 / far^2), in which t^2 cannot overflow.
     far = jnp.maximum(t, 1.0)
     above = REACH / (far * jnp.sqrt((t / far) ** 2 + (REACH / far) / far) + t)
     high = jnp.minimum(b - t, above)
@@ -78,7 +79,7 @@ def truncated_normal(lower: jax.Array, upper: jax.Array) -> TruncatedNormal:
     # Mass, and variance about the mean of the nodes.
     whole = jnp.sum(weights * density, axis=0)
     share = weights * density / whole
-    middle = jnp.sum(share * u, axis=0)
+    middle = jnp.sum(share * u, axis=0)  # mean of u
     variance = jnp.sum(share * (u - middle) ** 2, axis=0)
 
     # Mean by the ends: (phi(a) - phi(b)) / Z with phi(a) - phi(b) = phi(a) (1 - exp(-(b - a)(b + a) / 2)).

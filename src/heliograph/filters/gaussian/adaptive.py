@@ -97,31 +97,33 @@ class AdaptiveFilter(AbstractWrapper):
 
     @corrects
     def correct(self, state: AdaptiveBelief, z: ArrayLike, k: Step = 0) -> tuple[AdaptiveBelief, Innovation]:
-        """Correct the state and the law of the noise variances with what arrived of z."""
-        # Moments of what arrives without its noise, and how a robust base weighs outliers: by a rule, or by the law's
-        # Gaussian branches. Another base weighs nothing.
+        """Correct the state and the law of the noise variances with what arrived of z (m,), NaN for what did not."""
+        # Moments of what arrives without its noise.
         base, belief, noise = self.base, state.gaussian, at(self.noise, k)
         sensor, plant = at(base.sensor, k), at(base.plant, k)
         signal = signal_without_noise(plant, sensor, base.transform, belief, second_moments_at_start(base.plant, base))
-        before = predict_behind_channel(signal, at(base.channel, k))
+        predicted = predict_behind_channel(signal, at(base.channel, k))
         angles = base.received_angles if isinstance(base, RobustFilter) else base.observed_angles
-        z = wrap_near(jnp.asarray(z), before.signal, angles)
+        z = wrap_near(jnp.asarray(z), predicted.signal, angles)
+        # How a robust base weighs outliers: by its rule, else by the Gaussian branches of the noise's law. Another base
+        # weighs nothing.
         rule = base.rule if isinstance(base, RobustFilter) else None
         law = noise.law(signal.mean) if isinstance(base, RobustFilter) and rule is None else None
         learned = _variational_update(
-            before,
-            (state.shape, state.scale),
-            z,
-            noise.center,
-            jnp.diagonal(jnp.asarray(noise.covariance)),
-            jnp.asarray(self.memory),
-            rule,
-            law,
+            predicted=predicted,
+            shape_before=state.shape,
+            scale_before=state.scale,
+            z=z,
+            center=noise.center,
+            variance=jnp.diagonal(jnp.asarray(noise.covariance)),
+            memory=jnp.asarray(self.memory),
+            rule=rule,
+            law=law,
         )
         # The innovation that a Gaussian filter with the variances learned before reports.
-        value, covariance, present = z - before.signal - noise.center, learned.covariance, ~jnp.isnan(z)
+        value, covariance, present = z - predicted.signal - noise.center, learned.covariance, ~jnp.isnan(z)
         both = present[:, None] & present[None]
-        density = log_density(value, covariance, jnp.abs(z) + jnp.abs(before.signal))
+        density = log_density(value, covariance, jnp.abs(z) + jnp.abs(predicted.signal))
         innovation = Innovation(value, jnp.where(both, covariance, jnp.nan), density, learned.weight)
         return AdaptiveBelief(learned.state, learned.shape, learned.scale), innovation
 
@@ -145,9 +147,49 @@ class VariationalUpdate(NamedTuple):
     weight: jax.Array
 
 
+class WeighedResiduals(NamedTuple):
+    """Residuals of the received components with their weights, (m,) each.
+
+    residual: z less its expectation and the noise's mean; weight: with which it is used; reported: weight to report;
+    received: whether it arrived, and was not left out.
+    """
+
+    residual: jax.Array
+    weight: jax.Array
+    reported: jax.Array
+    received: jax.Array
+
+
+def _weigh_residuals(
+    predicted: PredictedMeasurement,
+    e: jax.Array,
+    arrived: jax.Array,
+    noise: jax.Array,
+    rule: AbstractWeights | None,
+    scaled_law: NoiseBranches | None,
+    center: jax.Array,
+    variance: jax.Array,
+) -> WeighedResiduals:
+    """Return the innovations e (m,) weighed by the noise's law, by a rule, or not at all, in this order.
+
+    `noise`: variances of the noise; `scaled_law`: its branches with these variances; `center`: its mean; `variance`:
+    its nominal variances, in which precisions are counted. Others as of `_variational_update`.
+    """
+    if scaled_law is not None:
+        weight, shift = branch_precision(predicted, e + center, variance, scaled_law)
+        residual = jnp.where(arrived, e + center - shift, 0.0)
+        return WeighedResiduals(residual=residual, weight=weight, reported=weight, received=arrived)
+    if rule is not None:
+        weight, reported = rule.iterate(predicted, _make_independent_noise(noise), e, arrived)
+        return WeighedResiduals(residual=e, weight=weight, reported=reported, received=arrived & (weight > SMALLEST))
+    ones = jnp.ones_like(e)
+    return WeighedResiduals(residual=e, weight=ones, reported=ones, received=arrived)
+
+
 def _variational_update(
-    before: PredictedMeasurement,
-    state: tuple[jax.Array, jax.Array],
+    predicted: PredictedMeasurement,
+    shape_before: jax.Array,
+    scale_before: jax.Array,
     z: jax.Array,
     center: jax.Array,
     variance: jax.Array,
@@ -162,11 +204,12 @@ def _variational_update(
     state is corrected with the variances before the last b.
 
     Args:
-        before: prediction of z without its noise.
-        state: (a, b) before, (m,) each.
-        z: what arrived, NaN where nothing did.
-        center: mean of the noise.
-        variance: nominal variance of the noise.
+        predicted: prediction of z without its noise.
+        shape_before: a before the step (m,).
+        scale_before: b before the step (m,).
+        z: what arrived (m,), NaN where nothing did.
+        center: mean of the noise (m,).
+        variance: nominal variance of the noise (m,).
         memory: share of a and b that is kept a step.
         rule: how a robust filter weighs outliers; None for none, or with `law`.
         law: the Gaussian branches of the noise, for the score update instead; None for none.
@@ -174,32 +217,28 @@ def _variational_update(
     arrived = ~jnp.isnan(z)
     # Forget towards the prior, and count the new value.
     prior_weight = PRIOR_SHAPE * (1 - memory)
-    shape, scale = memory * state[0] + prior_weight, memory * state[1] + prior_weight * variance
+    shape, scale = memory * shape_before + prior_weight, memory * scale_before + prior_weight * variance
     after_shape = shape + 0.5
-    e = jnp.where(arrived, z - before.signal - center, 0.0)
-    # `weight` is used, `shown` reported; `received` are the components whose weight is not zero.
-    noise, weight, shown, received = scale / shape, jnp.ones_like(e), jnp.ones_like(e), arrived
-    residual = e
     # Variational Bayes: an update with R = b / a, then b from what is known of the noise's square.
+    e = jnp.where(arrived, z - predicted.signal - center, 0.0)
+    noise = scale / shape
     for _ in range(ITERATIONS):
-        if law is not None:  # each branch's noise in units of the variance
-            weight, shift = branch_precision(before, e + center, variance, _scale_law(law, noise / variance))
-            residual = jnp.where(arrived, e + center - shift, 0.0)
-            shown = weight
-        elif rule is not None:
-            weight, shown = rule.iterate(before, _make_independent_noise(noise), e, arrived)
-            received = arrived & (weight > SMALLEST)
-        used = reweight(_make_independent_noise(noise), weight)
-        learned = scale + weight * expected_squared_residuals(before, used, residual, received) / 2
-        previous_noise, noise = noise, jnp.where(received, learned / after_shape, noise)
-    # The state with the last variances.
-    if law is not None:
-        x = update_by_score(before, z, _scale_law(law, previous_noise / variance)).state
+        scaled_law = None if law is None else _scale_law(law, noise / variance)
+        weighed = _weigh_residuals(predicted, e, arrived, noise, rule, scaled_law, center, variance)
+        used = reweight(_make_independent_noise(noise), weighed.weight)
+        squared = expected_squared_residuals(predicted, used, weighed.residual, weighed.received)
+        noise = jnp.where(weighed.received, (scale + weighed.weight * squared / 2) / after_shape, noise)
+    # The state with the variances before the last b.
+    if scaled_law is not None:
+        x = update_by_score(predicted, z, scaled_law).state
     else:
-        x = joint_update(before, e, received, used)
-    a, b = jnp.where(received, after_shape, state[0]), jnp.where(received, noise * after_shape, state[1])
+        x = joint_update(predicted, e, weighed.received, used)
     return VariationalUpdate(
-        x, a, b, before.columns.covariance + jnp.diag(scale / shape), jnp.where(arrived, shown, jnp.nan)
+        state=x,
+        shape=jnp.where(weighed.received, after_shape, shape_before),
+        scale=jnp.where(weighed.received, noise * after_shape, scale_before),
+        covariance=predicted.columns.covariance + jnp.diag(scale / shape),
+        weight=jnp.where(arrived, weighed.reported, jnp.nan),
     )
 
 
@@ -209,7 +248,7 @@ def _make_independent_noise(variance: jax.Array) -> WeightedColumns:
 
 
 def _scale_law(law: NoiseBranches, ratio: jax.Array) -> NoiseBranches:
-    """Scale the noise's branches to a variance `ratio` times as large."""
+    """Return the noise's Gaussian branches scaled to variances `ratio` (m,) times as large."""
     ratio = ratio[:, None]
     return NoiseBranches(law.log_share, law.mean * jnp.sqrt(ratio), law.variance * ratio, law.least * ratio)
 

@@ -66,7 +66,7 @@ def keep_where_unchanged(changes: jax.Array, after: T, before: T) -> T:
 
 
 def observe_by_young(signal: Signal, channel: SecondOrder, z: ArrivedInnovation, scalars: Array) -> Gaussian:
-    """Update by `Polytope` for any description of the channel; scalars (2,), NaN to minimise the trace over them.
+    """Return the state after z by `Polytope`'s bound; scalars b1, b2 (2,), NaN to minimise the trace over them.
 
     (1 + b1) P - C' Omega^-1 C with Omega = base + (1/b1 + 1/b2) shift + (1 + b2) M (H P H' + R) M' is what a Kalman
     update makes of the prior (1 + b1) P and, of z, of the noise (1 + b1)^2 [base + (1/b1 + 1/b2) shift +
@@ -91,8 +91,10 @@ def observe_by_young(signal: Signal, channel: SecondOrder, z: ArrivedInnovation,
 def observe_by_zero_mean(signal: Signal, channel: SecondOrder, z: ArrivedInnovation, scalar: Array) -> Gaussian:
     """Return the state after z by `ZeroMean`: the prior error has mean zero, its correlation with the gain is unknown.
 
-    For each beta > 0 the bound is P, updated by a measurement with the noise Omega - M H P H' M', plus beta C Pyy^+ C':
-    Omega = power(Pyy) + spread(yhat yhat') + shift(Pyy) / beta, and C Pyy^+ C' is what the received components explain.
+    z = G y + n; y has mean yhat, covariance Pyy and slopes H in the state, whose covariance is P; M = E G. For each
+    beta > 0 the bound is P, updated by a measurement with the noise Omega - M H P H' M', plus beta C Pyy^+ C', with
+    C = Cov(x, y): what the received components explain of the state. Omega = power(Pyy) + spread(yhat yhat') +
+    shift(Pyy) / beta, the maps of second moments of (y, 1) that `channel` has.
 
     Args:
         signal: moments of the state and of y, jointly.
@@ -117,9 +119,8 @@ def observe_by_zero_mean(signal: Signal, channel: SecondOrder, z: ArrivedInnovat
     cross = (slopes * prior.variances) @ prior.root.T
     parts = base + unit_variance_where_absent(present), shift, cross @ cross.T, jnp.sum(explained**2 @ share)
     beta = trace_minimising_scalars(zero_mean_fixed_point_map, scalar, parts)[0]
-    after = condition_on_observation(
-        prior, slopes, z.innovation, factor_spread(base + shift / beta - of_state), present
-    )[0]
+    noise = factor_spread(base + shift / beta - of_state)
+    after, _ = condition_on_observation(prior, slopes, z.innovation, noise, present)
     wider = from_columns(after.mean, join_columns(after.columns, WeightedColumns(explained, beta * share)))
     return keep_where_unchanged(jnp.any(present), wider, after)
 
@@ -127,7 +128,10 @@ def observe_by_zero_mean(signal: Signal, channel: SecondOrder, z: ArrivedInnovat
 def _select_received(
     signal: Signal, channel: SecondOrder, present: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return M H of what arrived, M H P H' M' and M R M'."""
+    """Return M H (m, n), and M H P H' M' and M R M' (m, m): slopes and two parts of the covariance of M y.
+
+    M: the channel's mean gain, with rows of zeros for what did not arrive.
+    """
     gain = jnp.where(present[:, None], jnp.asarray(channel.mean_gain), 0.0)
     slopes = gain @ signal.slopes
     return slopes, WeightedColumns(slopes, signal.prior.variances).covariance, signal.noise.through(gain).covariance

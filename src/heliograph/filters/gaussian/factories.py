@@ -34,9 +34,17 @@ def _make_gaussian_filter(
     initial_covariance: ArrayLike | None,
     trusted: bool,
 ) -> GaussianFilter:
-    """Return the Gaussian filter of checked parts, on the channel's second moments without its memory, with its claim.
+    """Check the parts, and return their Gaussian filter on the channel's second moments without its memory.
 
-    `trusted`: whether the channel is the true one, so that more than "nominal" may be claimed.
+    Args:
+        plant: the plant, n states.
+        sensor: its sensor.
+        channel: from the sensor to the filter; None for one that delivers everything as it is.
+        transform: moments of a nonlinear function.
+        update: how an uncertain channel is bounded.
+        initial_mean: mean (n,) of the first state; None for the plant's.
+        initial_covariance: its covariance (n, n); None for the plant's.
+        trusted: whether the channel is the true one, so that more than "nominal" may be claimed.
     """
     start = check_plant(plant)
     instance("update", update, AbstractUpdate, "one such as Polytope()")
@@ -44,15 +52,15 @@ def _make_gaussian_filter(
     check_link(first(sensor), first(channel), len(start.states))
     angles = find_received_angles(plant, sensor, channel)
     mean, spread, prior_given = prior_of(start, initial_mean, initial_covariance)
-    # Moments of the channel, its memory ignored.
+    # Moments of the channel without its memory: where that matters, the described channel is not the true one.
     premise = Premise(plant, sensor, channel)
     trusted = trusted and not memory_matters(channel)
     channel = without_memory(channel)
     described = describe_channel_moments(channel, update)
     pairs = zip(unstack(channel), unstack(described), strict=True)
-    # The Kalman filter is exact: linear, no random gain, no angle.
-    on_line = not start.circular and not first(sensor).circular  # an attitude has no linear plant
-    linear = on_line and is_linear(plant, sensor) and not any(has_random_gain(c, s) for c, s in pairs)
+    # The Kalman filter is exact: linear, no random gain, no angle (and so no attitude: that has no linear plant).
+    without_angles = not start.circular and not first(sensor).circular
+    linear = without_angles and is_linear(plant, sensor) and not any(has_random_gain(c, s) for c, s in pairs)
     claim = update.claim(uncertain=False) if linear and trusted and not prior_given else "nominal"
     claim = lower_by_noise(claim, plant, sensor, channel)
     filter = GaussianFilter(

@@ -117,20 +117,26 @@ class GivingInFilter(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: GateAndRival, z: ArrayLike, k: Step = 0) -> tuple[GateAndRival, Innovation]:
-        """Correct the gate's state, and its rival with what the gate refused too; believe the rival if it is time."""
+        """Correct the gate's state with z (m,), and the rival with what the gate refuses too; then choose between them.
+
+        The gate gives in, and the rival's state is believed from now on, where a number has been refused for long and
+        the numbers that were not refused do not contradict the rival.
+        """
+        # The gate's own update, and which numbers it refused: how often in a row.
         z = jnp.asarray(z)
         arrived = ~jnp.isnan(z)
         after, innovation = self.base.correct(state.believed, z, k)
-        left_out = arrived & (_weight_of(innovation) < 0.5)  # a gate's weights are 0 and 1
+        left_out = arrived & (_component_weights(innovation) < 0.5)  # a gate's weights are 0 and 1
         refused = jnp.where(arrived, jnp.where(left_out, state.refused + 1, 0.0), state.refused)
         suspect = refused > 0
-        # The rival, opened where it would refuse what the gate does.
+        # The rival, its prior widened where it would refuse what the gate does. It begins as the gate's state.
         prior = _choose(jnp.any(state.refused > 0), state.rival, state.believed)
-        opened = self._open(prior, z, left_out, k)
+        opened = self._widen_prior(prior, z, left_out, k)
         rival, rival_innovation = self.base.correct(opened, z, k)
-        evidence = state.evidence + self._compare(rival_innovation, innovation, arrived & ~suspect)
-        # It gives in after refusals for long enough, unless the other numbers contradict the rival.
-        gives_in = self._is_long(refused, state.elapsed) & (evidence > -CONTRADICTED)
+        evidence = state.evidence + self._compare_densities(rival_innovation, innovation, arrived & ~suspect)
+        # Give in after refusals for long enough, unless the other numbers contradict the rival. A rival ends where the
+        # gate gives in, or no number is refused any more: both states are then the chosen one.
+        gives_in = self._is_refused_long(refused, state.elapsed) & (evidence > -CONTRADICTED)
         rival_continues = jnp.any(suspect) & ~gives_in
         jump = wrap_near(rival.mean, after.mean, self.angles_used().states) - after.mean
         chosen = _choose(gives_in, rival, after)
@@ -146,7 +152,7 @@ class GivingInFilter(AbstractSizedFilter):
         )
         return belief, _choose(gives_in, rival_innovation, innovation)
 
-    def _is_long(self, refused: jax.Array, elapsed: jax.Array) -> jax.Array:
+    def _is_refused_long(self, refused: jax.Array, elapsed: jax.Array) -> jax.Array:
         """Return whether a number has been refused for long enough in a row: often enough, or over enough time."""
         long = jnp.zeros((), dtype=bool)
         if self.after is not None:
@@ -155,8 +161,11 @@ class GivingInFilter(AbstractSizedFilter):
             long = long | (jnp.any(refused > 1) & (elapsed >= self.seconds))
         return long
 
-    def _open(self, prior: Gaussian, z: jax.Array, left_out: jax.Array, k: Step) -> Gaussian:
-        """Return a state, wider where that lets it use numbers that were left out and that it would leave out too."""
+    def _widen_prior(self, prior: Gaussian, z: jax.Array, left_out: jax.Array, k: Step) -> Gaussian:
+        """Return the rival's prior, widened so that the gate's rule lets it use the numbers (m,) that were `left_out`.
+
+        It is widened only for numbers that the rule would refuse under this prior too.
+        """
         predicted, _ = self.base.predict_received(prior, k)
         noise, rule = at(self.base.noise, k), _gate_of(self.base)
         # Innovation e, its variance S, and V = Var t of the state alone.
@@ -171,8 +180,8 @@ class GivingInFilter(AbstractSizedFilter):
         wider = WeightedColumns(jnp.eye(n), n / jnp.minimum(rule.c, 1.0) * jnp.sum(change**2, axis=1))
         return from_columns(predicted.prior.mean, join_columns(predicted.prior.columns, wider))
 
-    def _compare(self, rival: Innovation, gate: Innovation, counts: jax.Array) -> jax.Array:
-        """Return the log density of the numbers that count under the rival less that under the gate."""
+    def _compare_densities(self, rival: Innovation, gate: Innovation, counts: jax.Array) -> jax.Array:
+        """Return the summed log density of the numbers that count (m,) under the rival less that under the gate."""
 
         def log_density(innovation: Innovation) -> jax.Array:
             """Return the log density of each number that counts, of squares up to the gate's limit c, without 2 pi."""
@@ -205,7 +214,7 @@ def _most_probable_change(predicted: PredictedMeasurement, e: jax.Array, of_stat
     return jnp.asarray(cross * (e / jnp.where(of_state > 0, of_state, 1.0)))
 
 
-def _weight_of(innovation: Innovation) -> jax.Array:
+def _component_weights(innovation: Innovation) -> jax.Array:
     """Return the weights of the received numbers (m,)."""
     return jnp.asarray(innovation.weight)
 

@@ -70,6 +70,7 @@ def robust_filter(
     Source: Masreliez (1975) for the score; Duran-Martin et al., Outlier-robust Kalman filtering through generalised
         Bayes (2024), for weights of one update.
     """
+    # Parts that fit, and the rule's type.
     start = check_plant(plant)
     check_link(first(sensor), first(channel), len(start.states), moments=False)
     if rule is not None:
@@ -77,7 +78,10 @@ def robust_filter(
     move = Cubature() if transform is None else transform
     instance("transform", move, AbstractTransform, "one such as Cubature()")
     mean, spread, _ = prior_of(start, initial_mean, initial_covariance)
-    plain, noise = separate_outlier_noise(sensor, without_memory(channel), rule is None or isinstance(rule, StudentVB))
+    # The channel without the noise that is weighed, and that noise. Its components must be independent where its law's
+    # branches are used: by the score (no rule) and by StudentVB.
+    needs_law = rule is None or isinstance(rule, StudentVB)
+    plain, noise = separate_outlier_noise(sensor, without_memory(channel), needs_law)
     if isinstance(rule, StudentVB):
         rule = rule.of_law(_student_degrees_of(first(noise)))
     robust = RobustFilter(

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from operator import itemgetter
 
 import equinox as eqx
 import jax
@@ -21,7 +22,7 @@ from heliograph.filters.base import (
 from heliograph.filters.gaussian.belief import smoother_step_by_transform
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
-from heliograph.model.estimate import Estimate, Innovation, weakest
+from heliograph.model.estimate import Claim, Estimate, Innovation, weakest
 from heliograph.model.over_time import alike, stack
 from heliograph.model.premises.agreement import join_premises
 from heliograph.model.premises.premise import on_premise
@@ -62,26 +63,28 @@ class SequentialFilter(AbstractSizedFilter):
     def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
         """Correct with each node's measurement in turn; z: those of all nodes, one behind the other."""
         z = jnp.asarray(z)
-        # Filters of one structure: one correction compiled, run over the nodes.
         if all(alike(filter, self.filters[0]) for filter in self.filters):
-            arrays, rest = eqx.partition(stack(self.filters), eqx.is_array)
-
-            def correct(belief: Gaussian, node: tuple[PyTree, jax.Array]) -> tuple[Gaussian, Innovation]:
-                """Correct with one node's measurement."""
-                arrays_of_node, measurement = node
-                filter_of_node: GaussianFilter = eqx.combine(arrays_of_node, rest)
-                return filter_of_node.correct(belief, measurement, k)
-
-            state, innovation = jax.lax.scan(correct, state, (arrays, z.reshape(len(self.filters), -1)))
-            return state, _join_innovations(
-                [jax.tree.map(lambda leaf: leaf[i], innovation) for i in range(len(self.filters))]  # noqa: B023
-            )
+            return self._correct_in_one_loop(state, z, k)
         # Filters of different structure: one correction each.
-        ends, parts = np.cumsum([filter.received for filter in self.filters]), []
+        ends, innovations = np.cumsum([filter.received for filter in self.filters]), []
         for filter, received in zip(self.filters, jnp.split(z, ends[:-1]), strict=True):
             state, innovation = filter.correct(state, received, k)
-            parts.append(innovation)
-        return state, _join_innovations(parts)
+            innovations.append(innovation)
+        return state, _join_innovations(innovations)
+
+    def _correct_in_one_loop(self, state: Gaussian, z: jax.Array, k: Step) -> tuple[Gaussian, Innovation]:
+        """Correct as `correct` does, for filters of one structure: one correction compiled, run over the nodes."""
+        arrays, rest = eqx.partition(stack(self.filters), eqx.is_array)
+
+        def correct(belief: Gaussian, node: tuple[PyTree, jax.Array]) -> tuple[Gaussian, Innovation]:
+            """Correct with one node's measurement."""
+            arrays_of_node, measurement = node
+            filter_of_node: GaussianFilter = eqx.combine(arrays_of_node, rest)
+            return filter_of_node.correct(belief, measurement, k)
+
+        nodes = len(self.filters)
+        state, innovations = jax.lax.scan(correct, state, (arrays, z.reshape(nodes, -1)))
+        return state, _join_innovations([jax.tree.map(itemgetter(i), innovations) for i in range(nodes)])
 
     @estimates
     def estimate(self, state: Gaussian) -> Estimate:
@@ -95,7 +98,7 @@ class SequentialFilter(AbstractSizedFilter):
 
 
 def _join_innovations(parts: Sequence[Innovation]) -> Innovation:
-    """Return the innovations of nodes, one after another, as one: each is given those before it."""
+    """Return one innovation of all nodes' measurements, from each node's given the nodes before it."""
     covariance = jax.scipy.linalg.block_diag(*(innovation.covariance for innovation in parts))
     total = jnp.sum(jnp.stack([jnp.asarray(innovation.log_likelihood) for innovation in parts]))
     return Innovation(jnp.concatenate([innovation.value for innovation in parts]), covariance, total)
@@ -117,19 +120,16 @@ def sequential_filter(filters: Sequence[GaussianFilter]) -> SequentialFilter:
     nodes = tuple(items("sequential filter", filters, "filters"))
     for filter in nodes:
         instance("sequential filter", filter, GaussianFilter, "filters of single nodes (cubature, extended, ...)")
-    # All estimate the same plant; the claim is that of the weakest filter.
+    # All estimate the same plant.
     sizes = [(len(filter.states), len(filter.inputs)) for filter in nodes]
     if len(set(sizes)) != 1:
         raise fail("sequential filter", "filters of as many states and inputs each", sizes)
     angles = {filter.angles_used().states for filter in nodes}
     if len(angles) != 1:
         raise fail("sequential filter", "filters of one plant, whose angles are the same states", sorted(angles))
-    weakest_claim = weakest([filter.claim for filter in nodes])
-    central = SequentialFilter(
-        filters=nodes,
-        **make_sizes(
-            "exact" if weakest_claim == "exact" else "nominal", nodes[0], sum(filter.received for filter in nodes)
-        ),
-    )
+    # A bound of one node is none after another one's: anything below "exact" is "nominal".
+    claim: Claim = "exact" if weakest([filter.claim for filter in nodes]) == "exact" else "nominal"
+    central = SequentialFilter(filters=nodes, **make_sizes(claim, nodes[0], sum(filter.received for filter in nodes)))
+    # What the claim is about is known if it is of every node.
     premises = [filter.premise for filter in nodes if filter.premise is not None]
     return on_premise(central, join_premises(premises) if len(premises) == len(nodes) else None)

@@ -241,9 +241,13 @@ def _is_multiple_of_identity(matrix: jax.Array | np.ndarray) -> bool:
 def combine_hop_ranges(channel: AbstractRandomAffine, variance: Callable[[HopRange], float]) -> SecondOrder:
     """Return the worst-case second moments of a chain of hops, from the range of possible moments of each hop's gain.
 
-    Hop i multiplies by a g: amplitude a, gain g of mean m up to +-r. Hop after hop, with s the largest E g^2:
-    V <- var S + (|m| + r)^2 V bounds the variance of the product of the gains g, S <- s S its power, and
-    N <- (a^2 s) N + Q the noise. `variance` returns the bound `var` on the variance of a hop's g.
+    Each hop multiplies by a g and adds noise of covariance Q: amplitude a, gain g of mean m up to +-r, the largest
+    E g^2 being s. From V = 0, S = 1, N = 0, hop after hop: V <- var S + (|m| + r)^2 V bounds the variance of the
+    product of the gains g, S <- s S its power E (g_1 g_2 ...)^2, and N <- (a^2 s) N + Q the noise's covariance.
+
+    Args:
+        channel: a chain of hops, each one gain for all components and noise of zero mean.
+        variance: returns the bound `var` on the variance of a hop's g.
     """
     hops = [_describe_hop(hop) for hop in channel.in_series]
     # The recursion over the hops.
@@ -266,6 +270,11 @@ def combine_hop_ranges(channel: AbstractRandomAffine, variance: Callable[[HopRan
         return QuadraticMap(center, np.zeros_like(center))
 
     zero = np.zeros_like(noise)
-    parts = make_map(spread + shift**2, noise), make_map(shift**2, zero), make_map(power, zero)
-    mean = np.concatenate([gain, np.zeros((len(noise), 1))], axis=1)
-    return describe_second_moments(mean, *parts, nominal_spread(channel), shift > 0)
+    return describe_second_moments(
+        mean=np.concatenate([gain, np.zeros((len(noise), 1))], axis=1),
+        spread=make_map(spread + shift**2, noise),
+        shift=make_map(shift**2, zero),
+        power=make_map(power, zero),
+        nominal=nominal_spread(channel),
+        uncertain=shift > 0,
+    )

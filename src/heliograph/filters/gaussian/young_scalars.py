@@ -29,11 +29,16 @@ Sweep = Callable[..., tuple[jax.Array, Slopes]]  # (log beta, *parts) -> log f(b
 def trace_minimising_scalars(sweep: Sweep, given: Array, parts: Parts) -> jax.Array:
     """Return the scalars beta of Young's inequality that minimise tr P; those that are `given` (not NaN) stay.
 
-    Alternating minimisation converges slowly, so this is Newton's method, after one sweep from START. Where a Newton
-    step is too long the sweep itself is taken. The last step is taken outside the loop: its derivative is that of the
-    root, by the implicit function theorem, in reverse mode too.
+    At the minimum beta = f(beta). Iterating f (a sweep) converges slowly, so this is Newton's method for t = log beta,
+    after one sweep from START. Where a Newton step is too long the sweep itself is taken. The last step is taken
+    outside the loop: its derivative is that of the root, by the implicit function theorem, in reverse mode too.
+
+    Args:
+        sweep: returns log f(beta) and its derivatives by log beta, from log beta and `parts`.
+        given: scalars that are fixed, NaN for those that are to be found (1,) or (2,).
+        parts: matrices of the bound, the other arguments of `sweep`.
     """
-    # No derivatives inside the loop; its unknown is t = log beta.
+    # No derivatives inside the loop.
     fixed = jax.lax.stop_gradient(parts)
     free = jnp.isnan(given)
 
@@ -79,7 +84,11 @@ def young_omega(beta: jax.Array, base: jax.Array, shift: jax.Array, mean_part: j
 def young_fixed_point_map(
     t: jax.Array, base: jax.Array, shift: jax.Array, mean_part: jax.Array, cross_square: jax.Array, trace: jax.Array
 ) -> tuple[jax.Array, Slopes]:
-    """Return the next log beta, and its slopes: beta_1 = sqrt(tr W S / tr P), beta_2 = sqrt(tr W S / tr W M).
+    """Return the next log beta, and its derivatives, in the search of the beta that minimises the bound's trace.
+
+    beta_1 <- sqrt(tr(W S) / tr P) and beta_2 <- sqrt(tr(W S) / tr(W M)), with W = Omega^-1 C' C Omega^-1 of the last
+    beta. By d tr(W X) = -2 tr(Omega^-1 dOmega W X): in units of log beta_1, dOmega = -S / beta_1; of log beta_2,
+    dOmega = -S / beta_2 + beta_2 M.
 
     Args:
         t: log beta (2,).
@@ -89,6 +98,7 @@ def young_fixed_point_map(
         cross_square: C' C of the cross-covariance C of state and measurement (m, m).
         trace: tr P of the prior.
     """
+    # W; s = Omega^-1 S, m = Omega^-1 M.
     beta = jnp.exp(t)
     weight, (s, m) = _trace_weight(young_omega(beta, base, shift, mean_part), cross_square, (shift, mean_part))
     ws, wm = weight @ shift, weight @ mean_part

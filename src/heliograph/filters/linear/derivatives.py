@@ -133,21 +133,36 @@ class FilterStep(NamedTuple):
     present: jax.Array
 
     def differentiate(self, d: ModelMatrices, before: MomentSlopes) -> tuple[MomentSlopes, jax.Array, jax.Array]:
-        """Return the derivatives of the estimate after the step, and of e and S, zero of what did not arrive."""
+        """Return the derivatives, in one free number, of the estimate after the step, and of e and S.
+
+        With a dash for the derivative, P the predicted covariance, C = P H', K = C S^-1, w = S^-1 e:
+
+            m-' = F m' + F' m + b',   P' = F (P of before)' F' + (F' (P of before) F' and its transpose) + Q',
+            C' = P' H' + P (H')',   e' = -(H m-' + H' m- + c'),   S' = H C' + H' C + R',
+            m' = m-' + K e' + (C' - K S') w,   and of the corrected covariance P' - C' K' - K C'' + K S' K'.
+
+        Args:
+            d: derivatives of the step's matrices.
+            before: derivatives of the mean and covariance before the step.
+
+        Returns:
+            Derivatives of the corrected mean and covariance, of e (m,) and of S (m, m), zero of what did not arrive.
+        """
         F, H, P = self.matrices.F, self.matrices.H, self.prior.covariance
         # Prediction.
         mean = F @ before.mean + d.F @ self.before.mean + d.b
         turned = d.F @ self.before.covariance @ F.T
         covariance = symmetric(F @ before.covariance @ F.T + (turned + turned.T) + d.Q)
-        # Innovation.
+        # Innovation; `cross` is C'.
         present = self.present
         both = present[:, None] & present
         cross = jnp.where(present, covariance @ H.T + P @ d.H.T, 0.0)
         e = jnp.where(present, -(H @ mean + d.H @ self.prior.mean + d.c), 0.0)
         S = jnp.where(both, symmetric(H @ cross + d.H @ P @ H.T + d.R), 0.0)
-        # Correction: of what did not arrive the gain is zero.
-        seen, safe = jnp.where(present[:, None], H, 0.0), jnp.where(both, self.S, 0.0)
-        solved = psd_solve(safe, jnp.concatenate([jnp.where(present, self.e, 0.0)[:, None], seen @ P], axis=1))
+        # Correction: w = S^-1 e and K = (S^-1 H P)', zero of what did not arrive.
+        H_arrived, S_arrived = jnp.where(present[:, None], H, 0.0), jnp.where(both, self.S, 0.0)
+        e_arrived = jnp.where(present, self.e, 0.0)
+        solved = psd_solve(S_arrived, jnp.concatenate([e_arrived[:, None], H_arrived @ P], axis=1))
         w, gain = solved[:, 0], solved[:, 1:].T
         mean = mean + gain @ e + (cross - gain @ S) @ w
         # C' K' + K C'' - K S' K' = (C' - K S' / 2) K' and its transpose.

@@ -63,7 +63,11 @@ class LinearFilterOfRecord(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: RecordedBelief, z: ArrayLike, k: Step = 0) -> tuple[RecordedBelief, Innovation]:
-        """Correct the filter's own state; S and P are those of this recording."""
+        """Correct the filter's own state as it does, and P by its gain K: P - K H P - P H' K' + K S K'.
+
+        S is the covariance of the innovation that the filter would compute if the moments of x before any data were
+        those given this recording, E[x x'] = m m' + P. The innovation that is returned has this S.
+        """
 
         def correct_mean(mean: jax.Array, value: jax.Array) -> tuple[jax.Array, jax.Array]:
             """Return the corrected mean and the innovation, from the predicted mean and z."""
@@ -73,7 +77,8 @@ class LinearFilterOfRecord(AbstractSizedFilter):
 
         mean, P = state.own.gaussian.mean, jnp.asarray(state.covariance)
         after, own = self.filter.correct(state.own, z, k)
-        # The gain K, and H, the derivative of what is expected of z by the mean, from the filter's own arithmetic.
+        # The gain K, and H, the derivative by the mean of what is expected of z, from the filter's own arithmetic: its
+        # innovation is z - H m - c.
         arrived = ~jnp.isnan(own.value)
         (_, gain), (slope, _) = jax.jacfwd(correct_mean, (0, 1))(mean, jnp.asarray(z))
         H, K = jnp.where(arrived[:, None], -slope, 0.0), jnp.where(arrived, gain, 0.0)

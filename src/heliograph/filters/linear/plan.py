@@ -145,9 +145,13 @@ def plan_filter(
 
 
 def _record_matrices(filter: AbstractFilter, inputs: Array, projection: Array | None) -> PlannedFilter:
-    """Return the gains and covariances of a filter at every step, recorded while it runs over data of zeros.
+    """Return the filter with its gains and covariances of every step, recorded while it runs over data of zeros.
 
-    `inputs` (steps, inputs). `projection`: the covariances kept are those of this linear map of the state; None: all.
+    Args:
+        filter: one of which only the mean depends on data.
+        inputs: of each step (steps, inputs).
+        projection: (n, N), maps the filter's mean and covariance to those of the plant's state; None where they are
+            these already.
     """
     # Complete data of zeros: the matrices do not depend on their values.
     zeros = jnp.zeros(filter.received)
@@ -180,7 +184,15 @@ _plan_by_xla = quickly_compiled(_record_matrices)
 def plan_step(
     filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step
 ) -> tuple[LinearStep, PyTree, PyTree]:
-    """Return matrices of a step from this state, whatever its mean, and the states after prediction and correction."""
+    """Return the matrices of step k, the state after its prediction, and that after its correction.
+
+    Args:
+        filter: one of which only the mean depends on data, and affinely.
+        state: before the step; the matrices are the same whatever its mean, and the states returned are from mean 0.
+        z: measurement (m,), which says by NaN what did not arrive.
+        u: input.
+        k: number of the step.
+    """
     # F and f: the prior mean is affine in the mean, so that f is its value and F its derivative at 0.
     zero_mean = jnp.zeros_like(gaussian_of(state).mean)
 
@@ -190,7 +202,7 @@ def plan_step(
         return jnp.asarray(gaussian_of(prior).mean), prior
 
     transition, prior = jax.jacfwd(predict, has_aux=True)(zero_mean)
-    # K and C: derivatives of posterior mean and innovation.
+    # K: derivative of the posterior mean by z; -C: derivative of the innovation by the prior mean; -c: its value at 0.
     (_, gain), (output, _), after, innovation = _correction_slopes(filter, prior, zero_mean, z, k)
     step = LinearStep(
         transition=transition,

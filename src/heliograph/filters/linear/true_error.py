@@ -69,14 +69,8 @@ def true_error(
 
     Source: the moments of jump linear systems, as in Costa, Fragoso and Marques (2005), for the filter's state too.
     """
-    check_linear("true error", plant, sensor)
-    instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
-    # The filter must fit the world in sizes, not in its model.
+    _check_fits(filter, plant, sensor, channel)
     start, n = first(plant), len(first(plant).states)
-    check_link(first(sensor), first(channel), n, late=True)
-    if filter.received != first(channel).outputs or len(filter.states) != n:
-        got = f"one of {len(filter.states)} that receives {filter.received}"
-        raise fail("filter", f"one of {n} states that receives {first(channel).outputs} numbers", got)
     # Gains of the filter for these inputs.
     u = array("inputs", np.zeros((check_horizon(horizon), 0)) if inputs is None else inputs, (horizon, None))
     planned = filter.planned(u)
@@ -85,15 +79,15 @@ def true_error(
     # A late channel: past signals are states too.
     if first(channel).past:
         plant, sensor, channel = with_past(plant, sensor, channel)
-    begin, total = first(plant), len(first(plant).states)
-    initial, world = channels_by_mode(channel)
+    begin, total = first(plant), len(first(plant).states)  # n, and the past signals
+    initial, world = channels_by_mode(channel)  # P(j) at the start, and the channel in each mode j, at each step
     projection = np.eye(n) if planned.projection is None else np.asarray(planned.projection)
     # N_j at the start, with r = (x, 1, s): P(j) E[r r'], where only x has a covariance; s is the planned start.
     mean = np.concatenate([begin.initial_mean, [1.0], planned.start])
     square = np.outer(mean, mean)
     square[:total, :total] += begin.initial_covariance
     moments, true = np.asarray(initial)[:, None, None] * square, []
-    # Error x - xhat = D r; one prediction and one correction per step.
+    # Error x - xhat = D r; one prediction and one correction per step. The modes move from the second step on.
     difference = np.concatenate([np.eye(n, total + 1), -projection], axis=1)
     for k in range(horizon):
         transition = np.eye(len(moments)) if k == 0 else np.asarray(at(world, k).transition)
@@ -105,12 +99,30 @@ def true_error(
     return TrueError(start.states, claimed, np.array(true))
 
 
+def _check_fits(filter: AbstractFilter, plant: AnyPlant, sensor: AnySensor, channel: Channel) -> None:
+    """Raise ValueError unless plant and sensor are linear, and the filter has the sizes of this world, in any model."""
+    check_linear("true error", plant, sensor)
+    instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
+    n, received = len(first(plant).states), first(channel).outputs
+    check_link(first(sensor), first(channel), n, late=True)
+    if filter.received != received or len(filter.states) != n:
+        got = f"one of {len(filter.states)} that receives {filter.received}"
+        raise fail("filter", f"one of {n} states that receives {received} numbers", got)
+
+
 def _propagate_moments(
     moments: np.ndarray, plant: LinearPlant, step: LinearStep, u: np.ndarray, rows: np.ndarray
 ) -> np.ndarray:
-    """Propagate E[r r' 1{mode}] (M, size, size), r = (x, 1, s), by x+ = A x + b + w, s- = F s + f and the modes' chain.
+    """Return E[r r' 1{mode}] (M, size, size), r = (x, 1, s), after the prediction of a step.
 
-    `rows`: transition matrix of the modes (M, M).
+    x+ = A x + b + w of the plant, s- = F s + f of the filter, and the modes move by their chain.
+
+    Args:
+        moments: E[r r' 1{mode}] before the step.
+        plant: the true plant.
+        step: the filter's F and f.
+        u: input of the step.
+        rows: transition matrix of the modes (M, M).
     """
     n, inputs, size = len(plant.states), jnp.asarray(u), moments.shape[-1]
     # r+ = [A b 0; 0 1 0; 0 f F] r + (w, 0, 0).
@@ -124,20 +136,27 @@ def _propagate_moments(
 
 
 def _correct_moments(moments: np.ndarray, sensor: LinearSensor, world: ChannelByMode, step: LinearStep) -> np.ndarray:
-    """Propagate moments through s = s- + K (z - C s- - c), with z = (G, n) y~, of the mode, and y~ = C~ (x, 1) + v.
+    """Return E[r r' 1{mode}] (M, size, size), r = (x, 1, s), after s = s- + K (z - C s- - c).
 
-    `moments`: E[r r' 1{mode}] (M, size, size), r = (x, 1, s).
+    z = (G, n) y~, G and n by the mode; y~ = (y, 1) = C~ (x, 1) + (v, 0).
+
+    Args:
+        moments: E[r r' 1{mode}] after the prediction.
+        sensor: the true sensor.
+        world: mean and spread of (G, n) in each mode.
+        step: the filter's K, C and c.
     """
     p, n = sensor.matrix.shape
     gain, mean, law = np.asarray(step.gain), np.asarray(world.mean), moments[:, n, n, None, None]
     measure, noise = np.zeros((p + 1, n + 1)), np.zeros((p + 1, p + 1))
     measure[:p, :n], measure[:p, n], measure[p, n] = sensor.matrix, sensor.noise.mean, 1.0
     noise[:p, :p] = sensor.noise.covariance
-    # Given the mode: the mean map of r, then what the gain's spread and the noise add.
+    # Mean map of r given the mode: s <- s - K (C s + c) + K E[(G, n)] C~ (x, 1).
     use = np.zeros_like(moments) + np.eye(moments.shape[-1])
     use[:, n + 1 :, : n + 1] += gain @ mean @ measure
     use[:, n + 1 :, n + 1 :] -= gain @ step.output
     use[:, n + 1 :, n] -= gain @ step.offset
+    # E[y~ y~' 1{mode}], and what the spread of (G, n) and the sensor's noise add to s.
     second = propagate_by_mode(measure, moments[:, : n + 1, : n + 1], law * noise)
     added = np.einsum("jmlab,jab->jml", np.asarray(world.spread), second) + law * propagate_by_mode(mean, noise, 0.0)
     after: np.ndarray = propagate_by_mode(use, moments, 0.0)

@@ -166,8 +166,9 @@ class AdditiveModalFilter(AbstractModalFilter):
     def _measurement_model(self, state: AdditiveBelief, k: Step) -> MeasurementModel:
         """Return z = common + H zeta + v: H and `common` from Hbar and the D_a, and columns whose squares sum to Cov v.
 
-        Letters of the subscripts: a, b, c functions (1, phi_1, ...), m received, p + 1 sent and the 1, l received, j
-        modes of a link.
+        Hbar is the mean of the gains (G, n), D_a what function phi_a of a link's mode adds to it, Gamma = E[phi phi']
+        of the functions (1, phi_1, ...), and y~ = (y, 1) what is sent. Letters of the subscripts: a, b functions, c
+        columns of Gamma, m and l received numbers, p entries of y~, j modes of a link.
         """
         terms: tuple[ChannelByMode, ...] = at(self.terms, k)
         sensor = at(self.sensor, k)
@@ -191,8 +192,9 @@ class AdditiveModalFilter(AbstractModalFilter):
             for term, law in zip(terms, state.laws, strict=True)
         )
         # Rounding of z, by its second moments (m,).
-        by_function = mean_gain_by_function
-        rounding = rounding_of(jnp.einsum("c,cma,ab,cmb->m", gamma.weights, by_function, sent, by_function))
+        rounding = rounding_of(
+            jnp.einsum("c,cmp,pq,cmq->m", gamma.weights, mean_gain_by_function, sent, mean_gain_by_function)
+        )
         noise_columns = join_columns(*known_noise, rounding, factor_spread(jnp.asarray(gain_noise)))
         return MeasurementModel(concatenate_modes(matrix.at[0, :, -1].set(0.0)), common, noise_columns)
 

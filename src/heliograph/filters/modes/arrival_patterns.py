@@ -63,22 +63,27 @@ def _describe_step_by_pattern(
     before: JointModes,
     flags: Float[np.ndarray, "M F"],
 ) -> SideInformation:
-    """Return the channel of one step by mode and pattern of arrivals, from the outcomes (what may arrive) of each mode.
+    """Return the channel of one step by mode and pattern of arrivals.
 
-    `before` has the transition from the modes of the step before; `flags` is P(flag | mode). Moments are of (G, n), the
-    gain and offset: (modes, patterns, m, p), second ones (modes, patterns, m, m, p, p).
+    Args:
+        outcomes: of each mode, what may arrive: a probability, which components arrive, and the random map z = G y + n.
+        patterns: all patterns of arrivals, each (m,).
+        before: modes of the step before, with the transition to this step's.
+        flags: P(flag | mode).
     """
-    m, p = outcomes[0][0].map.outputs, outcomes[0][0].map.inputs + 1
+    some_map = outcomes[0][0].map
+    m, p = some_map.outputs, some_map.inputs + 1  # (G, n) is (m, p)
     shape = (len(outcomes), len(patterns))
-    # Sums over the outcomes of each mode: P, P E[(G, n)] and P E[(G, n) x (G, n)].
+    # Sums over the outcomes of each mode and pattern: P, P E[(G, n)] and P E[(G, n) x (G, n)].
     chance, mean, second = np.zeros(shape), np.zeros((*shape, m, p)), np.zeros((*shape, m, m, p, p))
     for j, of_mode in enumerate(outcomes):
         for outcome in of_mode:
-            a, (first_order, second_order) = patterns.index(tuple(outcome.arrived)), second_moments(outcome.map)
+            a = patterns.index(tuple(outcome.arrived))
+            first_order, second_order = second_moments(outcome.map)
             chance[j, a] += outcome.probability
             mean[j, a] += outcome.probability * first_order
             second[j, a] += outcome.probability * second_order
-    # Conditional moments given mode and pattern.
+    # Moments given mode and pattern; where the pattern cannot occur they are 0.
     divisor = np.where(chance > 0, chance, 1.0)
     mean, second = mean / divisor[..., None, None], second / divisor[..., None, None, None, None]
     spread = second - np.array([[symmetric_product(gain, gain) for gain in row] for row in mean])

@@ -155,15 +155,21 @@ def mix_and_predict(
     u: jax.Array,
     start: jax.Array,
 ) -> Gaussian:
-    """Return the two moments of f(x, u) + w, x from each mixture of `parts` by weights (components, mixtures).
+    """Return for each mixture the Gaussian (mixtures, n) of the mean and covariance of f(x, u) + w, x from the mixture.
 
-    A linear plant is applied to the parts before they are mixed, so that only these are moved. `start` (n,) is
-    E[x_i^2] before any data.
+    Args:
+        plant: f, and the law of w.
+        transform: of moments, for a nonlinear plant.
+        parts: Gaussians that are mixed, one a component.
+        weight: [c, g], weight of component c in mixture g; columns need not sum to 1.
+        u: input.
+        start: E[x_i^2] before any data (n,).
     """
     share = normalise_columns(weight)
     if not isinstance(plant, LinearPlant):
         mixtures = jax.vmap(partial(merge_mixture, parts), in_axes=1)(share)
         return jax.vmap(lambda x: predict_gaussian(plant, transform, x, u, start))(mixtures)
+    # A linear plant moves the parts before they are mixed, so that n parts are moved rather than all mixtures.
     matrix, noise = plant.transition_matrix(u), process_noise(plant, u, start).covariance
     means = jax.vmap(lambda mean: matrix @ mean + plant.shift(u))(parts.mean)
     spreads = jax.vmap(lambda x: x.columns.through(matrix).covariance)(parts)
@@ -195,7 +201,8 @@ def move_by_law(
         transform: of moments, for a nonlinear plant.
         parts: Gaussians that are mixed, one a component.
         weight: (components, mixtures).
-        moves: of each Gaussian after the step: number of the mixture that it was, and the mode that moves it.
+        moves: two arrays, of each Gaussian after the step the number of the mixture that it was before, and the mode
+            that moves it.
         u: input.
         start: E[x_i^2] before any data (n,).
     """

@@ -120,8 +120,12 @@ class MixtureFilter(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: MixtureBelief, z: ArrayLike, k: Step = 0) -> tuple[MixtureBelief, Innovation]:
-        """Correct with z: one Kalman update per combination, weighted by its likelihood, then moment matching."""
-        c, z, x = at(self.components, k), jnp.asarray(z), state.gaussian  # c: gain, offset and noise by combination
+        """Correct with z: one Kalman update per combination, weighted by its likelihood, then moment matching.
+
+        A combination is one choice of the values (atoms) of all gains and noises: a gain, an offset and a Gaussian
+        noise.
+        """
+        c, z, x = at(self.components, k), jnp.asarray(z), state.gaussian
         prior = state.law[c.mode] * jnp.asarray(c.weight)
         size = square_root(second_moments_at_start(self.plant))  # of the states, for the rounding of gain @ x
         present = ~jnp.isnan(z)
@@ -138,6 +142,7 @@ class MixtureFilter(AbstractSizedFilter):
             return after, (likelihood, jnp.sum(present & innovations.determined), value, total)
 
         after, (likelihood, certain, value, total) = jax.vmap(condition_on_combination)(c.gain, c.offset, c.noise)
+        # Posterior weights of the combinations; `excluded` where none of them can produce z: the state stays.
         weight, density, excluded = posterior_weights(prior, drop_below_point_mass(likelihood, certain))
         # Innovation of the mixture, angles near that of the most probable combination.
         value = wrap_near(value, value[jnp.argmax(prior)], self.observed_angles)
@@ -203,19 +208,21 @@ def mixture_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, resolut
         got = f"{type(first(plant)).__name__} and {type(first(sensor)).__name__}"
         raise fail("mixture filter", "a LinearPlant and a LinearSensor", got)
     check_link(first(sensor), first(channel), len(first(plant).states))
-    # All combinations of atoms, mode by mode, for each step where they vary.
-    angles = find_received_angles(plant, sensor, channel)
-    floor, start = float(scalar("resolution", resolution, 0.0, 1e100)) ** 2, first(plant)
+    # All combinations of atoms, mode by mode, for each step where they vary; one step stands for all where none do.
+    added_variance = float(scalar("resolution", resolution, 0.0, 1e100)) ** 2
     steps = steps_covered((sensor, channel)) or 1
     modes = [_joint_modes_of(now) for now in list_steps(channel, steps)]
-    items = zip(list_steps(sensor, steps), modes, [modes[0], *modes[:-1]], strict=True)
-    components = restack([_list_combinations(*item, floor) for item in items], sensor, channel)
+    modes_before = [modes[0], *modes[:-1]]
+    combinations = [
+        _list_combinations(of_step, now, before, added_variance)
+        for of_step, now, before in zip(list_steps(sensor, steps), modes, modes_before, strict=True)
+    ]
     return MixtureFilter(
         plant=plant,
-        components=components,
+        components=restack(combinations, sensor, channel),
         initial=modes[0].initial,
-        observed_angles=angles,
-        **make_sizes("nominal", start, first(channel).outputs),
+        observed_angles=find_received_angles(plant, sensor, channel),
+        **make_sizes("nominal", first(plant), first(channel).outputs),
     )
 
 
@@ -226,10 +233,16 @@ def _joint_modes_of(channel: AbstractRandomAffine) -> JointModes:
     return joint_modes(channel)
 
 
-def _list_combinations(sensor: AnySensor, now: JointModes, before: JointModes, floor: float) -> AtomCombinations:
-    """Return all combinations of atoms of z = G (C x + v) + n by mode, with the variance `floor` added to each noise.
+def _list_combinations(
+    sensor: AnySensor, now: JointModes, before: JointModes, added_variance: float
+) -> AtomCombinations:
+    """Return all combinations of values (atoms) of the gains and noises of z = G (C x + v) + n at one step, by mode.
 
-    `before`: the modes of the step before, whose chain leads to this step.
+    Args:
+        sensor: C and v.
+        now: the links' modes, each with its law of G and n.
+        before: the modes of the step before, whose chain leads to this step.
+        added_variance: variance that is added to each component of each noise.
     """
     assert isinstance(sensor, LinearSensor)  # checked before
     sensed = GainAndNoise(Constant(1.0), sensor.matrix, sensor.noise)
@@ -246,7 +259,7 @@ def _list_combinations(sensor: AnySensor, now: JointModes, before: JointModes, f
         weight=weight,
         gain=gain,
         offset=offset,
-        noise=factor_covariances(noise + floor * np.eye(noise.shape[-1])),
+        noise=factor_covariances(noise + added_variance * np.eye(noise.shape[-1])),
         mode=np.array(modes),
         transition=before.transition,
     )

@@ -90,11 +90,16 @@ class ModeObservedFilter(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: ModeObservedBelief, z: ArrayLike, k: Step = 0) -> tuple[ModeObservedBelief, Innovation]:
-        """Correct with z, given the memories' states that came with it: those of this step, or, `late`, of the last."""
+        """Correct with z, given the states of the links' memories that came with it.
+
+        Where `late`, they are those of the step before: its measurement is used again with them, then z under the law
+        of the memories that follows. z: what the channel delivers (m,), then one number for each memory, the number of
+        its mode or its gain; NaN for what did not arrive. Without these numbers z is not used.
+        """
         sensor, channel, observed = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
-        # Received vector: z, then the states of the memories.
         m = channel.outputs
         z, published = observed[:m], observed[m:]
+        # At the first step there are no states of a step before: none are needed.
         is_known = ~jnp.any(jnp.isnan(published)) | (~state.begun if self.late else False)
         modes = jnp.nan_to_num(published)
         if self.late:
@@ -213,7 +218,11 @@ def mode_late_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> Mo
 
 
 def _make_mode_observed_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, late: bool) -> ModeObservedFilter:
-    """Check the parts and build the filter that receives the memories' states with z, of this step or one `late`."""
+    """Check the parts; return the best linear filter that receives the states of the links' memories with z.
+
+    A memory is a chain of modes, or a gain that drifts, in the channel. Its state arrives at the same step, or `late`:
+    one step later.
+    """
     check_linear("filter that observes the mode", plant, sensor)
     # Erasures are side information of another kind.
     if any(step.erases for step in unstack(channel) if isinstance(step, AbstractRandomAffine)):
@@ -221,8 +230,9 @@ def _make_mode_observed_filter(plant: AnyPlant, sensor: AnySensor, channel: Chan
         raise fail("filter that observes the mode", expected, "one that loses packets")
     start = first(plant)
     check_link(first(sensor), first(channel), len(start.states))
-    # A late mode says what follows by the chain: nominal where the chain is uncertain.
+    # From a late mode the present one is predicted by the chain: nominal where the chain is uncertain.
     claim = "nominal" if late and uncertain_chain(channel) else claim_of_modes(channel)
+    claim = lower_by_noise(claim, plant, sensor, channel)
     # Received: z and one number per memory.
     received_numbers = first(channel).outputs + len(memories(channel))
     filter = ModeObservedFilter(
@@ -230,7 +240,7 @@ def _make_mode_observed_filter(plant: AnyPlant, sensor: AnySensor, channel: Chan
         sensor=sensor,
         channel=channel,
         late=late,
-        **make_sizes(lower_by_noise(claim, plant, sensor, channel), start, received_numbers),
+        **make_sizes(claim, start, received_numbers),
     )
     received = at_each_step(lambda link: with_flag(link, late=late), channel) if memories(channel) else channel
     return on_premise(filter, Premise(plant, sensor, received))

@@ -66,10 +66,19 @@ def move_pairs(
     u: jax.Array,
     start: jax.Array,
 ) -> MovedPairs:
-    """Return each of M Gaussians moved by the plant of each of M modes; `plant_of`: which plant each mode has."""
+    """Return the Gaussian of each mode i moved by the plant of each mode j, [i, j], and the smoother gain back.
+
+    Args:
+        plants: the different plants.
+        plant_of: [j], number of the plant of mode j.
+        transform: of moments, for a nonlinear plant.
+        parts: the Gaussian of each mode (M, n).
+        u: input.
+        start: E[x_i^2] before any data (n,).
+    """
 
     def move(plant: AbstractPlant, x: Gaussian) -> MovedPairs:
-        """Move one Gaussian by one plant."""
+        """Move one Gaussian by one plant: f(x, u) by its slopes in x, and what these do not explain."""
         image = image_of(plant, transform, x, u)
         rest = sum_unexplained(image, process_noise(plant, u, start))
         mean = image.mean + plant.noise_mean()
@@ -93,10 +102,15 @@ class FutureObservation(NamedTuple):
 
 
 def divide_gaussians(later: Gaussian, known: Gaussian) -> FutureObservation:
-    """Return the ratio of two Gaussians, N(later) / N(known), as an observation of a state that has `known`.
+    """Return the ratio of two densities N(x; s, S) / N(x; q, Q) as an observation that turns N(q, Q) into N(s, S).
 
-    V and e as in the module's words: V' Q V = I with Q = Cov known, V' S V = diag(e) with S = Cov later. Rows are
-    scaled by sqrt(1 - e), so that no noise is infinite.
+    With V' Q V = I and V' S V = diag(e), and where e < 1, it is V'x + noise = (V's - e V'q) / (1 - e), the noise of
+    variance e / (1 - e), component by component. Rows are multiplied by sqrt(1 - e), so that no noise is infinite: its
+    variance is then e.
+
+    Args:
+        later: N(s, S), what is known with later data.
+        known: N(q, Q), what was known before these.
     """
     # Whitening W of `known`, W Q W' = I, zero in components that are known exactly.
     variances = jnp.sum(known.root**2 * known.variances, axis=1)
@@ -109,13 +123,14 @@ def divide_gaussians(later: Gaussian, known: Gaussian) -> FutureObservation:
     e, turn = eigh((root * later.variances) @ root.T + jnp.diag(jnp.where(varies, 0.0, 1.0)))
     gained = 1 - jnp.maximum(e, 0.0)
     tells = gained > NOTHING
+    # sqrt(1 - e) (V's - e V'q) / (1 - e) = sqrt(1 - e) V'q + V'(s - q) / sqrt(1 - e).
     share = jnp.sqrt(jnp.where(tells, gained, 1.0))
     axes = turn.T @ whitening
     rows = share[:, None] * axes
     value = rows @ known.mean + axes @ (later.mean - known.mean) / share
     return FutureObservation(
         rows=rows,
-        value=jnp.where(tells, value, jnp.nan),
+        value=jnp.where(tells, value, jnp.nan),  # NaN: no observation
         noise=jnp.where(tells, jnp.maximum(e, 0.0), 1.0),
     )
 
@@ -142,7 +157,9 @@ class ModalSmootherStep(SmootherStep):
     def back(self, later: ModalLaw) -> ModalLaw:  # type: ignore[override]
         """Return mode probabilities and Gaussians before the step, given all data, from those after it given all data.
 
-        `pairs`, `ways` and `weights` are by [i, j]: mode i before the step, mode j after it.
+        `pairs` (Gaussians moved by a mode), `ways` (smoother gains back) and `weights` (probabilities) are by [i, j]:
+        mode i before the step, mode j after it. What later data say of the state in mode j is the ratio of `later` to
+        `known`, an observation of each pair (i, j).
         """
         near = wrap_near(later.gaussian.mean, self.known.mean, self.angles)
         observations = jax.vmap(divide_gaussians)(later.gaussian._replace(mean=near), self.known)

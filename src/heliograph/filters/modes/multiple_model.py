@@ -72,10 +72,18 @@ def correct_in_every_mode(
     z: jax.Array,
     angles: Angles = (),
 ) -> tuple[Gaussian, jax.Array, Innovation]:
-    """Correct each signal's prior in its mode; return posteriors, their weights, and the mixture's innovation.
+    """Return the posteriors of several Gaussians, each corrected in its mode, their weights, the mixture's innovation.
 
-    weight+ ~ weight P(what arrives | mode) N(z; ...): the likelihood of the innovation is that of z given what arrives.
-    `signal`, `mode` and `weight`: one entry for each Gaussian; `channel`: by mode and pattern of arrivals.
+    The weight becomes proportional to weight P(what arrives | mode) N(z; ...). The innovation's likelihood is that of z
+    given which components arrive.
+
+    Args:
+        signal: moments of the sensor's signal under each Gaussian (K, ...).
+        channel: by mode and pattern of arrivals.
+        mode: in which each Gaussian is corrected (K,).
+        weight: probability of each Gaussian and its mode (K,).
+        z: measurement (m,), NaN for what did not arrive.
+        angles: components of z that are angles.
     """
     # Channel moments by mode, given which components arrived.
     kind = pattern_of(channel, ~jnp.isnan(z)) if len(channel.present) > 1 else 0

@@ -26,6 +26,7 @@ from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimat
 from heliograph.filters.gaussian.belief import second_moments_at_start
 from heliograph.filters.gaussian.signal import factor_spread, signal_size_at_start
 from heliograph.filters.modes.arrival_patterns import SideInformation, append_flag, describe_by_pattern, pattern_of
+from heliograph.filters.modes.gram_schmidt import orthogonalise_first_rows
 from heliograph.filters.modes.linear_by_mode import centred_measurement, centred_transition, noise_in_mode
 from heliograph.filters.modes.modal import (
     concatenate_modes,
@@ -122,10 +123,11 @@ class SideInformationFilter(AbstractSizedFilter):
 
     @predicts
     def predict(self, state: SideInformationBelief, u: ArrayLike = (), k: Step = 0) -> SideInformationBelief:
-        """Predict s+ = F s; where the mode goes from i to j, e+ = F e + (1_j - p_i) x A~ x~ + 1_j x w~.
+        """Predict s+ = F s, and the moments of q = (e, x~) in each mode.
 
-        1_j is the unit vector of mode j, p_i row i of the transition matrix, A~ the plant about the centre, w~ its
-        noise; `x` between them is the Kronecker product.
+        s estimates zeta = x~ 1{mode}, mode after mode, e = zeta - s, x~ = (x - c, 1). Where the mode goes from i to j,
+        e+ = F e + (1_j - p_i) x A~ x~ + 1_j x w~: 1_j is the unit vector of mode j, p_i row i of the transition matrix,
+        A~ the plant about the centre c, w~ its noise; `x` between two of them is the Kronecker product.
         """
         plant, channel = at(self.plant, k), at(self.channel, k)
         move, _, centre = centred_transition(plant, u, state.centre)
@@ -157,7 +159,11 @@ class SideInformationFilter(AbstractSizedFilter):
     def correct(
         self, state: SideInformationBelief, z: ArrayLike, k: Step = 0
     ) -> tuple[SideInformationBelief, Innovation]:
-        """Weight the modes by the flag and by the pattern of arrivals, then project zeta on (1, s, z)."""
+        """Weight the modes by the flag and by the pattern of arrivals, then project zeta on (1, s, z).
+
+        z: what the channel delivers (m,), NaN for what did not arrive, and then the number of the flag, where
+        `flagged`.
+        """
         sensor, channel, observed = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
         z, flag = (observed[:-1], observed[-1]) if self.flagged else (observed, jnp.asarray(0.0))
         # P(flag, pattern | mode).
@@ -166,7 +172,8 @@ class SideInformationFilter(AbstractSizedFilter):
         flag_chance = jnp.where(flag_arrived, jnp.asarray(channel.flags)[:, number], 1.0)
         pattern = pattern_of(channel, arrived)
         weight = jnp.asarray(channel.chance)[:, pattern] * flag_chance
-        # Moments given the side information: each mode's grow by weight = P(mode | it) / P(mode), `excess` is by what.
+        # Moments given the side information: each mode's grow by the factor weight = P(mode | it) / P(mode), which is
+        # by `excess`.
         _, x, weights = _split_columns(state)
         weight = weight / (weight @ _mode_probabilities(x, weights))
         prior = state._replace(variances=jnp.asarray(weight)[:, None] * state.variances)
@@ -176,6 +183,7 @@ class SideInformationFilter(AbstractSizedFilter):
         )
         size = signal_size_at_start(sensor, second_moments_at_start(self.plant))
         received = _describe_received(prior, sensor, size, *links)
+        # What z says of zeta, then the innovation as it is reported: NaN for what did not arrive.
         after, innovations, innovation = _project_on_data(prior, excess, received, z)
         likelihood = innovations.log_density(arrived, jnp.abs(z) + jnp.abs(innovation.mean))
         value = jnp.where(arrived, innovation.mean, jnp.nan)
@@ -238,10 +246,18 @@ def _describe_received(
     gain_spread: jax.Array,
     link: WeightedColumns,
 ) -> ReceivedModel:
-    """Return what is received of zeta: the output matrix, the mean output, and the noise in each mode.
+    """Return what is received of zeta = x~ 1{mode}: the output matrix, the mean output, and the noise in each mode.
 
-    `size` (p,): of the numbers that are summed in y, for rounding. `gains`, `gain_spread`, `link`: the channel by mode.
-    Cov(z | zeta) in mode j is T_j(E[y y' 1{j}]) + P(j) (Hbar_j R~ Hbar_j' + Cov n_j), and the rounding of z.
+    In mode j, z = H y~ + n with y~ = (y, 1) = C~ x~ + v~: the noise has the covariance T_j(E[y~ y~' 1{j}]) +
+    P(j) (Hbar_j R~ Hbar_j' + Cov n_j), T_j(Y) = E[(H - Hbar_j) Y (H - Hbar_j)' | j], and the rounding of z.
+
+    Args:
+        state: estimate of zeta and moments of each mode.
+        sensor: C~ and R~ = Cov v~.
+        size: squares of the numbers that are summed in y, for rounding (p,).
+        gains: Hbar_j (M, m, p + 1).
+        gain_spread: the tensor of T_j (M, m, m, p + 1, p + 1).
+        link: columns of Cov n_j (M, m, m).
     """
     (measure, noise), (_, x, weights) = centred_measurement(sensor, state.centre), _split_columns(state)
     law = _mode_probabilities(x, weights)
@@ -266,10 +282,20 @@ def _describe_received(
 def _project_on_data(
     state: SideInformationBelief, excess: jax.Array, received: ReceivedModel, z: jax.Array
 ) -> tuple[SideInformationBelief, Innovations, PredictedInnovation]:
-    """Project zeta on (1, s, z): what these say of the error e goes from e to the estimate s.
+    """Project zeta on (1, s, z): what these say of the error e = zeta - s goes from e to the estimate s.
 
-    Before the side information (1, s) said nothing of e: what they say now is by what the weights grew, `excess`
-    (M, q). Returns the state after, the innovations of z in turn, and z's innovation with its covariance.
+    All random numbers are rows over common columns, those of all modes side by side, with weights: the second moment of
+    two of them is the weighted product of their rows. Before the side information (1, s) said nothing of e; what they
+    say now comes of the growth of the weights.
+
+    Args:
+        state: s, and moments of (e, x~) in each mode, given the side information.
+        excess: by what the weights of the columns grew by it (M, q).
+        received: z = common + output zeta + noise.
+        z: measurement (m,), NaN for what did not arrive.
+
+    Returns:
+        The state after; the innovations of z, each given the components before it; z - E[z | 1, s] and its covariance.
     """
     errors, x, weights = _split_columns(state)
     m, count, modes, arrived = len(z), len(state.mean), len(weights), ~jnp.isnan(z)
@@ -283,16 +309,17 @@ def _project_on_data(
     innovation_rows = jnp.where(arrived[:, None], jax.vmap(lambda e: received.output @ e)(errors) + noise, 0.0)
     basis, rows = _join_modes(x[:, -1:], zeta - errors), _join_modes(innovation_rows, errors)
     values = jnp.where(arrived, z - received.common - received.output @ state.mean, 0.0)
-    # Directions of s that rounding decides, eps of x~ and more where it was divided by little, say nothing.
+    # First 1 and s: e and z less what these say of them. Directions of s whose variance is rounding say nothing: eps of
+    # the second moments of x~, and of s itself.
     size = jnp.tile(jnp.square(_join_modes(x)) @ weights, modes) + jnp.square(basis[1:]) @ weights
     smallest = jnp.append(0.0, np.sqrt(unit_of(weights)) * size)
-    basis, basis_values, variances = gram_schmidt_first(basis, jnp.append(1.0, state.mean), weights, 1 + count)
+    basis, basis_values, variances = orthogonalise_first_rows(basis, jnp.append(1.0, state.mean), weights, 1 + count)
     inverses = reciprocal_or_zero(jnp.where(variances > smallest, variances, 0.0))
     gains = (rows @ (excess * basis).T) * inverses
     rows, values = rows - gains @ basis, jnp.append(values, -state.mean) - gains @ basis_values
     expected = PredictedInnovation(values[:m], WeightedColumns(rows[:m], weights).covariance)
     # Then what z says of e.
-    rows, values, variances = gram_schmidt_first(rows, values, weights, m)
+    rows, values, variances = orthogonalise_first_rows(rows, values, weights, m)
     innovations = Innovations(values[:m], variances, jnp.diagonal(expected.covariance))
     # Factors of each mode.
     remaining = jnp.moveaxis(rows[m:].reshape(count, modes, -1), 1, 0)
@@ -306,22 +333,6 @@ def _join_modes(*parts: jax.Array) -> jax.Array:
     """Stack the rows of all parts, each (M, rows, columns), with the columns of all modes side by side."""
     rows = jnp.moveaxis(jnp.concatenate(parts, axis=1), 0, 1)
     return rows.reshape(len(rows), -1)
-
-
-def gram_schmidt_first(
-    rows: jax.Array, numbers: jax.Array, weights: jax.Array, count: int
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Orthogonalise all rows against the first `count` in turn, by weighted Gram-Schmidt, and do the same to `numbers`.
-
-    Returns: rows, numbers, and the variances (count,) of the first rows given those above them.
-    """
-    variances = []
-    for i in range(count):
-        weighted = weights * rows[i]
-        variances.append(rows[i] @ weighted)
-        share = jnp.where(np.arange(len(rows)) > i, rows @ weighted * reciprocal_or_zero(variances[i]), 0.0)
-        rows, numbers = rows - outer(share, rows[i]), numbers - share * numbers[i]
-    return rows, numbers, jnp.stack(variances)
 
 
 def side_information_filter(
@@ -363,7 +374,9 @@ def side_information_filter(
         flagged=flags is not None,
         **make_sizes(claim, first(plant), first(channel).outputs + (flags is not None)),
     )
-    if flags is not None and len(memories(channel)) != 1:  # of several chains' joint mode: no channel delivers them
+    # What the filter is told is what `with_flag` delivers; flags of the joint mode of several chains no channel
+    # delivers, so that nothing is known of what the claim is about.
+    if flags is not None and len(memories(channel)) != 1:
         return filter
     received = channel if flags is None else at_each_step(lambda link: with_flag(link, chances), channel)
     return on_premise(filter, Premise(plant, sensor, received))

@@ -71,7 +71,10 @@ def _constant(value: Any) -> _TracedArray:
 
 
 def _degrees_of_operation(equation: Any, x: list[_TracedArray]) -> list[_TracedArray]:
-    """Return the degrees of the results of one traced operation (a JAX equation), from its operands x."""
+    """Return the degrees of the results of one traced operation (a JAX equation), from the degrees of its operands x.
+
+    KNOWN: a constant, with its value; GIVEN: made of arguments that are given; AFFINE: in the others; OTHER: any.
+    """
     name, params = equation.primitive.name, equation.params
 
     def compute(arrays: list[Any]) -> list[Any]:
@@ -97,9 +100,10 @@ def _degrees_of_operation(equation: Any, x: list[_TracedArray]) -> list[_TracedA
 
 
 def _degree_of_arithmetic(name: str, params: dict[str, Any], x: list[_TracedArray]) -> Any:
-    """Return the degrees, entry by entry, of the result of an operation on operands x; OTHER where it is not linear.
+    """Return the degrees, entry by entry, of the result of an operation on operands x; OTHER if it is not listed here.
 
-    A degree is a number, KNOWN < GIVEN < AFFINE < OTHER: a sum has the larger one of its terms.
+    A degree is a number, KNOWN (a constant) < GIVEN (no function of the variables) < AFFINE in them < OTHER, so that a
+    sum has the larger one of its terms. `name`: of the operation (a JAX primitive); `params`: its parameters.
     """
     match name:
         case "add" | "add_any" | "sub":

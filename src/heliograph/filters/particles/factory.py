@@ -31,17 +31,30 @@ def build_partly_drawn(
     drawn: Sequence[str] | None,
     nodes: int,
 ) -> PartlyDrawnFilter:
-    """Return the particle filter that draws modes and the named states (None: all), the rest a Gaussian in each."""
+    """Return the particle filter that draws modes and named states; each particle keeps a Gaussian of the others.
+
+    Args:
+        plant: the plant, maybe of several modes.
+        sensor: its sensor, maybe of several modes.
+        channel: from the sensor to the filter.
+        particles: their number.
+        seed: of the random numbers.
+        proposal: "optimal" draws with z, "prior" without.
+        resample: share of `particles` below which the effective number leads to resampling.
+        drawn: names of the drawn states; None for all.
+        nodes: number of modes that stand for a gain that drifts.
+    """
     start = models_of(instance("plant", first(plant), AbstractPlant, "a plant"))[0]
     for model in models_of(instance("sensor", first(sensor), AbstractSensor, "a sensor")):
         model.refuse_inputs("particle_filter")
         check_link(model, first(channel), len(start.states), moments=False)
     drawn_places = _find_places_of_drawn(start, drawn)
     _check_linear_given(plant, sensor, drawn_places)
-    # One chain of the modes of plant, sensor and links: joint.beside has plant and sensor in each joint mode.
+    # One chain of the modes of plant, sensor and links: joint.beside has the pair (plant, sensor) of each joint mode.
     joint = joint_modes(first(channel), nodes, beside=(first(plant), first(sensor)))
     sensor_modes = find_models("sensor", sensor, [model for _, model in joint.beside])
-    # The density of z in each mode, for each step that sensor or channel has.
+    # The density of z in each mode, for each step that sensor or channel covers; one step stands for all if none
+    # varies.
     steps = steps_covered((sensor, channel)) or 1
     densities = []
     for sensor_of_step, link in zip(list_steps(sensor, steps), list_steps(channel, steps), strict=True):

@@ -33,12 +33,12 @@ class DataRow(NamedTuple):
     k: Array
     z: Array
     u: Array
-    own: Array
-    proposing: Array
+    noise_key: Array
+    proposal_key: Array
     moved: Array
 
 
-class Group(NamedTuple):
+class ParticleGroup(NamedTuple):
     """Particles of a row with a leading axis: weights before and with z, what each is, and what it expects of z."""
 
     prior: Array
@@ -118,38 +118,58 @@ class _ParticlePrograms(NamedTuple):
 def _compile_programs(
     filter: Any, z: np.ndarray, u: np.ndarray, keys: tuple[np.ndarray, np.ndarray]
 ) -> _ParticlePrograms | None:
-    """Return the code for a filter, for rows like these and their keys; None if there is none."""
+    """Return the three programs of a row, compiled with the arrays that they share; None without native code.
+
+    Args:
+        filter: the filter.
+        z: measurements, of which the first row gives the shape, as of `u` and `keys`.
+        u: inputs.
+        keys: of noises and of proposals, (rows, ...) each.
+    """
+    # As many particles as fill whole groups, and arrays that several programs read: the row, particles, weights.
     length = -(-filter.particles // GROUP) * GROUP
     numbers = np.arange(length, dtype=np.uint32)
-    # Arrays that several programs read, shared by them: the row, the particles, their weights.
-    own, proposing = (np.zeros_like(part[0]) for part in keys)
-    row = DataRow(np.zeros((), int), np.zeros_like(z[0]), np.zeros_like(u[0]), own, proposing, np.ones((), bool))
+    noise_key, proposal_key = (np.zeros_like(part[0]) for part in keys)
+    row = DataRow(
+        k=np.zeros((), int), z=np.zeros_like(z[0]), u=np.zeros_like(u[0]), noise_key=noise_key,
+        proposal_key=proposal_key, moved=np.ones((), bool),
+    )  # fmt: skip
+    used, particles = np.ones((), bool), filter.make_room(length)
     log_weight, prior, weight = np.zeros((3, length))
-    before = row, np.ones((), bool), filter.make_room(length), log_weight, numbers
-    advance = _hold(_advance_particle, filter, before, (False, False, True, True, True), length)
+    # First program: a particle moved and weighed in each lane. It returns the particle's arrays, its log weight, and
+    # what it expected of z. Booleans say which arguments differ from lane to lane.
+    before = row, used, particles, log_weight, numbers
+    advance = _bind_in_place(_advance_particle, filter, before, (False, False, True, True, True), length)
     if advance is None:
         return None
-    leaves, form = jax.tree.flatten(before[2])
-    held, predicted = advance.outputs[: len(leaves)], tuple(advance.outputs[len(leaves) + 1 :])
-    now = jax.tree.unflatten(form, held)
-    # Sums, a lane for each group.
+    leaves, form = jax.tree.flatten(particles)
+    now = jax.tree.unflatten(form, advance.outputs[: len(leaves)])
+    log_weight_now, predicted = advance.outputs[len(leaves)], tuple(advance.outputs[len(leaves) + 1 :])
+    # Second and third: sums over the particles of a group in each lane.
     reference = tuple(np.zeros(part.shape[1:]) for part in predicted)
-    group: Group = jax.tree.map(
-        lambda part: part.reshape(length // GROUP, GROUP, *part.shape[1:]), Group(prior, weight, now, predicted)
+    group: ParticleGroup = jax.tree.map(
+        lambda part: part.reshape(length // GROUP, GROUP, *part.shape[1:]),
+        ParticleGroup(prior, weight, now, predicted),
     )
-    first = _hold(_sum_first, filter, (row, reference, group), (False, False, True), len(group.weight))
+    first = _bind_in_place(_sum_first, filter, (row, reference, group), (False, False, True), len(group.weight))
     if first is None:
         return None
     states = np.zeros(first.outputs[0].shape[1])
     arguments = states, group.weight, group.particles
-    second = _hold(_sum_second, filter, arguments, (False, True, True), len(group.weight))
+    second = _bind_in_place(_sum_second, filter, arguments, (False, True, True), len(group.weight))
+    if second is None:
+        return None
     memory = _RowMemory(*before, prior, weight, reference, states)
-    made = _ParticlePrograms(memory, now, advance.outputs[len(leaves)], predicted, advance, first, second)
-    return None if second is None else made
+    return _ParticlePrograms(memory, now, log_weight_now, predicted, advance, first, second)
 
 
-def _hold(function: Call, filter: Any, arguments: tuple[Any, ...], differs: tuple[bool, ...], runs: int) -> Any:
-    """Return a call of function(filter, *arguments) that reads these arrays in place; None without native code."""
+def _bind_in_place(
+    function: Call, filter: Any, arguments: tuple[Any, ...], differs: tuple[bool, ...], runs: int
+) -> Any:
+    """Return a call of function(filter, *arguments), `runs` times, that reads these arrays in place.
+
+    `differs` says which arguments have an entry for each run. None without native code.
+    """
     code = _bind(function, filter, arguments, differs)
     return None if code is None else code.for_runs(runs, dict(enumerate(jax.tree.leaves(arguments))))
 
@@ -178,14 +198,16 @@ def _advance_particle(
     """Move a particle and weigh it by z where the row is used; return it, its log weight, and what it expected."""
     numbers = jnp.asarray(number)[None]
     one = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], particle)
-    moved, law = filter.move(one, numbers, row.own, row.u, row.k, row.moved)
-    weighed = filter.weigh(moved, law, numbers, row.proposing, row.z, row.k)
+    moved, law = filter.move(one, numbers, row.noise_key, row.u, row.k, row.moved)
+    weighed = filter.weigh(moved, law, numbers, row.proposal_key, row.z, row.k)
     likelihood = jnp.where(used, weighed.log_likelihood[0], 0.0)
     told = jax.tree.map(lambda new, old: jnp.where(used, new, old), weighed.particles, moved)
     return _take_first(told), jnp.asarray(log_weight) + likelihood, _take_first(weighed.predicted)
 
 
-def _sum_first(filter: Any, row: DataRow, reference: tuple[Array, ...], group: Group) -> tuple[jax.Array, jax.Array]:
+def _sum_first(
+    filter: Any, row: DataRow, reference: tuple[Array, ...], group: ParticleGroup
+) -> tuple[jax.Array, jax.Array]:
     """Return the first sums of the states of a group of particles, and the sums of what they expect of z."""
     group = jax.tree.map(jnp.asarray, group)
     received = filter.sum_received(reference, group.prior, group.predicted, row.z, row.k)
@@ -227,48 +249,66 @@ def _unpack_sums(vector: Array, function: Call, *arguments: Any) -> Any:
 def _filter_rows(filter: Any, z: np.ndarray, u: np.ndarray, state: PyTree | None, begin: int) -> ScanResult | None:
     """Return last state and outputs of rows of data, the first with number `begin`; None without native code.
 
-    `state`: that after the row before; None at the start, where particles are drawn.
+    `z`: (rows, received), NaN for what did not arrive; `u`: (rows, inputs). `state`: that after the row before; None at
+    the start, where particles are drawn.
     """
+    # Random keys of all rows, which depend on the data and on no particle.
     key = None if state is None else np.asarray(state.key)
-    of_start, start, last, own, proposing = compute_once(_draw_keys, _draw_keys_by_xla, (filter, z, key))
+    start_key, choice_starts, last_key, noise_keys, proposal_keys = compute_once(
+        _draw_keys, _draw_keys_by_xla, (filter, z, key)
+    )
     k = begin + np.arange(len(z))
     moved = (np.arange(len(z)) > 0) | (state is not None and bool(state.moved))
-    rows, programs = DataRow(k, z, u, own, proposing, moved), _compile_programs(filter, z, u, (own, proposing))
+    rows = DataRow(k, z, u, noise_keys, proposal_keys, moved)
+    programs = _compile_programs(filter, z, u, (noise_keys, proposal_keys))
     if programs is None:
         return None
+    # The particles before the first row: drawn, or those of the state.
     loop = _ParticleLoop(filter, programs)
     if state is None:
         numbers = programs.memory.numbers[: filter.particles]
-        draw = _bind(_draw_start, filter, (of_start, numbers), (False, True))
+        draw = _bind(_draw_start, filter, (start_key, numbers), (False, True))
         if draw is None:
             return None
-        loop.begin(draw(of_start, numbers), np.zeros(filter.particles))
+        loop.begin(draw(start_key, numbers), np.zeros(filter.particles))
     else:
         loop.begin(jax.tree.map(np.asarray, filter.particles_of(state)), np.asarray(state.log_weight))
+    # Row by row the sums over particles, then of these the outputs of all rows, a row in each lane.
     steps = [
-        loop.step(DataRow(*row), choice) for row, choice in zip(zip(*rows, strict=True), start.tolist(), strict=True)
+        loop.step(DataRow(*row), choice_start)
+        for row, choice_start in zip(zip(*rows, strict=True), choice_starts.tolist(), strict=True)
     ]
     sums: ParticleSums = jax.tree.map(lambda *parts: np.stack(parts), *steps)
-    told = choose_code(_make_outputs_of_row, (filter, rows, sums), [False, True, True])
-    if told.code is None:
+    outputs = choose_code(_make_outputs_of_row, (filter, rows, sums), [False, True, True])
+    if outputs.code is None:
         return None
-    return ScanResult(loop.last_state(last), told.results())
+    return ScanResult(loop.last_state(last_key), outputs.results())
 
 
 def _draw_keys(filter: Any, z: Array, key: Array | None) -> tuple[jax.Array, ...]:
-    """Draw what no particle changes: the key of x_0; where choices start (rows,); the last key; those of rows.
+    """Return the random keys and numbers of rows that no particle changes.
 
-    `key` is that of the state before the rows, None before any.
+    Args:
+        filter: the filter.
+        z: measurements (rows, received), which keys depend on.
+        key: of the state before the rows; None before any.
+
+    Returns:
+        Key of x_0; uniform numbers by which particles are chosen (rows,); the key after the last row; keys of noises,
+        and of proposals (rows, ...).
     """
 
     def draw(key: jax.Array, row: jax.Array) -> tuple[jax.Array, tuple[jax.Array, ...]]:
-        key, choice, own = filter.keys_of_prediction(key)
-        key, proposing = filter.keys_of_correction(key, row)
-        return key, (jax.random.uniform(choice, (), float), own, proposing)
+        """Return the key after a row, and what is drawn for it."""
+        key, choice_key, noise_key = filter.keys_of_prediction(key)
+        key, proposal_key = filter.keys_of_correction(key, row)
+        return key, (jax.random.uniform(choice_key, (), float), noise_key, proposal_key)
 
-    first, of_start = filter.start_keys()
-    last, (start, own, proposing) = jax.lax.scan(draw, first if key is None else jnp.asarray(key), jnp.asarray(z))
-    return of_start, start, last, own, proposing
+    first, start_key = filter.start_keys()
+    last, (choice_starts, noise_keys, proposal_keys) = jax.lax.scan(
+        draw, first if key is None else jnp.asarray(key), jnp.asarray(z)
+    )
+    return start_key, choice_starts, last, noise_keys, proposal_keys
 
 
 _draw_keys_by_xla = quickly_compiled(_draw_keys)
@@ -294,32 +334,38 @@ class _ParticleLoop:
         self.sum, self.square = float(memory.weight.sum()), float(memory.weight @ memory.weight)
 
     def step(self, row: DataRow, start: float) -> ParticleSums:
-        """Choose the particles that go on, move and weigh them; return the sums over them."""
+        """Choose the particles that go on, move and weigh them; return the sums over them.
+
+        `start`: a uniform number, with which the choice begins.
+        """
         memory, programs = self.memory, self.programs
         for held, new in zip(memory.row, row, strict=True):
             held[...] = new
-        self._choose(start)
-        # A row that no particle explains is not used.
+        self._choose_particles(start)
+        # Move and weigh; a row that no particle explains is not used: they are only moved.
         used = self.filter.always_used or not np.isnan(row.z).all()
         largest = self._advance(used)
         excluded = used and not largest > -np.inf
         if excluded:
             largest = self._advance(False)
+        # weight = exp(log weight - largest).
         np.subtract(self.log_weight, largest, out=memory.log_weight)
         np.exp(memory.log_weight, out=memory.weight)
-        # weight = exp(log weight - largest). First sums of all groups, then second sums about the means.
+        # First sums of all groups, then second sums about the means (einsum: in half of the time of add.reduce).
         self._find_reference()
         programs.first()
-        states = np.einsum("ij->j", programs.first.outputs[0], out=memory.states)  # in half of the time of add.reduce
+        states = np.einsum("ij->j", programs.first.outputs[0], out=memory.states)
         received = np.einsum("ij->j", programs.first.outputs[1])
         programs.second()
         second = np.einsum("ijk->jk", programs.second.outputs[0])
+        # The sums of states begin with those of weights and of their squares. log p(z) is log of the sum of weights
+        # with z less that of weights before.
         before, self.sum, self.square = self.sum, float(states[0]), float(states[1])
         density = -np.inf if excluded else math.log(self.sum) + largest - math.log(before)
         reference = tuple(part.copy() for part in memory.reference)
         return ParticleSums(states.copy(), received, second, reference, np.asarray(density))
 
-    def _choose(self, start: float) -> None:
+    def _choose_particles(self, start: float) -> None:
         """Let particles go on as they are, or resampled where the effective number is too small."""
         memory, count = self.memory, self.count
         if not self.sum**2 / self.square < self.resample * count:

@@ -138,7 +138,9 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         if self._is_linear(plants):
             x = jax.tree.map(lambda new, old: jnp.where(moved, new, old), x, in_mode)
         # The law after the step in each mode that may follow.
-        by_model = [jax.vmap(lambda particle, plant=plant: self._move(plant, particle, u))(x) for plant in plants]
+        by_model = [
+            jax.vmap(lambda particle, plant=plant: self._move_particle(plant, particle, u))(x) for plant in plants
+        ]
         after: Gaussian = jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=1)[:, self.plant_modes, ...], *by_model)
         chance = jnp.where(moved, jnp.asarray(self.transition)[mode], jnp.asarray(self.initial))
         return Cloud(after, jnp.log(chance)), None
@@ -151,7 +153,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         """Return Gaussians (B, n) given their drawn states, which are drawn here."""
         return jax.vmap(condition_on_draw)(x, draw_normals(key, numbers, self.drawn, self.particles))
 
-    def _move(self, plant: AbstractPlant, x: Gaussian, u: jax.Array) -> Gaussian:
+    def _move_particle(self, plant: AbstractPlant, x: Gaussian, u: jax.Array) -> Gaussian:
         """Return the law of f(x) + w of one particle; f is affine in what of x has a variance."""
         order = np.array(self.order)
         # Of a linear plant the drawn states may have a variance still; of others they are known.
@@ -254,7 +256,8 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
             draw: standard normal numbers for d.
             uniform: three numbers, for prior or posterior, for the mode and for the atom of the noise.
         """
-        # Posterior of each mode by the linearised sensor, and alpha_j = log P(j) N_j(z); no mode, no posterior.
+        # Posterior of each mode by the linearised sensor, and alpha_j = log P(j) N_j(z); where no mode can produce z
+        # there is no posterior, and the prior is drawn from.
         share = self._prior_share(sensors, received)
         modes = jnp.arange(len(self.initial))
         posterior, alpha = jax.vmap(lambda j, x_j: self._linearised_posterior(sensors, received, j, x_j))(modes, x)

@@ -55,6 +55,16 @@ def propose_particles(
     covariance of q is (I + C' R^-1 C)^-1 too. Where the sensor is not linear or the noise has several atoms, a share
     PRIOR_SHARE of q is N(0, I).
 
+    Args:
+        moved: center m (N, n) and root G (n, n) of each particle's law before z, and standard normal draws (N, n).
+        sensor: h, with slopes H.
+        atoms: of z given h(x), of which the mean gain M and the noise's covariance R are used.
+        z: measurement (m,), NaN for what did not arrive.
+        angles: components of z that are angles.
+        key: of the choice between prior and q.
+        numbers: of the particles; None for all of them at once.
+        particles: how many there are in all.
+
     Returns:
         States, and log N(e; 0, I) - log q(e) of each.
     """
@@ -68,6 +78,7 @@ def propose_particles(
 
     def propose_one(center: jax.Array, draw: jax.Array, from_prior: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return the position of one particle, and the correction of its log weight."""
+        # C = M H G, and r = z - M h(m) - c.
         slope = jnp.asarray(sensor.matrix) if isinstance(sensor, LinearSensor) else jax.jacfwd(sensor.measure)(center)
         columns = jnp.where(arrived[:, None], gain @ slope @ moved.root, 0.0)
         innovation = wrap_near(z - gain @ sensor.measure(center) - offset, jnp.zeros(len(z)), angles)

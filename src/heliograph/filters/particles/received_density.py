@@ -40,7 +40,10 @@ class ReceivedAtoms(Module):
         return expected
 
     def log_densities(self, y: jax.Array, z: jax.Array, angles: Angles) -> jax.Array:
-        """Return log p(z | y) of the components that arrived, of each y (N, p); -inf where y is no number."""
+        """Return log p(z | y) of the components of z (m,) that arrived, for each y (N, p); -inf where y is no number.
+
+        p is the sum over the atoms a of weight_a N(z; gain_a y + offset_a, noise_a). `angles`: components of z.
+        """
         present = ~jnp.isnan(z)
         both = present[:, None] & present
 
@@ -90,7 +93,11 @@ class ReceivedDensity(Module):
 def find_received_density(
     sensors: Sequence[AbstractSensor], channels: Sequence[AbstractRandomAffine]
 ) -> ReceivedDensity:
-    """Return the density of z given h(x), for the sensor and the channel without memory of each mode.
+    """Return the density of z given h(x), as atoms by mode and by set of components that arrive.
+
+    Args:
+        sensors: the sensor of each mode.
+        channels: the channel of each mode, without memory.
 
     Raises:
         ValueError: gains not of finitely many values, noises not Gaussian; a received number, or a combination

@@ -124,9 +124,9 @@ class StateParticleFilter(AbstractStateParticleFilter):
         draws = draw_normals(key, numbers, x.shape[1], self.particles)
         center, root = center + plant.noise_mean(), _root_of(noise_columns(plant, u))
         position = wrap_angles(center + draws @ root.T, plant.angles)
-        return position, self._law(plant, moved, MoveLaw(center, root, draws), u) if self.optimal else None
+        return position, self._find_law_of_move(plant, moved, MoveLaw(center, root, draws), u) if self.optimal else None
 
-    def _law(self, plant: AbstractPlant, moved: jax.Array, law: MoveLaw, u: jax.Array) -> MoveLaw:
+    def _find_law_of_move(self, plant: AbstractPlant, moved: jax.Array, law: MoveLaw, u: jax.Array) -> MoveLaw:
         """Return the law of x+ of each particle; at the first step of a linear plant that of x_0 and w together.
 
         So a first measurement that is far more precise than x_0 leaves more than few of the particles.
@@ -230,7 +230,17 @@ def _root_of(columns: WeightedColumns) -> jax.Array:
 def build_state_particles(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, particles: int, seed: int, proposal: str, resample: float
 ) -> StateParticleFilter:
-    """Return the particle filter that draws the whole state; arguments as those of `particle_filter`, checked here."""
+    """Return the particle filter that draws the whole state; check its arguments, which are those of `particle_filter`.
+
+    Args:
+        plant: the plant.
+        sensor: its sensor.
+        channel: from the sensor to the filter, without memory.
+        particles: their number.
+        seed: of the random numbers.
+        proposal: "optimal" draws with z, and needs Gaussian process noise; "prior" draws without.
+        resample: share of `particles` below which the effective number leads to resampling.
+    """
     start, first_sensor = instance("plant", first(plant), AbstractPlant, "a plant"), first(sensor)
     instance("sensor", first_sensor, AbstractSensor, "a sensor")
     first_sensor.refuse_inputs("particle_filter")
@@ -242,11 +252,14 @@ def build_state_particles(
             _check_gaussian(step)
     # The density of z given x, for each step that sensor or channel has of its own.
     steps = steps_covered((sensor, channel)) or 1
-    by_step = zip(list_steps(sensor, steps), list_steps(channel, steps), strict=True)
+    densities = [
+        find_received_density([sensor_of_step], [channel_of_step])  # one mode
+        for sensor_of_step, channel_of_step in zip(list_steps(sensor, steps), list_steps(channel, steps), strict=True)
+    ]
     return StateParticleFilter(
         plant=plant,
         sensor=sensor,
-        density=restack([find_received_density([s], [c]) for s, c in by_step], sensor, channel),
+        density=restack(densities, sensor, channel),
         resample=np.asarray(scalar("resample", resample, 0.0, 1.0)),
         observed_angles=find_received_angles(plant, sensor, channel),
         particles=check_count("particles", particles),

@@ -66,7 +66,7 @@ def describe_link(channel: AbstractRandomAffine) -> LinkOfBits:
     if not channel.remembers:
         fixed = _fix_rates(channel)
         weights = np.array([[share for share, _ in fixed]], dtype=float)
-        return LinkOfBits(tuple(link for _, link in fixed), weights, None)
+        return LinkOfBits(links=tuple(link for _, link in fixed), weights=weights, flag=None)
     told = list_told_modes(channel)
     if not told:
         expected = "one without memory, or with modes of one chain that are told last: hg.model.with_flag(link)"
@@ -79,7 +79,7 @@ def describe_link(channel: AbstractRandomAffine) -> LinkOfBits:
     for mode, of_mode in enumerate(combinations):
         weights[mode, start : start + len(of_mode)] = [share for share, _ in of_mode]
         start += len(of_mode)
-    return LinkOfBits(tuple(links), weights, channel.outputs - 1)
+    return LinkOfBits(links=tuple(links), weights=weights, flag=channel.outputs - 1)  # the mode is told last
 
 
 def list_told_modes(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
@@ -129,8 +129,9 @@ def _fix_rates(link: AbstractRandomAffine) -> list[tuple[float, AbstractRandomAf
 def infer_sent_bits(link: AbstractRandomAffine, received: Pairs) -> Pairs:
     """Return the likelihoods of the bits that went into a link, from those of the bits that came out.
 
-    A bit that may have been flipped: l(s) = (1 - p) l'(s) + p l'(-s); one that was copied: the product; one that
-    nobody received: 1.
+    Likelihood l(s) of a sent bit s by that of the received one, l'. A bit that may have been flipped:
+    l(s) = (1 - p) l'(s) + p l'(not s); one that was copied: the product over its copies; one that nobody received: 1.
+    Links in series are gone through from the last to the first.
 
     Args:
         link: of known error rates.

@@ -116,11 +116,13 @@ def word_filter(
         raise fail("hypotheses", "1 or 2", show_value(hypotheses))
     start = check_plant(plant)
     check_sensor(first(sensor), len(start.states))
+    # Behind a constant delay: the filter of the past, predicted to the present.
     if isinstance(channel, Delayed) and channel.constant and not channel.timestamped:
         return late_filter(word_filter(plant, sensor, channel.link, encoder, transform, hypotheses), channel.past)
     channel = perfect(len(first(sensor).outputs)) if channel is None else channel
     check_link(first(sensor), first(channel), len(start.states), late=True)
     refuse_angles("word filter", plant, sensor)
+    # The words, the component of y (or flag) at each output of the channel, and what the link does to bits.
     words = _alphabet_of(first(sensor), encoder)
     places = find_places(channel)
     links = at_each_step(describe_link, channel)
@@ -128,6 +130,7 @@ def word_filter(
     if encoder is None and not no_flips:
         raise fail("encoder", "Words, whose bits the channel flips", "none")
     rule = Cubature() if transform is None else instance("transform", transform, AbstractTransform, "a transform")
+    # A dither that is taken off arrives with each word, behind what the channel delivers.
     dithers = sum(place != FLAG for place in places) if words.dither == "subtracted" else 0
     one_gaussian = WordFilter(
         plant=plant,

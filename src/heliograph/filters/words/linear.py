@@ -59,7 +59,7 @@ class LinearWordsFilter(AbstractWrapper):
     @corrects
     def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
         """Correct with the words that arrived, as numbers."""
-        after, innovation = self.base.correct(state, self._as_numbers(jnp.asarray(z)), k)
+        after, innovation = self.base.correct(state, self._convert_words_to_numbers(jnp.asarray(z)), k)
         # Dithers have no innovation.
         dithers = self.received - len(self.centres)
         value = jnp.concatenate([jnp.asarray(innovation.value), jnp.full(dithers, jnp.nan)])
@@ -68,9 +68,9 @@ class LinearWordsFilter(AbstractWrapper):
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the smoother step of the filter of the numbers."""
-        return self.base.smoother_step(step._replace(z=self._as_numbers(jnp.asarray(step.z))))
+        return self.base.smoother_step(step._replace(z=self._convert_words_to_numbers(jnp.asarray(step.z))))
 
-    def _as_numbers(self, z: jax.Array) -> jax.Array:
+    def _convert_words_to_numbers(self, z: jax.Array) -> jax.Array:
         """Return q' - c - E[g] d of the received words and dithers, E[g] of the mode that was told."""
         values = z[: len(self.centres)] - jnp.asarray(self.centres)
         if self.received == len(self.centres):
@@ -88,7 +88,14 @@ class LinearWordsFilter(AbstractWrapper):
 def build_behind_words(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, encoder: Words, make: MakeFilter
 ) -> LinearWordsFilter:
-    """Build a linear filter of words from `make`, which builds one of numbers for a sensor and a channel.
+    """Return a linear filter of words, which is one of the numbers that they stand for about the centres of the range.
+
+    Args:
+        plant: a linear plant.
+        sensor: a linear sensor, whose outputs are sent as words.
+        channel: of words.
+        encoder: the words.
+        make: builds a linear filter of numbers, of a plant, a sensor and a channel.
 
     Raises:
         ValueError: words that do not fit, a dither that is not known behind a link that remembers, a range that is
@@ -100,11 +107,12 @@ def build_behind_words(
     instance("encoder", encoder, Words, "Words").check_outputs(outputs)
     check_sent(first(sensor), first(channel))
     places, numbers = find_places(channel), rewrite_about_centres(encoder, channel)
-    # Laws of the words: of each mode where modes are told, of each step else.
-    told = [rewrite_about_centres(encoder, link) for link in list_told_modes(first(channel))]
-    laws = [first(law) for law in told or unstack(numbers)]
+    # Laws of the words as numbers: of each mode where modes arrive with them, of each step else.
+    told_modes = [rewrite_about_centres(encoder, link) for link in list_told_modes(first(channel))]
+    laws = [first(law) for law in told_modes or unstack(numbers)]
+    # Whether the words' gain as numbers is random, given the mode where it is told: as where bits flip.
     remembers = first(channel).remembers
-    fades = (remembers and not told) or any(has_random_gain(law, second_order(law)) for law in laws)
+    fades = (remembers and not told_modes) or any(has_random_gain(law, second_order(law)) for law in laws)
     if encoder.dither in ("stochastic", "subtracted") and remembers and fades:
         expected = 'dither="triangular" (or "none"), or modes with one error rate each, told last (hg.model.with_flag)'
         raise fail("encoder behind a channel that remembers", expected, repr(encoder.dither))
@@ -120,7 +128,7 @@ def build_behind_words(
     refuse_overload(overload)
     words = tuple(i for i, place in enumerate(places) if place != FLAG)
     centres = np.array([0.0 if place == FLAG else encoder.each(encoder.centre, outputs)[place] for place in places])
-    gains = _gains_by_mode(laws if told else [numbers], words) if encoder.subtracts else np.zeros((1, 0))
+    gains = _gains_by_mode(laws if told_modes else [numbers], words) if encoder.subtracts else np.zeros((1, 0))
     late: Claim = "upper" if first(channel).past else "exact"  # before the first word its noise is none, and claimed
     claim = weakest([lower_by_noise(base.claim, rounded), late, _claim_of(overload)])
     return LinearWordsFilter(
@@ -128,7 +136,7 @@ def build_behind_words(
         centres=centres,
         gains=gains,
         words=words,
-        flag=len(places) - 1 if told else None,
+        flag=len(places) - 1 if told_modes else None,
         overload=overload,
         **make_sizes(claim, start, len(places) + gains.shape[1]),
     )

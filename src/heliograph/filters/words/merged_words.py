@@ -25,8 +25,9 @@ Carried = tuple[
 def sum_merged(pairs: jax.Array, received: jax.Array, grid: WordGrid, prior: SignalPrior) -> LikelihoodSums:
     """Return the sums over cells of 2^b fine words, an eighth to a quarter of a deviation wide, without the overloads.
 
-    Within a merged cell the low bits say that y is about mu with a variance v, a Gaussian as the prior: with
-    pi = l_1 / (l_0 + l_1) of each low bit, mu = first word + D sum 2^j pi and v = D^2 (sum 4^j pi (1 - pi) + 1/12).
+    D is the step between words, l_0 and l_1 the likelihoods of a zero and a one of a bit. Within a merged cell the b
+    low bits say that y is about mu with a variance v, taken for a Gaussian as the prior is: with pi = l_1 / (l_0 +
+    l_1) of low bit j, mu = first word + D sum 2^j pi and v = D^2 (sum 4^j pi (1 - pi) + 1/12).
 
     Args:
         pairs: likelihoods of a zero and a one of each bit, (bits, 2).
@@ -34,6 +35,7 @@ def sum_merged(pairs: jax.Array, received: jax.Array, grid: WordGrid, prior: Sig
         grid: the words.
         prior: of y.
     """
+    # b = `level`: cells of `size` words, of which `low` are the bits.
     bits = np.arange(grid.bits)
     level = jnp.floor(jnp.log2(jnp.maximum(prior.deviation * FINE / grid.step, 1.0)))
     level = jnp.minimum(level, grid.bits - 1.0)
@@ -44,7 +46,8 @@ def sum_merged(pairs: jax.Array, received: jax.Array, grid: WordGrid, prior: Sig
     mean = jnp.sum(jnp.where(low, 2.0**bits * ones, 0.0))
     variance = grid.step**2 * (jnp.sum(jnp.where(low, 4.0**bits * ones * (1 - ones), 0.0)) + 1 / 12)
     inner = jnp.prod(jnp.where(low, total, 1.0))
-    # Each cell is a Gaussian times the prior's, wide s^2 together: mass e^(-away^2 / (2 wide)).
+    # Each cell is a Gaussian about mu times the prior of deviation s: its mass is e^(-a^2 / (2 wide)), a = (mu - m) /
+    # s, wide = 1 + v / s^2. Cells are summed in blocks, from REACH deviations below the prior's mean on.
     wide = 1 + variance / prior.deviation**2
     width = size * grid.step / prior.deviation
     block = 2.0**MERGED
@@ -73,16 +76,17 @@ def _sum_blocks(
 ) -> LikelihoodSums:
     """Return the sums over cells of likelihood times e^(-a^2 / (2 wide)), of that times a, and times a^2.
 
-    Of the cell j of a block, whose first is at a, e^(-(a + j w)^2 / (2 v)) is e^(-a^2 / (2 v)) r^j e^(-(j w)^2 / (2 v))
-    with r = e^(-a w / v): a polynomial in r with the same coefficients in all blocks. From block to block the first
-    factor changes by r^J e^(-(J w)^2 / (2 v)), and r by e^(-J w^2 / v), J cells.
+    a is the distance of a cell from the prior's mean, w the width of a cell, both in the prior's deviations, v =
+    `wide`. Of cell j of a block whose first is at a, e^(-(a + j w)^2 / (2 v)) is e^(-a^2 / (2 v)) r^j e^(-(j w)^2 / (2
+    v)) with r = e^(-a w / v): a polynomial in r with the same coefficients in all blocks. From block to block, J cells
+    on, the first factor changes by r^J e^(-(J w)^2 / (2 v)), and r by e^(-J w^2 / v).
 
     Args:
         pairs: likelihoods of a zero and a one of each bit of the cells' numbers (bits, 2).
         number: of the first block.
-        away: a of its first cell, in deviations of the prior.
-        width: w of a cell, likewise.
-        wide: v.
+        away: a of its first cell.
+        width: w.
+        wide: v, the variance of prior and cell together over that of the prior.
     """
     # e^(-(j w)^2 / (2 v)) is the product of e^(-(2 i + 1) w^2 / (2 v)) over i < j.
     factor = jnp.exp(-(width**2) / (2 * wide))

@@ -78,7 +78,7 @@ class TwoHypothesesFilter(AbstractSizedFilter):
     def correct(self, state: Hypotheses, z: ArrayLike, k: Step = 0) -> tuple[Hypotheses, Innovation]:
         """Correct with the words that arrived, one component of y after another."""
         base, z, n = self.base, jnp.asarray(z), len(self.states)
-        words = base.read(z, at(base.links, k))
+        words = base.read_words(z, at(base.links, k))
 
         def append_measured(part: Gaussian) -> Gaussian:
             """Return the joint law of the state and what is measured, under one hypothesis."""
@@ -106,33 +106,44 @@ class TwoHypothesesFilter(AbstractSizedFilter):
         """Return the smoother step of one Gaussian of the mixture's moments."""
         return smoother_step_by_transform(self.base, step.map_states(_merge), self.base)
 
+    def _split_by_answer(self, part: Gaussian, i: int, words: ReceivedWords) -> tuple[Gaussian, jax.Array]:
+        """Condition one hypothesis on word i, and on each answer to whether its leading bits are right: yes, no.
+
+        Returns the hypothesis given each answer (2, ...), and the probabilities of word and answer (2,).
+        """
+        row = part.root[len(self.states) + i]
+        prior = self.base.prior_of(part, i)
+        change = self.base.condition_by_leading_bits(i, words, prior, LEADING)
+        mass = jnp.exp(change.log_mass)
+        possible = (mass > SURE * jnp.sum(mass)) & (prior.deviation > 0)
+
+        def impose(possible: jax.Array, shift: jax.Array, ratio: jax.Array) -> Gaussian:
+            """Return the hypothesis with these moments of y_i, as it is where the answer is impossible."""
+            shift, ratio = jnp.where(possible, shift, 0.0), jnp.where(possible, ratio, 1.0)
+            return impose_moments_of_combination(part, row, shift * prior.deviation, jnp.maximum(ratio, 0.0))
+
+        return jax.vmap(impose)(possible, change.shift, change.ratio), jnp.where(possible, mass, 0.0)
+
     def _split_and_merge(
         self, joint: Hypotheses, i: int, words: ReceivedWords, begun: jax.Array
     ) -> tuple[Hypotheses, jax.Array]:
-        """Condition either hypothesis on word i and on whether it was right, and merge by whether all have been.
+        """Condition both hypotheses on word i and on whether it was right; merge the four by whether all words were.
 
-        begun: whether another word of the message was used. Returns the probability of what came, too.
+        Args:
+            joint: the two Gaussians of (x, y): all words of the message so far were right, or not.
+            i: component of y.
+            words: what was received.
+            begun: whether another word of the message was used before.
+
+        Returns:
+            The hypotheses after word i, and the probability of what came; as they were, if it did not come.
         """
-
-        def split_by_answer(part: Gaussian) -> tuple[Gaussian, jax.Array]:
-            """Return one hypothesis given each answer, right or not (2, ...), and the chances of word and answer."""
-            row = part.root[len(self.states) + i]
-            prior = self.base.prior_of(part, i)
-            change = self.base.condition_by_leading_bits(i, words, prior, LEADING)
-            mass = jnp.exp(change.log_mass)
-            possible = (mass > SURE * jnp.sum(mass)) & (prior.deviation > 0)
-
-            def impose(possible: jax.Array, shift: jax.Array, ratio: jax.Array) -> Gaussian:
-                """Return the hypothesis with these moments of y_i, as it is where the answer is impossible."""
-                shift, ratio = jnp.where(possible, shift, 0.0), jnp.where(possible, ratio, 1.0)
-                return impose_moments_of_combination(part, row, shift * prior.deviation, jnp.maximum(ratio, 0.0))
-
-            return jax.vmap(impose)(possible, change.shift, change.ratio), jnp.where(possible, mass, 0.0)
-
-        parts, mass = jax.lax.map(split_by_answer, joint.parts)  # by hypothesis before and answer
+        # [h, a]: hypothesis h before the word, answer a.
+        parts, mass = jax.lax.map(lambda part: self._split_by_answer(part, i, words), joint.parts)
         mass = mass * joint.weights[:, None]
         total = jnp.sum(mass)
-        # Right: this word, and under the first hypothesis those before it.
+        # All right: this word, and under the first hypothesis those before it. Before the first word of a message
+        # either hypothesis is of the message before, and only this word counts.
         right = jnp.array([[True, False], [True, False]]) & jnp.stack([jnp.asarray(True), ~begun])[:, None]
         flat = jax.tree.map(lambda leaf: leaf.reshape(4, *leaf.shape[2:]), parts)
 

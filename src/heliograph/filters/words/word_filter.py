@@ -67,7 +67,7 @@ class WordFilter(AbstractBeliefFilter):
         signal = self.measure(state, k)
         noise = triangularise_noise(join_columns(signal.noise, rounding_of(signal.size)))
         joint, total = append_rows(state, signal.mean, signal.slopes, noise), jnp.zeros(())
-        words = self.read(z, at(self.links, k))
+        words = self.read_words(z, at(self.links, k))
         for i in range(len(self.low)):
             row, prior = joint.root[n + i], self.prior_of(joint, i)
             change = self._condition(i, words, prior)
@@ -89,15 +89,16 @@ class WordFilter(AbstractBeliefFilter):
         plant, sensor = at(self.plant, k), at(self.sensor, k)
         return signal_of(plant, sensor, self.transform, state, second_moments_at_start(self.plant, self))
 
-    def read(self, z: jax.Array, link: LinkOfBits) -> "ReceivedWords":
-        """Return which words were received, and what their bits say of those that were sent.
+    def read_words(self, z: jax.Array, link: LinkOfBits) -> "ReceivedWords":
+        """Return which word of each component was received, and what its bits say of those that were sent.
 
         z has the received words, and flags of modes among them, as `places` says; behind these, where dither is
         subtracted, the dither of each word. A word is the number i of low + i spacing.
         """
         outputs = len(self.places)
+        # Rows of z that are words, the component of y of each, and how many steps it lies above the lowest word.
         rows = [i for i, place in enumerate(self.places) if place != FLAG]
-        component = np.array([self.places[i] for i in rows])  # of each word
+        component = np.array([self.places[i] for i in rows])
         dither = z[outputs:] if len(z) > outputs else jnp.zeros(len(rows))
         index = (z[np.array(rows)] - jnp.asarray(self.low)[component]) / jnp.asarray(self.spacing)[component]
         arrived = ~jnp.isnan(index) & ~jnp.isnan(dither)
@@ -116,7 +117,7 @@ class WordFilter(AbstractBeliefFilter):
         present, numbers, dithers = (jnp.stack(values) for values in zip(*first_copies, strict=True))
         # P(received | sent 0) and P(received | sent 1) of each bit, by each law of the link, and the laws' weights.
         pairs, weights = list[jax.Array](), jnp.ones(1)
-        if not self.certain:
+        if not self.certain:  # bits may flip
             bit = jnp.mod(jnp.floor(number[:, None] / 2.0 ** np.arange(self.bits)), 2.0)
             received_bits = jnp.stack([1 - bit, bit], axis=-1)
             pairs = link.pairs(jnp.where(arrived[:, None, None], received_bits, 1.0))
@@ -129,15 +130,24 @@ class WordFilter(AbstractBeliefFilter):
         return SignalPrior(joint.mean[place], jnp.sqrt(joint.root[place] ** 2 @ joint.variances))
 
     def condition_by_leading_bits(self, i: int, words: "ReceivedWords", prior: SignalPrior, leading: int) -> WordEffect:
-        """Return what its word does to y_i, if the word was right in its `leading` bits and if not, (2,) each.
+        """Return what the received word of y_i says of it, if its leading bits arrived as they were sent, and if not.
 
-        A pair of `words.pairs` has, bit by bit, the likelihoods of a sent 0 and of a sent 1, (bits, 2).
+        Args:
+            i: component of y.
+            words: what was received; `words.pairs` has for each law of the link the likelihoods of a sent 0 and of a
+                sent 1, (components, bits, 2).
+            prior: of y_i.
+            leading: number of the highest bits that are right together, or not.
+
+        Returns:
+            Log probability, shift of the mean and ratio of variances, (2,) each: right, and not.
         """
         pairs, bits = [pair[i] for pair in words.pairs], np.arange(self.bits)
         bit = jnp.mod(jnp.floor(words.numbers[i] / 2.0**bits), 2.0)
         as_received = jnp.stack([1 - bit, bit], axis=-1)
+        # Likelihoods of words whose leading bits are those received: of any other leading bit zero.
         if_right = jnp.where((bits >= self.bits - leading)[:, None], as_received, 1.0)
-        # Both answers from the same sums, of all likelihoods and of those that are right: not right is all less right.
+        # Both answers from the same sums, over all words and over those that are right: not right is all less right.
         all_and_right = [*pairs, *(pair * if_right for pair in pairs)]
         right, wrong = jnp.append(0 * words.weights, words.weights), jnp.append(words.weights, -words.weights)
         weights = jnp.stack([right, wrong])
@@ -158,7 +168,16 @@ class WordFilter(AbstractBeliefFilter):
     def innovation(
         self, signal: Signal, words: "ReceivedWords", z: jax.Array, numbers: SecondOrder, total: jax.Array
     ) -> Innovation:
-        """Return the innovation of the words as numbers about their centres, flags and dithers as not received."""
+        """Return the innovation of the words as numbers about their centres; NaN for flags and dithers.
+
+        Args:
+            signal: moments of y before it is rounded.
+            words: what was received.
+            z: received words and flags, then the dithers that are taken off.
+            numbers: mean gain and spread that words have as numbers behind the link.
+            total: log-likelihood of the words.
+        """
+        # y - c with the error of rounding: its variance is `error`.
         error = LARGEST[self.dither].error * jnp.asarray(self.spacing) ** 2
         mean = signal.mean - jnp.asarray(self.centre)
         noise = join_columns(signal.noise, WeightedColumns(np.eye(len(self.low)), error))

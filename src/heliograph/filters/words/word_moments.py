@@ -56,9 +56,11 @@ def sum_neighbours(
     prior: SignalPrior,
     dither: str,
 ) -> LikelihoodSums:
-    """Sum over blocks of neighbouring words, of which the first and the last are taken for half-lines.
+    """Return the sums M, E[t L], E[t^2 L] over blocks of neighbouring words, of which the end ones are half-lines.
 
-    The likelihood of a word is that of the bits above its block times that of those in it, a table for all blocks.
+    L is the likelihood of the word that y is rounded to, t = (y - m) / s. That of a word is the likelihood of the bits
+    above its block times that of those in it, a table for all blocks. L is constant but at the edges between words, so
+    that the sums are over the edges (`sum_by_edges`).
 
     Args:
         pairs: likelihoods of a zero and a one of each bit (bits, 2), for each combination of error rates.
@@ -192,7 +194,10 @@ def _cut_to_cell(index: jax.Array, grid: WordGrid, prior: SignalPrior) -> WordEf
 def effect_of_bits(
     pairs: list[jax.Array], weights: jax.Array, received: jax.Array, grid: WordGrid, prior: SignalPrior, dither: str
 ) -> WordEffect:
-    """Return what the received bits of a word do to y.
+    """Return what the received bits of a word do to y: log probability, shift of its mean, ratio of its variances.
+
+    Words of few bits are all summed; else those within the prior's reach, or cells of several where they are finer than
+    FINE deviations.
 
     Args:
         pairs: likelihoods of a zero and a one of each bit (bits, 2), for each combination of error rates.

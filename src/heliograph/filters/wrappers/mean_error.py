@@ -75,7 +75,16 @@ def mean_error_bound(
 
 @compile_in_float64
 def _bound_mean_covariance(filter: ToldFilter, contexts: ToldContexts, u: Array) -> jax.Array:
-    """Return the bound on the mean covariance at each step (steps, n, n): compiled body of `mean_error_bound`."""
+    """Return the bound on the mean covariance at each step (steps, n, n): compiled body of `mean_error_bound`.
+
+    In mode j of the chain that tells numbers, V+_j = sum_a P(a | j) f(sum_i b_ij V_i, a): f(P, a) is what is left of a
+    covariance P after a step with the message a, b_ij = P(i before | j now). The output is sum_j P(j) V+_j.
+
+    Args:
+        filter: of a linear filter, told numbers with each message.
+        contexts: the numbers that each mode may tell, and the chain.
+        u: inputs (steps, inputs).
+    """
     start = filter.init()
     modes = len(contexts.initial)
 
@@ -114,9 +123,10 @@ def _bound_mean_covariance(filter: ToldFilter, contexts: ToldContexts, u: Array)
 
 
 def _list_contexts(filter: ToldFilter) -> ToldContexts:
-    """List the numbers that may be told, with their probabilities.
+    """Return the numbers that a message may tell, with their probabilities, by mode of the chain that tells them.
 
-    Those of a chain are its modes, one in each; those that are drawn anew are all combinations over the maps.
+    A chain tells its mode, one number in each. Numbers that are drawn anew at each step have one mode, in which all
+    combinations over the maps that tell some may come.
     """
     memories = [affine.memory for affine in told_maps(first(filter.link))]
     chains = [memory for memory in memories if isinstance(memory, MarkovChain)]
@@ -126,8 +136,12 @@ def _list_contexts(filter: ToldFilter) -> ToldContexts:
         modes = chains[0].modes
         numbers = np.arange(float(modes))[:, None, None]
         return ToldContexts(
-            numbers, np.ones((modes, 1)), np.asarray(chains[0].initial), np.asarray(chains[0].transition)
+            numbers=numbers,
+            weights=np.ones((modes, 1)),
+            initial=np.asarray(chains[0].initial),
+            transition=np.asarray(chains[0].transition),
         )
+    # All combinations so far with each number of the next map.
     values, weights = np.zeros((1, 0)), np.ones(1)
     for memory in memories:
         more, chances = _find_quadrature(memory)
@@ -135,7 +149,7 @@ def _list_contexts(filter: ToldFilter) -> ToldContexts:
             raise fail("numbers told", f"at most {MOST} combinations of nodes", len(values) * len(more))
         values = np.concatenate([np.repeat(values, len(more), axis=0), np.tile(more, (len(values), 1))], axis=1)
         weights = np.outer(weights, chances).ravel()
-    return ToldContexts(values[None], weights[None], np.ones(1), np.ones((1, 1)))
+    return ToldContexts(numbers=values[None], weights=weights[None], initial=np.ones(1), transition=np.ones((1, 1)))
 
 
 def _find_quadrature(memory: AbstractMemory) -> tuple[Float[np.ndarray, "nodes told"], Float[np.ndarray, " nodes"]]:

@@ -175,22 +175,24 @@ def _spoil_state(state: PyTree, spoilt: jax.Array) -> PyTree:
 
 
 def build_told_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: FilterMaker) -> ToldFilter:
-    """Build a filter behind a channel that tells of its link from `make`, which builds one for a link of known law.
+    """Return the filter behind a channel that delivers with z the numbers that give its link's law (told numbers).
 
     Args:
         plant: the plant.
         sensor: its sensor.
         channel: a channel that delivers numbers after z; it may vary over time.
-        make: builds a filter of plant, sensor and a link.
+        make: builds a filter of plant, sensor and a link of known law.
 
     Claim: that of the filter for typical numbers; "nominal" where the numbers depend on the state, or leave open
     what is not drawn anew with each message.
     """
+    # The channel without what is told, and the filter for typical numbers, which predicts.
     link = at_each_step(lambda channel: make_certain(separate_told(channel).link), channel)
     base = make(plant, sensor, at_each_step(believe_typical, link))
     claim = base.claim
     if any(affine.reservation for affine in told_maps(first(link))):
         claim = weakest([claim, "nominal"])
+    # Rows of z in which the link's values and the told numbers stand.
     _, values, numbers = separate_told(first(channel))
     filter = ToldFilter(
         base=base,

@@ -111,7 +111,7 @@ def accept_sensor_inputs(make: Callable[P, F]) -> Callable[P, F]:
             return make(*args, **kwargs)
         plant, sensor = given.pop("plant"), given.pop("sensor")
 
-        make_any: Callable[..., AbstractFilter] = make  # its parameters are not those of `build` any more
+        make_any: Callable[..., AbstractFilter] = make  # called by names of its parameters, two of which are taken out
 
         def make_for(typical: AnySensor) -> AbstractFilter:
             """Make the filter of this sensor and of all other arguments."""

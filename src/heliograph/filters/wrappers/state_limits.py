@@ -76,7 +76,7 @@ class LimitedFilter(AbstractSizedFilter):
         prior = state if _is_particles(state) else self._hold(state)
         after, innovation = self.base.correct(prior, z, k)
         # log P(within | z) - log P(within); nothing where one of them is 0 to rounding.
-        log_after, log_before = self._condition(after)[0], self._condition(state)[0]
+        log_after, log_before = self._condition_with_mass(after)[0], self._condition_with_mass(state)[0]
         both = jnp.isfinite(log_after) & jnp.isfinite(log_before)
         change = jnp.where(both, log_after - log_before, 0.0)
         return after, replace(innovation, log_likelihood=innovation.log_likelihood + change)
@@ -92,7 +92,7 @@ class LimitedFilter(AbstractSizedFilter):
 
     def condition(self, state: PyTree) -> PyTree:
         """Return the state of the filter within, given that the plant's state lies within the limits."""
-        return self._condition(state)[1]
+        return self._condition_with_mass(state)[1]
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return that of the filter within, whose estimates are conditioned on the limits."""
@@ -118,6 +118,7 @@ class LimitedFilter(AbstractSizedFilter):
         return self.base.of_atoms
 
     def _claimed(self, estimate: Estimate) -> Estimate:
+        """Return the estimate with this filter's claim."""
         return replace(estimate, claim=self.claim)
 
     def _enter(self, state: PyTree) -> PyTree:
@@ -140,13 +141,16 @@ class LimitedFilter(AbstractSizedFilter):
         """Return one Gaussian with its mean held within the limits."""
         return hold_mean_within_limits(x, self.limits)
 
-    def _condition(self, state: PyTree) -> tuple[jax.Array, PyTree]:
-        """Return log P(within the limits), and the state given that."""
+    def _condition_with_mass(self, state: PyTree) -> tuple[jax.Array, PyTree]:
+        """Return the log probability that the plant's state lies within the limits, and the filter's state given that.
+
+        A filter's state is one that holds another filter's state, particles, a Gaussian, or a mixture of Gaussians.
+        """
         if isinstance(state, StateUnderInputs):
-            log_mass, inner = self._condition(state.base)
+            log_mass, inner = self._condition_with_mass(state.base)
             return log_mass, state._replace(base=inner)
-        if hasattr(state, "believed"):
-            log_mass, inner = self._condition(state.believed)
+        if hasattr(state, "believed"):  # of a gate that may give in to its rival
+            log_mass, inner = self._condition_with_mass(state.believed)
             return log_mass, state._replace(believed=inner)
         if isinstance(state, StateParticles):
             return self._condition_particles(state)
@@ -155,7 +159,8 @@ class LimitedFilter(AbstractSizedFilter):
         if x.mean.ndim == 1:
             log_mass, inside = truncate_to_limits(jax.tree.map(lambda leaf: leaf[None], x), self.limits)
             return log_mass[0], with_gaussian(held, jax.tree.map(lambda leaf: leaf[0], inside))
-        # Of a mixture each Gaussian by itself, and their weights by the probability of each to be within.
+        # Of a mixture each Gaussian by itself, and its weight times the probability that it is within; where no
+        # Gaussian is, to rounding, the weights stay.
         log_masses, inside = truncate_to_limits(x, self.limits)
         weight = jnp.asarray(held.weight)
         weight_within = weight * jnp.exp(log_masses).reshape(-1, *[1] * (weight.ndim - 1))

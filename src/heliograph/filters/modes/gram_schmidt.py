@@ -1,0 +1,31 @@
+"""Weighted Gram-Schmidt: random numbers, as rows over weighted columns, less their projections on the first ones."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.factors.columns import reciprocal_or_zero
+from heliograph.numerics.linalg import outer
+
+
+def orthogonalise_first_rows(
+    rows: jax.Array, numbers: jax.Array, weights: jax.Array, count: int
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Subtract from each row its projections on those of the first `count` rows that are above it.
+
+    Args:
+        rows: random numbers (k, columns), of which products a W b', W = diag(weights), are second moments.
+        numbers: values (k,) of the rows, from which the same multiples are subtracted.
+        weights: of the columns.
+        count: number of the rows on which is projected, one after the other.
+
+    Returns:
+        The rows, the numbers, and the second moments (count,) of the first rows after the subtraction.
+    """
+    variances = []
+    for i in range(count):
+        weighted = weights * rows[i]
+        variances.append(rows[i] @ weighted)
+        share = jnp.where(np.arange(len(rows)) > i, rows @ weighted * reciprocal_or_zero(variances[i]), 0.0)
+        rows, numbers = rows - outer(share, rows[i]), numbers - share * numbers[i]
+    return rows, numbers, jnp.stack(variances)
