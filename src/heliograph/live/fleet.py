@@ -226,7 +226,7 @@ class Fleet:
         screened = limits.screen(values[None], unscreened.repeats)
         if not screened.refused.any():
             return ScreenedEvent(event, repeats=screened.repeats)
-        why = limits.why(values, screened.refused[0], self.network.nodes[node].received_names)
+        why = limits.describe_missing(values, screened.refused[0], self.network.nodes[node].received_names)
         what_is_left = event._replace(values=screened.values[0].tolist())
         counts = {reason: int(count.sum()) for reason, count in count_by_reason(screened.refused).items()}
         return ScreenedEvent(what_is_left, counts, why, screened.repeats)

@@ -141,17 +141,19 @@ def with_flag(
     Raises:
         ValueError: rows that are no probabilities, or a channel that holds no memory, or several and `chain` not given.
     """
+    # The chain, or all memories of the channel.
     late = flag("late", late)
     held = list(memories(channel).values())
     if chain is None and (not held or (probabilities is not None and len(held) > 1)):
         raise fail("chain", "one that the flag tells of, since the channel does not hold just one", "none")
+    # The states themselves.
     if probabilities is None:
         outputs = [ModeOutput(m, channel.inputs) for m in (held if chain is None else [chain])]
-        return Stack([channel, *(OneStepLate(flag) if late else flag for flag in outputs)])
+        return Stack([channel, *(OneStepLate(output) if late else output for output in outputs)])
     memory = held[0] if chain is None else chain
     if not isinstance(memory, MarkovChain):
         raise fail("chain", "a MarkovChain, of whose modes classes tell", type(memory).__name__)
-    # In each mode a noise whose values are the flags, and nothing of what is sent.
+    # Classes: in each mode a noise whose values are the flags, and nothing of what is sent.
     rows = array("flags", probabilities, (memory.modes, None))
     no_signal, flags = np.zeros((1, channel.inputs)), np.arange(rows.shape[1])[:, None]
     classes = Modes(memory, [GainAndNoise(Constant(1.0), no_signal, FiniteSupport(flags, row)) for row in rows])

@@ -58,6 +58,7 @@ def read_state_limits(
     Raises:
         ValueError: what is no such table, a name that is no state or an angle, a start that they exclude.
     """
+    # A table whose keys are states that are no angles.
     expected = 'a table such as {"soc": (0, 1), "speed": (0, None)}'
     try:
         given = dict(limits)
@@ -67,6 +68,7 @@ def read_state_limits(
     for name in given:
         if name not in free:
             raise fail("limits of states", f"names of states that are no angles, {free}", show_value(name))
+    # Each interval holds the initial mean; infinite ones are left out.
     read = []
     for name in (name for name in states if name in given):
         low, high = read_intervals([given[name]], 1, f"limits of {name!r}")[0].tolist()

@@ -131,7 +131,7 @@ class Limits(Module):
         """Return True for each number that by itself counts as missing; NaN is not one of them."""
         return np.asarray(self.judge_values(z) > 0)
 
-    def why(self, z: Float[np.ndarray, " m"], refused: Int[np.ndarray, " m"], names: Sequence[str]) -> str:
+    def describe_missing(self, z: Float[np.ndarray, " m"], refused: Int[np.ndarray, " m"], names: Sequence[str]) -> str:
         """Describe in words the components of a measurement that are refused; "" if there are none.
 
         `refused`: the number of each one's reason, as `screen` returns it.

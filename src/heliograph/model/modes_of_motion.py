@@ -59,7 +59,7 @@ class SwitchingRates(Module):
         self.growth, self.turn = values.real, values.imag
         self.real, self.imaginary = projectors.real, projectors.imag
 
-    def over(self, time: jax.Array) -> jax.Array:
+    def transition_over(self, time: jax.Array) -> jax.Array:
         """Return exp(G t), the transition (modes, modes) over a time t."""
         size = jnp.exp(jnp.asarray(self.growth) * time)
         cosine, sine = size * jnp.cos(self.turn * time), size * jnp.sin(self.turn * time)
@@ -151,9 +151,11 @@ class _ChosenPlant(AbstractPlant):
         )  # fmt: skip
 
     def transition(self, x: jax.Array, u: jax.Array) -> jax.Array:
+        """Return f(x, u) of the chosen plant."""
         return jnp.stack([model.transition(x, u) for model in self.models])[self.index]
 
     def sample_noise(self, key: jax.Array, u: jax.Array) -> jax.Array:
+        """Draw the noise of the chosen plant."""
         return jnp.stack([model.sample_noise(key, u) for model in self.models])[self.index]
 
 
@@ -227,6 +229,7 @@ class _ChosenSensor(AbstractSensor):
         self.outputs, self.circular = models[0].outputs, models[0].circular
 
     def measure(self, x: jax.Array) -> jax.Array:
+        """Return h(x) of the chosen sensor."""
         return jnp.stack([model.measure(x) for model in self.models])[self.index]
 
 
@@ -257,6 +260,7 @@ def markov_plant(
         ValueError: fewer than two models, models of other states, inputs, angles, limits or laws of x_0 than the first,
             probabilities that are none; rates that are none, or without an input "dt" or an initial law.
     """
+    # Models that differ in their law of motion alone.
     plants = _check_models("models of a plant", models, AbstractPlant)
     for i, plant in enumerate(plants[1:], start=1):
         for what in ("states", "inputs", "circular", "limits"):
@@ -269,7 +273,8 @@ def markov_plant(
                 raise fail(f"law of x_0 of model {i}", "that of model 0, since the state starts before the first mode",
                            f"another {what.replace('_', ' ')}")  # fmt: skip
     if rates is None:
-        return ModalPlant(_chain_of(transition, initial, name, modes, len(plants)), plants)
+        return ModalPlant(_read_chain(transition, initial, name, modes, len(plants)), plants)
+    # Rates in place of a chain: its transition is the identity, and the rates move the mode by the time between rows.
     if initial is None:
         raise fail("rates of the modes", "initial=, the law of the mode of the first row, beside them", "none")
     if transition is not None or modes is not None:
@@ -278,7 +283,7 @@ def markov_plant(
     if TIME_STEP not in plants[0].inputs:
         raise fail("rates of the modes", f"plants with the input {TIME_STEP!r}", list(plants[0].inputs))
     moving = SwitchingRates(rates)
-    return ModalPlant(_chain_of(np.eye(len(moving.growth)), initial, name, None, len(plants)), plants, moving)
+    return ModalPlant(_read_chain(np.eye(len(moving.growth)), initial, name, None, len(plants)), plants, moving)
 
 
 def markov_sensor(
@@ -313,7 +318,7 @@ def markov_sensor(
             if getattr(sensor, what) != getattr(sensors[0], what):
                 raise fail(f"{what} of model {i}", f"{list(getattr(sensors[0], what))}, as those of model 0",
                            list(getattr(sensor, what)))  # fmt: skip
-    return ModalSensor(_chain_of(transition, initial, name, modes, len(sensors)), sensors)
+    return ModalSensor(_read_chain(transition, initial, name, modes, len(sensors)), sensors)
 
 
 def transition_over(plant: AbstractPlant, u: jax.Array, chain: jax.Array) -> jax.Array:
@@ -323,7 +328,7 @@ def transition_over(plant: AbstractPlant, u: jax.Array, chain: jax.Array) -> jax
     """
     if not isinstance(plant, ModalPlant) or plant.rates is None:
         return chain
-    by_rates = plant.rates.over(u[plant.inputs.index(TIME_STEP)])
+    by_rates = plant.rates.transition_over(u[plant.inputs.index(TIME_STEP)])
     return jnp.kron(by_rates, jnp.eye(len(chain) // len(by_rates))) @ chain
 
 
@@ -344,14 +349,25 @@ def _check_models(name: str, models: object, kind: type) -> tuple[Any, ...]:
     return checked
 
 
-def _chain_of(
+def _read_chain(
     transition: "Transition | None",
     initial: ArrayLike | None,
     name: str | None,
     modes: object,
     count: int,
 ) -> MarkovChain:
-    """Return the chain that was given: by its transition, as one, or as that of another model."""
+    """Return the chain of the modes: made of its transition, given as a chain, or that of another model.
+
+    Args:
+        transition: a chain, or P(next mode j | present mode i) (modes, modes); None beside `modes`.
+        initial: law (modes,) of the mode at the first step, beside probabilities alone; None for the stationary law.
+        name: of a chain that models share, beside probabilities alone; None for one of its own.
+        modes: a plant, sensor or link whose chain it is; None beside `transition`.
+        count: number of modes that it must have.
+
+    Raises:
+        ValueError: both or neither of `transition` and `modes`, another number of modes, uncertain transitions.
+    """
     if (transition is None) == (modes is None):
         raise fail("chain of the modes", "transition=, or modes= of a model that has them",
                    "none" if modes is None else "both")  # fmt: skip

@@ -238,6 +238,7 @@ class Plant(AbstractPlant):
         n = self.initial_mean.shape[-1]
         self.states = names("state names", states, n, "x")
         self.inputs = names("input names", inputs, len(name_list("input names", inputs)), "u")
+        # The functions of x and u return a state, and a covariance.
         u = np.zeros(len(self.inputs))
         check_shape("transition(x, u)", transition, (self.initial_mean, u), (n,))
         if callable(noise):
@@ -245,6 +246,7 @@ class Plant(AbstractPlant):
             self.noise = noise
         else:
             self.noise = as_noise("process noise", noise, n)
+        # States that are angles or attitudes, which a full turn must leave the same, and limits of the others.
         self.circular = read_angles("circular states", circular, self.states)
         self.attitude = _read_attitude(self.states, attitude, self.circular)
         if limits and attitude:
@@ -305,13 +307,13 @@ class LinearPlant(AbstractPlant):
         if varies and not inputs:
             raise fail("inputs", "the names of those that plant matrices depend on, such as ['dt']", "none")
         count = None if inputs is None or not varies else len(name_list("input names", inputs))
-        entry: Any = np.zeros((n, count or 0)) if input_matrix is None else input_matrix
-        if not callable(entry):
-            entry = array("input matrix", entry, (n, count))
-        self.inputs = names("input names", inputs, entry.shape[-1] if count is None else count, "u")
+        B: Any = np.zeros((n, count or 0)) if input_matrix is None else input_matrix
+        if not callable(B):
+            B = array("input matrix", B, (n, count))
+        self.inputs = names("input names", inputs, B.shape[-1] if count is None else count, "u")
         # A, B and Cov(w), each a constant or a function of u.
-        self.matrix = self._matrix("plant matrix", matrix, (n, n))
-        self.input_matrix = self._matrix("input matrix", entry, (n, len(self.inputs)))
+        self.matrix = self._read_matrix("plant matrix", matrix, (n, n))
+        self.input_matrix = self._read_matrix("input matrix", B, (n, len(self.inputs)))
         if callable(noise):
             check_shape("process noise covariance(u)", noise, (np.zeros(len(self.inputs)),), (n, n))
         self.noise = noise if callable(noise) else as_noise("process noise", noise, n)
@@ -320,7 +322,7 @@ class LinearPlant(AbstractPlant):
         u = np.zeros(len(self.inputs))
         check_turns("plant", self.transition, self.initial_mean, self.manifold, self.manifold, u)
 
-    def _matrix(self, name: str, value: MatrixLike, shape: tuple[int, int]) -> Any:
+    def _read_matrix(self, name: str, value: MatrixLike, shape: tuple[int, int]) -> Any:
         """Return an array, or a function of the inputs, after a check of its shape."""
         if not callable(value):
             return array(name, value, shape)

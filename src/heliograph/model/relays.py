@@ -99,7 +99,7 @@ class RelayNetwork(Module):
         check_horizon(horizon, covered)
 
     def steps(self, horizon: int) -> "RelaySteps":
-        """Return the matrices and moments of each step, the first leading from x_0 to x_1.
+        """Return the matrices and moments of steps 0 to horizon - 1, the first leading from x_0 to x_1.
 
         Raises:
             ValueError: a horizon beyond what varies over time; links with uncertain probabilities.
@@ -108,9 +108,9 @@ class RelayNetwork(Module):
         # Moments of each slot, computed once where links do not vary over time.
         varies = steps_covered(self.slots) is not None
         period = horizon if varies else min(len(self.slots), horizon)
-        tables = [_compute_slot_moments(self, self.slots[k % len(self.slots)], k) for k in range(period)]
+        by_slot = [_compute_slot_moments(self, self.slots[k % len(self.slots)], k) for k in range(period)]
         gain, offset, spread, receives, transmits = (
-            np.stack(parts)[np.arange(horizon) % period] for parts in zip(*tables, strict=True)
+            np.stack(parts)[np.arange(horizon) % period] for parts in zip(*by_slot, strict=True)
         )
         transition = _repeat_over_steps(self.plant, horizon, lambda p: p.matrix, 2)
         drift = _repeat_over_steps(self.plant, horizon, lambda p: p.noise.mean, 1)
@@ -180,9 +180,20 @@ class RelaySteps(Module):
 
 
 def _compute_slot_moments(network: RelayNetwork, slot: Slot, k: int) -> tuple[np.ndarray, ...]:
-    """Return gain, offset, spread, receiving rows and transmitting senders of a slot, shaped as in `RelaySteps`."""
+    """Return second moments of all that is received in one slot, given all that is sent in it.
+
+    Args:
+        network: the network.
+        slot: links of the slot, by listener and sender.
+        k: step, at which links that vary are read.
+
+    Returns:
+        Mean gain (R, T) and offset (R,) of the R received numbers from the T sent ones; spread (R, R, T + 1, T + 1) of
+        gain and offset; which numbers are received (R,), and which senders transmit (senders,), as 1 and 0.
+    """
     m, senders = len(first(network.sensor).outputs), (SENSOR, *network.relays)
     rows, columns = sum(network.received), len(senders) * m
+    # First row of each filter among all that is received.
     starts = dict(zip(network.filters, np.cumsum((0, *network.received[:-1])), strict=True))
     gain, offset, receives = np.zeros((rows, columns)), np.zeros(rows), np.zeros(rows)
     spread, transmits = np.zeros((rows, rows, columns + 1, columns + 1)), np.zeros(len(senders))

@@ -154,6 +154,7 @@ def stuck_counts(
     Raises:
         ValueError: another count of them, fewer than 2 readings, a sensor or a channel that does not say.
     """
+    # One answer for all received numbers, or one for each.
     expected = f"True, a whole number of equal readings from 2 to {MOST:,}, None, or a list of {received} of these"
     for_all = stuck is None or isinstance(stuck, bool | np.bool_) or is_whole(stuck)
     if not for_all and not isinstance(stuck, Sequence | np.ndarray):
@@ -165,7 +166,7 @@ def stuck_counts(
     for i, wanted in enumerate(each):
         if wanted is None or (isinstance(wanted, bool | np.bool_) and not wanted):
             continue
-        if isinstance(wanted, bool | np.bool_):
+        if isinstance(wanted, bool | np.bool_):  # True: by the law of the noise
             counts[i] = _count_by_law(received, sensor, channel)[i]
         elif is_whole(wanted) and 2 <= wanted <= MOST:
             counts[i] = wanted

@@ -136,6 +136,7 @@ class Sensor(AbstractSensor):
         resolution: "ArrayLike | None" = None,
         inputs: "Names" = (),
     ):
+        # A function of (x, u), with a noise that may depend on u too.
         self.inputs = name_inputs(inputs)
         if self.inputs:
             self.function = function("measure of a sensor", measure, "(x, u)")
@@ -143,6 +144,7 @@ class Sensor(AbstractSensor):
             self.circular = read_angles("circular outputs", circular, self.outputs)
             self.noise = _round_to(self.noise, resolution, self.circular)
             return
+        # A function of x alone: the number of outputs is that of their names, or of the noise's components.
         self.function, law = _take_state_alone(measure), _constant("sensor noise", noise)
         dimension = (count_components(law) or 1) if outputs is None else len(name_list("sensor outputs", outputs))
         self.noise = as_noise("sensor noise", law, dimension)
@@ -195,12 +197,13 @@ class LinearSensor(AbstractSensor):
         resolution: "ArrayLike | None" = None,
         inputs: "Names" = (),
     ):
+        # C or the noise depends on inputs.
         self.inputs = name_inputs(inputs)
         if self.inputs:
             rows = count_rows(matrix, self.inputs)
             self.outputs, self.noise = read_noise_of_inputs(noise, outputs, rows, self.inputs)
-            named: Any = OfInputs(matrix, "sensor matrix", self.inputs) if callable(matrix) else matrix
-            self.matrix = named if callable(matrix) else array("sensor matrix", named, ("outputs", "states"))
+            C: Any = OfInputs(matrix, "sensor matrix", self.inputs) if callable(matrix) else matrix
+            self.matrix = C if callable(matrix) else array("sensor matrix", C, ("outputs", "states"))
             self.circular = read_angles("circular outputs", circular, self.outputs)
             self.noise = _round_to(self.noise, resolution, self.circular)
             return
@@ -306,6 +309,7 @@ def without_output_names(model: T) -> T:
 
 
 def _is_sensor(model: object) -> bool:
+    """Return whether an object is a sensor."""
     return isinstance(model, AbstractSensor)
 
 

@@ -59,16 +59,20 @@ def find_long_silences(
         inputs: of the plant (steps, inputs).
         names: of the inputs.
     """
+    # Time at each row: the sum of dt, or the row's number.
     found = dict[str, LongSilences]()
     clock = np.cumsum(inputs[:, names.index(TIME_STEP)]) if TIME_STEP in names else np.arange(len(inputs), dtype=float)
     for node, z in measurements.items():
         timeout = timeouts[node]
         if timeout is None or not len(z):
             continue
-        came = np.flatnonzero(np.any(~np.isnan(z), axis=1))
-        ends = np.concatenate([[0], came, [len(z) - 1]])
+        # Silences lie between successive rows in which something came, the first and the last row added.
+        rows_with_data = np.flatnonzero(np.any(~np.isnan(z), axis=1))
+        ends = np.concatenate([[0], rows_with_data, [len(z) - 1]])
         lengths = np.diff(clock[ends])
-        long = lengths > timeout
-        if long.any():
-            found[node] = LongSilences(timeout, ends[:-1][long], lengths[long], name_unit(names))
+        is_long = lengths > timeout
+        if is_long.any():
+            found[node] = LongSilences(
+                timeout=timeout, rows=ends[:-1][is_long], lengths=lengths[is_long], unit=name_unit(names)
+            )
     return found

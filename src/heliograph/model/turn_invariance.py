@@ -26,10 +26,17 @@ def check_turns(
     results: Manifold,
     *rest: np.ndarray,
 ) -> None:
-    """Raise ValueError where a full turn of an angle or an attitude changes f(center) by more than turns of results.
+    """Raise ValueError where a full turn of an angle or an attitude changes f(center), but for full turns of results.
 
-    `rest` are further arguments of the function. What depends on a traced number has no value to judge: it was judged
-    where its numbers were known.
+    What depends on a traced number has no value to judge: it was judged where its numbers were known.
+
+    Args:
+        name: of what has the function, for the error.
+        function: f.
+        center: a state (n,).
+        given: which components of a state are angles and attitudes.
+        results: which components of f(x) are.
+        rest: further arguments of f.
     """
     if not (given.angles or given.rotations) or is_traced(center):
         return
@@ -54,7 +61,16 @@ def _compare_turned(
     results: Manifold,
     rest: tuple[np.ndarray, ...],
 ) -> None:
-    """Raise ValueError where f of one of the states turned, the same as `center`, differs by more than turns."""
+    """Raise ValueError where f differs, by more than full turns of its results, at states that are one and the same.
+
+    Args:
+        name: of what has the function, for the error.
+        function: f.
+        center: a state (n,).
+        turned: the same state with full turns in some components, each (n,).
+        results: which components of f(x) are angles and attitudes.
+        rest: further arguments of f.
+    """
     if not len(turned):
         return
     try:

@@ -65,7 +65,7 @@ def discretize(
     """
     model = _read_continuous(A, intensity, B)
     step = scalar("length of a step", dt, 0.0)
-    return model.over(step)
+    return model.discretize_over(step)
 
 
 class ContinuousSystem(Module):
@@ -75,16 +75,20 @@ class ContinuousSystem(Module):
     b: Array
     intensity: Array
 
-    def over(self, dt: Any) -> Discretized:
-        """Return the step of length dt, known or traced."""
+    def discretize_over(self, dt: Any) -> Discretized:
+        """Return the step of length dt, known or traced: F = exp(A dt), its integral times B, and Q.
+
+        By series over a short step h = dt / 2^count, which is then doubled `count` times.
+        """
         xp = library(self.a, self.b, self.intensity, dt)
         a = xp.asarray(self.a)
         size = xp.max(xp.sum(xp.abs(a), axis=0)) * dt
-        # dt = h 2^count with |A| h <= 1/2.
+        # |A| h <= 1/2.
         count = xp.ceil(xp.log2(xp.maximum(2 * size, 1.0)))
         short = dt / 2**count
-        integral, noise = self._series(xp, a, short)
+        integral, noise = self._integrate_short_step(xp, a, short)
         growth = a @ integral
+        # F - I, F, the integral of F, and Q, doubled: by a loop of fixed length where `count` is traced.
         parts = growth, np.eye(len(a)) + growth, integral, noise
         if is_traced(parts, count):
             parts = jax.lax.fori_loop(0, HALVINGS, _double_where(count), parts)
@@ -92,12 +96,13 @@ class ContinuousSystem(Module):
             for _ in range(int(count)):
                 parts = _double_step(*parts)
         growth, squared, integral, noise = parts
-        # I + growth has lost what is small beside 1, the squared F what rounding of 1 was doubled to.
+        # F: I + (F - I) loses what is small beside 1; the squared F is off by 2^count roundings of 1. The latter where
+        # F is so small that it is the better one.
         decayed = xp.max(xp.abs(squared)) * 2**count < 1
         matrix = xp.where(decayed, squared, np.eye(len(a)) + growth)
         return Discretized(matrix, (noise + noise.T) / 2, integral @ self.b)
 
-    def _series(self, xp: Any, a: Any, h: Any) -> tuple[Any, Any]:
+    def _integrate_short_step(self, xp: Any, a: Any, h: Any) -> tuple[Any, Any]:
         """Return the integral of exp(A s), and that of exp(A s) S exp(A s)', over a short step h."""
 
         def add_term(k: Any, parts: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -158,7 +163,7 @@ class TransitionOverStep(Module):
 
     def __call__(self, u: jax.Array) -> jax.Array:
         """Return F (n, n)."""
-        return jnp.asarray(self.model.over(u[self.place]).matrix)
+        return jnp.asarray(self.model.discretize_over(u[self.place]).matrix)
 
 
 class NoiseOverStep(TransitionOverStep):
@@ -166,7 +171,7 @@ class NoiseOverStep(TransitionOverStep):
 
     def __call__(self, u: jax.Array) -> jax.Array:
         """Return Q (n, n)."""
-        return jnp.asarray(self.model.over(u[self.place]).noise)
+        return jnp.asarray(self.model.discretize_over(u[self.place]).noise)
 
 
 class InputMatrixOverStep(TransitionOverStep):
@@ -174,7 +179,7 @@ class InputMatrixOverStep(TransitionOverStep):
 
     def __call__(self, u: jax.Array) -> jax.Array:
         """Return the matrix (n, inputs + 1), zero for dt."""
-        matrix = jnp.asarray(self.model.over(u[self.place]).input_matrix)
+        matrix = jnp.asarray(self.model.discretize_over(u[self.place]).input_matrix)
         return jnp.concatenate([matrix, jnp.zeros((len(matrix), 1))], axis=1)
 
 
@@ -214,19 +219,28 @@ def continuous_plant(
     model = _read_continuous(A, intensity, B)
     count = model.b.shape[1]
     named = names("input names", inputs, count, "u")
+    # Steps of one length: constant matrices.
     if dt is not None:
-        step = model.over(scalar("length of a step", dt, 0.0))
-        parts = step.matrix, step.noise, initial_mean, initial_covariance, step.input_matrix, states, named
-        return LinearPlant(*parts, limits=limits)
-    every = with_time_step(named)
+        step = model.discretize_over(scalar("length of a step", dt, 0.0))
+        return LinearPlant(
+            matrix=step.matrix,
+            noise=step.noise,
+            initial_mean=initial_mean,
+            initial_covariance=initial_covariance,
+            input_matrix=step.input_matrix,
+            states=states,
+            inputs=named,
+            limits=limits,
+        )
+    # Steps of a length that the last input says: matrices that are functions of it.
     return LinearPlant(
-        TransitionOverStep(model, count),
-        NoiseOverStep(model, count),
-        initial_mean,
-        initial_covariance,
-        InputMatrixOverStep(model, count) if count else None,
-        states,
-        every,
+        matrix=TransitionOverStep(model, count),
+        noise=NoiseOverStep(model, count),
+        initial_mean=initial_mean,
+        initial_covariance=initial_covariance,
+        input_matrix=InputMatrixOverStep(model, count) if count else None,
+        states=states,
+        inputs=with_time_step(named),
         limits=limits,
     )
 

@@ -74,6 +74,7 @@ def join(plants: "Sequence[AbstractPlant]") -> LinearPlant | Plant:
     Raises:
         ValueError: no plants, one that varies over time, a state that two have.
     """
+    # Plants whose states all have different names.
     parts = [
         instance("plant to join", plant, AbstractPlant, "a plant that does not vary")
         for plant in items("plants", plants, "plants")
@@ -84,9 +85,10 @@ def join(plants: "Sequence[AbstractPlant]") -> LinearPlant | Plant:
     doubled = sorted({str(name) for name in states if states.count(name) > 1})
     if doubled:
         raise fail("states of joined plants", "each name once (components and axes take another name)", doubled)
+    # All inputs, each once, and where among them those of each plant are.
     inputs = list(dict.fromkeys(name for plant in parts for name in plant.inputs))
     places = tuple(tuple(inputs.index(name) for name in plant.inputs) for plant in parts)
-    # Laws of the initial state and of the noises.
+    # Laws of the initial state, and of the noises: one law, or a function of the inputs where some noise is one.
     center, start = _join_starts(parts)
     noises = [plant.noise for plant in parts if isinstance(plant.noise, AbstractNoise)]
     noise = Independent(noises) if len(noises) == len(parts) else JointNoise(tuple(parts), places)
@@ -96,8 +98,8 @@ def join(plants: "Sequence[AbstractPlant]") -> LinearPlant | Plant:
     if not all(isinstance(plant, LinearPlant) for plant in parts):
         move = SideBySide(tuple(parts), places)
         return Plant(move, noise, center, start, states, inputs, circular=circular, attitude=attitude, limits=limits)
-    matrix, driven = _join_matrices(parts, places, len(inputs))
-    return LinearPlant(matrix, noise, center, start, driven, states, inputs, circular=circular, limits=limits)
+    matrix, input_matrix = _join_matrices(parts, places, len(inputs))
+    return LinearPlant(matrix, noise, center, start, input_matrix, states, inputs, circular=circular, limits=limits)
 
 
 def _join_starts(parts: list[Any]) -> tuple[Any, Any]:

@@ -212,7 +212,17 @@ def _repeat_on_axes(
     initial_covariance: NoiseLike | None,
     start: Any = None,
 ) -> LinearPlant:
-    """Return the same motion on each axis, independently."""
+    """Return the plant of the same motion dx = A x dt + dW on each axis, independently.
+
+    Args:
+        motion: A (order, order) of one axis.
+        intensity: of W on one axis (order, order).
+        axes: names of the positions.
+        dt: length of every step; None where the input "dt" says it.
+        initial_mean: of all states, axis by axis; None for zero.
+        initial_covariance: of all states; None for `start` on each axis.
+        start: variances of one axis before the first step (order,); None for WIDE ones.
+    """
     named = name_list("axes", axes)
     if not named:
         raise fail("axes", "at least one name", "none")

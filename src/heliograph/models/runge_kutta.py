@@ -62,7 +62,8 @@ class LinearizedNoise(MotionOverStep):
         """Return Q (n, n)."""
         own, dt = self.split(u)
         jacobian = jax.jacfwd(lambda x: as_real(self.drift(x, own)))(jnp.asarray(self.state))
-        return jnp.asarray(ContinuousSystem(jacobian, np.zeros((len(self.state), 0)), self.intensity).over(dt).noise)
+        linearized = ContinuousSystem(jacobian, np.zeros((len(self.state), 0)), self.intensity)
+        return jnp.asarray(linearized.discretize_over(dt).noise)
 
 
 def runge_kutta_plant(
@@ -104,18 +105,19 @@ def runge_kutta_plant(
     """
     function("drift", drift, "(x, u)")
     mean = array("initial mean", initial_mean, (None,))
-    n, own = len(mean), name_list("input names", inputs)
-    check_shape("drift(x, u)", drift, (mean, np.zeros(len(own))), (n,))
+    n, inputs_of_drift = len(mean), name_list("input names", inputs)
+    check_shape("drift(x, u)", drift, (mean, np.zeros(len(inputs_of_drift))), (n,))
+    # The length of a step: a number, or None where the last input says it.
     step = None if dt is None else scalar("length of a step", dt, 0.0)
-    at = mean if linearized_at is None else array("state of linearization", linearized_at, (n,))
+    state = mean if linearized_at is None else array("state of linearization", linearized_at, (n,))
     count = check_count("substeps", substeps)
     return Plant(
-        RungeKuttaStep(drift, step, count),
-        LinearizedNoise(drift, step, count, covariance("noise intensity", intensity, n), at),
-        mean,
-        initial_covariance,
-        states,
-        own if step is not None else with_time_step(own),
-        [str(name) for name in name_list("circular states", circular)],
+        transition=RungeKuttaStep(drift, step, count),
+        noise=LinearizedNoise(drift, step, count, covariance("noise intensity", intensity, n), state),
+        initial_mean=mean,
+        initial_covariance=initial_covariance,
+        states=states,
+        inputs=inputs_of_drift if step is not None else with_time_step(inputs_of_drift),
+        circular=[str(name) for name in name_list("circular states", circular)],
         limits=limits,
     )

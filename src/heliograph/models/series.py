@@ -106,15 +106,14 @@ def trend(
     ]
     named = text("name of a component", name)
     prefix = "" if named == "trend" else f"{named}_"
-    start = _read_start(initial_variance)
     plant = LinearPlant(
-        [[1.0, 1.0], [0.0, 1.0]],
-        _diagonal(variances),
-        array("initial mean", initial_mean, (2,)),
-        start,
+        matrix=[[1.0, 1.0], [0.0, 1.0]],
+        noise=_diagonal(variances),
+        initial_mean=array("initial mean", initial_mean, (2,)),
+        initial_covariance=_read_start(initial_variance),
         states=[f"{prefix}level", f"{prefix}slope"],
     )
-    return Component(named, plant, [1.0, 0.0])
+    return Component(named, plant, loading=[1.0, 0.0])
 
 
 def seasonal(
@@ -172,15 +171,17 @@ def trigonometric_seasonal(
 
     Source: Harvey, Forecasting, structural time series models and the Kalman filter (1989), 2.3.4.
     """
+    # At whole steps the waves j and period - j are the same.
     length = float(scalar("period", period, 1.0 + 1e-9))
     most = int(length // 2)
     count = most if harmonics is None else check_count("harmonics", harmonics)
     if not 1 <= count <= most:
         raise fail("harmonics", f"from 1 to {most}, which differ at whole steps", count)
+    # A block, two states (of which the first is seen) and two weights for each wave.
     q, start = scalar("variance of the season", variance, 0.0), _read_start(initial_variance)
     named, blocks, states, loading = text("name of a component", name), [], [], []
     for j in range(1, count + 1):
-        alone = 2 * j == length  # cos(pi t), of which the shifted wave is 0
+        alone = 2 * j == length  # cos(pi t), of which the shifted wave is 0: one state
         blocks.append(np.array([[-1.0]]) if alone else _rotation(2 * np.pi * j / length))
         states += [f"{named}_{j}"] if alone else [f"{named}_{j}", f"{named}_{j}_shifted"]
         loading += [1.0] if alone else [1.0, 0.0]
@@ -238,6 +239,7 @@ def arma(
 
     Source: Harvey, Forecasting, structural time series models and the Kalman filter (1989), 3.3 and 4.1.3.
     """
+    # Harvey's state: the present value, and what is known of later ones; the first column of F has the coefficients.
     phi, theta = array("ar", ar, (None,)), array("ma", ma, (None,))
     q = scalar("variance of the noise", variance, 0.0)
     size = max(len(phi), len(theta) + 1)
@@ -246,6 +248,7 @@ def arma(
     matrix = xp.concatenate([first[:, None], np.eye(size)[:, :-1]], axis=1)
     if not is_traced(matrix) and np.max(np.abs(np.linalg.eigvals(matrix))) > STATIONARY:
         raise fail("ar", "coefficients of a stationary process, all roots inside the circle", phi.tolist())
+    # e enters the present value, and with the coefficients of the moving average the later ones.
     enters = xp.concatenate([np.ones(1), theta, np.zeros(size - 1 - len(theta))])
     noise = q * xp.outer(enters, enters)
     named = text("name of a component", name)

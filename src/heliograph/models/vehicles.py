@@ -197,18 +197,26 @@ def _make_vehicle_plant(
     dt: ArrayLike | None,
     axes: Names,
 ) -> Plant:
-    """Return the plant of a vehicle that drives over arcs of circles.
+    """Return the plant of a vehicle that drives over arcs of circles; states: both axes and "heading".
 
-    Its inputs are "speed" and `steered_by`: the turn rate, or with a wheelbase the angle of its front wheel.
+    Args:
+        wheelbase: distance of the axles of a bicycle, steered by the angle of its front wheel; None of a unicycle,
+            which is steered by its turn rate.
+        steered_by: name of the input by which it is steered, behind "speed".
+        intensity: S of Q = S dt (3, 3).
+        initial_mean: mean before the first step (3,).
+        initial_covariance: its covariance, or the law of its deviation.
+        dt: length of every step; None where the input "dt" says it.
+        axes: names of both positions.
     """
     step = None if dt is None else scalar("length of a step", dt, 0.0)
     spread = covariance("noise intensity", intensity, 3)
     inputs = ["speed", steered_by]
     return Plant(
-        ArcMotion(step, wheelbase),
-        ScaledNoise(step, spread) if step is None else spread * step,
-        initial_mean,
-        initial_covariance,
+        transition=ArcMotion(step, wheelbase),
+        noise=ScaledNoise(step, spread) if step is None else spread * step,
+        initial_mean=initial_mean,
+        initial_covariance=initial_covariance,
         states=[*two_axes(axes), "heading"],
         inputs=with_time_step(inputs) if step is None else inputs,
         circular=["heading"],

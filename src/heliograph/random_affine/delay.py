@@ -205,6 +205,7 @@ def place_on_delay_line(channel: T) -> T:
     """Return the channel, or a tree in which each channel with delays is the same map of the line without delay."""
 
     def take_line(leaf: object) -> object:
+        """Return the map of the line of a channel with delays; anything else as it is."""
         return leaf.line if isinstance(leaf, AbstractDelayLine) else leaf
 
     replaced: T = jax.tree.map(take_line, channel, is_leaf=lambda leaf: isinstance(leaf, AbstractDelayLine))
@@ -305,7 +306,7 @@ class Relayed(AbstractDelayLine):
 
 
 def connect_in_series(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAffine:
-    """Return links in series, each with its own delay; constant delays add up.
+    """Return links in series, each with its own delay, as one channel; constant delays add up.
 
     A relay without memory that stores what it received for a constant d equals one that receives it d steps later:
     gains and noises are independent over time. One that stores it for a random time may forward one value twice, with
@@ -332,13 +333,16 @@ def connect_in_series(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAf
 
 
 def _join_links_behind_delay(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAffine:
-    """Join links in series of which only the first may have a random delay."""
+    """Return links in series, of which only the first may have a random delay, as one series behind one delay.
+
+    A constant delay may be moved to the front past links that forget: their gains and noises are independent over time.
+    """
     delays = [link for link in links if isinstance(link, Delayed)]
     if not delays:
         return Series(links)
     if links[0].past and not isinstance(links[0], Delayed):
         raise fail("series", "links each delayed by itself", "a combination of delayed links")
-    # The random delay comes first; constant ones are added to it.
+    # The first link's own delay, which may be random (None without one), and the constant ones that are added to it.
     first, added = (delays[0], delays[1:]) if isinstance(links[0], Delayed) else (None, delays)
     # A time stamp would have to be that of the whole delay: only the last delay may have one, and of the first link's
     # own none may follow.

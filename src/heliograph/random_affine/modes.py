@@ -60,7 +60,7 @@ class Modes(AbstractUniform, AbstractModal):
         return _ChosenMap(self.maps, jnp.asarray(state)) if present is None else present
 
     def covers_kind(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
-        """Return modes of a chain that is believed possible, with maps that are covered one by one."""
+        """Return whether `own` is of modes whose chain this one's covers, with maps that are covered one by one."""
         if not isinstance(own, Modes) or not self.memory.covers(own.memory) or len(own.maps) != len(self.maps):
             return False
         return all(x.covers(y, same_noise) for x, y in zip(self.maps, own.maps, strict=True))
@@ -77,9 +77,11 @@ class _ChosenMap(AbstractUniform):
     index: jax.Array
 
     def sample(self, key: jax.Array) -> jax.Array:
+        """Draw from the map of the index."""
         return jnp.stack([m.sample(key) for m in self.maps])[self.index]
 
     def moments(self, order: int) -> JointMoments:
+        """Return the moments of the map of the index."""
         matrices = [jnp.asarray(m.moments(order).matrix) for m in self.maps]
         return JointMoments(jnp.stack(matrices)[self.index], self.outputs, self.inputs, order)
 
@@ -249,7 +251,9 @@ def joint_modes(
     # Independent memories: their laws multiply.
     initial = reduce(xp.kron, [chain.initial for chain in chains], np.ones(1))
     transition = reduce(xp.kron, [chain.transition for chain in chains], np.ones((1, 1)))
-    largest = reduce(xp.kron, [chain.transition + chain.radius for chain in chains], np.ones((1, 1)))
+    largest = reduce(
+        xp.kron, [chain.transition + chain.radius for chain in chains], np.ones((1, 1))
+    )  # each at its most
     # The state of each memory in each joint mode, and the maps given these.
     by_mode = [
         dict(zip(held, [state.item() for state in states], strict=True))

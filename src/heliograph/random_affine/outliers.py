@@ -130,17 +130,19 @@ class Contaminated(AbstractNoise):
     bounded: bool = eqx.field(static=True)
 
     def __init__(self, covariance: ArrayLike, share: ArrayLike, outlier_covariance: ArrayLike, bias: ArrayLike = 0.0):
+        # Shares, covariances and biases of the kinds of outliers, one each.
         inlier = check.covariance("covariance of contaminated noise", covariance, _size(covariance))
         n = inlier.shape[-1]
-        parts, several = _read_shares(share)
-        outliers = _check_matrices("covariance of the outliers", outlier_covariance, len(parts), several)
-        biases = _check_matrices("bias of the outliers", bias, len(parts), several)
-        xp = library(inlier, parts, outliers, biases)
+        outlier_shares, are_several = _read_shares(share)
+        kinds = len(outlier_shares)
+        outliers = _check_matrices("covariance of the outliers", outlier_covariance, kinds, are_several)
+        biases = _check_matrices("bias of the outliers", bias, kinds, are_several)
+        xp = library(inlier, outlier_shares, outliers, biases)
         spreads = [check.covariance("covariance of the outliers", r, n) for r in outliers]
         centers = [xp.broadcast_to(array("bias of the outliers", b, (n,) if rank("bias", b) else ()), (n,))
                    for b in biases]  # fmt: skip
-        # The first branch is the noise without outliers; the moments are those of the mixture.
-        self.shares = xp.concatenate([xp.stack([1 - sum(parts)]), xp.stack(parts)])
+        # The first branch is the noise without outliers; mean and covariance are those of the mixture.
+        self.shares = xp.concatenate([xp.stack([1 - sum(outlier_shares)]), xp.stack(outlier_shares)])
         self.means = xp.stack([xp.zeros(n), *centers])
         self.covariances = xp.stack([inlier, *spreads])
         self.mean = self.shares @ self.means
@@ -239,6 +241,7 @@ def has_bounded_noise(*parts: PyTree) -> bool:
     """Return whether some noise in these parts of a network is known by a bound of its covariance alone."""
 
     def is_law(leaf: object) -> bool:
+        """Return whether a leaf is a noise law that may be a bound."""
         return isinstance(leaf, Contaminated)
 
     return any(leaf.bounded for leaf in jax.tree.leaves(parts, is_leaf=is_law) if is_law(leaf))

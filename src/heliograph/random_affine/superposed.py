@@ -143,7 +143,7 @@ class Superposed(AbstractCombination):
         return self.as_stack.moment_interval(order)
 
     def covers_kind(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
-        """Return a sum at the same places with such a noise, of maps that are covered one by one."""
+        """Return whether `own` is a sum at the same places, with such a noise, of maps that are covered one by one."""
         if not isinstance(own, Superposed) or own.places != self.places or not same_noise(self.noise, own.noise):
             return False
         return self.covers_maps(own, same_noise)
@@ -303,9 +303,9 @@ def _assemble_moments(powers: _SumPowers, outputs: int, inputs: int, order: int)
 def move_sensor_into_links(
     matrix: Matrix, noise: AbstractNoise, channel: AbstractRandomAffine
 ) -> AbstractRandomAffine | None:
-    """Return a sum of links of y = C x + v as one of links of x, C_i x + v_i through link i, whose moments are smaller.
+    """Return a sum of links of y = C x + v as a sum of links of x: C_i x + v_i through link i, in fewer numbers.
 
-    That holds where the parts of v that links carry are independent; else, and for another channel, there is none.
+    None where the parts of v that links carry are not independent, or where the channel does not begin with a sum.
     """
     first, *rest = channel.in_series
     if not isinstance(first, Superposed) or (parts := noise.split(first.places)) is None:
@@ -318,28 +318,36 @@ def move_sensor_into_links(
     return Series([Superposed(links, first.noise, [everything] * len(links), len(everything)), *rest])
 
 
+class _MapsWithMemories(NamedTuple):
+    """Maps of a sum, by their numbers, and the names of the memories that they have."""
+
+    memories: set[str]
+    maps: list[int]
+
+
 def split_terms_without_common_memory(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
     """Return maps that share no memory, independent of each other, whose sum is the channel; one if it is no sum.
 
-    The maps of a sum that share one stay together, and so do those without; the first has the noise.
+    The maps of a sum that share a memory (a chain of modes, or a gain that drifts) stay together in one term, and so do
+    those without any. The first term has the noise of the sum.
     """
     if not isinstance(channel, Superposed):
         return [channel]
-    groups: list[tuple[set[str], list[int]]] = []  # memories, and the maps that have them
+    # Map after map: the groups that share a memory with it, or have none like it, are joined by it.
+    groups: list[_MapsWithMemories] = []
     for i, affine in enumerate(channel.maps):
         held, members = set(memories(affine)), [i]
-        joined = [group for group in groups if group[0] & held or not (group[0] or held)]
-        for group in joined:
+        for group in [group for group in groups if group.memories & held or not (group.memories or held)]:
             groups.remove(group)
-            held, members = held | group[0], group[1] + members
-        groups.append((held, members))
-    none = as_noise("noise of a term", 0.0, channel.outputs)
+            held, members = held | group.memories, group.maps + members
+        groups.append(_MapsWithMemories(held, members))
+    no_noise = as_noise("noise of a term", 0.0, channel.outputs)
     return [
         Superposed(
-            [channel.maps[i] for i in members],
-            channel.noise if first == 0 else none,
-            [channel.places[i] for i in members],
-            channel.inputs,
+            maps=[channel.maps[i] for i in group.maps],
+            noise=channel.noise if number == 0 else no_noise,
+            places=[channel.places[i] for i in group.maps],
+            inputs=channel.inputs,
         )
-        for first, (_, members) in enumerate(groups)
+        for number, group in enumerate(groups)
     ]

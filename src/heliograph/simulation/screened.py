@@ -77,5 +77,5 @@ def _describe_refused(
     """Say how many readings a node refused for one reason, and which they are in the first such row."""
     here = np.where(refused == number_of(reason), refused, 0)
     row, came = int(np.argmax(here.any(axis=1))), int(np.count_nonzero(~np.isnan(z)))
-    why = limits.why(z[row], here[row], node.received_names)
+    why = limits.describe_missing(z[row], here[row], node.received_names)
     return f"{np.count_nonzero(here)} of {came} values count as not arrived, by {reason}; row {row + 1}: {why}"

@@ -71,9 +71,16 @@ def explain_unevenness(plant: AbstractPlant, dt: int) -> str:
 def _integrate_parts(
     plant: AbstractPlant, dt: int, x: Float[Array, " n"], intervals: Float[Array, "cut part"]
 ) -> tuple[Float[Array, "cut n"], Float[Array, "cut n n"], Float[Array, "cut n n"]]:
-    """Return for each cut the mean, transition matrix and noise covariance after its intervals, passed one by one.
+    """Return the mean, transition matrix and noise covariance after some intervals of time, passed one after another.
 
-    intervals (cut, part): lengths, in the plant's unit of time; the mean starts at x.
+    Args:
+        plant: the plant.
+        dt: number of the input that is the length of an interval; all other inputs are 1.
+        x: mean at the start (n,).
+        intervals: [c, p], length of interval p of the cut c of a span of time, in the plant's unit.
+
+    Returns:
+        For each cut the mean (n,), the product of the transition matrices and the noise's covariance (n, n).
     """
 
     def integrate(parts: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -83,11 +90,8 @@ def _integrate_parts(
         for interval in parts:
             u = jnp.where(np.arange(len(plant.inputs)) == dt, interval, 1.0)
             a, moved = jax.jacfwd(plant.moves(u, state))(state), plant.transition(state, u)
-            state, matrix, spread = (
-                plant.manifold.settle(moved, moved + plant.noise_mean()),
-                a @ matrix,
-                a @ spread @ a.T + plant.noise_covariance(u),
-            )
+            state = plant.manifold.settle(moved, moved + plant.noise_mean())
+            matrix, spread = a @ matrix, a @ spread @ a.T + plant.noise_covariance(u)
         return state, matrix, spread
 
     moved: tuple[jax.Array, jax.Array, jax.Array] = jax.vmap(integrate)(jnp.asarray(intervals))

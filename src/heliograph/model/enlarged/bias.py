@@ -55,7 +55,8 @@ def with_bias(
     instance("sensor with a bias", sensor, AbstractSensor, "one that does not vary")
     n, outputs = len(plant.states), len(sensor.outputs)
     check_sensor(sensor, n)
-    # How many biases there are: the first that is known says.
+    # How many biases there are: a plant of b says, or the outputs, or E; else D, of which any number
+    # of columns is accepted.
     by_output = coupling is None and loading is None
     count: int | str = "biases"
     if isinstance(bias, LinearPlant):
@@ -63,25 +64,34 @@ def with_bias(
     elif by_output:
         count = outputs
     # E (n, biases) and D (outputs, biases).
-    drives = None if coupling is None else array("coupling of the bias", coupling, (n, count))
-    count = count if drives is None else drives.shape[1]
-    seen: Any = loading
+    E = None if coupling is None else array("coupling of the bias", coupling, (n, count))
+    count = count if E is None else E.shape[1]
+    D: Any = loading
     if loading is None:
-        seen = np.eye(outputs) if by_output else np.zeros((outputs, count))
-    seen = array("loading of the bias", seen, (outputs, count))
-    drives = np.zeros((n, seen.shape[1])) if drives is None else drives
+        D = np.eye(outputs) if by_output else np.zeros((outputs, count))
+    D = array("loading of the bias", D, (outputs, count))
+    E = np.zeros((n, D.shape[1])) if E is None else E
+    # Biases of given deviations: their plant is that of Gauss-Markov processes.
     if not isinstance(bias, LinearPlant):
-        names = [f"bias{i}" for i in range(seen.shape[1])]
+        names = [f"bias{i}" for i in range(D.shape[1])]
         if by_output:
             names = [rename(name, f"{name}_bias") for name in sensor.outputs]
         bias = _make_gauss_markov(plant, names, bias, time, dt)
-    return append_driving_plant(plant, bias, drives), _append_to_sensor(sensor, seen, n)
+    return append_driving_plant(plant, bias, E), _append_to_sensor(sensor, D, n)
 
 
 def _make_gauss_markov(
     plant: AbstractPlant, names: list[str], deviation: ArrayLike, time: ArrayLike, dt: ArrayLike | str
 ) -> LinearPlant:
-    """Return the Gauss-Markov processes: b+ = a b + xi, a = exp(-dt / T), Var xi = (1 - a^2) deviation^2."""
+    """Return the plant of Gauss-Markov processes: b+ = a b + xi, a = exp(-dt / T), Var xi = (1 - a^2) deviation^2.
+
+    Args:
+        plant: the plant that they drive or are measured with, for the names of its inputs.
+        names: of the processes.
+        deviation: standard deviation of each at all times, or one for all.
+        time: T of each, or one for all.
+        dt: length of a step, or the name of the input that says it.
+    """
     count, what = len(names), "deviation of a bias"
     deviations = [scalar(what, x, 0.0) for x in _broadcast_to_biases(what, deviation, count)]
     rates = [_compute_rate(x) for x in _broadcast_to_biases("time of a bias", time, count)]
@@ -98,9 +108,11 @@ def _make_gauss_markov(
         raise fail("dt", f"a number, or one of the inputs {list(plant.inputs)}", repr(dt))
 
     def matrix_over(u: jax.Array) -> jax.Array:
+        """Return diag(a) over a step of length u[0]."""
         return jnp.diag(jnp.exp(-u[0] * rate))
 
     def noise_over(u: jax.Array) -> jax.Array:
+        """Return the covariance of xi over a step of length u[0]."""
         return jnp.diag(jnp.asarray(size) ** 2 * -jnp.expm1(-2 * u[0] * rate))
 
     return LinearPlant(matrix_over, noise_over, center, start, states=names, inputs=[dt])
@@ -129,7 +141,18 @@ class DrivenTransition(Module):
 
 
 def append_driving_plant(plant: AbstractPlant, bias: LinearPlant, coupling: np.ndarray) -> LinearPlant | Plant:
-    """Return the plant of [x; b]: x and b start independently of each other, and are driven by independent noises."""
+    """Return the plant of [x; b]: x+ = f(x, u) + E b + w and b+ = F b + B u + xi, linear if f is.
+
+    x and b start independently of each other, and w and xi are independent.
+
+    Args:
+        plant: the plant of x.
+        bias: the plant of b, whose inputs are some of those of x.
+        coupling: E (n, biases).
+
+    Raises:
+        ValueError: a plant of b with another input, a coupling to attitudes.
+    """
     models = plant, bias
     if set(bias.inputs) - set(plant.inputs):
         raise fail("bias", f"a plant whose inputs are some of {list(plant.inputs)}", list(bias.inputs))
@@ -165,10 +188,12 @@ def _stack_blocks(plant: LinearPlant, bias: LinearPlant, coupling: np.ndarray, p
         return matrix, xp.concatenate([plant.input_matrix, bias.input_matrix @ pick])
 
     def move(u: jax.Array) -> jax.Array:
+        """Return [[A, E], [0, F]] under the inputs u."""
         of_bias = bias.transition_matrix(pick @ u)
         return jnp.block([[plant.transition_matrix(u), jnp.asarray(coupling)], [jnp.asarray(below), of_bias]])
 
     def drive(u: jax.Array) -> jax.Array:
+        """Return [B; B_b] under the inputs u."""
         return jnp.concatenate([matrix_of(plant.input_matrix, u), matrix_of(bias.input_matrix, pick @ u) @ pick])
 
     return move, drive

@@ -82,6 +82,7 @@ def with_clocks(
     Raises:
         ValueError: a clock whose node has no sensor, negative deviations, another input, wrong shapes.
     """
+    # Each clock is that of a node, and each sensor one that measures the plant.
     instance("plant with clocks", plant, AbstractPlant, "a plant that does not vary")
     sensors, clocks = table("sensors", sensors, "sensors of nodes"), table("clocks", clocks, "clocks of nodes")
     n = len(plant.states)
@@ -111,11 +112,16 @@ def _read_step(plant: AbstractPlant, dt: ArrayLike | str) -> Any:
 
 
 def _make_clocks(clocks: Mapping[str, Clock], dt: str | Any) -> LinearPlant:
-    """Return offset and drift of each clock: o+ = o + dt d, d+ = d + its wandering, all independent at the start.
+    """Return the plant of all clocks: offset o+ = o + dt d and drift d+ = d + w of each, independent at the start.
 
-    Steps of one length: the drift gains the variance `wander` at each. Lengths that vary, by an input: it gains
-    wander dt within a step, as white noise does, and the offset what that makes of it.
+    Steps of one length: w has the variance `wander`. Lengths that an input says: d gains white noise within the step,
+    w has the variance wander dt, and o gains its integral.
+
+    Args:
+        clocks: by node.
+        dt: length of a step, or the input that says it.
     """
+    # Means and variances of (offset, drift) of clock after clock.
     means, variances, wanders, states = [], [], [], []
     for name, clock in clocks.items():
         instance(f"clock of {name!r}", clock, Clock, "a Clock")
@@ -138,9 +144,11 @@ def _make_clocks(clocks: Mapping[str, Clock], dt: str | Any) -> LinearPlant:
 
     # Steps of a length that an input says: the integral of white noise in the drift, and of that in the offset.
     def matrix_over(u: jax.Array) -> jax.Array:
+        """Return the transition matrix over a step of length u[0]."""
         return jnp.kron(each, jnp.array([[1.0, u[0]], [0.0, 1.0]]))
 
     def noise_over(u: jax.Array) -> jax.Array:
+        """Return the noise's covariance over a step of length u[0]."""
         of_clock = jnp.array([[u[0] ** 3 / 3, u[0] ** 2 / 2], [u[0] ** 2 / 2, u[0]]])
         return jnp.kron(jnp.asarray(strength), of_clock)
 

@@ -42,6 +42,7 @@ def joint_sensor(sensors: Mapping[str, AbstractSensor]) -> LinearSensor | Sensor
     Raises:
         ValueError: no sensors, or one that varies; nodes and outputs of which two make one name.
     """
+    # Sensors that do not vary, and names of their outputs that are all different.
     by_node = table("sensors", sensors, "sensors of nodes")
     if not by_node:
         raise fail("sensors", "at least one", "none")
@@ -50,6 +51,7 @@ def joint_sensor(sensors: Mapping[str, AbstractSensor]) -> LinearSensor | Sensor
     outputs = [rename(output, f"{name}_{output}") for name, sensor in by_node.items() for output in sensor.outputs]
     outputs = list(names("outputs of all nodes", outputs, len(outputs), "y"))
     circular = tuple(f"{name}_{output}" for name, sensor in by_node.items() for output in sensor.circular)
+    # Sensors of inputs are joined under these; linear ones become one matrix.
     parts = tuple(by_node.values())
     if any(sensor.inputs for sensor in parts):
         return _join_sensors_of_inputs(parts, outputs, circular)
@@ -64,7 +66,7 @@ def joint_sensor(sensors: Mapping[str, AbstractSensor]) -> LinearSensor | Sensor
 
 
 class SensorsUnderInputs(Module):
-    """Sensors of which some depend on inputs.
+    """Sensors side by side of which some depend on inputs, with the places of their inputs among all.
 
     Args:
         parts: the sensors.
@@ -75,7 +77,7 @@ class SensorsUnderInputs(Module):
     places: tuple[tuple[int, ...], ...] = eqx.field(static=True)
 
     def given(self, u: jax.Array) -> list[Any]:
-        """Return the sensors of known inputs."""
+        """Return the sensors as they are under all inputs u (inputs,)."""
         return [part.given(own) for part, own in zip(self.parts, split_inputs(u, self.places), strict=True)]
 
 

@@ -41,14 +41,21 @@ def with_past(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> tuple[Any
 
 
 def _append_line(plant: Any, sensor: Any, past: int) -> LinearPlant:
-    """Return the plant of (x, y_k, ..., y_{k-past}): x+ = A x + B u + w, y+ = C x+ + v, and the line moves on."""
+    """Return the plant of (x, y_k, ..., y_{k-past}): x+ = A x + B u + w, y+ = C x+ + v, and older outputs move on.
+
+    Args:
+        plant: the linear plant of x.
+        sensor: the linear sensor, C and v.
+        past: number of past outputs that are kept beside the present one.
+    """
     if not isinstance(plant.noise, AbstractNoise):
         raise fail("noise of a plant behind a random delay", "a covariance or a noise law", "a function of the inputs")
     c = sensor.matrix
     xp = library(plant.matrix, plant.input_matrix, c)
     m, n = c.shape
     length = past * m
-    # Columns of x, and of the line, of which y_k, ..., y_{k-past+1} move on by one place.
+    # Blocks of rows: x+ (n), y+ (m), older outputs (past m). Columns of x, and of the outputs, of which y_k, ...,
+    # y_{k-past+1} move on by one place.
     from_state = xp.concatenate([plant.matrix, c @ plant.matrix, np.zeros((length, n))])
     from_line = np.concatenate([np.zeros((n + m, length + m)), np.eye(length, length + m)])
     driven = xp.concatenate([plant.input_matrix, c @ plant.input_matrix, np.zeros((length, len(plant.inputs)))])

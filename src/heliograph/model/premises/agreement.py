@@ -45,6 +45,7 @@ def list_differences(believed: Premise, own: Premise) -> tuple[str, ...]:
         believed: what the filter was made for.
         own: plant, sensor, channel and trigger of the place where it stands, and limits of what it uses.
     """
+    # `order`: how much of the noises' laws the filter uses; None for all.
     order, own = believed.order, _enlarge_world_by_past(believed, own)
     parts = [] if _test_all_steps(_same_plant, believed.plant, own.plant, order) else [PLANT]
     if own.relays is not None or believed.relays is not None:
@@ -60,6 +61,7 @@ def list_differences(believed: Premise, own: Premise) -> tuple[str, ...]:
         parts.append(RANGE)
     if not are_same(believed.encoder, own.encoder):
         parts.append(ENCODER)
+    # Sensor and channel agree one by one, or in what is received of the state through both.
     sensors = _test_all_steps(_same_sensor, believed.sensor, own.sensor, order)
     channels = _same_channel(believed.channel, own.channel, order, believed.trigger is None)
     if sensors and channels:
@@ -67,7 +69,8 @@ def list_differences(believed: Premise, own: Premise) -> tuple[str, ...]:
     observations = (believed.sensor, believed.channel), (own.sensor, own.channel)
     if _test_all_steps(_same_observation, *observations, order):
         return tuple(parts)
-    return tuple(parts + [part for part, agree in ((SENSOR, sensors), (CHANNEL, channels)) if not agree])
+    parts += [part for part, agree in ((SENSOR, sensors), (CHANNEL, channels)) if not agree]
+    return tuple(parts)
 
 
 def _enlarge_world_by_past(believed: Premise, own: Premise) -> Premise:
@@ -153,6 +156,7 @@ def _same_motion(a: AbstractPlant, b: AbstractPlant) -> bool:
 
 
 def _same_disturbance(a: AbstractPlant, b: AbstractPlant, order: int | None) -> bool:
+    """Return whether two plants' process noises agree, as laws or as functions of the inputs."""
     if isinstance(a.noise, AbstractNoise) and isinstance(b.noise, AbstractNoise):
         return _same_noise(a.noise, b.noise, order)
     return same_function(a.noise_covariance, b.noise_covariance, (len(a.inputs),))

@@ -57,6 +57,7 @@ class Words(Module):
         dither: Dither = "none",
         resolution: "Float[ArrayLike, ''] | None" = None,
     ):
+        # The range of the words; of a resolution D the highest word follows.
         self.low, self.high = (np.asarray(_read_end(name, v)) for name, v in (("low", low), ("high", high)))
         if not np.all(self.high > self.low):
             raise fail("range of words", "low below high", f"{self.low.tolist()} and {self.high.tolist()}")
@@ -199,13 +200,19 @@ class WordReader(NamedTuple):
 
     places: tuple[int, ...]
 
-    def read(self, encoder: Words, outputs: int, numbers: jax.Array) -> jax.Array:
-        """Return the received words and flags, in the order of the channel, then the dithers to be taken off."""
+    def read_words(self, encoder: Words, outputs: int, numbers: jax.Array) -> jax.Array:
+        """Return the received words and flags, in the order of the channel, then the dithers to be taken off.
+
+        Args:
+            encoder: of the words.
+            outputs: length of y.
+            numbers: what the channel delivers: for each word its bits, as signs, and its dither if it has one; flags.
+        """
         low, step = (jnp.asarray(encoder.each(end, outputs)) for end in (encoder.low, encoder.step))
         powers = 2.0 ** np.arange(encoder.bits)
         values, dithers, start = list[jax.Array](), list[jax.Array](), 0
         for place in self.places:
-            if place < 0:
+            if place < 0:  # a flag
                 values.append(numbers[start])
                 start += 1
                 continue

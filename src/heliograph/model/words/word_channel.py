@@ -55,7 +55,7 @@ def rewrite_in_bits(encoder: Words, channel: Channel) -> Channel:
         selection=lambda matrix: known(np.kron(matrix, eye)),
         size=encoder.carried,
     )
-    carried: Channel = at_each_step(lambda link: route(link, form).map, channel)
+    carried: Channel = at_each_step(lambda link: rewrite_channel(link, form).map, channel)
     return carried
 
 
@@ -68,8 +68,11 @@ def rewrite_about_centres(encoder: Words, channel: Channel) -> Channel:
     """
 
     def convert(link: AbstractRandomAffine) -> AbstractRandomAffine:
+        """Return the link of one step between words as numbers about their centres."""
         power = encoder.each(encoder.power, signal_size(link))
-        return route(link, WordForm(lambda flips, places: flips.about_centre(power[list(places)]), known, 1)).map
+        return rewrite_channel(
+            link, WordForm(lambda flips, places: flips.about_centre(power[list(places)]), known, 1)
+        ).map
 
     numbers: Channel = at_each_step(convert, channel)
     return numbers
@@ -78,7 +81,7 @@ def rewrite_about_centres(encoder: Words, channel: Channel) -> Channel:
 def find_places(channel: Channel) -> Places:
     """Return the component of y that each output of a channel of words carries, FLAG of a number that is no word."""
     form = WordForm(lambda flips, places: known(np.eye(flips.dimension)), known, 1)
-    return route(first(channel), form).places
+    return rewrite_channel(first(channel), form).places
 
 
 def reader_of(channel: Channel) -> WordReader:
@@ -86,8 +89,8 @@ def reader_of(channel: Channel) -> WordReader:
     return WordReader(find_places(channel))
 
 
-def route(channel: AbstractRandomAffine, form: WordForm) -> RewrittenMap:
-    """Write a channel of words in another form.
+def rewrite_channel(channel: AbstractRandomAffine, form: WordForm) -> RewrittenMap:
+    """Return a channel of words written in another form, and the components of y at its outputs.
 
     Raises:
         ValueError: a channel that does more with words than select, copy, flip, delay and lose them.
@@ -97,7 +100,15 @@ def route(channel: AbstractRandomAffine, form: WordForm) -> RewrittenMap:
 
 
 def _rewrite_map(link: AbstractRandomAffine, places: Places, form: WordForm) -> RewrittenMap:
-    """Write a map of words in another form; `places`: the components that come in, word by word."""
+    """Return a map of words written in another form, and the components of y at its outputs.
+
+    Maps that are made of others are rewritten part by part: those in series hand on the components.
+
+    Args:
+        link: the map; it may select, copy, flip, delay and lose words.
+        places: component of y that each word carries which comes in.
+        form: how flips and selections are written, and how many numbers a word is.
+    """
     match link:
         case Flips():
             return RewrittenMap(form.flips(link, places), places)
@@ -109,24 +120,24 @@ def _rewrite_map(link: AbstractRandomAffine, places: Places, form: WordForm) -> 
             return _rewrite_series(link, places, form)
         case Stack():
             parts = [_rewrite_map(part, places, form) for part in link.maps]
-            together = tuple(p for part in parts for p in part.places)
-            return RewrittenMap(Stack([part.map for part in parts]), together)
+            places_of_all = tuple(place for part in parts for place in part.places)
+            return RewrittenMap(Stack([part.map for part in parts]), places_of_all)
         case AbstractUniform():
-            return _route_choice(link, places, form)
+            return _rewrite_choice(link, places, form)
         case Erasure() | DelayLine():
             (inner,) = inner_maps(link)
-            routed = _rewrite_map(inner, places, form)
-            return RewrittenMap(replace_inner_maps(link, [routed.map]), routed.places)
-        case Delayed() if not link.timestamped:
+            rewritten = _rewrite_map(inner, places, form)
+            return RewrittenMap(replace_inner_maps(link, [rewritten.map]), rewritten.places)
+        case Delayed() if not link.timestamped:  # the choice of what is late, then the link
             chosen = _rewrite_map(link.delay, places, form)
-            routed = _rewrite_map(link.link, chosen.places, form)
-            maps = [chosen.map if inner is link.delay else routed.map for inner in inner_maps(link)]
-            return RewrittenMap(replace_inner_maps(link, maps), routed.places)
+            rewritten = _rewrite_map(link.link, chosen.places, form)
+            maps = [chosen.map if inner is link.delay else rewritten.map for inner in inner_maps(link)]
+            return RewrittenMap(replace_inner_maps(link, maps), rewritten.places)
     raise refuse_link(type(link).__name__)
 
 
 def _rewrite_selection(link: GainAndNoise, places: Places, form: WordForm) -> RewrittenMap:
-    """Return the route of a wire that selects components; words pass no other gain."""
+    """Return a wire that selects components, rewritten; words pass no other gain."""
     matrix, gain = np.asarray(link.matrix), link.law.constant
     is_noiseless = not np.any(np.asarray(link.noise.covariance)) and not np.any(np.asarray(link.noise.mean))
     selects_one_each = np.isin(matrix, (0, 1)).all() and (matrix.sum(axis=1) == 1).all()
@@ -136,17 +147,17 @@ def _rewrite_selection(link: GainAndNoise, places: Places, form: WordForm) -> Re
 
 
 def _rewrite_series(link: Series, places: Places, form: WordForm) -> RewrittenMap:
-    """Return the route through maps one after another."""
+    """Return maps one after another, rewritten: each gets the components that the one before delivers."""
     maps = []
     for part in link.maps:
-        routed = _rewrite_map(part, places, form)
-        places = routed.places
-        maps.append(routed.map)
+        rewritten = _rewrite_map(part, places, form)
+        places = rewritten.places
+        maps.append(rewritten.map)
     return RewrittenMap(Series(maps), places)
 
 
-def _route_choice(link: AbstractUniform, places: Places, form: WordForm) -> RewrittenMap:
-    """Return the route through one of several maps, all of which deliver the same components."""
+def _rewrite_choice(link: AbstractUniform, places: Places, form: WordForm) -> RewrittenMap:
+    """Return a choice among several maps, rewritten; raise ValueError unless all deliver the same components."""
     parts = [_rewrite_map(part, places, form) for part in link.maps]
     if len({part.places for part in parts}) > 1:
         raise fail("channel of words", "choices and modes that deliver the same components", "others")

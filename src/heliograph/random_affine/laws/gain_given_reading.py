@@ -79,9 +79,15 @@ def gain_given_reading(law: AbstractLaw, reading: Float[Array, ""], variance: Fl
 
 
 def _integrate_posterior(law: AbstractLaw, a: jax.Array, variance: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the mean and variance of the posterior of a positive gain, by quadrature over all within NATS of its mode.
+    """Return the mean and variance of a positive gain g given a reading a = g + e, e of N(0, variance).
 
-    In t = g^(1/4), or log g of a law that is wide on a logarithmic scale, the density is smooth to its ends.
+    By quadrature over all t where the posterior's log density is within NATS of that at its mode. In t = g^(1/4), or
+    log g of a law that is wide on a logarithmic scale, the density is smooth to its ends.
+
+    Args:
+        law: of g before the reading.
+        a: the reading.
+        variance: of its error.
     """
     deviation = jnp.sqrt(variance)
 
@@ -152,7 +158,7 @@ def _find_density_end(log_density: LogDensity, outer: jax.Array, mode: jax.Array
 
 
 def gain_quadrature(
-    law: AbstractLaw, count: int = GAINS
+    law: AbstractLaw,
 ) -> tuple[Float[np.ndarray, "nodes 1"], Float[np.ndarray, " nodes"]]:
     """Return gains (nodes, 1) and weights (nodes,) by which a mean over a gain is a sum: those of Gauss and Legendre.
 

@@ -203,7 +203,10 @@ class Discrete(AbstractLaw):
 
     @cache_by_object
     def corners(self) -> Float[jax.Array | np.ndarray, "corner atom"]:
-        """Return the corners of the polytope of probabilities: each but one at an end of its interval.
+        """Return the corners of the polytope of probabilities, one in each row, with every value's probability.
+
+        The polytope: each probability within its radius and in [0, 1], the sum 1. At a corner each but one of the
+        uncertain probabilities is at an end of its interval.
 
         Raises:
             ValueError: more than CORNER_LIMIT uncertain atoms, whose corners are too many to list.
@@ -222,11 +225,12 @@ class Discrete(AbstractLaw):
             for ends in product(*((low[i], high[i]) for i in others)):
                 corner = self.probabilities.copy()
                 corner[others] = ends
-                corner[slack] = 0.0
+                corner[slack] = 0.0  # not counted in the sum of the others
                 corner[slack] = 1.0 - corner.sum()
                 if low[slack] - BEYOND <= corner[slack] <= high[slack] + BEYOND:
                     corners.add(tuple(np.round(np.clip(corner, 0.0, 1.0), 15)))
-        return np.array([np.array(c) / sum(c) for c in sorted(corners)])
+        # Rounded, so that each corner is found once; then of sum 1 again.
+        return np.array([np.array(corner) / sum(corner) for corner in sorted(corners)])
 
 
 class CertainDiscrete(Discrete):

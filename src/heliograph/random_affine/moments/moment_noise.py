@@ -78,7 +78,7 @@ def check_moments(moments: np.ndarray) -> None:
     (finitely many atoms) h must lie in its range.
     """
     sequence = np.concatenate([[1.0], moments])
-    # Moments in units of the second one's root, so that one tolerance serves all orders; up to the first order whose
+    # m[k] = E[n^k] in units of root(E[n^2])^k, so that one tolerance serves all orders; up to the first order whose
     # unit is no double.
     scale = max(float(sequence[2]) ** 0.5, np.finfo(float).tiny) if sequence[2] > 0 else 1.0
     size = scale ** np.arange(len(sequence))
@@ -116,27 +116,29 @@ def recorded_noise(samples: "Float[ArrayLike, 'samples *components']", order: in
     Raises:
         ValueError: fewer than two samples, an order below 1, numbers that are not finite.
     """
-    single = rank("noise samples", samples) == 1
-    values = array("noise samples", samples, (None,) if single else (None, None))
-    values = values[:, None] if single else values
+    # Samples as (samples, components).
+    is_scalar = rank("noise samples", samples) == 1
+    values = array("noise samples", samples, (None,) if is_scalar else (None, None))
+    values = values[:, None] if is_scalar else values
     if len(values) < 2:
         raise fail("noise samples", "at least two", len(values))
     check_count("order of the noise moments", order)
-    absolute = np.abs(values)
-    worst, where = 0.0, 1
     # The moment that is known worst, relative to its largest possible size, and its order.
+    absolute = np.abs(values)
+    worst, worst_order = 0.0, 1
     for powers in (a for k in range(1, order + 1) for a in list_exponents(values.shape[1], k)):
         degree = sum(powers)
         # Standard error of the mean of n^a, and Hölder's bound of its size.
         error = np.std(np.prod(values ** np.array(powers), axis=1)) / np.sqrt(len(values))
         size = np.prod(np.mean(absolute**degree, axis=0) ** (np.array(powers) / degree))
         if size > 0 and error / size > worst:
-            worst, where = float(error / size), degree
-    if worst > MOMENT_ERROR:
+            worst, worst_order = float(error / size), degree
+    if worst > MOMENT_ERROR:  # the error falls as 1 / root of the number of samples
         needed = ceil(len(values) * (worst / MOMENT_ERROR) ** 2)
         warnings.warn(
-            f"recorded noise: a moment of order {where} is known to {100 * worst:.0f} % only; about {needed:,} samples "
-            f"instead of {len(values):,} would give {100 * MOMENT_ERROR:.0f} %, or use a filter of lower degree",
+            f"recorded noise: a moment of order {worst_order} is known to {100 * worst:.0f} % only; about "
+            f"{needed:,} samples instead of {len(values):,} would give {100 * MOMENT_ERROR:.0f} %, or use a filter of "
+            "lower degree",
             stacklevel=2,
         )
     return FiniteSupport(values, np.full(len(values), 1 / len(values)))

@@ -162,9 +162,10 @@ class MomentBounds(NamedTuple):
 
 
 def _bound_moments(channel: AbstractRandomAffine) -> MomentBounds:
-    """Return E[(G, n)] under the nominal law, and maps W -> matrix above spread, shift and power of every possible law.
+    """Return E[(G, n)] under the nominal law, and maps that bound second moments of z = G y + n under all laws.
 
-    Exact where the law is known.
+    The maps take W = E[(y, 1) (y, 1)'] to a matrix above the spread E[((G, n) - nominal mean) W (...)'], the shift (the
+    same of the law's mean) and the power E[(G, n) W (G, n)'] without the constant. Exact where the law is known.
     """
     # Whether corner laws are few enough to be listed.
     corners = count_corners(channel)
@@ -213,10 +214,11 @@ def _drop_known_gain(channel: AbstractRandomAffine, spread: Tensor) -> Tensor:
 
 
 def _bound_stacked_maps(channel: Stack) -> list[QuadraticMap]:
-    """Return bounds of spread, shift and power of a stack of independent maps.
+    """Return bounds of spread, shift and power of a stack of independent maps H_i, of nominal means M_i.
 
-    Diagonal blocks are those of each part. Off the diagonal, parts meet through their means only:
-    E[(H_i - M_i) Y Y' (H_j - M_j)'] = D_i Y Y' D_j' with |D_i| at most the reach of the mean of part i.
+    Diagonal blocks are those of each part. Off the diagonal, parts meet through their means only, Y = (y, 1):
+    E[(H_i - M_i) Y Y' (H_j - M_j)'] = D_i Y Y' D_j', D_i = E H_i - M_i at most the `reach` of part i in each entry. A
+    bound is a map with a center, and a radius of each entry.
     """
     n, mean, start = channel.outputs, channel.moments(1).mean[:-1], 0
     blocks: list[list[QuadraticMap]] = []  # (spread, shift, power) of each part
@@ -237,6 +239,7 @@ def _bound_stacked_maps(channel: Stack) -> list[QuadraticMap]:
     reach, size = xp.concatenate(reaches), xp.abs(mean)
     cross = symmetric_product(reach, reach)
     power_cross = drop_constant(symmetric_product(size, reach) + symmetric_product(reach, size) + cross)
+    # Of spread, shift and power.
     centers = (0.0, 0.0, drop_constant(symmetric_product(mean, mean)))
     radii = (cross, cross, power_cross)
     return [
@@ -288,17 +291,24 @@ def _stack_spreads(spreads: Sequence[Tensor]) -> Tensor:
 
 
 def _bound_sum(channel: Superposed, parts: Sequence[MomentBounds]) -> MomentBounds:
-    """Return the bounds of a sum of independent maps: their spreads add up, and their means meet in every pair.
+    """Return the bounds of a sum of independent maps and a noise, from those of each map.
 
-    With D_i the shift of a mean, (sum D_i) Y (sum D_i)' <= sum_i D_i Y D_i' / w_i for weights w of sum 1, which are as
-    the sizes of the shifts; the spread about the nominal means is within sum_i Spread_i + (1 / w_i - 1) D_i Y D_i'.
+    Spreads add up; shifts of means meet in every pair. With D_i the shift of mean i and Y = E[(y, 1) (y, 1)'],
+    (sum D_i) Y (sum D_i)' <= sum_i D_i Y D_i' / w_i for weights w of sum 1, here in proportion to the sizes of the
+    shifts; the spread about the nominal means is within sum_i Spread_i + (1 / w_i - 1) D_i Y D_i'.
+
+    Args:
+        channel: the sum.
+        parts: bounds of each of its maps.
     """
+    # Nominal mean, map of the noise, of the mean's power, and sum of the spreads.
     every = range(len(parts))
     mean = channel.in_places({i: parts[i].mean for i in every}, 1)
     mean = mean + channel.noise.mean[:, None] * np.eye(channel.inputs + 1)[-1]
     noise = map_of_known_law(channel.noise.covariance[..., None, None] * _constant_power(channel.inputs + 1))
     of_mean = map_of_known_law(drop_constant(symmetric_product(mean, mean)))
     own = add_maps(_sum_maps(channel, {i: (parts[i].spread, 1.0) for i in every}), noise)
+    # Known means: nothing is shifted.
     sizes = [size_of_map(bounds.shift) for bounds in parts]
     total = sum(sizes)
     if is_zero(total):
@@ -306,7 +316,7 @@ def _bound_sum(channel: Superposed, parts: Sequence[MomentBounds]) -> MomentBoun
     inverse = {i: total / sizes[i] for i in every if not is_zero(sizes[i])}  # 1 / w_i
     shift = _sum_maps(channel, {i: (parts[i].shift, weight) for i, weight in inverse.items()})
     cross = _sum_maps(channel, {i: (parts[i].shift, weight - 1) for i, weight in inverse.items()})
-    # Power of the mean, (m + d)^2 <= (1 + d / m) m^2 + (1 + m / d) d^2, and the variances.
+    # Power: of the mean m shifted by d, (m + d)^2 <= (1 + d / m) m^2 + (1 + m / d) d^2, and the variances.
     mean_size = size_of_map(of_mean)
     ratio = total / library(mean_size).where(mean_size > 0, mean_size, 1.0)
     power = add_maps(signal_of_map(own), scale_map(of_mean, 1 + ratio), scale_map(signal_of_map(shift), 1 + 1 / ratio))

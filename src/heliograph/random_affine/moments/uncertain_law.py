@@ -38,9 +38,14 @@ def dominate(tensors: Tensor, mean: Matrix) -> QuadraticMap:
 
 
 def _find_common_gain(tensors: Tensor, mean: Matrix) -> tuple[Tensor, np.ndarray | jax.Array]:
-    """Return max_v s_v M y y' M' + N_max, the largest noise, and whether it dominates the tensors of all laws v.
+    """Return max_v s_v M y y' M' + N_max, N_max the largest noise, and whether it dominates the tensors of all laws v.
 
-    It does if to rounding gains_v = s_v M y y' M', gain and noise are uncorrelated, and N_max - N_v >= 0.
+    It does if the gain's part of the tensor of law v is s_v M y y' M', to rounding, gain and noise are uncorrelated,
+    and N_max - N_v >= 0.
+
+    Args:
+        tensors: (law, m, m, p + 1, p + 1), maps of (y, 1) (y, 1)' to a second moment of z.
+        mean: (M, mean offset) (m, p + 1).
     """
     xp = library(tensors, mean)
     shape = symmetric_product(mean[:, :-1], mean[:, :-1])  # M y y' M'
@@ -70,9 +75,16 @@ def _find_common_gain(tensors: Tensor, mean: Matrix) -> tuple[Tensor, np.ndarray
 
 
 def bound_from_intervals(channel: AbstractRandomAffine, nominal: JointMoments, mean: Matrix) -> list[QuadraticMap]:
-    """Return bounds of spread, shift and power from the interval of each moment.
+    """Return bounds of spread, shift and power of a channel, from the interval in which each of its moments lies.
 
-    With the nominal mean H0 and raw second moments and means m of any law the spread is raw - H0 m' - m H0' + H0 H0'.
+    With the nominal mean H0, and raw second moments and means m of any law, the spread is raw - H0 m' - m H0' + H0 H0',
+    the shift (m - H0)(m - H0)', and the power raw without the constant. A bound is a map: a center, and a radius of
+    each entry.
+
+    Args:
+        channel: the channel.
+        nominal: its moments up to the second under the nominal law, for their shape.
+        mean: H0 (m, p + 1).
     """
     low, high = channel.moment_interval(2)
     xp = library(low, high, mean)

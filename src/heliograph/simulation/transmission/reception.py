@@ -173,7 +173,7 @@ def _send_through_channel(
         return y, z, memory
     words, numbers = group.encoder.send(y, draw_key(key, k, group.checksums, DITHER))
     memory, received = deliver_signal(group.channel, memory, numbers, key, k, group.checksums, group.memories)
-    return words, group.reader.read(group.encoder, len(y), received), memory
+    return words, group.reader.read_words(group.encoder, len(y), received), memory
 
 
 def _first_mean(filter: AbstractFilter) -> jax.Array:
