@@ -62,6 +62,7 @@ def sum_chunk(recursion: Recursion, state: PyTree, rows: PyTree, first: Array, c
     """Scan rows as `scan_chunk` does, and return the sums over rows of what is kept of each."""
 
     def step(state: PyTree, data: PyTree, k: Array) -> tuple[PyTree, PyTree]:
+        """Step over row k; return the state after it and what is kept of it."""
         return recursion.step(state, data, k)
 
     return sum_rows(step, jax.tree.map(jnp.asarray, state), rows, first, count)

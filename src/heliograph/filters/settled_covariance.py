@@ -92,11 +92,11 @@ def find_settled_state(recursion: Recursion, start: PyTree, rows: PyTree, ahead:
         return None
     arguments = recursion, start, row, np.arange(TURNS * ahead).reshape(2, -1)
     choice = choose_code(_settle, arguments, [False] * len(arguments))
-    return None if choice.code is None else compare_windows(varies, *choice.results())
+    return None if choice.code is None else find_unchanged_state(varies, *choice.results())
 
 
-def compare_windows(varies: tuple[bool, ...], after_windows: PyTree, outputs: PyTree) -> SettledState | None:
-    """Return the state after two windows of rows if it is the one after the first; None if not.
+def find_unchanged_state(varies: tuple[bool, ...], after_windows: PyTree, outputs: PyTree) -> SettledState | None:
+    """Return the state after two windows of rows if it is, but for means, the one after the first; None if not.
 
     Args:
         varies: which leaves of `outputs` depend on data.
@@ -183,6 +183,7 @@ def sum_settled_rows(
     """Scan complete rows as `scan_settled_rows` does; return the last means, and sums of all that is kept of a row."""
 
     def step(means: list[jax.Array], data: PyTree, k: Array) -> tuple[list[jax.Array], PyTree]:
+        """Step over the complete row k from the settled state with these means; return the next means, and output."""
         after, outputs = step_settled(recursion, settled.state, means, data, k)
         return means_of(after), outputs
 

@@ -191,6 +191,7 @@ def dropout(channel: AbstractRandomAffine, arrival: ArrayLike, radius: ArrayLike
     p = scalar("arrival probability", arrival, 0.0, 1.0)
 
     def build(links: Sequence[AbstractRandomAffine]) -> Mixture:
+        """Return the channel of one step: its link with probability p, else silence."""
         nothing = silent(links[0].outputs, links[0].inputs)
         return Mixture([links[0], nothing], library(p).stack([p, 1 - p]), radius)
 
@@ -311,6 +312,7 @@ def mean_gain(channel: Channel) -> Channel:
     """
 
     def mean_of(channel: AbstractRandomAffine) -> AbstractRandomAffine:
+        """Return the channel of one step with its gains at their means; raise ValueError if it remembers."""
         check_forgets("channel taken at its mean gain", check_maps("channel taken at its mean gain", [channel])[0])
         return channel.mean_gain()
 

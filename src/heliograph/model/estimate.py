@@ -45,6 +45,7 @@ class Estimate(Module):
     attitude: tuple[int, ...] = eqx.field(static=True, default=(), repr=False)
 
     def __check_init__(self) -> None:
+        """Raise ValueError unless the claim is one."""
         check_claim(self.claim)
 
     def error(self, truth: Float[Array, "... n"]) -> Any:
@@ -153,7 +154,7 @@ def _are_covariances(bound: np.ndarray) -> np.ndarray:
 
 
 def _judge_covariances(bound: np.ndarray) -> np.ndarray:
-    """Return the same mask, of each matrix by itself."""
+    """Return which matrices (..., n, n) are finite and positive semidefinite to rounding, judged one by one."""
     finite = ~find_not_finite(bound, 2)
     if finite.all() and _are_definite((bound + np.swapaxes(bound, -1, -2)) / 2):
         return np.asarray(finite)

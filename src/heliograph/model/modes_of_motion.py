@@ -125,6 +125,7 @@ class ModalPlant(AbstractPlant, AbstractWithMemory):
         return _ChosenPlant(self.models, jnp.asarray(state)) if same_numbers is None else same_numbers
 
     def _refuse(self) -> NoReturn:
+        """Raise ValueError: what needs one law of motion got several."""
         raise fail(
             "plant", f"one law of motion here ({SEVERAL_TAKEN_BY})", f"a markov_plant of {len(self.models)} modes"
         )
@@ -198,6 +199,7 @@ class ModalSensor(AbstractSensor, AbstractWithMemory):
         return _ChosenSensor(self.models, jnp.asarray(state)) if same_numbers is None else same_numbers
 
     def _refuse(self) -> NoReturn:
+        """Raise ValueError: what needs one law of what is measured got several."""
         raise fail("sensor", f"one law of what is measured here ({SEVERAL_TAKEN_BY})",
                    f"a markov_sensor of {len(self.models)} modes")  # fmt: skip
 
@@ -209,9 +211,11 @@ class _ChosenNoise(Module):
     index: jax.Array
 
     def sample(self, key: jax.Array) -> jax.Array:
+        """Draw from the noise of the index."""
         return jnp.stack([noise.sample(key) for noise in self.noises])[self.index]
 
     def report(self, value: jax.Array) -> jax.Array:
+        """Return what the sensor of the index reports of a value, such as it rounded."""
         return jnp.stack([noise.report(value) for noise in self.noises])[self.index]
 
 

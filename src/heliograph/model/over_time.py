@@ -40,10 +40,12 @@ class OverTime(Module):
 
 
 def _convert_leaf(leaf: object) -> object:
+    """Return numbers and lists as arrays of doubles, anything else as it is."""
     return np.asarray(leaf, dtype=np.float64) if isinstance(leaf, int | float | list) else leaf
 
 
 def _list_arrays(tree: object) -> list[PyTree]:
+    """Return the arrays of a tree."""
     return [leaf for leaf in jax.tree.leaves(tree) if eqx.is_array(leaf)]
 
 
@@ -64,6 +66,7 @@ def structure(model: object) -> Hashable:
 
 
 def _describe_structure(leaves: Sequence[Any], tree: Hashable) -> Hashable:
+    """Return a key of a tree's form, the shapes of its arrays and its other leaves."""
     return tree, tuple(("array", leaf.shape) if eqx.is_array(leaf) else leaf for leaf in leaves)
 
 
@@ -73,13 +76,14 @@ def alike(a: object, b: object) -> bool:
 
 
 def _stack_leaves(*leaves: PyTree) -> object:
+    """Return arrays stacked along a new first axis, by JAX if one of them is JAX's."""
     if any(isinstance(leaf, jax.Array) for leaf in leaves):
         return jnp.stack(leaves)
     return np.stack(leaves)
 
 
 def over_time(items: Sequence[object]) -> OverTime:
-    """One model object per time step (a channel, a plant, ...) as a single object that varies in time.
+    """Return one model object per time step (a channel, a plant, ...) as a single object that varies in time.
 
     What channels remember without a name is one memory over time, whose transition may differ from step to step.
 
@@ -104,6 +108,7 @@ def at(tree: PyTree, k: int | np.integer | Int[np.ndarray | Array, ""]) -> PyTre
     """
 
     def read(leaf: object) -> PyTree:
+        """Return the k-th values of an `OverTime`, anything else as it is."""
         if not isinstance(leaf, OverTime):
             return leaf
         values, rest = eqx.partition(leaf.values, eqx.is_array)
@@ -113,6 +118,7 @@ def at(tree: PyTree, k: int | np.integer | Int[np.ndarray | Array, ""]) -> PyTre
 
 
 def _take_entry(values: PyTree, k: PyTree) -> object:
+    """Return values[k], also for a k that is traced."""
     if isinstance(k, jax.Array):
         return jax.lax.dynamic_index_in_dim(jnp.asarray(values), k, keepdims=False, allow_negative_indices=False)
     return values[k, ...]  # the dots keep a number an array

@@ -72,7 +72,7 @@ class AbstractSensor(Module):
         if not self.inputs:
             return self
         places = np.array([list(names).index(name) for name in self.inputs])
-        return _give(self, u[places])
+        return _sensor_under_inputs(self, u[places])
 
     def typical(self, names: Sequence[str]) -> "AbstractSensor":
         """Return the sensor under inputs of 1; raise ValueError unless the plant has the inputs that it needs."""
@@ -90,7 +90,7 @@ class AbstractSensor(Module):
     def check_states(self, states: int) -> None:
         """Raise ValueError unless the sensor measures a state of this length and returns its outputs."""
         if self.inputs:
-            _give(self, np.ones(len(self.inputs))).check_states(states)
+            _sensor_under_inputs(self, np.ones(len(self.inputs))).check_states(states)
             return
         try:
             got = trace_shape("measure(x) of a sensor", self.measure, np.zeros(states))
@@ -145,7 +145,7 @@ class Sensor(AbstractSensor):
             self.noise = _round_to(self.noise, resolution, self.circular)
             return
         # A function of x alone: the number of outputs is that of their names, or of the noise's components.
-        self.function, law = _take_state_alone(measure), _constant("sensor noise", noise)
+        self.function, law = _take_state_alone(measure), _require_constant("sensor noise", noise)
         dimension = (count_components(law) or 1) if outputs is None else len(name_list("sensor outputs", outputs))
         self.noise = as_noise("sensor noise", law, dimension)
         self.outputs = names("sensor outputs", outputs, dimension, "y")
@@ -207,8 +207,8 @@ class LinearSensor(AbstractSensor):
             self.circular = read_angles("circular outputs", circular, self.outputs)
             self.noise = _round_to(self.noise, resolution, self.circular)
             return
-        self.matrix = array("sensor matrix", _constant("sensor matrix", matrix), ("outputs", "states"))
-        self.noise = as_noise("sensor noise", _constant("sensor noise", noise), self.matrix.shape[-2])
+        self.matrix = array("sensor matrix", _require_constant("sensor matrix", matrix), ("outputs", "states"))
+        self.noise = as_noise("sensor noise", _require_constant("sensor noise", noise), self.matrix.shape[-2])
         self.outputs = names("sensor outputs", outputs, self.matrix.shape[-2], "y")
         self.circular = read_angles("circular outputs", circular, self.outputs)
         self.noise = _round_to(self.noise, resolution, self.circular)
@@ -250,7 +250,7 @@ def _round_to(noise: AbstractNoise, resolution: ArrayLike | None, circular: Sequ
 
 
 @in_float64
-def _give(sensor: AbstractSensor, u: Array) -> AbstractSensor:
+def _sensor_under_inputs(sensor: AbstractSensor, u: Array) -> AbstractSensor:
     """Return the sensor under its inputs u, computed in double precision."""
     return sensor.given(jnp.asarray(u))
 
@@ -270,7 +270,7 @@ def _take_state_alone(measure: object) -> Callable[[jax.Array], ArrayLike]:
     return checked
 
 
-def _constant(name: str, value: object) -> Any:
+def _require_constant(name: str, value: object) -> Any:
     """Return a constant; raise ValueError where it is a function of inputs that have no names."""
     if callable(value):
         expected = "a constant, or inputs=[...], the names of those of the plant that a function takes"

@@ -46,6 +46,7 @@ class NoiseOfInputs(Module):
         return value * jnp.eye(self.outputs) if value.ndim == 0 else value
 
     def _refuse(self) -> Any:
+        """Raise ValueError: here the noise must be a constant law."""
         raise fail(
             "sensor noise", "a constant one, as what is computed before data needs", f"one of {list(self.inputs)}"
         )

@@ -101,6 +101,7 @@ class AbstractTrigger(Module):
         return jnp.where(sender.begun, reason, SendReason.FIRST)
 
     def _event_reason(self) -> int:
+        """Return the reason of a transmission that the rule's event makes."""
         return SendReason.EVENT
 
     def after(self, sender: SenderState, y: jax.Array, reason: jax.Array, arrived: jax.Array) -> SenderState:
@@ -296,6 +297,7 @@ class Periodic(AbstractTrigger):
         return jnp.full(len(error), k % self.period == self.phase)
 
     def _event_reason(self) -> int:
+        """Return the reason of a transmission by schedule."""
         return SendReason.SCHEDULE
 
 

@@ -40,7 +40,7 @@ def constant_velocity(
 
     Source: Bar-Shalom, Li and Kirubarajan, Estimation with applications to tracking (2001), 6.2.2.
     """
-    return _repeat_on_axes([[0, 1], [0, 0]], _intensity(2, intensity), axes, dt, initial_mean, initial_covariance)
+    return _repeat_on_axes([[0, 1], [0, 0]], _make_intensity(2, intensity), axes, dt, initial_mean, initial_covariance)
 
 
 def constant_acceleration(
@@ -67,7 +67,7 @@ def constant_acceleration(
     Source: Bar-Shalom, Li and Kirubarajan, Estimation with applications to tracking (2001), 6.2.3.
     """
     motion = [[0, 1, 0], [0, 0, 1], [0, 0, 0]]
-    return _repeat_on_axes(motion, _intensity(3, intensity), axes, dt, initial_mean, initial_covariance)
+    return _repeat_on_axes(motion, _make_intensity(3, intensity), axes, dt, initial_mean, initial_covariance)
 
 
 def singer(
@@ -99,7 +99,9 @@ def singer(
     size, rate = _deviation_and_rate(deviation, time)
     motion = library(rate).asarray([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -rate]])
     start = library(size).asarray([WIDE, WIDE, size**2])
-    return _repeat_on_axes(motion, _intensity(3, 2 * size**2 * rate), axes, dt, initial_mean, initial_covariance, start)
+    return _repeat_on_axes(
+        motion, _make_intensity(3, 2 * size**2 * rate), axes, dt, initial_mean, initial_covariance, start
+    )
 
 
 def gauss_markov(
@@ -183,7 +185,7 @@ def _deviation_and_rate(deviation: ArrayLike, time: ArrayLike) -> tuple[Any, Any
     return scalar("deviation", deviation, 0.0, LARGEST), 1 / scalar("time", time, 1 / LARGEST)
 
 
-def _intensity(order: int, value: ArrayLike) -> Any:
+def _make_intensity(order: int, value: ArrayLike) -> Any:
     """Return the intensity of noise that enters the last of so many states."""
     q = scalar("noise intensity", value, 0.0)
     return q * np.diag([0.0] * (order - 1) + [1.0])

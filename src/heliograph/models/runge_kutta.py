@@ -34,15 +34,15 @@ class RungeKuttaStep(MotionOverStep):
 
     def __call__(self, x: jax.Array, u: jax.Array) -> jax.Array:
         """Return the state after a step."""
-        own, dt = self.split(u)
+        inputs, dt = self.split(u)
         h = dt / self.substeps
 
         def take_substep(_: object, x: jax.Array) -> jax.Array:
             """Return the state after one of the shorter steps."""
-            first = as_real(self.drift(x, own))
-            second = as_real(self.drift(x + h / 2 * first, own))
-            third = as_real(self.drift(x + h / 2 * second, own))
-            fourth = as_real(self.drift(x + h * third, own))
+            first = as_real(self.drift(x, inputs))
+            second = as_real(self.drift(x + h / 2 * first, inputs))
+            third = as_real(self.drift(x + h / 2 * second, inputs))
+            fourth = as_real(self.drift(x + h * third, inputs))
             moved: jax.Array = x + h / 6 * (first + 2 * second + 2 * third + fourth)
             return moved
 

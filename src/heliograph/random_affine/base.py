@@ -165,7 +165,7 @@ class AbstractRandomAffine(Module):
         return matrices.min(axis=0), matrices.max(axis=0)
 
     def _interval_of_parts(self, order: int) -> Interval:
-        """Combine intervals of the parts' moments; by default a refusal."""
+        """Return the interval of E[Sym^order(H)] made of those of the parts; by default raise ValueError."""
         raise fail("uncertain channel", f"at most {CORNERS} corner laws", count_corners(self))
 
     def mean_gain(self) -> "AbstractRandomAffine":
@@ -286,7 +286,7 @@ class AbstractRandomAffine(Module):
         return len(believed) == len(parts) and all(x.covers(y, same_noise) for x, y in pairs)
 
     def covers_kind(self, own: "AbstractRandomAffine", same_noise: SameNoise) -> bool:
-        """Decide the same as `covers` of a map that is no series; by default only an equal map is covered."""
+        """Return whether `own`, no series, is covered as `covers` says; by default only an equal one is."""
         return are_same(self, own)
 
     @property
@@ -333,6 +333,7 @@ def replace_inner_maps(channel: T, maps: Sequence[AbstractRandomAffine]) -> T:
 
 
 def _fields(channel: object) -> tuple[list[PyTree], jax.tree_util.PyTreeDef]:
+    """Return the leaves of a map, the maps inside it being leaves, and their tree."""
     return jax.tree.flatten(channel, is_leaf=lambda x: x is not channel and isinstance(x, AbstractRandomAffine))
 
 

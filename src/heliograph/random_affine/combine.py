@@ -123,7 +123,7 @@ class Series(AbstractCombination):
 
     @cache_by_object
     def corner_moments(self, order: int) -> Corners:
-        """Return the products of the parts' corners."""
+        """Return E[Sym^order(H)] at each combination of the maps' corners: the product of their matrices."""
         first, *rest = (m.corner_moments(order) for m in self.maps)
         for corners in rest:
             products = corners @ first[:, None]
@@ -131,7 +131,7 @@ class Series(AbstractCombination):
         return first
 
     def _interval_of_parts(self, order: int) -> Interval:
-        """Return the products of the parts' intervals."""
+        """Return the interval of E[Sym^order(H)]: the matrix product of the intervals of all maps."""
         intervals = [m.moment_interval(order) for m in self.maps]
         return reduce(lambda before, after: multiply_matrices(after, before), intervals)
 
@@ -141,7 +141,7 @@ class Series(AbstractCombination):
         return [m for affine in self.maps for m in affine.in_series]
 
     def carry_known_gains(self, known: KnownGains) -> KnownGains:
-        """Return the outputs that are known behind each map in turn."""
+        """Return for each output whether its gain is known behind all maps in turn, from the same of each input."""
         return reduce(lambda before, affine: affine.carry_known_gains(before), self.maps, known)
 
     def carry_angles(self, sent: Angles) -> Angles:
@@ -173,7 +173,7 @@ class Series(AbstractCombination):
         return ARROW.join(filter(None, (affine.in_words() for affine in self.maps)))
 
     def detach_outliers(self) -> tuple[AbstractRandomAffine, AbstractNoise | None]:
-        """Take the noise of the last map."""
+        """Return the series without the noise of its last map where its law has outliers, and that noise."""
         *before, last = self.maps
         plain, noise = last.detach_outliers()
         return (self, None) if noise is None else (Series([*before, plain]), noise)
@@ -248,7 +248,7 @@ class Stack(AbstractCombination):
         )
 
     def _interval_of_parts(self, order: int) -> Interval:
-        """Return the products of the parts' interval polynomials, row by row."""
+        """Return the interval of E[Sym^order(H)]: row by row the product of the maps' interval polynomials."""
         tables = [[stack_parts(m.moment_interval(k)) if k else None for k in range(order + 1)] for m in self.maps]
         rows = stack_parts(multiply_moments_of_parts(self, order, tables, multiply_interval_polynomials))
         return rows[:, 0], rows[:, 1]
@@ -259,11 +259,11 @@ class Stack(AbstractCombination):
         return [m for affine in self.maps for m in affine.in_parallel]
 
     def covers_kind(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
-        """Return a stack of maps that are covered one by one."""
+        """Return whether `own` is a stack of maps that this one's cover one by one."""
         return self.covers_maps(own, same_noise)
 
     def carry_known_gains(self, known: KnownGains) -> KnownGains:
-        """Return the known gains of the maps, one after another."""
+        """Return for each output whether its gain is known, map after map, from the same of each input."""
         return np.concatenate([affine.carry_known_gains(known) for affine in self.maps])
 
     def carry_angles(self, sent: Angles) -> Angles:
@@ -293,7 +293,7 @@ class Stack(AbstractCombination):
         return list_in_words(self.maps)
 
     def detach_outliers(self) -> tuple[AbstractRandomAffine, AbstractNoise | None]:
-        """Take the noise of each map, none where a map has no outliers."""
+        """Return the stack without the noises of its maps where their laws have outliers, and these noises."""
         parts = [affine.detach_outliers() for affine in self.maps]
         if all(noise is None for _, noise in parts):
             return self, None

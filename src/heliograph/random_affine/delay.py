@@ -44,7 +44,7 @@ class AbstractDelayLine(AbstractMapWrapper):
         return (self.line,)
 
     def rebuilt(self, *parts: AbstractRandomAffine) -> AbstractRandomAffine:
-        """Return another map of the line, as late."""
+        """Return a delay line of the same length with another map."""
         return DelayLine(parts[0], self.past)
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
@@ -264,7 +264,7 @@ class RelayStorage(AbstractMapWrapper):
         return self.base.init(key), jnp.zeros((self.steps, self.base.outputs, self.base.inputs + 1))
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
-        """Draw the present reception, and put it before the earlier ones."""
+        """Draw the present reception; return H of all stored ones, the newest first, and those to be stored."""
         inner, before = state
         inner, h = self.base.draw(inner, key)
         # Each reception takes its own part of the line: that of t steps ago begins t signals later.

@@ -75,6 +75,7 @@ def condition_on_states(channel: T, by_identity: Mapping[str, int | float | jax.
     """Return `condition_on_memories` for states by the identity of their memory, among which there may be others."""
 
     def condition(leaf: PyTree) -> PyTree:
+        """Return a map with a memory as it is in the memory's state, anything else as it is."""
         return leaf.given(by_identity[leaf.memory.identity]) if is_modal(leaf) else leaf
 
     memoryless: T = jax.tree.map(condition, channel, is_leaf=is_modal)
@@ -126,6 +127,7 @@ def replace_memories(channel: T, twins: Mapping[str, AbstractMemory]) -> T:
     """Return the map with other memories in place of those of these identities."""
 
     def replace(leaf: PyTree) -> PyTree:
+        """Return a map with a memory with the other memory in its place, anything else as it is."""
         if not is_modal(leaf) or leaf.memory.identity not in twins:
             return leaf
         return eqx.tree_at(lambda m: m.memory, leaf, twins[leaf.memory.identity])

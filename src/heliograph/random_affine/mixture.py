@@ -85,7 +85,7 @@ class Mixture(AbstractUniform, AbstractCombination):
         return len(self.choice.corners()) * super().corner_count()
 
     def covers_kind(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
-        """Return a mixture by a law that is believed possible, of maps that are covered one by one."""
+        """Return whether `own` is a mixture by a law that this one's covers, of maps that are covered one by one."""
         return isinstance(own, Mixture) and self.choice.covers(own.choice) and self.covers_maps(own, same_noise)
 
     def list_atoms(self) -> list[AffineComponent]:

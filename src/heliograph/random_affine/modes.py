@@ -135,7 +135,7 @@ class OneStepLate(AbstractMapWrapper):
         return self.base.init(key), jnp.full((self.outputs, self.inputs + 1), jnp.nan)
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
-        """Draw for the next step."""
+        """Return what was drawn at the step before, and draw what the next step receives."""
         inner, before = state
         inner, h = self.base.draw(inner, key)
         return (inner, h[:-1]), jnp.concatenate([before, h[-1:]])

@@ -72,7 +72,7 @@ class StudentT(AbstractNoise):
         return True
 
     def branches(self) -> GaussianBranches:
-        """Return one for each of the PRECISIONS."""
+        """Return each component as a mixture of Gaussian branches, one for each of the PRECISIONS."""
         xp, n = library(self.degrees, self.scale), self.dimension
         shape = (n, len(PRECISIONS))
         shares = xp.broadcast_to(_take_log(precision_shares(self.degrees)), shape)
@@ -202,18 +202,18 @@ class Contaminated(AbstractNoise):
         return not np.any(np.asarray(self.means) != 0)
 
     def branches(self) -> GaussianBranches:
-        """Return the branches of the law."""
+        """Return each component as a mixture of Gaussian branches about the mean, those of the law."""
         xp, n = library(self.shares), self.dimension
         shares = xp.broadcast_to(_take_log(self.shares), (n, len(self.shares)))
         variances = xp.diagonal(self.covariances, axis1=1, axis2=2).T
         return GaussianBranches(shares, (self.means - self.mean).T, variances)
 
     def without_outliers(self) -> NoiseWithoutOutliers:
-        """Return the first branch."""
+        """Return the mean and covariance of the first branch: the noise without outliers."""
         return NoiseWithoutOutliers(self.means[0] - self.mean, self.covariances[0])
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """Draw the branch, then from it."""
+        """Draw the branch by the shares, then the noise from it."""
         first, second = jax.random.split(key)
         branch = draw_index(self.shares, first)
         laws = [Gaussian(r, m) for r, m in zip(self.covariances, self.means, strict=True)]

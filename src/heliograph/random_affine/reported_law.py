@@ -323,6 +323,7 @@ def believe_told(channel: T, numbers: Numbers) -> T:
     parts = _share_numbers_by_map(channel, numbers)
 
     def believe(leaf: object) -> object:
+        """Return a map as its receiver knows it given its numbers, anything else as it is."""
         return leaf.believed(parts[leaf.memory.identity]) if isinstance(leaf, AbstractTold) else leaf
 
     conditioned: T = jax.tree.map(believe, channel, is_leaf=_is_told)
@@ -351,6 +352,7 @@ def _share_numbers_by_map(channel: object, numbers: Numbers) -> dict[str, Number
 
 
 def _list_noise_covariances(link: AbstractRandomAffine) -> list[jax.Array | np.ndarray]:
+    """Return the covariances of all noises in a link."""
     leaves = jax.tree.leaves(link, is_leaf=lambda leaf: isinstance(leaf, AbstractNoise))
     return [leaf.covariance for leaf in leaves if isinstance(leaf, AbstractNoise)]
 
@@ -372,6 +374,7 @@ def make_certain(link: T) -> T:
     """
 
     def certain(leaf: object) -> object:
+        """Return a law of finitely many gains, or a map of modes, as one whose probabilities are certain."""
         if isinstance(leaf, Discrete):
             return CertainDiscrete(leaf)
         if isinstance(leaf, AbstractModal) and isinstance(leaf.memory, MarkovChain):
@@ -383,4 +386,5 @@ def make_certain(link: T) -> T:
 
 
 def _is_told(leaf: object) -> bool:
+    """Return whether an object is a map of which numbers are told."""
     return isinstance(leaf, AbstractTold)

@@ -128,18 +128,18 @@ class Superposed(AbstractCombination):
 
     @cache_by_object
     def moments(self, order: int) -> JointMoments:
-        """Return E[z^a | y] by halves."""
+        """Return E[Sym^order(H)], from those of the maps and the noise."""
         check_forgets("moments of a map", self)
         parts = [m.moments(order).matrix[None] for m in self.maps]
         return JointMoments(self._add_moments(parts, order)[0], self.outputs, self.inputs, order)
 
     @cache_by_object
     def corner_moments(self, order: int) -> Corners:
-        """Return the same with every combination of the maps' corners."""
+        """Return E[Sym^order(H)] at every combination of the maps' corners."""
         return self._add_moments([m.corner_moments(order) for m in self.maps], order)
 
     def _interval_of_parts(self, order: int) -> Interval:
-        """Return that of the sum of a stack."""
+        """Return the interval of E[Sym^order(H)], that of the same map written as the sum of a stack."""
         return self.as_stack.moment_interval(order)
 
     def covers_kind(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
@@ -170,7 +170,7 @@ class Superposed(AbstractCombination):
         return f"sum of {list_in_words(self.maps)}"
 
     def detach_outliers(self) -> tuple[AbstractRandomAffine, AbstractNoise | None]:
-        """Take the noise of the receiver where its law has outliers."""
+        """Return the sum without the receiver's noise where its law has outliers, and that noise; else None for it."""
         if not self.noise.has_outliers:
             return self, None
         mean_alone = Gaussian(np.zeros((self.outputs, self.outputs)), self.noise.mean)

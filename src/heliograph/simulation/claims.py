@@ -10,7 +10,7 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.scheduled import ScheduledFilter
 from heliograph.fusion.network_fusion import Fusion
 from heliograph.model.estimate import Claim
-from heliograph.model.premises.agreement import RANGE, join_premises, list_differences, part_of
+from heliograph.model.premises.agreement import RANGE, join_premises, list_differences, restrict_premise_to_rows
 from heliograph.model.premises.premise import Premise, StaticPremise
 from heliograph.simulation.node import FUSED, HasNodes, Node, ReceivingNode
 
@@ -137,7 +137,7 @@ def find_premise(network: HasNodes, name: str) -> Premise:
         limits = node.limits if node.limits is not None and node.limits.bounded else None
         return Premise(plant, node.sensor, node.channel, node.trigger, range=limits, encoder=node.encoder)
     if network.common is not None:
-        return part_of(Premise(plant, network.common.sensor, network.common.channel), network.rows[name])
+        return restrict_premise_to_rows(Premise(plant, network.common.sensor, network.common.channel), network.rows[name])
     if network.relays is None:  # a node without a sensor
         return Premise(plant)
     schedules = {

@@ -131,7 +131,7 @@ class EventFilter(AbstractSizedFilter):
         plant, u, start = at(self.plant, k), jnp.asarray(u), second_moments_at_start(self.plant)
         both = jax.vmap(lambda x: predict_with_reference(plant, self.transform, x, u, start))(state.gaussian)
         if self.trigger.reference == "prediction":
-            expected = self.reference(self._merge_state(state).mean, u, k)
+            expected = self.predict_reference(self._merge_state(state).mean, u, k)
             of_reference = len(self.states) + np.arange(self.outputs)
             both = jax.vmap(lambda x: set_known_components(x, of_reference, expected))(both)
         # The modes move from the second step on: the initial law is that of the first step.
@@ -144,7 +144,7 @@ class EventFilter(AbstractSizedFilter):
             label = jnp.where(age <= oldest, older, 0.0) + jnp.where(age == oldest, label, 0.0)
         return EventBelief(state.weight, both, label, state.begun, jnp.asarray(True))
 
-    def reference(self, mean: jax.Array, u: ArrayLike, k: Step) -> jax.Array:
+    def predict_reference(self, mean: jax.Array, u: ArrayLike, k: Step) -> jax.Array:
         """Return the prediction of y at step k that both ends compute, from the mean after the step before and u."""
         return predict_signal(at(self.plant, k), at(self.sensor, k), mean, u)
 

@@ -78,10 +78,10 @@ class StochasticEventFilter(AbstractSizedFilter):
         law = jnp.where(state.moved, state.law @ rows, state.law)
         reference = state.reference
         if self.trigger.reference == "prediction":
-            reference = self.reference(state.gaussian.mean, u, k)
+            reference = self.predict_reference(state.gaussian.mean, u, k)
         return StochasticBelief(moved, law, reference, jnp.asarray(True))
 
-    def reference(self, mean: jax.Array, u: ArrayLike, k: Step) -> jax.Array:
+    def predict_reference(self, mean: jax.Array, u: ArrayLike, k: Step) -> jax.Array:
         """Return the prediction of y at step k that both ends compute, from the mean after the step before and u."""
         return predict_signal(at(self.plant, k), at(self.sensor, k), mean, u)
 
@@ -180,7 +180,7 @@ class StochasticEventFilter(AbstractSizedFilter):
     def _change_by_sending(
         self, link: tuple[jax.Array, jax.Array], signal: Signal, reference: jax.Array, log_silent: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Return the change of z's predicted mean and covariance given that it was sent, as values far from r are.
+        """Return how z's predicted mean (m,) and covariance (m, m) change given that it was sent: far from r.
 
         Of y ~ N(m, S) the share s is silent, with mean m + d and covariance S_s, so that of what is sent the mean is
         m - s d / (1 - s) and the second moment about m is (S - s (S_s + d d')) / (1 - s).

@@ -136,7 +136,7 @@ def predict_gaussian(
 def transform_about_mean(
     plant: AbstractPlant, transform: AbstractTransform, x: Gaussian, u: jax.Array
 ) -> tuple[jax.Array, Image]:
-    """Return the state about which the moments of f(x, u) are, and these: of attitudes about their mean on the group.
+    """Return the state about which moments of f(x, u) are taken, and these moments; of attitudes it is their mean.
 
     The mean of attitudes m is where changes from it have the mean 0. m_0 = f(m, u), m_(i+1) = m_i plus the mean change
     from m_i: the error shrinks by the square of the attitudes' deviation in each.
@@ -158,7 +158,10 @@ class PredictsByTransform(Protocol):
 
 
 def smoother_step_by_transform(filter: PredictsByTransform, step: StepTrace, start: HasStart) -> SmootherStep:
-    """Return the smoother step of x+ = f(x, u) + w; `start`: of which law at the start numbers have their size."""
+    """Return the smoother step of x+ = f(x, u) + w, with the moments of f by the filter's transform.
+
+    `start`: the plant or filter from whose initial law rounding is counted.
+    """
     plant, u = at(filter.plant, step.k), jnp.asarray(step.u)
     image = image_of(plant, filter.transform, gaussian_of(step.before), u)
     rest = sum_unexplained(image, process_noise(plant, u, second_moments_at_start(filter.plant, start)))

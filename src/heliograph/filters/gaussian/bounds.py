@@ -15,7 +15,7 @@ from heliograph.factors.gaussian import Gaussian, condition_on_observation, from
 from heliograph.factors.repeated import triangularise_noise
 from heliograph.filters.gaussian.signal import ArrivedInnovation, Signal, augmented_second_moment, factor_spread
 from heliograph.filters.gaussian.young_scalars import (
-    trace_minimising_scalars,
+    find_trace_minimising_scalars,
     young_fixed_point_map,
     zero_mean_fixed_point_map,
 )
@@ -80,7 +80,7 @@ def observe_by_young(signal: Signal, channel: SecondOrder, z: ArrivedInnovation,
     cross = (slopes * prior.variances) @ prior.root.T
     trace = jnp.trace(prior.covariance)
     parts = base + unit_variance_where_absent(present), shift, of_state + of_noise, cross @ cross.T, trace
-    beta = trace_minimising_scalars(young_fixed_point_map, scalars, parts)
+    beta = find_trace_minimising_scalars(young_fixed_point_map, scalars, parts)
     a, b = jnp.where(jnp.any(present), 1 + beta[0], 1.0), 1 + beta[1]
     # The same bound as a Kalman update.
     noise = a**2 * (base + (1 / beta[0] + 1 / beta[1]) * shift + b * of_noise) + a * (a * b - 1) * of_state
@@ -118,7 +118,7 @@ def observe_by_zero_mean(signal: Signal, channel: SecondOrder, z: ArrivedInnovat
     # The best beta, then the update with what is left of Omega as noise.
     cross = (slopes * prior.variances) @ prior.root.T
     parts = base + unit_variance_where_absent(present), shift, cross @ cross.T, jnp.sum(explained**2 @ share)
-    beta = trace_minimising_scalars(zero_mean_fixed_point_map, scalar, parts)[0]
+    beta = find_trace_minimising_scalars(zero_mean_fixed_point_map, scalar, parts)[0]
     noise = factor_spread(base + shift / beta - of_state)
     after, _ = condition_on_observation(prior, slopes, z.innovation, noise, present)
     wider = from_columns(after.mean, join_columns(after.columns, WeightedColumns(explained, beta * share)))

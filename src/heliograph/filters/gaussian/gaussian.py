@@ -74,6 +74,7 @@ class GaussianFilter(AbstractBeliefFilter):
         """
 
         def step(state: Gaussian, row: tuple[jax.Array, ...]) -> tuple[Gaussian, tuple[jax.Array, ...]]:
+            """Filter one row; the output is the mean and covariance of its signal, and z near what is expected."""
             k, z_k, u_k = row
             prior = self.predict(state, u_k, k)
             channel, y = at(self.channel, k), self.predict_signal(prior, k)
@@ -81,6 +82,7 @@ class GaussianFilter(AbstractBeliefFilter):
             return self.correct(prior, z_k, k)[0], (y.mean, y.covariance, near)
 
         def expect(z: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+            """Return the same for all rows of one run."""
             start, rows = jax.tree.map(jnp.asarray, self.init()), (jnp.arange(len(z)), z, jnp.asarray(u))
             mean, covariance, near = jax.lax.scan(step, start, rows)[1]
             return mean, covariance, near

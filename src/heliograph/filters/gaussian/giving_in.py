@@ -226,7 +226,7 @@ def _gate_of(base: RobustFilter) -> Gate:
 
 
 def _choose(condition: jax.Array, if_true: Any, if_false: Any) -> Any:
-    """Return one of two trees of arrays."""
+    """Return the tree of arrays `if_true` where the condition holds, else `if_false`."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), if_true, if_false)
 
 

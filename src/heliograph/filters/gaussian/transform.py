@@ -75,7 +75,11 @@ class Cubature(AbstractTransform):
     """
 
     def image(self, function: Function, x: Gaussian) -> Image:
-        """Propagate the points and take their sample moments."""
+        """Return the moments of f(x) from its values at the 2 n points.
+
+        With s_j = sqrt(n d_j) L_j the differences f(m + s_j) - f(m - s_j) make the slopes, and what the sums
+        f(m + s_j) + f(m - s_j) differ by from their mean makes the curvature, both with weights 1 / (4 n).
+        """
         n = len(x.mean)
         steps = square_root(n * x.variances)
         ahead, behind = evaluate_beside_mean(function, x, steps)
@@ -105,7 +109,7 @@ class Linearization(AbstractTransform):
     keeps_center: ClassVar[bool] = True
 
     def image(self, function: Function, x: Gaussian) -> Image:
-        """Evaluate f and its Jacobian at the mean."""
+        """Return f(m) and the slopes J L, J the Jacobian of f at the mean m."""
         mean = function(x.mean)
         return image_by_slopes(mean, jax.jacfwd(function)(x.mean) @ x.root, x)
 

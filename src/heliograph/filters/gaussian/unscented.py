@@ -67,7 +67,7 @@ class Unscented(AbstractTransform):
             raise fail("kappa", f"at least {least:g} for {n} states, so that no covariance is indefinite", kappa)
 
     def image(self, function: Function, x: Gaussian) -> Image:
-        """Propagate the points and take their weighted moments.
+        """Return the moments of f(x) from its values at the mean and the 2 n points.
 
         With a_j and b_j what is odd and even in xi_j at m +- sqrt(c d_j) L_j, b the mean of all b_j: slopes a_j, and
         sum_j (b_j - b)(b_j - b)' / c + (alpha^2 kappa / n + beta) d d', d = n b / c, which is a sum of squares.

@@ -26,7 +26,7 @@ Slopes = list[list[jax.Array]]  # slopes[i][j] = d log f_i / d log beta_j
 Sweep = Callable[..., tuple[jax.Array, Slopes]]  # (log beta, *parts) -> log f(beta), slopes
 
 
-def trace_minimising_scalars(sweep: Sweep, given: Array, parts: Parts) -> jax.Array:
+def find_trace_minimising_scalars(sweep: Sweep, given: Array, parts: Parts) -> jax.Array:
     """Return the scalars beta of Young's inequality that minimise tr P; those that are `given` (not NaN) stay.
 
     At the minimum beta = f(beta). Iterating f (a sweep) converges slowly, so this is Newton's method for t = log beta,

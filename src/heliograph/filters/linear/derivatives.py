@@ -61,7 +61,7 @@ class DifferentiatedInnovation(NamedTuple):
 
 
 def differentiate_start(make: Callable[[Array], Any], x: Array) -> EstimateWithDerivatives:
-    """Return the estimate before the first step.
+    """Return the estimate before the first step, with its derivatives in each free number.
 
     Args:
         make: the filter by the free numbers, a `LinearFilter` with `has_known_gain`.
@@ -74,13 +74,13 @@ def differentiate_start(make: Callable[[Array], Any], x: Array) -> EstimateWithD
 def differentiate_step(
     make: Callable[[Array], Any], x: Array, before: EstimateWithDerivatives, row: tuple[Array, Array], k: Array
 ) -> tuple[EstimateWithDerivatives, DifferentiatedInnovation]:
-    """Return the estimate after a row (z, u), z NaN for what did not arrive, and the row's innovation.
+    """Return estimate and innovation of a row (z, u), both with their derivatives in each free number.
 
     Args:
         make: the filter by the free numbers, a `LinearFilter` with `has_known_gain`.
         x: the free numbers (p,).
         before: the estimate before the row.
-        row: measurement (m,) and input.
+        row: measurement (m,), NaN for what did not arrive, and input.
         k: the row's number.
     """
     z, u = row
@@ -100,7 +100,7 @@ def differentiate_step(
 
 
 def find_model_matrices(filter: Any, u: Array, k: Array) -> ModelMatrices:
-    """Return the matrices of a step."""
+    """Return F, b, Q, H, c and R of step k of a linear filter, under the input u."""
     plant, sensor, channel = at(filter.plant, k), at(filter.sensor, k), at(filter.channel, k)
     law, gain = sensor.noise, jnp.asarray(channel.mean_gain)
     return ModelMatrices(

@@ -55,6 +55,7 @@ class ScoreRecursion(Recursion):
         Now = tuple[EstimateWithDerivatives, jax.Array]  # a state, and the information of the rows before
 
         def body(now: Now, row: tuple[Array, Array, Array]) -> tuple[Now, tuple[jax.Array, jax.Array]]:
+            """Step over one row: add its information, and put out its log-density and score."""
             k, z, u = row
             after, (density, score, halves) = self.step(now[0], (z, u), k)
             return (after, now[1] + halves), (density, score)
@@ -80,11 +81,13 @@ class ScoreRecursion(Recursion):
         return None if rows is None else (*rows.outputs, sums[2])
 
     def _start(self) -> EstimateWithDerivatives:
+        """Return the estimate before the first row with its derivatives, computed in double precision by XLA."""
         start: EstimateWithDerivatives = compute_once(_start_at, _start_by_xla, (self.make, self.x))
         return start
 
 
 def _start_at(make: Callable[[Array], Any], x: Array) -> EstimateWithDerivatives:
+    """Return the estimate before the first row of the filter of free numbers x: compiled body of `_start`."""
     return differentiate_start(make, x)
 
 

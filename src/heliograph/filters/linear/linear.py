@@ -159,7 +159,7 @@ def signal_before_data(state: LinearBelief, sensor: LinearSensor, start: jax.Arr
 def correct_linear(
     state: LinearBelief, sensor: LinearSensor, channel: SecondOrder, rule: Polytope, z: jax.Array, start: jax.Array
 ) -> tuple[LinearBelief, Innovation]:
-    """Correct with the components of z that arrived.
+    """Return the estimate corrected with the components of z (m,) that arrived, and the innovation.
 
     What is expected of z is by the estimate; gain and covariance are by the moments before any data.
     """

@@ -96,7 +96,10 @@ def centred_motion(
 def noise_by_mode(
     plants: Sequence[LinearPlant], modes: Sequence[int], u: ArrayLike, start: jax.Array, law: jax.Array
 ) -> WeightedColumns:
-    """Return columns of the process noise and rounding of zeta, P(j) Cov w_j in the block of mode j."""
+    """Return columns of the process noise and rounding of zeta = (x~ 1{mode = 1}, x~ 1{mode = 2}, ...), x~ = (x, 1).
+
+    The block of mode j is P(j) Cov w_j, with P(j) = law[j] and the plant number modes[j].
+    """
     parts = [noise_in_mode(plant, u, start) for plant in plants]
     matrix = jax.scipy.linalg.block_diag(*(parts[mode].matrix for mode in modes))
     return WeightedColumns(

@@ -32,7 +32,7 @@ class AbstractMerging(Module):
         return jnp.diag(law)
 
     def by_mode(self, parts: Gaussian, weight: jax.Array) -> Gaussian:
-        """Return one Gaussian for each mode, of components and weights (K, M) as `kept` returns them."""
+        """Return one Gaussian for each mode, of components and weights (K, M) as `keep_components` returns them."""
         return parts
 
     def mixing_weights(self, weight: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -52,7 +52,7 @@ class AbstractMerging(Module):
         places = np.arange(modes)
         return places, places
 
-    def kept(self, parts: Gaussian, weight: jax.Array, modes: int) -> tuple[Gaussian, jax.Array]:
+    def keep_components(self, parts: Gaussian, weight: jax.Array, modes: int) -> tuple[Gaussian, jax.Array]:
         """Return the components after the update of all pairs, and their weights (K, M)."""
         return parts, jnp.diag(weight)
 
@@ -61,7 +61,7 @@ class MergeAll(AbstractMerging):
     """One Gaussian for all modes (GPB1)."""
 
     def mixing_weights(self, weight: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Replace every component by the whole mixture."""
+        """Return weights (K, 1) of one mixture of all, and (M, M) of its copies in the modes after the move."""
         return jnp.sum(weight, axis=1, keepdims=True), jnp.diag(jnp.sum(weight @ rows, axis=0))
 
     def moves(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
@@ -73,7 +73,7 @@ class MergeByNextMode(AbstractMerging):
     """One Gaussian per mode, mixed by the mode that the chain comes from (IMM)."""
 
     def mixing_weights(self, weight: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Mix, for each mode j, all components that lead to it."""
+        """Return weights (K, M) that mix for each next mode all that lead to it, and those (M, M) after the move."""
         mixed = weight @ rows
         return mixed, jnp.diag(jnp.sum(mixed, axis=0))
 
@@ -87,15 +87,15 @@ class MergeByMode(AbstractMerging):
         return True
 
     def mixing_weights(self, weight: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Mix nothing: components keep the mode of their last update."""
+        """Return weights (K, M) that mix each mode's component alone, and the joint probabilities after the move."""
         return weight, jnp.sum(weight, axis=0)[:, None] * rows
 
     def update_pairs(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
-        """Pair every component with every mode."""
+        """Return the pairs (component, mode) of the update: every component with every mode."""
         return np.repeat(np.arange(modes), modes), np.tile(np.arange(modes), modes)
 
-    def kept(self, parts: Gaussian, weight: jax.Array, modes: int) -> tuple[Gaussian, jax.Array]:
-        """Return one component for each present mode."""
+    def keep_components(self, parts: Gaussian, weight: jax.Array, modes: int) -> tuple[Gaussian, jax.Array]:
+        """Return one component for each present mode, merged over the modes before, and the weights (M, M)."""
         pairs = weight[:, None] * (self.update_pairs(modes)[1][:, None] == np.arange(modes))
         merged = jax.vmap(partial(merge_mixture, parts), in_axes=1)(normalise_columns(pairs))
         return merged, jnp.diag(jnp.sum(pairs, axis=0))
@@ -110,16 +110,16 @@ class MergePairs(AbstractMerging):
         return True
 
     def by_mode(self, parts: Gaussian, weight: jax.Array) -> Gaussian:
-        """Merge the pairs of each present mode."""
+        """Return one Gaussian for each present mode, merged from its pairs."""
         return jax.vmap(partial(merge_mixture, parts), in_axes=1)(normalise_columns(weight))
 
     def start(self, law: jax.Array) -> jax.Array:
-        """Put the law of the modes on the pairs of equal modes."""
+        """Return the weights (M^2, M) of pairs before any data: the law (M,) on pairs of equal modes."""
         modes = len(law)
         return self._by_mode(jnp.eye(modes).reshape(-1) * jnp.repeat(law, modes), modes)
 
     def mixing_weights(self, weight: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Merge what ends in one mode; pair (j, l) has probability P(j) T_jl."""
+        """Return weights (M^2, M) that merge what ends in one mode, and those of pairs (j, l) after it, P(j) T_jl."""
         modes = len(rows)
         return weight, self._by_mode((jnp.sum(weight, axis=0)[:, None] * rows).reshape(-1), modes)
 
@@ -128,15 +128,15 @@ class MergePairs(AbstractMerging):
         return np.repeat(np.arange(modes), modes), np.tile(np.arange(modes), modes)
 
     def update_pairs(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
-        """Update each pair in its present mode."""
+        """Return the pairs (component, mode) of the update: each component, a pair of modes, with its present mode."""
         return np.arange(modes**2), np.tile(np.arange(modes), modes)
 
-    def kept(self, parts: Gaussian, weight: jax.Array, modes: int) -> tuple[Gaussian, jax.Array]:
-        """Keep all pairs, until the next move."""
+    def keep_components(self, parts: Gaussian, weight: jax.Array, modes: int) -> tuple[Gaussian, jax.Array]:
+        """Return all components, pairs of modes, as they are until the next move, and their weights (M^2, M)."""
         return parts, self._by_mode(weight, modes)
 
     def _by_mode(self, weight: jax.Array, modes: int) -> jax.Array:
-        """Place the weights (M^2,) of pairs in the columns of their present modes."""
+        """Return the weights (M^2,) of pairs as (M^2, M), each in the column of its present mode."""
         return jnp.asarray(weight[:, None] * (np.tile(np.arange(modes), modes)[:, None] == np.arange(modes)))
 
 
@@ -212,7 +212,7 @@ def move_by_law(
         in_order = np.array_equal(mixture_of, np.arange(weight.shape[1]))
         return moved if in_order else jax.tree.map(lambda leaf: leaf[mixture_of], moved)
     # Plant after plant, the components that it moves; then all of them in order again.
-    mixtures = mix(parts, normalise_columns(weight))
+    mixtures = mix_moments(parts, normalise_columns(weight))
     plant_of_component, results = plant_of[mode_of], []
     for number, plant in enumerate(plants):
         sources = mixture_of[plant_of_component == number]
@@ -231,7 +231,7 @@ class Moments(NamedTuple):
     covariance: jax.Array
 
 
-def mix(parts: Gaussian, share: jax.Array) -> Moments:
+def mix_moments(parts: Gaussian, share: jax.Array) -> Moments:
     """Return the moments of mixtures of Gaussians, by their shares (components, mixtures)."""
     covariances = jax.vmap(lambda x: x.covariance)(parts)
     return Moments(*jax.vmap(lambda weights: moments_of_mixture(parts.mean, covariances, weights), in_axes=1)(share))

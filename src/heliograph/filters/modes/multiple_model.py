@@ -189,7 +189,7 @@ class MultipleModelFilter(AbstractSizedFilter):
         (signal, weights), plant = self.prior_signals(state, k), models_of(at(self.plant, k))[0]
         after, weight, mixed = correct_in_every_mode(signal, channel, jnp.asarray(j), weights, z, self.observed_angles)
         parts = after._replace(mean=align_angles(plant, after.mean, weight))
-        return ModalBeliefs(*self.merging.kept(parts, weight, modes), state.moved), mixed
+        return ModalBeliefs(*self.merging.keep_components(parts, weight, modes), state.moved), mixed
 
     def prior_signals(self, state: ModalBeliefs, k: Step) -> tuple[Signal, jax.Array]:
         """Return the signal of each pair (component, mode) that is corrected, and its weight before."""

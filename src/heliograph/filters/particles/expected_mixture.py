@@ -52,7 +52,7 @@ def sum_mixtures(
     return ReceivedSums(jnp.sum(share), share @ value, spread, jnp.sum(weight), weight @ predicted.chance)
 
 
-def tell_innovation(sums: ReceivedSums, base: jax.Array, z: jax.Array, density: jax.Array) -> Innovation:
+def compute_mixture_innovation(sums: ReceivedSums, base: jax.Array, z: jax.Array, density: jax.Array) -> Innovation:
     """Return the innovation's mean, covariance and log-likelihood given what arrived; `density`: log p(z, arrivals)."""
     present = ~jnp.isnan(z)
     weight = jnp.where(sums.weight > 0, sums.weight, 1.0)

@@ -183,7 +183,7 @@ def _bind(function: Call, filter: Any, arguments: tuple[Any, ...], differs: tupl
 
 
 def _draw_start(filter: Any, key: Array, number: Array) -> PyTree:
-    """Draw what a particle is before any row."""
+    """Return the particle of this number before any row, drawn with the key."""
     return _take_first(filter.draw_start(key, number[None]))
 
 
@@ -222,7 +222,7 @@ def _sum_second(filter: Any, states: Array, weight: Array, particles: PyTree) ->
 
 
 def _make_outputs_of_row(filter: Any, row: DataRow, sums: ParticleSums) -> tuple[Any, ...]:
-    """Return what is told of a row, by its sums."""
+    """Return mean, covariance, innovation, law of modes and effective number of a row, from sums over its particles."""
     one, weight = jax.tree.map(jnp.asarray, filter.make_room(1)), jnp.ones(1)
     states = _unpack_sums(sums.states, filter.sum_states, weight, one)
     predicted = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], sums.reference)
@@ -325,7 +325,7 @@ class _ParticleLoop:
         self.pairs = list(zip(self.held, jax.tree.leaves(self.memory.particles), strict=True))
 
     def begin(self, particles: PyTree, log_weight: np.ndarray) -> None:
-        """Take particles (N, ...) with these log weights, the largest 0."""
+        """Set the particles (N, ...) before the next row, and their log weights, the largest 0."""
         memory, count = self.memory, self.count
         for held, new in zip(self.held, jax.tree.leaves(particles), strict=True):
             held[:count], held[count:] = new, new[0]

@@ -29,9 +29,9 @@ from heliograph.filters.particles.drawn_states import (
 from heliograph.filters.particles.expected_mixture import (
     ExpectedMixture,
     ReceivedSums,
+    compute_mixture_innovation,
     find_base,
     sum_mixtures,
-    tell_innovation,
 )
 from heliograph.filters.particles.moments import StateSums
 from heliograph.filters.particles.proposal import PRIOR_SHARE, noise_columns
@@ -297,9 +297,9 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         """
         gain, offset, noise = jax.tree.map(lambda leaf: leaf[mode], received.overall)
         y, slopes = slopes_given_drawn(partial(self._measure, sensors, mode), x, drawn=0)
-        return self._condition(x, gain @ slopes, gain @ y + offset, noise, received.z)
+        return self._condition_on_received(x, gain @ slopes, gain @ y + offset, noise, received.z)
 
-    def _condition(
+    def _condition_on_received(
         self, x: Gaussian, slopes: jax.Array, expected: jax.Array, noise: WeightedColumns, z: jax.Array
     ) -> tuple[Gaussian, jax.Array]:
         """Return x given z = expected + slopes xi + v, and the log density of z."""
@@ -320,7 +320,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
 
         def condition_on_atom(gain: jax.Array, offset: jax.Array, noise: WeightedColumns) -> tuple[Gaussian, jax.Array]:
             """Return x given z of one atom, and the log density of z."""
-            return self._condition(x, gain @ slopes, gain @ y + offset, noise, received.z)
+            return self._condition_on_received(x, gain @ slopes, gain @ y + offset, noise, received.z)
 
         atoms = jax.tree.map(lambda leaf: leaf[mode], (received.gain, received.offset, received.noise))
         after, densities = jax.vmap(condition_on_atom)(*atoms)
@@ -360,7 +360,9 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         self, received: ReceivedSums, reference: tuple[Any, ...], z: jax.Array, k: Step, density: jax.Array
     ) -> Innovation:
         """Return z less its mean over particles, modes and atoms, its covariance, and log p(z)."""
-        return tell_innovation(received, find_base(ExpectedMixture(*reference), z, self.observed_angles), z, density)
+        return compute_mixture_innovation(
+            received, find_base(ExpectedMixture(*reference), z, self.observed_angles), z, density
+        )
 
     def sum_states(self, weight: jax.Array, particles: Cloud) -> StateSums:
         """Return the first sums of particles (B,), drawn states first."""

@@ -102,5 +102,5 @@ def propose_particles(
 
 
 def noise_columns(plant: AbstractPlant, u: jax.Array) -> WeightedColumns:
-    """Return the factors of Cov w."""
+    """Return the factors of Cov w (n, n) of a plant under the input u."""
     return plant.noise.columns if isinstance(plant.noise, AbstractNoise) else columns_of(plant.noise_covariance(u))

@@ -94,7 +94,7 @@ class TwoHypothesesFilter(AbstractSizedFilter):
             begun = begun | words.present[i]
         total = jnp.where(words.are_words, total, -jnp.inf)
         after = joint._replace(parts=take_leading(joint.parts, n))
-        return after, base.innovation(base.measure(_merge(state), k), words, z, at(base.numbers, k), total)
+        return after, base.compute_innovation(base.measure(_merge(state), k), words, z, at(base.numbers, k), total)
 
     @estimates
     def estimate(self, state: Hypotheses) -> Estimate:

@@ -74,7 +74,7 @@ def signed_tail_and_density(a: jax.Array) -> tuple[jax.Array, jax.Array]:
     return jnp.where(a < 0, 1 - q, q), density
 
 
-def step_as_it_is(a: jax.Array, width: jax.Array) -> LikelihoodStep:
+def step_without_dither(a: jax.Array, width: jax.Array) -> LikelihoodStep:
     """Return a step without dither: Q, phi and a phi."""
     q, density = tail_and_density(a)
     return LikelihoodStep(q, density, a * density)
@@ -110,8 +110,8 @@ def smooth_step_by_triangle(a: jax.Array, width: jax.Array) -> LikelihoodStep:
 
 
 SMOOTH: dict[str, Smooth] = {
-    "none": step_as_it_is,
-    "subtracted": step_as_it_is,
+    "none": step_without_dither,
+    "subtracted": step_without_dither,
     "stochastic": smooth_step_by_uniform,
     "triangular": smooth_step_by_triangle,
 }

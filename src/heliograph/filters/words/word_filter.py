@@ -70,14 +70,14 @@ class WordFilter(AbstractBeliefFilter):
         words = self.read_words(z, at(self.links, k))
         for i in range(len(self.low)):
             row, prior = joint.root[n + i], self.prior_of(joint, i)
-            change = self._condition(i, words, prior)
+            change = self._find_effect_of_word(i, words, prior)
             changes = words.present[i] & jnp.isfinite(change.log_mass) & (prior.deviation > 0)
             row = jnp.where(changes, row, 0.0)
             shift, ratio = jnp.where(changes, change.shift, 0.0), jnp.where(changes, change.ratio, 1.0)
             joint = impose_moments_of_combination(joint, row, shift * prior.deviation, ratio)
             total = total + jnp.where(words.present[i], change.log_mass, 0.0)
         total = jnp.where(words.are_words, total, -jnp.inf)
-        return take_leading(joint, n), self.innovation(signal, words, z, at(self.numbers, k), total)
+        return take_leading(joint, n), self.compute_innovation(signal, words, z, at(self.numbers, k), total)
 
     @property
     def of_atoms(self) -> bool:
@@ -151,21 +151,21 @@ class WordFilter(AbstractBeliefFilter):
         all_and_right = [*pairs, *(pair * if_right for pair in pairs)]
         right, wrong = jnp.append(0 * words.weights, words.weights), jnp.append(words.weights, -words.weights)
         weights = jnp.stack([right, wrong])
-        return effect_of_bits(all_and_right, weights, words.numbers[i], self._grid(i, words), prior, self.dither)
+        return effect_of_bits(all_and_right, weights, words.numbers[i], self._word_grid(i, words), prior, self.dither)
 
-    def _condition(self, i: int, words: "ReceivedWords", prior: SignalPrior) -> WordEffect:
-        """Return what was received of its word does to y_i."""
-        grid = self._grid(i, words)
+    def _find_effect_of_word(self, i: int, words: "ReceivedWords", prior: SignalPrior) -> WordEffect:
+        """Return what the received word of y_i says of it: log probability, shift of the mean, ratio of variances."""
+        grid = self._word_grid(i, words)
         if self.certain:
             return effect_of_cell(words.numbers[i], grid, prior, self.dither)
         pairs = [pair[i] for pair in words.pairs]
         return effect_of_bits(pairs, words.weights, words.numbers[i], grid, prior, self.dither)
 
-    def _grid(self, i: int, words: "ReceivedWords") -> WordGrid:
-        """Return the words of y_i, less the dither."""
+    def _word_grid(self, i: int, words: "ReceivedWords") -> WordGrid:
+        """Return the words of y_i as a grid: the lowest less the dither, the step, the bits."""
         return WordGrid(jnp.asarray(self.low)[i] - words.dithers[i], jnp.asarray(self.spacing)[i], self.bits)
 
-    def innovation(
+    def compute_innovation(
         self, signal: Signal, words: "ReceivedWords", z: jax.Array, numbers: SecondOrder, total: jax.Array
     ) -> Innovation:
         """Return the innovation of the words as numbers about their centres; NaN for flags and dithers.

@@ -105,7 +105,10 @@ def sum_neighbours(
 def sum_window(
     pairs: list[jax.Array], weights: jax.Array, received: jax.Array, grid: WordGrid, prior: SignalPrior, dither: str
 ) -> LikelihoodSums:
-    """Sum over the words within the reach of the prior, and the one that was received; arguments `effect_of_bits`'."""
+    """Return the sums M, E[t L], E[t^2 L] over words within the prior's reach, and the one that was received.
+
+    Arguments are those of `effect_of_bits`.
+    """
     count = WINDOW * 2**BLOCK
     start = jnp.floor((prior.mean - REACH * prior.deviation - grid.low) / (grid.step * 2**BLOCK)) * 2**BLOCK
     start = jnp.clip(start, 0.0, 2.0**grid.bits - count)
@@ -119,7 +122,7 @@ def sum_window(
 def sum_cell(
     likelihood: jax.Array, index: jax.Array, grid: WordGrid, prior: SignalPrior, dither: str
 ) -> LikelihoodSums:
-    """Sum over one word that is far from the prior."""
+    """Return the sums M, E[t L], E[t^2 L] of a likelihood that is this number in the cell of one word, 0 elsewhere."""
     edges = index + jnp.array([-0.5, 0.5])
     t = (grid.low + edges * grid.step - prior.mean) / prior.deviation
     if grid.bits:  # overloads: the end words have one edge
@@ -138,7 +141,7 @@ class WordEffect(NamedTuple):
     ratio: jax.Array
 
 
-def change_by_sums(sums: LikelihoodSums) -> WordEffect:
+def find_effect_from_sums(sums: LikelihoodSums) -> WordEffect:
     """Return the moments from the sums; log M is -inf where it is less than the smallest number."""
     possible = sums.mass > np.finfo(float).tiny
     mass = jnp.where(possible, sums.mass, 1.0)
@@ -146,27 +149,27 @@ def change_by_sums(sums: LikelihoodSums) -> WordEffect:
     return WordEffect(jnp.where(possible, jnp.log(mass), -jnp.inf), shift, sums.second / mass - shift**2)
 
 
-def widen(prior: SignalPrior, grid: WordGrid, dither: str) -> tuple[SignalPrior, jax.Array]:
+def widen_by_dither(prior: SignalPrior, grid: WordGrid, dither: str) -> tuple[SignalPrior, jax.Array]:
     """Return the law of y + d, taken for Gaussian as the step D is small, and its variance over that of y."""
     wide = 1 + ADDED[dither] * (grid.step / prior.deviation) ** 2
     return SignalPrior(prior.mean, prior.deviation * jnp.sqrt(wide)), wide
 
 
-def narrow(change: WordEffect, wide: jax.Array) -> WordEffect:
+def take_off_dither(change: WordEffect, wide: jax.Array) -> WordEffect:
     """Return what is known of y from what is known of y + d, whose variance is `wide` times that of y."""
     return WordEffect(change.log_mass, change.shift / jnp.sqrt(wide), 1 - (1 - change.ratio) / wide)
 
 
 def effect_of_cell(index: jax.Array, grid: WordGrid, prior: SignalPrior, dither: str) -> WordEffect:
     """Return what the word of number `index` does to y, where no bit can have flipped."""
-    wider, wide = widen(prior, grid, dither)
-    cut = narrow(_cut_to_cell(index, grid, wider), wide)
+    wider, wide = widen_by_dither(prior, grid, dither)
+    cut = take_off_dither(_cut_to_cell(index, grid, wider), wide)
     if not ADDED[dither]:
         return cut
     # A dither of steps that are not small: the edges are smooth, but far away only cells have digits.
     away = jnp.abs((grid.low + index * grid.step - prior.mean) / prior.deviation)
     width = grid.step / prior.deviation
-    smooth = change_by_sums(sum_cell(jnp.ones(()), index, grid, prior, dither))
+    smooth = find_effect_from_sums(sum_cell(jnp.ones(()), index, grid, prior, dither))
     use = (width >= FINE) & (away - width < FAR)
     return WordEffect(*(jnp.where(use, a, b) for a, b in zip(smooth, cut, strict=True)))
 
@@ -209,18 +212,18 @@ def effect_of_bits(
     """
     if grid.bits <= TABLE:
         blocks = 2 ** max(grid.bits - BLOCK, 0)
-        return change_by_sums(sum_neighbours(pairs, weights, jnp.zeros(()), blocks, grid, prior, dither))
+        return find_effect_from_sums(sum_neighbours(pairs, weights, jnp.zeros(()), blocks, grid, prior, dither))
 
     def change_by_wide_words() -> WordEffect:
         """Sum word by word within the prior's reach."""
-        return change_by_sums(sum_window(pairs, weights, received, grid, prior, dither))
+        return find_effect_from_sums(sum_window(pairs, weights, received, grid, prior, dither))
 
     def change_by_fine_words() -> WordEffect:
         """Sum over cells of several words each."""
-        wider, wide = widen(prior, grid, dither)
+        wider, wide = widen_by_dither(prior, grid, dither)
         sums = [sum_merged(pair, received, grid, wider).plus(sum_overloads(pair, grid, wider)) for pair in pairs]
         merged = LikelihoodSums(*(weights @ jnp.stack(terms) for terms in zip(*sums, strict=True)))
-        return narrow(change_by_sums(merged), wide)
+        return take_off_dither(find_effect_from_sums(merged), wide)
 
     change: WordEffect = jax.lax.cond(grid.step >= FINE * prior.deviation, change_by_wide_words, change_by_fine_words)
     return change

@@ -237,6 +237,7 @@ class LateFilter(AbstractWrapper):
         """Return the prediction over the last `delay` steps."""
 
         def move(j: jax.Array, base: PyTree) -> PyTree:
+            """Predict over the step j after that of the last signal."""
             return self._predict_if_begun(base, jnp.asarray(state.inputs)[j], state.step - self.delay + 1 + j)
 
         if not self.delay:

@@ -113,7 +113,9 @@ class FedBackFilter(AbstractWrapper):
         """Return the belief of the plant's state."""
         return state.gaussian
 
-    def reference(self, known: Float[Array, " n"], u: Float[Array, " inputs"], k: Step) -> Float[jax.Array, " m"]:
+    def predict_reference(
+        self, known: Float[Array, " n"], u: Float[Array, " inputs"], k: Step
+    ) -> Float[jax.Array, " m"]:
         """Return the reference r that is subtracted from y at step k, from the estimate before and the input over k."""
         return predict_signal(at(self.base.plant, k), at(self.base.sensor, k), known, u)
 
@@ -126,7 +128,7 @@ class FedBackFilter(AbstractWrapper):
     def predict(self, state: FedBackBelief, u: ArrayLike = (), k: Step = 0) -> FedBackBelief:
         """Return the mean and covariance of f(x, u) + w, and the reference that the sensor will subtract."""
         moved = self.base.predict(state.gaussian, u, k)
-        return FedBackBelief(moved, self.reference(state.gaussian.mean, jnp.asarray(u), k))
+        return FedBackBelief(moved, self.predict_reference(state.gaussian.mean, jnp.asarray(u), k))
 
     @corrects
     def correct(self, state: FedBackBelief, z: ArrayLike, k: Step = 0) -> tuple[FedBackBelief, Innovation]:

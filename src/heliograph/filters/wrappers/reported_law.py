@@ -165,9 +165,10 @@ class ToldFilter(AbstractWrapper):
 
 
 def _spoil_state(state: PyTree, spoilt: jax.Array) -> PyTree:
-    """Make all real numbers of a state NaN, or leave it as it is."""
+    """Return a state with all its real numbers NaN where `spoilt`, else as it is."""
 
     def spoil(leaf: jax.Array) -> jax.Array:
+        """Return NaN in place of real numbers where the state is spoilt."""
         is_real = jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.floating)
         return jnp.where(spoilt, jnp.nan, leaf) if is_real else leaf
 

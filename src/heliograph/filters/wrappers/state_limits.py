@@ -87,7 +87,7 @@ class LimitedFilter(AbstractSizedFilter):
         return self._claimed(self.base.estimate(self.condition(state)))
 
     def after_step(self, state: PyTree, k: Step) -> Estimate:
-        """Return the same after step k."""
+        """Return the mean and covariance after step k, given that the state lies within the limits."""
         return self._claimed(self.base.after_step(self.condition(state), k))
 
     def condition(self, state: PyTree) -> PyTree:
@@ -95,7 +95,7 @@ class LimitedFilter(AbstractSizedFilter):
         return self._condition_with_mass(state)[1]
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return that of the filter within, whose estimates are conditioned on the limits."""
+        """Return the smoother step of the filter within, whose estimates are then conditioned on the limits."""
         inner = self.base.smoother_step(step.map_states(self._hold))
         return replace(inner, limits=self.limits, claim=weakest([inner.claim, "nominal"]))
 
@@ -105,16 +105,16 @@ class LimitedFilter(AbstractSizedFilter):
 
     @property
     def remarks(self) -> bool:
-        """As the filter within."""
+        """True if the filter within may remark anything."""
         return self.base.remarks
 
     def remark(self, state: PyTree) -> Remark:
-        """Say what the filter within says."""
+        """Return the remark of the filter within."""
         return self.base.remark(state)
 
     @property
     def of_atoms(self) -> bool:
-        """As the filter within."""
+        """True if the filter within is a mixture over atoms."""
         return self.base.of_atoms
 
     def _claimed(self, estimate: Estimate) -> Estimate:
@@ -126,7 +126,7 @@ class LimitedFilter(AbstractSizedFilter):
         return self.condition(state) if _is_particles(state) else self._hold(state)
 
     def _hold(self, state: PyTree) -> PyTree:
-        """Hold the means of a state's Gaussians within the limits."""
+        """Return a filter's state with the means of its Gaussians held within the limits."""
         if isinstance(state, StateUnderInputs):
             return state._replace(base=self._hold(state.base))
         if hasattr(state, "believed"):  # of a gate that may give in to its rival

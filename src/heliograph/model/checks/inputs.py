@@ -132,6 +132,7 @@ def parts_in(models: PyTree, kind: type) -> Iterator[PyTree]:
     """Yield what a model object holds of a class of models, constant or over time."""
 
     def is_part(part: object) -> bool:
+        """Return whether an object is of the class, constant or over time."""
         return isinstance(stacked(part), kind)
 
     yield from (part for part in jax.tree.leaves(models, is_leaf=is_part) if is_part(part))
@@ -166,17 +167,19 @@ def _sensor_matrix(sensor: LinearSensor, u: jax.Array) -> jax.Array:
 
 
 def _sensor_noise(sensor: AbstractSensor, u: jax.Array) -> jax.Array:
+    """Return the noise's covariance of a sensor of inputs, under its inputs u."""
     assert isinstance(sensor.noise, NoiseOfInputs)
     return sensor.noise.given(u)
 
 
 def _input_matrix(plant: AbstractPlant, u: jax.Array) -> jax.Array:
+    """Return B of a linear plant under the inputs u."""
     assert isinstance(plant, LinearPlant)
     return matrix_of(plant.input_matrix, u)
 
 
 def _check_functions(plant: AnyPlant | AnySensor, u: Float[np.ndarray, "steps inputs"], steps: np.ndarray) -> None:
-    """Raise one line that names the row if a matrix or covariance is no such thing for some inputs u."""
+    """Raise ValueError that names the row whose inputs u give a matrix that is not finite, or no covariance."""
     functions = _list_functions(first(plant))
     parts = list(_evaluate_by_parts(plant, tuple(functions.values()), u, steps)) if functions else []
     for name, values in zip(functions, map(np.concatenate, zip(*parts, strict=True)), strict=True):
@@ -207,6 +210,7 @@ def _evaluate_at_steps(
     """Return what functions return at each step, each (steps, n, m): compiled, for operation by operation is slow."""
 
     def of_step(k: jax.Array, u_k: jax.Array) -> tuple[jax.Array, ...]:
+        """Return what the functions return at step k."""
         now = at(plant, k)
         return tuple(function(now, u_k) for function in functions)
 

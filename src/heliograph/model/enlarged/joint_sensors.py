@@ -27,7 +27,7 @@ class JointSensor(AbstractSensor):
     outputs: tuple[str, ...] = eqx.field(static=True)
 
     def measure(self, x: jax.Array) -> jax.Array:
-        """Return all of them."""
+        """Return the measurements of all sensors of the state x, one after another."""
         return jnp.concatenate([sensor.measure(x) for sensor in self.parts])
 
 
@@ -132,6 +132,7 @@ def join_links(sensors: Mapping[str, AnySensor], channels: Sequence[Channel]) ->
     """
 
     def joint(*parts: AbstractSensor) -> AbstractSensor:
+        """Return the joint sensor of one step."""
         return joint_sensor(dict(zip(sensors, parts, strict=True)))
 
     sensor: AnySensor = at_each_step(joint, *sensors.values())

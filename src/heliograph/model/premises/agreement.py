@@ -74,7 +74,10 @@ def list_differences(believed: Premise, own: Premise) -> tuple[str, ...]:
 
 
 def _enlarge_world_by_past(believed: Premise, own: Premise) -> Premise:
-    """Return the world with past signals as states, where the filter was made for these: of them it tells the first."""
+    """Return the world `own` with past signals as states, where the filter was made for such a larger plant.
+
+    Of these states it estimates the first, x itself.
+    """
     if own.sensor is None or own.channel is None or not first(own.channel).past:
         return own
     if len(first(believed.plant).states) <= len(first(own.plant).states):
@@ -102,7 +105,7 @@ def join_premises(premises: Sequence[Premise]) -> Premise:
     )
 
 
-def part_of(premise: Premise, rows: Sequence[int]) -> Premise:
+def restrict_premise_to_rows(premise: Premise, rows: Sequence[int]) -> Premise:
     """Return the premise of what is received of these rows of the channel's outputs."""
     chosen = known(np.eye(first(premise.channel).outputs)[list(rows)])
     return premise.replaced(channel=at_each_step(lambda channel: Series([channel, chosen]), premise.channel))
@@ -177,6 +180,7 @@ def _same_sensor(a: AbstractSensor, b: AbstractSensor, order: int | None) -> boo
     matrices = matrix_of(a), matrix_of(b)
     if matrices[0] is not None and matrices[1] is not None:
         return equal_to_rounding(*matrices)
+    # Sensors do not know how many states they measure: any number that both take will do.
     return any(same_function(a.measure, b.measure, (n,)) for n in _states_of(a, b))
 
 
@@ -190,6 +194,7 @@ def _same_sensor_of_inputs(a: AbstractSensor, b: AbstractSensor, order: int | No
             return False
     elif not same_function(_noise_given(a), _noise_given(b), u):
         return False
+    # Sensors do not know how many states they measure: any number that both take will do.
     return any(same_function(_measure_given(a), _measure_given(b), (n,), u) for n in _states_of(a, b))
 
 
@@ -204,7 +209,7 @@ def _measure_given(sensor: AbstractSensor) -> Callable[[jax.Array, jax.Array], o
 
 
 def _states_of(*sensors: AbstractSensor) -> list[int]:
-    """Return the numbers of states that both sensors take, among the first few."""
+    """Return the least number of states up to 32 that both sensors take, in a list; [] if there is none."""
     return [n for n in range(1, 33) if all(_takes_states(sensor, n) for sensor in sensors)][:1]
 
 
@@ -226,7 +231,10 @@ def matrix_of(sensor: AbstractSensor) -> np.ndarray | None:
 
 
 def _same_trigger(believed: AbstractTrigger | None, own: AbstractTrigger | None) -> bool:
-    """Decide whether a filter knows why nothing came; what is not sent by a schedule is missing whatever its value."""
+    """Return whether the sender's rule is the one that the filter believes.
+
+    A filter that believes in none agrees with a schedule: what is not sent by it is missing whatever its value.
+    """
     if believed is None:
         return own is None or isinstance(own, Periodic)
     return are_same(believed, own)

@@ -78,9 +78,11 @@ class StaticPremise:
         self.premise, self.lowered = premise, lowered
 
     def __eq__(self, other: object) -> bool:
+        """Return True for any other premise."""
         return isinstance(other, StaticPremise)
 
     def __hash__(self) -> int:
+        """Return the hash that all premises have."""
         return hash(StaticPremise)
 
 
@@ -137,6 +139,7 @@ def believes(make: Callable[P, B]) -> Callable[P, B]:
 
     @wraps(make)
     def build(*args: P.args, **kwargs: P.kwargs) -> B:
+        """Make the filter, and keep with it the plant, sensor, channel, trigger and encoder among the arguments."""
         given = parameters.bind(*args, **kwargs).arguments
         premise = Premise(**{name: given[name] for name in parts if name in given})
         if premise.sensor is not None and premise.channel is None:

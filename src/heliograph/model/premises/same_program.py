@@ -59,11 +59,13 @@ def _same_program(a: core.Jaxpr, b: core.Jaxpr) -> bool:
 
 
 def _define(names: tuple[dict[Any, int], dict[Any, int]], a: Sequence[Any], b: Sequence[Any]) -> None:
+    """Give the variables of both programs, a and b, their next numbers, in place."""
     for known, variables in zip(names, (a, b), strict=True):
         known.update({variable: len(known) + i for i, variable in enumerate(variables)})
 
 
 def _same_atoms(names: tuple[dict[Any, int], dict[Any, int]], a: Sequence[Any], b: Sequence[Any]) -> bool:
+    """Return whether lists of operands are the same, one by one (`_same_atom`)."""
     if len(a) != len(b):
         return False
     return all(_same_atom(names, x, y) for x, y in zip(a, b, strict=True))

@@ -64,6 +64,7 @@ def combine_atoms(parts: Sequence[list[Atom]], join: Callable[[Atom, Atom], Atom
     """
 
     def pairs(a: list[Atom], b: list[Atom]) -> list[Atom]:
+        """Return every atom of a joined with every atom of b; raise ValueError of too many."""
         if len(a) * len(b) > COMPONENT_LIMIT:
             raise fail("mixture filter", f"at most {COMPONENT_LIMIT:,} combinations of atoms", f"{len(a) * len(b):,}")
         return [join(x, y) for x in a for y in b]
@@ -101,6 +102,7 @@ def stack_branches(parts: Sequence[GaussianBranches]) -> GaussianBranches:
     fills = (-np.inf, 0.0, 1.0)
 
     def padded(law: GaussianBranches) -> list[Array]:
+        """Return the arrays of a law with branches of no probability, up to the largest number."""
         more = ((0, 0), (0, most - law.mean.shape[1]))
         return [xp.pad(value, more, constant_values=fill) for value, fill in zip(law, fills, strict=True)]
 

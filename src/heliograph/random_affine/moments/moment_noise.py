@@ -179,19 +179,23 @@ def about_mean(law: AbstractNoise) -> AbstractNoise:
 
 @about_mean.register
 def _(law: Gaussian) -> AbstractNoise:
+    """Return Gaussian noise of mean zero."""
     return Gaussian(law.covariance)
 
 
 @about_mean.register
 def _(law: FiniteSupport) -> AbstractNoise:
+    """Return the noise with its values less their mean."""
     return FiniteSupport(law.atoms - law.mean, law.probabilities)
 
 
 @about_mean.register
 def _(law: Independent) -> AbstractNoise:
+    """Return the parts, each about its mean."""
     return Independent([about_mean(component) for component in law.parts])
 
 
 @about_mean.register
 def _(law: Shaped) -> AbstractNoise:
+    """Return B (u - E u) of a noise B u."""
     return Shaped(law.matrix, about_mean(law.source))

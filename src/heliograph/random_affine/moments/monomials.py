@@ -238,6 +238,7 @@ def give_moments(written: Callable[[Any, int], Any]) -> Callable[[Any, int], Joi
 
     @wraps(written)
     def moments(channel: Any, order: int) -> JointMoments:
+        """Return the moments of this order, from what the map's own method returns: these, or their matrix."""
         result = written(channel, order)
         if isinstance(result, JointMoments):
             return result

@@ -60,11 +60,13 @@ def _push_through_hop(channel: GainAndNoise, order: int, moments: Array1) -> Arr
 
 @push_moments.register
 def _push_through_series(channel: Series, order: int, moments: Array1) -> Array1:
+    """Return E[mono(z)] behind maps one after another."""
     return reduce(lambda m, affine: push_moments(affine, order, m), channel.maps, moments)
 
 
 @push_moments.register
 def _push_through_mixture(channel: Mixture, order: int, moments: Array1) -> Array1:
+    """Return E[mono(z)] behind one of several maps: the mean of theirs."""
     parts = [push_moments(affine, order, moments) for affine in channel.maps]
     return channel.choice.probabilities @ stack_parts(parts)
 
@@ -109,6 +111,7 @@ class TabulatedNoise(AbstractNoise):
 
 @noise_vector.register
 def _look_moments_up(noise: TabulatedNoise, order: int) -> Array1:
+    """Return all moments up to `order` of a noise, out of its table."""
     return noise.table[_positions_of_lower_order(noise.dimension, order, noise.order)]
 
 

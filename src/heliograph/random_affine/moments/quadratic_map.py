@@ -40,11 +40,12 @@ class QuadraticMap(Module):
 
 
 def _or_one(value: jax.Array) -> jax.Array:
+    """Return positive numbers as they are, and 1 in place of others: a divisor."""
     return jnp.where(value > 0, value, 1.0)
 
 
 def map_of_known_law(tensor: Tensor) -> QuadraticMap:
-    """Map W -> T:W of a law that is known, without an uncertain part."""
+    """Return the map W -> T:W of a law that is known, without an uncertain part."""
     return QuadraticMap(tensor, np.zeros(tensor.shape))
 
 
@@ -60,12 +61,12 @@ def size_of_map(shift: QuadraticMap) -> Any:
 
 
 def add_maps(*maps: QuadraticMap) -> QuadraticMap:
-    """Add maps of second moments."""
+    """Return the sum of maps of second moments."""
     return reduce(lambda a, b: QuadraticMap(a.center + b.center, a.radius + b.radius), maps)
 
 
 def scale_map(part: QuadraticMap, factor: Any) -> QuadraticMap:
-    """Multiply a map of second moments by a number."""
+    """Return a map of second moments times a number."""
     return QuadraticMap(factor * part.center, factor * part.radius)
 
 

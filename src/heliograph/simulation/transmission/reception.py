@@ -124,7 +124,7 @@ class SeparateChannels(AbstractMedium):
             y = measure(sensor, x, draw_key(key, k, group.checksums, SENSOR))
             reference: jax.Array | None = None
             if group.reference_filter is not None and link.feed_back is not None:
-                reference = group.reference_filter.reference(link.feed_back, u, k)
+                reference = group.reference_filter.predict_reference(link.feed_back, u, k)
             if isinstance(group.reference_filter, FedBackFilter) and reference is not None:
                 y = y - reference
             y, z, memory = _send_through_channel(group, link.memory, y, key, k)
