@@ -137,7 +137,9 @@ def find_premise(network: HasNodes, name: str) -> Premise:
         limits = node.limits if node.limits is not None and node.limits.bounded else None
         return Premise(plant, node.sensor, node.channel, node.trigger, range=limits, encoder=node.encoder)
     if network.common is not None:
-        return restrict_premise_to_rows(Premise(plant, network.common.sensor, network.common.channel), network.rows[name])
+        return restrict_premise_to_rows(
+            Premise(plant, network.common.sensor, network.common.channel), network.rows[name]
+        )
     if network.relays is None:  # a node without a sensor
         return Premise(plant)
     schedules = {
