@@ -40,17 +40,17 @@ class JudgementReader:
 
     def __init__(self, fleet: Fleet):
         self.fleet, places = fleet, fleet.program.places
-        central = _judgement_columns([output for output in places if output.node == Network.FUSED])
-        # By index of a node the columns of the judgements on it; the nodes without a filter of their own.
-        self._judgement_columns, self._judged_centrally = {}, set[int]()
-        for index, name in enumerate(fleet.network.names):
-            of_node = _judgement_columns(
-                [output for output in places if output.node == name and _takes_measurements(fleet, output)]
-            )
-            self._judgement_columns[index] = of_node if len(of_node) else central
-            if not len(of_node):
-                self._judged_centrally.add(index)
+        # Columns of the judgements among a row's outputs, (filter, part): of all filters, and of the central ones.
         self._all_columns = _judgement_columns(places)
+        central = _judgement_columns([place for place in places if place.node == Network.FUSED])
+        # By index of a node those on it; the nodes without a filter of their own, whose events central filters judge.
+        self._judgement_columns, self._judged_centrally = dict[int, np.ndarray](), set[int]()
+        for index, name in enumerate(fleet.network.names):
+            of_node = [place for place in places if place.node == name and _takes_measurements(fleet, place)]
+            own = _judgement_columns(of_node)
+            self._judgement_columns[index] = own if len(own) else central
+            if not len(own):
+                self._judged_centrally.add(index)
         # By node and filter: how often a faulty function was looked for, and the sentence that was found.
         self._faults: dict[tuple[str, str], tuple[int, str]] = {}
 
@@ -70,7 +70,7 @@ class JudgementReader:
         return Judgement.why_inputs(outputs[self._all_columns])
 
     def find_implausible(self, taken: Sequence[Candidate]) -> dict[int, str]:
-        """Return the indices of the implausible candidates, each with the reason.
+        """Return {index of an implausible candidate: the reason}, by the rows that were just stepped.
 
         Of a plant with implausible inputs only the first of these is returned: what comes after it was judged with it.
         Of several events of one node in one row only the largest is returned, since the row was judged as a whole; an
@@ -78,66 +78,75 @@ class JudgementReader:
         """
         if not taken:
             return {}
-        # Most rows raise no flag: look at the parts of a judgement only where one is raised.
-        pool = self.fleet.pool
-        slots = np.array([candidate.row.slot for candidate in taken])
-        flagged = (pool.table[slots[:, None], pool.outputs.start + self._all_columns[:, FLAGS].ravel()] > 0).any(axis=1)
-        # Reasons by candidate; by plant the first of its implausible inputs.
-        reasons, first_inputs = dict[int, str](), dict[str, int]()
-        for i in np.flatnonzero(flagged).tolist():
-            plant, event, outputs = taken[i].plant, taken[i].event, pool.table[slots[i], pool.outputs]
-            why = None
-            if event.node_index < 0:
-                why = self.why_inputs(outputs)
-                if why:
-                    first = first_inputs.setdefault(plant.name, i)
-                    first_inputs[plant.name] = min(first, i, key=lambda j: taken[j].row.key)
-            elif _largest_number(event) >= 0:
-                why = Judgement.why_values(outputs[self._judgement_columns[event.node_index]])
-            if why:
-                reasons[i] = why
+        flagged = self._find_flagged(taken)
+        reasons = {i: why for i in flagged if (why := self._explain(taken[i]))}
+        # Of several nodes' events that were judged together only the one to blame; of one node in one row the largest.
         self._drop_blameless(taken, reasons)
-        # Of one node in one row the event with the largest number.
         largest: dict[tuple[int, int], int] = {}
         for i in reasons:
             node_of_row = taken[i].row.slot, taken[i].event.node_index
             largest[node_of_row] = max(largest.get(node_of_row, i), i, key=lambda j: _largest_number(taken[j].event))
         # What came after implausible inputs of its plant was judged with these: it may be all right without them.
+        first_inputs: dict[str, int] = {}
+        for i in reasons:
+            if taken[i].event.node_index < 0:
+                first = first_inputs.setdefault(taken[i].plant.name, i)
+                first_inputs[taken[i].plant.name] = min(first, i, key=lambda j: taken[j].row.key)
         return {
             i: why + self._name_faulty_function(taken[i])
             for i, why in reasons.items()
             if i in largest.values() and first_inputs.get(taken[i].plant.name, i) == i
         }
 
+    def _find_flagged(self, taken: Sequence[Candidate]) -> list[int]:
+        """Return the indices of the candidates in whose rows any filter's judgement raises a flag; most raise none."""
+        pool, slots = self.fleet.pool, np.array([candidate.row.slot for candidate in taken])
+        flags = pool.outputs.start + self._all_columns[:, FLAGS].ravel()
+        flagged: list[int] = np.flatnonzero((pool.table[slots[:, None], flags] > 0).any(axis=1)).tolist()
+        return flagged
+
+    def _explain(self, candidate: Candidate) -> str | None:
+        """Return why a candidate is implausible by the judgements of its row; None if it is not, or has no number."""
+        event, pool = candidate.event, self.fleet.pool
+        outputs = pool.table[candidate.row.slot, pool.outputs]
+        if event.node_index < 0:  # inputs
+            return self.why_inputs(outputs)
+        if _largest_number(event) < 0:
+            return None
+        return Judgement.why_values(outputs[self._judgement_columns[event.node_index]])
+
     def _name_faulty_function(self, candidate: Candidate) -> str:
-        """Name the function of a filter that returned no number in a row, after a semicolon; "" where none did.
+        """Return the name of a filter's function that returned no number in a row, after "; "; "" where none did.
 
         A filter's fault, once found, is repeated without another search. A filter is searched at most TRIES times, for
         a plant may send implausible events for ever.
         """
-        # The event's row, what the filters said after it, and the row before it: the first that is held has no events.
-        rows, event, row = candidate.plant.rows, candidate.event, candidate.row
-        pool, before = self.fleet.pool, rows.held[rows.index(row.key) - 1]
-        after = pool.table[row.slot, pool.outputs]
+        event, row = candidate.event, candidate.row
+        row_before, outputs = self._find_row_before(candidate), self.fleet.pool.table[row.slot, self.fleet.pool.outputs]
+        # Filters that take the event: of its node, or of all nodes. Inputs concern every filter.
+        concerned = None if event.node_index < 0 else (Network.FUSED, self.fleet.network.names[event.node_index])
         for place in self.fleet.program.places:
-            # Filters that judged this row to be no number, of the event's node or of all nodes.
             filter = filter_of(self.fleet, place)
-            judged = place.judgement is not None and Judgement.is_spoilt(after[place.judgement.reason])
-            concerned = event.node_index < 0 or place.node in (
-                Network.FUSED,
-                self.fleet.network.names[event.node_index],
-            )
-            if filter is None or not judged or not concerned:
+            if filter is None or (concerned is not None and place.node not in concerned):
                 continue
-            # Call the filter's functions from the estimate before the row: which of them returns no number?
-            tried, said = self._faults.get((place.node, place.filter), (0, ""))
-            if not said and tried < TRIES:
-                inputs, step = pool.inputs_between(before.slot, row.slot)
-                said = find_function_fault(filter, self._estimate_after(before, filter, place), inputs, step)
-                self._faults[place.node, place.filter] = tried + 1, said
-            if said:
-                return f"; {said}"
+            # Only those that judged the row to be no number.
+            if place.judgement is None or not Judgement.is_spoilt(outputs[place.judgement.reason]):
+                continue
+            # Call the filter's functions from its estimate before the row: which of them returns no number?
+            tries, sentence = self._faults.get((place.node, place.filter), (0, ""))
+            if not sentence and tries < TRIES:
+                inputs, step = self.fleet.pool.inputs_between(row_before.slot, row.slot)
+                estimate = self._estimate_after(row_before, filter, place)
+                sentence = find_function_fault(filter, estimate, inputs, step)
+                self._faults[place.node, place.filter] = tries + 1, sentence
+            if sentence:
+                return f"; {sentence}"
         return ""
+
+    def _find_row_before(self, candidate: Candidate) -> HeldRow:
+        """Return the row before the candidate's; there is one, since the first that is held takes no event."""
+        rows = candidate.plant.rows
+        return rows.held[rows.index(candidate.row.key) - 1]
 
     def _estimate_after(self, row: HeldRow, filter: AbstractFilter, place: FilterColumns) -> Estimate:
         """Return what a filter estimated after a row, from its columns; before all events its initial estimate."""
@@ -176,7 +185,7 @@ class JudgementReader:
         columns = rows.places[event.node_index]
         trial.numbers[columns] = [nan] * (columns.stop - columns.start)
         # Stepped from the row before, judged, and let go.
-        self.fleet.step_row(rows.held[rows.index(row.key) - 1], trial)
+        self.fleet.step_row(self._find_row_before(candidate), trial)
         judged = pool.table[trial.slot, pool.outputs][self._judgement_columns[event.node_index]]
         pool.give([trial.slot])
         return Judgement.why_values(judged) is None
@@ -193,42 +202,39 @@ def _judgement_columns(outputs: Sequence[FilterColumns]) -> np.ndarray:
     return np.array(results, dtype=int).reshape(-1, len(Judgement._fields))
 
 
+class WatchedAngles(NamedTuple):
+    """Angles to watch in rows of the table, which are removed from `angles` once they were said.
+
+    Attributes:
+        name: name before what is said: "node/filter" of states, the node of what it receives.
+        columns: columns of the table, of the variances of the filter's states or of the received numbers.
+        angles: which of these numbers are angles, and what to say of them.
+    """
+
+    name: str
+    columns: np.ndarray
+    angles: WideAngles
+
+
 class FleetAngles:
     """Watch a fleet for angles that a filter knows less well than it can use, and for degrees; each is said once."""
 
     def __init__(self, fleet: Fleet):
-        # Name, columns of the variances of its states in the table, and the angles among these, by filter.
-        self._pool, self._watched = fleet.pool, list[tuple[str, np.ndarray, WideAngles]]()
-        # The same by node of what it receives.
-        self._received = list[tuple[str, np.ndarray, WideAngles]]()
-        for place in fleet.program.places:
-            filter = filter_of(fleet, place)
-            if filter is not None and (angles := WideAngles(filter)).states:
-                n = len(filter.states)
-                variances = fleet.pool.outputs.start + place.covariance + np.arange(n) * (n + 1)
-                self._watched.append((f"{place.node}/{place.filter}", variances, angles))
-        # What each node receives, by a filter that takes it: its own, or one of all nodes; each column only once.
-        watched = set[int]()
-        for place in fleet.program.places:
-            if (filter := filter_of(fleet, place)) is not None and filter.received:
-                here = _list_received(fleet.network, place.node)
-                angles = WideAngles(filter, list(here.values()))
-                for i, column in enumerate(here):
-                    if column in watched:
-                        angles.received.pop(i, None)
-                watched |= set(here)
-                self._received.append((place.node, fleet.pool.numbers.start + np.array(list(here)), angles))
+        self._pool = fleet.pool
+        self._states = _watch_states(fleet)
+        self._received = _watch_received(fleet)
 
     def find_new(self, plants: Sequence[PlantState]) -> list[tuple[str, str]]:
         """Return (name of the plant, line) for each angle whose doubt shows in a newest row for the first time."""
-        self._watched = [watched for watched in self._watched if watched[-1].states]
-        self._received = [watched for watched in self._received if watched[-1].received]
-        if not self._watched and not self._received:
+        # Of which all has been said is watched no longer.
+        self._states = [watched for watched in self._states if watched.angles.states]
+        self._received = [watched for watched in self._received if watched.angles.received]
+        if not self._states and not self._received:
             return []
         slots = np.array([plant.rows.held[-1].slot for plant in plants], dtype=int)
         wide = [
             (plants[row].name, f"{name}: {line}")
-            for name, columns, angles in self._watched
+            for name, columns, angles in self._states
             for row, line in angles.said_of(self._pool.table[slots[:, None], columns])
         ]
         return wide + [
@@ -236,6 +242,39 @@ class FleetAngles:
             for name, columns, angles in self._received
             for row, line in angles.doubt_unit(self._pool.table[slots[:, None], columns])
         ]
+
+
+def _watch_states(fleet: Fleet) -> list[WatchedAngles]:
+    """Return for each filter with angles among its states what to watch: the variances of its states."""
+    watched = list[WatchedAngles]()
+    for place in fleet.program.places:
+        filter = filter_of(fleet, place)
+        if filter is not None and (angles := WideAngles(filter)).states:
+            # The diagonal of its covariance, (n, n) row by row.
+            n = len(filter.states)
+            variances = fleet.pool.outputs.start + place.covariance + np.arange(n) * (n + 1)
+            watched.append(WatchedAngles(f"{place.node}/{place.filter}", variances, angles))
+    return watched
+
+
+def _watch_received(fleet: Fleet) -> list[WatchedAngles]:
+    """Return what each node receives, to watch by a filter that takes it: its own, or one of all nodes.
+
+    Each column is watched only once.
+    """
+    watched, seen = list[WatchedAngles](), set[int]()
+    for place in fleet.program.places:
+        filter = filter_of(fleet, place)
+        if filter is None or not filter.received:
+            continue
+        names = _list_received(fleet.network, place.node)
+        angles = WideAngles(filter, list(names.values()))
+        for i, column in enumerate(names):
+            if column in seen:
+                angles.received.pop(i, None)
+        seen |= set(names)
+        watched.append(WatchedAngles(place.node, fleet.pool.numbers.start + np.array(list(names)), angles))
+    return watched
 
 
 def _list_received(network: Network, node: str) -> dict[int, str]:

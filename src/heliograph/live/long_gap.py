@@ -13,7 +13,7 @@ Step = Callable[[Float[np.ndarray, "row state"], int], Float[np.ndarray, "row st
 """Takes several states, each by itself, through the silent step with this number."""
 
 LONG = 10_000  # steps: a longer gap is not stepped through one by one
-PROBED = 256  # steps by which a jump is proved
+PROBED = 256  # real steps of a probe, by which a jump is proved
 PROBES = 32  # after so many a state neither settles nor moves by an affine map
 TAIL = 4  # steps taken one by one at the end, for what a filter remembers of the step before
 SETTLED = 1e-13  # relative change over a probe: rounding
@@ -91,34 +91,46 @@ def pass_long_gap(step: Step, start: Float[np.ndarray, " state"], state: Float[n
 def _pass_silent_steps(
     step: Step, state: Float[np.ndarray, " state"], at: int, count: int, places: Sequence[FactorPlaces]
 ) -> Float[np.ndarray, " state"]:
-    """Take `count` steps of silence: a few probes, PROBED real steps each, and the rest at once by what these show.
+    """Return the state after `count` steps of silence: a few probes, and the rest at once by what these show.
 
-    Where a probe moves nothing the state rests; where an affine map predicts the probe it is applied for all steps that
-    are left; else the probes are extrapolated. A state holds factors L, D of covariances at `places`; they are compared
-    and extrapolated as L D L', since P' = F P F' + Q is affine in P and not in its factors.
+    A probe is PROBED real steps in a row. Where one moves nothing the state rests; where an affine map predicts it, the
+    map is applied for all steps that are left; else the probes are extrapolated. A state holds factors L, D of
+    covariances at `places`; states are compared and extrapolated with L D L' there, since P' = F P F' + Q is affine in
+    P and not in its factors.
+
+    Args:
+        step: the silent step, of states with factors.
+        state: state before the gap.
+        at: number of the step that led to it.
+        count: number of steps.
+        places: of the factors in a state.
     """
-    passed = [state]  # the states after 0, 1, 2, ... probes
+    after_probes = [state]  # the states after 0, 1, 2, ... probes
 
-    def as_covariances(states: Sequence[Float[np.ndarray, " state"]]) -> Sequence[Float[np.ndarray, " state"]]:
+    def with_covariances(states: Sequence[Float[np.ndarray, " state"]]) -> Sequence[Float[np.ndarray, " state"]]:
+        """Return states with covariances in place of their factors."""
         return list(convert_to_covariances(np.stack(states), places))
 
-    def by_covariances(states: Float[np.ndarray, "row state"], k: int) -> Float[np.ndarray, "row state"]:
+    def step_covariances(states: Float[np.ndarray, "row state"], k: int) -> Float[np.ndarray, "row state"]:
+        """Return states with covariances after the silent step with number k."""
         return convert_to_covariances(step(convert_to_factors(states, places), k), places)
 
     for i in range(min(PROBES, count // PROBED)):
-        passed.append(_step_through(step, passed[-1], at + i * PROBED, PROBED))
-        if not (moving := _find_moving(*as_covariances(passed[-2:]))).any():
-            return passed[-1]
-        if i & (i + 1) == 0:  # after 1, 2, 4, ... probes; the jump starts before the last of them
-            jumped = _jump_by_affine_map(
-                by_covariances, as_covariances(passed[-2:]), moving, at + i * PROBED, count - i * PROBED
-            )
+        after_probes.append(_step_through(step, after_probes[-1], at + i * PROBED, PROBED))
+        probe = with_covariances(after_probes[-2:])
+        entries_moving = _find_moving(*probe)
+        if not entries_moving.any():
+            return after_probes[-1]
+        # After 1, 2, 4, ... probes the map is tried, which costs a step for each entry; it starts before the last one.
+        if i & (i + 1) == 0:
+            begin, left = at + i * PROBED, count - i * PROBED
+            jumped = _jump_by_affine_map(step_covariances, probe, entries_moving, begin, left)
             if jumped is not None:
                 return _restore_factors(jumped, places)
-    done = PROBED * (len(passed) - 1)
+    done = PROBED * (len(after_probes) - 1)
     if count - done < PROBED:
-        return _step_through(step, passed[-1], at + done, count - done)
-    return _restore_factors(_extrapolate_state(as_covariances(passed), count - done), places)
+        return _step_through(step, after_probes[-1], at + done, count - done)
+    return _restore_factors(_extrapolate_state(with_covariances(after_probes), count - done), places)
 
 
 def _restore_factors(state: Float[np.ndarray, " state"], places: Sequence[FactorPlaces]) -> Float[np.ndarray, " state"]:
@@ -154,7 +166,7 @@ def _step_through(step: Step, state: Float[np.ndarray, " state"], at: int, count
 
 
 def _find_moving(before: Float[np.ndarray, " state"], after: Float[np.ndarray, " state"]) -> np.ndarray:
-    """Return the mask of the numbers that changed by more than rounding."""
+    """Return the mask of a state's numbers that changed by more than rounding; NaN that stays NaN did not."""
     with np.errstate(invalid="ignore"):
         close = np.abs(after - before) <= SETTLED * np.maximum(np.abs(before), np.abs(after))
     moving: np.ndarray = ~(close | (before == after) | (np.isnan(before) & np.isnan(after)))
@@ -165,8 +177,11 @@ def _jump_by_affine_map(step: Step, probe: Sequence[Float[np.ndarray, " state"]]
             at: int, count: int) -> Float[np.ndarray, " state"] | None:  # fmt: skip
     """Return the state `count` steps after the begin of a probe by the affine map there; None if it fails the probe.
 
+    With s the state before the probe and g the step, g(s + d) = g(s) + A d, so that the distance d from s goes on by
+    d' = A d + c, c = g(s) - s.
+
     Args:
-        step: the silent step, of states with covariances.
+        step: the silent step g, of states with covariances.
         probe: the states before and after PROBED real steps.
         moving: which numbers changed over the probe; the map is of these alone.
         at: number of the step before the probe.
@@ -175,29 +190,44 @@ def _jump_by_affine_map(step: Step, probe: Sequence[Float[np.ndarray, " state"]]
     state, probed = probe
     if not (np.isfinite(state[moving]) & np.isfinite(probed[moving])).all():
         return None
-    # A by differences along each number that moves: over a power of two of about the size of its movement, so that
-    # the division is exact, and not less than 2^-20 of the number itself, so that rounding does not count.
     columns = np.flatnonzero(moving)
-    size = np.exp2(np.ceil(np.log2(np.maximum(np.abs(probed - state), np.abs(state) * 2.0**-20)[columns])))
-    tried = np.repeat(state[None], len(columns) + 1, axis=0)
-    tried[np.arange(1, len(columns) + 1), columns] += size
-    after = step(tried, at + 1)[:, columns]
-    matrix, moved = ((after[1:] - after[0]) / size[:, None]).T, after[0] - state[columns]
+    matrix, moved = _measure_affine_map(step, state, probed - state, columns, at)
     if not np.isfinite(matrix).all():
         return None
-    # Entries in units of the movements are rounded to LEAST: a zero computed as 1e-15 would let what grows for ever
-    # drive what rests.
-    units = size[:, None] / size
-    matrix = np.round(matrix / units / LEAST) * LEAST * units
-    # The map has to predict the probe.
+    # The map has to predict the probe, to AGREES of the movement; rounding of the numbers themselves does not count.
     with np.errstate(over="ignore", invalid="ignore"):
-        expected, seen = _iterate_affine_map(matrix, moved, PROBED), (probed - state)[columns]
-        scale = np.abs(seen) + AGREES * np.abs(state)[columns]
-        if not (np.abs(expected - seen) <= AGREES * scale + SETTLED * np.abs(probed)[columns]).all():
+        expected, movement = _iterate_affine_map(matrix, moved, PROBED), (probed - state)[columns]
+        scale = np.abs(movement) + AGREES * np.abs(state)[columns]
+        if not (np.abs(expected - movement) <= AGREES * scale + SETTLED * np.abs(probed)[columns]).all():
             return None
         jumped = state.copy()
         jumped[columns] += _iterate_affine_map(matrix, moved, count)
     return jumped
+
+
+def _measure_affine_map(
+    step: Step, state: Float[np.ndarray, " state"], movement: Float[np.ndarray, " state"], columns: np.ndarray, at: int
+) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, " m"]]:
+    """Return A and c = g(s) - s of the step g(s + d) = g(s) + A d, by differences along each of the m `columns`.
+
+    Args:
+        step: the silent step g.
+        state: the state s.
+        movement: by how much each number moves over a probe, which scales its difference.
+        columns: numbers of the state that move; A and c are of these alone.
+        at: number of the step before.
+    """
+    # Over a power of two of about the size of the movement, so that the division is exact, and not less than 2^-20 of
+    # the number itself, so that rounding does not count.
+    size = np.exp2(np.ceil(np.log2(np.maximum(np.abs(movement), np.abs(state) * 2.0**-20)[columns])))
+    tried = np.repeat(state[None], len(columns) + 1, axis=0)  # s itself, then s with one number changed
+    tried[np.arange(1, len(columns) + 1), columns] += size
+    after = step(tried, at + 1)[:, columns]
+    matrix = ((after[1:] - after[0]) / size[:, None]).T
+    # Entries in units of the movements are rounded to LEAST: a zero computed as 1e-15 would let what grows for ever
+    # drive what rests.
+    units = size[:, None] / size
+    return np.round(matrix / units / LEAST) * LEAST * units, after[0] - state[columns]
 
 
 def _iterate_affine_map(

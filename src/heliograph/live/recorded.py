@@ -61,45 +61,67 @@ def replay_events(
         raise fail("lag", f"a number from 0 to the window, {window:g}", lag)
     timeline = Timeline(network, window, start, ahead, capacity)
     # Order of arrival; without an arrival time an event arrives when it is measured.
-    coming = sorted(events, key=_arrival_of) if isinstance(events, Sequence) else events
-    finals: list[Record] = []
-    lagged: list[tuple[float, Mapping[str, Mapping[str, Estimate]]]] = []
-    waiting: list[float] = []  # moments of which the lag has not passed
-
-    def smooth_moments(until: float) -> None:
-        """Smooth each waiting moment whose lag ends before `until`, which nothing that arrives earlier can change."""
-        while lag is not None and waiting and waiting[0] + lag < until:
-            moment = heappop(waiting)
-            if (lagged and lagged[-1][0] == moment) or moment > timeline.now:  # there already; of a wrong clock
-                continue
-            timeline.advance(moment + lag)
-            lagged.append((moment, timeline.lagged(min(timeline.now - moment, window))))
-
+    in_order = sorted(events, key=_arrival_of) if isinstance(events, Sequence) else events
+    smoother = None if lag is None else _LaggedSmoother(timeline, lag)
     # Final estimates are collected before the timeline would drop any.
+    finals: list[Record] = []
     count = 0
-    for count, event in enumerate(coming, 1):
-        smooth_moments(_arrival_of(event))
-        if timeline.push(*event) == "used" and event.node != INPUTS and timeline.now <= event.time + (lag or 0.0):
-            heappush(waiting, event.time)
+    for count, event in enumerate(in_order, 1):
+        if smoother is not None:
+            smoother.smooth_until(_arrival_of(event))
+        verdict = timeline.push(*event)
+        if smoother is not None and verdict == "used" and event.node != INPUTS:
+            smoother.note_moment(event.time)
         if count % timeline.capacity == 0:
             finals.append(timeline.final())
     if not count:
         raise fail("events", "at least one", "none")
-    smooth_moments(np.inf)
+    if smoother is not None:
+        smoother.smooth_until(np.inf)
     # The rest becomes final.
     timeline.advance(timeline.now + window + 1.0)
     finals.append(timeline.final())
-    late = None if lag is None else _make_record(network, lagged)
-    return ReplayResult(_join_records(finals), late, timeline.counts, timeline.forced)
+    lagged = None if smoother is None else _make_record(network, smoother.smoothed)
+    return ReplayResult(_join_records(finals), lagged, timeline.counts, timeline.forced)
+
+
+class _LaggedSmoother:
+    """Smooths the estimates of each moment with a measurement as soon as a fixed lag has passed since.
+
+    Attributes:
+        smoothed: (moment, estimates there by node and filter), in order of time.
+    """
+
+    def __init__(self, timeline: Timeline, lag: float):
+        self.smoothed: list[tuple[float, Mapping[str, Mapping[str, Estimate]]]] = []
+        self._timeline, self._lag = timeline, lag
+        self._waiting: list[float] = []  # a heap of moments of which the lag has not passed
+
+    def note_moment(self, moment: float) -> None:
+        """Note that something was measured at a moment, which will be smoothed unless its lag has passed already."""
+        if self._timeline.now <= moment + self._lag:
+            heappush(self._waiting, moment)
+
+    def smooth_until(self, arrival: float) -> None:
+        """Smooth each moment noted whose lag ends before `arrival`: nothing that comes from then on can change it."""
+        timeline, smoothed = self._timeline, self.smoothed
+        while self._waiting and self._waiting[0] + self._lag < arrival:
+            moment = heappop(self._waiting)
+            is_done = bool(smoothed) and smoothed[-1][0] == moment  # two nodes measured then
+            if is_done or moment > timeline.now:  # the latter of a wrong clock, whose leap was taken back
+                continue
+            timeline.advance(moment + self._lag)
+            lag = min(timeline.now - moment, timeline.window)
+            smoothed.append((moment, timeline.lagged(lag)))
 
 
 def _arrival_of(event: Event) -> float:
-    """Return when an event arrived."""
+    """Return when an event arrived: its arrival, else its own time."""
     return event.time if event.arrival is None else event.arrival
 
 
 def _join_records(parts: Sequence[Record]) -> Record:
-    """Join records one after another in time."""
+    """Return one record of several, one after another in time, with the same nodes and filters."""
     estimates = {
         node: {
             name: _stack_estimates([record.estimates[node][name] for record in parts], np.concatenate)
@@ -111,7 +133,7 @@ def _join_records(parts: Sequence[Record]) -> Record:
 
 
 def _make_record(network: Network, parts: Sequence[tuple[float, Mapping[str, Mapping[str, Estimate]]]]) -> Record:
-    """Make a record of estimates by node and filter at one time after another."""
+    """Return the record of `parts`: (time, estimates then by node and filter), in order of time."""
     results = [estimates for _, estimates in parts]
     estimates = {
         node: {

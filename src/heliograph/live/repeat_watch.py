@@ -68,24 +68,32 @@ class RepeatWatch:
         Its `found` has one more where a run has become too long with this reading.
         """
         m, before = len(values), before or FIRST
+        # The fields of `Repeats` by component, to be changed in place.
         newest, lengths = list(before.newest or [np.nan] * m), list(before.lengths or [0] * m)
         steps, readings = list(before.steps or [inf] * m), list(before.readings or [0] * m)
         equal, found = list(before.equal or [0] * m), list(before.found or [0] * m)
         for i, value in enumerate(values):
-            if value != value:
+            if value != value:  # NaN
                 continue
             if value == newest[i]:
                 lengths[i] += 1
                 equal[i] += 1
-            else:
+            else:  # a new run; the least difference of two successive readings bounds the resolution
                 if readings[i]:
                     steps[i] = min(steps[i], abs(value - newest[i]))
                 newest[i], lengths[i] = value, 1
             readings[i] += 1
+            # Found once, when its length reaches what is too long.
             if lengths[i] >= LEAST:
                 found[i] += lengths[i] == self._count_too_many(i, lengths[i], steps[i], readings[i], equal[i])
-        followed = tuple(newest), tuple(lengths), tuple(steps), tuple(readings), tuple(equal), tuple(found)
-        return Repeats(*followed)
+        return Repeats(
+            newest=tuple(newest),
+            lengths=tuple(lengths),
+            steps=tuple(steps),
+            readings=tuple(readings),
+            equal=tuple(equal),
+            found=tuple(found),
+        )
 
     def describe(self, output: int, name: str, repeats: Repeats) -> str:
         """Say that an output repeats its newest reading for longer than its noise allows, and what refuses that."""
@@ -98,7 +106,7 @@ class RepeatWatch:
         )
 
     def _bound(self, output: int, step: float) -> float:
-        """Return the largest probability that a reading of this resolution equals the one before it."""
+        """Return the largest probability, over the noises, that an output of resolution `step` repeats its reading."""
         key = output, step
         if key not in self._bounds:
             if len(self._bounds) > 10_000:
@@ -108,7 +116,16 @@ class RepeatWatch:
         return self._bounds[key]
 
     def _count_too_many(self, output: int, length: int, step: float, readings: int, equal: int) -> float:
-        """Return the least count of equal readings that is too long, given the present run and what came before it."""
+        """Return the least count of equal readings in a row that is too long for an output; infinite if none is.
+
+        Args:
+            output: index of the output.
+            length: of the present run.
+            step: least difference of two successive readings so far.
+            readings: how many there were, with the run.
+            equal: how many of these were equal to the one before, with the run.
+        """
+        # (e + 1) / (o + 2) of the pairs outside the run: e = equal - (length - 1), o = readings - length.
         by_count = (equal - (length - 1) + 1) / (readings - length + 2)
         p = max(self._bound(output, step), by_count)
         return inf if p >= 1 - SURE else max(LEAST, 1 + ceil(log(SELDOM) / log(p)))

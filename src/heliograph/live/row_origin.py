@@ -2,9 +2,10 @@
 
 import numpy as np
 
+from heliograph.filters.plausibility import Judgement
 from heliograph.live.fleet import Fleet
 from heliograph.live.network_program import NetworkProgram
-from heliograph.model.estimate import Estimate, lower_unsound_claim
+from heliograph.model.estimate import Estimate, JudgedEstimate, lower_unsound_claim
 from heliograph.model.forecast_origin import Origin
 from heliograph.model.over_time import first
 
@@ -39,4 +40,30 @@ def estimates_by_name(program: NetworkProgram, outputs: np.ndarray) -> dict[str,
         modes = place.probabilities(outputs)
         estimate = Estimate(mean, covariance, place.claim, modes, attitude=attitude)
         estimates[place.node][place.filter] = lower_unsound_claim(estimate)
+    return estimates
+
+
+def judged_estimates_by_name(program: NetworkProgram, outputs: np.ndarray) -> dict[str, dict[str, Estimate]]:
+    """Return the estimates of a row by node and filter, each with what its filter made of what arrived there.
+
+    `outputs`: those of the row, (outputs,). A fusion that tests nothing itself has an estimate alone.
+    """
+    estimates = estimates_by_name(program, outputs)
+    for place in program.places:
+        tested = place.judgement or place.tested  # columns of its squared distance and count
+        if tested is None:
+            continue
+        estimate, nis = estimates[place.node][place.filter], float(outputs[tested.distance])
+        reason = 0.0 if place.judgement is None else float(outputs[place.judgement.reason])
+        estimates[place.node][place.filter] = JudgedEstimate(
+            mean=estimate.mean,
+            covariance=estimate.covariance,
+            claim=estimate.claim,
+            modes=estimate.modes,
+            attitude=estimate.attitude,
+            nis=nis,
+            received=int(outputs[tested.arrived]),
+            refused=Judgement.describe(reason, nis) if reason > 0 else "",
+            weight=None if place.weighed is None else outputs[list(place.weighed.weight)],
+        )
     return estimates

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from heliograph.filters.plausibility import Judgement
 from heliograph.live.event import INPUTS, VERDICTS, CheckedEvent, Verdict, check_63_bits, check_moment, check_numbers
 from heliograph.live.final_rows import FinalRows, GateCounts
 from heliograph.live.fleet import Fleet, Options
@@ -15,14 +14,14 @@ from heliograph.live.fleet_remarks import FleetRemarks, FleetRepeatWatch
 from heliograph.live.implausible_events import Candidate, FleetAngles, JudgementReader
 from heliograph.live.link_counts import LinkCounts
 from heliograph.live.network_program import shared_program
-from heliograph.live.row_origin import estimates_by_name, make_row_origin
+from heliograph.live.row_origin import estimates_by_name, judged_estimates_by_name, make_row_origin
 from heliograph.live.sender_status import SenderStatus
 from heliograph.live.sorted_rows import BEFORE, HeldRow
 from heliograph.live.stored.migration import DESCRIPTION, SAME, PlantMigration, describe_network
 from heliograph.live.stored.plant_codec import pack_plant, unpack_plant
 from heliograph.live.stored.snapshot import check_same_network, pack, unpack_snapshot
 from heliograph.model.checks.refusals import SCREENED, Reason
-from heliograph.model.estimate import Estimate, JudgedEstimate
+from heliograph.model.estimate import Estimate
 from heliograph.model.forecast_origin import Origin
 from heliograph.numerics.check import check_count, fail, instance, scalar, show_value
 from heliograph.numerics.module import readable
@@ -74,6 +73,7 @@ class Timeline:
     """
 
     def __init__(self, network: Network, window: float, start: float = 0.0, ahead: float = 0.0, capacity: int = 1000):
+        # The arguments, checked.
         self.network = instance("network", network, Network, "a Network")
         self.window, self.ahead = float(scalar("window", window, 0)), float(scalar("ahead", ahead, 0))
         start, self.capacity = float(scalar("start", start)), check_count("capacity", capacity)
@@ -85,13 +85,15 @@ class Timeline:
             raise fail("start", "0 where time counts steps", start)
         if what := self._program.uneven:
             warnings.warn(f"timeline: predictions depend on when others are asked for: {what}", stacklevel=2)
-        # A fleet of one plant, and a slot to look ahead in.
+        # A fleet of one plant, and a slot of its table to predict into.
         self._fleet = Fleet(self._program, Options(self.window, self.ahead, capacity=self.capacity), alone=True)
         self._plant, self._spare = self._fleet.begin_plant("", start, None), self._fleet.pool.take()
+        # What judges events, and what is warned of: angles, states of filters, readings that repeat.
         self._judges = JudgementReader(self._fleet)
         self.reasons: dict[str, str] = {}
         self._angles, self._remarks = FleetAngles(self._fleet), FleetRemarks(self._fleet)
         self._held = FleetRepeatWatch(self._fleet)
+        # Of final rows: what filters left out, and the outputs that `final` has not returned yet.
         self._gates = GateCounts(self._program.places)
         self._finals = FinalRows(2 * self.capacity, self._program.step_rows.outputs.size)
 
@@ -150,28 +152,36 @@ class Timeline:
         return self._counts_of("held")
 
     def _counts_of(self, what: str) -> dict[str, int]:
-        """Return one of the counts of the links, by node."""
+        """Return {node: the count of its link called `what`}, an attribute of `LinkCounts`; 0 before a message."""
         return {name: getattr(self._plant.links.get(name, LinkCounts()), what) for name in self.network.names}
 
     def push(self, node: str, sequence: int, time: float, values: ArrayLike, arrival: float | None = None) -> Verdict:
-        """Take what a node measured at `time`, which arrived at `arrival` (None: at once), and judge it.
+        """Take what a node measured at `time`, which arrived at `arrival` (None: at once); return the verdict on it.
 
         It costs a step from the event's row on into each later one.
+
+        Args:
+            node: name of the node, or "inputs" of the plant's inputs.
+            sequence: the node's running count, from 0.
+            time: moment of the measurement, in steps or in the unit of dt.
+            values: what was measured, NaN where a component did not arrive; shape (received,) of the node.
+            arrival: moment of arrival.
 
         Raises:
             ValueError: an unknown node, values that are not the node's, a time that is no number or no step; nothing
                 is counted, and everything stays as it was.
         """
-        plant, before = self._plant, self._plant.clock
+        plant, clock_before = self._plant, self._plant.clock
         screened = self._fleet.screen_event(node, self._convert_event(node, sequence, time, values, arrival), plant)
         event = screened.event
         verdict = self._fleet.take_event(plant, event, arrival is not None)
         if verdict == "used":
-            why = screened.why if screened.is_empty else self._why_implausible(event, plant.changes[-1][0])
+            row, _ = plant.changes[-1]
+            why = screened.why if screened.is_empty else self._why_implausible(event, row)
             if why is not None:
                 # As if it had never arrived.
                 verdict, self.reasons[node] = "implausible", why
-                self._fleet.undo_events(plant, before)
+                self._fleet.undo_events(plant, clock_before)
                 self._fleet.step([plant])
             else:
                 for _, line in (*self._angles.find_new([plant]), *self._remarks.find_new([plant])):
@@ -205,7 +215,7 @@ class Timeline:
 
         Each says what its filter made of what arrived at `now`: `nis`, `received` and `refused` of `JudgedEstimate`.
         """
-        return self._arrange_judgements(self._outputs_after(self._slot_now()[0]))
+        return judged_estimates_by_name(self._program, self._outputs_after(self._slot_now()[0]))
 
     @property
     def origin(self) -> Origin:
@@ -308,21 +318,31 @@ class Timeline:
     def _carry_over(
         cls, network: Network, head: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
     ) -> dict[str, np.ndarray]:
-        """Return the arrays of a snapshot of another network or version as this network would have saved them."""
+        """Return the arrays of a snapshot of another network or version as this network would have saved them.
+
+        It warns of each change, and where final rows cannot be carried on. Raises ValueError where nothing can.
+
+        Args:
+            network: the network as it is now.
+            head: head of the snapshot.
+            arrays: its arrays: "plant", the plant's bytes; "final.time" and "final", rows not yet read.
+        """
+        # The identities of both networks, with a description of where states stand.
         window, ahead, capacity = head["options"]
         fleet = Fleet(shared_program(network), Options(window, ahead, capacity=capacity), alone=True)
         mine, other = fleet.program.identity | {DESCRIPTION: describe_network(fleet)}, head["of"]
         # A version before 0.3.0 did not write where states stand: it is known for the same nodes and filters.
         if DESCRIPTION not in head:
             check_same_network("snapshot", mine, other, (*SAME, "nodes", "filters"), accept=True)
-        there = other | {DESCRIPTION: head.get(DESCRIPTION) or describe_network(fleet, covariances=True)}
-        carrier = PlantMigration(fleet, mine, lambda line: warnings.warn(f"timeline, {line}", stacklevel=5))
-        carrier.begin("snapshot", there)
+        other = other | {DESCRIPTION: head.get(DESCRIPTION) or describe_network(fleet, covariances=True)}
+        migration = PlantMigration(fleet, mine, lambda line: warnings.warn(f"timeline, {line}", stacklevel=5))
+        migration.begin("snapshot", other)
+        # The plant, which has no name, and the final rows, if their filters are the same.
         try:
-            plant = np.frombuffer(carrier.migrate({"": arrays["plant"].tobytes()})[""], np.uint8)
+            plant = np.frombuffer(migration.migrate({"": arrays["plant"].tobytes()})[""], np.uint8)
         except ValueError as error:
             raise fail("snapshot", "rows of the filters that are here", f"other ones: {error}") from None
-        time, final = arrays["final.time"], carrier.migrate_outputs(arrays["final"])
+        time, final = arrays["final.time"], migration.migrate_outputs(arrays["final"])
         if final is None:
             said = f"timeline, snapshot: {len(time)} final rows are estimates of other filters, and not carried on"
             warnings.warn(said, stacklevel=4)
@@ -331,7 +351,7 @@ class Timeline:
 
     @classmethod
     def _resume(cls, network: Network, head: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> "Timeline":
-        """Make a timeline from a saved state."""
+        """Return a timeline of the network that goes on from a saved state: head and arrays of its snapshot."""
         window, ahead, capacity = head["options"]
         with warnings.catch_warnings():  # the warning was given when the timeline was made
             warnings.simplefilter("ignore")
@@ -351,12 +371,12 @@ class Timeline:
         if not isinstance(node, str) or node not in sizes:
             raise fail("node of an event", f"one of {', '.join(sizes)}", show_value(node))
         index, size = sizes[node]
-        at = check_moment(f"{name}, time", time)
-        self._fleet.check_step(f"{name}, time", at)
-        came = max(self._plant.confirmed, at) if arrival is None else check_moment(f"{name}, arrival", arrival)
-        given = check_numbers(name, values, size, self._fleet.count_values_alone(node))
-        known = self._fleet.append_losses(node, given.tolist())
-        return CheckedEvent(index, check_63_bits(f"{name}, sequence", sequence), at, known, came)
+        moment = check_moment(f"{name}, time", time)
+        self._fleet.check_step(f"{name}, time", moment)
+        arrived = max(self._plant.confirmed, moment) if arrival is None else check_moment(f"{name}, arrival", arrival)
+        numbers = check_numbers(name, values, size, self._fleet.count_values_alone(node)).tolist()
+        numbers = self._fleet.append_losses(node, numbers)
+        return CheckedEvent(index, check_63_bits(f"{name}, sequence", sequence), moment, numbers, arrived)
 
     def _finalise(self) -> None:
         """Move the base up to the watermark, and read the outputs of the rows that are final by it."""
@@ -367,28 +387,6 @@ class Timeline:
             self._finals.add(np.array([row.key[0] for row in read]), outputs)
             self._gates.add(outputs)
         self._fleet.free_slots(results)
-
-    def _arrange_judgements(self, outputs: np.ndarray) -> dict[str, dict[str, Estimate]]:
-        """Return the estimates of a row by node and filter, each with what its filter made of what arrived there."""
-        estimates = self._arrange_outputs(outputs)
-        for place in self._program.places:
-            estimate, judged = estimates[place.node][place.filter], place.judgement or place.tested
-            if judged is not None:
-                nis, received = float(outputs[judged.distance]), int(outputs[judged.arrived])
-                reason = 0.0 if place.judgement is None else float(outputs[place.judgement.reason])
-                refused = Judgement.describe(reason, nis) if reason > 0 else ""
-                estimates[place.node][place.filter] = JudgedEstimate(
-                    estimate.mean,
-                    estimate.covariance,
-                    estimate.claim,
-                    estimate.modes,
-                    estimate.attitude,
-                    nis=nis,
-                    received=received,
-                    refused=refused,
-                    weight=None if place.weighed is None else outputs[list(place.weighed.weight)],
-                )
-        return estimates
 
     def _arrange_outputs(self, outputs: np.ndarray) -> dict[str, dict[str, Estimate]]:
         """Return the estimates in the outputs of a row, or of rows, by node and filter."""
