@@ -1,6 +1,7 @@
 """Log-likelihoods, criteria and tests of fits, against what they are by hand."""
 
 import time
+from functools import cache
 
 import numpy as np
 import pytest
@@ -23,49 +24,58 @@ def walk(q=None, r=None):
     return network
 
 
-FOUND = hg.fit(walk(), WALK, starts=1)
-FIXED = hg.fit(walk(r=1.0), WALK, starts=1)
+@cache
+def found():
+    """Both variances fitted, once for all tests."""
+    return hg.fit(walk(), WALK, starts=1)
+
+
+@cache
+def fixed():
+    """One of them, where the other is known."""
+    return hg.fit(walk(r=1.0), WALK, starts=1)
 
 
 def test_criteria_are_those_of_the_books():
     """k = 2 numbers, n = 150 values."""
-    top = FOUND.log_likelihood
-    assert isinstance(top, float) and FOUND.log_likelihoods == {"linear": top}
-    assert FOUND.observations == 150 and FOUND.free_numbers == 2
-    assert FOUND.aic == 4 - 2 * top and FOUND.bic == 2 * np.log(150) - 2 * top
-    assert abs(FOUND.aicc - (4 - 2 * top + 12 / 147)) < 1e-12
+    fit = found()
+    top = fit.log_likelihood
+    assert isinstance(top, float) and fit.log_likelihoods == {"linear": top}
+    assert fit.observations == 150 and fit.free_numbers == 2
+    assert fit.aic == 4 - 2 * top and fit.bic == 2 * np.log(150) - 2 * top
+    assert abs(fit.aicc - (4 - 2 * top + 12 / 147)) < 1e-12
 
 
 def test_a_ratio_of_likelihoods_and_walds_test_agree():
     """Of one number that is well known: both are chi-square of one degree, and near each other (within a third)."""
-    ratio, wald = FOUND.likelihood_ratio(FIXED), FOUND.wald({"r": 1.0})
+    ratio, wald = found().likelihood_ratio(fixed()), found().wald({"r": 1.0})
     assert ratio.freedom == wald.freedom == 1
-    assert ratio.statistic == pytest.approx(2 * (FOUND.log_likelihood - FIXED.log_likelihood), abs=1e-9)
+    assert ratio.statistic == pytest.approx(2 * (found().log_likelihood - fixed().log_likelihood), abs=1e-9)
     assert ratio.p_value == pytest.approx(chi2.sf(ratio.statistic, 1))
-    error = FOUND.rows()[1].standard_error
-    assert wald.statistic == pytest.approx(((FOUND.values["r"] - 1) / error) ** 2, rel=1e-9)
-    far = FOUND.wald({"q": 9.0, "r": 9.0})
+    error = found().rows()[1].standard_error
+    assert wald.statistic == pytest.approx(((found().values["r"] - 1) / error) ** 2, rel=1e-9)
+    far = found().wald({"q": 9.0, "r": 9.0})
     assert far.freedom == 2 and far.p_value < 1e-6
 
 
 def test_a_fit_is_printed_at_once_and_its_intervals_when_asked_for():
-    found = hg.fit(walk(), WALK, starts=1)
+    fit = hg.fit(walk(), WALK, starts=1)
     start = time.perf_counter()
-    said = str(found)
+    said = str(fit)
     assert time.perf_counter() - start < 1  # an evaluation of 150 rows takes a millisecond
     assert "about" in said and "`rows()`" in said and "q" in said
-    found.rows()
-    assert "about" not in str(found)
+    fit.rows()
+    assert "about" not in str(fit)
 
 
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda: FIXED.likelihood_ratio(FOUND), "smaller model: expected one of fewer free numbers, got 1 more"),
-        (lambda: FOUND.likelihood_ratio(hg.fit(walk(r=1.0), WALK[:100], starts=1)), "same 150 values"),
-        (lambda: FOUND.likelihood_ratio(3), "smaller model: expected what hg.fit returns"),
-        (lambda: FOUND.wald({"z": 1.0}), r"values: expected numbers for some of \['q', 'r'\]"),
-        (lambda: FOUND.wald({}), "values: expected numbers"),
+        (lambda: fixed().likelihood_ratio(found()), "smaller model: expected one of fewer free numbers, got 1 more"),
+        (lambda: found().likelihood_ratio(hg.fit(walk(r=1.0), WALK[:100], starts=1)), "same 150 values"),
+        (lambda: found().likelihood_ratio(3), "smaller model: expected what hg.fit returns"),
+        (lambda: found().wald({"z": 1.0}), r"values: expected numbers for some of \['q', 'r'\]"),
+        (lambda: found().wald({}), "values: expected numbers"),
     ],
 )
 def test_what_cannot_be_tested_says_so_in_one_line(call, words):

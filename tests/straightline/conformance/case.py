@@ -1,6 +1,6 @@
 """Cases of an operation: a function of one run's arrays, and runs of edge values for it."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -49,6 +49,24 @@ class Case(NamedTuple):
     def row(self, run: int) -> tuple[np.ndarray, ...]:
         """One run's arguments."""
         return tuple(a[run] for a in self.arguments)
+
+
+class Table(Mapping[str, list[Case]]):
+    """Cases by operation, each made when it is asked for: what JAX takes is found by tracing it."""
+
+    def __init__(self, makers: Mapping[str, Callable[[], list[Case]]]):
+        self._makers, self._made = makers, dict[str, list[Case]]()
+
+    def __getitem__(self, name: str) -> list[Case]:
+        if name not in self._made:
+            self._made[name] = self._makers[name]()
+        return self._made[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._makers)
+
+    def __len__(self) -> int:
+        return len(self._makers)
 
 
 def in_single(case: Case, units: float) -> Case:

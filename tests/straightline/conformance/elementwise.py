@@ -30,8 +30,8 @@ UNITS = {name: 4.0 for name in (
     "exp", "log", "log1p", "expm1", "sin", "cos", "tan", "tanh", "atan2", "erf", "erf_inv", "erfc", "asin",
     "acos", "atan", "asinh", "acosh", "atanh",
 )} | dict.fromkeys(FOURTEEN_DIGITS, 256.0)  # fmt: skip
-CASES = {
-    name: of_each_type(NAMED.get(name) or getattr(lax, name), ARITY.get(name, 2), UNITS.get(name, 0.0))
+MAKERS: dict[str, Callable[[], list[Case]]] = {
+    name: partial(of_each_type, NAMED.get(name) or getattr(lax, name), ARITY.get(name, 2), UNITS.get(name, 0.0))
     for name in ELEMENTWISE
 }
 WHOLE = tuple(d for d in DTYPES if d not in (np.float64, np.bool_))
@@ -91,28 +91,28 @@ def _total(op: str) -> list[Case]:
     return cases
 
 
-CASES |= {
-    "select_n": _select_cases(),
-    "integer_pow": [
+MAKERS |= {
+    "select_n": _select_cases,
+    "integer_pow": lambda: [
         c for n in (-3, -2, -1, 0, 1, 2, 3, 7) for c in of_each_type(lambda x, n=n: lax.integer_pow(x, n), 1, 4.0)
     ],
-    "square": of_each_type(lax.square, 1),
-    "pow": of_each_type(lax.pow, 2, 4.0, mixed=True),
-    "rsqrt": of_each_type(lax.rsqrt, 1, 2.0),
-    "logistic": of_each_type(lax.logistic, 1, 4.0),
-    "clamp": [
+    "square": partial(of_each_type, lax.square, 1),
+    "pow": partial(of_each_type, lax.pow, 2, 4.0, mixed=True),
+    "rsqrt": partial(of_each_type, lax.rsqrt, 1, 2.0),
+    "logistic": partial(of_each_type, lax.logistic, 1, 4.0),
+    "clamp": lambda: [
         Case(lambda a, x, b: lax.clamp(a, x, b), pairs(numbers(d)[:12], numbers(d), numbers(d)[:12]))
         for d in DTYPES
         if d != np.bool_
     ],
-    "nextafter": of_each_type(lax.nextafter, 2),
-    "convert_element_type": _conversions(),
-    "bitcast_convert_type": _bits(),
-    "round": [c for how in lax.RoundingMethod for c in of_each_type(lambda x, how=how: lax.round(x, how), 1)],
-    "shift_right_arithmetic": of_each_type(lax.shift_right_arithmetic, 2),
-    "log2": of_each_type(jax.numpy.log2, 1, 4.0, dtypes=(np.float64,)),
-    "one_minus_square": of_each_type(lambda x: 1 - x * x, 1),
-    "eq_to": _total("eq"),
-    "le_to": _total("le"),
-    "lt_to": _total("lt"),
+    "nextafter": partial(of_each_type, lax.nextafter, 2),
+    "convert_element_type": _conversions,
+    "bitcast_convert_type": _bits,
+    "round": lambda: [c for how in lax.RoundingMethod for c in of_each_type(lambda x, how=how: lax.round(x, how), 1)],
+    "shift_right_arithmetic": partial(of_each_type, lax.shift_right_arithmetic, 2),
+    "log2": partial(of_each_type, jax.numpy.log2, 1, 4.0, dtypes=(np.float64,)),
+    "one_minus_square": partial(of_each_type, lambda x: 1 - x * x, 1),
+    "eq_to": partial(_total, "eq"),
+    "le_to": partial(_total, "le"),
+    "lt_to": partial(_total, "lt"),
 }

@@ -23,6 +23,7 @@ The cases are made of the table of rules, so that a new rule is covered by being
 
 import sys
 import warnings
+from functools import partial
 from itertools import product
 from typing import Any
 
@@ -37,10 +38,11 @@ from straightline.compiled import Compiled
 from straightline.lowering import IN_MEMORY, RULES, trace_function
 from straightline.nodes import Unsupported
 from tests.straightline.conformance import arrays, elementwise, matrices, programs
-from tests.straightline.conformance.case import Case, in_single, is_taken
+from tests.straightline.conformance.case import Case, Table, in_single, is_taken
 from tests.straightline.conformance.engines import by_known, by_lanes, by_xla, difference, program_of
 
-CASES = arrays.CASES | elementwise.CASES | matrices.CASES | programs.CASES
+LISTED = [{name: partial(list, cases) for name, cases in part.CASES.items()} for part in (arrays, matrices, programs)]
+CASES = Table(LISTED[0] | elementwise.MAKERS | LISTED[1] | LISTED[2])
 ADDED = {"add", "sub", "add_any", "reduce_sum", "cumsum", "dot_general", "scatter-add", "scatter_add", "scatter-sub"}
 PRODUCTS = {"dot_general"}
 SINGLE = {"cumsum": 90.0}  # units in single precision, where they are more than in double
