@@ -53,8 +53,11 @@ def adds_up(network: object) -> bool:
 class SumTask(NamedTuple):
     """What a design of a sum of links searches: amplitudes of the free links, within limits, for a small error.
 
+    An amplitude is the factor by which a link's transmitter multiplies what it measures.
+
     links: rows, noises and amplitudes at present. limits: of the free links' powers. free: which links are. covariance:
-    of the steady error, from the information of a step; error: the criterion of it. starts, seed: of searches.
+    J (n, n), the information of a step, -> steady error covariance; error: covariance -> the number to be small.
+    starts, seed: of searches.
     """
 
     links: SummedLinks
@@ -88,58 +91,67 @@ class SumTask(NamedTuple):
         links = self.links
         return min(self.limits.total, float((self.caps**2 * links.unit)[self.free].sum()))
 
-    def value(self, amplitudes: Vector) -> float:
-        """Return the error with these amplitudes."""
+    def error_of_amplitudes(self, amplitudes: Vector) -> float:
+        """Return the error with these amplitudes of all links."""
         return self.error(self.covariance(self.links.information(amplitudes)))
 
-    def bound(self, total: float) -> float:
+    def bound_error(self, total: float) -> float:
         """Return a lower bound of the error of all amplitudes with this total power of the free links."""
         all_links = total + self.fixed
         states = self.links.rows.shape[1]
         information = self.links.best_information(all_links) if all_links > 0 else np.zeros((states, states))
         return self.error(self.covariance(information))
 
-    def closed_form(self, total: float) -> Vector | None:
+    def solve_closed_form(self, total: float) -> Vector | None:
         """Return the best amplitudes by a formula, None where there is none: it needs one signal and all links free."""
         return solve_closed_form(self.links, total, self.caps) if np.all(self.free) else None
 
-    def search(self, total: float, starts: int, first: Vector | None = None) -> Vector:
-        """Return the amplitudes of the least error that descents find from `first` and from so many drawn starts.
+    def search_amplitudes(self, total: float, starts: int, first: Vector | None = None) -> Vector:
+        """Return the amplitudes (links,) of the least error that descents find from `first` and from drawn starts.
 
         Amplitudes may be negative: their signs matter where noises of links are correlated.
+
+        Args:
+            total: power that the free links may send together.
+            starts: number of starts that are drawn.
+            first: amplitudes at which the first descent begins (links,); none unless given.
         """
         links, free = self.links, self.free
-        unit = links.unit[free]
-        generator, best, best_error = np.random.default_rng(self.seed), links.present, np.inf
-        scale = np.minimum(self.caps[free], np.sqrt(total / unit))
+        # The free amplitudes are searched as x = a / scale in [-1, 1], the scale being the most that limits allow.
+        scale = np.minimum(self.caps[free], np.sqrt(total / links.unit[free]))
         if not np.all(np.isfinite(scale)):
             raise fail("budget", "one that limits every transmitter", "no limit")
 
-        def amplitudes_of(x: Vector) -> Vector:
-            """Return the amplitudes of all links from x = a / scale of the free ones, scaled down to the total."""
+        def amplitudes_at(x: Vector) -> Vector:
+            """Return the amplitudes of all links at x, the free ones scaled down where they exceed the total."""
             a = np.clip(x, -1, 1) * scale
-            power = float(a**2 @ unit)
+            power = float(a**2 @ links.unit[free])
             amplitudes = links.present.copy()
             amplitudes[free] = a * np.sqrt(total / power) if power > total else a
             return amplitudes
 
-        def loss(x: Vector) -> float:
-            return self.value(amplitudes_of(x))
+        def error_at(x: Vector) -> float:
+            return self.error_of_amplitudes(amplitudes_at(x))
 
-        begin = [generator.uniform(-1.0, 1.0, len(scale)) for _ in range(starts)]
+        generator, best, least = np.random.default_rng(self.seed), links.present, np.inf
+        points = [generator.uniform(-1.0, 1.0, len(scale)) for _ in range(starts)]
         if first is not None:
-            begin = [np.divide(first[free], scale, out=np.zeros_like(scale), where=scale > 0), *begin]
-        for start in begin:
-            result = scipy.optimize.minimize(loss, start, method="L-BFGS-B", bounds=[(-1.0, 1.0)] * len(scale))
-            if result.fun < best_error:
-                best, best_error = amplitudes_of(np.asarray(result.x)), float(result.fun)
+            points = [np.divide(first[free], scale, out=np.zeros_like(scale), where=scale > 0), *points]
+        for point in points:
+            result = scipy.optimize.minimize(error_at, point, method="L-BFGS-B", bounds=[(-1.0, 1.0)] * len(scale))
+            if result.fun < least:
+                best, least = amplitudes_at(np.asarray(result.x)), float(result.fun)
         return best
 
 
 def design_sum_of_links(problem: DesignProblem, network: Network) -> PowerDesign:
     """Return the powers of the least steady error within the budget, or the least power that reaches a target error.
 
-    Closed forms where all links of one signal are free, else a search with a bound beside it.
+    By closed forms where all links of one signal are free, else by a search with a bound beside it.
+
+    Args:
+        problem: budget, error or target error, and which transmitters are free.
+        network: of one node, which receives a sum of links (`superposed`).
 
     Raises:
         ValueError: parts that the formulas do not cover; `hg.design` of a function of free numbers does.
@@ -150,25 +162,27 @@ def design_sum_of_links(problem: DesignProblem, network: Network) -> PowerDesign
     if error.steps > 1:
         raise fail("design of a sum of links", "the steady error", f"an error over {error.steps} steps")
     plant, process = check_constant_noise(check_design_plant(network.plant))
-    links, unit_channel = find_links_of_sum(node, np.asarray(measurement_moment(node.sensor, steady_moment(plant))))
+    measured = np.asarray(measurement_moment(node.sensor, steady_moment(plant)))  # E (y, 1)(y, 1)'
+    links, unit_channel = find_links_of_sum(node, measured)
     names = tuple(f"{name}.{hop}" for hop in transmitter_names(node.channel))
     task = _make_task(problem, plant, process, links, names)
-    chosen, certificate = (
-        _find_least_error_amplitudes(task, task.limits.total)
-        if problem.target_error is None
-        else _find_least_power_amplitudes(task, float(scalar("target error", problem.target_error, 0.0)))
-    )
-    # The network with these amplitudes.
+    # The best amplitudes, for the error within the budget or for the power at the target.
+    if problem.target_error is None:
+        amplitudes, certificate = _find_least_error_amplitudes(task, task.limits.total)
+    else:
+        target = float(scalar("target error", problem.target_error, 0.0))
+        amplitudes, certificate = _find_least_power_amplitudes(task, target)
+    # The channel with these: the one of unit amplitudes, amplified.
     channel: AbstractRandomAffine = unit_channel
-    for hop, amplitude in zip(transmitter_names(node.channel), chosen, strict=True):
+    for hop, amplitude in zip(transmitter_names(node.channel), amplitudes, strict=True):
         channel = amplify_transmitter(channel, hop, float(amplitude))
     return PowerDesign(
         problem=problem,
-        powers={name: np.array([power]) for name, power in zip(names, chosen**2 * links.unit, strict=True)},
-        error=task.value(chosen),
+        powers={name: np.array([power]) for name, power in zip(names, amplitudes**2 * links.unit, strict=True)},
+        error=task.error_of_amplitudes(amplitudes),
         certificate=certificate,
-        present=task.value(links.present),
-        covariance=task.covariance(links.information(chosen))[None],
+        present=task.error_of_amplitudes(links.present),
+        covariance=task.covariance(links.information(amplitudes))[None],
         sensitivity=dict.fromkeys(names, float("nan")),
         price=float("nan"),
         numbers={},
@@ -179,19 +193,22 @@ def design_sum_of_links(problem: DesignProblem, network: Network) -> PowerDesign
 def _make_task(
     problem: DesignProblem, plant: LinearPlant, process: AbstractNoise, links: SummedLinks, names: Sequence[str]
 ) -> SumTask:
-    """Return the search: which links are free, the limits of their powers, and the error as a function of J."""
+    """Return the search: which links are free, the limits of their powers, and the error by a step's information.
+
+    `names`: of the links' transmitters, in the order of the links.
+    """
     free = find_free_transmitters(names, problem.free)
     limits = make_unlimited(1, int(free.sum()))
     if problem.budget is not None:
         sent = links.present**2 * links.unit
         limits = make_power_limits(check_budget(problem.budget), names, free, sent[None])
-    moves, noise = np.asarray(plant.matrix), np.asarray(process.covariance)
+    transition, noise = np.asarray(plant.matrix), np.asarray(process.covariance)
     criterion = problem.criterion.criterion(plant.states)
     return SumTask(
-        links,
-        limits,
-        free,
-        covariance=lambda information: steady_error(moves, noise, information),
+        links=links,
+        limits=limits,
+        free=free,
+        covariance=lambda information: steady_error(transition, noise, information),
         error=lambda covariance: criterion.exact(covariance[None]),
         starts=check_count("starts", problem.starts),
         seed=check_seed("seed", problem.seed),
@@ -199,55 +216,58 @@ def _make_task(
 
 
 def _find_least_error_amplitudes(task: SumTask, total: float) -> tuple[Vector, Certificate]:
-    """Return the amplitudes of the least error with a total power of the free links, and the certificate."""
-    solution = task.closed_form(total)
+    """Return the amplitudes (links,) of the least error with a total power of the free links, and the certificate."""
+    solution = task.solve_closed_form(total)
     if solution is not None:
-        error = task.value(solution)
+        error = task.error_of_amplitudes(solution)
         return solution, Certificate(convex=True, value=error, bound=error, stationarity=0.0, starts=1, unit="error")
-    chosen = task.search(total, task.starts)
-    error = task.value(chosen)
-    bound = min(task.bound(min(total, task.largest_total)), error)
-    return chosen, Certificate(
+    found = task.search_amplitudes(total, task.starts)
+    error = task.error_of_amplitudes(found)
+    bound = min(task.bound_error(min(total, task.largest_total)), error)
+    return found, Certificate(
         convex=False, value=error, bound=bound, stationarity=np.nan, starts=task.starts, unit="error"
     )
 
 
 def _find_least_power_amplitudes(task: SumTask, target: float) -> tuple[Vector, Certificate]:
-    """Return the amplitudes of the least power that reach a target error, and the certificate.
+    """Return the amplitudes (links,) of the least power that reach a target error, and the certificate.
 
     By bisection of the power of the free links, since the least error falls with it.
     """
-    chosen, certificate = _reach_target(task, target)
-    largest = float((chosen**2 * task.links.unit)[task.free].sum())
+    best, certificate = _reach_target(task, target)
+    largest = float((best**2 * task.links.unit)[task.free].sum())
     low, high = 0.0, largest
     for _ in range(HALVINGS if certificate.convex else SEARCHES):
         middle = (low + high) / 2
-        tried = _try_power(task, middle, chosen)
-        if task.value(tried) <= target:
-            high, chosen = middle, tried
+        tried = _try_power(task, middle, best)
+        if task.error_of_amplitudes(tried) <= target:
+            high, best = middle, tried
         else:
             low = middle
         if high - low <= ALIKE * largest:
             break
-    needed = float((chosen**2 * task.links.unit).sum())
+    needed = float((best**2 * task.links.unit).sum())
     bound = needed if certificate.convex else _bound_power(task, target, needed)
-    return chosen, certificate._replace(value=needed, bound=bound, unit="power")
+    return best, certificate._replace(value=needed, bound=bound, unit="power")
 
 
 def _try_power(task: SumTask, power: float, near: Vector) -> Vector:
     """Return the best amplitudes at a power of the free links: by formula, else by one descent from `near`."""
     if not power > 0:
         return np.where(task.free, 0.0, task.links.present)
-    solution = task.closed_form(power)
-    return task.search(power, 1, near) if solution is None else solution
+    solution = task.solve_closed_form(power)
+    return task.search_amplitudes(power, 1, near) if solution is None else solution
 
 
 def _bound_power(task: SumTask, target: float, needed: float) -> float:
-    """Return the total power at which the lower bound of the error reaches the target: no less power can reach it."""
+    """Return the total power at which the lower bound of the error reaches the target: no less power can reach it.
+
+    By bisection of the power of the free links, up to the total power `needed` that was found to reach it.
+    """
     low, high = 0.0, needed - task.fixed
     for _ in range(HALVINGS):
         middle = (low + high) / 2
-        low, high = (low, middle) if task.bound(middle) <= target else (middle, high)
+        low, high = (low, middle) if task.bound_error(middle) <= target else (middle, high)
     return low + task.fixed
 
 
@@ -261,26 +281,62 @@ def _reach_target(task: SumTask, target: float) -> tuple[Vector, Certificate]:
     total = task.largest_total
     if unlimited:  # any power to begin with: that sent at present, or the receiver's noise
         total = max(float((task.links.present**2 * task.links.unit).sum()), task.links.floor)
-    chosen, certificate = _find_least_error_amplitudes(task, total)
+    found, certificate = _find_least_error_amplitudes(task, total)
     for _ in range(DOUBLINGS if unlimited else 0):
         if certificate.value <= target:
             break
         total = 2 * total
-        chosen, certificate = _find_least_error_amplitudes(task, total)
+        found, certificate = _find_least_error_amplitudes(task, total)
     if certificate.value > target * (1 + ALIKE):
         within = "whatever the power" if unlimited else "within the budget"
         raise fail("target error", f"at least {certificate.value:.6g}, the least found {within}", f"{target:.6g}")
-    return chosen, certificate
+    return found, certificate
 
 
 def find_links_of_sum(node: Node, second: Float[np.ndarray, "m1 m1"]) -> tuple[SummedLinks, Superposed]:
-    """Return the links of a node's sum, and the sum with all amplitudes 1.
+    """Return the links of a node's sum, as arrays of the design, and the sum in which all amplitudes are 1.
 
-    `second`: E (y, 1)(y, 1)' of the sensor's outputs.
+    Each link sends one output y_i of the sensor with a random gain g_i; an amplitude of 1 sends y_i as it is.
+
+    Args:
+        node: with a linear sensor behind a sum of links.
+        second: E (y, 1)(y, 1)' of the sensor's outputs.
 
     Raises:
         ValueError: a sensor or a sum that the formulas do not cover.
     """
+    sensor, channel = _check_sum(node)
+    # The sum in which each transmitter sends what it measures.
+    unit = channel
+    for hop in transmitter_names(channel):
+        amplified = amplify_transmitter(unit, hop, None)
+        assert isinstance(amplified, Superposed)
+        unit = amplified
+    # Of each link E g, Var g, and the variance of its own noise; the noises add up with that of the receiver.
+    moments = [second_order(link) for link in unit.maps]
+    mean = np.array([float(link.mean_gain[0, 0]) for link in moments])
+    variance = np.array([float(link.nominal.center[0, 0, 0, 0]) for link in moments])
+    floor = sum(float(link.nominal.center[0, 0, -1, -1]) for link in moments) + float(channel.noise.covariance[0, 0])
+    # D_ij = E[g_i] E[g_j] R_ij + (i = j) Var(g_i) t_i, with the noise R of the outputs that are sent, t_i = E y_i^2.
+    outputs = [of_link[0] for of_link in channel.places]
+    power = np.array(list(compute_sent_powers(unit, second).values()))
+    sensor_noise = np.asarray(sensor.noise.covariance)[np.ix_(outputs, outputs)]
+    # Present amplitudes: sizes from powers, signs from mean gains.
+    present = np.sqrt(np.array(list(compute_sent_powers(channel, second).values())) / power)
+    present_gains = np.array([float(second_order(link).mean_gain[0, 0]) for link in channel.maps])
+    signs = np.sign(present_gains) * np.sign(mean)
+    links = SummedLinks(
+        rows=mean[:, None] * np.asarray(sensor.matrix)[outputs],
+        noise=np.outer(mean, mean) * sensor_noise + np.diag(variance * power),
+        unit=power,
+        floor=floor,
+        present=np.where(signs == 0, 1.0, signs) * present,
+    )
+    return links, unit
+
+
+def _check_sum(node: Node) -> tuple[LinearSensor, Superposed]:
+    """Return the sensor and the sum of a node; ValueError where a design has no formulas for them."""
     sensor, channel = node.sensor, node.channel
     if not isinstance(sensor, LinearSensor) or sensor.circular:
         raise _unfit("a sensor that varies, is not linear or has angles")
@@ -290,28 +346,7 @@ def find_links_of_sum(node: Node, second: Float[np.ndarray, "m1 m1"]) -> tuple[S
     counts = [len(transmitter_names(link)) for link in channel.maps]
     if any(count != 1 for count in counts) or any(link.inputs > 1 for link in channel.maps):
         raise _unfit(f"{counts} hops and {[link.inputs for link in channel.maps]} numbers")
-    # The sum in which each transmitter sends what it measures, with amplitude 1.
-    unit = channel
-    for hop in transmitter_names(channel):
-        amplified = amplify_transmitter(unit, hop, None)
-        assert isinstance(amplified, Superposed)
-        unit = amplified
-    # Of each link E g, Var g, and the variance of its own noise; the noises add up with that of the receiver.
-    moments = [second_order(link) for link in unit.maps]
-    mean = np.array([float(link.mean_gain[0, 0]) for link in moments])
-    spread = np.array([float(link.nominal.center[0, 0, 0, 0]) for link in moments])
-    floor = sum(float(link.nominal.center[0, 0, -1, -1]) for link in moments) + float(channel.noise.covariance[0, 0])
-    # D_ij = E[g_i] E[g_j] R_ij + (i = j) Var(g_i) t_i, with the sensor's output that each link sends.
-    outputs = [of_link[0] for of_link in channel.places]
-    power = np.array(list(compute_sent_powers(unit, second).values()))
-    sensor_noise = np.asarray(sensor.noise.covariance)[np.ix_(outputs, outputs)]
-    noise = np.outer(mean, mean) * sensor_noise + np.diag(spread * power)
-    rows = mean[:, None] * np.asarray(sensor.matrix)[outputs]
-    # Present amplitudes: sizes from powers, signs from mean gains.
-    present = np.sqrt(np.array(list(compute_sent_powers(channel, second).values())) / power)
-    present_gains = np.array([float(second_order(link).mean_gain[0, 0]) for link in channel.maps])
-    signs = np.sign(present_gains) * np.sign(mean)
-    return SummedLinks(rows, noise, power, floor, np.where(signs == 0, 1.0, signs) * present), unit
+    return sensor, channel
 
 
 def _unfit(got: str) -> ValueError:
@@ -325,12 +360,15 @@ def steady_error(
 ) -> Float[np.ndarray, "n n"]:
     """Return the steady covariance after each step of a filter of x+ = A x + w that receives this information in each.
 
-    matrix: A; process: Cov w; information: J, taken as J = H' H, a measurement H x with noise of covariance I.
+    Args:
+        matrix: A.
+        process: Cov w.
+        information: J, taken as J = H' H, a measurement H x with noise of covariance I; zero where nothing is told.
     """
     values, vectors = np.linalg.eigh(information)
     used = values > ALIKE * max(values[-1], 0.0)
     if not used.any():
         return np.asarray(scipy.linalg.solve_discrete_lyapunov(matrix, process))
-    output = (vectors[:, used] * np.sqrt(values[used])).T  # H
-    prior = scipy.linalg.solve_discrete_are(matrix.T, output.T, process, np.eye(len(output)))
+    h = (vectors[:, used] * np.sqrt(values[used])).T
+    prior = scipy.linalg.solve_discrete_are(matrix.T, h.T, process, np.eye(len(h)))
     return observe_information(roots_of(prior), information).covariance

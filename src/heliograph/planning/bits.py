@@ -43,7 +43,11 @@ class BitsDesign(NamedTuple):
 
 
 class _Senders(NamedTuple):
-    """Plant and senders: rows c_i of the sensors, and information j_i(B) of words of B bits, (sender, MOST + 1)."""
+    """Linear plant and its senders, each of which sends one output c_i x + v_i as a word of some bits.
+
+    transition, process: A and Q of the plant. rows: c_i of the sensors. information: [i, B] = j_i(B), what a word of B
+    bits says of c_i x, as the inverse of a noise variance, for B from 0 to MOST.
+    """
 
     transition: Float[np.ndarray, "n n"]
     process: Float[np.ndarray, "n n"]
@@ -86,7 +90,11 @@ def design_bits(network: Network, total: int) -> BitsDesign:
 
 
 def _describe_senders(network: Network) -> _Senders:
-    """Return plant, sensors and the information of their words; ValueError of a network that is not of such senders."""
+    """Return plant, sensors and the information of their words of 0 to MOST bits, as arrays.
+
+    Raises:
+        ValueError: a plant that is not linear and stable; a node without an encoder, or with several outputs.
+    """
     plant = network.plant
     expected = "a stable LinearPlant without inputs, as words overload in the end of any other"
     if not isinstance(plant, LinearPlant) or not isinstance(plant.noise, AbstractNoise) or plant.inputs:
@@ -100,19 +108,32 @@ def _describe_senders(network: Network) -> _Senders:
             raise fail(f"node {name!r} of a design of bits", "one with an encoder and one output", "another")
         if not isinstance(node.sensor, LinearSensor):
             raise fail(f"sensor of node {name!r} of a design of bits", "a LinearSensor", type(node.sensor).__name__)
-        r = np.asarray(node.sensor.noise.covariance)
         rows.append(np.asarray(node.sensor.matrix)[0])
-        # j(B) = 1 / (R + D^2/12 + U (1/g^2 - 1)), U = D^2 (4^B - 1)/12, and 0 of no bits.
-        g, span = _find_bit_gain(name, node), float(np.max(node.encoder.high) - np.min(node.encoder.low))
-        counts = np.arange(1, MOST + 1)
-        step = span / (2.0**counts - 1)
-        noise = r[0, 0] + step**2 / 12 * (1 + (4.0**counts - 1) * (1 / g**2 - 1))
-        information.append(np.concatenate([[0.0], 1 / noise]))
-    return _Senders(a, q, np.array(rows), np.array(information))
+        encoder_range = float(np.max(node.encoder.high) - np.min(node.encoder.low))
+        variance = float(np.asarray(node.sensor.noise.covariance)[0, 0])
+        information.append(_compute_word_information(variance, encoder_range, _find_bit_gain(name, node)))
+    return _Senders(transition=a, process=q, rows=np.array(rows), information=np.array(information))
+
+
+def _compute_word_information(variance: float, encoder_range: float, gain: float) -> Float[np.ndarray, " bits"]:
+    """Return the information j(B) of words of B = 0 to MOST bits about the value that was measured.
+
+    j(B) = 1 / (R + D^2/12 + U (1/g^2 - 1)) with the step D = range / (2^B - 1) and U = D^2 (4^B - 1)/12, the variance
+    of uniform words; 0 of no bits.
+
+    Args:
+        variance: R, of the sensor's noise.
+        encoder_range: of the values that the words cover.
+        gain: g = 1 - 2p of each bit, where p is the probability that it is flipped.
+    """
+    counts = np.arange(1, MOST + 1)
+    step = encoder_range / (2.0**counts - 1)
+    noise = variance + step**2 / 12 * (1 + (4.0**counts - 1) * (1 / gain**2 - 1))
+    return np.concatenate([[0.0], 1 / noise])
 
 
 def _find_bit_gain(name: str, node: Node) -> float:
-    """Return the gain g = 1 - 2p of a node's link for one bit; ValueError unless its error rate is constant."""
+    """Return the gain g = 1 - 2p of a node's link for one bit, p its error rate; ValueError unless that is constant."""
     link = node.channel
     if isinstance(link, Flips) and isinstance(link.error, Constant):
         return float(link.gain.moment(1))
@@ -129,25 +150,31 @@ def _take_information(senders: _Senders, bits: Sequence[int] | np.ndarray) -> Fl
 
 
 def _find_covariance(senders: _Senders, j: Float[np.ndarray, " senders"]) -> Float[np.ndarray, "n n"]:
-    """Return the steady covariance after the words, P = (P-^-1 + sum j c c')^-1."""
-    on = j > 0
-    a, q, c = senders.transition, senders.process, senders.rows[on]
-    if not on.any():
+    """Return the steady covariance P = (X^-1 + sum_i j_i c_i c_i')^-1 after words of information j, X before them."""
+    sends = j > 0
+    a, q, c = senders.transition, senders.process, senders.rows[sends]
+    if not sends.any():
         open_loop: np.ndarray = solve_discrete_lyapunov(a, q)
         return open_loop
-    before = solve_discrete_are(a.T, c.T, q, np.diag(1 / j[on]))
-    gain = np.linalg.solve(c @ before @ c.T + np.diag(1 / j[on]), c @ before).T
+    noise = np.diag(1 / j[sends])
+    before = solve_discrete_are(a.T, c.T, q, noise)
+    gain = np.linalg.solve(c @ before @ c.T + noise, c @ before).T
     after: np.ndarray = before - gain @ c @ before
     symmetric: np.ndarray = (after + after.T) / 2
     return symmetric
 
 
 def _find_error(senders: _Senders, j: Float[np.ndarray, " senders"]) -> float:
+    """Return the trace of the steady covariance after words of this information j."""
     return float(np.trace(_find_covariance(senders, j)))
 
 
 def _find_slopes(senders: _Senders, j: Float[np.ndarray, " senders"]) -> Float[np.ndarray, " senders"]:
-    """Return the derivatives of the steady trace by each j: -c' P Y P c, Y = I + M' Y M with M = (I - K C) A."""
+    """Return the derivatives of the steady trace by each j_i: -c_i' P Y P c_i, with Y = I + M' Y M.
+
+    P is the covariance after the words and M = (I - K C) A = P X^-1 A moves the error of one step to the next, X being
+    the covariance before the words.
+    """
     p = _find_covariance(senders, j)
     before = senders.transition @ p @ senders.transition.T + senders.process
     m = p @ np.linalg.pinv(before) @ senders.transition
@@ -157,14 +184,14 @@ def _find_slopes(senders: _Senders, j: Float[np.ndarray, " senders"]) -> Float[n
 
 
 def _add_greedily(senders: _Senders, total: int) -> Float[np.ndarray, " senders"]:
-    """Return bits of each sender, added where the error decreases most for a bit, until `total` of them are spent.
+    """Return the bits of each sender, added where the error falls most for a bit, until `total` of them are spent.
 
-    Several may be added at once to one sender.
+    Several may be added at once to one sender; fewer are spent where none lowers the error.
     """
     bits = np.zeros(len(senders.rows), dtype=int)
     error = _find_error(senders, _take_information(senders, bits))
     while (left := total - bits.sum()) > 0:
-        # (decrease of the error for a bit, sender, bits added, error then)
+        # (decrease of the error for each bit, sender, bits added, error then): the first counts most.
         best = (0.0, 0, 0, error)
         for i in range(len(bits)):
             for more in range(1, min(left, MOST - bits[i]) + 1):
@@ -180,7 +207,7 @@ def _add_greedily(senders: _Senders, total: int) -> Float[np.ndarray, " senders"
 
 
 def _bound_by_relaxation(senders: _Senders, total: int) -> float:
-    """Bound the error of any bits from below: that of the best real numbers of bits, with concave information.
+    """Return a lower bound of the error of any bits of this total: the least of real bits with concave information.
 
     By Frank and Wolfe's steps j + 2 / (k + 2) (best - j); the error is convex in j, so that the tangent at each j is
     nowhere above it, and its least value over all bits of this total is a bound.
@@ -197,23 +224,25 @@ def _bound_by_relaxation(senders: _Senders, total: int) -> float:
 
 
 def _find_envelope(values: Float[np.ndarray, " bits"]) -> list[tuple[int, float]]:
-    """Return the corners (B, j) of the concave envelope of j over B, from B = 0 on."""
+    """Return the corners (B, j) of the concave envelope of j(B) = values[B], from B = 0 on, as far as it rises."""
     corners = [(0, float(values[0]))]
     while corners[-1][0] < len(values) - 1:
+        # The next corner is the one to which the line rises most steeply.
         start, low = corners[-1]
         further = np.arange(start + 1, len(values))
         rises = (values[further] - low) / (further - start)
         if rises.max() <= 0:
             break
-        at = int(further[np.argmax(rises)])
-        corners.append((at, float(values[at])))
+        bits = int(further[np.argmax(rises)])
+        corners.append((bits, float(values[bits])))
     return corners
 
 
 def _spend_bits(hulls: list[list[tuple[int, float]]], worth: np.ndarray, total: int) -> Float[np.ndarray, " senders"]:
-    """Return the j_i of real bits, `total` in sum, that maximise sum_i worth_i j_i: the steepest edges first.
+    """Return the information j_i (senders,) of real bits, `total` in sum, that maximises sum_i worth_i j_i.
 
-    hulls: corners (bits, j) of each sender's concave envelope, between which j is linear.
+    The steepest edges of the envelopes come first. `hulls`: corners (bits, j) of each sender's concave envelope,
+    between which j is linear.
     """
     edges = [  # (worth of a bit, sender, bits, information)
         (worth[i] * (high - low) / (b - a), i, b - a, high - low)
@@ -221,10 +250,10 @@ def _spend_bits(hulls: list[list[tuple[int, float]]], worth: np.ndarray, total: 
         for (a, low), (b, high) in pairwise(hull)
     ]
     j, left = np.zeros(len(hulls)), float(total)
-    for _, i, width, rise in sorted(edges, reverse=True):
-        share = min(1.0, left / width)
-        j[i] += share * rise
-        left -= share * width
+    for _, sender, bits, information in sorted(edges, reverse=True):
+        share = min(1.0, left / bits)
+        j[sender] += share * information
+        left -= share * bits
         if left <= 0:
             break
     return j

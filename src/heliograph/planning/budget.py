@@ -79,16 +79,18 @@ class PowerLimits(NamedTuple):
     mean: Float[np.ndarray, "free"]
     total: float
 
-    def best(self, gain: Powers) -> Powers:
-        """Return the allowed powers q with the largest sum of gain * q; zero where the gain is not positive.
+    def find_best_powers(self, gain: Powers) -> Powers:
+        """Return the allowed powers q (time, free) with the largest sum of gain * q.
 
-        Limits are nested (an entry, its column, all), so entries are filled greedily, the largest gain first.
+        They are zero where the gain is not positive. Limits are nested (an entry, its column, all), so entries are
+        filled
+        greedily, the largest gain first.
         """
         powers, steps = np.zeros_like(gain), len(gain)
         # What the limits of the total and of each transmitter leave, as sums over time.
         total_left, left = self.total * steps, self.mean * steps
-        for flat in np.argsort(-gain, axis=None, kind="stable"):
-            k, h = np.unravel_index(flat, gain.shape)
+        for entry in np.argsort(-gain, axis=None, kind="stable"):
+            k, h = np.unravel_index(entry, gain.shape)  # step and transmitter
             if gain[k, h] <= 0 or total_left <= 0:
                 break
             power = min(float(self.peak[k, h]), float(left[h]), total_left)
@@ -99,22 +101,26 @@ class PowerLimits(NamedTuple):
             total_left -= power
         return powers
 
-    def even(self, on: Bool[np.ndarray, "time free"]) -> Powers:
-        """Return the largest allowed powers that are zero where not `on`, and min(level, own limit) at one level."""
-        limit = np.where(on, np.minimum(self.peak, self.mean), 0.0)  # a limit of the mean, at every step
+    def find_even_powers(self, on: Bool[np.ndarray, "time free"]) -> Powers:
+        """Return the largest allowed powers that are even: one level for all, or an entry's own limit if that is less.
+
+        They are zero where not `on`. A limit of the mean is kept at every step.
+        """
+        limit = np.where(on, np.minimum(self.peak, self.mean), 0.0)
         total = self.total * len(on)
         if not np.isfinite(total):
             return limit
-        # The level at which min(limit, level) sums to the total, if it ever does.
+        # The level at which min(limit, level) sums to the total, if it ever does: entries in rising order of their
+        # limits take what is left of the total in equal parts, or their limits.
         ordered = np.sort(limit.ravel())
-        for i, bound in enumerate(ordered):
+        for i, least_limit in enumerate(ordered):
             level = total / (len(ordered) - i)
-            if level <= bound:
+            if level <= least_limit:
                 return np.minimum(limit, level)
-            total -= bound
+            total -= least_limit
         return limit
 
-    def clip(self, powers: Powers) -> Powers:
+    def clip_powers(self, powers: Powers) -> Powers:
         """Return the powers, cut at their peaks and then scaled down where a mean or the total is above its limit.
 
         For powers that rounding, or a solver's accuracy, puts a little outside.
@@ -125,7 +131,7 @@ class PowerLimits(NamedTuple):
         total = powers.mean(axis=0).sum()
         return powers * (self.total / total) if total > self.total else powers
 
-    def rows(self) -> tuple[Float[np.ndarray, "limits entries"], Float[np.ndarray, "limits"]]:
+    def make_limit_rows(self) -> tuple[Float[np.ndarray, "limits entries"], Float[np.ndarray, "limits"]]:
         """Return (rows, bounds): the finite limits of mean and total as rows @ powers.ravel() <= bounds.
 
         Each row is in units of its limit, so that bounds are 1, or 0 where nothing may be sent.
@@ -139,7 +145,7 @@ class PowerLimits(NamedTuple):
 
 
 def make_unlimited(steps: int, count: int) -> PowerLimits:
-    """Return the limits that exclude nothing."""
+    """Return the limits of so many free transmitters over so many steps that exclude nothing."""
     return PowerLimits(np.full((steps, count), np.inf), np.full(count, np.inf), np.inf)
 
 
@@ -147,6 +153,12 @@ def make_power_limits(
     budget: Budget, names: Sequence[str], free: Bool[np.ndarray, "hop"], powers: Float[np.ndarray, "time hop"]
 ) -> PowerLimits:
     """Return the limits that the budget leaves to the free transmitters, while the others send their `powers`.
+
+    Args:
+        budget: limits of all transmitters.
+        names: of all transmitters, in the order of the hops.
+        free: which of them are free (hop,).
+        powers: what each sends at present (time, hop); those of free ones do not matter.
 
     Raises:
         ValueError: limits for transmitters that there are not, powers of the others above the budget.
@@ -156,21 +168,21 @@ def make_power_limits(
     total_limit = np.inf if budget.total is None else budget.total
     # What is not free has to be within the limits, and takes its part of the total.
     fixed = np.where(free, 0.0, powers)
-    mean, peak = fixed.mean(axis=0), fixed.max(axis=0)
-    for name, mean_power, limit in zip(names, mean, mean_limit, strict=True):
-        _check_sent(f"power of {name!r}", mean_power, limit)
-    for name, peak_power, limit in zip(names, peak, peak_limit, strict=True):
-        _check_sent(f"peak of {name!r}", peak_power, limit)
-    _check_sent("total", mean.sum(), total_limit)
+    fixed_mean, fixed_peak = fixed.mean(axis=0), fixed.max(axis=0)
+    for name, sent, limit in zip(names, fixed_mean, mean_limit, strict=True):
+        _check_sent(f"power of {name!r}", sent, limit)
+    for name, sent, limit in zip(names, fixed_peak, peak_limit, strict=True):
+        _check_sent(f"peak of {name!r}", sent, limit)
+    _check_sent("total", fixed_mean.sum(), total_limit)
     return PowerLimits(
         peak=np.tile(peak_limit[free], (len(powers), 1)),
         mean=mean_limit[free],
-        total=max(total_limit - mean.sum(), 0.0),
+        total=max(total_limit - fixed_mean.sum(), 0.0),
     )
 
 
 def _check_sent(what: str, power: float, limit: float) -> None:
-    """Raise ValueError where transmitters that are not free send more than a limit."""
+    """Raise ValueError where transmitters that are not free send more than a limit; `what`: the limit, in words."""
     if power > limit * (1 + MET):
         expected = f"a {what} of at least {power:.6g}, which is sent by what is not free"
         raise fail("budget", expected, f"{limit:.6g}")

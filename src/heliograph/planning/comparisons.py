@@ -28,7 +28,7 @@ Advance = TypeAliasType("Advance", Callable[[str], None])
 
 
 def _report_nothing(what: str) -> None:
-    """Do nothing: progress is not reported."""
+    """Do nothing with a word on what comes next: progress is not reported."""
 
 
 @readable
@@ -96,7 +96,7 @@ def error_over_sites(
     y: "Float[ArrayLike, ' rows']",
     advance: Advance = _report_nothing,
 ) -> "SiteMap":
-    """Return the least error at a design's total power, with its network standing elsewhere.
+    """Return the least error at a design's total power where its network stands at each of several places.
 
     Args:
         best: the design.
@@ -114,9 +114,10 @@ def error_over_sites(
     instance("design", best, PowerDesign, "a PowerDesign")
     function("network of a map", build, "x and y")
     columns, rows = array("x of a map", x, (None,)), array("y of a map", y, (None,))
-    errors = np.zeros((len(rows), len(columns)))
+    # The design is made again at each place, from few starts, since errors are compared and nothing is built.
     problem = best.problem.replace_total(best.total)
     problem = replace(problem, starts=min(problem.starts, SITE_STARTS))
+    errors = np.zeros((len(rows), len(columns)))
     for row, north in enumerate(rows):
         advance(f"the map at y = {north:.4g}")
         for column, east in enumerate(columns):
@@ -172,34 +173,34 @@ def worth_of_changes(
 
 
 def _list_changes(problem: DesignProblem, network: Network, exponent: float | None) -> dict[str, DesignProblem]:
-    """Return the problems of the changed networks, by the name of the change."""
-    nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
-    without_filters = {name: Node(node.sensor, node.channel, {}) for name, node in nodes.items()}
+    """Return {name of a change: the design problem of the changed network}.
+
+    Changes are each sensor once more, each left out, and if `exponent` (of the path loss) is given a relay in each hop.
+    """
+    senders = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
+    nodes = {name: Node(node.sensor, node.channel, {}) for name, node in senders.items()}  # without filters
     free = None if problem.free is None else tuple(problem.free)
 
     def with_nodes(nodes: dict[str, Node], free: tuple[str, ...] | None) -> DesignProblem:
         return replace(problem, network=Network(network.plant, nodes), free=free)
 
     problems = {}
-    for name, node in without_filters.items():
-        # The sensor once more.
+    for name, node in nodes.items():
+        # The sensor once more; it is free as the others are.
         twin = f"{name} again"
-        problems[f"one more {name}"] = with_nodes(
-            {**without_filters, twin: node}, None if free is None else (*free, twin)
-        )
+        with_twin = None if free is None else (*free, twin)
+        problems[f"one more {name}"] = with_nodes({**nodes, twin: node}, with_twin)
         # The sensor left out, unless nothing is left or nothing is free then. A target error is one of all sensors.
         still_free = None if free is None else tuple(each for each in free if _name_node(each) != name)
-        if len(without_filters) > 1 and still_free != () and problem.target_error is None:
-            rest = {other: other_node for other, other_node in without_filters.items() if other != name}
+        if len(nodes) > 1 and still_free != () and problem.target_error is None:
+            rest = {other: other_node for other, other_node in nodes.items() if other != name}
             problems[f"without {name}"] = with_nodes(rest, still_free)
         # A relay in each hop. Hops behind it are counted anew, so that nodes are free as a whole.
         if exponent is not None and isinstance(node.channel, AbstractRandomAffine):
             free_nodes = None if free is None else tuple(dict.fromkeys(_name_node(each) for each in free))
             for hop in transmitter_names(node.channel):
                 with_relay = Node(node.sensor, _insert_relay(node.channel, hop, exponent), {})
-                problems[f"a relay halfway of {name}.{hop}"] = with_nodes(
-                    {**without_filters, name: with_relay}, free_nodes
-                )
+                problems[f"a relay halfway of {name}.{hop}"] = with_nodes({**nodes, name: with_relay}, free_nodes)
     return problems
 
 

@@ -131,11 +131,11 @@ class Criterion(NamedTuple):
         return self._replace(weight=weights / size[:, None, None], sharpness=None)
 
     def sharper(self) -> "list[Criterion]":
-        """Return the criteria from the smoothest to this one."""
+        """Return the criteria from the smoothest to this one, by which a search begins: only this one for a trace."""
         return [self] if self.sharpness is None else [self._replace(sharpness=q) for q in SHARPER]
 
     def _differentiate_steps(self, p: Matrices) -> tuple[Float[np.ndarray, "time"], Matrices]:
-        """Return f(P_k) and df/dP_k of each step."""
+        """Return f(P_k) (time,) and df/dP_k (time, n, n) of each step; f: the trace, or the smoothed eigenvalue."""
         if self.sharpness is None:
             return np.einsum("kij,kij->k", self.weight, p), self.weight
         # tr(S^q)^(1/q) and its derivative W^1/2 S^(q-1) W^1/2 tr(S^q)^(1/q - 1), relative to the largest eigenvalue.
@@ -149,7 +149,7 @@ class Criterion(NamedTuple):
 
 
 def _root(weight: Matrices) -> Matrices:
-    """Return W^1/2."""
+    """Return the symmetric root W^1/2 of each matrix W (time, n, n)."""
     values, vectors = np.linalg.eigh(weight)
     scale = np.sqrt(np.maximum(values, 0.0))
     return np.asarray((vectors * scale[:, None, :]) @ np.swapaxes(vectors, 1, 2))

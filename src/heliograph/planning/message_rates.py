@@ -50,7 +50,7 @@ class MessageRate(NamedTuple):
 
 
 class _ScalarSystem(NamedTuple):
-    """x+ = a x + N(0, q), y = c x + N(0, r)."""
+    """Linear plant and sensor of one number each: x+ = a x + N(0, q), y = c x + N(0, r)."""
 
     a: float
     q: float
@@ -75,9 +75,9 @@ def simulate_rate(
     horizon: int = 400,
     seed: int = 0,
 ) -> MessageRate:
-    """Return the rate and error of `event_filter` behind a rule, by simulation: any plant, any link.
+    """Return the rate of messages and the error of `event_filter` behind a rule, by simulation: any plant, any link.
 
-    Means over the last three quarters of the steps.
+    Means over the last three quarters of the steps, when the start is forgotten.
 
     Args:
         plant: the plant.
@@ -95,7 +95,8 @@ def simulate_rate(
     check_count("horizon", horizon, 4)
     node = Node(sensor, channel, {"event": event_filter(plant, sensor, channel, trigger)}, trigger=trigger)
     record = monte_carlo(Network(plant, {"sender": node}), horizon, runs, seed)
-    # Means over time of each run, whose spread gives the standard errors.
+    # Means over time of each run, whose spread gives the standard errors: transmissions are (runs, steps, 1), errors
+    # (runs, steps, n).
     sent = record.transmissions["sender"][:, horizon // 4 :] != 0
     rates = sent.mean(axis=(1, 2))
     squares = (record.errors("sender", "event")[:, horizon // 4 :] ** 2).mean(axis=1)
@@ -111,12 +112,13 @@ def prediction_error_rate(plant: AnyPlant, sensor: AnySensor, delta: float, loss
     """Return rate and error of a sender whose Kalman filter sends its estimate where the prediction is off by delta.
 
     The prediction is that from the last estimate that was acknowledged; each is lost with probability `loss`, and the
-    sender knows. With P the sender's variance and e the difference of its estimate and the prediction,
+    sender knows. With P the variance of the sender's filter, P- that before it measures, and e the difference of its
+    estimate and the prediction, of a plant x+ = a x + N(0, q) measured with noise of variance R in units of x,
 
         e+ = a e + N(0, s^2),  s^2 = P-^2 / (P- + R),     0 where an estimate arrives,
 
-    visits in silence from one arrival to the next: v = kappa (N(.; 0, s^2) + int N(.; a e, s^2) v de), kappa = 1 within
-    delta, `loss` beyond; rate (1 + int_{|e| > delta} v) / T and error P + int e^2 v / T, T = 1 + int v. Exact.
+    visits v(e) in silence from one arrival to the next: v = kappa (N(.; 0, s^2) + int N(.; a e, s^2) v de), kappa = 1
+    within delta, `loss` beyond; rate (1 + int_{|e| > delta} v) / T and error P + int e^2 v / T, T = 1 + int v. Exact.
 
     Args:
         plant: of one state.
@@ -135,7 +137,8 @@ def prediction_error_rate(plant: AnyPlant, sensor: AnySensor, delta: float, loss
     posterior = system.kalman_variance
     prior = a * a * posterior + q
     s = prior / np.sqrt(prior + r / c**2)
-    # Parts of the line, within delta and beyond, with nodes and weights; what is beyond counts where losses leave it.
+    # Parts of the line, within delta and beyond, with nodes and weights. Beyond delta e stays only where what is sent
+    # is lost, so that without losses there is nothing.
     far = delta + REACH * s / np.sqrt(1 - loss)
     edges = [-far, -delta, delta, far] if loss else [-delta, delta]
     if far > LONGEST * s:
@@ -145,8 +148,8 @@ def prediction_error_rate(plant: AnyPlant, sensor: AnySensor, delta: float, loss
     nodes, weights = _make_quadrature(edges, s)
     # The integral equation of the visits v at the nodes (Nystrom's method), then the sums over a cycle.
     kappa = np.where(np.abs(nodes) <= delta, 1.0, loss)
-    kernel = kappa[:, None] * _normal(nodes[:, None] - a * nodes, s * s) * weights
-    visits = np.linalg.solve(np.eye(len(nodes)) - kernel, kappa * _normal(nodes, s * s)) * weights
+    kernel = kappa[:, None] * _normal(nodes[:, None] - a * nodes, s * s) * weights  # [to, from]
+    visits = np.linalg.solve(np.eye(len(nodes)) - kernel, kappa * _normal(nodes, s * s)) * weights  # v de
     cycle = 1 + visits.sum()
     rate = (1 + visits[np.abs(nodes) > delta].sum()) / cycle
     error = posterior + nodes**2 @ visits / cycle
@@ -200,7 +203,7 @@ def send_on_delta_rate(plant: AnyPlant, sensor: AnySensor, delta: float) -> floa
 
 
 def _send_on_delta_rate(system: _ScalarSystem, delta: float) -> float:
-    """Return the rate of messages, however small, extrapolated from two grids."""
+    """Return the rate of messages of send-on-delta, however small, extrapolated from two grids."""
     a, r, delta = system.a, system.r / system.c**2, delta / abs(system.c)  # in units of the state
     if not abs(a) < 1:
         raise fail("plant", "a stable one, which has a rate in the long run", f"a = {a:g}")
@@ -213,24 +216,26 @@ def _send_on_delta_rate(system: _ScalarSystem, delta: float) -> float:
 
 
 def _choose_cells(system: _ScalarSystem, delta: float, share: float) -> tuple[int, int, float]:
-    """Return how many cells lie on either side of 0, how many delta spans, and their length.
+    """Return how many cells lie on either side of 0, how many reach from a cell to delta, and their length.
+
+    Cells are at most `share` of the deviation of either noise, in units of the state.
 
     Raises:
         ValueError: more cells than can be computed.
     """
     a, q, r = system.a, system.q, system.r
-    # Cells of at most `share` deviations of either noise; delta is the edge of a cell, so h = delta / (cells + 1/2).
-    cells = int(np.ceil(min(delta / (share * np.sqrt(min(q, r))), MOST_CELLS) - 0.5))
-    h = delta / (cells + 0.5)
+    # delta is the edge of a cell, so h = delta / (cells + 1/2).
+    cells_of_delta = int(np.ceil(min(delta / (share * np.sqrt(min(q, r))), MOST_CELLS) - 0.5))
+    h = delta / (cells_of_delta + 0.5)
     # As many as reach over HELD deviations of what is measured.
-    n = int(np.ceil(min(HELD * np.sqrt(q / (1 - a * a) + r) / h, MOST_CELLS)))
-    if n > POINTS:
+    cells_each_side = int(np.ceil(min(HELD * np.sqrt(q / (1 - a * a) + r) / h, MOST_CELLS)))
+    if cells_each_side > POINTS:
         raise fail(
             "plant, sensor and delta",
             f"a measurement whose deviation is at most {POINTS // 11} times that of either noise, and of delta",
-            f"{n / 5.5:.3g} times",
+            f"{cells_each_side / 5.5:.3g} times",
         )
-    return n, cells, h
+    return cells_each_side, cells_of_delta, h
 
 
 def _compute_rate_on_grid(system: _ScalarSystem, delta: float, share: float) -> tuple[float, float]:
@@ -241,44 +246,52 @@ def _compute_rate_on_grid(system: _ScalarSystem, delta: float, share: float) -> 
     as f[i, j] = P(x in cell i, last sent in cell j).
     """
     a, q, r = system.a, system.q, system.r
-    deviation = np.sqrt(q / (1 - a * a))
-    n, cells, h = _choose_cells(system, delta, share)
+    cells_each_side, cells_of_delta, h = _choose_cells(system, delta, share)
     # Probabilities of a cell given the middle of another, which sum to 1: move[new, old], noise[x, z].
-    x = np.arange(-n, n + 1) * h
+    x = np.arange(-cells_each_side, cells_each_side + 1) * h
     move, noise = _cell_probabilities(x, a * x, np.sqrt(q)).T, _cell_probabilities(x, x, np.sqrt(r))
     # quiet[i, j] = P(no message) of x in cell i, with the value of cell j sent last.
     quiet = ndtr((x + delta - x[:, None]) / np.sqrt(r)) - ndtr((x - delta - x[:, None]) / np.sqrt(r))
-    size = 2 * n + 1
-    beyond = max(size - cells - 1, 0)  # values sent last on one side of a measured cell, more than delta away at most
+    size = len(x)
 
-    def send_part(f: np.ndarray) -> np.ndarray:
-        """Return the part of the law that sends a message, after it: last sent is what is measured now."""
-        # Of each measured cell the mass of values sent last that lie more than delta from it: above, then below.
-        sums = np.cumsum(f, axis=1)
-        far = np.zeros_like(f)
-        far[:, :beyond] = sums[:, -1:] - sums[:, size - beyond - 1 : -1]
-        far[:, size - beyond :] += sums[:, :beyond]
-        return np.asarray(far * noise)
-
-    def step(vector: np.ndarray) -> np.ndarray:
-        """Return the law after a step: x moves, then is sent or not."""
+    def move_and_send(vector: np.ndarray) -> np.ndarray:
+        """Return the law after a step, from that before it, each (size^2,): x moves, then is sent or not."""
         f = move @ vector.reshape(size, size)
-        return np.asarray(f * quiet + send_part(f)).ravel()
+        return np.asarray(f * quiet + _send_part(f, noise, cells_of_delta)).ravel()
 
     # The stationary law is the eigenvector of a step for its largest eigenvalue, 1: power iterations (Arnoldi) from the
     # law of the state and a value that was just sent.
+    deviation = np.sqrt(q / (1 - a * a))
     start = _cell_probabilities(x, np.zeros(1), deviation).T * noise
-    operator = LinearOperator((size**2, size**2), matvec=step, dtype=np.float64)
+    operator = LinearOperator((size**2, size**2), matvec=move_and_send, dtype=np.float64)
     try:
         _, vectors = eigs(operator, 1, v0=start.ravel(), maxiter=int(PRODUCTS / size**3 / 20) + 2, tol=1e-9)
     except ArpackError as why:
         raise fail("delta", "one whose rate of messages converges within seconds", f"{delta:g}") from why
     f = np.real(vectors[:, 0] / vectors.sum()).reshape(size, size)
-    return float(send_part(move @ f).sum()), h
+    return float(_send_part(move @ f, noise, cells_of_delta).sum()), h
+
+
+def _send_part(f: np.ndarray, noise: np.ndarray, cells_of_delta: int) -> np.ndarray:
+    """Return the part of the law f that sends a message, after it: last sent is what is measured now.
+
+    Args:
+        f: [i, j] = P(x in cell i, last sent in cell j), before the message.
+        noise: [i, z] = P(measured in cell z | x in cell i).
+        cells_of_delta: number of cells on either side of a measured one that are no further than delta from it.
+    """
+    # Of each measured cell the mass of values sent last that lie more than delta from it: above, then below.
+    size = len(f)
+    beyond = max(size - cells_of_delta - 1, 0)  # measured cells that have any such value above them, or below
+    sums = np.cumsum(f, axis=1)
+    far = np.zeros_like(f)
+    far[:, :beyond] = sums[:, -1:] - sums[:, size - beyond - 1 : -1]
+    far[:, size - beyond :] += sums[:, :beyond]
+    return np.asarray(far * noise)
 
 
 def _cell_probabilities(x: np.ndarray, means: np.ndarray, deviation: float) -> np.ndarray:
-    """Return the probabilities (mean, cell) that a Gaussian falls into the cell around each x.
+    """Return the probabilities [i, j] that a Gaussian of mean i falls into the cell around x[j].
 
     Cells end halfway between neighbours; the outermost reach to infinity.
     """
@@ -304,7 +317,7 @@ def delta_for_rate(plant: AnyPlant, sensor: AnySensor, rate: float) -> float:
 def _find_threshold(
     rate: float, rate_at: Callable[[float], float], system: _ScalarSystem, accuracy: float = 1e-10
 ) -> float:
-    """Return the threshold delta at which `rate_at(delta)`, which falls with delta, has this rate."""
+    """Return the threshold delta at which `rate_at(delta)`, which falls as delta rises, is this rate."""
     if not 0 < scalar("rate", rate) < 1:
         raise fail("rate", "a number between 0 and 1", rate)
     unit = np.sqrt(system.q * system.c**2 + system.r)

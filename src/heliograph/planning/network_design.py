@@ -95,36 +95,46 @@ def design(
 
 
 def _design_powers(problem: DesignProblem) -> PowerDesign:
-    """Return the design of a network of independent paths, or of paths from arrays, all of whose powers are free."""
+    """Return the design of powers of a network of independent paths or a sum of links, or of paths from arrays.
+
+    Raises:
+        ValueError: neither a budget nor a target error; paths that were made for another error.
+    """
     if problem.budget is None and problem.target_error is None:
         raise fail("design", "a budget of power or a target error", "neither")
-    if isinstance(problem.network, Network) and adds_up(problem.network):
-        return design_sum_of_links(problem, problem.network)
-    starts, seed = check_count("starts", problem.starts), check_seed("seed", problem.seed)
-    target = None if problem.target_error is None else float(scalar("target error", problem.target_error, 0.0))
-    error, network = problem.criterion, problem.network
-    # Paths, and what is sent at present.
+    network, error = problem.network, problem.criterion
+    if isinstance(network, Network) and adds_up(network):
+        return design_sum_of_links(problem, network)
+    # Paths, and the powers (time, hop) that are sent at present; paths from arrays have none yet.
     if isinstance(network, Network):
-        paths, fixed = paths_of(network, error)
+        paths, present_powers = paths_of(network, error)
         states = network.states
     else:
         assert isinstance(network, Paths)
-        paths, fixed = network, np.zeros(network.kappa.shape)
+        _check_paths(network, problem)
+        paths, present_powers = network, np.zeros(network.kappa.shape)
         states = tuple(f"x{i}" for i in range(network.rows.shape[-1]))
-        if error.steps != len(paths.kappa) or (error.horizon is None) != (paths.plants.start is None):
-            raise fail("error", f"that over {len(paths.kappa)} steps for which the paths were made", f"{error.steps}")
-        if problem.free is not None:
-            raise fail("free powers of paths", "all of them", show_value(problem.free))
-    # What is free, and its limits.
-    chosen = find_free_transmitters(paths.names, problem.free)
+    # Which of them are free, and their limits.
+    free = find_free_transmitters(paths.names, problem.free)
     if problem.budget is None:
-        limits = make_unlimited(error.steps, int(chosen.sum()))
+        limits = make_unlimited(error.steps, int(free.sum()))
     else:
-        limits = make_power_limits(check_budget(problem.budget), paths.names, chosen, fixed)
-    criterion = error.criterion(states)
-    task = make_power_task(paths, criterion, limits, chosen, fixed, starts, seed)
-    present = task.problem.exact(fixed[:, chosen]) if isinstance(network, Network) else float("nan")
-    return design_paths(problem, task, target, present)
+        limits = make_power_limits(check_budget(problem.budget), paths.names, free, present_powers)
+    starts, seed = check_count("starts", problem.starts), check_seed("seed", problem.seed)
+    target = None if problem.target_error is None else float(scalar("target error", problem.target_error, 0.0))
+    task = make_power_task(paths, error.criterion(states), limits, free, present_powers, starts, seed)
+    is_network = isinstance(network, Network)
+    present_error = task.problem.exact(present_powers[:, free]) if is_network else float("nan")
+    return design_paths(problem, task, target, present_error)
+
+
+def _check_paths(paths: Paths, problem: DesignProblem) -> None:
+    """Raise ValueError unless paths from arrays were made for the problem's error, and all their powers are free."""
+    error, steps = problem.criterion, len(paths.kappa)
+    if error.steps != steps or (error.horizon is None) != (paths.plants.start is None):
+        raise fail("error", f"that over {steps} steps for which the paths were made", f"{error.steps}")
+    if problem.free is not None:
+        raise fail("free powers of paths", "all of them", show_value(problem.free))
 
 
 Gains = dict[str, Float[np.ndarray, "slots n _"]]
@@ -140,16 +150,9 @@ def design_relays(problem: DesignProblem, relays: RelayNetwork) -> PowerDesign:
     Raises:
         ValueError: another error than the steady trace, a target error, some relays free alone, limits of single ones.
     """
-    if problem.free is not None or problem.target_error is not None:
-        raise fail("design of relays that filter", "all relays free, and a budget or none", "free or target_error")
-    error = problem.criterion
-    if error.weight is not None or error.worst or error.steps > 1 or error.horizon is not None:
-        raise fail("error of relays that filter", "the steady trace (slots are the steps)", "another")
-    limits = None if problem.budget is None else check_budget(problem.budget)
-    if limits is not None and (limits.total is None or limits.per_transmitter is not None or limits.peak is not None):
-        raise fail("budget of relays that filter", "a total for each slot", "other limits")
-    # Errors of the designed gains, and of those that minimise each relay's error.
-    gains = periodic_relays_for_best_receiver(relays, power_limit=None if limits is None else limits.total)
+    power_limit = _check_relay_problem(problem)
+    # Errors (slots, n, n) of the designed gains, and of those that minimise each relay's error.
+    gains = periodic_relays_for_best_receiver(relays, power_limit=power_limit)
     local_gains = periodic_local_error_design(relays).gains
     covariance, local_covariance = (periodic_behind_relays(relays, design) for design in (gains, local_gains))
     value, present = (float(np.trace(p, axis1=1, axis2=2).mean()) for p in (covariance, local_covariance))
@@ -157,15 +160,15 @@ def design_relays(problem: DesignProblem, relays: RelayNetwork) -> PowerDesign:
     slots, n = len(relays.slots), len(relays.states)
     receiver_gains = {RECEIVER: np.zeros((slots, n, relays.received[-1]))}
     powers = periodic_given_design(relays, gains | receiver_gains).power
-    y = measurement_moment(relays.sensor, steady_moment(relays.plant))
-    sensed = [any(SENSOR in links for links in slot.values()) for slot in relays.slots]
+    measured = measurement_moment(relays.sensor, steady_moment(relays.plant))  # E (y, 1)(y, 1)'
+    sensor_sends = [any(SENSOR in links for links in slot.values()) for slot in relays.slots]
     # One descent of a problem that is not convex: no bound, and no linear model of the error.
     certificate = Certificate(
         convex=False, value=value, bound=float("-inf"), stationarity=float("nan"), starts=1, unit="error"
     )
     return PowerDesign(
         problem=problem,
-        powers={SENSOR: np.trace(y[:-1, :-1]) * np.array(sensed, dtype=float), **powers},
+        powers={SENSOR: np.trace(measured[:-1, :-1]) * np.array(sensor_sends, dtype=float), **powers},
         error=value,
         certificate=certificate,
         present=present,
@@ -175,6 +178,23 @@ def design_relays(problem: DesignProblem, relays: RelayNetwork) -> PowerDesign:
         numbers=dict(gains),
         realised=_make_relay_network(relays, gains),
     )
+
+
+def _check_relay_problem(problem: DesignProblem) -> float | None:
+    """Return what all relays together may send in each slot, None without a limit.
+
+    Raises:
+        ValueError: another error than the steady trace, a target error, some relays free alone, limits of single ones.
+    """
+    if problem.free is not None or problem.target_error is not None:
+        raise fail("design of relays that filter", "all relays free, and a budget or none", "free or target_error")
+    error = problem.criterion
+    if error.weight is not None or error.worst or error.steps > 1 or error.horizon is not None:
+        raise fail("error of relays that filter", "the steady trace (slots are the steps)", "another")
+    limits = None if problem.budget is None else check_budget(problem.budget)
+    if limits is not None and (limits.total is None or limits.per_transmitter is not None or limits.peak is not None):
+        raise fail("budget of relays that filter", "a total for each slot", "other limits")
+    return None if limits is None else limits.total
 
 
 def _make_relay_network(relays: RelayNetwork, gains: Gains) -> Network:

@@ -50,14 +50,17 @@ def designed_network(network: Network, powers: Mapping[str, Float[np.ndarray, "s
     instance("error", error, Error, "an Error")
     nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     powers = _check_powers(powers, nodes, error.steps)
-    # Channels with these powers at each step, from E (x, 1)(x, 1)' of the state.
+    # E (x, 1)(x, 1)' of the state at each step, from which E (y, 1)(y, 1)' of what is sent follows.
     seconds = [steady_moment(plant)] * error.period if error.horizon is None else moments_over(plant, error.horizon)
-    by_step: dict[str, list[AbstractRandomAffine]] = {name: [] for name in nodes}
-    for k, second in enumerate(seconds):
-        for name, node in nodes.items():
-            moment = measurement_moment(node.sensor, second, k)
-            by_step[name].append(set_transmitter_powers(at(node.channel, k), moment, _select_node(name, powers, k), k))
-    channels = {name: _make_over_time(steps) for name, steps in by_step.items()}
+    # Each node's channel with these powers at each step.
+    channels = {}
+    for name, node in nodes.items():
+        by_step: list[AbstractRandomAffine] = []
+        for k, second in enumerate(seconds):
+            measured = measurement_moment(node.sensor, second, k)
+            of_node = _select_node(name, powers, k)
+            by_step.append(set_transmitter_powers(at(node.channel, k), measured, of_node, k))
+        channels[name] = _make_over_time(by_step)
     designed = {name: add_best_filter(plant, node, channels[name]) for name, node in nodes.items()}
     fused = {}
     if len(nodes) > 1:
@@ -78,6 +81,7 @@ def repeat_network(network: Network) -> Network:
         times = -(-COVERED // leaf.steps)
         return OverTime(jax.tree.map(lambda v: np.tile(v, (times, *[1] * (np.ndim(v) - 1))), leaf.values))
 
+    # An OverTime holds arrays with a leading axis over steps.
     covered: Network = jax.tree.map(repeat, network, is_leaf=lambda leaf: isinstance(leaf, OverTime))
     return covered
 

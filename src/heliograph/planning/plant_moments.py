@@ -67,7 +67,10 @@ def check_constant_noise(plant: AnyPlant) -> tuple[LinearPlant, AbstractNoise]:
 
 
 def check_design_plant(plant: AnyPlant) -> LinearPlant:
-    """Return the plant of the first step; ValueError unless linear, with constant noise, without inputs and angles."""
+    """Return the plant of the first step; ValueError unless it is one of which powers can be designed.
+
+    That is a linear one with constant noise, without inputs and angles.
+    """
     start, _ = check_constant_noise(plant)
     if start.inputs:
         raise fail("plant of a design", "no inputs", list(start.inputs))
@@ -118,7 +121,7 @@ def moments_over(plant: AnyPlant, horizon: int, inputs: ArrayLike | None = None)
 
 
 def _read_noise(plant: LinearPlant, u: Float[np.ndarray, "inputs"]) -> tuple[Array, Array]:
-    """Return the mean and covariance of w; the noise may be a function of the inputs in operations of JAX."""
+    """Return the mean and covariance of the plant's noise w at inputs u; JAX may trace a noise that depends on them."""
     if isinstance(plant.noise, AbstractNoise):
         return plant.noise.mean, plant.noise.covariance
     with jax.enable_x64(True):

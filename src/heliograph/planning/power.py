@@ -93,44 +93,59 @@ def power(
     """
     instance("network", network, Network, "a Network")
     start = first(network.plant)
-    rate = spectral_radius(np.asarray(start.matrix)) ** 2 if isinstance(start, LinearPlant) else float("nan")
+    growth = spectral_radius(np.asarray(start.matrix)) ** 2 if isinstance(start, LinearPlant) else float("nan")
     if network.relays is not None:
         sent = _compute_relay_powers(network, horizon)
-        return SentPower(sent, {name: np.zeros_like(power) for name, power in sent.items()}, rate)
+        return SentPower(sent, {name: np.zeros_like(power) for name, power in sent.items()}, growth)
     sources = _list_sources(network)
     covered = steps_covered((network.plant, sources))
     if horizon is None and covered is not None:
         raise fail("steady power", "a network that does not vary (give a horizon)", "parts that are OverTime")
     steps = 1 if horizon is None else check_horizon(horizon, covered)
     u = np.zeros((steps, len(start.inputs))) if inputs is None else array("inputs", inputs, (steps, len(start.inputs)))
-    # E (y, 1)(y, 1)' of each sensor: exact, or the mean of drawn trajectories.
-    linear = all(is_linear(network.plant, sensor) and not first(sensor).circular for sensor, _ in sources.values())
-    if linear and not start.circular:
-        seconds = [steady_moment(network.plant)] if horizon is None else moments_over(network.plant, steps, u)
-        y = {
-            name: np.array([[measurement_moment(sensor, x, k) for k, x in enumerate(seconds)]])
-            for name, (sensor, _) in sources.items()
-        }
+    # E (y, 1)(y, 1)' of what each sensor sends: exact, or the mean of drawn trajectories.
+    if _is_exact(network, sources):
+        moments = _compute_moments(network.plant, sources, u, horizon)
     elif horizon is None:
         raise fail("power", "a horizon, since plant or sensor is not linear", "none")
     else:
-        y = _draw_moments(network.plant, sources, u, check_count("runs", runs, BATCHES), check_seed("seed", seed))
+        runs, seed = check_count("runs", runs, BATCHES), check_seed("seed", seed)
+        moments = _draw_moments(network.plant, sources, u, runs, seed)
     # A sensor with feedback sends its innovation, which stays bounded or not whatever the plant does.
     for name, informing in _find_feedback_filters(network).items():
-        y[name], rate = _compute_innovation_moments(informing, u, horizon), float("nan")
-    power, error = {}, {}
+        moments[name], growth = _compute_innovation_moments(informing, u, horizon), float("nan")
+    # What each hop of the channels sends, with the standard error over batches of drawn trajectories.
+    over_time, error = {}, {}
     for name, (_, channel) in sources.items():
-        for hop, values in _compute_hop_powers(channel, y[name], horizon).items():
-            power[f"{name}.{hop}"] = values.mean(axis=0)
+        for hop, values in _compute_hop_powers(channel, moments[name], horizon).items():
+            over_time[f"{name}.{hop}"] = values.mean(axis=0)
             spread = values.std(axis=0, ddof=1) if len(values) > 1 else np.zeros(steps)
             error[f"{name}.{hop}"] = spread / np.sqrt(len(values))
-    return SentPower(over_time=power, standard_error=error, growth=rate)
+    return SentPower(over_time=over_time, standard_error=error, growth=growth)
+
+
+def _is_exact(network: Network, sources: Sources) -> bool:
+    """Return whether second moments are exact without draws: plant and sensors are linear without angles."""
+    plant = network.plant
+    linear = all(is_linear(plant, sensor) and not first(sensor).circular for sensor, _ in sources.values())
+    return linear and not first(plant).circular
+
+
+def _compute_moments(
+    plant: AnyPlant, sources: Sources, inputs: Float[np.ndarray, "steps u"], horizon: int | None
+) -> dict[str, Moments]:
+    """Return E (y, 1)(y, 1)' of each sensor's output at each step, in one batch, of a linear plant and sensors."""
+    seconds = [steady_moment(plant)] if horizon is None else moments_over(plant, len(inputs), inputs)
+    return {
+        name: np.array([[measurement_moment(sensor, x, k) for k, x in enumerate(seconds)]])
+        for name, (sensor, _) in sources.items()
+    }
 
 
 def _compute_hop_powers(
     channel: Channel, moments: Moments, horizon: int | None
 ) -> dict[str, Float[np.ndarray, "batch steps"]]:
-    """Return the powers that a channel's hops send, by name, for each batch and step of E (y, 1)(y, 1)'."""
+    """Return {hop: powers (batch, steps)} of a channel's hops, by E (y, 1)(y, 1)' of what goes into the channel."""
     batches = [[_compute_powers_at(channel, k, now, horizon) for k, now in enumerate(batch)] for batch in moments]
     return {hop: np.array([[now[hop] for now in batch] for batch in batches]) for hop in batches[0][0]}
 
@@ -148,7 +163,7 @@ def _list_sources(network: Network) -> Sources:
 
 
 def _find_feedback_filters(network: Network) -> dict[str, AbstractFilter]:
-    """Return the filters that send their prediction back to the sensor, by node."""
+    """Return by node the filter that sends its prediction back to the node's sensor, of nodes with one."""
     nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     return {name: node.filters[node.informed_by] for name, node in nodes.items() if node.informed_by is not None}
 
@@ -177,7 +192,7 @@ def _compute_innovation_moments(
 
 
 def _compute_relay_powers(network: Network, horizon: int | None) -> dict[str, Float[np.ndarray, "steps"]]:
-    """Return the powers of a sensor and relays that filter, at each step of the horizon or of their schedules.
+    """Return what a sensor and relays that filter send, at each step of the horizon or of their schedules.
 
     Exact for schedules s+ = A s + K (z - B s - b) in which a relay expects the z that others would send if all of them
     had its own estimate s, as `relay_schedules` makes them.
@@ -192,26 +207,28 @@ def _compute_relay_powers(network: Network, horizon: int | None) -> dict[str, Fl
     covered = min(len(schedule.gain) for schedule in schedules.values())
     steps = covered if horizon is None else check_horizon(horizon, covered)
     moved = relays.steps(steps)
-    rows, n = moved.predict_maps()[0], len(relays.states)
+    # The schedule's A and B have to be the plant's A and the rows of B that the relay expects: rows of all filters,
+    # each filter's behind those before it.
+    expected_rows, n = moved.predict_maps()[0], len(relays.states)
     ends = dict(zip(relays.filters, np.cumsum(relays.received), strict=True))
     gains = {RECEIVER: np.zeros((steps, n, relays.received[-1]))}
-    # The schedule's A and B have to be the plant's and the rows that the relay expects.
     for (name, schedule), count in zip(schedules.items(), relays.received, strict=False):
         gains[name] = np.asarray(schedule.gain)[:steps]
-        expected = rows[:, ends[name] - count : ends[name]]
+        expected = expected_rows[:, ends[name] - count : ends[name]]
         pairs = (schedule.transition, moved.transition), (schedule.expected, expected)
         if not all(np.shape(a)[1:] == b.shape[1:] and np.allclose(a[:steps], b, SAME, SAME) for a, b in pairs):
             raise fail(f"schedule of {name!r}", "s+ = A s + K (z - B s - b), as relay_schedules makes them", "another")
-    # The sensor sends y in the slots in which it transmits.
-    y = np.array([measurement_moment(relays.sensor, x, k) for k, x in enumerate(moments_over(relays.plant, steps))])
-    sensor = np.trace(y[:, :-1, :-1], axis1=1, axis2=2) * moved.transmits_in_slot[:, 0]
+    # The sensor sends y in the slots in which it transmits: E y'y there.
+    seconds = moments_over(relays.plant, steps)
+    measured = np.array([measurement_moment(relays.sensor, x, k) for k, x in enumerate(seconds)])
+    sensor = np.trace(measured[:, :-1, :-1], axis1=1, axis2=2) * moved.transmits_in_slot[:, 0]
     return {SENSOR: sensor, **given_design(relays, gains).power}
 
 
 def _draw_moments(
     plant: AnyPlant, sources: Sources, inputs: Float[np.ndarray, "steps u"], runs: int, seed: int
 ) -> dict[str, Moments]:
-    """Return E (y, 1)(y, 1)' of each sensor over each batch of drawn trajectories."""
+    """Return E (y, 1)(y, 1)' of each sensor (batch, steps, m1, m1), a mean over each batch of drawn trajectories."""
     keys = jax.random.split(seed_key(seed), (BATCHES, runs // BATCHES))
     sensors = {name: sensor for name, (sensor, _) in sources.items()}
     return {name: np.asarray(y) for name, y in _average_draws(plant, sensors, jnp.asarray(inputs), keys).items()}
@@ -221,31 +238,44 @@ def _draw_moments(
 def _average_draws(
     plant: AnyPlant, sensors: dict[str, AnySensor], inputs: Array, keys: jax.Array
 ) -> dict[str, jax.Array]:
-    """Return E (y, 1)(y, 1)' of each sensor and step, a mean over drawn trajectories for each batch of keys."""
+    """Return E (y, 1)(y, 1)' of each sensor at each step, (batch, steps, m1, m1), a mean over drawn trajectories.
 
-    def simulate(key: jax.Array) -> dict[str, jax.Array]:
-        """Draw one trajectory of the plant; return (y, 1)(y, 1)' of each sensor at its steps."""
-        begin, rest = jax.random.split(key)
+    Args:
+        plant: the plant.
+        sensors: by name.
+        inputs: of the plant (steps, inputs).
+        keys: a random key for each trajectory (batch, trajectories).
+    """
 
-        def draw_step(x: jax.Array, row: tuple[Array, Array]) -> tuple[jax.Array, dict[str, jax.Array]]:
-            k, u = row
-            moves, *draws = jax.random.split(jax.random.fold_in(rest, k), 1 + len(sensors))
-            # The state moves, then every sensor measures it.
-            now = at(plant, k)
-            x = now.plus(now.transition(x, u), now.sample_noise(moves, u))
-            moments = {}
-            for draw, (name, sensor) in zip(draws, sensors.items(), strict=True):
-                here = at(sensor, k)
-                y = jnp.append(wrap_angles(here.measure(x) + here.noise.sample(draw), here.angles), 1.0)
-                moments[name] = jnp.outer(y, y)
-            return x, moments
+    def draw_trajectory(key: jax.Array) -> dict[str, jax.Array]:
+        return _draw_squares(plant, sensors, inputs, key)
 
-        start = at(plant, 0).sample_initial(begin)
-        over_time: dict[str, jax.Array] = jax.lax.scan(
-            draw_step, start, (jnp.arange(len(inputs)), jnp.asarray(inputs))
-        )[1]
-        return over_time
-
-    runs: dict[str, jax.Array] = jax.vmap(jax.vmap(simulate))(keys)
-    averages: dict[str, jax.Array] = jax.tree.map(lambda moments: moments.mean(axis=1), runs)
+    squares: dict[str, jax.Array] = jax.vmap(jax.vmap(draw_trajectory))(keys)
+    averages: dict[str, jax.Array] = jax.tree.map(lambda of_sensor: of_sensor.mean(axis=1), squares)
     return averages
+
+
+def _draw_squares(
+    plant: AnyPlant, sensors: dict[str, AnySensor], inputs: Array, key: jax.Array
+) -> dict[str, jax.Array]:
+    """Return (y, 1)(y, 1)' of what each sensor measures at each step of one drawn trajectory, (steps, m1, m1)."""
+    key_of_start, key_of_steps = jax.random.split(key)
+
+    def draw_step(x: jax.Array, row: tuple[Array, Array]) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """Return the state after step k, and (y, 1)(y, 1)' of every sensor that measures it then."""
+        k, u = row
+        key_of_noise, *keys = jax.random.split(jax.random.fold_in(key_of_steps, k), 1 + len(sensors))
+        now = at(plant, k)
+        x = now.plus(now.transition(x, u), now.sample_noise(key_of_noise, u))
+        squares = {}
+        for key_of_sensor, (name, sensor) in zip(keys, sensors.items(), strict=True):
+            here = at(sensor, k)
+            y = wrap_angles(here.measure(x) + here.noise.sample(key_of_sensor), here.angles)
+            extended = jnp.append(y, 1.0)
+            squares[name] = jnp.outer(extended, extended)
+        return x, squares
+
+    start = at(plant, 0).sample_initial(key_of_start)
+    rows = (jnp.arange(len(inputs)), jnp.asarray(inputs))
+    over_time: dict[str, jax.Array] = jax.lax.scan(draw_step, start, rows)[1]
+    return over_time

@@ -63,6 +63,8 @@ class DescentProblem(NamedTuple):
 class Programme:
     """A design problem with its limits, as a function of z = x / unit; values are divided by `size`, that of the start.
 
+    The room of a limit is the part of it that is left: negative where it is exceeded.
+
     Args:
         problem: the design problem.
         limits: of powers, and of the error where there is a target.
@@ -75,19 +77,22 @@ class Programme:
         self.bounds = Bounds(problem.low / problem.unit, problem.high / problem.unit)
         self._last: tuple[bytes, Evaluation | None] = (b"", None)
         self.size = 1.0
-        value = self.value(start / problem.unit)[0]
+        value = self.objective(start / problem.unit)[0]
         self.size = max(value, LEAST_SIZE) if np.isfinite(value) else 1.0
 
-    def at(self, z: Vector) -> Evaluation | None:
-        """Return the evaluation at a point, None where it does not exist; the last one is cached."""
+    def evaluate_at(self, z: Vector) -> Evaluation | None:
+        """Return the evaluation at a point z, None where it does not exist; the last one is cached."""
         key = z.tobytes()
         if key != self._last[0]:
             self._last = key, self.problem.evaluate(np.asarray(z * self.problem.unit), self.sharpness)
         return self._last[1]
 
-    def value(self, z: Vector) -> tuple[float, Vector]:
-        """Return the error, or mean total power where there is a target, over the size, and its derivative by z."""
-        evaluation = self.at(z)
+    def objective(self, z: Vector) -> tuple[float, Vector]:
+        """Return the error, or mean total power where there is a target, over the size, and its derivative by z.
+
+        Infinite where the point does not exist.
+        """
+        evaluation = self.evaluate_at(z)
         if evaluation is None:
             return np.inf, np.zeros_like(z)
         if self.limits.target is None:
@@ -95,47 +100,51 @@ class Programme:
         scale = self.limits.steps * self.size
         return float(evaluation.powers.sum()) / scale, evaluation.power_slope.sum(axis=0) * self.problem.unit / scale
 
-    def room(self, z: Vector) -> Float[np.ndarray, "limits"]:
-        """Return what each limit leaves, as a part of it, of the target last: negative where a limit is exceeded."""
+    def limit_room(self, z: Vector) -> Float[np.ndarray, "limits"]:
+        """Return what each limit leaves at z as a part of it, the target's last: negative where one is exceeded."""
         rows, most, target = self.limits.rows, self.limits.most, self.limits.target
-        evaluation = self.at(z)
+        evaluation = self.evaluate_at(z)
         if evaluation is None:
             return np.full(len(most) + (target is not None), -1.0)
         room = most - rows @ evaluation.powers
         return room if target is None else np.append(room, 1 - evaluation.error / target)
 
-    def room_slope(self, z: Vector) -> Float[np.ndarray, "limits x"]:
-        """Return the derivative of the room by z."""
+    def limit_room_slope(self, z: Vector) -> Float[np.ndarray, "limits x"]:
+        """Return the derivative of `limit_room` by z, (limits, x)."""
         rows, most, target = self.limits.rows, self.limits.most, self.limits.target
-        evaluation = self.at(z)
+        evaluation = self.evaluate_at(z)
         if evaluation is None:
             return np.zeros((len(most) + (target is not None), len(z)))
         slope = -(rows @ evaluation.power_slope) * self.problem.unit
         return slope if target is None else np.vstack([slope, -evaluation.error_slope * self.problem.unit / target])
 
-    def feasible(self, z: Vector) -> bool:
-        """Decide whether the point exists and meets the limits."""
-        return self.at(z) is not None and bool(np.all(self.room(z) >= -FEASIBLE))
+    def is_feasible(self, z: Vector) -> bool:
+        """Return whether the point exists and meets the limits, to FEASIBLE."""
+        return self.evaluate_at(z) is not None and bool(np.all(self.limit_room(z) >= -FEASIBLE))
 
     def merit(self, z: Vector) -> float:
         """Return the value of a feasible point, else infinite."""
-        return self.value(z)[0] if self.feasible(z) else np.inf
+        return self.objective(z)[0] if self.is_feasible(z) else np.inf
 
     def descend(self, z: Vector, tolerance: float) -> Vector:
         """Return the point where a sequential quadratic programme ends, or the start where that is better."""
-        constraints = [NonlinearConstraint(self.room, 0.0, np.inf, self.room_slope)] if len(self.room(z)) else []
+        constraints = (
+            [NonlinearConstraint(self.limit_room, 0.0, np.inf, self.limit_room_slope)]
+            if len(self.limit_room(z))
+            else []
+        )
         before = self.merit(z)
-        end = self._minimize(self.value, z, constraints, tolerance)
+        end = self._minimize(self.objective, z, constraints, tolerance)
         # Neither the start nor the end is within the limits: first back into them, then down again.
-        if np.isinf(before) and not self.feasible(end):
+        if np.isinf(before) and not self.is_feasible(end):
             end = self._minimize(self._excess, end, [], tolerance)
-            return self._minimize(self.value, end, constraints, tolerance)
+            return self._minimize(self.objective, end, constraints, tolerance)
         return end if self.merit(end) < before else z
 
     def _excess(self, z: Vector) -> tuple[float, Vector]:
-        """Return the squared excess over the limits, for a way back into them."""
-        broken = np.minimum(self.room(z), 0.0)
-        return float(broken @ broken), 2 * broken @ self.room_slope(z)
+        """Return the squared excess over the limits, and its derivative by z: what a way back into them minimises."""
+        broken = np.minimum(self.limit_room(z), 0.0)
+        return float(broken @ broken), 2 * broken @ self.limit_room_slope(z)
 
     def _minimize(
         self,
@@ -144,7 +153,10 @@ class Programme:
         constraints: list[NonlinearConstraint],
         tolerance: float,
     ) -> Vector:
-        """Minimise by SLSQP within bounds and constraints; return the end, moved to where the limits hold."""
+        """Return the end of SLSQP's minimisation of a function from z, within bounds and constraints.
+
+        `function`: z -> value and gradient. The end is moved to where the limits hold; it is z if it is not finite.
+        """
         optimum = minimize(function, z, jac=True, method="SLSQP", bounds=self.bounds, constraints=constraints,
                           options={"ftol": tolerance, "maxiter": ITERATIONS})  # fmt: skip
         end = np.clip(optimum.x, self.bounds.lb, self.bounds.ub)
@@ -152,7 +164,10 @@ class Programme:
         return self.problem.restore(end * unit) / unit if np.all(np.isfinite(end)) else z
 
     def polish(self, z: Vector) -> Vector:
-        """Return the point after Newton's steps on the active limits, as long as no exact penalty rises by them."""
+        """Return the point after Newton's steps on the active limits, as long as no exact penalty rises by them.
+
+        `z`: where a descent ended, within the limits.
+        """
         for _ in range(ROUNDS):
             newton = self._solve_newton_step(z)
             if newton is None:
@@ -163,44 +178,37 @@ class Programme:
             unit = self.problem.unit
             end = self.problem.restore(np.clip(z + step, self.bounds.lb, self.bounds.ub) * unit) / unit
             before, after = (self._penalty(point, multipliers, active) for point in (z, end))
-            if not (self.feasible(end) and after <= before * (1 + ROUNDING)):
+            if not (self.is_feasible(end) and after <= before * (1 + ROUNDING)):
                 break
             z = end
         return z
 
     def _penalty(self, z: Vector, multipliers: Vector, active: Bool[np.ndarray, "limits"]) -> float:
-        """Return the value plus the excess over the active limits, weighed by the multipliers."""
-        excess = np.maximum(-self.room(z), 0.0)
-        return float(self.value(z)[0] + np.maximum(multipliers, 0.0) @ excess[active])
+        """Return the value plus the excess over the active limits, weighed by their multipliers."""
+        excess = np.maximum(-self.limit_room(z), 0.0)
+        return float(self.objective(z)[0] + np.maximum(multipliers, 0.0) @ excess[active])
 
     def _solve_newton_step(self, z: Vector) -> tuple[Vector, Vector, Bool[np.ndarray, "limits"]] | None:
-        """Return the step d, the multipliers m of the active limits, and which limits are active; None without a step.
+        """Return the step d from z, the multipliers m of the active limits, and which limits are active.
 
-        H d - A' m = -g and A d = -room over the variables at no bound, with the gradient g of the value, the slopes A
-        of the active limits' room, and H the Hessian of the Lagrangian value - m' room.
+        Over the variables at no bound it solves H d - A' m = -g and A d = -room, with the gradient g of the value, the
+        slopes A of the active limits' room, and H the Hessian of the Lagrangian value - m' room. None where all
+        variables are at bounds, or derivatives are not finite.
         """
         index = np.flatnonzero((z > self.bounds.lb + ACTIVE) & (z < self.bounds.ub - ACTIVE))
-        room = self.room(z)
+        room = self.limit_room(z)
         active = room <= ACTIVE
         if not len(index):
             return None
         # A and g, by each variable over its own size.
         scale = np.where(z[index] != 0, np.abs(z[index]), 1.0)
-        face = self.room_slope(z)[active][:, index] * scale
-        gradient = self.value(z)[1][index] * scale
-        # Multipliers that leave least of the gradient, then the Hessian of the Lagrangian by differences.
-        multipliers = np.linalg.lstsq(face.T, gradient, rcond=None)[0]
-
-        def lagrangian_gradient(point: Vector) -> Vector:
-            return np.asarray((self.value(point)[1] - multipliers @ self.room_slope(point)[active])[index] * scale)
-
-        at_z, hessian = lagrangian_gradient(z), np.empty((len(index), len(index)))
-        for column, variable in enumerate(index):
-            shift = np.zeros_like(z)
-            shift[variable] = SHIFT * scale[column]
-            hessian[:, column] = (lagrangian_gradient(z + shift) - at_z) / SHIFT
+        slopes = self.limit_room_slope(z)[active][:, index] * scale
+        gradient = self.objective(z)[1][index] * scale
+        # Multipliers that leave least of the gradient, then the Hessian of the Lagrangian with these.
+        multipliers = np.linalg.lstsq(slopes.T, gradient, rcond=None)[0]
+        hessian = self._differentiate_lagrangian(z, multipliers, active, index, scale)
         # The equations of Karush, Kuhn and Tucker on the active limits.
-        system = np.block([[(hessian + hessian.T) / 2, -face.T], [face, np.zeros((len(face), len(face)))]])
+        system = np.block([[(hessian + hessian.T) / 2, -slopes.T], [slopes, np.zeros((len(slopes), len(slopes)))]])
         right = np.concatenate([-gradient, -room[active]])
         if not np.all(np.isfinite(system)):
             return None
@@ -209,9 +217,33 @@ class Programme:
         step[index] = scale * solution[: len(index)]
         return step, solution[len(index) :], active
 
+    def _differentiate_lagrangian(
+        self, z: Vector, multipliers: Vector, active: Bool[np.ndarray, "limits"], index: np.ndarray, scale: Vector
+    ) -> Float[np.ndarray, "k k"]:
+        """Return the Hessian of the Lagrangian value - m' room at z, by differences of its gradients.
+
+        Args:
+            z: the point.
+            multipliers: m, of the active limits.
+            active: which limits are.
+            index: the k variables by which it is differentiated.
+            scale: size of each of them, in units of which the Hessian is.
+        """
+
+        def lagrangian_gradient(point: Vector) -> Vector:
+            gradient, slopes = self.objective(point)[1], self.limit_room_slope(point)[active]
+            return np.asarray((gradient - multipliers @ slopes)[index] * scale)
+
+        at_z, hessian = lagrangian_gradient(z), np.empty((len(index), len(index)))
+        for column, variable in enumerate(index):
+            shift = np.zeros_like(z)
+            shift[variable] = SHIFT * scale[column]
+            hessian[:, column] = (lagrangian_gradient(z + shift) - at_z) / SHIFT
+        return hessian
+
 
 def search_from_starts(problem: DescentProblem, limits: PowerAndErrorLimits, starts: Sequence[Vector]) -> Vector | None:
-    """Return the best end x of descents from these points, refined and polished; None where none meets the limits."""
+    """Return the best end x of descents from these points x, refined and polished; None where none meets the limits."""
     points, sharpest = [start / problem.unit for start in starts], problem.sharpnesses[-1]
     # Coarse descents from everywhere, the largest eigenvalue sharper and sharper.
     for sharpness in problem.sharpnesses if len(points) > 1 else problem.sharpnesses[:-1]:
@@ -225,4 +257,4 @@ def search_from_starts(problem: DescentProblem, limits: PowerAndErrorLimits, sta
         best = programme.descend(best, FINE)
         if not np.isinf(before) and not programme.merit(best) < before * (1 - FINE):
             break
-    return programme.polish(best) * problem.unit if programme.feasible(best) else None
+    return programme.polish(best) * problem.unit if programme.is_feasible(best) else None

@@ -124,27 +124,41 @@ def worth_of_sensors(
         raise fail("additions", "nodes of other names than the network's", taken[0])
     check_count("steps", steps)
     cases = list(_list_cases([*nodes], [*added], steps, without, table("outages", outages or {}, "steps")))
-    # One filter of all that is received, and one set of draws.
+    # One filter of all that is received, additions included, and one set of draws.
     every = {**nodes, **{name: instance(f"addition {name!r}", node, Node, "a Node") for name, node in added.items()}}
     bare = {name: Node(node.sensor, node.channel, {}) for name, node in every.items()}
-    best_filter = _make_filter_of_all(network, bare)
+    filter_of_all = _make_filter_of_all(network, bare)
+    is_exact = filter_of_all.claim == "exact"
     drawn = monte_carlo(Network(network.plant, bare), steps, check_count("runs", runs), key, inputs=inputs)
     u = np.zeros((steps, 0)) if inputs is None else np.asarray(inputs, float)
-    exact, sizes = best_filter.claim == "exact", [bare[name].received for name in bare]
     z, truth = np.concatenate([drawn.measurements[name] for name in bare], axis=-1), np.asarray(drawn.truth)
-    # Root mean square errors of each case, all of them first.
+    # The error of each case, in which what is not used is NaN. The first case is that of all nodes.
+    sizes = [bare[name].received for name in bare]
     errors: list[ErrorWithout] = []
     for case in cases:
         used = np.where(np.repeat(case.used, sizes, axis=1), z, np.nan)
-        squares = _squares_at_end(best_filter, used, u, truth, exact)
-        error = np.sqrt(squares.mean(axis=0))
-        # The standard error of a root: sd(root m) = sd(m) / (2 root m).
-        spread = squares.std(axis=0) / np.sqrt(len(squares))
-        uncertainty = np.divide(spread, 2 * error, out=np.zeros_like(error), where=error > 0)
-        of_all = errors[0].error if errors else error
-        increase = np.divide(error, of_all, out=np.full_like(error, np.nan), where=of_all > 0)
-        errors.append(ErrorWithout(name=case.name, error=error, uncertainty=uncertainty, increase=increase))
-    return SensorWorth(network.states, complete=errors[0], cases=tuple(errors[1:]), exact=exact, added=tuple(added))
+        squares = _squares_at_end(filter_of_all, used, u, truth, is_exact)
+        errors.append(_describe_error(case.name, squares, errors[0].error if errors else None))
+    return SensorWorth(network.states, complete=errors[0], cases=tuple(errors[1:]), exact=is_exact, added=tuple(added))
+
+
+def _describe_error(
+    name: str, squares: Float[np.ndarray, "runs n"], complete: Float[np.ndarray, " n"] | None
+) -> ErrorWithout:
+    """Return the root mean square error of a case, with its standard error and its ratio to that of all nodes.
+
+    Args:
+        name: of the case.
+        squares: squared error of each state in each run, or its variance.
+        complete: error with all nodes (n,); None if this is that case.
+    """
+    error = np.sqrt(squares.mean(axis=0))
+    # The standard error of a root: sd(root m) = sd(m) / (2 root m).
+    spread = squares.std(axis=0) / np.sqrt(len(squares))
+    uncertainty = np.divide(spread, 2 * error, out=np.zeros_like(error), where=error > 0)
+    of_all = error if complete is None else complete
+    increase = np.divide(error, of_all, out=np.full_like(error, np.nan), where=of_all > 0)
+    return ErrorWithout(name=name, error=error, uncertainty=uncertainty, increase=increase)
 
 
 def _check_plain_nodes(network: Network) -> dict[str, Node]:
@@ -163,17 +177,25 @@ def _check_plain_nodes(network: Network) -> dict[str, Node]:
 def _list_cases(
     names: list[str], added: list[str], steps: int, without: Sequence[str] | None, outages: Mapping[str, int]
 ) -> Iterator[_SensorCase]:
-    """Yield the cases: all nodes first, then each left out, each outage, each addition."""
-    each = names if len(names) > 1 else []
-    left = each if without is None else items("nodes left out", without, "names")
-    for what, asked in (("nodes left out", left), ("outages", outages)):
+    """Yield the cases: all nodes first, then each node left out, each outage, each addition.
+
+    Args:
+        names: of the network's nodes.
+        added: names of nodes that are tried beside them.
+        steps: length of a run.
+        without: nodes that are left out, each by itself; None for each of several.
+        outages: for how many steps at the end a node is out, by its name.
+    """
+    each_of_several = names if len(names) > 1 else []
+    left_out = each_of_several if without is None else items("nodes left out", without, "names")
+    for what, asked in (("nodes left out", left_out), ("outages", outages)):
         for name in asked:
             if name not in names:
                 raise fail(what, f"some of the nodes {', '.join(names)}", repr(name))
-    # Rows (steps, nodes) that are used: those of the network's nodes, not those of additions.
+    # Which values are used (steps, nodes): those of the network's nodes, not those of additions.
     base = np.tile(np.isin([*names, *added], names), (steps, 1))
     yield _SensorCase("all", base)
-    for name in left:
+    for name in left_out:
         used = base.copy()
         used[:, names.index(name)] = False
         yield _SensorCase(f"without {name}", used)
@@ -204,7 +226,7 @@ def _make_filter_of_all(network: Network, nodes: Mapping[str, Node]) -> Abstract
 
 
 def _given_arrival(channel: AbstractRandomAffine) -> AbstractRandomAffine:
-    """Return the channel of what arrives."""
+    """Return the channel given that what it carries arrives."""
     return channel.condition_on_arrival() if channel.erases else channel
 
 

@@ -46,43 +46,57 @@ class SummedLinks(NamedTuple):
 
 
 def solve_closed_form(links: SummedLinks, total: float, caps: Vector) -> Vector | None:
-    """Return the best amplitudes of one scalar signal by the formulas of the module docstring; None where none applies.
+    """Return the best amplitudes (links,) of one scalar signal by formulas; None where there is none.
 
-    Under a total power, and under limits of each amplitude where the noises of links are independent.
+    The sum of links with amplitudes a carries the information j = (b' a)^2 / (a' D a + N), with the gains b, noise D of
+    the links and N of the receiver, and sends the power a' T a, T = diag(unit). There are formulas where only the total
+    power binds, and under limits of each amplitude where the noises of links are independent.
+
+    Args:
+        links: rows B (of one signal: multiples b of one direction), D, T and N.
+        total: largest power that all may send together.
+        caps: largest size of each amplitude.
     """
     # One signal: all rows of B are multiples b_i of one direction.
     _, sizes, right = np.linalg.svd(links.rows)
     if len(sizes) > 1 and sizes[1] > ALIKE * sizes[0]:
         return None
     b = links.rows @ right[0]
-    # Where only the total binds: a ~ (D + N T / P)^-1 b.
+    # Where only the total P binds: a ~ (D + N T / P)^-1 b.
     if np.isfinite(total):
-        free = np.linalg.solve(links.noise + np.diag(links.floor * links.unit / total), b)
-        free = free * np.sqrt(total / (free**2 @ links.unit))
-        if np.all(np.abs(free) <= caps):
-            return np.asarray(free)
+        uncapped = np.linalg.solve(links.noise + np.diag(links.floor * links.unit / total), b)
+        uncapped = uncapped * np.sqrt(total / (uncapped**2 @ links.unit))
+        if np.all(np.abs(uncapped) <= caps):
+            return np.asarray(uncapped)
     diagonal = np.diagonal(links.noise)
     if np.any(np.abs(links.noise - np.diag(diagonal)) > ALIKE * np.sqrt(np.outer(diagonal, diagonal))):
         return None
     # Where only the limits of each bind.
-    best: np.ndarray = np.sign(b) * _cap_amplitudes(np.abs(b), diagonal, links.floor, caps)
-    if best**2 @ links.unit <= total:
-        return best
-
-    # Both: the multiplier nu of the total, between 0 and N / P, at which the power is the total.
-    def amplitudes_at(nu: float) -> Vector:
-        sizes = _cap_amplitudes(np.abs(b), diagonal + nu * links.unit, links.floor - nu * total, caps)
-        return np.asarray(np.sign(b) * sizes)
-
+    capped: np.ndarray = np.sign(b) * _cap_amplitudes(np.abs(b), diagonal, links.floor, caps)
+    if capped**2 @ links.unit <= total:
+        return capped
+    # Both: D + nu T and N - nu P in place of D and N, with the multiplier nu of the total, between 0 and N / P, at
+    # which the power is the total; by bisection, as the power falls with nu.
     low, high = 0.0, links.floor / total
     for _ in range(HALVINGS):
         nu = (low + high) / 2
-        low, high = (nu, high) if amplitudes_at(nu) ** 2 @ links.unit > total else (low, nu)
-    return amplitudes_at(high)
+        sizes = _cap_amplitudes(np.abs(b), diagonal + nu * links.unit, links.floor - nu * total, caps)
+        low, high = (nu, high) if (np.sign(b) * sizes) ** 2 @ links.unit > total else (low, nu)
+    sizes = _cap_amplitudes(np.abs(b), diagonal + high * links.unit, links.floor - high * total, caps)
+    return np.asarray(np.sign(b) * sizes)
 
 
 def _cap_amplitudes(b: Vector, noise: Vector, floor: float, caps: Vector) -> Vector:
-    """Return a_i = min(theta b_i / D_i, cap_i) at the theta at which theta b' a = a' D a + N."""
+    """Return the amplitudes a_i = min(theta b_i / D_i, cap_i) (links,) that maximise (b' a)^2 / (a' D a + N).
+
+    theta is where theta b' a = a' D a + N, found by bisection.
+
+    Args:
+        b: gains, not negative.
+        noise: the diagonal of D.
+        floor: N.
+        caps: largest amplitudes.
+    """
     ratio = np.divide(b, noise, out=np.full_like(b, np.inf), where=noise > 0)
 
     def amplitudes_at(theta: float) -> Vector:

@@ -49,7 +49,9 @@ def transmitter_names(channel: AbstractRandomAffine) -> list[str]:
 
 
 def select_transmitters(names: Sequence[str], chosen: Sequence[str], what: str) -> np.ndarray:
-    """Return the mask of the names that are chosen, by name or by what stands before a dot.
+    """Return the mask (names,) of the transmitters that are chosen, by name or by what stands before a dot.
+
+    `what`: what the choice is of, for messages.
 
     Raises:
         ValueError: a choice that is there under no name.
@@ -77,9 +79,10 @@ def compute_sent_powers(channel: AbstractRandomAffine, second: Second, step: int
 
 
 def steady_powers(channel: AbstractRandomAffine, second: Second) -> dict[str, Any]:
-    """Return the power of each transmitter in the long run, in the stationary law of the channel's modes.
+    """Return {name: power} of each transmitter in the long run, in the stationary law of the channel's modes.
 
     A start that is stationary is kept: where a chain has several closed classes, it says how probable each is.
+    `second`: E (y, 1)(y, 1)' of what goes into the channel.
     """
     joint = joint_modes(channel, order=2)
     unchanged = np.allclose(joint.initial @ joint.transition, joint.initial, rtol=0.0, atol=UNCHANGED)
@@ -87,31 +90,42 @@ def steady_powers(channel: AbstractRandomAffine, second: Second) -> dict[str, An
 
 
 def powers_of_law(channel: AbstractRandomAffine, second: Second, law: Float[Array, "modes"]) -> dict[str, Any]:
-    """Return the power of each transmitter by name where the channel's modes have this law.
+    """Return the power of each transmitter of a channel by name, where the channel's modes have this law.
 
-    A channel without memory has one mode. The mean is that over the modes in which a transmitter is received.
+    A channel without memory has one mode. The mean is that over the modes in which a transmitter is received: in the
+    others it sends as well, which the receiver does not notice.
+
+    Args:
+        channel: the channel.
+        second: E (y, 1)(y, 1)' of what goes into the channel.
+        law: probability of each mode.
     """
     # By transmitter: the sum of P(mode) power over modes in which it is received, and the sum of their P(mode).
-    total: dict[str, Scalar] = dict.fromkeys(transmitter_names(channel), 0.0)
-    occurs = dict(total)
-    for weight, mode_map in zip(law, joint_modes(channel, order=2).maps, strict=True):
-        # Powers in a mode; a transmitter that is not received there sends as in other modes.
-        powers: dict[str, Scalar] = {}
+    weighted_power: dict[str, Scalar] = dict.fromkeys(transmitter_names(channel), 0.0)
+    received = dict(weighted_power)
+    for probability, mode_map in zip(law, joint_modes(channel, order=2).maps, strict=True):
+        for name, power in _list_powers(mode_map, second).items():
+            weighted_power[name] += probability * power
+            received[name] += probability
+    return {name: _divide_by_probability(weighted_power[name], received[name]) for name in weighted_power}
 
-        def note(
-            name: str, hop: AbstractHop, signal: SignalMoment | None, powers: dict[str, Scalar] = powers
-        ) -> AbstractHop:
-            """Note the power tr A E[y y'] A' that a hop sends, if it receives something; the hop stays."""
-            assert signal is not None and isinstance(hop, GainAndNoise)
-            if not hop.is_silent:
-                powers[name] = signal.arrives * (hop.matrix @ signal.second[:-1, :-1] * hop.matrix).sum()
-            return hop
 
-        visit_hops(mode_map, note, SignalMoment(second, 1.0))
-        for name, power in powers.items():
-            total[name] += weight * power
-            occurs[name] += weight
-    return {name: _divide_by_probability(total[name], occurs[name]) for name in total}
+def _list_powers(channel: AbstractRandomAffine, second: Second) -> dict[str, Scalar]:
+    """Return the power tr A E[y y'] A' that each hop of a channel of one mode sends, of those that are not silent.
+
+    A is the matrix of the hop's transmitter and y what it receives; `second`: E (y, 1)(y, 1)' of the channel's input.
+    """
+    powers: dict[str, Scalar] = {}
+
+    def note_power(name: str, hop: AbstractHop, signal: SignalMoment | None) -> AbstractHop:
+        """Note what the hop sends, and leave it as it is."""
+        assert signal is not None and isinstance(hop, GainAndNoise)
+        if not hop.is_silent:
+            powers[name] = signal.arrives * (hop.matrix @ signal.second[:-1, :-1] * hop.matrix).sum()
+        return hop
+
+    visit_hops(channel, note_power, SignalMoment(second, 1.0))
+    return powers
 
 
 def _divide_by_probability(total: Scalar, probability: Scalar) -> Scalar:

@@ -58,10 +58,10 @@ CASES = {
 
 def check_gradients(problem, relative=2e-3):
     x = problem.numbers.start
-    slopes = problem.at(x).slopes
+    slopes = problem.solve_at(x).slopes
     for i in range(len(x)):
         h = relative * x[i]
-        ends = [problem.at(x + s * h * np.eye(len(x))[i]) for s in (-2, -1, 1, 2)]
+        ends = [problem.solve_at(x + s * h * np.eye(len(x))[i]) for s in (-2, -1, 1, 2)]
         for values, slope in (
             ([p.error for p in ends], slopes.error[i]),
             ([p.powers for p in ends], slopes.powers[..., i]),
@@ -93,16 +93,16 @@ def first_step(measured):
 
 def test_the_error_is_that_of_the_recursion(problem):
     name, item = problem
-    result = item.at(item.numbers.start).covariances[0]
+    result = item.solve_at(item.numbers.start).covariances[0]
     network = item.network(item.numbers.start)
     if name == "shared gain":
         node = network.nodes["node"]
         best = hg.linear_filter(PLANT, node.sensor, node.channel).planned(np.zeros((200, 0)))
         np.testing.assert_allclose(result, best.covariances[-1], rtol=1e-10)
-        powers = item.at(item.numbers.start).powers
+        powers = item.solve_at(item.numbers.start).powers
         np.testing.assert_allclose(powers[0], list(hg.power(network).mean.values()), rtol=1e-12)
         return
-    m = first_step(item.at(item.numbers.start).system)
+    m = first_step(item.solve_at(item.numbers.start).system)
     parts = m.law[:, None, None] * np.eye(2)
     for _ in range(400):  # the recursion of X_j, as it is written
         after = np.zeros_like(parts)
@@ -116,7 +116,7 @@ def test_the_error_is_that_of_the_recursion(problem):
 
 def test_observed_losses_are_bounded_by_what_drawn_losses_leave():
     problem = problem_of("observed losses")
-    result = problem.at(problem.numbers.start)
+    result = problem.solve_at(problem.numbers.start)
     p, q = np.diag(result.covariances[0])
     assert result.error == pytest.approx(p + 0.5 * q, rel=1e-12)
     m, runs = first_step(result.system), 200
@@ -135,7 +135,7 @@ def test_a_bound_holds_for_every_possible_law_and_is_no_looser_than_a_filters():
     """The gain of the bound, run under each extreme law: (x, e) is a linear system with random coefficients."""
     result = hg.design(uncertain, free={"amplification": (1.2, 1.2, 1.2)}, budget=100, starts=1)
     node = result.network.nodes["node"]
-    k = problem_of("uncertain").at(np.append(1.2, result.numbers["young"])).solution.gains[0, 0]
+    k = problem_of("uncertain").solve_at(np.append(1.2, result.numbers["young"])).solution.gains[0, 0]
     a, q, c = PLANT.matrix, PLANT.noise.covariance, 1.2 * SUM.matrix
     for p in (0.2, 0.3, 0.4):
         values, law = np.array([0.6, 1.0, 1.4]), np.array([p, 0.4, 0.6 - p])

@@ -41,9 +41,9 @@ def test_other_steps_other_functions_and_a_start_of_their_own_compile():
 
 def test_a_number_outside_of_the_function_that_is_another_now_is_seen(monkeypatch):
     x = np.array([1.2])
-    before = problem().at(x)
+    before = problem().solve_at(x)
     monkeypatch.setitem(OUTSIDE, "noise", 0.6)
-    after, fresh = problem().at(x), problem(build=lambda amplification: one_hop(amplification)).at(x)
+    after, fresh = problem().solve_at(x), problem(build=lambda amplification: one_hop(amplification)).solve_at(x)
     assert after.error == pytest.approx(fresh.error, rel=1e-13)
     np.testing.assert_allclose(after.slopes.error, fresh.slopes.error, rtol=1e-13)
     assert after.error > 1.01 * before.error

@@ -44,18 +44,19 @@ def design_numbers(task: DesignProblem, build: Build) -> PowerDesign:
     target = None if task.target_error is None else float(scalar("target error", task.target_error, 0.0))
     if target == 0:
         raise fail("target error", "a number above zero", "0")
-    # What cannot be is refused before any descent.
-    before = problem.at(problem.numbers.start)
+    # What cannot be is refused before any descent: at the start, and near the ends of the numbers' ranges.
+    present = problem.solve_at(problem.numbers.start)
     problem.check_ends()
+    # The best of descents from the start, and from points that are drawn.
     limits = _make_limit_rows(_limit_powers(problem, task.budget), target)
     draws = np.random.default_rng(seed)
-    begin = [problem.numbers.start, *(problem.numbers.draw_start(draws) for _ in range(starts - 1))]
+    points = [problem.numbers.start, *(problem.numbers.draw_start(draws) for _ in range(starts - 1))]
     descent = problem.descent_problem()
-    best = search_from_starts(descent, limits, begin)
+    best = search_from_starts(descent, limits, points)
     if best is None:
-        raise _explain_unmet(descent, limits, begin)
+        raise _explain_unmet(descent, limits, points)
     # The design, and what Lagrange's conditions say of it. The problem is not convex: there is no lower bound.
-    found, conditions = problem.at(best), check_lagrange_conditions(descent, limits, best)
+    found, conditions = problem.solve_at(best), check_lagrange_conditions(descent, limits, best)
     network, error = problem.network(best), problem.criterion.exact(found.covariances)
     value, unit = (error, "error") if target is None else (conditions.value, "power")
     certificate = Certificate(
@@ -67,7 +68,7 @@ def design_numbers(task: DesignProblem, build: Build) -> PowerDesign:
         powers=dict(zip(problem.names, found.powers.T, strict=True)),
         error=error,
         certificate=certificate,
-        present=problem.criterion.exact(before.covariances),
+        present=problem.criterion.exact(present.covariances),
         covariance=found.covariances,
         sensitivity=dict(zip(problem.names, (-conditions.worth.sum(axis=0)).tolist(), strict=True)),
         price=float(np.max(conditions.worth, initial=0.0) * limits.steps),
@@ -77,7 +78,7 @@ def design_numbers(task: DesignProblem, build: Build) -> PowerDesign:
 
 
 def _limit_powers(problem: NumberProblem, budget: object) -> PowerLimits:
-    """Return the limits of the transmitters' powers that a budget sets; none without a budget."""
+    """Return the limits that a budget sets to the powers of all transmitters (steps, hops); none without a budget."""
     steps, hops = problem.error.steps, len(problem.names)
     if budget is None:
         return make_unlimited(steps, hops)
@@ -88,8 +89,11 @@ def _limit_powers(problem: NumberProblem, budget: object) -> PowerLimits:
 
 
 def _make_limit_rows(allowed: PowerLimits, target: float | None) -> PowerAndErrorLimits:
-    """Return the finite limits of a budget as rows of all powers; peaks too, since powers are no free numbers here."""
-    rows, most = allowed.rows()
+    """Return the finite limits of a budget, peaks too, as rows of all powers, and the target error (None without one).
+
+    Powers are no free numbers here, so that their peaks are limits like others.
+    """
+    rows, most = allowed.make_limit_rows()
     peak = allowed.peak.ravel()
     finite = np.isfinite(peak)
     peak_rows = (np.eye(peak.size) / np.where(finite, peak, 1.0)[:, None])[finite]
@@ -104,7 +108,7 @@ def _make_limit_rows(allowed: PowerLimits, target: float | None) -> PowerAndErro
 def _explain_unmet(problem: DescentProblem, limits: PowerAndErrorLimits, begin: list[Vector]) -> ValueError:
     """Return the error for limits that no start meets: it names the least error within them, or the least power.
 
-    A programme's `size` is its value at its start, here the least that was found.
+    `begin`: the starts that were tried. A programme's `size` is its value at its start, here the least that was found.
     """
     starts, sharpest = len(begin), problem.sharpnesses[-1]
     # The target error may be what cannot be met: the least error within the limits of power.
@@ -125,24 +129,27 @@ def _explain_unmet(problem: DescentProblem, limits: PowerAndErrorLimits, begin: 
 
 
 def check_lagrange_conditions(problem: DescentProblem, limits: PowerAndErrorLimits, x: Vector) -> LagrangeConditions:
-    """Return Lagrange's conditions at x: how far the gradient is from a sum of the reached limits' normals.
+    """Return Lagrange's conditions at the point x: how far the gradient is from a sum of the reached limits' normals.
 
     The multipliers m >= 0 minimise |gradient - normals' m|; in a minimum nothing of the gradient is left.
     """
+    # In units of each number and of the value at x, `programme.size`: z = x / unit.
     programme, z = Programme(problem, limits, problem.sharpnesses[-1], x), x / problem.unit
-    value, gradient = programme.value(z)
-    reached = programme.room(z) < ACTIVE
-    # Normals of the limits that are reached: of powers and target, and of the numbers' ends.
+    value, gradient = programme.objective(z)
+    # Normals of the limits that are reached: of powers, the target last, and of the numbers' ends.
+    reached = programme.limit_room(z) < ACTIVE
     axes = np.eye(len(z))
-    low, high = x <= problem.low + ACTIVE * problem.unit, x >= problem.high - ACTIVE * problem.unit
-    normals = [*programme.room_slope(z)[reached], *axes[low], *-axes[high]]
+    at_low, at_high = x <= problem.low + ACTIVE * problem.unit, x >= problem.high - ACTIVE * problem.unit
+    normals = [*programme.limit_room_slope(z)[reached], *axes[at_low], *-axes[at_high]]
     multipliers, residual = np.zeros(len(reached)), float(np.linalg.norm(gradient))
     if normals:
         solution, residual = nnls(np.array(normals).T, gradient)
         multipliers[reached] = solution[: int(reached.sum())]
-    # A watt's worth, from the multipliers of the limits of power.
+    # The worth of a watt of each transmitter at each step, from the multipliers of the limits of power.
     worth = limits.rows.T @ multipliers[: len(limits.most)] * programme.size
-    if limits.target is not None:  # the value is the power: a watt's worth in units of the error
+    if limits.target is not None:
+        # The value is the mean power, so that a watt of one step is 1 / steps of it, and `worth` what limits add. The
+        # target's multiplier, power per error, turns that into the error that the watt takes away.
         power_per_error = multipliers[-1] * programme.size / limits.target
         worth = (worth + 1 / limits.steps) / power_per_error if power_per_error > 0 else np.zeros_like(worth)
     return LagrangeConditions(

@@ -57,7 +57,7 @@ class ModeSolution(NamedTuple):
 
 
 def solve_riccati(m: ModeSystem, criterion: Criterion) -> ModeSolution:
-    """Return the covariances with the best gains, and their adjoint under the criterion.
+    """Return the covariances X with the best gains K, and their adjoint L under the criterion, by step and mode.
 
     Raises:
         ValueError: an error that grows without limit.
@@ -76,7 +76,10 @@ def solve_riccati(m: ModeSystem, criterion: Criterion) -> ModeSolution:
 
 
 def _solve_periodic(m: ModeSystem) -> tuple[Parts, np.ndarray]:
-    """Return X (steps, modes, n, n) and the best gains K for steps that repeat for ever."""
+    """Return X (steps, modes, n, n) and the best gains K (steps, modes, n, m) for steps that repeat for ever.
+
+    X_k,i = E[e e' 1{mode i}] is the error covariance after step k, split by mode.
+    """
     # The recursion, until its gains stabilise.
     last = m.law[-1, :, None, None] * m.process[-1]
     for _ in range(PLAIN):
@@ -95,9 +98,9 @@ def _solve_periodic(m: ModeSystem) -> tuple[Parts, np.ndarray]:
 
 
 def _run_riccati(m: ModeSystem, parts: Float[np.ndarray, "_ n n"]) -> tuple[Parts, np.ndarray]:
-    """Run the coupled Riccati recursion over all steps; return X after each (steps, modes, n, n) and its best gains.
+    """Return X after each step (steps, modes, n, n) and its best gains, by the coupled Riccati recursion.
 
-    `parts` is X before the first step, by mode; one for all modes together where their chain has no memory.
+    `parts`: X before the first step, by mode; one for all modes together where their chain has no memory.
     """
     covariances, gains = [], []
     for k in range(len(m.law)):
@@ -128,7 +131,7 @@ def _close_loop(m: ModeSystem, gains: Numbers) -> JumpSystem:
 
 
 def lagrangian(m: ModeSystem, solution: ModeSolution) -> jax.Array:
-    """Return sum_k,j <L_k,j, right side of X_k,j>, whose gradient at fixed X, K and L is that of the error."""
+    """Return sum_k,j <L_k,j, right side of X_k,j>, whose gradient in m at fixed X, K and L is that of the error."""
     parts, gains, adjoint = (jnp.asarray(values) for values in solution)
     earlier = jnp.roll(parts, 1, axis=0)
     if m.start is not None:  # the first step's chain forgets the mode before: any will do

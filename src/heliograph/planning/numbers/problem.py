@@ -77,7 +77,7 @@ class FreeNumbers(NamedTuple):
         return np.concatenate([number.high.ravel() for number in self.by_name.values()])
 
     def named(self, x: Array) -> dict[str, Any]:
-        """Return the numbers by name, each in its shape."""
+        """Return {name: number in its shape} from the vector x of all free numbers."""
         by_name, begin = {}, 0
         for name, number in self.by_name.items():
             by_name[name] = x[begin : begin + number.start.size].reshape(number.start.shape)
@@ -85,7 +85,7 @@ class FreeNumbers(NamedTuple):
         return by_name
 
     def draw_start(self, draws: np.random.Generator) -> Vector:
-        """Return another start: anywhere between the ends, or where there are none by a factor about the first."""
+        """Return another start, a vector: anywhere between the ends, or without ends by a factor about the first."""
         between = np.isfinite(self.low) & np.isfinite(self.high)
         within = draws.uniform(np.where(between, self.low, 0.0), np.where(between, self.high, 1.0))
         factor = np.exp(draws.normal(size=len(self.low)))
@@ -146,10 +146,10 @@ def read_free_numbers(build: Build, free: object) -> tuple[Build, FreeNumbers]:
             raise fail(f"free number {mark.name!r}", "one between two limits", f"a {mark.domain.kind}")
         ends = (np.full(mark.start.shape, end) for end in (mark.domain.low, mark.domain.high))
         marks[mark.name] = FreeNumber(np.asarray(mark.start), *ends)
-    return partial(_mark_powers, description), FreeNumbers(marks)
+    return partial(_build_by_name, description), FreeNumbers(marks)
 
 
-def _mark_powers(description: Description, **values: object) -> Network:
+def _build_by_name(description: Description, **values: object) -> Network:
     """Return the network of a description with these values in place of its marks."""
     return description.at(values)
 
@@ -194,8 +194,8 @@ class TracedNetwork:
         shapes = tuple((name, number.start.shape) for name, number in self.numbers.by_name.items())
         return shapes, self.error.steps, self.error.horizon is None, self.young
 
-    def system(self, x: Array) -> ModeSystem:
-        """Return the system of the best linear filter at these numbers."""
+    def make_system(self, x: Array) -> ModeSystem:
+        """Return the system of the best linear filter where the free numbers have the values x (numbers,)."""
         values = self.numbers.named(jnp.asarray(x))
         young = values.pop(YOUNG) if self.young else None
         try:
@@ -205,9 +205,9 @@ class TracedNetwork:
             raise fail("network of free numbers", expected, type(error).__name__) from None
         return make_mode_system(network, self.error, young)
 
-    def slopes(self, x: Array, solution: ModeSolution) -> ErrorAndPowerSlopes:
+    def differentiate_by_numbers(self, x: Array, solution: ModeSolution) -> ErrorAndPowerSlopes:
         """Return the derivatives of error and powers by the numbers x, at the fixed X, K and L of the solution."""
-        system, pull_back = jax.vjp(self.system, jnp.asarray(x))
+        system, pull_back = jax.vjp(self.make_system, jnp.asarray(x))
         # Cotangents of the system: that of the error first, then a unit one for each power.
         of_error, size = jax.grad(lagrangian)(system, solution), system.powers.size
         unit = jnp.eye(size).reshape(size, *system.powers.shape)
@@ -222,7 +222,7 @@ def programs(
     network: TracedNetwork,
 ) -> tuple[Callable[[Array], ModeSystem], Callable[[Array, ModeSolution], ErrorAndPowerSlopes]]:
     """Return the compiled programs of a network's system and derivatives; equal networks share them."""
-    return compile_on_call(network.system), compile_on_call(network.slopes)
+    return compile_on_call(network.make_system), compile_on_call(network.differentiate_by_numbers)
 
 
 class EvaluatedPoint(NamedTuple):
@@ -287,7 +287,7 @@ class NumberProblem:
                     what = f"{' '.join(str(end).split())}, where: {error}"
                     raise fail(f"ends of {name!r}", "numbers between which there is a network", what) from None
 
-    def at(self, x: Vector, criterion: Criterion | None = None) -> EvaluatedPoint:
+    def solve_at(self, x: Vector, criterion: Criterion | None = None) -> EvaluatedPoint:
         """Return system, solution and derivatives at x, for a criterion (that of the problem unless given).
 
         Raises:
@@ -312,7 +312,7 @@ class NumberProblem:
         `sharpness`: q, with which tr(S^q)^(1/q) stands for the largest eigenvalue; None for the trace.
         """
         try:
-            point = self.at(x, self.criterion._replace(sharpness=sharpness))
+            point = self.solve_at(x, self.criterion._replace(sharpness=sharpness))
         except ValueError:
             return None
         return Evaluation(

@@ -115,27 +115,33 @@ def check_time_variation(network: Network, error: Error) -> None:
 
 
 def make_mode_system(network: Network, error: Error, young: Array | None = None) -> ModeSystem:
-    """Return the system of a network's best linear filter. Noises are exact, upper bounds of uncertain probabilities.
+    """Return the system of a network's best linear filter over the steps of an error, by the modes that it observes.
 
-    `young` is the scalar b of each step, None where the mean gains are known.
+    Noises are exact, or upper bounds where probabilities are uncertain.
+
+    Args:
+        network: the network at some values of its free numbers, which may be traced.
+        error: says over which steps: a period that repeats for ever, or a horizon.
+        young: the scalar b of Young's inequality at each step, (steps,) or (); None where the mean gains are known.
 
     Raises:
-        ValueError: a channel with memory whose mode is not observed.
+        ValueError: a channel with memory whose mode is not observed, more than MOST_MODES modes together.
     """
     steps, forever = error.steps, error.horizon is None
     plants = [at(network.plant, k) for k in range(steps)]
     a = jnp.stack([jnp.asarray(plant.matrix) for plant in plants])
     q = jnp.stack([jnp.asarray(plant.noise.covariance) for plant in plants])
-    # What is measured and sent, from the second moments of the state itself.
+    # What each node receives, from the second moments E (x, 1)(x, 1)' of the state itself.
     seconds = [steady_moment(plants[0])] * steps if forever else moments_over(network.plant, steps)
-    states, b = jnp.stack([jnp.asarray(second) for second in seconds]), None
-    if young is not None:
-        b = jnp.broadcast_to(young, (steps,))
+    states = jnp.stack([jnp.asarray(second) for second in seconds])
+    b = None if young is None else jnp.broadcast_to(young, (steps,))
     nodes = [describe_reception(name, source, states, forever, b) for name, source in list_sources(network).items()]
     count = prod(node.law.shape[1] for node in nodes)
     if count > MOST_MODES:
         raise fail("modes of a design", f"at most {MOST_MODES} together", count)
+    # All nodes together: modes of independent nodes have the Kronecker products of their laws and chains.
     output, noise = _stack_nodes(nodes)
+    # Young's bound is a step of the filter with (1 + b) A X A' and (1 + b) Q.
     scale = jnp.ones((steps, 1, 1)) * (1.0 if b is None else 1 + b[:, None, None])
     return ModeSystem(
         transition=jnp.sqrt(scale) * a,
@@ -150,12 +156,15 @@ def make_mode_system(network: Network, error: Error, young: Array | None = None)
 
 
 def _stack_nodes(nodes: list[NodeReception]) -> tuple[Array, Array]:
-    """Return H and N of all nodes together, for every combination of a mode of each, the last node's fastest."""
+    """Return H (time, M, m, n) and N (time, M, m, m) of all nodes together.
+
+    There is a mode for every combination of a mode of each node, the last node's fastest.
+    """
     outputs, noises = [], []
-    for modes in product(*(range(node.law.shape[1]) for node in nodes)):
-        pairs = list(zip(nodes, modes, strict=True))
-        outputs.append(jnp.concatenate([node.output[:, j] for node, j in pairs], axis=1))
-        blocks = [node.noise[:, j] for node, j in pairs]
+    for combination in product(*(range(node.law.shape[1]) for node in nodes)):
+        pairs = list(zip(nodes, combination, strict=True))
+        outputs.append(jnp.concatenate([node.output[:, mode] for node, mode in pairs], axis=1))
+        blocks = [node.noise[:, mode] for node, mode in pairs]
         noises.append(jax.vmap(lambda *parts: jax.scipy.linalg.block_diag(*parts))(*blocks))
     return jnp.stack(outputs, axis=1), jnp.stack(noises, axis=1)
 
@@ -163,31 +172,51 @@ def _stack_nodes(nodes: list[NodeReception]) -> tuple[Array, Array]:
 def describe_reception(
     name: str, source: SensorAndChannel, states: Float[Array, "time n1 n1"], forever: bool, young: Array | None
 ) -> NodeReception:
-    """Describe a node's reception of states with E (x, 1)(x, 1)'; steps repeat `forever` or begin with the first.
+    """Return what a node receives at each step: the chain of its channel's observed modes, H, N and sent powers.
+
+    Args:
+        name: of the node, for messages.
+        source: its sensor and channel.
+        states: E (x, 1)(x, 1)' of the state at each step.
+        forever: whether the steps repeat for ever, or begin with the first.
+        young: the scalar b of Young's inequality at each step (time,), or None.
 
     Raises:
         ValueError: a channel with memory whose mode is not observed.
     """
+    # Spans of steps with one sensor and channel each: every step by itself if either varies, else all of them.
     steps, varies = len(states), isinstance(source.sensor, OverTime) or isinstance(source.channel, OverTime)
     spans = [range(k, k + 1) for k in range(steps)] if varies else [range(steps)]
     channels = [at(source.channel, span[0]) for span in spans]
     modes = [_observe_modes(name, channel) for channel in channels]
-    # The chain and its law at each step.
-    onward = jnp.concatenate([jnp.tile(m.onward, (len(span), 1, 1)) for m, span in zip(modes, spans, strict=True)])
-    if modes[0].forgets:
-        law: Array = jnp.concatenate(
-            [jnp.tile(m.initial, (len(span), 1)) for m, span in zip(modes, spans, strict=True)]
-        )
-        chain: Array = jnp.tile(law[:, None, :], (1, law.shape[1], 1))
-    else:
-        law, chain = _propagate_laws(onward, modes[0].initial, forever)
-    # H, N and powers over each span with one sensor and one channel.
+    law, chain = _find_laws_and_chain(modes, [len(span) for span in spans], forever)
+    # H, N and powers over each span.
     parts = []
-    for span, channel, m in zip(spans, channels, modes, strict=True):
+    for span, channel, of_channel in zip(spans, channels, modes, strict=True):
         now = np.array(span)
         b = None if young is None else young[now]
-        parts.append(_describe_steps(at(source.sensor, span[0]), channel, m, states[now], b, law[now]))
-    return NodeReception(chain, law, *(jnp.concatenate(series) for series in zip(*parts, strict=True)))
+        parts.append(_describe_steps(at(source.sensor, span[0]), channel, of_channel, states[now], b, law[now]))
+    output, noise, powers = (jnp.concatenate(series) for series in zip(*parts, strict=True))
+    return NodeReception(chain=chain, law=law, output=output, noise=noise, powers=powers)
+
+
+def _find_laws_and_chain(
+    modes: list[_ObservedModes], lengths: list[int], forever: bool
+) -> tuple[Float[Array, "time M"], Float[Array, "time M M"]]:
+    """Return the law of the modes at each step, and the chain [k, i, j] = P(j at step k | i at the step before).
+
+    Args:
+        modes: the observed modes of each span of steps with one channel.
+        lengths: number of steps of each span.
+        forever: whether the steps repeat for ever, or begin with the first.
+    """
+    pairs = list(zip(modes, lengths, strict=True))
+    if modes[0].forgets:
+        law: Array = jnp.concatenate([jnp.tile(of_span.initial, (length, 1)) for of_span, length in pairs])
+        chain: Array = jnp.tile(law[:, None, :], (1, law.shape[1], 1))
+        return law, chain
+    onward = jnp.concatenate([jnp.tile(of_span.onward, (length, 1, 1)) for of_span, length in pairs])
+    return _propagate_laws(onward, modes[0].initial, forever)
 
 
 def means_are_known(name: str, channel: AbstractRandomAffine) -> bool:
@@ -228,7 +257,8 @@ def _propagate_laws(
 ) -> tuple[Float[Array, "time M"], Float[Array, "time M M"]]:
     """Return the law of the modes at each step, and the chain into it, from the chain `onward` from each step.
 
-    For ever: periodic laws, and the last step leads to the first. Else from the initial law on, whatever was before.
+    [k, i, j] of either chain is the probability of mode j after mode i. `forever`: laws are periodic, and the last step
+    leads to the first; else they go from the initial law on, whatever was before.
     """
     over_period = reduce(jnp.matmul, onward)
     law = [stationary(over_period) if forever and len(over_period) > 1 else jnp.asarray(initial)]
@@ -248,15 +278,24 @@ def _describe_steps(
 ) -> tuple[Array, Array, Array]:
     """Return H (time, M, m, n), N (time, M, m, m) and powers (time, hops) over steps with one sensor and channel.
 
-    states: E (x, 1)(x, 1)' of each step; law: of the modes at each step; young: the scalar b of each step, or None.
+    H is the mean map from state to what arrives in each of M modes, N the covariance of its noise.
+
+    Args:
+        sensor: the sensor.
+        channel: the channel.
+        modes: its modes that the receiver observes.
+        states: E (x, 1)(x, 1)' of each step (time, n1, n1).
+        young: the scalar b of Young's inequality at each step (time,); None where mean gains are known.
+        law: of the modes at each step (time, M).
     """
+    # H and N of each mode, from E (y, 1)(y, 1)' of what the sensor measures at each step.
     y = jax.vmap(lambda second: measurement_moment(sensor, second))(states)
     pairs = zip(modes.maps, modes.arrived, strict=True)
     described = [_describe_mode(mode_map, arrived, y, sensor, young) for mode_map, arrived in pairs]
     output = jnp.stack([jnp.tile(h, (len(y), 1, 1)) for h, _ in described], axis=1)
 
     def compute_powers(moment: Array, law: Array) -> Array:
-        """Return the powers (hops,) of a step with E (y, 1)(y, 1)' = moment."""
+        """Return the powers (hops,) of a step with E (y, 1)(y, 1)' = moment, and this law of the modes (M,)."""
         powers = [jnp.asarray(power) for power in powers_of_law(channel, moment, law).values()]
         return jnp.stack(powers) if powers else jnp.zeros(0)
 

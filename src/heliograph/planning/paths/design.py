@@ -38,8 +38,8 @@ Mask = Bool[np.ndarray, "time free"]
 class PathProblem(NamedTuple):
     """Error of paths as a function of free powers (time, free), as a descent needs it.
 
-    path: of each free column. information: j of each path and dj/dp of each column, from the free powers. scale: of
-    the powers.
+    path: number of the path of each free column. information: free powers -> j of each path and dj/dp of each column, j
+    being the information that a path carries at a step. limits: of the free powers. scale: size of the powers.
     """
 
     paths: Paths
@@ -58,7 +58,10 @@ class PathProblem(NamedTuple):
         return self.criterion.exact(self.covariances(powers))
 
     def sensitivity(self, powers: Powers) -> tuple[float, Powers, Powers]:
-        """Return error, -d error / d j of the path of each free hop, and d error / d p; by one adjoint recursion."""
+        """Return the error, -d error / d j of each free hop's path, and d error / d p (both (time, free)).
+
+        By one adjoint recursion, at the free powers p (time, free).
+        """
         information, slope = self.information(powers)
         p = error_covariances(self.paths, information)
         value, weights = self.criterion.smooth(p)
@@ -66,40 +69,49 @@ class PathProblem(NamedTuple):
         return value, by_information, -by_information * slope
 
     def evaluate(self, x: Vector, sharpness: int | None) -> Evaluation:
-        """Return the error, powers and their derivatives."""
+        """Return the error, powers and their derivatives at x, powers in one row, with this smoothing of the error."""
         powers = np.maximum(x, 0.0).reshape(self.limits.peak.shape)
         sharp = self._replace(criterion=self.criterion._replace(sharpness=sharpness))
         value, _, gradient = sharp.sensitivity(powers)
         return Evaluation(value, gradient.ravel(), powers.ravel(), np.eye(x.size))
 
-    def linear(self, powers: Powers) -> tuple["PathProblem", float, Powers]:
-        """Return the problem with the linear error that touches this one from below at p, its value and gradient."""
+    def support(self, powers: Powers) -> tuple["PathProblem", float, Powers]:
+        """Return the problem whose error, linear in P, touches this one's from below at p, its value and gradient.
+
+        The gradient is by the powers p (time, free).
+        """
         problem = self._replace(criterion=self.criterion.supporting(self.covariances(powers)))
         value, _, gradient = problem.sensitivity(powers)
         return problem, value, gradient
 
     def lower_bound(self, powers: Powers) -> float:
-        """Return Frank and Wolfe's bound f(p) + min over allowed q of grad f(p).(q - p), which no convex f is below."""
-        _, value, gradient = self.linear(powers)
-        return float(value + np.sum(gradient * (self.limits.best(-gradient) - powers)))
+        """Return Frank and Wolfe's lower bound of a convex error within the limits, from its tangent at powers p.
 
-    def least_total(self, powers: Powers, target: float) -> float:
-        """Return the least total power at which the linear model at p reaches the target: a convex f needs no less."""
-        _, value, gradient = self.linear(powers)
+        It is f(p) + min over allowed q of grad f(p).(q - p).
+        """
+        _, value, gradient = self.support(powers)
+        return float(value + np.sum(gradient * (self.limits.find_best_powers(-gradient) - powers)))
+
+    def bound_least_total(self, powers: Powers, target: float) -> float:
+        """Return the least total power at which the tangent at p reaches the target: a convex error needs no less.
+
+        By bisection of the total power.
+        """
+        _, value, gradient = self.support(powers)
         low, high = 0.0, float(powers.mean(axis=0).sum()) * (1 + 1e-9)
         for _ in range(100):
             middle = (low + high) / 2
-            best = self.limits._replace(total=middle).best(-gradient)
+            best = self.limits._replace(total=middle).find_best_powers(-gradient)
             reached = value + np.sum(gradient * (best - powers))
             low, high = (low, middle) if reached <= target else (middle, high)
         return low
 
-    def solve(self, starts: list[Powers], target: float | None = None) -> Powers | None:
-        """Return the best powers from these starts, for the least error or for the least total that reaches a target.
+    def solve_from_starts(self, starts: list[Powers], target: float | None = None) -> Powers | None:
+        """Return the best powers (time, free) of descents from these starts, or None where none reaches the target.
 
-        None where no start reaches the target.
+        They are those of the least error, or with a target of the least total power that reaches it.
         """
-        rows, most = self.limits.rows()
+        rows, most = self.limits.make_limit_rows()
         peak = self.limits.peak
         problem = DescentProblem(
             low=np.zeros(peak.size),
@@ -107,7 +119,7 @@ class PathProblem(NamedTuple):
             unit=np.full(peak.size, self.scale),
             sharpnesses=[criterion.sharpness for criterion in self.criterion.sharper()],
             evaluate=self.evaluate,
-            restore=lambda x: self.limits.clip(x.reshape(peak.shape)).ravel(),
+            restore=lambda x: self.limits.clip_powers(x.reshape(peak.shape)).ravel(),
         )
         best = search_from_starts(
             problem, PowerAndErrorLimits(rows, most, target, len(peak)), [start.ravel() for start in starts]
@@ -116,7 +128,10 @@ class PathProblem(NamedTuple):
 
 
 class PowerTask(NamedTuple):
-    """A problem in the free powers (time, free), which hops are free, what the others send, and starts of a search."""
+    """A problem in the free powers (time, free), which hops are free, what the others send, and starts of a search.
+
+    fixed: powers that all hops send at present, of which those of the free ones do not matter.
+    """
 
     problem: PathProblem
     free: Bool[np.ndarray, "hop"]
@@ -129,7 +144,7 @@ class PowerTask(NamedTuple):
         return is_convex(self.problem.path)
 
     def whole(self) -> SplitPaths:
-        """Return the paths by the power that their free hops send together."""
+        """Return the paths as functions of the power that their free hops send together."""
         return split_paths(self.problem.paths, self.free, self.fixed)
 
     def relax(self) -> PathProblem:
@@ -175,8 +190,14 @@ def make_power_task(
 ) -> PowerTask:
     """Return the problem in the free powers, with starts that are even over some choices of the paths that send.
 
-    criterion: the error; limits: of the free powers; free: which hops are; fixed: what all send at present; starts: how
-    many; seed: of those that are drawn.
+    Args:
+        paths: the paths of all hops.
+        criterion: the error.
+        limits: of the free powers.
+        free: which hops are free.
+        fixed: what all hops send at present.
+        starts: number of starts, if there are as many choices.
+        seed: of the choices that are drawn.
     """
 
     def information(powers: Powers) -> PathInformation:
@@ -186,14 +207,10 @@ def make_power_task(
         of_paths = path_information(paths, every)
         return PathInformation(of_paths.information, of_paths.slope[:, free])
 
-    # Where no total is given: that of the other limits, or so much that a hop's noise hardly counts.
-    total = limits.total
-    if not np.isfinite(total):
-        largest = np.minimum(limits.peak.mean(axis=0), limits.mean)
-        plenty = 10 * max(paths.alpha.max(), np.finfo(float).tiny)
-        total = float(np.where(np.isfinite(largest), largest, plenty).sum())
+    total = limits.total if np.isfinite(limits.total) else _choose_total(limits, paths)
     masks = choose_supports(paths.path[free], len(fixed), starts, seed)
-    even = [limits._replace(total=total).even(mask) for mask in masks]
+    even = [limits._replace(total=total).find_even_powers(mask) for mask in masks]
+    # The scale of the powers: the largest limit, or power of the first start, that is a number.
     sizes = [limits.total, *limits.peak[np.isfinite(limits.peak)], float(even[0].max(initial=0.0))]
     scale = max((size for size in sizes if np.isfinite(size)), default=1.0) or 1.0
     problem = PathProblem(
@@ -207,10 +224,22 @@ def make_power_task(
     return PowerTask(problem=problem, free=free, fixed=fixed, starts=even)
 
 
-def choose_supports(path: Int[np.ndarray, "free"], steps: int, starts: int, seed: int) -> list[Mask]:
-    """Return masks (steps, free) of the hops that send: all, then every choice of paths, or `starts` in all, drawn.
+def _choose_total(limits: PowerLimits, paths: Paths) -> float:
+    """Return the total power of starts where none is given: what peaks and means allow, or plenty.
 
-    A convex problem has one minimum, and one start.
+    Plenty is so much that the noise of a hop hardly counts, ten times the largest alpha.
+    """
+    largest = np.minimum(limits.peak.mean(axis=0), limits.mean)
+    plenty = 10 * max(paths.alpha.max(), np.finfo(float).tiny)
+    return float(np.where(np.isfinite(largest), largest, plenty).sum())
+
+
+def choose_supports(path: Int[np.ndarray, "free"], steps: int, starts: int, seed: int) -> list[Mask]:
+    """Return masks (steps, free) of the hops that send at a start: all, and then choices of the paths that send.
+
+    They are every choice if there are at most `starts`, else as many as are drawn. A convex problem has one minimum,
+    and
+    one start. `path`: number of the path of each free hop.
     """
     whole = np.ones((steps, len(path)), dtype=bool)
     if is_convex(path):
@@ -230,21 +259,23 @@ def choose_supports(path: Int[np.ndarray, "free"], steps: int, starts: int, seed
 
 
 def least_error_powers(task: PowerTask) -> tuple[Powers, Certificate]:
-    """Return the powers of the least error within the limits of a `task`, and the certificate."""
+    """Return the powers (time, free) of the least error within the limits of a task, and the certificate."""
     problem, starts = task.problem, task.starts
     # Water filling solves a convex problem of the trace but for rounding; the descent goes on from there.
     if task.convex and problem.criterion.sharpness is None and np.all(np.isfinite(starts[0])):
-        whole = SplitPaths(*(values[:, problem.path] for values in task.whole()))
-        starts = [water_filling(problem.limits, problem.sensitivity, whole, starts[0])]
-    powers = problem.solve(starts)
+        path_of_hop = SplitPaths(*(values[:, problem.path] for values in task.whole()))
+        starts = [water_filling(problem.limits, problem.sensitivity, path_of_hop, starts[0])]
+    powers = problem.solve_from_starts(starts)
     assert powers is not None  # the starts are within the limits
-    # The bound of a convex error, or of the concave envelopes above each path's information.
+    # How far the tangent at these powers still falls within the limits; of a convex error that is a bound.
     value, bound = problem.exact(powers), problem.lower_bound(powers)
-    stationarity = max(problem.linear(powers)[1] - bound, 0.0) / value
+    _, tangent_value, _ = problem.support(powers)
+    stationarity = max(tangent_value - bound, 0.0) / value
+    # Else the bound is that of the convex problem with concave envelopes above each path's information.
     if not task.convex:
         relaxed = task.relax()
-        lower = relaxed.solve([task.of_paths(powers)])
-        bound = relaxed.lower_bound(task.of_paths(powers) if lower is None else lower)
+        relaxed_powers = relaxed.solve_from_starts([task.of_paths(powers)])
+        bound = relaxed.lower_bound(task.of_paths(powers) if relaxed_powers is None else relaxed_powers)
     return powers, Certificate(
         convex=task.convex,
         value=value,
@@ -256,31 +287,31 @@ def least_error_powers(task: PowerTask) -> tuple[Powers, Certificate]:
 
 
 def least_power(task: PowerTask, target: float) -> tuple[Powers, Certificate]:
-    """Return the powers of the least total that reaches the target error, and the certificate."""
+    """Return the powers (time, free) of the least total that reaches the target error, and the certificate."""
     _check_reachable(task, target)
-    # Without a limit of the total, which is checked afterwards.
+    # Searched without the limit of the total, which is checked afterwards.
     limits = task.problem.limits
-    free_total = task._replace(problem=task.problem._replace(limits=limits._replace(total=np.inf)))
-    powers = _find_least_powers(free_total.problem, task.starts, target)
+    unlimited = task._replace(problem=task.problem._replace(limits=limits._replace(total=np.inf)))
+    powers = _find_least_powers(unlimited.problem, task.starts, target)
     if powers is None:
         raise fail("target error", "one that some start reaches (give more starts)", f"{target:.6g}")
     total = float(powers.mean(axis=0).sum())
     if total > limits.total * (1 + MET):
         least = least_error_powers(task)[1].value
         raise fail("target error", f"at least {least:.6g}, the least found within the budget", f"{target:.6g}")
-    # The bound: of the linear model where the problem is convex, else of that of the envelopes.
-    problem, near = free_total.problem, powers
-    stationarity = 1 - problem.least_total(near, target) / total if total > 0 else 0.0
+    # What the tangent at these powers says that less would do; of a convex error that is a bound.
+    bound = unlimited.problem.bound_least_total(powers, target)
+    stationarity = 1 - bound / total if total > 0 else 0.0
+    # Else the bound is that of the convex problem with concave envelopes above each path's information.
     if not task.convex:
-        problem, near = free_total.relax(), task.of_paths(powers)
-        lower = _find_least_powers(problem, [near], target)
-        near = near if lower is None else lower
-    bound = min(problem.least_total(near, target), total)
+        relaxed, of_paths = unlimited.relax(), task.of_paths(powers)
+        relaxed_powers = _find_least_powers(relaxed, [of_paths], target)
+        bound = relaxed.bound_least_total(of_paths if relaxed_powers is None else relaxed_powers, target)
     fixed = float(task.fixed[:, ~task.free].mean(axis=0).sum())
     return powers, Certificate(
         convex=task.convex,
         value=total + fixed,
-        bound=bound + fixed,
+        bound=min(bound, total) + fixed,
         stationarity=max(stationarity, 0.0),
         starts=len(task.starts),
         unit="power",
@@ -288,7 +319,10 @@ def least_power(task: PowerTask, target: float) -> tuple[Powers, Certificate]:
 
 
 def _find_least_powers(problem: PathProblem, starts: list[Powers], target: float) -> Powers | None:
-    """Return the least powers that reach a target, from starts each raised until it does; None where none can."""
+    """Return the powers of the least total that reaches a target, by descents from the starts; None where none does.
+
+    Each start is raised first until it reaches the target.
+    """
     no_power = np.zeros_like(starts[0])
     if problem.criterion.smooth(problem.covariances(no_power))[0] <= target:
         return no_power
@@ -296,17 +330,17 @@ def _find_least_powers(problem: PathProblem, starts: list[Powers], target: float
     if not raised:
         return None
     scale = max(float(raised[0].mean(axis=0).sum()), np.finfo(float).tiny)
-    return problem._replace(scale=scale).solve(raised, target)
+    return problem._replace(scale=scale).solve_from_starts(raised, target)
 
 
 def _raise_powers(problem: PathProblem, start: Powers, target: float) -> Powers | None:
-    """Return the start times the least factor that reaches the target, as far as peaks and means allow; None if none.
+    """Return the start times the least factor that reaches the target, as far as peaks and means allow; else None.
 
     By bisection of the factor's logarithm.
     """
 
     def reaches(factor: float) -> bool:
-        return problem.criterion.smooth(problem.covariances(problem.limits.clip(start * factor)))[0] <= target
+        return problem.criterion.smooth(problem.covariances(problem.limits.clip_powers(start * factor)))[0] <= target
 
     low, high = FACTORS
     if not reaches(high):
@@ -314,7 +348,7 @@ def _raise_powers(problem: PathProblem, start: Powers, target: float) -> Powers 
     for _ in range(BISECTIONS):
         middle = np.sqrt(low * high)
         low, high = (low, middle) if reaches(middle) else (middle, high)
-    return problem.limits.clip(start * high)
+    return problem.limits.clip_powers(start * high)
 
 
 def _check_reachable(task: PowerTask, target: float) -> None:
@@ -330,14 +364,21 @@ def _check_reachable(task: PowerTask, target: float) -> None:
 
 
 def design_paths(problem: DesignProblem, task: PowerTask, target: float | None, present: float) -> PowerDesign:
-    """Return the design of a task: the least error, or the least power for a target."""
+    """Return the design of a task: the least error within its limits, or the least power that reaches a target.
+
+    Args:
+        problem: what was to be designed, for the result.
+        task: the search of the free powers.
+        target: the target error; None for the least error.
+        present: error of the network as it is.
+    """
     powers, certificate = least_error_powers(task) if target is None else least_power(task, target)
     paths = task.problem.paths
     every = task.fixed.copy()
     every[:, task.free] = powers
-    # Derivatives by the powers of all hops, of those that are not free too.
-    whole = task.problem._replace(path=paths.path, information=lambda p: path_information(paths, p))
-    gradient = whole.sensitivity(every)[2]
+    # Derivatives (time, hop) by the powers of all hops, of those that are not free too.
+    all_free = task.problem._replace(path=paths.path, information=lambda p: path_information(paths, p))
+    _, _, gradient = all_free.sensitivity(every)
     return PowerDesign(
         problem=problem,
         powers=dict(zip(paths.names, every.T, strict=True)),
@@ -346,6 +387,7 @@ def design_paths(problem: DesignProblem, task: PowerTask, target: float | None, 
         present=present,
         covariance=task.problem.covariances(powers),
         sensitivity=dict(zip(paths.names, gradient.sum(axis=0).tolist(), strict=True)),
+        # A watt more at every step, sent at one step by one transmitter, is worth `steps` times a watt there.
         price=float(np.max(-gradient[:, task.free] * len(gradient), initial=0.0)),
         numbers={},
         realised=None,

@@ -75,7 +75,7 @@ def solve_fixed_point(step: RiccatiMap) -> Float[np.ndarray, "n n"]:
 
 
 def compute_covariances(plants: PlantSteps, information: Matrices) -> Matrices:
-    """Return the posterior covariance P_k of each step under the information received at each step.
+    """Return the posterior covariance P_k of each step (time, n, n) under the information J_k received at each step.
 
     Raises:
         ValueError: steps that repeat for ever, under which the error grows without limit.
@@ -99,7 +99,10 @@ def compute_covariances(plants: PlantSteps, information: Matrices) -> Matrices:
 
 
 def adjoint(plants: PlantSteps, information: Matrices, p: Matrices, weights: Matrices) -> Matrices:
-    """Return the adjoint L_k, the gradient of the cost with respect to P_k through all later steps."""
+    """Return the adjoint L_k (time, n, n), the gradient of the cost with respect to P_k through all later steps.
+
+    `information`: J_k; `p`: P_k; `weights`: derivative W_k of the cost by P_k alone; all (time, n, n).
+    """
     phi = (np.eye(p.shape[-1]) - p @ information) @ plants.transition
     always = JumpSystem(np.ones((len(p), 1, 1)), phi[:, None], np.zeros_like(phi[:, None]))
     return always.adjoint(weights, plants.start is None)[:, 0]
@@ -173,17 +176,16 @@ def independent_paths(
             law of x_0 with one.
     """
     error = instance("error", Error() if error is None else error, Error, "an Error")
+    steps = error.steps
     a = array("transition of paths", transition, ("states", "states"))
-    n, hops, steps = len(a), 1 if rank("alpha of paths", alpha) < 2 else np.shape(alpha)[1], error.steps
+    n = len(a)
     a, q = array("transition of paths", a, (n, n)), covariance("process noise of paths", process, n)
     c = array("rows of paths", rows, (None, n))
     r = require_at_least(0.0, "noises of paths", array("noises of paths", noises, (len(c),)))
-    fading = require_at_least(
-        1.0, "kappa of paths", array("kappa of paths", _broadcast_to_hops(kappa, len(c), hops), (len(c), hops))
-    )
-    costs = require_at_least(
-        0.0, "alpha of paths", array("alpha of paths", _broadcast_to_hops(alpha, len(c), hops), (len(c), hops))
-    )
+    # Hops (sensors, hops of each).
+    shape = len(c), 1 if rank("alpha of paths", alpha) < 2 else np.shape(alpha)[1]
+    hop_kappa = _check_hops("kappa of paths", kappa, shape, least=1.0)
+    hop_alpha = _check_hops("alpha of paths", alpha, shape, least=0.0)
     mean = array("initial mean of paths", np.zeros(n) if initial_mean is None else initial_mean, (n,))
     start = None
     if error.horizon is not None:
@@ -199,37 +201,46 @@ def independent_paths(
         rows=np.tile(c, (steps, 1, 1)),
         second=signal + r,
         signal=signal,
-        path=np.repeat(np.arange(len(c)), hops),
-        kappa=np.tile(fading.ravel(), (steps, 1)),
-        alpha=np.tile(costs.ravel(), (steps, 1)),
-        names=names("names of transmitters", transmitters, len(c) * hops, "sender"),
+        path=np.repeat(np.arange(shape[0]), shape[1]),
+        kappa=np.tile(hop_kappa.ravel(), (steps, 1)),
+        alpha=np.tile(hop_alpha.ravel(), (steps, 1)),
+        names=names("names of transmitters", transmitters, shape[0] * shape[1], "sender"),
     )
 
 
 def require_at_least(least: float, name: str, value: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """Return the numbers, none below `least`; ValueError if some are."""
+    """Return the numbers of this name, none below `least`; ValueError if some are."""
     if value.size and np.min(value) < least:
         raise fail(name, f"numbers of at least {least:g}", f"{np.min(value):g}")
     return value
 
 
-def _broadcast_to_hops(value: ArrayLike, sensors: int, hops: int) -> Float[np.ndarray, "..."]:
-    """Return the numbers as (sensors, hops), from one number for all, or from one for each sensor with one hop."""
+def _check_hops(name: str, value: ArrayLike, shape: tuple[int, int], least: float) -> Float[np.ndarray, "sensors hops"]:
+    """Return a number for each hop, of this shape (sensors, hops of each), none below `least`.
+
+    Args:
+        name: of the numbers, for messages.
+        value: numbers of that shape, one for all, or one for each sensor if it has one hop.
+        shape: (sensors, hops of each).
+        least: least value that is allowed.
+    """
     numbers = np.asarray(value)
     if numbers.ndim == 0:
-        return np.broadcast_to(numbers, (sensors, hops))
-    return numbers[:, None] if numbers.ndim == 1 and hops == 1 else numbers
+        numbers = np.broadcast_to(numbers, shape)
+    elif numbers.ndim == 1 and shape[1] == 1:
+        numbers = numbers[:, None]
+    return require_at_least(least, name, array(name, numbers, shape))
 
 
 def fading(paths: Paths) -> PathValues:
-    """Return K, the product of kappa along each path."""
+    """Return K (time, path), the product of kappa = E g^2 / (E g)^2 of the hops along each path."""
     return np.asarray(_arrange_by_place(paths, paths.kappa)[0].prod(axis=-1))
 
 
 def _arrange_by_place(
     paths: Paths, values: Powers
 ) -> tuple[Float[np.ndarray, "time path place"], Int[np.ndarray, "hop"]]:
-    """Return the values of hops (time, path, place along the path), 1 where a path is shorter; and each hop's place."""
+    """Return the values of hops as (time, path, place along the path), 1 where a path is shorter, and hops' places."""
     order = np.argsort(paths.path, kind="stable")
     counts = np.bincount(paths.path, minlength=paths.second.shape[1])
     position = np.empty_like(paths.path)
@@ -240,19 +251,24 @@ def _arrange_by_place(
 
 
 def share_of_signal(powers: Powers, alpha: Powers) -> Powers:
-    """Return p / (p + alpha) of each hop; zero where neither power nor noise is."""
+    """Return p / (p + alpha) of each hop (time, hop); 1 of one without noise, whatever its power."""
     total = powers + alpha
     # A hop without noise: any power does.
     return np.asarray(np.divide(powers, total, out=np.ones_like(powers), where=total > 0))
 
 
 def path_information(paths: Paths, powers: Powers) -> PathInformation:
-    """Return the information j of each path at each step, and dj/dp of each hop, at these powers (time, hop)."""
-    along, position = _arrange_by_place(paths, share_of_signal(powers, paths.alpha))
-    # F, and the product of the other hops' factors for its derivative.
-    others = np.stack([np.delete(along, h, axis=-1).prod(axis=-1) for h in range(along.shape[-1])], axis=-1)
-    product, full = along.prod(axis=-1), paths.second * fading(paths)
+    """Return the information j of each path at each step, and dj/dp of each hop, at these powers (time, hop).
+
+    j = F / (s K - t F) and dj/dp_h = s K / (s K - t F)^2 dF/dp_h, where F is the product of p / (p + alpha) along the
+    path, s = E y^2 of what is sent, t = s less the sensor's noise, and K the product of kappa.
+    """
+    factors, position = _arrange_by_place(paths, share_of_signal(powers, paths.alpha))  # (time, path, place)
+    product, full = factors.prod(axis=-1), paths.second * fading(paths)  # F and s K
     left = full - paths.signal * product
+    # dF/dp_h is the product of the other hops' factors times alpha / (p + alpha)^2.
+    places = range(factors.shape[-1])
+    others = np.stack([np.delete(factors, place, axis=-1).prod(axis=-1) for place in places], axis=-1)
     total = powers + paths.alpha
     by_power = np.divide(paths.alpha, total**2, out=np.zeros_like(powers), where=total > 0)
     slope = (full / left**2)[:, paths.path] * others[:, paths.path, position] * by_power
@@ -260,12 +276,12 @@ def path_information(paths: Paths, powers: Powers) -> PathInformation:
 
 
 def information_matrix(paths: Paths, information: PathValues) -> Float[np.ndarray, "time n n"]:
-    """Return J = sum_i j_i c_i' c_i."""
+    """Return the information J = sum_i j_i c_i' c_i of each step (time, n, n), from j of each path (time, path)."""
     return np.asarray(np.swapaxes(paths.rows, 1, 2) @ (information[:, :, None] * paths.rows))
 
 
 def error_covariances(paths: Paths, information: PathValues) -> Float[np.ndarray, "time n n"]:
-    """Return the error covariance of the best linear filter after each step."""
+    """Return the error covariance of the best linear filter after each step (time, n, n), from j of each path."""
     return compute_covariances(paths.plants, information_matrix(paths, information))
 
 
@@ -275,7 +291,14 @@ def path_sensitivities(
     p: Float[np.ndarray, "time n n"],
     weights: Float[np.ndarray, "time n n"],
 ) -> PathValues:
-    """Return the sensitivity -d cost / d j of each path: w_i = c_i P L P c_i'."""
+    """Return the sensitivity -d cost / d j = c P L P c' of each path at each step, (time, path).
+
+    Args:
+        paths: the paths.
+        information: j of each path (time, path).
+        p: the error covariance P after each step.
+        weights: derivative of the cost by P of each step.
+    """
     ahead = adjoint(paths.plants, information_matrix(paths, information), p, weights)
     projected = paths.rows @ p
     return np.asarray(np.sum((projected @ ahead) * projected, axis=-1))

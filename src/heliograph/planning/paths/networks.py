@@ -24,7 +24,11 @@ UNCORRELATED = 1e-12  # relative: a covariance of noises that counts as none
 
 
 class HopChain(NamedTuple):
-    """A chain of hops for one number: the combination of (outputs, 1) it carries, and kappa and alpha of the hops."""
+    """A chain of hops for one number: what it carries, and kappa and alpha of its hops.
+
+    row: the number is row @ (y, 1), with the sensor's outputs y. hops: {name: (kappa, alpha)} in the order of the
+    chain.
+    """
 
     row: Float[np.ndarray, "m1"]
     hops: dict[str, tuple[float, float]]
@@ -47,15 +51,8 @@ def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "
     instance("network", network, Network, "a Network")
     plant, steps = network.plant, instance("error", error, Error, "an Error").steps
     start_plant = check_design_plant(plant)
-    if network.relays is not None:
-        raise fail("network", "a RelayNetwork alone, whose relays' gains are free", "a Network of relays that filter")
-    if network.common is not None:
-        raise _unfit("nodes that share a channel (give a function of free numbers)")
-    # Second moments of the plant at each step, or in its steady state.
-    nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
-    deciding = [name for name, node in nodes.items() if node.trigger is not None]
-    if deciding:
-        raise fail("design", "senders that transmit at each step", f"triggers of {deciding}")
+    nodes = _check_sending_nodes(network)
+    # Second moments E (x, 1)(x, 1)' of the plant at each step, or in its steady state.
     covered = steps_covered((plant, [(node.sensor, node.channel) for node in nodes.values()]))
     if error.horizon is None:
         if covered is not None:
@@ -64,7 +61,7 @@ def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "
     else:
         check_horizon(steps, covered)
         seconds, start = moments_over(plant, steps), np.asarray(start_plant.initial_covariance)
-    # Paths of each step, and the plant's moves.
+    # Paths of each step, and the plant's A and Q.
     described = [_build_step(nodes, k, np.asarray(second)) for k, second in enumerate(seconds)]
     plant_at = [at(plant, k) for k in range(steps)]
     paths = Paths(
@@ -84,8 +81,23 @@ def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "
     return paths, np.array([step.powers for step in described])
 
 
+def _check_sending_nodes(network: Network) -> dict[str, Node]:
+    """Return the nodes by name; refuse relays that filter, nodes that share a channel, and senders that decide."""
+    if network.relays is not None:
+        raise fail("network", "a RelayNetwork alone, whose relays' gains are free", "a Network of relays that filter")
+    if network.common is not None:
+        raise _unfit("nodes that share a channel (give a function of free numbers)")
+    nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
+    deciding = [name for name, node in nodes.items() if node.trigger is not None]
+    if deciding:
+        raise fail("design", "senders that transmit at each step", f"triggers of {deciding}")
+    return nodes
+
+
 def find_chains(channel: AbstractRandomAffine, rows: Float[np.ndarray, "k m1"], prefix: str = "") -> list[HopChain]:
-    """Return the chains of a channel that carries rows @ (y, 1), their hops' names beginning with `prefix`.
+    """Return the chains of a channel that carries the numbers rows @ (y, 1); names of hops begin with `prefix`.
+
+    y: the sensor's outputs. A wire is a known matrix without noise; the parts of a stack are chains side by side.
 
     Raises:
         ValueError: a channel that is not made of independent chains, each for one number.
@@ -107,48 +119,52 @@ def find_chains(channel: AbstractRandomAffine, rows: Float[np.ndarray, "k m1"], 
 
 
 def _make_chain(parts: list[AbstractRandomAffine], rows: Float[np.ndarray, "k m1"], prefix: str) -> HopChain:
-    """Return a series of maps as a path: the row of outputs that it carries, kappa and alpha of each hop.
+    """Return maps in series as one chain: the row that it carries, kappa = E g^2 / (E g)^2 and alpha of each hop.
+
+    Args:
+        parts: the maps, in the order in which the signal passes them.
+        rows: what arrives at the first one is rows @ (y, 1), with the sensor's outputs y.
+        prefix: beginning of the names of hops.
 
     Raises:
         ValueError: maps that are not hops of one number, wires, and unobserved losses.
     """
     if parts[-1].outputs != 1:
         raise _unfit(f"one gain for {parts[-1].outputs} numbers")
-    # fading: product of 1 / P(arrival) of unobserved losses; shifted: a wire behind a hop adds a constant.
-    row, fading, shifted = rows[0], 1.0, False
+    row, loss_factor, has_offset = rows[0], 1.0, False
     hops: dict[str, tuple[float, float]] = {}
     while parts:
         affine = parts.pop(0)
-        # An unobserved loss is fading.
+        # A loss that nobody observes is a random gain, 0 or 1, of kappa = 1 / P(arrival).
         if isinstance(affine, Mixture):
             inner, factor = _split_loss(affine)
-            parts, fading = [*inner.in_series, *parts], fading * factor
+            parts, loss_factor = [*inner.in_series, *parts], loss_factor * factor
             continue
         if not isinstance(affine, GainAndNoise):
             raise _unfit(type(affine).__name__)
-        # Hops, and wires between them. The first map may combine several outputs; of one it keeps the units.
+        # The first map may combine several numbers; of a single one the hop's alpha holds the unit already.
         if not hops:
             row = np.asarray(affine.matrix)[0] @ rows if affine.inputs > 1 else rows[0]
         if affine.transmits:
-            if shifted:
+            if has_offset:
                 raise _unfit("a relay that takes a reference off")
             hops[f"{prefix}hop{len(hops) + 1}"] = _describe_hop(affine)
         elif affine.inputs != 1 or affine.outputs != 1:
             raise _unfit("a wire of several numbers behind a hop")
-        elif hops:
-            shifted = shifted or bool(np.any(np.asarray(affine.noise.mean)))
-    # Fading multiplies the last hop.
+        elif hops:  # a wire behind a hop: its gain changes no ratio, but a constant would be amplified by a relay
+            has_offset = has_offset or bool(np.any(np.asarray(affine.noise.mean)))
+    # Losses multiply kappa of the last hop.
     if hops:
         last = list(hops)[-1]
         kappa, alpha = hops[last]
-        hops[last] = (kappa * fading, alpha)
-    elif fading > 1:
+        hops[last] = (kappa * loss_factor, alpha)
+    elif loss_factor > 1:
         raise _unfit("a wire that loses what it carries")
     return HopChain(row, hops)
 
 
 def _describe_hop(hop: GainAndNoise) -> tuple[float, float]:
-    """Return kappa = E g^2 / (E g)^2 and alpha = Var m / E g^2."""
+    """Return kappa = E g^2 / (E g)^2 and alpha = Var m / E g^2 of a hop that delivers g sent + m."""
     if len(hop.law.extremes()) > 1:
         raise _unfit("a gain with uncertain probabilities")
     mean, square = float(hop.law.moment(1)), float(hop.law.moment(2))
@@ -199,7 +215,10 @@ class _PathsOfStep(NamedTuple):
 
 
 def _build_step(nodes: Mapping[str, Node], k: int, state: Float[np.ndarray, "n1 n1"]) -> _PathsOfStep:
-    """Describe the paths of all nodes at step k: what they carry, its powers, and the numbers of their hops."""
+    """Return the paths of all nodes at step k: what each carries, its powers, and its hops.
+
+    `state`: E (x, 1)(x, 1)' of the plant's state at this step.
+    """
     step = _PathsOfStep([], [], [], [], [], [], [], [])
     for name, node in nodes.items():
         if node.informed_by is not None:
@@ -208,29 +227,33 @@ def _build_step(nodes: Mapping[str, Node], k: int, state: Float[np.ndarray, "n1 
         if not isinstance(sensor, LinearSensor):
             raise fail(f"sensor of {name!r}", "a LinearSensor", type(sensor).__name__)
         refuse_angles("design", sensor)
-        # Chains, and what their transmitters send at present.
-        y, noise = np.asarray(measurement_moment(sensor, state)), np.asarray(sensor.noise.covariance)
-        chains, sends = find_chains(channel, np.eye(len(sensor.outputs), len(y))), compute_sent_powers(channel, y, k)
+        # Chains of the channel, and what their transmitters send at present, by E (y, 1)(y, 1)' of the outputs.
+        measured, noise = np.asarray(measurement_moment(sensor, state)), np.asarray(sensor.noise.covariance)
+        chains = find_chains(channel, np.eye(len(sensor.outputs), len(measured)))
+        sent_powers = compute_sent_powers(channel, measured, k)
         _check_uncorrelated(name, np.array([chain.row[:-1] for chain in chains]), noise)
-        # Each chain is a path: what it carries of the sensor's outputs, then its hops.
+        # Each chain is a path that carries row @ (y, 1): c, E of its square, that less the sensor's noise, its hops.
         for chain in chains:
             row = chain.row[:-1]
             step.rows.append(row @ np.asarray(sensor.matrix))
-            step.second.append(float(chain.row @ y @ chain.row))
+            step.second.append(float(chain.row @ measured @ chain.row))
             step.signal.append(step.second[-1] - float(row @ noise @ row))
             if not chain.hops and not step.second[-1] > step.signal[-1]:
                 raise fail(f"sensor of {name!r}", "noise, since a wire adds none", "none")
             for hop, (kappa, alpha) in chain.hops.items():
                 step.kappa.append(kappa)
                 step.alpha.append(alpha)
-                step.powers.append(sends[hop])
+                step.powers.append(sent_powers[hop])
                 step.names.append(f"{name}.{hop}")
                 step.path.append(len(step.rows) - 1)
     return step
 
 
 def _check_uncorrelated(name: str, rows: Float[np.ndarray, "path m"], covariance: Float[np.ndarray, "m m"]) -> None:
-    """Raise ValueError where paths carry noise of the sensor that they share."""
+    """Raise ValueError where two paths of a node carry correlated noise of its sensor.
+
+    `rows`: combination of the outputs that each path carries; `covariance`: of the sensor's noise.
+    """
     noise = rows @ covariance @ rows.T
     deviation = np.sqrt(np.diag(noise))
     if np.any(np.abs(noise - np.diag(np.diag(noise))) > UNCORRELATED * np.outer(deviation, deviation)):

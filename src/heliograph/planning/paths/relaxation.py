@@ -47,7 +47,7 @@ class SplitPaths(NamedTuple):
 
 
 def split_paths(paths: Paths, free: Bool[np.ndarray, "hop"], fixed: Powers) -> SplitPaths:
-    """Return the paths by the power that their free hops send together, the others sending the powers `fixed`."""
+    """Return the paths by the power that their free hops send together; the others send the powers `fixed`."""
     full = paths.second * fading(paths)
     # alpha of the free hops of each path.
     free_hops = [np.flatnonzero((paths.path == i) & free) for i in range(full.shape[1])]
@@ -88,7 +88,7 @@ def split_power(alpha: "Float[ArrayLike, ' H']", total: "Float[ArrayLike, '']") 
 
 
 def check_hop_noises(alpha: ArrayLike) -> Float[np.ndarray, "H"]:
-    """Return the noises of a chain's hops, checked."""
+    """Return the noises alpha of a chain's hops (H,), checked: not negative, and of a size whose square is a number."""
     noise = require_at_least(0.0, "alpha of hops", array("alpha of hops", alpha, (None,)))
     if not len(noise):
         raise fail("alpha of hops", "at least one", "none")
@@ -98,21 +98,19 @@ def check_hop_noises(alpha: ArrayLike) -> Float[np.ndarray, "H"]:
 
 
 def split_power_over_hops(whole: SplitPaths, total: PathValues) -> PowerSplit:
-    """Return the best split of each path's power `total` over its free hops, with the path's information and slope."""
+    """Return the split of each path's power over its free hops that is best, with the path's information and slope.
+
+    With the noise factor D = A prod_h (1 + alpha_h / p_h) of a path the information is j = 1 / (D - t); it is greatest
+    for the powers p_h(l) of one multiplier l, and then dD/dP = -l D.
+
+    Args:
+        whole: A (`full`), t (`signal`) and alpha of the paths.
+        total: the power P of each path at each step (time, path).
+    """
     alpha, power = whole.alpha, np.where(total > 0, total, 1.0)[..., None]
     hops = (alpha > 0).sum(axis=-1)
-    # One multiplier l for a path's hops, by Newton's method for log l from l = (sum_h root alpha_h / P)^2, which is
-    # exact for much power.
-    log_l = 2 * np.log(np.where(hops[..., None] > 0, np.sqrt(alpha).sum(axis=-1, keepdims=True), 1.0) / power)
-    for _ in range(NEWTON_STEPS):
-        p, falls = _split_at_multiplier(alpha, log_l)
-        reached = p.sum(axis=-1, keepdims=True)
-        excess = np.log(np.divide(reached, power, out=np.ones_like(power), where=reached > 0))
-        step = np.divide(excess * reached, falls, out=np.zeros_like(falls), where=falls > 0)
-        log_l = log_l + step
-        if np.all(np.abs(step) <= SETTLED * (1 + np.abs(log_l))):
-            break
-    # The powers, of exactly this sum.
+    # The powers p_h(l), (time, path, hop), of exactly this sum.
+    log_l = _find_multiplier(alpha, power)
     p = _split_at_multiplier(alpha, log_l)[0]
     reached = p.sum(axis=-1, keepdims=True)
     p = p * np.divide(power, reached, out=np.ones_like(power), where=reached > 0)
@@ -130,11 +128,31 @@ def split_power_over_hops(whole: SplitPaths, total: PathValues) -> PowerSplit:
     )
 
 
-def _split_at_multiplier(alpha: np.ndarray, log_l: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return p_h(l) of each hop, and -d sum_h p_h / d log l of each path.
+def _find_multiplier(alpha: Hops, power: np.ndarray) -> np.ndarray:
+    """Return log l of each path (time, path, 1), with the multiplier l at which sum_h p_h(l) is its power.
 
-    p_h = 2 (alpha / l) / (root + alpha) with root = sqrt(alpha^2 + 4 alpha / l): the formula of the module docstring
-    without its difference, and so without cancellation.
+    By Newton's method for log sum_h p_h as a function of log l, from l = (sum_h root alpha_h / P)^2, which is exact for
+    much power. `power`: P > 0 (time, path, 1).
+    """
+    has_hops = (alpha > 0).any(axis=-1, keepdims=True)
+    log_l: np.ndarray = 2 * np.log(np.where(has_hops, np.sqrt(alpha).sum(axis=-1, keepdims=True), 1.0) / power)
+    for _ in range(NEWTON_STEPS):
+        p, falls = _split_at_multiplier(alpha, log_l)
+        reached = p.sum(axis=-1, keepdims=True)
+        excess = np.log(np.divide(reached, power, out=np.ones_like(power), where=reached > 0))
+        step = np.divide(excess * reached, falls, out=np.zeros_like(falls), where=falls > 0)
+        log_l = log_l + step
+        if np.all(np.abs(step) <= SETTLED * (1 + np.abs(log_l))):
+            break
+    return log_l
+
+
+def _split_at_multiplier(alpha: np.ndarray, log_l: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return p_h(l) of each hop (time, path, hop), and -d sum_h p_h / d log l of each path (time, path, 1).
+
+    p_h = 2 (alpha / l) / (root + alpha) with root = sqrt(alpha^2 + 4 alpha / l): the same as (root - alpha) / 2,
+    without
+    the difference, and so without cancellation.
     """
     inverse = np.exp(-log_l)
     root = np.sqrt(alpha**2 + 4 * alpha * inverse)
@@ -159,9 +177,11 @@ class Envelope(NamedTuple):
 
 
 def compute_envelope(whole: SplitPaths, cap: PathValues) -> Envelope:
-    """Return the concave envelope of each path's information on [0, cap].
+    """Return the concave envelope of each path's information j(P) over its power P on [0, cap], cap (time, path).
 
-    The ray touches j where D (1 - P l) = t: by bisection in log l, as the left side falls with l.
+    With several hops j is S-shaped, and the envelope begins with a ray from zero. The ray touches j where
+    D (1 - P l) = t: by bisection in log l, as the left side falls with l. D = A prod (1 + alpha_h / p_h(l)) and
+    P = sum_h p_h(l), the best split by the multiplier l.
     """
     alpha, hops = whole.alpha, (whole.alpha > 0).sum(axis=-1)
     largest = np.where(hops > 0, alpha.max(axis=-1), 1.0)
@@ -171,8 +191,9 @@ def compute_envelope(whole: SplitPaths, cap: PathValues) -> Envelope:
         p = _split_at_multiplier(alpha, middle[..., None])[0]
         noise = np.divide(alpha, p, out=np.zeros_like(p), where=p > 0)
         left_side = whole.full * np.prod(1 + noise, axis=-1) * (1 - p.sum(axis=-1) * np.exp(middle))
-        above = left_side >= whole.signal
-        low, high = np.where(above, middle, low), np.where(above, high, middle)
+        is_above = left_side >= whole.signal
+        low, high = np.where(is_above, middle, low), np.where(is_above, high, middle)
+    # The power where the ray touches, at most the cap, and its slope j(P) / P.
     touch = np.where(hops > 1, _split_at_multiplier(alpha, low[..., None])[0].sum(axis=-1), 0.0)
     touch = np.minimum(touch, cap)
     at_touch = split_power_over_hops(whole, touch)

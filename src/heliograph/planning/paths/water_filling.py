@@ -37,11 +37,18 @@ def water_filling(
     whole: SplitPaths,
     start: Powers,
 ) -> Powers:
-    """Return the best powers within limits by the fixed point, from a start, until the gap closes or shrinks no more.
+    """Return the powers (time, free) of the least error within limits, where each path has one free hop.
 
-    `sensitivity` gives error and derivatives at powers (time, free), `whole` the path of each free hop.
+    By the fixed point that the optimum's condition gives: the powers that fill to one level at the present sensitivity
+    of the error, and on the way to them the best point, until the gap to a lower bound closes or shrinks no more.
+
+    Args:
+        limits: of the powers.
+        sensitivity: powers -> error, -d error / d j of each free hop's path, d error / d p.
+        whole: the path of each free hop.
+        start: powers at which to begin.
     """
-    # j = p / (a p + b) of each free hop's path.
+    # The information of each free hop's path is j = p / (a p + b).
     a = np.maximum(whole.full - whole.signal, STEEPEST * whole.full)
     b = whole.full * whole.alpha[..., 0]
 
@@ -49,17 +56,18 @@ def water_filling(
         return ErrorSlopes(*sensitivity(powers))
 
     best = p = start
-    smallest, idle = np.inf, 0
+    least_gap, idle = np.inf, 0
     slopes = slopes_at(p)
     for _ in range(STEPS):
         # The gap of Frank and Wolfe: what the error's tangent leaves to be gained.
-        gap = float(np.sum(slopes.gradient * (p - limits.best(-slopes.gradient))))
-        idle = 0 if gap < (1 - CLOSED) * smallest else idle + 1
-        if gap < smallest:
-            smallest, best = gap, p
+        gap = float(np.sum(slopes.gradient * (p - limits.find_best_powers(-slopes.gradient))))
+        idle = 0 if gap < (1 - CLOSED) * least_gap else idle + 1
+        if gap < least_gap:
+            least_gap, best = gap, p
         if gap <= CLOSED * abs(slopes.error) or idle > PATIENCE:
             break
-        p, slopes = _search_line(slopes_at, p, slopes, _fill_to_limits(limits, slopes.weights, a, b) - p)
+        filled = _fill_to_limits(limits, slopes.weights, a, b)
+        p, slopes = _search_line(slopes_at, p, slopes, filled - p)
     return best
 
 
@@ -68,8 +76,8 @@ def _search_line(
 ) -> tuple[Powers, ErrorSlopes]:
     """Return a point of less error on the way from p to p + way, and its slopes.
 
-    The end of the way, or where the slopes at both ends say that the error is least. Where rounding hides the way down,
-    half of it, by which the gap still shrinks.
+    It is the end of the way, or where the slopes at both ends say that the error is least. Where rounding hides the way
+    down it is half of it, by which the gap still shrinks. `slopes`: those at p.
     """
     slope = float(np.sum(slopes.gradient * way))
     length = 1.0
@@ -85,17 +93,22 @@ def _search_line(
 
 
 def _fill_to_limits(limits: PowerLimits, weights: Powers, a: Powers, b: Powers) -> Powers:
-    """Return the powers [y root(w b) - b]^+ / a = [y rise - dry]^+ at the level y that the limits set."""
+    """Return the powers [y sqrt(w b) - b]^+ / a (time, free) at the level y that the limits set.
+
+    They are [y rise - dry]^+ with rise = sqrt(w b) / a and dry = b / a. `weights`: w = -d error / d j of each path,
+    which carries the information j = p / (a p + b).
+    """
     rise, dry = np.sqrt(np.maximum(weights, 0.0) * b) / a, b / a
     steps = len(dry)
     # The level at which each transmitter's mean is reached, then that of the total under these.
     no_limit = np.full(steps, np.inf)
-    highest = np.broadcast_to([
+    of_means = [
         _find_level(rise[:, i], dry[:, i], limits.peak[:, i], no_limit, limits.mean[i] * steps)
         for i in range(dry.shape[1])
-    ], dry.shape)  # fmt: skip
+    ]
+    highest = np.broadcast_to(of_means, dry.shape)
     level = _find_level(rise.ravel(), dry.ravel(), limits.peak.ravel(), highest.ravel(), limits.total * steps)
-    return limits.clip(_fill_to_level(np.minimum(level, highest), rise, dry, limits.peak))
+    return limits.clip_powers(_fill_to_level(np.minimum(level, highest), rise, dry, limits.peak))
 
 
 def _fill_to_level(
@@ -104,7 +117,7 @@ def _fill_to_level(
     dry: Float[np.ndarray, "*k"],
     peak: Float[np.ndarray, "*k"],
 ) -> Float[np.ndarray, "*k"]:
-    """Return the powers min([level rise - dry]^+, peak); a sensor of no use stays dry at any level."""
+    """Return the powers min([level rise - dry]^+, peak), of the arguments' shape; 0 where rise is 0, at any level."""
     with np.errstate(invalid="ignore"):
         wet = np.where(rise > 0, level * rise - dry, 0.0)
     return np.clip(wet, 0.0, peak)
@@ -117,9 +130,12 @@ def _find_level(
     highest: Float[np.ndarray, "k"],
     total: float,
 ) -> float:
-    """Return the level at which the powers sum to the total; infinite where they never do."""
-    live = rise > 0
-    rise, dry, peak, highest = rise[live], dry[live], peak[live], highest[live]
+    """Return the level y at which the powers min([min(y, highest) rise - dry]^+, peak) sum to the total; else infinity.
+
+    Of k powers, each with its own `rise`, `dry`, `peak` and `highest` level.
+    """
+    useful = rise > 0
+    rise, dry, peak, highest = rise[useful], dry[useful], peak[useful], highest[useful]
     if not rise.size or not np.isfinite(total):
         return np.inf
     # The sum is piecewise linear in the level, with a turn where a power begins, or ends to grow.
