@@ -215,7 +215,7 @@ def _fit_with_progress(
 def collect_results_files(learned: "FitResults", out: Path, network: str) -> "Results":
     """Return the content of the results folder."""
     from heliograph.files.fitted import as_json, write_fitted
-    from heliograph.report.pages.fit import draw_fit_figures, pages
+    from heliograph.report.pages.fit import draw_fit_figures, make_page_of_drawings
     from heliograph.report.results import Results
 
     content = as_json(learned.fit, network=learned.network, measurements=learned.measurements, rows=learned.learned)
@@ -225,7 +225,7 @@ def collect_results_files(learned: "FitResults", out: Path, network: str) -> "Re
         write_fitted(content, network, learned.measurements, folder, out)
 
     summary = {**content, "held_out_rows": learned.held_out, **_convert_comparison_to_json(learned)}
-    return Results(draw_fit_figures(learned), pages(learned), summary, write)
+    return Results(draw_fit_figures(learned), make_page_of_drawings(learned), summary, write)
 
 
 def _convert_comparison_to_json(learned: "FitResults") -> "dict[str, Json]":

@@ -69,7 +69,8 @@ class Arrivals:
             return rate
         # In N rows N / period messages are due by the rate: the pattern's D due rows are more than one more than that
         # where D > N / period + 1, or period * D > N + period.
-        return rate if rate.period * pattern.rows.sum() > len(self.arrived) + rate.period else None
+        is_pattern_worse = rate.period * pattern.rows.sum() > len(self.arrived) + rate.period
+        return rate if is_pattern_worse else None
 
     @cached_property
     def period(self) -> float | None:
@@ -208,7 +209,7 @@ def rows_are_messages(arrived: Mapping[str, Bool[np.ndarray, " time"]]) -> bool:
 
 
 def _read_clock(time: np.ndarray) -> Float[np.ndarray, " time"]:
-    """Return the times as numbers: dates in seconds after the first."""
+    """Return the times as numbers (time,): dates as seconds after the first."""
     if time.dtype.kind == "M":
         return np.asarray((time - time[0]) / np.timedelta64(1, "s"), dtype=float)
     return np.asarray(time, dtype=float)
@@ -222,22 +223,20 @@ def list_arrivals(network: Network, times: np.ndarray, received: Mapping[str, np
         times: of the rows (time,).
         received: by node, (time, received), NaN where nothing arrived.
     """
-    time, row = np.unique(times, return_inverse=True)
+    time, time_of_row = np.unique(times, return_inverse=True)
 
-    def by_time(in_row: Any) -> np.ndarray:
+    def by_time(in_row: np.ndarray) -> np.ndarray:
         """Return whether something is true in any row of each distinct time."""
         at_time = np.zeros(len(time), dtype=bool)
-        at_time[row[in_row]] = True
+        at_time[time_of_row[in_row]] = True
         return at_time
 
-    messages = rows_are_messages({node: by_time(np.any(~np.isnan(z), axis=1)) for node, z in received.items()})
+    of_messages = rows_are_messages({node: by_time(np.any(~np.isnan(z), axis=1)) for node, z in received.items()})
     links = []
     for node, z in received.items():
         receiver = network.nodes[node]
-        declared, may_be_lost, limits = None, not receiver.complete, receiver.limits
-        shares = _find_arrival_probabilities(receiver) if isinstance(receiver, Node) else None
-        if isinstance(receiver, Node) and isinstance(receiver.trigger, Periodic):
-            declared, may_be_lost = int(receiver.trigger.period), first(receiver.channel).erases
+        limits = receiver.limits
+        declared_period, may_be_lost, shares = _read_declarations(receiver)
         for i, name in enumerate(receiver.received_names):
             arrived = ~np.isnan(z[:, i])
             links.append(
@@ -248,9 +247,10 @@ def list_arrivals(network: Network, times: np.ndarray, received: Mapping[str, np
                     by_time(arrived),
                     values=z[arrived, i],
                     may_be_lost=may_be_lost,
-                    declared_period=declared,
+                    declared_period=declared_period,
+                    # Numbers that come with the values, such as a mode, stand behind those that shares are of.
                     stated_share=None if shares is None or i >= len(shares) else float(shares[i]),
-                    of_messages=messages,
+                    of_messages=of_messages,
                     refuses=limits is not None,
                     watched=limits is not None and limits.stuck is not None,
                 )
@@ -258,8 +258,25 @@ def list_arrivals(network: Network, times: np.ndarray, received: Mapping[str, np
     return links
 
 
+def _read_declarations(receiver: Any) -> tuple[int | None, bool, Float[np.ndarray, " received"] | None]:
+    """Return what the network says of a node's messages: period in rows, whether they may be lost, shares that arrive.
+
+    The period is that of a sender that declares one (`Periodic`), else None; shares are by received number, None where
+    they are not single numbers.
+    """
+    if not isinstance(receiver, Node):
+        return None, not receiver.complete, None
+    shares = _find_arrival_probabilities(receiver)
+    if isinstance(receiver.trigger, Periodic):
+        return int(receiver.trigger.period), first(receiver.channel).erases, shares
+    return None, not receiver.complete, shares
+
+
 def _find_arrival_probabilities(receiver: Node) -> Float[np.ndarray, " received"] | None:
-    """Return the probability of arrival of each received number; None of a link whose losses remember or change."""
+    """Return the probability of arrival of each received number; None of a link whose losses remember or change.
+
+    None too where the sender decides when to send.
+    """
     sends_always = receiver.trigger is None or isinstance(receiver.trigger, Periodic)
     if not sends_always or isinstance(receiver.channel, OverTime):
         return None

@@ -39,20 +39,28 @@ def compare_nodes(network: Network, record: Record, inputs: np.ndarray, level: f
     has_centre = any(isinstance(fusion, AbstractFilter) for fusion in network.fused.values())
     if len(nodes) < 2 or len(names) > MOST or has_centre:
         return None
-    links = [x.channel.condition_on_arrival() for x in nodes.values() if not isinstance(x.channel, OverTime)]
-    sensor, channel = join_links({name: node.sensor for name, node in nodes.items()}, links)
-    linear = isinstance(network.plant, LinearPlant) and isinstance(sensor, LinearSensor)
-    try:
-        joint = (heliograph.linear_filter if linear else heliograph.cubature_filter)(network.plant, sensor, channel)
-    except InputError:  # a link that no such filter is made for
+    joint = _make_joint_filter(network, nodes)
+    if joint is None:
         return None
     z = np.concatenate([record.measurements[name] for name in nodes], axis=1)
-    off = find_constant_error(names, joint, z, inputs)
-    if off is None or off.size < LEAST:
+    found = find_constant_error(names, joint, z, inputs)
+    if found is None or found.size < LEAST:
         return None
-    deviations = min(off.significance, abs(off.error) / off.standard_error)
+    deviations = min(found.significance, abs(found.error) / found.standard_error)
     # The level is shared by all outputs and both signs (Bonferroni).
-    return off if deviations > -ndtri(level / (2 * len(names))) else None
+    return found if deviations > -ndtri(level / (2 * len(names))) else None
+
+
+def _make_joint_filter(network: Network, nodes: dict[str, Node]) -> AbstractFilter | None:
+    """Return a filter of what all these nodes receive; None behind a link for which no such filter is made."""
+    links = [x.channel.condition_on_arrival() for x in nodes.values() if not isinstance(x.channel, OverTime)]
+    sensor, channel = join_links({name: node.sensor for name, node in nodes.items()}, links)
+    is_linear = isinstance(network.plant, LinearPlant) and isinstance(sensor, LinearSensor)
+    make_filter = heliograph.linear_filter if is_linear else heliograph.cubature_filter
+    try:
+        return make_filter(network.plant, sensor, channel)
+    except InputError:
+        return None
 
 
 def _can_be_joined(node: Node) -> bool:

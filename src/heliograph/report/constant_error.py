@@ -54,7 +54,7 @@ def find_constant_error(
     measurements: Float[np.ndarray, "time m"],
     inputs: Float[np.ndarray, "time inputs"],
 ) -> ConstantError | None:
-    """Find the one output of several whose constant error explains innovations best; None where there is none.
+    """Return the one output of several whose constant error explains innovations best; None where there is none.
 
     A constant b added to output j moves the innovations e of a filter by b r_j, of which the response r_j is found by
     adding a small step. With S their covariance, twice the logarithm of the likelihood ratio of b over 0 is greatest at
@@ -71,37 +71,63 @@ def find_constant_error(
         return None
     outcome = filter.run(measurements, inputs)
     e, s = np.asarray(outcome.innovations), np.asarray(outcome.innovation_covariances)
-    there, variance = ~np.isnan(e), np.diagonal(s, axis1=1, axis2=2)
-    deviations = np.sqrt([np.median(v[t]) if t.any() else 0.0 for v, t in zip(variance.T, there.T, strict=True)])
-    whiten = _inverse_roots(s, there)
-    white = np.einsum("tij,tj->ti", whiten, np.where(there, e, 0.0))
-    tried = []
+    arrived, variance = ~np.isnan(e), np.diagonal(s, axis1=1, axis2=2)
+    # Usual deviation of each output's innovations; 0 of one that never arrived.
+    columns = zip(variance.T, arrived.T, strict=True)
+    deviations = np.sqrt([np.median(of_output[there]) if there.any() else 0.0 for of_output, there in columns])
+    # Innovations in units of the claim: S^-1/2 e.
+    whiten = _inverse_roots(s, arrived)
+    white = np.einsum("tij,tj->ti", whiten, np.where(arrived, e, 0.0))
+    candidates = []
     for j in np.flatnonzero((deviations > 0) & np.isfinite(deviations)):
-        response = np.where(there, _find_response(filter, measurements, inputs, e, int(j), deviations), 0.0)
+        response = np.where(arrived, _find_response(filter, measurements, inputs, e, int(j), deviations), 0.0)
         white_response = np.einsum("tij,tj->ti", whiten, response)
-        candidate = _estimate_error(names[int(j)], white, response, white_response, there.any(axis=1), deviations[j])
+        candidate = _estimate_error(names[int(j)], white, response, white_response, arrived.any(axis=1), deviations[j])
         if candidate is not None:
-            tried.append(candidate)
-    if not tried:
-        return None
-    best = max(tried, key=lambda one: one.gain)
-    others = tuple(one.output for one in tried if one is not best and best.gain - one.gain < CLEAR)
-    left = np.where(there, e - best.error * best.response, np.nan)
-    excess = float(np.sum(white**2)) - np.count_nonzero(there)
+            candidates.append(candidate)
+    return _choose_candidate(candidates, e, variance, white) if candidates else None
+
+
+def _choose_candidate(
+    candidates: "Sequence[_Candidate]",
+    e: Float[np.ndarray, "time m"],
+    variance: Float[np.ndarray, "time m"],
+    white: Float[np.ndarray, "time m"],
+) -> ConstantError:
+    """Return the likeliest of the errors of single outputs, and what innovations are without its effect.
+
+    Args:
+        candidates: the likeliest error of each output.
+        e: innovations, NaN where nothing arrived.
+        variance: their claimed variances.
+        white: innovations in units of the filter's claim, 0 where nothing arrived.
+    """
+    arrived = ~np.isnan(e)
+    best = max(candidates, key=lambda candidate: candidate.gain)
+    # Outputs whose error explains nearly as much cannot be told from the best.
+    others = tuple(c.output for c in candidates if c is not best and best.gain - c.gain < CLEAR)
+    left = np.where(arrived, e - best.error * best.response, np.nan)
+    # Squares of white innovations sum to their number where the claim holds.
+    excess = float(np.sum(white**2)) - np.count_nonzero(arrived)
     return ConstantError(
         (best.output, *others),
         best.error,
         best.standard_error,
         explained=best.gain / excess if excess > 0 else 0.0,
         squares=left**2 / np.where(variance > 0, variance, np.nan),
-        white=np.where(there, white - best.error * best.white_response, np.nan),
+        white=np.where(arrived, white - best.error * best.white_response, np.nan),
         size=float(best.size),
         significance=float(best.significance),
     )
 
 
 class _Candidate(NamedTuple):
-    """The likeliest error of one output, and what it does; gain: twice the logarithm of the likelihood ratio."""
+    """The likeliest constant error of one output, and what it does to the innovations (time, m).
+
+    gain: twice the logarithm of its likelihood ratio. response: change of the innovations by an error of one, also
+    (white_response) in units of the filter's claim. size: the error in deviations of the output's innovations.
+    significance: mean of what the rows say for it, over its standard error.
+    """
 
     gain: float
     output: str
@@ -121,7 +147,10 @@ def _estimate_error(
     received: Bool[np.ndarray, " time"],
     deviation: float,
 ) -> _Candidate | None:
-    """Return the likeliest constant error of one output; None where the innovations do not depend on it.
+    """Return the likeliest constant error b of one output; None where the innovations do not depend on it.
+
+    b = sum r' w / sum r' r over all rows, with white innovations w and the response r of them to an error of one; its
+    likelihood ratio to no error is exp((sum r' w)^2 / (2 sum r' r)).
 
     Args:
         output: its name.
@@ -131,11 +160,12 @@ def _estimate_error(
         received: whether anything arrived in each row.
         deviation: of the output's innovations.
     """
+    agreements = np.sum(white_response * white, axis=1)  # of each row
     weight, agreement = float(np.sum(white_response**2)), float(np.sum(white_response * white))
     if not (weight > 0 and np.isfinite(agreement)):
         return None
-    error, agreements = agreement / weight, np.sum(white_response * white, axis=1)
-    mean, spread = average_correlated(np.where(received, agreements, np.nan))
+    error = agreement / weight
+    mean, standard_error = average_correlated(np.where(received, agreements, np.nan))
     return _Candidate(
         gain=agreement * error,
         output=output,
@@ -144,7 +174,7 @@ def _estimate_error(
         response=response,
         white_response=white_response,
         size=abs(error) / deviation,
-        significance=abs(mean) / spread if spread > 0 else 0.0,
+        significance=abs(mean) / standard_error if standard_error > 0 else 0.0,
     )
 
 
@@ -156,7 +186,10 @@ def _find_response(
     output: int,
     deviations: Float[np.ndarray, " m"],
 ) -> Float[np.ndarray, "time m"]:
-    """Return the change of all innovations by a step of one in an output, 0 where an angle went around."""
+    """Return the change of all innovations by an error of one in an output, 0 where an angle went around.
+
+    `output`: its number. The filter is run again with a small step added, SMALL of the output's deviation.
+    """
     step = SMALL * deviations[output]
     moved = np.array(measurements, dtype=float)
     moved[:, output] += step
@@ -164,17 +197,17 @@ def _find_response(
     return np.where(np.abs(response) * deviations[output] < LARGEST * deviations, response, 0.0)
 
 
-def _inverse_roots(s: Float[np.ndarray, "time m m"], there: Float[np.ndarray, "time m"]) -> np.ndarray:
-    """Return S^(-1/2) of each row (time, m, m) over the components that are `there`; zero for the others.
+def _inverse_roots(s: Float[np.ndarray, "time m m"], arrived: Float[np.ndarray, "time m"]) -> np.ndarray:
+    """Return S^(-1/2) of each row (time, m, m) over the components that arrived; zero for the others.
 
     Zero also where S is not finite; a direction in which S has no positive eigenvalue counts nothing.
     """
-    both = np.asarray(there[:, :, None] & there[:, None, :])
+    both = np.asarray(arrived[:, :, None] & arrived[:, None, :])
     eye = np.eye(s.shape[1])
     filled = np.where(both, s, eye)
-    sound = np.asarray(np.isfinite(filled).all(axis=(1, 2)))
-    filled = np.where(sound[:, None, None], filled, eye)
+    is_finite = np.asarray(np.isfinite(filled).all(axis=(1, 2)))
+    filled = np.where(is_finite[:, None, None], filled, eye)
     values, vectors = np.linalg.eigh(filled)
     root = np.where(values > 0, np.abs(values), np.inf) ** -0.5
     inverse = np.einsum("tij,tj,tkj->tik", vectors, root, vectors)
-    return np.asarray(np.where(both & sound[:, None, None], inverse, 0.0))
+    return np.asarray(np.where(both & is_finite[:, None, None], inverse, 0.0))

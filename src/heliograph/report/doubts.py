@@ -3,11 +3,13 @@
 from collections.abc import Sequence
 
 from heliograph.report.constant_error import ConstantError
+from heliograph.report.repeated_values import HeldValue
+from heliograph.simulation.declared.judgement import DeclaredJudgement
 from heliograph.simulation.results.whiteness import MemoryTest
 
 
 def _name_outputs(outputs: Sequence[str], sizes: Sequence[float]) -> tuple[str, str]:
-    """Return " of" and the names of the outputs, "" where all are meant (`outputs` is [""]); and their sizes."""
+    """Return " of y, z" ("" if `outputs` is [""], which means all), and the sizes as text."""
     return f" of {', '.join(outputs)}" if outputs != [""] else "", ", ".join(f"{size:.2f}" for size in sizes)
 
 
@@ -58,3 +60,26 @@ def say_underconfident(name: str, outputs: Sequence[str], sizes: Sequence[float]
         "Either noises are stated too large, or the sensor's error changes slowly and the filter follows it: then its "
         "claim is too small. Innovations cannot tell the two apart, a reference can"
     )
+
+
+def say_what_to_do(held: HeldValue, refused: bool) -> str:
+    """Return what to do about an output that repeats a value: that it was refused, or how to have it refused."""
+    if refused:
+        return "what repeated for longer was refused"
+    return (
+        "what else is said of filters that use it may be due to that. "
+        f"stuck={held.stuck} of its node refuses what repeats for longer"
+    )
+
+
+def say_declared(judgements: Sequence[DeclaredJudgement], unit: str) -> list[str]:
+    """Return the sentences on variances that messages declare, of several links after the names of their outputs.
+
+    `unit`: of the plant's time.
+    """
+    several = len(judgements) > 1
+    return [
+        f"{', '.join(judgement.outputs)}: {sentence}" if several else sentence
+        for judgement in judgements
+        for sentence in judgement.sentences(unit)
+    ]

@@ -29,7 +29,7 @@ def draw_forecasts(
     names: Sequence[str],
     sigmas: float,
 ) -> None:
-    """Draw the filters' forecasts with their bands after their estimates, and a line where the record ends.
+    """Draw the filters' forecasts with their bands, following their estimates, and a vertical line where these end.
 
     Args:
         panels: one for each state.
@@ -42,11 +42,12 @@ def draw_forecasts(
     for number, name in enumerate(names):
         if name not in forecasts:
             continue
-        forecast, last, colour = forecasts[name], record.estimates[node][name], COLOURS[number % len(COLOURS)]
+        forecast, estimate, colour = forecasts[name], record.estimates[node][name], COLOURS[number % len(COLOURS)]
         time = np.concatenate([record.time[-1:], forecast.time])
         for i, panel in enumerate(panels):
-            # From the last estimate on.
-            last_mean, last_deviation = np.asarray(last.mean)[-1, i], np.sqrt(np.asarray(last.covariance)[-1, i, i])
+            # The curve begins at the last estimate of state i.
+            last_mean = np.asarray(estimate.mean)[-1, i]
+            last_deviation = np.sqrt(np.asarray(estimate.covariance)[-1, i, i])
             mean = np.append(last_mean, forecast.states.mean[:, i])
             band = sigmas * np.append(last_deviation, forecast.states.deviation[:, i])
             panel.plot(time, mean, color=colour, linestyle=(0, (4, 1.5)))
@@ -56,7 +57,10 @@ def draw_forecasts(
 
 
 def forecast_tables(record: Record, forecasts: Forecasts) -> list[Table | Text]:
-    """Return a table for each filter: mean and interval of each state and output at horizons spread over all."""
+    """Return a text on what is forecast, then a table for each filter.
+
+    A table has mean and interval of each state and output, at horizons spread over all.
+    """
     any_forecast = next(forecast for filters in forecasts.values() for forecast in filters.values())
     sentence_on_inputs = {
         "held": "Inputs are held at those of the last row.",
@@ -95,5 +99,5 @@ def _format_mean_and_interval(mean: float, low: float, high: float, deviation: f
 
 
 def _format_time(time: np.generic) -> str:
-    """Return a time in words."""
+    """Return a time as text: a date to the second, else a number."""
     return str(time)[:19] if isinstance(time, np.datetime64) else f"{time:g}"

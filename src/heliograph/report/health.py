@@ -15,7 +15,15 @@ from heliograph.numerics.types import ArrayLike, Float
 from heliograph.report.arrivals import Arrivals, list_arrivals
 from heliograph.report.compared_nodes import compare_nodes
 from heliograph.report.constant_error import ConstantError, find_constant_error
-from heliograph.report.doubts import say_apart, say_constant_error, say_memory, say_overconfident, say_underconfident
+from heliograph.report.doubts import (
+    say_apart,
+    say_constant_error,
+    say_declared,
+    say_memory,
+    say_overconfident,
+    say_underconfident,
+    say_what_to_do,
+)
 from heliograph.report.expected_squares import compare_squares, expect_squares
 from heliograph.report.forecasts import Forecasts, Residuals
 from heliograph.report.outputs import ListeningFilter, OutputHealth, judge_outputs_of_filter, list_listeners, weighs
@@ -90,7 +98,7 @@ class Health:
 
     def warnings(self) -> list[str]:
         """Return one line for each reason to doubt the network, the weightiest first."""
-        lines = [*self.record.failures(), *self.held().values(), *self.possible]
+        lines = [*self.record.failures(), *self.describe_held_outputs().values(), *self.possible]
         lines += [f"{node}: {found.describe()}" for node, found in self.silences.items()]
         for link in self.links:
             name = f"{link.node}: {link.component}"
@@ -108,24 +116,24 @@ class Health:
         lines += [self.time_unit] * bool(self.time_unit)
         return lines + [line for doubted in self.doubted() for line in self._describe_doubts(doubted)]
 
-    def held(self) -> dict[tuple[str, str], str]:
-        """Return a line for each output that repeats one value for longer than its noise allows, by node and output.
+    def describe_held_outputs(self) -> dict[tuple[str, str], str]:
+        """Return by (node, output) a line for each output that repeats one value for longer than its noise allows.
 
         An output that a node's filter and a central one both use is there once, by the node's.
         """
         trusted = {(filter.node, filter.filter) for filter in self.filters if filter.trusted}
         # Central filters first, whose outputs are named "node: output": a node's own filter takes their place.
-        stuck: dict[str, tuple[str, str, HeldValue]] = {}
+        held_outputs: dict[str, tuple[str, str, HeldValue]] = {}
         for health in sorted(self.outputs, key=lambda output: output.node != Network.FUSED):
             output = health.judged.output
             name = output if health.node == Network.FUSED else f"{health.node}: {output}"
             if health.judged.held is not None and (health.node, health.filter) in trusted:
-                stuck[name] = health.node, output, health.judged.held
+                held_outputs[name] = health.node, output, health.judged.held
         watched = {f"{link.node}: {link.component}" for link in self.links if link.watched}
         return {
             (node, output): f"{name} is stuck, or has no noise: {held}, where its noise makes no run as long; "
-            f"{_say_what_to_do(held, name in watched)}"
-            for name, (node, output, held) in stuck.items()
+            f"{say_what_to_do(held, name in watched)}"
+            for name, (node, output, held) in held_outputs.items()
         }
 
     def doubted(self) -> list[FilterHealth]:
@@ -133,7 +141,7 @@ class Health:
 
         None of those that use an output which is stuck: their innovations tell of that alone.
         """
-        stuck = {node for node, _ in self.held()}
+        stuck = {node for node, _ in self.describe_held_outputs()}
 
         def is_doubted(health: FilterHealth) -> bool:
             """Return whether one of these filters is trusted, uses nothing that is stuck, and has doubts."""
@@ -147,7 +155,7 @@ class Health:
         return [line for filter in self.filters if not filter.trusted for line in self._describe_doubts(filter)]
 
     def _describe_doubts(self, health: FilterHealth) -> Iterator[str]:
-        """Say which claims innovations contradict: the size of each output's, of all together, and their memory."""
+        """Yield which claims innovations contradict: the size of each output's, of all together, and their memory."""
         yield from self._describe_left_out(health)
         name = f"{health.node}/{health.filter}"
         off = self.off.get((health.node, health.filter))
@@ -155,7 +163,7 @@ class Health:
             yield say_constant_error(name, off)
             if off.nothing_else:
                 return
-        said = _say_declared(health)
+        said = say_declared(health.declared, health.unit)
         yield from (f"{name}: {sentence}" for sentence in said)
         if said or health.test is None:  # the judgement of what was declared says more than sizes and memory do
             return
@@ -168,27 +176,31 @@ class Health:
         return FALSE / sum(filter.test is not None for filter in self.filters)
 
     def _describe_sizes(self, health: FilterHealth, test: MemoryTest) -> Iterator[str]:
-        """Say of which outputs the mean square of innovations is not what is claimed."""
+        """Yield a sentence on the outputs whose innovations are larger than claimed, and one on those that are smaller.
+
+        Each output is judged by itself, since a mean over outputs hides the one that is wrong; all together where none
+        is wrong by itself. `test`: that of the filter's innovations.
+        """
         name, level = f"{health.node}/{health.filter}", self._level()
         outputs = [one for one in self.outputs if (one.node, one.filter) == (health.node, health.filter)]
-        weighs = any(output.weighs for output in outputs)
-        # Each output by itself, since a mean over outputs hides the one that is wrong; all together where none is.
-        # Size of each: mean square over its claim, the standard error of that, number of innovations.
+        # By output (mean square over its claim, the standard error of that, number of innovations); "" of all together.
         judged = [output.judged for output in outputs]
         sizes = {j.output: (j.size, j.size_error, j.summary.received) for j in judged if j.summary.received > LAGS}
-        wrong = {output: compare_with_claim(*size, level / len(sizes)) for output, size in sizes.items()}
-        if not any(wrong.values()):
+        signs = {output: compare_with_claim(*size, level / len(sizes)) for output, size in sizes.items()}
+        if not any(signs.values()):
             sizes = {"": (test.power, test.power_error, health.numbers)}
-            wrong = {"": compare_with_claim(*sizes[""], level)}
-        for sign, say in ((1, say_overconfident), (-1, say_underconfident)):
-            if weighs and sign < 0:  # a filter that leaves outliers out has smaller innovations
-                continue
-            named = [output for output, departure in wrong.items() if departure == sign]
-            # One that is far off pulls the estimates, and so makes others a little larger.
-            most = max((sizes[output][0] - 1 for output in named), default=0.0)
-            named = [output for output in named if sign < 0 or sizes[output][0] - 1 >= PULLED * most]
+            signs = {"": compare_with_claim(*sizes[""], level)}
+        by_output = {output: size for output, (size, _, _) in sizes.items()}
+        larger = [output for output, sign in signs.items() if sign > 0]
+        # One that is far off pulls the estimates, and so makes others a little larger: these are not named.
+        most = max((by_output[output] - 1 for output in larger), default=0.0)
+        larger = [output for output in larger if by_output[output] - 1 >= PULLED * most]
+        smaller = [output for output, sign in signs.items() if sign < 0]
+        if any(output.weighs for output in outputs):  # a filter that leaves outliers out has smaller innovations
+            smaller = []
+        for named, say in ((larger, say_overconfident), (smaller, say_underconfident)):
             if named:
-                yield say(name, named if len(sizes) > 1 else [""], [sizes[output][0] for output in named])
+                yield say(name, named if len(sizes) > 1 else [""], [by_output[output] for output in named])
 
     def explains_all(self, health: FilterHealth, off: ConstantError) -> bool:
         """Return whether innovations without the effect of a constant error are as large as claimed, without memory."""
@@ -201,7 +213,7 @@ class Health:
         return test is None or not self._has_memory(health, test)
 
     def _has_memory(self, health: FilterHealth, test: MemoryTest) -> bool:
-        """Return whether innovations predict those after, by the last one or by several, and more than by chance.
+        """Return whether innovations predict those after them, by the last one or by several, and more than by chance.
 
         Of N numbers that know nothing of one another each lag seems to predict 1 / N of the variance.
         """
@@ -213,22 +225,12 @@ class Health:
         return probability < self._level() and test.predictable - by_chance >= LEAST_SHARE
 
     def _describe_left_out(self, health: FilterHealth) -> Iterator[str]:
-        """Say of which outputs a filter that weighs left out most, as `heliograph.run` does."""
+        """Yield which outputs a filter that weighs left out most, in the words of `heliograph.run`."""
         for output in self.outputs:
             if output.weighs and (output.node, output.filter) == (health.node, health.filter):
                 yield from output.judged.summary.describe_left_out(
                     f"{health.node}/{health.filter}", output.judged.output
                 )
-
-
-def _say_what_to_do(held: HeldValue, refused: bool) -> str:
-    """Say that the rest of a run was refused, or how it would be."""
-    if refused:
-        return "what repeated for longer was refused"
-    return (
-        "what else is said of filters that use it may be due to that. "
-        f"stuck={held.stuck} of its node refuses what repeats for longer"
-    )
 
 
 def compare_with_claim(size: float, error: float, numbers: int, level: float) -> int:
@@ -275,21 +277,26 @@ def examine(
         filters.append(_examine_filter(network, listener, record, u))
         if filters[-1].white is not None:
             outputs += judge_outputs_of_filter(network, listener, record, u)
+    # Links, and what the network itself says of filters and estimates.
     beliefs = tuple(belief.words for belief in network.beliefs())
     timeouts = {node: network.nodes[node].timeout for node in network.names}
     silences = find_long_silences(timeouts, record.measurements, u, network.inputs)
     links, possible = list_arrivals(network, record.time, record.measurements), doubt_estimates(network, record)
     health = Health(record, links, filters, outputs, network.shared, beliefs, possible=possible, silences=silences)
+    # What may explain the doubts: a constant error of one output, or times in another unit.
     off = {
         (judged.node, judged.filter): _find_constant_error(network, health, judged, u) for judged in health.doubted()
     }
-    apart = None if health.held() else compare_nodes(network, record, u, FALSE)
+    apart = None if health.describe_held_outputs() else compare_nodes(network, record, u, FALSE)
     health = replace(health, off={place: error for place, error in off.items() if error is not None}, apart=apart)
     return replace(health, time_unit=_doubt_time_unit(network, health, u))
 
 
 def _examine_filter(network: Network, listener: ListeningFilter, record: Record, inputs: np.ndarray) -> FilterHealth:
-    """Return one filter's innovations in units of its claim, and what tests say of them."""
+    """Return one filter's innovations in units of its claim (white), and what tests say of them.
+
+    There are neither of a filter that claims no covariance, or receives nothing.
+    """
     node, name, filter, z = listener.node, listener.name, listener.filter, listener.measurements
     white, test, expected = None, None, np.ones(1)
     if filter.claim != "none" and filter.received:
@@ -297,11 +304,11 @@ def _examine_filter(network: Network, listener: ListeningFilter, record: Record,
         test = _test_innovations(subtract_mean(white) if weighs(filter) else white)
         expected = expect_squares(filter, z, inputs)
         test = test and _compare_size(test, white, expected)
-    lost = np.any(record.estimates[node][name].claims == "none")
+    lost_claim = np.any(record.estimates[node][name].claims == "none")
     return FilterHealth(
         node,
         name,
-        "none" if lost else filter.claim,
+        "none" if lost_claim else filter.claim,
         white,
         test,
         trusted=listener.trusted,
@@ -338,16 +345,6 @@ def _find_constant_error(
         return None
     off = off._replace(nothing_else=health.explains_all(judged, off))
     return off if off.nothing_else or off.explained > MOST else None
-
-
-def _say_declared(health: FilterHealth) -> list[str]:
-    """Return what is to be said of variances that messages declare, of several links after the names of the outputs."""
-    several = len(health.declared) > 1
-    return [
-        f"{', '.join(judgement.outputs)}: {sentence}" if several else sentence
-        for judgement in health.declared
-        for sentence in judgement.sentences(health.unit)
-    ]
 
 
 def _name_time_unit(record: Record) -> str:

@@ -24,20 +24,24 @@ def find_law_medians(
         node: name of the node; of a filter of the centre, the nodes' numbers one after the other.
         variance: claimed variance of each innovation.
     """
+    # A filter of the centre: each node's numbers by its own law.
     if node == Network.FUSED:
-        sizes = np.cumsum([0, *(network.nodes[name].received for name in network.names)])
-        return np.concatenate([find_law_medians(network, name, variance[a:b])
-                               for name, a, b in zip(network.names, sizes[:-1], sizes[1:], strict=True)])  # fmt: skip
+        ends = np.cumsum([network.nodes[name].received for name in network.names])
+        of_nodes = zip(network.names, np.split(variance, ends[:-1]), strict=True)
+        return np.concatenate([find_law_medians(network, name, of_node) for name, of_node in of_nodes])
     receiver = network.nodes[node]
     if not isinstance(receiver, Node):
         return np.zeros(receiver.received)
+    # Medians are 0 of symmetric laws; behind links that remember, or tell more than values, they are taken for 0.
     noise, channel = first(receiver.sensor).noise, first(receiver.channel).condition_on_arrival()
     if noise.is_symmetric or channel.remembers or channel.past or channel.outputs != receiver.received:
         return np.zeros(receiver.received)
-    # v through the mean gain, and what else the innovation is made of.
+    # M (v - E v) of drawn noises, (draws, received), with the mean gain M.
     with jax.enable_x64(True):
-        drawn = np.asarray(jax.vmap(noise.sample)(jax.random.split(jax.random.key(0), DRAWS)))
+        noises = np.asarray(jax.vmap(noise.sample)(jax.random.split(jax.random.key(0), DRAWS)))
         gain = np.asarray(channel.moments(1).matrix)[: channel.outputs, : channel.inputs]
-    through = (drawn - np.asarray(noise.mean)) @ gain.T
-    rest = np.sqrt(np.maximum(variance - through.var(axis=0), 0.0))
-    return np.asarray(np.median(through + rest * np.random.default_rng(0).standard_normal(through.shape), axis=0))
+    received = (noises - np.asarray(noise.mean)) @ gain.T
+    # A Gaussian number beside it, of what is left of the claimed variance.
+    rest = np.sqrt(np.maximum(variance - received.var(axis=0), 0.0))
+    drawn = received + rest * np.random.default_rng(0).standard_normal(received.shape)
+    return np.asarray(np.median(drawn, axis=0))

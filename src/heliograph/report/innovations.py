@@ -11,8 +11,9 @@ from matplotlib.figure import Figure
 from heliograph.disk.quoting import quote_for_figure, visible
 from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, STYLE, VERMILION, stacked_panels
 from heliograph.report.health import FilterHealth, Health
-from heliograph.report.outputs import round_to
+from heliograph.report.outputs import OutputHealth, round_to
 from heliograph.report.pages.page import Picture, PictureChoice, Section, Table, Text
+from heliograph.simulation.declared.judgement import DeclaredJudgement
 from heliograph.simulation.network import Network
 from heliograph.simulation.results.record import Record
 
@@ -40,13 +41,8 @@ def draw_innovations(health: Health, tested: Sequence[FilterHealth]) -> Figure:
     figure, grid = stacked_panels(len(tested), 1.5, 0.6)
     names = _name_components(health)
     for axes, judged in zip(grid, tested, strict=True):
-        white = np.asarray(judged.white)
-        # A colour for each output; of more outputs than colours, such as a centre's, one for all.
-        count = white.shape[1]
-        if count > len(COLOURS):
-            colours, labels = [BLUE] * count, [f"{count} outputs", *[None] * (count - 1)]
-        else:
-            colours, labels = list(COLOURS[:count]), list(map(quote_for_figure, names[judged.node]))
+        white = np.asarray(judged.white)  # (time, outputs)
+        colours, labels = _choose_colours(white.shape[1], names[judged.node])
         for component, colour, label in zip(white.T, colours, labels, strict=False):
             axes.plot(health.record.time, component, ".", markersize=3, color=colour, label=label)
         for level in (-BAND, BAND):
@@ -58,6 +54,16 @@ def draw_innovations(health: Health, tested: Sequence[FilterHealth]) -> Figure:
     return figure
 
 
+def _choose_colours(count: int, names: Sequence[str]) -> tuple[list[str], list[str | None]]:
+    """Return colour and label of each of `count` outputs with these names.
+
+    Of more outputs than there are colours, such as a centre's, all have one colour and only the first has a label.
+    """
+    if count > len(COLOURS):
+        return [BLUE] * count, [f"{count} outputs", *[None] * (count - 1)]
+    return list(COLOURS[:count]), list(map(quote_for_figure, names))
+
+
 def _name_components(health: Health) -> dict[str, list[str]]:
     """Return the names of the measurement's components by node; of a central filter those of all nodes."""
     names: dict[str, list[str]] = {}
@@ -67,31 +73,46 @@ def _name_components(health: Health) -> dict[str, list[str]]:
 
 
 def make_innovations_section(health: Health, drawings: Mapping[str, bytes]) -> Section:
-    """Return the tests of each filter's innovations, their pictures, and what they say of each output."""
-    table = _make_tests_table(health)
-    text = "An innovation is what arrived less what the filter expected. The tests need no true state."
-    # Pictures of the innovations, by node; of one figure with all filters, by the node of the first.
-    tested = tested_by_figure(health)
-    pictures = {
-        filters[0].node: Picture(drawings[name], "Innovations over time in claimed deviations",
-                                 f"Innovations in claimed standard deviations, one colour an output (of more than "
-                                 f"{len(COLOURS)} one for all); 5 of 100 may lie beyond ±{BAND:g}.")
-        for name, filters in tested.items() if name in drawings
-    }  # fmt: skip
-    drawn = {filter.node for name, filters in tested.items() if name in drawings for filter in filters}
-    left = [f"{filter.node}/{filter.filter}" for filter in health.filters
-            if filter.white is not None and filter.node not in drawn]  # fmt: skip
+    """Return the section of a run's page with tests and pictures of innovations, and what they say of each output.
+
+    `drawings`: each figure as SVG, by its name; those that are missing are named in a text.
+    """
+    intro = "An innovation is what arrived less what the filter expected. The tests need no true state."
     # Fusions of estimates are in no row of the table.
     in_table = {(filter.node, filter.filter) for filter in health.filters}
     fusions = [name for name in health.record.estimates.get(Network.FUSED, {}) if (Network.FUSED, name) not in in_table]
     if fusions:
-        text += (
+        intro += (
             f" A fusion of estimates receives nothing itself ({', '.join(map(visible, fusions))}): the filters that it "
             "fuses are tested here, and itself on the live page of `heliograph serve`."
         )
-    missing = say_not_drawn(left, "Their numbers are in the table.")
-    tables = [*_make_outputs_table(health), *_make_declared_table(health)]
-    return Section("Innovations", [Text([text]), table, *choose_picture(pictures), *missing, *tables])
+    # Pictures by node; one figure with all filters counts as that of the first one's node.
+    figures = {name: filters for name, filters in tested_by_figure(health).items() if name in drawings}
+    text = (
+        f"Innovations in claimed standard deviations, one colour an output (of more than {len(COLOURS)} one for all); "
+        f"5 of 100 may lie beyond ±{BAND:g}."
+    )
+    pictures = {
+        filters[0].node: Picture(drawings[name], "Innovations over time in claimed deviations", text)
+        for name, filters in figures.items()
+    }
+    drawn_nodes = {filter.node for filters in figures.values() for filter in filters}
+    not_drawn = [
+        f"{filter.node}/{filter.filter}"
+        for filter in health.filters
+        if filter.white is not None and filter.node not in drawn_nodes
+    ]
+    return Section(
+        "Innovations",
+        [
+            Text([intro]),
+            _make_tests_table(health),
+            *choose_picture(pictures),
+            *say_not_drawn(not_drawn, "Their numbers are in the table."),
+            *_make_outputs_table(health),
+            *_make_declared_table(health),
+        ],
+    )
 
 
 def _make_tests_table(health: Health) -> Table:
@@ -122,17 +143,6 @@ def _sort_fused_first(filters: Iterable[FilterHealth]) -> list[FilterHealth]:
 
 def _make_outputs_table(health: Health) -> list[Table]:
     """Return the table of each output's bias and size, and of how many values weighing filters doubted; [] if empty."""
-    rows = []
-    for output in health.outputs:
-        # Numbers of the summary; bias and size to two digits of their standard errors.
-        judged, s = output.judged, output.judged.summary
-        doubted = f"{s.down_weighted} ({100 * s.share.low:.2g} to {100 * s.share.high:.2g} %)" if output.weighs else "–"
-        half = (s.bias_high - s.bias_low) / 2
-        error = half / 1.96
-        bias = f"{round_to(s.bias, error)} ± {round_to(half, error)}"
-        size = f"{round_to(judged.size, judged.size_error)} ± {round_to(1.96 * judged.size_error, judged.size_error)}"
-        remarks = ["to blame"] * judged.to_blame + ["stuck"] * (judged.held is not None)
-        rows.append([output.name, f"{s.received} of {s.expected}", doubted, bias, size, ", ".join(remarks)])
     caption = (
         "**Down-weighted**: values that counted less than half, and the interval of their share. **Bias**: median "
         "of the innovations in the output's unit, less that of the law of its noise. **Size**: mean square of the "
@@ -140,7 +150,27 @@ def _make_outputs_table(health: Health) -> list[Table]:
         "that allow for correlated rows. **To blame**: its share lies above that of the filter's other outputs "
         "together, by an interval of the difference. **Stuck**: one value repeats for longer than its noise allows."
     )
+    rows = [_make_output_cells(output) for output in health.outputs]
     return [Table(["filter: output", "received", "down-weighted", "bias", "size", ""], rows, caption)] if rows else []
+
+
+def _make_output_cells(output: OutputHealth) -> list[str]:
+    """Return an output's row of the table: name, received, down-weighted, bias, size, remarks.
+
+    Bias and size have two digits of their standard errors.
+    """
+    judged, summary = output.judged, output.judged.summary
+    doubted = "–"
+    if output.weighs:
+        low, high = 100 * summary.share.low, 100 * summary.share.high
+        doubted = f"{summary.down_weighted} ({low:.2g} to {high:.2g} %)"
+    half = (summary.bias_high - summary.bias_low) / 2
+    error = half / 1.96
+    bias = f"{round_to(summary.bias, error)} ± {round_to(half, error)}"
+    size = f"{round_to(judged.size, judged.size_error)} ± {round_to(1.96 * judged.size_error, judged.size_error)}"
+    remarks = ["to blame"] * judged.to_blame + ["stuck"] * (judged.held is not None)
+    received = f"{summary.received} of {summary.expected}"
+    return [output.name, received, doubted, bias, size, ", ".join(remarks)]
 
 
 def _make_declared_table(health: Health) -> list[Table]:
@@ -151,12 +181,7 @@ def _make_declared_table(health: Health) -> list[Table]:
             name = f"{filter.node}/{filter.filter}"
             if len(filter.declared) > 1:
                 name += f": {', '.join(judgement.outputs)}"
-            for one in judgement.classes:
-                declared = f"{one.low:.3g}" if one.low == one.high else f"{one.low:.3g} to {one.high:.3g}"
-                size = f"{one.nis:.3g} ({one.nis_low:.2f} to {one.nis_high:.2f})"
-                has_scale = one.scale_low != one.scale_high
-                scale = f"{one.scale:.3g} ({one.scale_low:.3g} to {one.scale_high:.3g})" if has_scale else "–"
-                rows.append([visible(name), declared, f"{one.numbers:,}", size, scale])
+            rows += [[visible(name), *cells] for cells in _make_class_rows(judgement)]
     caption = (
         "**Declared**: variances that came with the messages, in classes. **Size**: mean square of the innovations "
         "over the claimed one, and where it lies for true variances in 99 of 100 recordings. **Scale**: the factor of "
@@ -164,6 +189,19 @@ def _make_declared_table(health: Health) -> list[Table]:
         "alone is no sign of safety: an error that changes slowly makes one too, and no scale mends it."
     )
     return [Table(["filter", "declared", "values", "size", "scale"], rows, caption)] if rows else []
+
+
+def _make_class_rows(judgement: DeclaredJudgement) -> list[list[str]]:
+    """Return the cells of each class of declared variances: its range, how many values, size, and scale or "–"."""
+    rows = []
+    for of_class in judgement.classes:
+        is_single = of_class.low == of_class.high
+        declared = f"{of_class.low:.3g}" if is_single else f"{of_class.low:.3g} to {of_class.high:.3g}"
+        size = f"{of_class.nis:.3g} ({of_class.nis_low:.2f} to {of_class.nis_high:.2f})"
+        has_scale = of_class.scale_low != of_class.scale_high
+        scale = f"{of_class.scale:.3g} ({of_class.scale_low:.3g} to {of_class.scale_high:.3g})" if has_scale else "–"
+        rows.append([declared, f"{of_class.numbers:,}", size, scale])
+    return rows
 
 
 def choose_picture(pictures: Mapping[str, Picture]) -> list[Picture | PictureChoice]:

@@ -40,16 +40,17 @@ class FilterErrors(NamedTuple):
 
 
 def compare_with_truth(record: Record) -> list[FilterErrors]:
-    """Compare each filter with the truth, the fused ones first; nothing without one."""
+    """Return the errors of each filter, the fused ones first; nothing of a record without true states."""
     if record.truth is None:
         return []
-    known = np.sum(~np.isnan(np.asarray(record.truth)), axis=-1)
+    known = np.sum(~np.isnan(np.asarray(record.truth)), axis=-1)  # states whose truth is known, by row
     results = []
     for node, estimates in sorted(record.estimates.items(), key=lambda pair: pair[0] != Network.FUSED):
         for name, estimate in estimates.items():
-            nees = record.nees(node, name)
+            rmse, nees = record.rmse(node, name), record.nees(node, name)
+            # Per known state: over all claimed rows together, with the standard error of a mean over rows.
             claimed = ~np.isnan(nees)
-            rmse = record.rmse(node, name)
+            has_nees = bool(claimed.any())
             per_state = nees / np.where(known > 0, known, np.nan)
             results.append(
                 FilterErrors(
@@ -58,15 +59,18 @@ def compare_with_truth(record: Record) -> list[FilterErrors]:
                     claim=weakest(np.unique(estimate.claims).tolist()),
                     rmse=rmse,
                     rmse_error=_estimate_rmse_errors(record, node, name, rmse),
-                    nees=float(nees[claimed].sum() / known[claimed].sum()) if claimed.any() else np.nan,
-                    nees_error=average_correlated(per_state)[1] if claimed.any() else np.nan,
+                    nees=float(nees[claimed].sum() / known[claimed].sum()) if has_nees else np.nan,
+                    nees_error=average_correlated(per_state)[1] if has_nees else np.nan,
                 )
             )
     return results
 
 
 def _estimate_rmse_errors(record: Record, node: str, name: str, rmse: Mapping[str, float]) -> dict[str, float]:
-    """Return the standard error of each RMSE, that of the mean square over twice the RMSE; NaN where there is none."""
+    """Return the standard error of each RMSE by state, that of the mean square over twice the RMSE; NaN without one.
+
+    `rmse`: of the filter `name` at `node`, by state.
+    """
     truth = np.asarray(record.truth)
     squares = np.where(np.isnan(truth), np.nan, record.errors(node, name)) ** 2
     errors = {}
@@ -143,9 +147,10 @@ def list_listeners(network: Network, record: Record) -> Iterator[ListeningFilter
 
 
 def _find_relied_on(network: Network) -> dict[str, set[str]]:
-    """Return the filters that the network relies on, by node: fused ones, else the first of the strongest claim.
+    """Return by node the names of the filters that the network relies on: fused ones, else that of the strongest claim.
 
-    Others, such as one that takes the mean of a random gain for it, are there to be compared with.
+    The first of several such. Others, such as one that takes the mean of a random gain for it, are there to be compared
+    with.
     """
     fused = {fusion.filter for fusion in (network.fused | network.meshes).values() if isinstance(fusion, Fusion)}
     relied_on = {}
@@ -167,33 +172,41 @@ def weighs(filter: AbstractFilter) -> bool:
 def judge_outputs_of_filter(
     network: Network, listener: ListeningFilter, record: Record, inputs: np.ndarray
 ) -> list[OutputHealth]:
-    """Judge each output by the innovations of one filter that claims a covariance.
+    """Return the judgement of each output by the innovations of one filter that claims a covariance.
 
     A median that the node's law of noise has itself, since it is not symmetric, is no bias.
+
+    Args:
+        network: the network.
+        listener: the filter, with what it received.
+        record: what was run, which holds the innovations of filters that weigh.
+        inputs: of the plant (time, inputs).
     """
+    # Innovations with variances and weights (time, outputs); a filter that does not weigh is run for them.
     innovations = record.weighed.get(listener.node, {}).get(listener.name)
-    weighed = innovations is not None
+    has_weights = innovations is not None
     if innovations is None:
         outcome = listener.filter.run(listener.measurements, inputs)
-        variance = np.diagonal(outcome.innovation_covariances, axis1=-2, axis2=-1)
-        innovations = Weighed(outcome.innovations, variance, np.ones_like(outcome.innovations))
-    medians = find_law_medians(network, listener.node, _median_over_time(np.asarray(innovations.variance)))
+        claimed = np.diagonal(outcome.innovation_covariances, axis1=-2, axis2=-1)
+        innovations = Weighed(outcome.innovations, claimed, np.ones_like(outcome.innovations))
+    # What the claim and the noise's law make of them.
+    variance = np.asarray(innovations.variance)
+    medians = find_law_medians(network, listener.node, _median_over_time(variance))
     expected = expect_squares(listener.filter, listener.measurements, inputs)
     laws = list_noise_laws(network, listener.node)
-    # What is told, such as a gain or a flag, is known: its innovations are 0, of variance 0, and it is not judged.
-    variance = np.asarray(innovations.variance)
-    is_known = np.any(variance == 0, axis=0) & ~np.any(variance > 0, axis=0)
-    places = np.flatnonzero(~is_known)
+    # Innovations of what is told, such as a gain or a flag, are 0, of variance 0: it is not judged.
+    is_told = np.any(variance == 0, axis=0) & ~np.any(variance > 0, axis=0)
+    outputs = np.flatnonzero(~is_told)
     judged = judge_outputs(
-        [listener.outputs[i] for i in places],
-        listener.measurements[:, places],
-        Weighed(*(np.asarray(column)[:, places] for column in innovations)),
-        medians[places],
-        blames=weighed and listener.blames,
-        expected=expected[:, places],
-        laws=[laws[i] for i in places],
+        [listener.outputs[i] for i in outputs],
+        listener.measurements[:, outputs],
+        Weighed(*(np.asarray(column)[:, outputs] for column in innovations)),
+        medians[outputs],
+        blames=has_weights and listener.blames,
+        expected=expected[:, outputs],
+        laws=[laws[i] for i in outputs],
     )
-    return [OutputHealth(listener.node, listener.name, weighed, output) for output in judged]
+    return [OutputHealth(listener.node, listener.name, has_weights, output) for output in judged]
 
 
 def _median_over_time(variance: np.ndarray) -> np.ndarray:
@@ -211,23 +224,30 @@ def judge_outputs(
     expected: np.ndarray,
     laws: Sequence[NoiseLaw] | None = None,
 ) -> list[OutputJudgement]:
-    """Judge each output by its innovations (time, m), and by the values that were received (time, m).
+    """Return what the innovations of a filter, and the values that were received, say of each output.
 
-    `medians` (m,): of innovations under a law that is not symmetric. `blames`: whether weights tell of outliers.
-    `expected` (time, m): of the squares, as `expect_squares` returns them.
-    `laws`: of each output's noise; None where they are not known. The bias is that beyond `medians`.
+    Args:
+        names: of the outputs (m).
+        received: values (time, m), NaN where none arrived.
+        innovations: value, variance and weight of each (time, m).
+        medians: of innovations under a law that is not symmetric (m,); the bias is that beyond these.
+        blames: whether weights tell of outliers.
+        expected: of the squares (time, m), as `expect_squares` returns them.
+        laws: of each output's noise; None where they are not known.
     """
     summaries = [
-        summary._replace(bias=summary.bias - m, bias_low=summary.bias_low - m, bias_high=summary.bias_high - m)
-        for summary, m in zip(innovations.summarise(), medians, strict=True)
+        summary._replace(
+            bias=summary.bias - median, bias_low=summary.bias_low - median, bias_high=summary.bias_high - median
+        )
+        for summary, median in zip(innovations.summarise(), medians, strict=True)
     ]
-    outliers = InnovationSummary.find_outlying(summaries) if blames else []
-    used, variance = innovations.square_used(), np.asarray(innovations.variance)
+    outlying = InnovationSummary.find_outlying(summaries) if blames else []
+    squares, variance = innovations.square_used(), np.asarray(innovations.variance)
     judged = []
     for i, (name, summary) in enumerate(zip(names, summaries, strict=True)):
-        size, size_error = compare_squares(used[:, i], expected[:, i])
+        size, size_error = compare_squares(squares[:, i], expected[:, i])
         held = find_held_value(received[:, i], variance[:, i], NO_LAW if laws is None else laws[i])
-        judged.append(OutputJudgement(name, i in outliers, summary, size, size_error, held))
+        judged.append(OutputJudgement(name, i in outlying, summary, size, size_error, held))
     return judged
 
 
@@ -248,8 +268,8 @@ class RecentOutputs:
         self._rows[node, name].append(np.array(row, dtype=float))
         self.left_out[node, name] += sum(weight == 0 for weight in outputs["weight"])
 
-    def health(self) -> list[OutputHealth]:
-        """Summarise each output of each filter over its newest rows."""
+    def summarise_outputs(self) -> list[OutputHealth]:
+        """Return what the newest rows of each filter say of each of its outputs."""
         results = []
         for (node, name), rows in self._rows.items():
             innovations = Weighed(*np.moveaxis(np.array(rows), 1, 0))
@@ -264,7 +284,7 @@ class RecentOutputs:
 
 
 def weighed_outputs(network: Network, record: Record) -> list[OutputHealth]:
-    """Summarise the innovations of all filters that weigh what arrives in a recording, by output."""
+    """Return what the innovations of all filters that weigh what arrives say of each output of a recording."""
     outputs: list[OutputHealth] = []
     for listener in list_listeners(network, record):
         if listener.name in record.weighed.get(listener.node, {}):

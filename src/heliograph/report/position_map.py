@@ -19,7 +19,7 @@ SIGMAS = 2.0
 
 
 def coordinates_of(states: Sequence[str]) -> tuple[int, int] | None:
-    """Return the places of two states that are a position in a plane, by their names; None where there are none."""
+    """Return the indices of two states that are a position in a plane, by their names; None where there are none."""
     plain = [state.split("(")[0].strip().lower() for state in states]
     for first, second in PAIRS:
         if first in plain and second in plain:
@@ -29,19 +29,23 @@ def coordinates_of(states: Sequence[str]) -> tuple[int, int] | None:
 
 @matplotlib.rc_context(STYLE)
 def draw_position_map(record: Record, node: str, names: Sequence[str]) -> Figure:
-    """Draw the paths that filters of a node estimate, with ellipses of two claimed deviations, and the true path."""
-    places = coordinates_of(record.states)
-    assert places is not None  # only then is a map drawn
-    i, j = places
+    """Draw the paths that filters of a node estimate, with ellipses of two claimed deviations, and the true path.
+
+    `names`: of the filters. The record's states have to be a position in a plane (`coordinates_of`).
+    """
+    coordinates = coordinates_of(record.states)
+    assert coordinates is not None  # only then is a map drawn
+    i, j = coordinates
     figure = Figure(figsize=(WIDTH, WIDTH), layout="constrained")
     axes = figure.subplots()
     for number, name in enumerate(names):
         estimate, colour = record.estimates[node][name], COLOURS[number % len(COLOURS)]
-        mean = np.asarray(estimate.mean)
-        axes.plot(mean[:, i], mean[:, j], color=colour, linewidth=1.2, label=quote_for_figure(name))
+        mean = np.asarray(estimate.mean)[:, [i, j]]
+        axes.plot(mean[:, 0], mean[:, 1], color=colour, linewidth=1.2, label=quote_for_figure(name))
         if estimate.claim != "none":
+            covariance = np.asarray(estimate.covariance)
             for k in np.unique(np.linspace(0, len(mean) - 1, ELLIPSES).astype(int)):
-                _add_ellipse(axes, mean[k, [i, j]], np.asarray(estimate.covariance)[k][np.ix_([i, j], [i, j])], colour)
+                _add_ellipse(axes, mean[k], covariance[k][np.ix_([i, j], [i, j])], colour)
     if record.truth is not None:
         axes.plot(record.truth[:, i], record.truth[:, j], color=INK, linestyle=":", label="truth")
     axes.set_aspect("equal", adjustable="datalim")
@@ -52,7 +56,7 @@ def draw_position_map(record: Record, node: str, names: Sequence[str]) -> Figure
 
 
 def _add_ellipse(axes: matplotlib.axes.Axes, center: np.ndarray, covariance: np.ndarray, colour: str) -> None:
-    """Add the ellipse (p - m)' P^-1 (p - m) = SIGMAS^2; nothing where P is no covariance."""
+    """Draw the ellipse (p - m)' P^-1 (p - m) = SIGMAS^2 of centre m and covariance P; nothing if P is not one."""
     if not (np.isfinite(covariance).all() and np.isfinite(center).all()):
         return
     values, vectors = np.linalg.eigh(covariance)

@@ -21,7 +21,7 @@ class Advance(Protocol):
 
 @contextmanager
 def _bar(*more: rich.progress.ProgressColumn) -> Iterator[rich.progress.Progress]:
-    """Show a bar on stderr with the current stage, removed at the end; nothing where stderr is no terminal."""
+    """Show a bar on stderr with the current stage and `more` columns in the block; nothing without a terminal."""
     console = rich.console.Console(stderr=True)
     columns = rich.progress.TextColumn("{task.description}", markup=False), rich.progress.BarColumn(), *more
     with rich.progress.Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
@@ -73,7 +73,7 @@ class Countdown:
             self.warm = self.last
 
     def left(self, total: int) -> float | None:
-        """Return the remaining seconds; None until every worker could do a second piece."""
+        """Return the remaining seconds to `total`; None until every worker could do a second piece."""
         if self.warm is None or self.pieces < 2 * self.workers:
             return None
         (warm_done, warm_time), (done, time) = self.warm, self.last
@@ -82,7 +82,7 @@ class Countdown:
 
 
 def format_remaining(seconds: float | None) -> str:
-    """Put a remaining time into words."""
+    """Return a remaining time in words: "about 3 min left"; None is unknown."""
     if seconds is None:
         return "time left unknown yet"
     for unit, size in (("h", 3600), ("min", 60)):
@@ -95,8 +95,11 @@ def format_remaining(seconds: float | None) -> str:
 def show_countdown(countdown: Countdown) -> Iterator[Callable[[str, int, int], None]]:
     """Show a bar on stderr with the time left, or print a line each minute where stderr is no terminal.
 
-    The context provides a function of (what is being done, how much is done, how much there is). The caller also has to
-    call `countdown.note`, since only it knows what a piece is.
+    The context provides a function show(what is being done, how much is done, how much there is). The caller also has
+    to call `countdown.note`, since only it knows what a piece is.
+
+    Args:
+        countdown: knows the pace of the work.
     """
     columns = (
         rich.progress.MofNCompleteColumn(),

@@ -83,20 +83,17 @@ class HeldValue(NamedTuple):
 def find_held_value(
     values: Float[np.ndarray, " time"], variance: Float[np.ndarray, " time"], law: NoiseLaw = NO_LAW
 ) -> HeldValue | None:
-    """Find the longest run of equal values, if chance makes one as long less than once in 10,000 recordings.
+    """Return the longest run of equal values, if chance makes one as long less than once in 10,000 recordings.
 
-    Of a reading of resolution q the innovation has variance S, of which q^2 / 12 may be that of rounding. It equals the
-    one before it with probability at most p = erf(q / sqrt(8 (S - q^2 / 12))), that of the q about the most probable
-    value; of noise with outliers that is the mean over its branches, each of variance S - r + r_j. A run of n then
-    begins at one of N readings with probability at most N p^(n - 1). The resolution is the least difference of two
-    values; where all values are equal, p = 1/2.
-    A law may repeat a value by itself, as a link that is off gives 0 each time: p is at least the share of the value
-    among the readings outside of the run, and the share of those that equal the one before.
+    A run of n begins at one of N readings with probability at most N p^(n - 1), where p bounds the probability that a
+    reading equals the one before it. It is what the noise allows (`_bound_repetition`). But a law may repeat a value by
+    itself, as a link that is off gives 0 each time: p is at least the share of the value among the readings outside of
+    the run, and the share of those that equal the one before. Where all values are equal, p = 1/2.
 
     Args:
         values: what was received (time,), NaN where nothing arrived.
-        variance: claimed variance S of the innovations (time,).
-        law: of the noise, r, which is part of S; Gaussian by default.
+        variance: claimed variance of the innovations (time,).
+        law: of the noise; Gaussian by default.
     """
     rows = np.flatnonzero(~np.isnan(values) & (variance > 0))
     if len(rows) < 3:
@@ -106,30 +103,50 @@ def find_held_value(
     starts = np.flatnonzero(np.concatenate([[True], received[1:] != received[:-1]]))
     lengths = np.diff(np.concatenate([starts, [len(received)]]))
     longest = int(np.argmax(lengths))
-    # The probability that chance repeats a value.
-    levels = np.unique(received)
-    resolution = float(np.min(np.diff(levels))) if len(levels) > 1 else 0.0
-    spread = max(float(np.median(variance[rows])) - law.total, 0.0) + law.variance - resolution**2 / 12
-    with np.errstate(divide="ignore", invalid="ignore"):
-        by_law = float(law.share @ np.where(spread > 0, erf(resolution / np.sqrt(8 * np.abs(spread))), 1.0))
-    repeats = max(by_law, *_shares_outside_run(received, starts[longest], lengths[longest])) if len(levels) > 1 else 0.5
-    if repeats >= 1:
+    start, length = int(starts[longest]), int(lengths[longest])
+    # p, and the logarithm of the expected number of runs as long.
+    p = 0.5
+    if length < len(received):
+        by_noise = _bound_repetition(received, float(np.median(variance[rows])), law)
+        p = max(by_noise, *_shares_outside_run(received, start, length))
+    if p >= 1:
         return None
-    log_expected = np.log(len(received)) + (int(lengths[longest]) - 1) * np.log(max(repeats, 1e-300))
-    if lengths[longest] < 3 or log_expected > np.log(SELDOM):
+    log_expected = np.log(len(received)) + (length - 1) * np.log(max(p, 1e-300))
+    if length < 3 or log_expected > np.log(SELDOM):
         return None
-    start = int(starts[longest])
     return HeldValue(
         value=float(received[start]),
         first_row=int(rows[start]),
-        readings=int(lengths[longest]),
+        readings=length,
         received=len(received),
-        stuck=int(longest_by_chance(np.array(repeats))),
+        stuck=int(longest_by_chance(np.array(p))),
     )
 
 
+def _bound_repetition(readings: Float[np.ndarray, " n"], variance: float, law: NoiseLaw) -> float:
+    """Return a bound p of the probability that noise makes a reading equal to the one before it.
+
+    Of readings of resolution q, the least difference of two, the innovation has variance S, of which q^2 / 12 may be
+    that of rounding: p = erf(q / sqrt(8 (S - q^2 / 12))), the probability of the q about the most probable value. Of
+    noise of several branches j, with variance r_j each and r of the whole, p is the mean over them, each with
+    S - r + r_j in place of S.
+
+    Args:
+        readings: not all equal.
+        variance: S.
+        law: shares and variances of the branches.
+    """
+    resolution = float(np.min(np.diff(np.unique(readings))))
+    smooth = max(variance - law.total, 0.0) + law.variance - resolution**2 / 12
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return float(law.share @ np.where(smooth > 0, erf(resolution / np.sqrt(8 * np.abs(smooth))), 1.0))
+
+
 def _shares_outside_run(readings: Float[np.ndarray, " n"], start: int, length: int) -> tuple[float, float]:
-    """Return the share of a run's value outside of it, and the share of readings there that equal the one before."""
+    """Return shares among the readings outside of a run: those with its value, and those equal to the one before.
+
+    The run of `length` begins at reading `start`.
+    """
     outside = np.ones(len(readings), dtype=bool)
     outside[start : start + length] = False
     equal = (readings[1:] == readings[:-1])[outside[1:] & outside[:-1]]

@@ -37,7 +37,7 @@ def find_pattern(arrived: Bool[np.ndarray, " time"]) -> Pattern | None:
 
 
 def _find_least_probable_rows(arrived: Bool[np.ndarray, " rows"]) -> Bool[np.ndarray, " length"] | None:
-    """Return the pattern that chance makes least: which of its rows are due; None where chance may make each."""
+    """Return the pattern that chance makes least, as which of its rows are due; None where chance may make each."""
     arrivals = np.flatnonzero(arrived)
     intervals = np.diff(arrivals)
     law = LossLaw.of_intervals(intervals)

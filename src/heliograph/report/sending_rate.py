@@ -48,10 +48,10 @@ def find_rate(arrived: Bool[np.ndarray, " time"]) -> Rate | None:
     if rate is not None:
         return rate
     rows = np.flatnonzero(arrived)
-    empty = _find_line(~arrived[rows[0] : rows[-1]]) if len(rows) else None
-    if empty is None or np.any(np.diff(empty.slots) > 1):
+    rate_of_empty = _find_line(~arrived[rows[0] : rows[-1]]) if len(rows) else None
+    if rate_of_empty is None or np.any(np.diff(rate_of_empty.slots) > 1):
         return None
-    return Rate(1 / (1 - 1 / empty.period), np.arange(np.count_nonzero(arrived)))
+    return Rate(1 / (1 - 1 / rate_of_empty.period), np.arange(np.count_nonzero(arrived)))
 
 
 def _find_line(arrived: Bool[np.ndarray, " time"]) -> Rate | None:
@@ -63,27 +63,30 @@ def _find_line(arrived: Bool[np.ndarray, " time"]) -> Rate | None:
     if len(rows) < FEWEST or len(rows) == 1 + np.ptp(rows):
         return None
     law, found = LossLaw.of_intervals(np.diff(rows)), None
-    decides = rows[0] + np.arange(min(1 + int(np.ptp(rows)), ENOUGH))
+    deciding_rows = rows[0] + np.arange(min(1 + int(np.ptp(rows)), ENOUGH))
+    arrivals_after_first = int(np.sum(rows <= deciding_rows[-1])) - 1
     for frequency in _find_peaks(arrived):
         # Due rows have phases within 1 / T = frequency: the other 1 - frequency of the circle is empty, about.
-        if _find_gap(frequency, rows)[1] < 1 - frequency - OFF:
+        _, gap = _find_gap(frequency, rows)
+        if gap < 1 - frequency - OFF:
             continue
+        # Each arrival is in a period of its own.
         line = _find_narrowest_line(frequency, rows)
         slots = np.floor(line.phases(rows)).astype(np.int64)
         if line.width >= 1 or np.any(np.diff(slots) < 1):
             continue
         # The chance counts for each line that would have been taken: rate, phase, width, first and last row, of each of
         # which the rows tell as many values apart as there are rows.
-        due = np.mod(line.phases(decides) + ROUNDING, 1) <= line.width + 2 * ROUNDING
-        chance = law.log_chance_within(due, int(np.sum(rows <= decides[-1])) - 1) + 5 * np.log(len(arrived))
+        due = np.mod(line.phases(deciding_rows) + ROUNDING, 1) <= line.width + 2 * ROUNDING
+        log_chance = law.log_chance_within(due, arrivals_after_first) + 5 * np.log(len(arrived))
         # Multiples of a frequency that passes do so too: the least is the sender's.
-        if chance < np.log(CHANCE) and (found is None or line.frequency < 1 / found.period):
+        if log_chance < np.log(CHANCE) and (found is None or line.frequency < 1 / found.period):
             found = Rate(1 / line.frequency, slots - slots[0])
     return found
 
 
 def _find_peaks(arrived: Bool[np.ndarray, " time"]) -> list[float]:
-    """Return frequencies to look at, in periods a row: of the usual intervals, and of the spectrum's largest peaks.
+    """Return frequencies to look at, in periods a row: of usual intervals, and of the largest peaks of the spectrum.
 
     A spectrum does not tell a frequency f from 1 - f: both are returned.
     """
@@ -98,7 +101,7 @@ def _find_peaks(arrived: Bool[np.ndarray, " time"]) -> list[float]:
 
 
 def _find_gap(frequency: float, rows: Int[np.ndarray, " arrivals"]) -> tuple[float, float]:
-    """Return the middle and the length of the largest part of a period, as a circle of length 1, without an arrival."""
+    """Return middle and length of the largest part of a period, as a circle of length 1, in which no arrival falls."""
     order = np.sort(np.mod(frequency * rows, 1))
     gaps = np.diff(order, append=order[0] + 1)
     largest = int(np.argmax(gaps))
@@ -106,7 +109,7 @@ def _find_gap(frequency: float, rows: Int[np.ndarray, " arrivals"]) -> tuple[flo
 
 
 def _find_narrowest_line(frequency: float, rows: Int[np.ndarray, " arrivals"]) -> _Line:
-    """Return the narrowest line through rows near a frequency, of which each row keeps its whole number of periods.
+    """Return the narrowest line through arrivals' rows near a frequency; each keeps its whole number of periods.
 
     Then the width is a convex function of the frequency: thirds that cannot hold its minimum are cut off.
     """

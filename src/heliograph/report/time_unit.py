@@ -20,27 +20,28 @@ def doubt_time_unit(
     inputs: Float[np.ndarray, "time inputs"],
     names: Sequence[str],
 ) -> str:
-    """Say that times are in another unit, where innovations are as claimed with it and not without it; else "".
+    """Return the sentence that times are in another unit, if innovations are as claimed in it and not else; or "".
 
     Args:
         name: of the filter.
         filter: a filter that claims a covariance.
         measurements: what it received (time, m), NaN where nothing arrived.
-        inputs: its inputs (time, inputs), of which dt is one.
+        inputs: its inputs (time, inputs), of which dt, the time between rows, is one.
         names: of the inputs.
     """
     if TIME_STEP not in names:
         return ""
     column = list(names).index(TIME_STEP)
-    stated = filter.run(measurements, inputs)
-    if _is_as_claimed(stated.innovations, stated.innovation_covariances):
+    as_stated = filter.run(measurements, inputs)
+    if _is_as_claimed(as_stated.innovations, as_stated.innovation_covariances):
         return ""
     for factor, words in UNITS.items():
         scaled = np.array(inputs, dtype=float)
         scaled[:, column] *= factor
-        other = filter.run(measurements, scaled)
-        gain = other.log_likelihood - stated.log_likelihood
-        if gain > CLEAR and _is_as_claimed(other.innovations, other.innovation_covariances):
+        in_unit = filter.run(measurements, scaled)
+        gain = in_unit.log_likelihood - as_stated.log_likelihood
+        if gain > CLEAR and _is_as_claimed(in_unit.innovations, in_unit.innovation_covariances):
+            # The first row has none before it, so that its dt says little.
             usual = float(np.median(inputs[1:, column])) if len(inputs) > 1 else float(inputs[0, column])
             return (
                 f"dt is {usual:g} between rows, and seems to be in another unit than the plant: with {words}, "

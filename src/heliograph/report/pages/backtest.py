@@ -39,7 +39,7 @@ class CoverageMiss:
         return self.score.coverage[self.level].value - CLAIMED[self.level]
 
     def describe(self) -> str:
-        """Say which interval held how much."""
+        """Return which interval held how much, in words."""
         s, share = self.score, self.score.coverage[self.level]
         return (f"{s.part} {s.name}, {s.horizon} ahead: the interval of {SHARES[self.level]} held {share.value:.1%} "
                 f"+- {share.error:.1%}: {'too sure' if self.excess < 0 else 'too cautious'}")  # fmt: skip
@@ -54,7 +54,7 @@ class FilterVerdict:
     misses: Sequence[CoverageMiss]
 
     def summarise(self) -> str:
-        """Say in a word whether its forecasts hold."""
+        """Return what its forecasts are worth in words: "hold", "are off", "are too sure" or "are too cautious"."""
         if not self.misses:
             return "hold"
         if all(miss.excess < 0 for miss in self.misses):
@@ -62,7 +62,7 @@ class FilterVerdict:
         return "are off" if any(miss.excess < 0 for miss in self.misses) else "are too cautious"
 
     def describe(self) -> str:
-        """Say it with numbers, and with the interval that is furthest off."""
+        """Return what its forecasts are worth, with numbers, and with the interval that is furthest off."""
         if not self.misses:
             return f"{self.name}: all {self.compared} intervals held what they claim, as far as chance lets tell."
         worst = max(self.misses, key=lambda miss: abs(miss.excess))
@@ -86,7 +86,7 @@ def make_backtest_results(found: "heliograph.forecasting.Backtest", network: str
 
 
 def judge_filters(found: "heliograph.forecasting.Backtest") -> list[FilterVerdict]:
-    """Compare the intervals of each filter with what came; filters with the largest share of misses come first."""
+    """Return the verdict on each filter by its intervals and what came, the largest share of misses first."""
     verdicts = []
     for name in dict.fromkeys(f"{s.node}/{s.filter}" for s in found.scores):
         scores = [s for s in found.scores if f"{s.node}/{s.filter}" == name and s.compared]
@@ -97,7 +97,7 @@ def judge_filters(found: "heliograph.forecasting.Backtest") -> list[FilterVerdic
 
 
 def list_doubts(found: "heliograph.forecasting.Backtest") -> list[str]:
-    """List coverages that are further from what was claimed than chance explains, a line each."""
+    """Return a line for each coverage that is further from what was claimed than chance explains."""
     return [f"{v.name}, {miss.describe()}" for v in judge_filters(found) for miss in v.misses]
 
 
@@ -109,13 +109,21 @@ def _draw_coverage(found: "heliograph.forecasting.Backtest") -> Figure:
     nodes = {node for node, _, _ in numbers}
     figure, panels = stacked_panels(len(numbers), 1.3, 0.9)
     for axes, (node, part, name) in zip(panels, numbers, strict=True):
-        for place, filter in enumerate(filters):
+        for i, filter in enumerate(filters):
             scores = [s for s in found.scores if (s.node, s.part, s.name, s.filter) == (node, part, name, filter)]
             shares = [s.coverage[DRAWN] for s in scores]
-            shift = 0.04 * (place - (len(filters) - 1) / 2)  # on a scale of logarithms, so that none hides another
-            axes.errorbar([s.horizon * np.exp(shift) for s in scores], [x.value for x in shares],
-                          [2 * x.error for x in shares], label=quote_for_figure(filter) if axes is panels[0] else None,
-                          color=COLOURS[place % len(COLOURS)], marker="o", markersize=4, linewidth=1)  # fmt: skip
+            # On a logarithmic axis each filter is shifted by the same length, so that none hides another.
+            shift = np.exp(0.04 * (i - (len(filters) - 1) / 2))
+            axes.errorbar(
+                [s.horizon * shift for s in scores],
+                [share.value for share in shares],
+                [2 * share.error for share in shares],
+                label=quote_for_figure(filter) if axes is panels[0] else None,
+                color=COLOURS[i % len(COLOURS)],
+                marker="o",
+                markersize=4,
+                linewidth=1,
+            )
         axes.axhline(CLAIMED[DRAWN], color=MUTED, linewidth=1, linestyle="--")
         axes.set_title(quote_for_figure(f"{part} {name}" if len(nodes) == 1 else f"{node}: {part} {name}"))
         axes.set(ylim=(-0.03, 1.03), yticks=[0, 0.4, 0.8], xscale="log")
@@ -129,25 +137,38 @@ def _draw_coverage(found: "heliograph.forecasting.Backtest") -> Figure:
 def make_backtest_page(
     found: "heliograph.forecasting.Backtest", network: str, drawings: Mapping[str, bytes], refit: int = 0
 ) -> Page:
-    """Return the page; `drawings` holds each figure as SVG, `refit` is how many rows lay between fits, 0 for none."""
+    """Return the page of a backtest.
+
+    Args:
+        found: the scores.
+        network: the user's name of the network.
+        drawings: each figure as SVG.
+        refit: rows between fits of its free numbers; 0 by default, for none.
+    """
     verdicts = judge_filters(found)
     lead = (
         f"From each of {found.rows:,} rows `{visible(network)}` forecast {', '.join(map(str, found.horizons))} rows "
         "ahead, as if nothing more arrived; scored is what came."
-        + (f" Its free numbers were fitted every {refit} rows, to those before." if refit else "")
     )
+    if refit:
+        lead += f" Its free numbers were fitted every {refit} rows, to those before."
     caption = (
         f"Share of what came within the interval of {SHARES[DRAWN]}, with two standard errors, which know that "
         "forecasts overlap; the dashed line is what was claimed."
     )
     not_drawn = len({(s.node, s.part, s.name) for s in found.scores}) - PANELS
-    caption += f" {not_drawn} more numbers are in the table." if not_drawn > 0 else ""
+    if not_drawn > 0:
+        caption += f" {not_drawn} more numbers are in the table."
     sentences = [visible(v.describe()) for v in verdicts[:LISTED]]
     if len(verdicts) > LISTED:
         sentences.append(f"{len(verdicts) - LISTED} more filters, none of them further off: in the table.")
     by_horizon: list[Picture | Table] = [Picture(drawings["coverage"], caption, caption), _make_score_table(found)]
-    return Page(f"Heliograph backtest: {visible(network)}", _make_title(verdicts), lead,
-                [Section("At a glance", [Points(sentences)]), Section("By horizon", by_horizon)])  # fmt: skip
+    return Page(
+        kicker=f"Heliograph backtest: {visible(network)}",
+        title=_make_title(verdicts),
+        lead=lead,
+        sections=[Section("At a glance", [Points(sentences)]), Section("By horizon", by_horizon)],
+    )
 
 
 def _make_title(verdicts: Sequence[FilterVerdict]) -> str:

@@ -49,7 +49,7 @@ class DesignResults:
 
 
 def design_results(results: DesignResults) -> Results:
-    """Return the content of the results folder."""
+    """Return the content of the results folder of a design: figures, page, summary and the two networks' sources."""
     return Results(
         draw_figures(results), partial(make_page, results), make_summary(results), partial(write_networks, results)
     )
@@ -68,7 +68,7 @@ def mean_powers(design: PowerDesign) -> dict[str, float]:
 
 
 def make_summary(results: DesignResults) -> dict[str, Json]:
-    """Return all numbers of the report."""
+    """Return all numbers of the report of a design by name, as summary.json holds them."""
     design, certificate = results.design, results.design.certificate
     # JSON has no arrays: all numbers become lists.
     best = None if results.map is None else dict(zip(("x", "y", "error"), results.map.best, strict=True))

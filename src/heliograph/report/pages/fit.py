@@ -7,11 +7,13 @@ from functools import partial
 import matplotlib
 import numpy as np
 import scipy
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from heliograph.disk.quoting import quote_for_figure, visible
 from heliograph.learning.fitting import Fit
 from heliograph.learning.held_out import Change, Uniformity
+from heliograph.learning.likelihood_maximum import Row
 from heliograph.learning.losses.losses import Losses
 from heliograph.report.figures import (
     AMBER,
@@ -78,22 +80,19 @@ def draw_fit_figures(learned: FitResults) -> dict[str, Figure]:
 def _draw_estimates(learned: FitResults) -> Figure:
     """Draw a panel for each number, since units differ: start, estimates by both forms of the likelihood, intervals."""
     rows = learned.fit.rows()[:MOST]
-    forms = [solution.form for solution in learned.fit.solutions]
-    by_form = {form: learned.fit.rows(form=form) for form in forms}
+    # The form that counts is last: it is drawn first, on top.
+    forms = [solution.form for solution in reversed(learned.fit.solutions)]
+    by_form = [learned.fit.rows(form=form) for form in forms]
     figure, grid = stacked_panels(len(rows), 0.62, 0.6, sharex=False)
     for i, (axes, row) in enumerate(zip(grid, rows, strict=True)):
-        # The form that counts is on top; a cross marks a number that the data do not determine.
-        for j, form in enumerate(reversed(forms)):
-            estimated = by_form[form][i]
-            color, width = (BLUE, 3.0) if j == 0 else (MUTED, 1.5)
-            ends = [estimated.low, estimated.high]
-            if np.isfinite(ends).all():
-                axes.plot(ends, [-j, -j], color=color, linewidth=width, alpha=0.7)
-            axes.plot(estimated.estimate, -j, "o" if estimated.identified else "x", color=color, markersize=6)
-        axes.plot(learned.starts[row.name], 0.6, "v", color=AMBER, markersize=5, clip_on=False)
+        for height, estimates in enumerate(by_form):
+            color, width = (BLUE, 3.0) if height == 0 else (MUTED, 1.5)
+            _draw_estimate(axes, estimates[i], -height, color, width)
+        start = learned.starts[row.name]
+        axes.plot(start, 0.6, "v", color=AMBER, markersize=5, clip_on=False)
         # A positive number that is known to a factor of ten or worse is shown by its logarithm.
-        ends = [row.low, row.high, row.estimate, learned.starts[row.name]]
-        if min(ends) > 0 and max(ends) > LOGARITHMIC * min(ends):
+        shown = [row.low, row.high, row.estimate, start]
+        if min(shown) > 0 and max(shown) > LOGARITHMIC * min(shown):
             axes.set_xscale("log")
         axes.set_ylim(-len(forms) + 0.4, 0.9)
         axes.set_yticks([])
@@ -101,6 +100,14 @@ def _draw_estimates(learned: FitResults) -> Figure:
         axes.margins(x=0.08)
         axes.grid(visible=False, axis="y")
     return figure
+
+
+def _draw_estimate(axes: Axes, row: Row, height: float, color: str, width: float) -> None:
+    """Draw an estimate and its interval, if it has one, at a height; a cross if the data do not determine it."""
+    ends = [row.low, row.high]
+    if np.isfinite(ends).all():
+        axes.plot(ends, [height, height], color=color, linewidth=width, alpha=0.7)
+    axes.plot(row.estimate, height, "o" if row.identified else "x", color=color, markersize=6)
 
 
 @matplotlib.rc_context(STYLE)
@@ -201,11 +208,16 @@ def _list_key_figures(learned: FitResults) -> list[KeyFigures]:
 
 
 def _make_estimates_table(learned: FitResults, drawings: Mapping[str, bytes]) -> list[Picture | Table]:
-    """Return the figure of the estimates, and the table with start, estimate and interval of each number."""
-    starts = learned.starts
-    rows = [
-        [visible(row.name), f"{starts[row.name]:.4g}", row.value, row.interval, row.form] for row in learned.fit.table
-    ]
+    """Return the figure of the estimates, and the table with start, estimate and interval of each number.
+
+    `drawings`: each figure as SVG.
+    """
+    picture = Picture(
+        drawings["estimates"],
+        "Each number with its interval and its start, on a scale of its own.",
+        "Estimates with their intervals (blue: the form that counts, grey: the other), from the starts (triangles). "
+        "A cross: the data do not determine it.",
+    )
     form = (
         "of the likelihood; the **conditional** one is sharper and counts where there is one, the **linear** one needs "
         "no more than second moments."
@@ -216,12 +228,10 @@ def _make_estimates_table(learned: FitResults, drawings: Mapping[str, bytes]) ->
         "95 % intervals that allow for scores that are correlated over time (long-run variance by cosines). "
         f"**Form**: {form}"
     )
-    picture = Picture(
-        drawings["estimates"],
-        "Each number with its interval and its start, on a scale of its own.",
-        "Estimates with their intervals (blue: the form that counts, grey: the other), from the starts (triangles). "
-        "A cross: the data do not determine it.",
-    )
+    starts = learned.starts
+    rows = [
+        [visible(row.name), f"{starts[row.name]:.4g}", row.value, row.interval, row.form] for row in learned.fit.table
+    ]
     return [picture, Table(["number", "start", "estimate", "95 %", "form"], rows, caption)]
 
 
@@ -309,6 +319,6 @@ def _make_delays_section(learned: FitResults) -> list[Section]:
     return [Section("How late measurements are", [table])] if rows else []
 
 
-def pages(learned: FitResults) -> "partial[Page]":
-    """Return a function that makes the page of the drawn figures."""
+def make_page_of_drawings(learned: FitResults) -> "partial[Page]":
+    """Return the function that makes the page of a fit from its figures as SVG."""
     return partial(make_fit_page, learned)

@@ -37,40 +37,43 @@ def draw_deliveries(health: Health) -> Figure:
 
 
 def make_links_blocks(health: Health, drawings: Mapping[str, bytes]) -> list[Table | Picture | Text]:
-    """Return the table of links, their figure, and what nodes share.
+    """Return the table of links, their figure, what was refused, and what nodes share.
 
-    Of each link: when it is due, what arrived, its longest gap, and mean and deviation of its values.
+    Of each link: when it is due, what arrived, its longest gap, and mean and deviation of its values. `drawings`: each
+    figure as SVG.
     """
-    rows = []
-    for link in health.links:
-        mean, deviation = _format_mean_and_deviation(link.values)
-        known = "may be lost" if link.may_be_lost else "never lost"
-        name = visible(f"{link.node}: {link.component}")
-        gap = "–" if link.due is None else str(link.longest_gap)
-        quiet = health.silences.get(link.node)
-        past = ["–" if quiet is None else f"{len(quiet.rows)}, up to {quiet.lengths.max():g}"] * bool(health.silences)
-        rows.append([name, link.due_in, _format_share(link, "{:.1%}", "–"), gap, *past, known, mean, deviation])
-    # The column on timeouts, if a sender has one and was silent for longer.
-    past = ["past its timeout"] * bool(health.silences)
-    headers = ["received", "due", "arrived", "longest gap", *past, "the network says", "mean", "std. deviation"]
     unit = health.record.units.get("time", "s" if health.record.time.dtype.kind == "M" else "the unit of time")
-    slower = (
+    explained = (
         f"**Due**: a sender that is slower than the rows is due at its own regular intervals (in {unit}), declared or "
         "found. One that is due in some of so many rows or intervals is so by a pattern that losses would not leave. "
         "Where each row is a message of some node, nobody knows when another without such an interval is due. A "
         "**gap** counts what was due and did not come."
     )
+    needs_words = any(link.due_in != "each row" for link in health.links)
     caption = _caption_deliveries(health)
     picture = [Picture(drawings["links"], caption, caption)] if "links" in drawings else []
-    left = [f"{link.node}: {link.component}" for link in health.links[MOST:]]
-    missing = say_not_drawn(left, "Their numbers are in the table.")
+    not_drawn = [f"{link.node}: {link.component}" for link in health.links[MOST:]]
+    # The column on timeouts is there if a sender has one and was silent for longer.
+    past = ["past its timeout"] * bool(health.silences)
+    headers = ["received", "due", "arrived", "longest gap", *past, "the network says", "mean", "std. deviation"]
     return [
-        Table(headers, rows, slower if any(link.due_in != "each row" for link in health.links) else ""),
+        Table(headers, [_make_link_cells(health, link) for link in health.links], explained if needs_words else ""),
         *picture,
-        *missing,
+        *say_not_drawn(not_drawn, "Their numbers are in the table."),
         *_list_refused(health),
         *describe_shared(health.shared),
     ]
+
+
+def _make_link_cells(health: Health, link: Arrivals) -> list[str]:
+    """Return a link's row of the table, in the order of the headers of `make_links_blocks`."""
+    mean, deviation = _format_mean_and_deviation(link.values)
+    name = visible(f"{link.node}: {link.component}")
+    gap = "–" if link.due is None else str(link.longest_gap)
+    quiet = health.silences.get(link.node)
+    past = ["–" if quiet is None else f"{len(quiet.rows)}, up to {quiet.lengths.max():g}"] * bool(health.silences)
+    says = "may be lost" if link.may_be_lost else "never lost"
+    return [name, link.due_in, _format_share(link, "{:.1%}", "–"), gap, *past, says, mean, deviation]
 
 
 def _list_refused(health: Health) -> list[Table]:
@@ -107,7 +110,7 @@ def _caption_deliveries(health: Health) -> str:
 
 
 def _format_share(link: Arrivals, form: str, unknown: str) -> str:
-    """Return the share that arrived in this form, or what stands for it where nobody knows how many were due."""
+    """Return the share of a link's messages that arrived, in this form; `unknown` if nobody knows what was due."""
     return unknown if link.due is None else form.format(link.share)
 
 

@@ -17,7 +17,7 @@ PANELS = 12  # numbers of a node that are drawn; the table of estimates has all
 
 
 def predicted_figures(health: Health) -> dict[str, Figure]:
-    """Return a figure for each node whose filters predict what arrives, by file name; none unless asked for."""
+    """Return {file name: figure} of predictions by node, and of residuals by filter; none unless asked for."""
     figures = {f"predicted_{i}": _draw_predicted(health, node) for i, node in enumerate(_list_nodes(health)[:MOST])}
     for i, (_, judged) in enumerate(_list_residuals(health)[:MOST]):
         figures[f"residuals_{i}"] = judged.figure(health.record.time)
@@ -25,31 +25,36 @@ def predicted_figures(health: Health) -> dict[str, Figure]:
 
 
 def predicted_sections(health: Health, drawings: Mapping[str, bytes]) -> list[Section]:
-    """Return the section of the page with these figures; none unless predictions were asked for."""
+    """Return the sections of a run's page on predictions and residuals; none unless predictions were asked for.
+
+    `drawings`: each figure as SVG, by the names of `predicted_figures`.
+    """
     if not health.predicted:
         return []
-    nodes = _list_nodes(health)
-    places = {node: f"predicted_{i}" for i, node in enumerate(nodes[:MOST])}
-    pictures = {
-        node: Picture(drawings[name], f"What filters of {visible(node)} predicted, and what arrived",
-                      f"{visible(node)}: predictions of what arrives, with bands of {BAND:g} claimed deviations on "
-                      "each side, and the data.")
-        for node, name in places.items() if name in drawings
-    }  # fmt: skip
-    text = (
+    intro = (
         "What each filter expected of a row, given the rows before it: also where nothing arrived. Of what arrived, "
         "95 of 100 should lie in the band of a filter whose claim is exact."
     )
-    left = [node for node in nodes if node not in pictures]
-    missing = say_not_drawn(left, "Their predictions are in the table of estimates.")
+    nodes = _list_nodes(health)
+    pictures = {}
+    for i, node in enumerate(nodes[:MOST]):
+        if (name := f"predicted_{i}") in drawings:
+            caption = (
+                f"{visible(node)}: predictions of what arrives, with bands of {BAND:g} claimed deviations on each "
+                "side, and the data."
+            )
+            title = f"What filters of {visible(node)} predicted, and what arrived"
+            pictures[node] = Picture(drawings[name], title, caption)
+    not_drawn = [node for node in nodes if node not in pictures]
+    missing = say_not_drawn(not_drawn, "Their predictions are in the table of estimates.")
     return [
-        Section("Predictions", [Text([text]), *choose_picture(pictures), *missing]),
+        Section("Predictions", [Text([intro]), *choose_picture(pictures), *missing]),
         *_make_residual_sections(health, drawings),
     ]
 
 
 def _list_residuals(health: Health) -> "list[tuple[str, heliograph.forecasting.Residuals]]":
-    """Return the residuals of each filter, what it did not predict, after "node/filter"."""
+    """Return ("node/filter", residuals: what it did not predict) of each filter."""
     return [(f"{node}/{name}", one) for node, filters in health.residuals.items() for name, one in filters.items()]
 
 
@@ -72,7 +77,7 @@ def _make_residual_sections(health: Health, drawings: Mapping[str, bytes]) -> li
 
 
 def _list_nodes(health: Health) -> list[str]:
-    """Return the nodes that have a filter which predicts what arrives."""
+    """Return the names of nodes with a filter that predicts what arrives."""
     return [
         node
         for node, filters in health.predicted.items()

@@ -160,11 +160,12 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
         drawings: each figure as SVG, by the names of `run_figures`; left out where the page would be too large.
 
     Raises:
-        ValueError: `health` is no diagnosis, or `network` no text.
+        ValueError: `health` is not what `examine` returns, or `network` is no text.
     """
     instance("health", health, Health, "what examine returns")
     instance("name of the network", network, str, "a text")
     record, doubts, drawings = health.record, health.warnings(), limit_size_of_drawings(drawings, PAGE)
+    rows = f"{len(record.time):,} rows, {_describe_span(record)}"
     glance = [
         _make_key_figures(health, len(doubts)),
         *_list_doubts(doubts),
@@ -172,15 +173,15 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
         *_list_premises(health),
         *_list_overloads(record),
     ]
+    forecasts = [Section("Forecasts", forecast_tables(record, health.forecasts))] if health.forecasts else []
     return Page(
         kicker=f"Heliograph run: {visible(network)}",
         title=_find_headline(health),
-        lead=f"The filters of `{visible(network)}` ran over {len(record.time):,} rows, {_describe_span(record)}. "
-        + _describe_agreement(health, doubts),
+        lead=f"The filters of `{visible(network)}` ran over {rows}. {_describe_agreement(health, doubts)}",
         sections=[
             Section("At a glance", glance),
             Section("Estimates", [*make_errors_table(record), *_list_pictures(health, drawings)]),
-            *([Section("Forecasts", forecast_tables(record, health.forecasts))] if health.forecasts else []),
+            *forecasts,
             *predicted_sections(health, drawings),
             make_innovations_section(health, drawings),
             Section("Links", make_links_blocks(health, drawings)),
@@ -217,7 +218,10 @@ def limit_size_of_drawings(drawings: Mapping[str, bytes], limit: int) -> dict[st
 
 
 def _find_headline(health: Health) -> str:
-    """Return the last estimate of the filter that the network relies on: its first two states, or its position."""
+    """Return the title of a run's page: the last estimate of the filter that the network relies on.
+
+    Its first two states, or its position, with bands where it claims a covariance.
+    """
     record = health.record
     nodes = _nodes_to_draw(record)
     if not nodes:
@@ -228,9 +232,9 @@ def _find_headline(health: Health) -> str:
     estimate = record.estimates[node][name]
     mean = np.asarray(estimate.mean)[-1]
     deviation = np.sqrt(np.maximum(np.diagonal(np.asarray(estimate.covariance)[-1]), 0.0))
-    shown = coordinates_of(record.states) or tuple(range(min(len(mean), 2)))
+    shown_states = coordinates_of(record.states) or tuple(range(min(len(mean), 2)))
     numbers = []
-    for i in shown:
+    for i in shown_states:
         band = f" ± {round_to(BAND * deviation[i], deviation[i])}" if estimate.claim != "none" else ""
         state, unit = record.states[i], record.units.get(record.states[i], "")
         numbers.append(f"{visible(state)} {round_to(mean[i], deviation[i])}{band} {visible(unit)}".strip())
@@ -238,25 +242,29 @@ def _find_headline(health: Health) -> str:
 
 
 def _list_pictures(health: Health, drawings: Mapping[str, bytes]) -> list[Picture | PictureChoice | Text]:
-    """Return the map of a position if there is one, the estimates by node, then the smoothed ones if there are any."""
+    """Return the pictures of the filtered estimates, then of the smoothed ones if there are any.
+
+    Of each kind the map of a position if there is one, estimates and probabilities of modes by node, and a text that
+    names what is not drawn. `drawings`: each figure as SVG, by its name.
+    """
     pictures: list[Picture | PictureChoice | Text] = []
     for kind, record in _collect_estimates(health):
+        nodes = _nodes_to_draw(record)
         added = ", given later data too" if kind == "smoothed" else ""
         if (name := _map_name(kind)) in drawings:
-            text = f"The path that {visible(_nodes_to_draw(record)[0])} estimates{added}"
+            text = f"The path that {visible(nodes[0])} estimates{added}"
             pictures.append(Picture(drawings[name], text, f"{text}, with ellipses of {BAND:g} claimed deviations."))
-        pictures += choose_picture({
-            node: Picture(drawings[f"{kind}_{i}"], f"Estimates of {visible(node)} over time with bands{added}",
-                          f"{visible(node)}: estimates with bands of {BAND:g} claimed standard deviations on each "
-                          f"side{added}.")
-            for i, node in enumerate(_nodes_to_draw(record)) if f"{kind}_{i}" in drawings
-        })  # fmt: skip
-        pictures += choose_picture({
-            node: Picture(drawings[f"{PREFIX}{kind}_{i}"], f"Modes at {visible(node)} over time{added}",
-                          f"{visible(node)}: probability of each mode{added}.")
-            for i, node in enumerate(_nodes_to_draw(record)) if f"{PREFIX}{kind}_{i}" in drawings
-        })  # fmt: skip
-        absent = [node for i, node in enumerate(_nodes_to_draw(record)) if f"{kind}_{i}" not in drawings]
+        estimates, modes = {}, {}
+        for i, node in enumerate(nodes):
+            if (name := f"{kind}_{i}") in drawings:
+                title = f"Estimates of {visible(node)} over time with bands{added}"
+                bands = f"with bands of {BAND:g} claimed standard deviations on each side"
+                estimates[node] = Picture(drawings[name], title, f"{visible(node)}: estimates {bands}{added}.")
+            if (name := f"{PREFIX}{kind}_{i}") in drawings:
+                title = f"Modes at {visible(node)} over time{added}"
+                modes[node] = Picture(drawings[name], title, f"{visible(node)}: probability of each mode{added}.")
+        pictures += [*choose_picture(estimates), *choose_picture(modes)]
+        absent = [node for node in nodes if node not in estimates]
         pictures += say_not_drawn(absent, f"Their figures are files beside this page ({kind}_0.svg and on).")
         pictures += say_not_drawn(_sort_nodes(record)[MOST:], "Their estimates are in the record.")
     return pictures
@@ -284,7 +292,7 @@ def _name_with_unit(state: str, units: Mapping[str, str]) -> str:
 
 
 def _describe_agreement(health: Health, doubts: list[str]) -> str:
-    """Return how many doubts there are about the network, or that there are none, in words."""
+    """Return the sentence on how many doubts there are about the network, or that there are none."""
     if doubts:
         return f"There {'is' if len(doubts) == 1 else 'are'} {_count_in_words(len(doubts), 'doubt')} about the network."
     tested = any(tested_filter.test is not None for tested_filter in health.filters)

@@ -11,13 +11,15 @@ from heliograph.simulation.results.record import Record
 
 
 def run_summary(health: Health) -> dict[str, Json]:
-    """Return all numbers of the report, by node and filter, and by node and component.
+    """Return all numbers of the report of a run by name, as summary.json holds them.
+
+    Those of filters and outputs are by node and filter, those of links by node and component.
 
     Args:
         health: what `examine` returned.
 
     Raises:
-        ValueError: what is no diagnosis.
+        ValueError: `health` is not what `examine` returns.
     """
     instance("health", health, Health, "what examine returns")
     filters: dict[str, dict[str, Json]] = {}
@@ -30,6 +32,10 @@ def run_summary(health: Health) -> dict[str, Json]:
     links: dict[str, dict[str, Json]] = {}
     for link in health.links:
         links.setdefault(link.node, {})[link.component] = _link_numbers(link)
+    overloads: dict[str, dict[str, Json]] = {
+        node: {name: _overload_numbers(*overload) for name, overload in by_filter.items()}
+        for node, by_filter in health.record.overloads.items()
+    }
     return {
         "rows": len(health.record.time),
         "warnings": health.warnings(),
@@ -39,16 +45,13 @@ def run_summary(health: Health) -> dict[str, Json]:
         "errors": _error_numbers(health.record),
         "links": links,
         "refused": _list_refused(health),
-        "overloads": {
-            node: {name: _overload_numbers(*overload) for name, overload in by_filter.items()}
-            for node, by_filter in health.record.overloads.items()
-        },
+        "overloads": overloads,
         "shared": {name: list(nodes) for name, nodes in health.shared.items()},
     }
 
 
 def _list_refused(health: Health) -> list[Json]:
-    """Return how many readings were refused by node, filter, place among what is received and reason; and messages."""
+    """Return what was refused, a dictionary for each node, filter, component and reason with a count; and messages."""
     readings: list[Json] = [dict(vars(refusal)) for refusal in health.record.refusals]
     return readings + [
         {"node": node, "reason": reason, "count": count}
@@ -58,7 +61,7 @@ def _list_refused(health: Health) -> list[Json]:
 
 
 def _filter_numbers(tested: FilterHealth) -> dict[str, Json]:
-    """Return what a filter claims, and what its innovations say of the claim and of variances that messages declare."""
+    """Return the numbers on one filter by name: its claim, tests of its innovations, and of what messages declare."""
     numbers: dict[str, Json] = {"claim": tested.claim}
     if tested.test is not None:
         numbers |= {
@@ -73,7 +76,7 @@ def _filter_numbers(tested: FilterHealth) -> dict[str, Json]:
 
 
 def _error_numbers(record: Record) -> dict[str, dict[str, Json]]:
-    """Return the errors by node and filter, where the truth is known."""
+    """Return RMSE by state and NEES of each filter, by node and filter; nothing where the truth is not known."""
     errors: dict[str, dict[str, Json]] = {}
     for of_filter in compare_with_truth(record):
         size = None if np.isnan(of_filter.nees) else of_filter.nees
@@ -83,12 +86,12 @@ def _error_numbers(record: Record) -> dict[str, dict[str, Json]]:
 
 
 def _overload_numbers(probability: np.ndarray, bound: np.ndarray) -> dict[str, Json]:
-    """Return how often each component's words are overloaded, and the bound on the claim, None of none."""
+    """Return by name how probably each component's words overload, and the bound on the claim (None if infinite)."""
     return {"probability": probability.tolist(), "bound": float(bound) if np.isfinite(bound) else None}
 
 
 def _link_numbers(link: Arrivals) -> dict[str, Json]:
-    """Return how often a component arrived, its longest gap, and when it is due."""
+    """Return by name what share of a component's messages arrived, its longest gap, and when it is due."""
     numbers: dict[str, Json] = {"arrived": None if link.due is None else link.share, "longest_gap": link.longest_gap}
     if link.period is not None:
         numbers["period"] = link.period

@@ -39,21 +39,29 @@ def draw_worth(worth: SensorWorth, title: str) -> Figure:
 
 
 def _draw_state(axes: Axes, worth: SensorWorth, i: int, limits: tuple[float, float]) -> None:
-    """Draw the bars of one state, the first case above, each with its number and, of runs, its standard error."""
+    """Draw a bar for each case, the first one above: the error of state i over that with all nodes.
+
+    Beside each bar stands its number, and if errors were drawn its standard error. `limits`: ends of the axis.
+    """
     increase = np.array([case.increase[i] for case in worth.cases])
-    known = np.where(np.isfinite(increase) & (increase > 0), increase, 1.0)
-    places = np.arange(len(known))
-    axes.barh(places, known - 1.0, left=1.0, height=BAR, color=[VERMILION if x > 1 else GREEN for x in known])
+    lengths = np.where(np.isfinite(increase) & (increase > 0), increase, 1.0)  # no bar where it is not known
+    heights = np.arange(len(lengths))
+    axes.barh(heights, lengths - 1.0, left=1.0, height=BAR, color=[VERMILION if x > 1 else GREEN for x in lengths])
     if not worth.exact:
         errors = np.array([case.uncertainty[i] for case in worth.cases]) / worth.complete.error[i]
-        axes.errorbar(known, places, xerr=errors, fmt="none", ecolor=INK, elinewidth=1.0)
-    for place, times in enumerate(increase):  # a column of numbers at the end of the rows
+        axes.errorbar(lengths, heights, xerr=errors, fmt="none", ecolor=INK, elinewidth=1.0)
+    for height, times in enumerate(increase):  # a column of numbers at the end of the rows
         words = f"{times:.3g}" if np.isfinite(times) else "not known"
-        axes.text(limits[1], place, words, va="center", ha="right", fontsize=9, color=INK)
+        axes.text(limits[1], height, words, va="center", ha="right", fontsize=9, color=INK)
     axes.axvline(1.0, color=BLUE, linewidth=1.0)
-    axes.set_yticks(places, [quote_for_figure(case.name) for case in worth.cases])
-    axes.set_ylim(len(known) - 0.5, -0.5)
+    axes.set_yticks(heights, [quote_for_figure(case.name) for case in worth.cases])
+    axes.set_ylim(len(lengths) - 0.5, -0.5)
     axes.grid(visible=False, axis="y")
+    _scale_axis(axes, limits)
+
+
+def _scale_axis(axes: Axes, limits: tuple[float, float]) -> None:
+    """Make the axis of factors logarithmic between these limits, with ticks at plain numbers."""
     axes.set_xscale("log")
     axes.set_xlim(*limits)
     is_narrow = limits[1] < NARROW * limits[0]

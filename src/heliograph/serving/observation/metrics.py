@@ -160,7 +160,7 @@ def _collect_outputs(watch: Watch) -> Iterable[Metric]:
         for name, words in what.items()
     }
     # Numbers of each output of each filter that weighs; none where there are too few rows.
-    for output in watch.outputs.health():
+    for output in watch.outputs.summarise_outputs():
         numbers = summarise_output(output)
         for name, metric in metrics.items():
             if isinstance(value := numbers[name], float):

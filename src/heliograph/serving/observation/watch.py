@@ -269,7 +269,7 @@ class Watch:
         with self._noting:
             points = [point for point in self._points.get(name, ()) if point.number > since]
             tests, senders = self._tests.get(name, {}), self._senders.get(name, {})
-            health = self._outputs[name].health() if name in self._outputs else []
+            health = self._outputs[name].summarise_outputs() if name in self._outputs else []
             # One JSON object; lists are bounded, so that its size does not grow with the plants.
             return {
                 "title": self.title,
