@@ -33,7 +33,18 @@ def sweep(
     setting: int | None = None,
     chunk: int | None = None,
 ) -> int:
-    """Run what is missing of a campaign, or one setting or chunk of it in this process; return the exit code.
+    """Run what is missing of a campaign, print its table and write its report; return the exit code.
+
+    Args:
+        path: of the campaign's TOML file.
+        out: the results folder.
+        workers: number of worker processes; None for one a processor, or for none where a setting is named.
+        scheduler: address of a Dask scheduler that is used instead; None for none.
+        setting: number of the only setting to run, in this process; None for all.
+        chunk: number of the only chunk of that setting; None for all.
+
+    Returns:
+        0, or FAILED if some work failed.
 
     Raises:
         ValueError: as `load_campaign` and `run_campaign`; a chunk without its setting.
@@ -54,16 +65,20 @@ def sweep(
     console = rich.console.Console()
     console.print(_count_chunks(outcome), soft_wrap=True, highlight=False, markup=False)
     console.print(f"Report: {report}", soft_wrap=True, highlight=False, markup=False)
-    # Problems go to stderr: damaged files, and failures with the way to repeat them.
+    _print_problems(outcome, out, with_traceback=only is not None)
+    return FAILED if outcome.failures else 0
+
+
+def _print_problems(outcome: CampaignRun, out: Path, with_traceback: bool) -> None:
+    """Print damaged files, and failures with the way to repeat them, to stderr."""
     for file in outcome.damaged:
         print(f"heliograph: damaged, so it does not count as done: {file}", file=sys.stderr)
     for failure in outcome.failures:
-        if only is not None:
+        if with_traceback:
             print(failure.traceback, end="", file=sys.stderr)
         print(f"heliograph: failed: {visible(str(failure))}", file=sys.stderr)
     if outcome.failures:
         print(f"heliograph: {out / FAILURES} says how to run each of them again alone", file=sys.stderr)
-    return FAILED if outcome.failures else 0
 
 
 def _select_chunks(campaign: Campaign, setting: int | None, chunk: int | None) -> list[tuple[int, int]] | None:
@@ -81,7 +96,7 @@ def _select_chunks(campaign: Campaign, setting: int | None, chunk: int | None) -
 
 
 def _count_chunks(run: CampaignRun) -> str:
-    """Say how many chunks were computed, and how many were already there."""
+    """Return in words how many chunks were computed, and how many were already there."""
     if not run.computed and not run.failures:
         return f"{run.folder}: nothing to compute, all {run.already} chunks are already there"
     return f"{run.folder}: {run.computed} chunks computed, {run.already} were already there"

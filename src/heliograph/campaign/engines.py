@@ -36,7 +36,10 @@ Untyped = Any  # what dask.distributed gives
 def start_engine(
     campaign: str, store: Path, workers: int, scheduler: str | None = None, timeout: float = math.inf
 ) -> AbstractContextManager[Engine]:
-    """Start the engine on the cluster of a scheduler; else with `workers` processes; for 0, in this process."""
+    """Return the engine as a context: on the cluster of a scheduler, else in `workers` processes, or for 0 in this one.
+
+    `campaign` is JSON, `store` the folder of the results; a job may take `timeout` seconds.
+    """
     if scheduler is not None:
         return run_on_cluster(campaign, store, scheduler, timeout)
     return run_in_processes(campaign, store, workers, timeout) if workers else run_in_this_process(campaign, store)
@@ -60,7 +63,7 @@ def run_in_processes(campaign: str, store: Path, workers: int, timeout: float = 
 
 
 def _share_jobs(crew: list["_Worker"], waiting: deque[Job]) -> Iterator[tuple[Job, Reply]]:
-    """Let a thread for each worker take jobs until none waits; yield each job with its reply, as they end."""
+    """Yield each of the waiting jobs with its reply, as they end; each worker has a thread that takes jobs for it."""
     finished: queue.SimpleQueue[tuple[Job, Reply]] = queue.SimpleQueue()
     count = len(waiting)
 
@@ -71,7 +74,7 @@ def _share_jobs(crew: list["_Worker"], waiting: deque[Job]) -> Iterator[tuple[Jo
                 job = waiting.popleft()
             except IndexError:
                 return
-            finished.put((job, worker.ask(job)))
+            finished.put((job, worker.get_reply(job)))
 
     for worker in crew:
         Thread(target=take_jobs, args=(worker,), daemon=True).start()
@@ -87,34 +90,37 @@ class _Worker:
         self.process: subprocess.Popen[str] | None = None
         self.stopped = False
 
-    def ask(self, job: Job) -> Reply:
-        """Return the reply to a job that the process does; if it dies or is too late, the next job gets a new one."""
+    def get_reply(self, job: Job) -> Reply:
+        """Send a job to the process and return its reply; if it dies or is too late, a reply that says so.
+
+        Then the next job gets a new process.
+        """
         process = self._ensure_running()
-        late = Event()
+        is_late = Event()
 
         def give_up() -> None:
-            late.set()
+            is_late.set()
             process.kill()
 
         # A timer kills the process at the timeout; then reading its answer ends, with an empty line or part of one.
-        guard = Timer(min(self.timeout, TIMEOUT_MAX), give_up)
-        guard.daemon = True
-        guard.start()
+        timer = Timer(min(self.timeout, TIMEOUT_MAX), give_up)
+        timer.daemon = True
+        timer.start()
         _send_line(process, json.dumps([job.setting, job.chunk]))
         assert process.stdout is not None
         line = process.stdout.readline()
-        guard.cancel()
+        timer.cancel()
         # A whole line is an answer; anything else means that the process ended.
-        if line.endswith("\n") and not late.is_set():
+        if line.endswith("\n") and not is_late.is_set():
             return Reply(**json.loads(line))
         code = process.wait()
         self._kill()
-        if late.is_set():
+        if is_late.is_set():
             return _make_late_reply(self.timeout)
         return Reply(error=f"WorkerDied: the worker process ended with {_describe_exit(code)}")
 
     def _ensure_running(self) -> subprocess.Popen[str]:
-        """Return the worker's process, started again where it has died."""
+        """Return the worker's process, started or, where it has died, started again."""
         if self.process is not None and self.process.poll() is not None:  # it died since its last job
             self._kill()
         if self.process is None:
@@ -147,7 +153,7 @@ class _Worker:
 
 
 def _send_line(process: subprocess.Popen[str], line: str) -> None:
-    """Send a line to a worker; one that is dead is noticed by its answer, which does not come."""
+    """Send a line to a worker process; one that is dead is noticed later, since no answer comes."""
     assert process.stdin is not None
     with suppress(OSError):  # it is dead: the answer, which does not come, will say so
         process.stdin.write(line + "\n")
@@ -181,7 +187,9 @@ def run_on_cluster(campaign: str, store: Path, address: str, timeout: float = ma
     try:
         client = start(address, set_as_default=False, timeout=CONNECT)
     except (OSError, ValueError, TypeError, RuntimeError) as error:
-        raise fail(f"scheduler {address}", "the address of a Dask scheduler that answers", _line(error)) from None
+        raise fail(
+            f"scheduler {address}", "the address of a Dask scheduler that answers", _format_error(error)
+        ) from None
     try:
         yield lambda jobs: _submit_jobs(client, campaign, str(store), deque(jobs), timeout)
     finally:
@@ -197,47 +205,55 @@ def _leave(client: Untyped) -> None:
 def _submit_jobs(
     client: Untyped, campaign: str, store: str, waiting: deque[Job], timeout: float
 ) -> Iterator[tuple[Job, Reply]]:
-    """Run jobs on a Dask cluster, a few more at once than it has threads; yield each with its reply.
+    """Run jobs on a Dask cluster, a few more at once than it has threads; yield each with its reply, as they end.
 
-    Where none returns within `timeout` seconds all that are left are given up, each with the reason.
+    Where none ends within `timeout` seconds all that are left are given up, each with a reply that says so.
+
+    Args:
+        client: of the cluster.
+        campaign: as JSON.
+        store: path of the store, which the workers see too.
+        waiting: the jobs, which are taken out of it.
+        timeout: seconds.
     """
     from distributed import as_completed
 
-    jobs: dict[object, Job] = {}
+    running: dict[object, Job] = {}  # by future
     collect: Untyped = as_completed
-    flying = collect(loop=client.loop)
-    while waiting or jobs:
+    futures = collect(loop=client.loop)  # yields those that are done
+    while waiting or running:
         # Submit a few jobs more than the cluster has threads, so that none of them waits.
-        room = max(LOOK_AHEAD * sum(_ask_cluster(client.nthreads).values()), 1) - len(jobs)
+        threads = sum(_ask_cluster(client.nthreads).values())
+        room = max(LOOK_AHEAD * threads, 1) - len(running)
         for _ in range(min(room, len(waiting))):
             job = waiting.popleft()
             future = client.submit(perform_job, campaign, store, job.setting, job.chunk, pure=False)
-            jobs[future] = job
-            flying.add(future)
+            running[future] = job
+            futures.add(future)
         # Wait for any job; without one for too long, give all up.
-        future = _wait_for_next(client, flying, timeout)
+        future = _wait_for_next(client, futures, timeout)
         if future is None:
-            client.cancel(list(jobs))
-            yield from ((job, _make_late_reply(timeout)) for job in jobs.values())
+            client.cancel(list(running))
+            yield from ((job, _make_late_reply(timeout)) for job in running.values())
             return
-        yield jobs.pop(future), _read_reply(future)
+        yield running.pop(future), _read_reply(future)
 
 
-def _wait_for_next(client: Untyped, flying: Untyped, timeout: float) -> Untyped:
-    """Return the next future that is done, of those in flight; None after `timeout` seconds without one.
+def _wait_for_next(client: Untyped, futures: Untyped, timeout: float) -> Untyped:
+    """Return the next of the futures that is done; None after `timeout` seconds without one.
 
     Raises:
         ValueError: the connection to the cluster is lost.
     """
     waited = 0.0
-    while not flying.has_ready():
+    while not futures.has_ready():
         if client.status != "running":
             raise fail(*LOST)
         if waited >= timeout:
             return None
         time.sleep(LOOK)
         waited += LOOK
-    return _ask_cluster(lambda: next(flying))
+    return _ask_cluster(lambda: next(futures))
 
 
 def _ask_cluster(ask: Callable[[], Untyped]) -> Untyped:
@@ -248,7 +264,7 @@ def _ask_cluster(ask: Callable[[], Untyped]) -> Untyped:
         raise fail(*LOST) from None
 
 
-def _line(error: Exception) -> str:
+def _format_error(error: Exception) -> str:
     """Return an error as one line, with its class."""
     return " ".join(f"{type(error).__name__}: {error}".split())
 
@@ -259,4 +275,4 @@ def _read_reply(future: Untyped) -> Reply:
         reply: Reply = future.result()
         return reply
     error = future.exception() if future.status == "error" else RuntimeError(f"the task was {future.status}")
-    return Reply(error=_line(error))
+    return Reply(error=_format_error(error))

@@ -105,45 +105,45 @@ def _sum_errors(group: zarr.Group, setting: int, runs: slice, claims: np.ndarray
 def _compute_state_scores(
     setting: int, labels: AxisLabels, claims: np.ndarray, steps: Sequence[int], sums: ErrorSums
 ) -> list[StateScore]:
-    """Return RMSE, claimed deviation and NEES with standard errors, by node, filter, state and step of one setting.
+    """Return RMSE, claimed deviation and NEES with standard errors, by step, node, filter and state of one setting.
 
     Args:
         setting: number of the setting.
         labels: names of nodes, filters and states.
         claims: what each filter claims (node, filter), "" where a node has no such filter.
-        steps: of the sums, 0 for all together.
+        steps: of the sums, 0 for the mean over all.
         sums: over the finite runs.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
+        # Mean over n runs and its standard error, sqrt((E[x^2] - E[x]^2) / (n - 1)).
         n = sums.runs[None, None, :, :, None]
-        # Mean and its standard error over n runs: sqrt((E[x^2] - E[x]^2) / (n - 1)).
         mean = sums.values / n
-        mean_error = np.sqrt(np.maximum(sums.squares / n - mean**2, 0.0) / (n - 1))
-        squared_error, claimed_variance, nees = mean  # each (step, node, filter, state)
-        squared_error_error, _, nees_error = mean_error
+        standard_error = np.sqrt(np.maximum(sums.squares / n - mean**2, 0.0) / (n - 1))
+        # Each (step, node, filter, state).
+        squared_error, claimed_variance, nees = mean
+        squared_error_error, _, nees_error = standard_error
         rmse, claimed = np.sqrt(squared_error), np.sqrt(claimed_variance)
         rmse_error = np.where(rmse > 0, squared_error_error / (2 * rmse), 0.0)  # of a root, to first order
-    return [
-        StateScore(
-            setting,
-            node,
-            name,
-            str(claims[i, j]),
-            state,
-            step,
-            rmse=float(rmse[k, i, j, s]),
-            rmse_error=float(rmse_error[k, i, j, s]),
-            claimed=float(claimed[k, i, j, s]),
-            nees_per_dimension=float(nees[k, i, j, s]),
-            nees_error=float(nees_error[k, i, j, s]),
-            finite_runs=int(sums.runs[i, j]),
-        )
-        for k, step in enumerate(steps)
-        for i, node in enumerate(labels.nodes)
-        for j, name in enumerate(labels.filters)
-        if claims[i, j]
-        for s, state in enumerate(labels.states)
-    ]
+    scores = []
+    for k, i, j, s in np.ndindex(rmse.shape):
+        if claims[i, j]:
+            scores.append(
+                StateScore(
+                    setting,
+                    labels.nodes[i],
+                    labels.filters[j],
+                    str(claims[i, j]),
+                    labels.states[s],
+                    steps[k],
+                    rmse=float(rmse[k, i, j, s]),
+                    rmse_error=float(rmse_error[k, i, j, s]),
+                    claimed=float(claimed[k, i, j, s]),
+                    nees_per_dimension=float(nees[k, i, j, s]),
+                    nees_error=float(nees_error[k, i, j, s]),
+                    finite_runs=int(sums.runs[i, j]),
+                )
+            )
+    return scores
 
 
 EXPLORE = "explore.html"
@@ -186,7 +186,10 @@ def write_explorer(results: str | Path, out: str | Path) -> Path:
 
 
 def write_explore_page(campaign: Campaign, scores: Sequence[Score], look: Look | None = None) -> str:
-    """Return the page as HTML. It has the first settings, as many as have at most ROWS rows in each table."""
+    """Return the page as HTML. It has the first settings, as many as have at most ROWS rows in each table.
+
+    `look`: reads scores of single states from the store; without it there are none.
+    """
     shown = _keep_first_settings(scores)
     settings = len({score.setting for score in shown})
     page = Page(
@@ -217,7 +220,7 @@ MEANING = (
 
 
 def _describe_shown_part(settings: int, campaign: Campaign, shown: Sequence[Score], scores: Sequence[Score]) -> str:
-    """Say how many of the settings and rows are on the page, and where all are."""
+    """Return in words how many of the settings and rows are on the page, and where all are."""
     if len(shown) == len(scores):
         return f"{len(shown)} rows, one for each setting, node and filter."
     return (
@@ -227,7 +230,7 @@ def _describe_shown_part(settings: int, campaign: Campaign, shown: Sequence[Scor
 
 
 def _keep_first_settings(scores: Sequence[Score]) -> list[Score]:
-    """Keep the scores of the first settings, each setting as a whole: as many as a page shows."""
+    """Return the scores of the first settings, each setting as a whole: as many as a page shows."""
     shown: list[Score] = []
     for _, of_setting in groupby(scores, key=lambda score: score.setting):
         rows = list(of_setting)
@@ -295,7 +298,7 @@ def _make_steps_table(campaign: Campaign, rows: Sequence[StateScore]) -> Explore
 
 
 def _make_columns(campaign: Campaign, rows: Sequence[StateScore], fields: Sequence[str]) -> dict[str, list[Value]]:
-    """Return columns of the settings' numbers, parameters and names, and of these quantities, row by row."""
+    """Return the columns of a table: settings, their parameters, names, and these fields of the scores, row by row."""
     parameters = {name: parameter_values(campaign, name).tolist() for name in campaign.parameters}
     return {
         "setting": [row.setting for row in rows],

@@ -42,7 +42,7 @@ def read_failures(out: Path) -> list[Failure]:
 
 
 def describe_failure(campaign: Campaign, out: Path, job: Job, reply: Reply) -> Failure:
-    """Describe a job that failed, from its last reply."""
+    """Return the failure of a job, with all that is needed to repeat it, from its last reply."""
     chunks = campaign.chunks(job.setting)
     chunks = chunks if job.chunk is None else [chunks[job.chunk]]
     return Failure(

@@ -55,7 +55,14 @@ class Reply:
 
 
 def perform_job(campaign: str, store: str, setting: int, chunk: int | None) -> Reply:
-    """Do one job of a campaign given as JSON; an error becomes a reply."""
+    """Return the reply to one job of a campaign given as JSON; an error becomes a reply too.
+
+    Args:
+        campaign: as JSON.
+        store: path of the store.
+        setting: number of the setting.
+        chunk: number of the chunk that is computed and written; None to describe the setting's network.
+    """
     try:
         plan = parse_campaign(campaign)
         _check_versions(plan)
@@ -104,7 +111,7 @@ def make_network_inputs(campaign: Campaign, network: Network) -> np.ndarray | No
 
 
 def _check_versions(campaign: Campaign) -> None:
-    """Raise ValueError unless this process has the packages and settings that the campaign was begun with."""
+    """Refuse a worker whose packages or settings are not those that the campaign was begun with (ValueError)."""
     here = versions()
     if here != campaign.versions:
         raise fail("versions on this worker", str(campaign.versions), here)
@@ -135,15 +142,22 @@ def _drop_old_programs(network: Network) -> None:
 
 
 def _arrange_results(recorded: PyTree, labels: AxisLabels) -> dict[str, np.ndarray]:
-    """Arrange the reducer's results on the axes of the store, (run, time, ...); NaN where a node lacks a filter."""
+    """Return the reducer's results by variable of the store, on its axes (run, time, node, filter, ...).
+
+    NaN where a node lacks a filter.
+
+    Args:
+        recorded: as `ErrorReducer` returns it, by node and filter.
+        labels: names along the axes of the store.
+    """
     estimates = recorded["estimates"]
     # Shapes are those of any filter; all have the same states.
     example = next(values for filters in estimates.values() for values in filters.values())
     runs, horizon = example["nees_per_dimension"].shape
     nodes, filters_count = len(labels.nodes), len(labels.filters)
     arrays = {
-        name: np.full((runs, horizon, nodes, filters_count, *example[name].shape[2:]), np.nan)
-        for name in ("error", "variance", "nees_per_dimension")
+        variable: np.full((runs, horizon, nodes, filters_count, *example[variable].shape[2:]), np.nan)
+        for variable in ("error", "variance", "nees_per_dimension")
     }
     # Each filter goes to its place along the axes (node, filter).
     for node, filters in estimates.items():
@@ -151,6 +165,7 @@ def _arrange_results(recorded: PyTree, labels: AxisLabels) -> dict[str, np.ndarr
             i, j = labels.nodes.index(node), labels.filters.index(name)
             for variable, array in arrays.items():
                 array[:, :, i, j] = values[variable]
+    # Of whole trajectories also truth and measurements, each filled up to the longest of any node.
     if "truth" in recorded:
         arrays["truth"] = recorded["truth"]
         arrays["measurement"] = np.full((runs, horizon, nodes, labels.received), np.nan)
@@ -169,7 +184,7 @@ class ErrorReducer(AbstractReducer[dict[str, PyTree]]):
     world: bool = eqx.field(static=True, default=False)
 
     def of_step(self, step: PyTree) -> OfStep:
-        """Collect the errors of one step."""
+        """Return the errors of one step, of each estimate; with `world` also truth and measurements."""
         recorded = {
             kind: jax.tree.map(
                 lambda estimate: _measure_errors(step["truth"], estimate),
@@ -183,7 +198,7 @@ class ErrorReducer(AbstractReducer[dict[str, PyTree]]):
         return OfStep(collected=recorded)
 
     def finish(self, carry: PyTree, collected: PyTree, network: Network) -> dict[str, PyTree]:
-        """Arrange the collected errors by node and filter."""
+        """Return the collected errors by node and filter, and with `world` truth and measurements."""
         results = {
             field: self.split_by_name(network, collected, itemgetter(field), axis)
             for field, axis in (("error", -3), ("variance", -3), ("nees_per_dimension", -2))

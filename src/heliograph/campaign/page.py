@@ -78,7 +78,7 @@ def describe_best_filter(scores: Sequence[Score]) -> str:
 
 
 def _describe_failures(failures: Sequence[Failure]) -> str:
-    """Say how many jobs failed."""
+    """Return in words how many jobs failed."""
     return f"{len(failures)} pieces of work failed and are missing here." if failures else "Nothing failed."
 
 
@@ -161,7 +161,7 @@ def _can_be_axis(campaign: Campaign, name: str) -> bool:
 
 
 def _drop_parameter(setting: Setting, name: str) -> Setting:
-    """Return a setting without one of its parameters."""
+    """Return a setting without the parameter of this name."""
     return {key: value for key, value in setting.items() if key != name}
 
 
@@ -169,33 +169,36 @@ def _drop_parameter(setting: Setting, name: str) -> Setting:
 def plot_by_parameter(campaign: Campaign, scores: Sequence[Score], parameter: str, quantity: ScoreColumn) -> Figure:
     """Plot a quantity against a parameter, a curve for each filter with error bars of two standard errors.
 
-    There is one panel for each node and each choice of the other parameters.
+    There is one panel for each node and each choice of the other parameters, PANELS at most.
     """
-    values = parameter_values(campaign, parameter)
-    # Panels: scores with equal node and equal other parameters.
-    panels: dict[str, list[Score]] = {}
-    for score in scores:
-        rest = _drop_parameter(campaign.settings[score.setting], parameter)
-        title = ", ".join([score.node, *(f"{name} = {value}" for name, value in rest.items())])
-        panels.setdefault(title, []).append(score)
-    shown = dict(list(panels.items())[:PANELS])
+    values = parameter_values(campaign, parameter)  # by setting
+    shown = dict(list(_group_into_panels(campaign, scores, parameter).items())[:PANELS])
     figure, grid = _make_panels(len(shown), 2.5)
     colours = _assign_colours(scores)
-    # A curve for each filter, in order of the parameter, with +- 2 standard errors.
-    for axes, (title, panel_scores) in zip(grid, shown.items(), strict=False):
-        for name in dict.fromkeys(score.filter for score in panel_scores):
-            curve = [score for score in panel_scores if score.filter == name]
+    for axes, (title, of_panel) in zip(grid, shown.items(), strict=False):
+        for name in dict.fromkeys(score.filter for score in of_panel):
+            curve = [score for score in of_panel if score.filter == name]
             curve.sort(key=lambda score: float(values[score.setting]))
             x = [values[score.setting] for score in curve]
             y, error = _list_values(curve, quantity)
             label = quote_for_figure(name)
             axes.errorbar(x, y, 2 * error, color=colours[name], marker="o", markersize=4, linewidth=1.4, label=label)
         axes.set_title(fill(quote_for_figure(title), TITLE))
-    drawn = [score for panel_scores in shown.values() for score in panel_scores]
+    drawn = [score for of_panel in shown.values() for score in of_panel]
     _choose_scale(grid[0], [values[score.setting] for score in drawn], "x")
     figure.supxlabel(quote_for_figure(parameter), fontsize=10, color=INK)
     _finish_figure(figure, grid, drawn, quantity, colours)
     return figure
+
+
+def _group_into_panels(campaign: Campaign, scores: Sequence[Score], parameter: str) -> dict[str, list[Score]]:
+    """Return {title: scores} with those of one node and of equal parameters, but for this one, together."""
+    panels: dict[str, list[Score]] = {}
+    for score in scores:
+        rest = _drop_parameter(campaign.settings[score.setting], parameter)
+        title = ", ".join([score.node, *(f"{name} = {value}" for name, value in rest.items())])
+        panels.setdefault(title, []).append(score)
+    return panels
 
 
 @matplotlib.rc_context(STYLE)
@@ -205,14 +208,15 @@ def plot_by_setting(campaign: Campaign, scores: Sequence[Score], quantity: Score
     settings = list(dict.fromkeys(score.setting for score in scores))[:SETTINGS]
     figure, grid = _make_panels(len(nodes), 0.9 + 0.3 * len(settings), columns=1)
     colours = _assign_colours(scores)
-    # Rows are settings; the filters of a row are shifted so that error bars do not overlap.
+    # A row for each setting, in which the filters are shifted so that their error bars do not overlap.
+    shifts = np.linspace(-0.2, 0.2, len(colours))
     for axes, node in zip(grid, nodes, strict=False):
-        for shift, name in zip(np.linspace(-0.2, 0.2, len(colours)), colours, strict=True):
+        for shift, name in zip(shifts, colours, strict=True):
             points = [s for s in scores if s.filter == name and s.node == node and s.setting in settings]
             x, error = _list_values(points, quantity)
-            rows = [settings.index(score.setting) + shift for score in points]
+            heights = [settings.index(score.setting) + shift for score in points]
             label = quote_for_figure(name)
-            axes.errorbar(x, rows, xerr=2 * error, color=colours[name], fmt="o", markersize=4, label=label)
+            axes.errorbar(x, heights, xerr=2 * error, color=colours[name], fmt="o", markersize=4, label=label)
         axes.set_yticks(range(len(settings)), [_name_setting(campaign, setting) for setting in settings])
         axes.set_ylim(len(settings) - 0.5, -0.5)
         axes.set_title(quote_for_figure(node))
@@ -250,7 +254,7 @@ def _assign_colours(scores: Sequence[Score]) -> dict[str, str]:
 
 
 def _list_values(scores: Sequence[Score], quantity: ScoreColumn) -> tuple[np.ndarray, np.ndarray]:
-    """Return a quantity of each score and its standard error, 0 where that is not known."""
+    """Return a quantity of each score and its standard error (scores,), 0 where that is not known."""
     values = np.array([getattr(score, quantity.value) for score in scores])
     return values, np.nan_to_num(np.array([getattr(score, quantity.error) for score in scores]))
 

@@ -54,7 +54,12 @@ def load_campaign(path: str | Path) -> Campaign:
 
 
 def read_campaign(text: str, source: str, path: Path) -> Campaign:
-    """Parse a campaign from the text of a file, with the source of its network's module.
+    """Return the campaign that the text of a TOML file describes.
+
+    Args:
+        text: of the file.
+        source: Python source of the network's module.
+        path: of the file, named in errors.
 
     Raises:
         ValueError: as `load_campaign`, except for settings that the function does not take.
@@ -67,8 +72,8 @@ def read_campaign(text: str, source: str, path: Path) -> Campaign:
             close = get_close_matches(key, KEYS, 1)
             hint = f" (closest: {close[0]!r})" if close else ""
             raise fail(f"{name}, key {key!r}", f"one of {', '.join(KEYS)}", f"an unknown key{hint}")
-    runs, horizon = _read_count(table, "runs", name), _read_count(table, "horizon", name)
     # Each reader checks its key and raises one line.
+    runs, horizon = _read_count(table, "runs", name), _read_count(table, "horizon", name)
     return Campaign(
         text=text,
         network=_read_network(table, name),
@@ -77,7 +82,7 @@ def read_campaign(text: str, source: str, path: Path) -> Campaign:
         horizon=horizon,
         runs=runs,
         seed=check_seed(f"{name}, seed", table.get("seed", 0)),
-        # No larger than all runs, as a multiple of BLOCK.
+        # At most all runs, rounded up to a multiple of BLOCK.
         chunk=min(_read_chunk(table.get("chunk", CHUNK), name), BLOCK * -(-runs // BLOCK)),
         keep=_read_choice(table.get("keep", KEEP[0]), KEEP, f"{name}, keep"),
         inputs=_read_inputs(table.get("inputs", {}), horizon, name),
@@ -88,7 +93,7 @@ def read_campaign(text: str, source: str, path: Path) -> Campaign:
 
 
 def _parse_toml(text: str, name: str) -> dict[str, object]:
-    """Return the tables of a campaign's TOML, under its name in errors."""
+    """Return the table of a campaign's TOML text; `name`: of its file, for errors."""
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -154,7 +159,9 @@ def _is_number(value: object) -> bool:
 
 
 def _read_settings(table: Mapping[str, object], name: str) -> list[Setting]:
-    """Return the settings of a campaign's file, from [grid] or [[settings]].
+    """Return the settings of a campaign's file, {parameter: value} each, from [grid] or [[settings]].
+
+    `table`: the file; `name`: its name, for errors.
 
     Raises:
         ValueError: both or neither of the two, a parameter whose name the store has already, a value that JSON cannot
@@ -163,14 +170,14 @@ def _read_settings(table: Mapping[str, object], name: str) -> list[Setting]:
     if ("grid" in table) == ("settings" in table):
         raise fail(f"campaign {name}", "either [grid] or [[settings]]", "both" if "grid" in table else "neither")
     settings = _expand_grid(table["grid"], name) if "grid" in table else _list_settings(table["settings"], name)
-    taken = {*DIMENSIONS, *VARIABLES, *COLUMNS}
     # Parameters become coordinates of the store: their names must be free there, their values plain.
+    taken = {*DIMENSIONS, *VARIABLES, *COLUMNS}
     for i, setting in enumerate(settings):
         for key, value in setting.items():
             if not key.isidentifier() or key in taken:
                 raise fail(f"{name}, parameter {key!r}", f"a Python name other than {', '.join(sorted(taken))}", key)
             _check_value(value, f"{name}, {key} of setting {i}")
-    # Equal settings would have equal keys, and so equal runs.
+    # Equal settings would have equal random keys, and so equal runs.
     seen: dict[str, int] = {}
     for i, setting in enumerate(settings):
         first = seen.setdefault(canonical(setting), i)
@@ -198,7 +205,7 @@ def _list_settings(settings: object, name: str) -> list[Setting]:
 
 
 def _check_value(value: object, name: str) -> None:
-    """Accept only values that JSON represents without loss."""
+    """Raise ValueError at a value that JSON does not represent without loss; `name`: of the value, for errors."""
     if isinstance(value, dict | list):
         for entry in value.values() if isinstance(value, dict) else value:
             _check_value(entry, name)
@@ -207,7 +214,7 @@ def _check_value(value: object, name: str) -> None:
 
 
 def _check_arguments(campaign: Campaign, name: str) -> None:
-    """Raise before any computation if the network's function does not take the settings."""
+    """Raise ValueError, before any computation, if the network's function does not take the settings as arguments."""
     signature = inspect.signature(campaign.function())
     for i, setting in enumerate(campaign.settings):
         try:

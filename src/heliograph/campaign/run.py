@@ -105,24 +105,17 @@ def _compute_missing(
 ) -> CampaignRun:
     """Compute the chunks that the store lacks, and write failures and summary; return what was done.
 
-    Arguments are those of `run_campaign`.
+    Arguments are those of `run_campaign`. Nobody else works in the folder `out`.
     """
     store = (out / STORE).absolute()
     remove_leftover_folders(store)
     check_replaceable(out, f"{STORE}/zarr.json")
     expected = _list_jobs(campaign, only)
-    # A store that exists must be of this campaign; damaged and partial files are removed first.
-    done: set[tuple[int, ...]] = set()
-    damaged: list[Path] = []
-    if store.is_dir():
-        check_same_campaign(store, campaign)
-        damaged = remove_damaged(store, campaign)
-        remove_partial(store)
-        done = done_chunks(store, campaign)
+    done, damaged = _clean_store(store, campaign)
     missing = [job for job in expected if (job.setting, job.chunk) not in done]
     already = len(expected) - len(missing)
     if not missing and not damaged and (out / SUMMARY).is_file():
-        return CampaignRun(out, already, 0, [], [])
+        return CampaignRun(out, already, computed=0, failures=[], damaged=[])
     failed: dict[Job, Reply] = {}
     if missing or damaged:
         count = _count_workers(workers, len(missing) or 1)
@@ -130,12 +123,26 @@ def _compute_missing(
             (out / SUMMARY).unlink(missing_ok=True)  # it is not right for what is computed now
             failed = _compute_settings(engine, campaign, store, missing, already, progress)
     remove_partial(store)
-    # Reports are written again after every call.
+    # Reports are written again after every call. A setting that could not be built lacks all its chunks.
     failures = [describe_failure(campaign, out, job, reply) for job, reply in failed.items()]
     write_failures(out, failures, tried=expected)
     write_summary(store, campaign, out / SUMMARY)
     lacking = sum(1 for job in missing if job in failed or Job(job.setting) in failed)
-    return CampaignRun(out, already, len(missing) - lacking, failures, damaged)
+    return CampaignRun(out, already, computed=len(missing) - lacking, failures=failures, damaged=damaged)
+
+
+def _clean_store(store: Path, campaign: Campaign) -> tuple[set[tuple[int, ...]], list[Path]]:
+    """Remove damaged and partial files from a store; return (setting, chunk) of what is done, and the damaged files.
+
+    Raises:
+        ValueError: a store of another campaign.
+    """
+    if not store.is_dir():
+        return set(), []
+    check_same_campaign(store, campaign)
+    damaged = remove_damaged(store, campaign)
+    remove_partial(store)
+    return done_chunks(store, campaign), damaged
 
 
 def _compute_settings(
@@ -146,7 +153,10 @@ def _compute_settings(
     already: int,
     progress: Progress,
 ) -> dict[Job, Reply]:
-    """Describe new settings, then compute the chunks of those that can be built; return failures, in order."""
+    """Describe new settings, then compute the missing chunks of those that can be built; return failures, in order.
+
+    `already`: number of chunks that are there, for `progress`.
+    """
     failed = _prepare_store(engine, campaign, store, {job.setting for job in missing}, progress)
     possible = [job for job in missing if Job(job.setting) not in failed]
     total = already + len(missing)
@@ -179,41 +189,52 @@ def _count_workers(workers: int | None, jobs: int) -> int:
 def _prepare_store(
     engine: Engine, campaign: Campaign, store: Path, settings: set[int], progress: Progress
 ) -> dict[Job, Reply]:
-    """Make the store if needed, and write missing claims; return the jobs of settings that cannot be built."""
-    new = not store.is_dir()
-    if new:
+    """Make the store if needed, and write missing claims; return the jobs of settings that cannot be built.
+
+    Args:
+        engine: does the jobs that describe a setting: build its network, and return its labels and claims.
+        campaign: the campaign.
+        store: path of the store.
+        settings: numbers of those of which chunks are to be computed.
+        progress: called after each description.
+    """
+    is_new = not store.is_dir()
+    if is_new:
         lacking = list(range(len(campaign.settings)))
     else:
         # Claims of the settings to compute, and of those that were begun: they may have been removed as damaged.
         begun = {setting for setting, _ in done_chunks(store, campaign)}
         lacking = sorted((settings | begun) - {setting for (setting,) in find_described(store)})
     jobs = [Job(setting) for setting in lacking]
-    results: dict[int, NetworkDescription] = {}
+    described: dict[int, NetworkDescription] = {}
 
     def accept(job: Job, value: NetworkDescription | None, done: int) -> None:
         """Keep the description of a setting."""
         assert value is not None  # these jobs only describe
-        results[job.setting] = value
+        described[job.setting] = value
         progress("building", done, len(jobs))
 
     failed = _try_jobs(engine, jobs, accept)
-    if new and not results:
+    if is_new and not described:
         first = next(iter(failed.values()))
         raise fail("campaign", "a setting whose network can be built", f"none: setting 0 gave {first.error}")
     # The axes of a new store are the union of all settings; later settings must fit into them.
-    labels = {setting: labels_from(results[setting]["labels"]) for setting in sorted(results)}
-    if new:
+    labels = {setting: labels_from(described[setting]["labels"]) for setting in sorted(described)}
+    if is_new:
         create_store(store, campaign, unite_labels(labels))
-    for setting, label in labels.items():
-        check_within(label, read_labels(store), setting)
-        write_claims(store, setting, results[setting]["claims"])
+    for setting, of_setting in labels.items():
+        check_within(of_setting, read_labels(store), setting)
+        write_claims(store, setting, described[setting]["claims"])
     return failed
 
 
 def _try_jobs(
     engine: Engine, jobs: Iterable[Job], accept: Callable[[Job, NetworkDescription | None, int], None]
 ) -> dict[Job, Reply]:
-    """Do jobs, repeat failed ones, call accept(job, value, number done) for the others; return the last failures."""
+    """Do jobs, failed ones again, up to TRIES times; return those that still fail, with their last replies.
+
+    `accept`: called as accept(job, value, number done) for each that succeeds. One that took too long is not repeated.
+    """
     done, left = 0, {job: Reply() for job in jobs}
     given_up: list[Job] = []  # what took too long once is not waited for again
     for _ in range(TRIES):

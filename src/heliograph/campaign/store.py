@@ -85,7 +85,10 @@ def unite_labels(parts: Mapping[int, AxisLabels]) -> AxisLabels:
 
 
 def check_within(labels: AxisLabels, known: AxisLabels, setting: int) -> None:
-    """Raise ValueError if a setting has a name, or a longer measurement, that the store was not made for."""
+    """Raise ValueError if a setting has a name, or a longer measurement, that the store has not.
+
+    `labels`: those of the setting; `known`: those of the store.
+    """
     lacking = [name for name in (*labels.nodes, *labels.filters) if name not in (*known.nodes, *known.filters)]
     if labels.states != known.states or labels.received > known.received or lacking:
         raise fail(f"setting {setting}", f"states, nodes and filters of the store, {known}", labels)
@@ -106,7 +109,7 @@ WORLD = {
     "truth": (("setting", "run", "time", "state"), "true state"),
     "measurement": (("setting", "run", "time", "node", "received"), "what reached the node, NaN beyond its length"),
 }
-CLAIM = "claim"
+CLAIM, CLAIM_AXES = "claim", ("setting", "node", "filter")
 
 
 def variables(campaign: Campaign) -> dict[str, tuple[tuple[str, ...], str]]:
@@ -115,7 +118,10 @@ def variables(campaign: Campaign) -> dict[str, tuple[tuple[str, ...], str]]:
 
 
 def create_store(path: Path, campaign: Campaign, labels: AxisLabels) -> None:
-    """Create the store, complete except for the claims and the chunks of runs."""
+    """Create the store of a campaign, complete except for the claims and the chunks of runs.
+
+    `labels`: names along its axes.
+    """
     with whole_folder(path) as folder:
         attributes = {
             "campaign": campaign.text,
@@ -129,17 +135,15 @@ def create_store(path: Path, campaign: Campaign, labels: AxisLabels) -> None:
         coordinates = _make_coordinates(campaign, labels)
         for name, values in coordinates.items():
             _write_coordinate(group, name, values, "setting" if name in campaign.parameters else name)
+        # Empty variables, of a file for each chunk of runs of each setting; the claims of a setting are one file.
         sizes = {name: len(values) for name, values in coordinates.items()}
-        # Empty variables; a file for each chunk of runs of each setting.
         for name, (axes, meaning) in variables(campaign).items():
             shape = tuple(sizes[axis] for axis in axes)
             chunks = (1, campaign.chunk, *shape[2:])
             _create_array(group, name, axes, shape, chunks, fill=np.nan, attributes={"long_name": meaning})
-        # The claims of a setting are one file.
-        axes = ("setting", "node", "filter")
-        shape = tuple(sizes[axis] for axis in axes)
+        shape = tuple(sizes[axis] for axis in CLAIM_AXES)
         meaning = "what the filter claims of its variance"
-        _create_array(group, CLAIM, axes, shape, (1, *shape[1:]), fill="", attributes={"long_name": meaning})
+        _create_array(group, CLAIM, CLAIM_AXES, shape, (1, *shape[1:]), fill="", attributes={"long_name": meaning})
         with warnings.catch_warnings():  # zarr says that consolidated metadata are not in the format's text yet
             warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)
             zarr.consolidate_metadata(folder)
@@ -193,15 +197,26 @@ def _create_array(
     attributes: Mapping[str, str],
     kind: np.dtype | type = np.float64,
 ) -> None:
-    """Create one array of the store, with its chunks, its fill value and a checksum for each chunk."""
-    text = isinstance(fill, str)
+    """Create one array of the store, with its chunks, its fill value and a checksum for each chunk.
+
+    Args:
+        group: the store.
+        name: of the array.
+        axes: their names.
+        shape: their lengths.
+        chunks: lengths of a chunk, which is one file.
+        fill: value of what is not written; a text makes an array of texts.
+        attributes: what is said of the array.
+        kind: type of the numbers.
+    """
+    is_text = isinstance(fill, str)
     group.create_array(
         name,
         shape=shape,
         chunks=chunks,
-        dtype=str if text else kind,
+        dtype=str if is_text else kind,
         fill_value=fill,
-        compressors=(Crc32cCodec(),) if text else (ZstdCodec(level=1), Crc32cCodec()),
+        compressors=(Crc32cCodec(),) if is_text else (ZstdCodec(level=1), Crc32cCodec()),
         dimension_names=axes,
         attributes=dict(attributes),
         chunk_key_encoding={"name": "default", "separator": "."},  # one flat folder for each variable
@@ -232,19 +247,19 @@ def write_claims(path: Path, setting: int, claims: Claims) -> None:
 
 
 def _sync(folder: Path, start: str) -> None:
-    """Make files of a folder whose names begin so outlast a loss of power, and that they are there."""
+    """Make files of a folder whose names begin with `start` outlast a loss of power, and that they are there."""
     for file in folder.glob(f"{start}*"):
         sync(file)
     sync(folder)
 
 
 def done_chunks(path: Path, campaign: Campaign) -> set[tuple[int, ...]]:
-    """Return (setting, chunk) of the chunks whose files all exist."""
+    """Return {(setting, chunk)} of the chunks of a campaign whose files all exist in the store."""
     return set.intersection(*(set(_find_chunk_files(path / name, 2)) for name in variables(campaign)))
 
 
 def find_described(path: Path) -> set[tuple[int, ...]]:
-    """Return (setting,) of the settings whose claims are written."""
+    """Return {(setting,)} of the settings whose claims are written in the store."""
     return set(_find_chunk_files(path / CLAIM, 1))
 
 

@@ -89,19 +89,19 @@ def read_summary(path: str | Path) -> list[Score]:
 
 
 def summarize(store: Path, campaign: Campaign) -> list[Score]:
-    """Compute the scores of every filter; the store is read chunk by chunk."""
+    """Return the scores of every filter by setting and node; the store is read chunk by chunk."""
     group, labels = zarr.open_group(store, mode="r"), read_labels(store)
-    claims, done = np.asarray(group[CLAIM]), done_chunks(store, campaign)
+    claims, done = np.asarray(group[CLAIM]), done_chunks(store, campaign)  # (setting, node, filter), "" of none
     scores = []
     for setting in range(len(campaign.settings)):
-        # Averages over time of each run, for the chunks that are done.
-        parts = [
+        # Squared error and NEES of each run, averages over time (run, node, filter), of the chunks that are done.
+        by_chunk = [
             _average_over_time(group, setting, slice(chunk.start, chunk.stop), claims[setting])
             for chunk in campaign.chunks(setting)
             if (setting, chunk.number) in done
         ]
         empty = np.empty((2, 0, len(labels.nodes), len(labels.filters)))
-        squared, nees = np.concatenate(parts, axis=1) if parts else empty
+        squared, nees = np.concatenate(by_chunk, axis=1) if by_chunk else empty
         # A score for each filter that the node has.
         for i, node in enumerate(labels.nodes):
             for j, name in enumerate(labels.filters):
@@ -124,14 +124,14 @@ def _average_over_time(group: zarr.Group, setting: int, runs: slice, claims: np.
 
 
 def _read_runs(group: zarr.Group, name: str, setting: int, runs: slice) -> np.ndarray:
-    """Return some runs of a setting, of one variable of the store."""
+    """Return the values of some runs of a setting, (run, time, ...), of the variable `name` of the store."""
     array = group[name]
     assert isinstance(array, zarr.Array)
     return np.asarray(array[setting, runs])
 
 
 def _make_score(names: tuple[int, str, str, str], squared: np.ndarray, nees: np.ndarray) -> Score:
-    """Return RMSE and NEES of a filter with their standard errors, from squared errors and NEES of each run.
+    """Return RMSE and NEES of a filter with their standard errors, from squared errors and NEES of each run (run,).
 
     `names` are setting, node, filter and claim.
     """
@@ -163,7 +163,7 @@ def score_headers(campaign: Campaign) -> list[str]:
 
 
 def score_row(campaign: Campaign, score: Score) -> list[str]:
-    """Return a row of the table of scores: values with their standard errors."""
+    """Return the cells of a score in the table of scores, in the order of `score_headers`."""
     setting = campaign.settings[score.setting]
     return [
         *(str(setting.get(name, "")) for name in campaign.parameters),
