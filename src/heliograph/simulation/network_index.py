@@ -4,6 +4,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from itertools import accumulate
 from typing import NamedTuple
 
+import numpy as np
+
 from heliograph.model.over_time import structure
 
 
@@ -61,3 +63,14 @@ def join_rows(received: Mapping[str, int]) -> dict[str, range]:
     """Return where each node's measurements stand among all, joined in this order; `received` says how many it has."""
     ends = accumulate(received.values())
     return {name: range(end - size, end) for (name, size), end in zip(received.items(), ends, strict=True)}
+
+
+def find_measurement_order(groups: Iterable[Sequence[str]], rows: Mapping[str, range]) -> np.ndarray | None:
+    """Return the order that brings measurements joined group after group into that of the nodes.
+
+    `rows`: where each node's measurements stand in the latter. None where the two are the same: no gather is compiled
+    then.
+    """
+    by_group = np.concatenate([rows[name] for names in groups for name in names])  # place of each in the nodes' order
+    order = np.argsort(by_group)
+    return None if np.array_equal(order, np.arange(len(order))) else order

@@ -17,7 +17,6 @@ from heliograph.numerics.float64 import refuse_forked_process
 from heliograph.numerics.times.row_times import check_times
 from heliograph.numerics.types import ArrayLike, PyTree, units_in
 from heliograph.simulation.arguments import read_measurements, read_plant_inputs
-from heliograph.simulation.centres.implausible_node import refuse_centrally
 from heliograph.simulation.centres.uplinks import SentReports
 from heliograph.simulation.description.possible import doubt_estimates
 from heliograph.simulation.description.remarks import say_remarks
@@ -40,6 +39,7 @@ from heliograph.simulation.recorded_rows import (
 from heliograph.simulation.results.no_numbers import warn_of_no_numbers
 from heliograph.simulation.results.record import Record
 from heliograph.simulation.results.reducer import trajectories_record
+from heliograph.simulation.rows.implausible_node import refuse_centrally
 from heliograph.simulation.screened import screen_recording
 from heliograph.simulation.smoothed import SmoothingPlan, add_truth, make_smoothed_record, select_smoothed_part
 from heliograph.simulation.stepping import AllFilters
@@ -200,11 +200,12 @@ def _collect_arrivals(filters: AllFilters, reports: Reports, steps: int) -> dict
     """Return what arrived of reports and between neighbours, by fusion."""
     reports = table("reports", reports, "reports by fusion")
     centre_arrivals: dict[str, PyTree] = {
-        name: centre.uplinks.recorded(name, centre.nodes, reports.get(name), steps)
+        name: centre.uplinks.read_recorded(name, centre.nodes, reports.get(name), steps)
         for name, centre in filters.reporting.items()
     }
     mesh_arrivals = {
-        name: mesh.edges.recorded(name, mesh.nodes, reports.get(name), steps) for name, mesh in filters.meshes.items()
+        name: mesh.edges.read_recorded(name, mesh.nodes, reports.get(name), steps)
+        for name, mesh in filters.meshes.items()
     }
     return centre_arrivals | mesh_arrivals
 

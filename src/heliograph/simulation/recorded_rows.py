@@ -115,7 +115,7 @@ def _filter_in_chunks(task: FilteringTask, z: tuple[np.ndarray, ...]) -> PyTree 
 
     All filters must be linear, and take each measurement as it is; results are not smoothed, and rows are many.
     """
-    if task.smoother is not None or not task.filters.are_linear:
+    if task.smoother is not None or not task.filters.are_linear_and_unfused:
         return None
     begin = task.begin or Begin(initial_states(task.filters), np.asarray(0))
     filtered = scan_in_chunks(NetworkRecursion(task.filters, begin.step), to_numpy(begin.states), (z, task.u))
@@ -133,7 +133,7 @@ def _scan_in_parts(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool)
         # The last part is filled with its last row, which does not count again.
         indices = np.minimum(np.arange(start, start + size), len(u) - 1)
         k, u_k, z_k, drawn = jax.tree.map(lambda leaf, rows=indices: np.asarray(leaf)[rows], rows)
-        drawn |= {name: (drawn[name], mesh.ahead(drawn[name])) for name, mesh in filters.meshes.items()}
+        drawn |= {name: (drawn[name], mesh.compute_weights_ahead(drawn[name])) for name, mesh in filters.meshes.items()}
         counts = np.arange(start, start + size) < len(u)
         states, results = _scanned_by_xla(filters, states, (k, u_k, z_k, drawn), judged, counts)
         parts.append(to_numpy(results))

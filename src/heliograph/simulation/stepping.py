@@ -1,7 +1,6 @@
 """One step of a whole network's filters, under the scan over time."""
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -10,14 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.filters.base import AbstractFilter, make_sizes
+from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.plan import LinearStep
 from heliograph.filters.smoother_step import gaussian_of
-from heliograph.fusion.all_reports import AllReports
 from heliograph.fusion.network_fusion import Fusion
 from heliograph.model.estimate import Estimate
-from heliograph.model.over_time import stack
-from heliograph.model.sensor import without_output_names
 from heliograph.numerics.check import fail, instance, text
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
@@ -25,30 +21,48 @@ from heliograph.simulation.centres.centre import (
     CentreFilter,
     CentreState,
     FusionCentre,
-    claim_of_reports,
 )
 from heliograph.simulation.centres.fused_innovation import FusedInnovation, following_prior, make_fused_innovations
 from heliograph.simulation.centres.fusions import (
     ReportFusion,
     StackedFusions,
-    centres_of,
-    find_source_filters,
+    build_centre_filter,
+    build_report_fusions,
+    list_centres,
     list_stacked_fusions,
 )
 from heliograph.simulation.centres.linearised import FollowedFusion, LinearisedCentre
 from heliograph.simulation.centres.mesh import Mesh
 from heliograph.simulation.centres.mesh_building import build_meshes
-from heliograph.simulation.centres.uplinks import uplinks_of
-from heliograph.simulation.network import FUSED, Network
-from heliograph.simulation.node import Node, ReceivingNode
-from heliograph.simulation.runs.side_by_side import StackedFilters, filter_step, initial_state
+from heliograph.simulation.network import Network
+from heliograph.simulation.network_index import find_measurement_order
+from heliograph.simulation.runs.side_by_side import (
+    StackedFilters,
+    StepOutput,
+    filter_step,
+    initial_state,
+    stack_by_kind,
+)
 
 
 class AllFilters(Module):
     """Every filter of a network: those of the nodes by kind, fusion rules, informed centres, central filters.
 
-    `order` brings the groups' measurements, joined, into the order of the nodes. `smooths`: central filters return
-    smoother steps, as do those of the kinds that do.
+    A group holds the nodes that differ in numbers alone; a kind holds, of one group, the filters that differ so.
+
+    Fields:
+        alike: the nodes' filters, those of a kind stacked.
+        fusions: of the nodes' estimates by rules that know nothing of the nodes.
+        centres: of the informed fusions, which know how the nodes' errors are correlated; one for each filter fused so.
+        reporting: fusions by reports over uplinks, by name.
+        meshes: fusions between neighbours, by name.
+        tests: of fused estimates by what arrives after them, by name.
+        central: filters of all nodes' measurements at once, by name.
+        order: brings the groups' measurements, joined, into the order of the nodes; None where they are in it.
+        complete: of each group, whether nothing of its measurements is ever missing.
+        n: number of the plant's states.
+        smooths: central filters return smoother steps, as do those of the kinds that do.
+        judges: filters judge their data.
     """
 
     alike: tuple[StackedFilters, ...]
@@ -59,7 +73,7 @@ class AllFilters(Module):
     tests: dict[str, FusedInnovation]
     central: dict[str, AbstractFilter]
     order: np.ndarray | None
-    complete: tuple[bool, ...] = eqx.field(static=True)  # of each group: nothing is ever missing
+    complete: tuple[bool, ...] = eqx.field(static=True)
     n: int = eqx.field(static=True)
     smooths: bool = eqx.field(static=True)
     judges: bool = eqx.field(static=True)
@@ -67,91 +81,84 @@ class AllFilters(Module):
     def __init__(
         self,
         network: Network,
-        smoothed_groups: Collection[int] | None = None,
+        smoothed_kinds: Collection[int] | None = None,
         judges: bool = False,
         tests: bool = False,
     ):
-        """Stack the filters of a network by structure.
+        """Stack the filters of a network, and build its fusions.
 
-        `smoothed_groups`: which kinds are to be smoothed, and the central filters with them; None if nothing is.
-        `judges`: filters judge their data, and skip implausible data on request. `tests`: fused estimates are tested by
-        what arrives at the next step.
+        Args:
+            network: the network.
+            smoothed_kinds: numbers of the kinds of filters to be smoothed, with all central filters; None if nothing
+                is.
+            judges: filters judge their data, and skip implausible data on request.
+            tests: fused estimates are tested by what arrives at the next step.
         """
-        self.smooths, self.judges = smoothed_groups is not None, judges
-        alike = []
-        for number, kind in enumerate(network.kinds):
-            nodes = network.groups[kind.group]
-            filters = [without_output_names(network.nodes[node].filters[f]) for f in kind.filters for node in nodes]
-            alike.append(
-                StackedFilters(
-                    filters=stack(filters),
-                    group=kind.group,
-                    count=len(kind.filters),
-                    nodes=len(nodes),
-                    smooths=smoothed_groups is not None and number in smoothed_groups,
-                    judges=judges,
-                )
-            )
-        self.alike = tuple(alike)
-        # Central filters, fusions, informed centres, centres with reports.
+        self.smooths, self.judges = smoothed_kinds is not None, judges
+        self.alike = stack_by_kind(network, smoothed_kinds or (), judges)
+        # At the centre: filters of all measurements, fusions of estimates, and those that know or receive more.
         self.central = {name: fusion for name, fusion in network.fused.items() if isinstance(fusion, AbstractFilter)}
-        self.fusions, self.centres = list_stacked_fusions(network), centres_of(network)
-        self.reporting, self.meshes = _make_report_fusions(network), build_meshes(network)
+        self.fusions, self.centres = list_stacked_fusions(network), list_centres(network)
+        self.reporting, self.meshes = build_report_fusions(network, AllFilters), build_meshes(network)
         self.tests = make_fused_innovations(network, self.alike) if tests else {}
-        # Permutation of the groups' measurements into the order of the nodes.
-        grouped = [name for names in network.groups for name in names]
-        lengths = [network.nodes[name].received for name in grouped]
-        entries = dict(zip(grouped, np.split(np.arange(sum(lengths)), np.cumsum(lengths)[:-1]), strict=True))
-        self.order = _unless_sorted(np.concatenate([entries[name] for name in network.names]))
+        self.order = find_measurement_order(network.groups, network.rows)
         self.complete = tuple(network.nodes[names[0]].complete for names in network.groups)
         self.n = len(network.states)
 
     def init(self) -> PyTree:
-        """Return states before the first step: of filters, central ones, quantizers, centres, reports, tests."""
+        """Return the states before the first step.
+
+        A tuple: of the nodes' filters by kind; of central filters by name; of quantizers, by stack of fusions; of the
+        informed centres; of fusions by reports and between neighbours by name; and the fused estimates to be tested.
+        """
         central = {name: initial_state(filter) for name, filter in self.central.items()}
         states = tuple(stacked.init() for stacked in self.alike)
-        sent = tuple(fusion.init(self.n) for fusion in self.fusions)
-        reporting: dict[str, PyTree] = {name: link.init() for name, link in self.reporting.items()}
-        reporting |= {name: mesh.init() for name, mesh in self.meshes.items()}
+        quantizers = tuple(fusion.init(self.n) for fusion in self.fusions)
+        exchanges: dict[str, PyTree] = {name: fusion.init() for name, fusion in self.reporting.items()}
+        exchanges |= {name: mesh.init() for name, mesh in self.meshes.items()}
         tested = {name: test.start for name, test in self.tests.items()}
-        return (
-            states,
-            central,
-            sent,
-            tuple(self._init_centre(centre, states) for centre in self.centres),
-            reporting,
-            tested,
-        )
+        centres = tuple(self._init_centre(centre, states) for centre in self.centres)
+        return states, central, quantizers, centres, exchanges, tested
 
     def _init_centre(
         self, centre: FusionCentre | LinearisedCentre, states: Sequence[PyTree]
     ) -> CentreState | dict[str, FollowedFusion]:
-        """Return the state in which a centre begins, from the first means of the filters whose estimates it fuses.
+        """Return a centre's state before the first step, from the first means of the filters whose estimates it fuses.
 
-        Those of one kind are stacked, (filter, node, n), of which a source takes filter number f.
+        `states`: of the nodes' filters by kind. Means of one kind are (filter and node, n), filter after filter.
         """
-        sources = [(gaussian_of(states[kind]), self.alike[kind].count, f) for kind, f in centre.sources]
-        return centre.init([x.mean.reshape(count, -1, self.n)[f] for x, count, f in sources])
+        means = []
+        for kind, f in centre.sources:
+            by_filter = gaussian_of(states[kind]).mean.reshape(self.alike[kind].count, -1, self.n)
+            means.append(by_filter[f])
+        return centre.init(means)
 
     @property
-    def are_linear(self) -> bool:
+    def are_linear_and_unfused(self) -> bool:
         """Whether no filter's gain depends on data, and nothing is fused."""
         filters = [*(stacked.filters for stacked in self.alike), *self.central.values()]
         fuses = self.fusions or self.centres or self.reporting or self.meshes
         return not fuses and all(filter.is_linear for filter in filters)
 
     @property
-    def informed(self) -> tuple[FusionCentre, ...]:
-        """Centres of filters whose gains do not depend on data."""
+    def linear_centres(self) -> tuple[FusionCentre, ...]:
+        """Informed centres of filters whose gains do not depend on data."""
         return tuple(centre for centre in self.centres if isinstance(centre, FusionCentre))
 
-    def matrices(self, centre: FusionCentre, states: PyTree, u: jax.Array, k: jax.Array) -> list[LinearStep]:
-        """Return the matrices of a centre's sources at step k; they depend on covariances alone, so z may be zero."""
-        sources = [(self.alike[kind], states[kind], f, self._make_zeros(kind)) for kind, f in centre.sources]
-        return [alike.matrices(centre.read, state, f, zeros, u, k) for alike, state, f, zeros in sources]
+    def list_step_matrices(self, centre: FusionCentre, states: PyTree, u: jax.Array, k: jax.Array) -> list[LinearStep]:
+        """Return the matrices of step k of the filters that a centre fuses, for each of its sources.
 
-    def followed(self, states: PyTree, u: jax.Array, k: jax.Array) -> PyTree:
-        """Return the states of the nodes' filters after step k, for measurements of zero."""
+        `states`: of the nodes' filters by kind, before the step. The matrices depend on covariances alone, so that
+        measurements of zero do.
+        """
+        matrices = []
+        for kind, f in centre.sources:
+            alike, zeros = self.alike[kind], self._make_zeros(kind)
+            matrices.append(alike.compute_by_node(centre.compute_matrices, states[kind], f, zeros, u, k))
+        return matrices
+
+    def step_without_data(self, states: PyTree, u: jax.Array, k: jax.Array) -> PyTree:
+        """Return the states of the nodes' filters by kind after step k, for measurements of zero."""
         kinds = enumerate(zip(self.alike, states, strict=True))
         return tuple(alike.step(state, self._make_zeros(kind), u, k)[0] for kind, (alike, state) in kinds)
 
@@ -168,15 +175,15 @@ class AllFilters(Module):
         drawn: Mapping[str, PyTree] | None = None,
         skip: tuple[Sequence[jax.Array], Mapping[str, jax.Array]] | None = None,
     ) -> tuple[PyTree, dict[str, PyTree]]:
-        """Step all filters with the measurements z of each group (node, received), and inputs u, over step k.
+        """Step all filters and fusions of the network over step k.
 
         Args:
-            states: of all filters and fusions, as `init` returns them.
-            z: measurements by group of nodes.
+            states: of all filters and fusions before the step, as `init` returns them.
+            z: measurements (node, received) by group of nodes, NaN where one is missing.
             u: inputs of the plant over the step.
             k: number of the step.
-            drawn: what was drawn of the uplinks and links between neighbours, by fusion; without, nothing is lost.
-            skip: reasons not to use data, of each kind and by name of central filters, in the form of judgements.
+            drawn: what the uplinks and the links between neighbours do, by fusion; without, nothing is lost.
+            skip: reasons not to use data, codes of `Reason`: (filter, node) by kind, and by name of central filters.
 
         Returns:
             The states after the step, and its outputs: "estimates" by kind, (filter, node, ...), then those between
@@ -185,24 +192,21 @@ class AllFilters(Module):
             name; where they judge, "judged" and "weighed" by kind, "judged_centrally" and "weighed_centrally" by name,
             and "tested", the squared innovations of fused estimates by name.
         """
-        filter_states, central, quantizer_states, centre_states, reporting, tested = states
+        filter_states, central, quantizer_states, centre_states, exchange_states, tested = states
+        reasons: Sequence[jax.Array | None] = [None] * len(filter_states)
+        central_reasons: Mapping[str, jax.Array] = {}
+        if skip is not None:
+            reasons, central_reasons = skip
         # The nodes' filters, and central ones on all measurements in the order of the nodes.
-        reasons = [None] * len(filter_states) if skip is None else skip[0]
-        central_reasons = {} if skip is None else skip[1]
         stepped = [
             stacked.step(state, z[stacked.group], u, k, reason)
             for stacked, state, reason in zip(self.alike, filter_states, reasons, strict=True)
         ]
-        joined = jnp.concatenate([jnp.ravel(values) for values in z])
-        joined = joined if self.order is None else joined[self.order]
-        stepped_centrally = {
-            name: filter_step(filter, central[name], joined, u, k, self.smooths, self.judges, central_reasons.get(name))
-            for name, filter in self.central.items()
-        }
+        stepped_centrally = self._step_central_filters(central, z, u, k, central_reasons)
         # Fusions of the nodes' estimates.
         estimates = tuple(output.estimate for _, output in stepped)
         following, of_fusions = self._step_fusions(
-            (filter_states, quantizer_states, centre_states, reporting), z, estimates, u, k, drawn or {}
+            (filter_states, quantizer_states, centre_states, exchange_states), z, estimates, u, k, drawn or {}
         )
         fused = {name: output.estimate for name, (_, output) in stepped_centrally.items()} | of_fusions.fused
         outputs: dict[str, PyTree] = {
@@ -211,7 +215,7 @@ class AllFilters(Module):
             "uplinks": of_fusions.uplinks,
             "reports": of_fusions.reports,
         }
-        # Tests of fused estimates, by what arrived after the last of them.
+        # Tests of the last step's fused estimates by what arrived now; those of this step are tested at the next.
         distances = {
             name: test.step(tested[name], self.alike, filter_states, z, u, k, reasons)
             for name, test in self.tests.items()
@@ -219,14 +223,34 @@ class AllFilters(Module):
         tested = {name: following_prior(fused[name]) for name in self.tests}
         if self.judges:
             outputs["tested"] = distances
+        # What else the filters' steps put out, under one name of the nodes' filters and another of central ones.
         for field, of_nodes, centrally in self._list_details():
             outputs[of_nodes] = tuple(getattr(output, field) for _, output in stepped)
             outputs[centrally] = {name: getattr(output, field) for name, (_, output) in stepped_centrally.items()}
         central = {name: state for name, (state, _) in stepped_centrally.items()}
         return (tuple(state for state, _ in stepped), central, *following, tested), outputs
 
+    def _step_central_filters(
+        self,
+        states: Mapping[str, PyTree],
+        z: Sequence[jax.Array],
+        u: jax.Array,
+        k: jax.Array,
+        skip: Mapping[str, jax.Array],
+    ) -> dict[str, tuple[PyTree, StepOutput]]:
+        """Return the next state and the output of each central filter, by name, on the measurements of all groups.
+
+        Arguments as of `step`; `states` and `skip` by name of the filter.
+        """
+        joined = jnp.concatenate([jnp.ravel(values) for values in z])
+        joined = joined if self.order is None else joined[self.order]
+        return {
+            name: filter_step(filter, states[name], joined, u, k, self.smooths, self.judges, skip.get(name))
+            for name, filter in self.central.items()
+        }
+
     def _list_details(self) -> list[tuple[str, str, str]]:
-        """Return further fields of each filter's step, with their names among the outputs of nodes and central ones."""
+        """Return (field of `StepOutput`, its name among the nodes' outputs, and among central filters') to put out."""
         judged = [("judgement", "judged", "judged_centrally"), ("weighed", "weighed", "weighed_centrally")]
         steps = [("steps", "smoother_steps", "central_steps")]
         return (steps if self.smooths else []) + (judged if self.judges else [])
@@ -240,14 +264,22 @@ class AllFilters(Module):
         k: jax.Array,
         drawn: Mapping[str, PyTree],
     ) -> tuple[tuple[PyTree, ...], "FusionOutputs"]:
-        """Step all fusions with the nodes' `estimates` of this step.
+        """Step all fusions with the estimates of the nodes' filters of this step.
 
-        `states`, before the step: of the nodes' filters, quantizers, centres and reports. Returns those of the last
-        three after the step, and what the fusions put out: nothing where there are none.
+        Args:
+            states: before the step, of the nodes' filters, quantizers, informed centres and exchanges of messages.
+            z: measurements (node, received) by group of nodes.
+            estimates: of the nodes' filters by kind, (filter, node, ...).
+            u: inputs of the plant over the step.
+            k: number of the step.
+            drawn: what the uplinks and the links between neighbours do, by fusion; without, nothing is lost.
+
+        Returns:
+            The states after the step of quantizers, centres and exchanges, and what the fusions put out.
         """
-        filter_states, quantizer_states, centre_states, reporting = states
-        fused, uplinks, reports, links_after = (dict[str, PyTree]() for _ in range(4))
-        # Rules, through their quantizers.
+        filter_states, quantizer_states, centre_states, exchange_states = states
+        fused, uplinks, reports, exchanges_after = (dict[str, PyTree]() for _ in range(4))
+        # Rules that know nothing of the nodes, through their quantizers.
         quantizers_after, centres_after = list[PyTree](), list[PyTree]()
         for fusion, state in zip(self.fusions, quantizer_states, strict=True):
             following, outcome, traffic = fusion.step(state, estimates, k)
@@ -260,22 +292,23 @@ class AllFilters(Module):
             centres_after.append(following)
             fused |= outcome
         # Centres with reports over uplinks.
-        for name, link in self.reporting.items():
-            arrivals = drawn[name] if name in drawn else link.uplinks.undrawn()
-            links_after[name], fused[name], traffic, reports[name] = link.step(
-                reporting[name], estimates, arrivals, u, k
+        for name, by_report in self.reporting.items():
+            draws = drawn[name] if name in drawn else by_report.uplinks.lossless()
+            exchanges_after[name], fused[name], traffic, reports[name] = by_report.step(
+                exchange_states[name], estimates, draws, u, k
             )
             uplinks |= {name: traffic} if traffic else {}
         # Fusions between neighbours, which have an estimate at each node.
         between_neighbours = list[Estimate]()
         for name, mesh in sorted(self.meshes.items()):
-            arrivals = drawn[name] if name in drawn else mesh.edges.lossless()  # within a process nothing is lost
+            # Drawn: flags of what arrives, or these and the weights that were computed from them ahead.
+            arrivals = drawn[name] if name in drawn else mesh.edges.lossless()
             flags, ahead = arrivals if isinstance(arrivals, tuple) else (arrivals, ())
-            links_after[name], of_mesh = mesh.step(reporting[name], z, jnp.asarray(flags), u, k, ahead)
+            exchanges_after[name], of_mesh = mesh.step(exchange_states[name], z, jnp.asarray(flags), u, k, ahead)
             between_neighbours.extend(of_mesh)
-            reports[name] = flags, jnp.zeros(())
+            reports[name] = flags, jnp.zeros(())  # no delays beside the flags, which hold them where there are any
         outputs = FusionOutputs(tuple(between_neighbours), fused, uplinks, reports)
-        return (tuple(quantizers_after), tuple(centres_after), links_after), outputs
+        return (tuple(quantizers_after), tuple(centres_after), exchanges_after), outputs
 
     def _step_centre(
         self,
@@ -287,14 +320,21 @@ class AllFilters(Module):
         u: jax.Array,
         k: jax.Array,
     ) -> tuple[PyTree, dict[str, Estimate]]:
-        """Step a centre with the estimates of its sources' filters, and with the matrices of their steps.
+        """Return an informed centre's next state, and its fused estimates by name.
 
-        `states`: of the filters before the step, from which the matrices follow.
+        Args:
+            centre: the centre.
+            state: its state before the step.
+            states: of the nodes' filters by kind before the step, from which the matrices of their steps follow.
+            z: measurements (node, received) by group of nodes.
+            estimates: of the nodes' filters by kind after the step, (filter, node, ...).
+            u: inputs of the plant over the step.
+            k: number of the step.
         """
         matrices = []
         for kind, f in centre.sources:
             alike = self.alike[kind]
-            matrices.append(alike.matrices(centre.read, states[kind], f, z[alike.group], u, k))
+            matrices.append(alike.compute_by_node(centre.compute_matrices, states[kind], f, z[alike.group], u, k))
         means = [jnp.asarray(estimates[kind].mean)[f] for kind, f in centre.sources]
         return centre.step(state, matrices, means, u, k)
 
@@ -321,19 +361,6 @@ def initial_states(filters: AllFilters) -> PyTree:
     return jax.tree.map(jnp.asarray, filters.init())
 
 
-def _make_report_fusions(network: Network) -> dict[str, ReportFusion]:
-    """Return the fusions by reports, each with its uplinks and its centre."""
-    results = {}
-    for name, fusion in network.fused.items():
-        if isinstance(fusion, Fusion) and fusion.by_report:
-            centre = centre_filter(network, name)
-            nodes = network.nodes_with(fusion.filter)
-            sources, order = find_source_filters(network, network.places, nodes, fusion.filter)
-            uplinks = uplinks_of(fusion, nodes, len(network.states))
-            results[name] = ReportFusion(uplinks, centre, order, sources, tuple(nodes))
-    return results
-
-
 def centre_filter(network: Network, name: str) -> CentreFilter:
     """Return the filter of the fusion centre for the fusion `name` of `network`, by `AllReports`, on nodes' reports.
 
@@ -357,37 +384,4 @@ def centre_filter(network: Network, name: str) -> CentreFilter:
     if not isinstance(fusion, Fusion) or not fusion.rule.uses_reports:
         by_reports = [n for n, f in network.fused.items() if isinstance(f, Fusion) and f.rule.uses_reports]
         raise fail("fusion", f"one of {by_reports}, which receive reports", repr(name))
-    # The nodes with that filter alone, for the moments of its errors.
-    names = network.nodes_with(fusion.filter)
-    complete = {node: network.nodes[node].complete for node in names}
-    claim = claim_of_reports(type(fusion.rule).__name__, network.claims()[FUSED][name], fusion, complete)
-    alone = Network(
-        network.plant,
-        {node: _keep_one_filter(network.nodes[node], fusion.filter) for node in network.names},
-        {"all": Fusion(fusion.filter, AllReports())},
-        network.relays,
-        network.common,
-    )
-    uplinks = uplinks_of(fusion, names, len(network.states))
-    return CentreFilter(
-        filters=AllFilters(alone),
-        links=uplinks.links,
-        rows=tuple(uplinks.rows.tolist()),
-        ages=uplinks.delay.shape[1],
-        widest=max(uplinks.received),
-        quantized=uplinks.quantizers is not None,
-        **make_sizes(claim, network, len(uplinks.rows)),
-    )
-
-
-def _keep_one_filter(node: Node | ReceivingNode, name: str) -> Node | ReceivingNode:
-    """Return a node with one of its filters, or with none if it has none of this name."""
-    filters = {label: filter for label, filter in node.filters.items() if label == name}
-    if isinstance(node, Node):
-        return Node(node.sensor, node.channel, filters)
-    return replace(node, filters=filters)
-
-
-def _unless_sorted(order: np.ndarray) -> np.ndarray | None:
-    """Return an order, None for 0, 1, 2, ...: no gather is compiled then."""
-    return None if np.array_equal(order, np.arange(len(order))) else order
+    return build_centre_filter(network, name, fusion, AllFilters)

@@ -11,10 +11,10 @@ from .fused_innovation import following_prior as following_prior
 from .fused_innovation import make_fused_innovations as make_fused_innovations
 from .fusions import ReportFusion as ReportFusion
 from .fusions import StackedFusions as StackedFusions
-from .fusions import centres_of as centres_of
-from .fusions import find_source_filters as find_source_filters
+from .fusions import build_centre_filter as build_centre_filter
+from .fusions import build_report_fusions as build_report_fusions
+from .fusions import list_centres as list_centres
 from .fusions import list_stacked_fusions as list_stacked_fusions
-from .implausible_node import refuse_centrally as refuse_centrally
 from .linearised import FollowedFusion as FollowedFusion
 from .linearised import LinearisedCentre as LinearisedCentre
 from .mesh import Mesh as Mesh
@@ -29,4 +29,3 @@ from .node_filter import node_network as node_network
 from .uplinks import SentReports as SentReports
 from .uplinks import Uplink as Uplink
 from .uplinks import UplinkDraws as UplinkDraws
-from .uplinks import uplinks_of as uplinks_of

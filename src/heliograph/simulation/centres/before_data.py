@@ -78,6 +78,7 @@ class CrossCovariances:
 
     @property
     def _sources(self) -> ErrorSources:
+        """The errors by their sources: the shared part, and the covariance of the independent part."""
         return ErrorSources(self.shared, self.independent)
 
     def fused(self, relays: Mapping[str, Sequence[str]]) -> "CrossCovariances":
@@ -90,14 +91,7 @@ class CrossCovariances:
         Raises:
             ValueError: no relays, a relay without nodes, unknown nodes, a node that two relays receive.
         """
-        listed = [name for names in relays.values() for name in names]
-        unknown = sorted(set(listed) - set(self.nodes))
-        if not relays or unknown or not all(relays.values()):
-            raise fail("relays", "each with some of the nodes", f"unknown ones {unknown}" if unknown else "none")
-        if len(set(listed)) < len(listed):
-            raise fail(
-                "nodes", "one relay for each", f"several for {sorted({n for n in listed if listed.count(n) > 1})}"
-            )
+        self._check_relays(relays)
         # Weights of each relay's nodes, and the moments of its error.
         index = {name: i for i, name in enumerate(self.nodes)}
         relayed = []
@@ -116,9 +110,23 @@ class CrossCovariances:
             independent=independent,
         )
 
+    def _check_relays(self, relays: Mapping[str, Sequence[str]]) -> None:
+        """Raise ValueError unless each relay receives some of the nodes, and no node has two relays."""
+        listed = [name for names in relays.values() for name in names]
+        unknown = sorted(set(listed) - set(self.nodes))
+        if not relays or unknown or not all(relays.values()):
+            raise fail("relays", "each with some of the nodes", f"unknown ones {unknown}" if unknown else "none")
+        if len(set(listed)) < len(listed):
+            twice = sorted({name for name in listed if listed.count(name) > 1})
+            raise fail("nodes", "one relay for each", f"several for {twice}")
+
 
 def _choose_weights(errors: ErrorSources) -> Float[np.ndarray, "n node n"]:
-    """Return the weights of least error variance, by factors where the errors' independent parts are regular enough."""
+    """Return the weights of least error variance for estimates with these errors.
+
+    By factors where the errors' independent parts are regular enough, at a cost linear in the nodes; else by their
+    joint covariance.
+    """
     # Least eigenvalue of the independent parts, in units of each component's whole deviation.
     scale = np.sqrt(np.einsum("iaa->ia", errors.covariances()))
     scale = np.where(scale > 0, scale, 1.0)
@@ -185,50 +193,55 @@ def fused_covariances(
 
 
 def _plan_filters(network: Network, horizon: int, inputs: ArrayLike | None) -> tuple[AllFilters, np.ndarray]:
-    """Return the filters, planned for the inputs, and the inputs (horizon, inputs); raise unless all need no data."""
+    """Return the network's filters, planned for the inputs, and the inputs (horizon, inputs).
+
+    Raises:
+        ValueError: no informed fusion, or filters whose gains depend on data.
+    """
     network.check_horizon(check_horizon(horizon))
     u = read_plant_inputs(network, inputs, horizon)
     filters = AllFilters(network)
     if not filters.centres:
         raise fail("fused covariances", "a fusion that knows the errors' joint covariance", "none in the network")
-    if len(filters.informed) < len(filters.centres):
+    if len(filters.linear_centres) < len(filters.centres):
         raise fail("covariances before data", "filters whose gains depend on no data", "some whose gains do")
     return plan_filters(filters, u), u
 
 
 @quickly_compiled
 def _compute_factors(filters: AllFilters, u: np.ndarray) -> SourceFactors:
-    """Return the joint covariance of all errors by its factors, along the steps of u, for the one informed fusion."""
-    (centre,) = filters.informed
-
-    separate, _, _, known, *_ = filters.init()
-    nodes, n = known[0].errors.bias.shape
+    """Return the joint covariance of all errors by its factors, after the steps of u, for the one informed fusion."""
+    (centre,) = filters.linear_centres
+    filter_states, _, _, (centre_state,), *_ = filters.init()
+    nodes, n = centre_state.errors.bias.shape
     # New sources of each step: the plant's noise, and noises of measurements where nodes share them.
     sources = n + (nodes * centre.size if isinstance(centre.observation_model, Together) else 0)
-    start = separate, initial_factors(known[0].errors, sources * len(u))
+    start = filter_states, initial_factors(centre_state.errors, sources * len(u))
 
-    def matrices(states: PyTree, u_k: jax.Array, k: jax.Array) -> LinearStep:
-        """Return the matrices of all nodes' filters in step k."""
-        return centre.gathered(filters.matrices(centre, states, u_k, k))
+    def compute_matrices(states: PyTree, u_k: jax.Array, k: jax.Array) -> LinearStep:
+        """Return the matrices of all nodes' filters in step k, from their states before it."""
+        return centre.gather_matrices(filters.list_step_matrices(centre, states, u_k, k))
 
-    return centre.factors(start, matrices, filters.followed, u)
+    return centre.propagate_error_factors(start, compute_matrices, filters.step_without_data, u)
 
 
 @quickly_compiled
 def _compute_fused(filters: AllFilters, u: np.ndarray) -> PyTree:
-    """Return the covariances of all fused estimates over the steps of u, which depend on no data."""
+    """Return the covariances (time, n, n) of all fused estimates, by name, over the steps of u."""
 
     def step(carry: tuple[PyTree, PyTree], row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
         """Step all covariances: of the nodes' filters, and of the centres by these filters' matrices; means are 0."""
-        (states, known), (k, u_k) = carry, row
-        published: dict[str, jax.Array] = {}
+        (states, centre_states), (k, u_k) = carry, row
+        covariances: dict[str, jax.Array] = {}
         following = []
-        for centre, state in zip(filters.informed, known, strict=True):
+        for centre, state in zip(filters.linear_centres, centre_states, strict=True):
             means = [jnp.zeros((filters.alike[kind].nodes, filters.n)) for kind, _ in centre.sources]
-            after, estimates = centre.step(state, filters.matrices(centre, states, u_k, k), means, u_k, k)
+            matrices = filters.list_step_matrices(centre, states, u_k, k)
+            after, estimates = centre.step(state, matrices, means, u_k, k)
             following.append(after)
-            published |= {name: jnp.asarray(estimate.covariance) for name, estimate in estimates.items()}
-        return (filters.followed(states, u_k, k), tuple(following)), published
+            covariances |= {name: jnp.asarray(estimate.covariance) for name, estimate in estimates.items()}
+        return (filters.step_without_data(states, u_k, k), tuple(following)), covariances
 
-    states, _, _, known, *_ = filters.init()
-    return jax.lax.scan(step, (states, known), (jnp.arange(len(u)), jnp.asarray(u)))[1]
+    states, _, _, centre_states, *_ = filters.init()
+    _, covariances = jax.lax.scan(step, (states, centre_states), (jnp.arange(len(u)), jnp.asarray(u)))
+    return covariances

@@ -46,17 +46,23 @@ from heliograph.simulation.centres.observation_model import Apart, Together
 
 
 class CentreState(NamedTuple):
-    """Moments of the errors, and the states of the rules, by name."""
+    """State of a centre: moments of the nodes' errors, and the states of its rules by name of the fusion."""
 
     errors: ErrorMoments
     rules: dict[str, PyTree]
 
 
 class FusionCentre(Module):
-    """All informed fusions of one filter's estimates, at the nodes that have it.
+    """All informed fusions of one filter's estimates, at the nodes that have it: each step propagates their errors.
 
-    `sources`: (kind, number within the kind) of the stacked filters, one group of nodes after another; `order` brings
-    what is gathered from them into the order of the nodes. `size`: length of the longest measurement.
+    Args:
+        plant: the linear plant that the filters estimate.
+        observation_model: of the nodes' measurements.
+        rules: by name of the fusion.
+        order: brings what is gathered from the sources into the order of the nodes.
+        sources: (kind, number within the kind) of the stacked filters, one group of nodes after another.
+        size: length of the longest measurement, to which others are padded.
+        claim: of the fused estimates.
     """
 
     plant: AnyPlant
@@ -67,38 +73,48 @@ class FusionCentre(Module):
     size: int = eqx.field(static=True)
     claim: Claim = eqx.field(static=True)
 
-    read = staticmethod(linear_step)
+    compute_matrices = staticmethod(linear_step)
 
     def init(self, starts: Sequence[jax.Array]) -> CentreState:
-        """Return the state before the first step, from the initial means of each source's filters."""
+        """Return the state before the first step, from the initial means (node, n) of each source's filters."""
         plant = at(self.plant, 0)
         errors = initial_errors(plant.initial_mean, plant.initial_covariance, jnp.concatenate(starts)[self.order])
         return CentreState(errors, {name: rule.start(errors) for name, rule in self.rules.items()})
 
-    def moved(self, errors: ErrorMoments, filters: LinearStep, u: jax.Array, k: jax.Array) -> CentreStep:
-        """Propagate the errors of filters with these matrices over step k, in the order of the nodes."""
-        step = self.error_step(errors.state_mean, errors.state_covariance, filters, u, k)
+    def step_errors(self, errors: ErrorMoments, filters: LinearStep, u: jax.Array, k: jax.Array) -> CentreStep:
+        """Return the step of the errors of filters with these matrices, and the errors' moments after it.
+
+        `errors`: moments before step k. `filters`: matrices in the order of the nodes.
+        """
+        step = self.compute_error_step(errors.state_mean, errors.state_covariance, filters, u, k)
         return CentreStep(step, propagate_errors_jointly(errors, step))
 
-    def error_step(
+    def compute_error_step(
         self, mean: jax.Array, covariance: jax.Array, filters: LinearStep, u: jax.Array, k: jax.Array
     ) -> ErrorStep:
-        """Return the linear maps of the errors in step k, for a plant with these moments before it."""
+        """Return the linear maps of the errors in step k, for a plant with these moments before it.
+
+        `mean` (n,) and `covariance` (n, n): of the plant's state. `filters`: matrices in the order of the nodes.
+        """
         plant: LinearPlant = at(self.plant, k)
         motion = Motion(plant.transition_matrix(u), plant.shift(u), plant.noise_covariance(u))
         observation = self.observation_model.observe(*propagate_state(mean, covariance, motion), k)
         return make_error_step(filters, motion, observation)
 
-    def factors(
+    def propagate_error_factors(
         self,
         start: tuple[PyTree, SourceFactors],
-        matrices: Callable[..., LinearStep],
-        follow: Callable[..., PyTree],
+        compute_matrices: Callable[..., LinearStep],
+        step_filters: Callable[..., PyTree],
         u: Array,
     ) -> SourceFactors:
-        """Propagate the errors by their sources over all steps, from the filters' states and the factors before them.
+        """Return the factors of the errors' joint covariance after all steps.
 
-        `matrices(states, u, k)` and `follow(states, u, k)` are those of the filters' step k, and their next states.
+        Args:
+            start: the filters' states and the factors before the first step.
+            compute_matrices: of (states, u, k), the matrices of the filters' step k in the order of the nodes.
+            step_filters: of (states, u, k), the filters' states after step k.
+            u: inputs of the plant (step, inputs), one row for each step.
         """
 
         def propagate(
@@ -106,22 +122,35 @@ class FusionCentre(Module):
         ) -> tuple[tuple[PyTree, SourceFactors], None]:
             """Step the filters' states, and the factors by the filters' matrices."""
             (states, factors), (k, u_k) = carry, row
-            spread = jnp.asarray(factors.state @ factors.state.T)
-            step = self.error_step(factors.mean[0], spread, matrices(states, u_k, k), u_k, k)
-            return (follow(states, u_k, k), propagate_factors(factors, step, k)), None
+            # Moments of the plant's state: row 0 of the means, and its part of the factors.
+            covariance = jnp.asarray(factors.state @ factors.state.T)
+            matrices = compute_matrices(states, u_k, k)
+            step = self.compute_error_step(factors.mean[0], covariance, matrices, u_k, k)
+            return (step_filters(states, u_k, k), propagate_factors(factors, step, k)), None
 
-        factors: SourceFactors = jax.lax.scan(propagate, start, (jnp.arange(len(u)), jnp.asarray(u)))[0][1]
+        (_, factors), _ = jax.lax.scan(propagate, start, (jnp.arange(len(u)), jnp.asarray(u)))
         return factors
 
-    def gathered(self, parts: Sequence[LinearStep]) -> LinearStep:
-        """Return the filters' matrices in the order of the nodes, padded with zeros to the longest measurement."""
+    def gather_matrices(self, parts: Sequence[LinearStep]) -> LinearStep:
+        """Return the filters' matrices in the order of the nodes, padded with zeros to the longest measurement.
+
+        `parts`: those of each source, with a leading axis of nodes.
+        """
         return gather_steps(parts, self.order, self.size)
 
     def step(
         self, state: CentreState, parts: Sequence[LinearStep], means: Sequence[jax.Array], u: jax.Array, k: jax.Array
     ) -> tuple[CentreState, dict[str, Estimate]]:
-        """Return the next state, and estimates by fusion, from the sources' matrices and means after the step."""
-        happened = self.moved(state.errors, self.gathered(parts), u, k)
+        """Return the next state, and the fused estimates of step k by name of the fusion.
+
+        Args:
+            state: before the step.
+            parts: matrices of the sources' filters in the step, with a leading axis of nodes.
+            means: of their estimates after it (node, n), by source.
+            u: inputs of the plant over the step.
+            k: number of the step.
+        """
+        happened = self.step_errors(state.errors, self.gather_matrices(parts), u, k)
         reports = jnp.concatenate(means)[self.order]
         after, results = {}, {}
         for name, rule in self.rules.items():
@@ -136,17 +165,22 @@ Matrices = TypeVar("Matrices", LinearStep, Linearised)
 
 
 def gather_steps(parts: Sequence[Matrices], order: np.ndarray, size: int) -> Matrices:
-    """Return the matrices of several groups of filters in this order, padded with zeros to `size` measurements."""
+    """Return the matrices of several groups of filters, one after another and then in this order.
+
+    Axes as long as the measurement are padded with zeros to `size`.
+    """
 
     def pad(name: str, leaf: jax.Array) -> jax.Array:
-        """Pad the measurement axes of the matrix `name`."""
+        """Return the matrix that is the field `name`, with its measurement axes padded to `size`."""
         padding = [(0, size - length) if axis - leaf.ndim in MEASURED.get(name, ()) else (0, 0)
                    for axis, length in enumerate(leaf.shape)]  # fmt: skip
         return jnp.pad(leaf, padding)
 
     matrices = type(parts[0])
-    joined = {f: jnp.concatenate([pad(f, getattr(part, f)) for part in parts]) for f in matrices._fields}
-    return matrices(**{f: leaf[order] for f, leaf in joined.items()})
+    joined = {
+        field: jnp.concatenate([pad(field, getattr(part, field)) for part in parts]) for field in matrices._fields
+    }
+    return matrices(**{field: leaf[order] for field, leaf in joined.items()})
 
 
 Parts = Mapping[str, tuple[AnySensor, Channel, AbstractFilter]]  # sensor, channel and filter of each node
@@ -155,11 +189,16 @@ Parts = Mapping[str, tuple[AnySensor, Channel, AbstractFilter]]  # sensor, chann
 def claim_of_informed(rule: str, plant: AnyPlant, nodes: Parts, shared: bool) -> Claim:
     """Return the claim of fusion by an informed rule: "exact", "upper" where noise is known by bounds, else "nominal".
 
-    `shared`: whether the nodes receive parts of one channel.
+    Args:
+        rule: its name, for errors.
+        plant: that all nodes estimate.
+        nodes: sensor, channel and filter of each node.
+        shared: whether the nodes receive parts of one channel.
 
     Raises:
         ValueError: naming the knowledge that is missing.
     """
+    # What a channel remembers would be part of the errors' joint state.
     for name, (_, channel, _) in nodes.items():
         if first(channel).remembers:
             expected = f"fusion by {rule}: node {name!r}"
@@ -231,21 +270,27 @@ class NodesFilters(Protocol):
     """The nodes' filters as their centre steps them: without data, on which their gains do not depend."""
 
     @property
-    def informed(self) -> tuple[FusionCentre, ...]:
+    def linear_centres(self) -> tuple[FusionCentre, ...]:
         """The centre of their errors' moments, alone."""
 
     def init(self) -> PyTree:
         """Return the states before the first step."""
 
-    def matrices(self, centre: FusionCentre, states: PyTree, u: jax.Array, k: jax.Array) -> Sequence[PyTree]:
-        """Return the matrices of the filters' next step."""
+    def list_step_matrices(self, centre: FusionCentre, states: PyTree, u: jax.Array, k: jax.Array) -> Sequence[PyTree]:
+        """Return the matrices of the filters' step k for each source of the centre, from their states before it."""
 
-    def followed(self, states: PyTree, u: jax.Array, k: jax.Array) -> PyTree:
-        """Return the states after a step."""
+    def step_without_data(self, states: PyTree, u: jax.Array, k: jax.Array) -> PyTree:
+        """Return the filters' states after step k."""
 
 
 class CentreBelief(NamedTuple):
-    """States of the nodes' filters, of which only covariances matter; moments of their errors; the estimate."""
+    """What the centre knows after a step.
+
+    Args:
+        nodes: states of the nodes' filters, of which only covariances matter.
+        errors: moments of their errors.
+        known: joint estimate of the plant's state, the errors and the reports that may still arrive.
+    """
 
     nodes: PyTree
     errors: ErrorMoments
@@ -257,8 +302,13 @@ class CentreFilter(AbstractSizedFilter):
 
     The measurement is, for each age in steps and each node in turn, the report that arrived, NaN where none did.
 
-    `rows`: which of all (age, node, component), flattened, can arrive. `ages`: possible ages, 0 included. `widest`:
-    components of the longest report. Local filters are propagated without data: their gains depend on none.
+    Args:
+        filters: of the nodes, propagated without data: their gains depend on none.
+        links: model of the uplinks, by which the reports come.
+        rows: which of all (age, node, component), flattened, can arrive.
+        ages: how many ages in steps a report can have, 0 included.
+        widest: components of the longest report.
+        quantized: whether reports are quantized.
     """
 
     filters: NodesFilters
@@ -278,15 +328,15 @@ class CentreFilter(AbstractSizedFilter):
     @predicts
     def predict(self, state: CentreBelief, u: ArrayLike = (), k: Step = 0) -> CentreBelief:
         """Predict plant and all errors; the nodes send their reports."""
-        (centre,), u, step = self.filters.informed, jnp.asarray(u), jnp.asarray(k)
-        filters: LinearStep = centre.gathered(self.filters.matrices(centre, state.nodes, u, step))
-        happened = centre.moved(state.errors, filters, u, step)
-        following = self.filters.followed(state.nodes, u, step)
+        (centre,), u, step = self.filters.linear_centres, jnp.asarray(u), jnp.asarray(k)
+        filters: LinearStep = centre.gather_matrices(self.filters.list_step_matrices(centre, state.nodes, u, step))
+        happened = centre.step_errors(state.errors, filters, u, step)
+        following = self.filters.step_without_data(state.nodes, u, step)
         return CentreBelief(following, happened.errors, propagate_errors(state.known, happened, at(self.links, k)))
 
     @corrects
     def correct(self, state: CentreBelief, z: ArrayLike, k: Step = 0) -> tuple[CentreBelief, Innovation]:
-        """Correct with the reports that arrived."""
+        """Correct with the reports that arrived, z of `rows`, NaN where one did not; return the innovation too."""
         nodes, rows = state.known.past.gain.shape[1], np.array(self.rows)
         reports = jnp.full(self.ages * nodes * self.widest, jnp.nan).at[rows].set(jnp.asarray(z))
         known, expected = correct_with_reports(state.known, reports.reshape(self.ages, nodes, self.widest))

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.factors.gaussian import Gaussian, from_covariance
+from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.adaptive import AdaptiveBelief
 from heliograph.filters.linear.belief import LinearBelief
 from heliograph.filters.plausibility import innovation_distance
@@ -34,6 +35,17 @@ class FusedDistance(NamedTuple):
     arrived: jax.Array
 
 
+class _Corrected(NamedTuple):
+    """The fused estimate x, predicted and corrected by some nodes.
+
+    distance: sum of their e_i' S_i^-1 e_i. arrived: how many numbers they received.
+    """
+
+    x: Gaussian
+    distance: jax.Array
+    arrived: jax.Array
+
+
 class FusedInnovation(Module):
     """Test of a fused estimate xf of covariance Pf by the measurements of the nodes whose estimates it fuses.
 
@@ -46,7 +58,7 @@ class FusedInnovation(Module):
 
     Args:
         start: the plant's initial law, before the first fusion.
-        sources: kind and filter of the estimates that are fused.
+        sources: (kind, number within the kind) of the filters whose estimates are fused.
     """
 
     start: Gaussian
@@ -56,44 +68,71 @@ class FusedInnovation(Module):
         self, before: Gaussian, alike: Sequence[StackedFilters], states: Sequence[PyTree], z: Sequence[jax.Array],
         u: jax.Array, k: jax.Array, skip: Sequence[jax.Array | None],
     ) -> FusedDistance:  # fmt: skip
-        """Test the prediction from the fused estimate `before`, with the filters' states before step k.
+        """Return e' S^-1 e of the fused estimate `before`, predicted over step k, by the measurements of that step.
 
-        `skip`: reasons not to use a node's measurement, by kind.
+        Args:
+            before: the fused estimate after step k - 1.
+            alike: the nodes' filters, stacked by kind.
+            states: of these filters before step k, by kind.
+            z: measurements (node, received) by group of nodes, NaN where one is missing.
+            u: inputs of the plant over the step.
+            k: number of the step.
+            skip: by kind, codes of the reason not to use a node's measurement (filter, node), 0 where it is used; None
+                where all are.
         """
-        # x = N(xf-, Pf-), d = 0; then for each node i: x, e_i, S_i by its correction, d += e_i' S_i^-1 e_i.
-        carry: tuple[Gaussian, jax.Array, jax.Array] | None = None
+        corrected: _Corrected | None = None
         for kind, f in self.sources:
-            # Arrays of each node's filter, its state and what it receives; a stack has the nodes of filter 0 first.
             stacked, reasons = alike[kind], skip[kind]
-            rows = slice(f * stacked.nodes, (f + 1) * stacked.nodes)
-            filters, beliefs = jax.tree.map(
-                lambda a, rows=rows: a[rows] if eqx.is_array(a) else a, (stacked.filters, states[kind])
-            )
+            filters, beliefs = stacked.take_filter(f, states[kind])
             received = z[stacked.group]
             if reasons is not None:
                 received = jnp.where(reasons[f][:, None] > 0, jnp.nan, received)
-            numbers, static = eqx.partition(filters, eqx.is_array)
-            # Prediction from the fused estimate, by the first node's model of the plant.
-            if carry is None:
-                head, state = jax.tree.map(lambda a: a[0], (numbers, beliefs))
-                start = eqx.combine(head, static).predict(with_gaussian(state, before), u, k)
-                carry = gaussian_of(start), jnp.zeros(()), jnp.zeros(())
+            # x = N(xf-, Pf-): predicted from the fused estimate, by the first node's model of the plant.
+            if corrected is None:
+                x = _predict_by_first(filters, beliefs, before, u, k)
+                corrected = _Corrected(x, jnp.zeros(()), jnp.zeros(()))
+            corrected = _correct_in_turn(corrected, filters, beliefs, received, u, k)
+        assert corrected is not None  # there is at least one node
+        return FusedDistance(jnp.where(corrected.arrived > 0, corrected.distance, jnp.nan), corrected.arrived)
 
-            def correct(carry: PyTree, row: PyTree, static: PyTree = static) -> tuple[PyTree, None]:
-                """Correct x by one node's filter, and add its squared innovation."""
-                x, distance, arrived = carry
-                numbers, prior, z_i = row
-                after, innovation = eqx.combine(numbers, static).correct(with_gaussian(prior, x), z_i, k)
-                more, count = innovation_distance(innovation)
-                return (gaussian_of(after), distance + more, arrived + count), None
 
-            # What else a filter's state holds, predicted; then correction by node after node.
-            predict = eqx.filter_vmap(lambda node, state: node.predict(state, u, k), in_axes=(eqx.if_array(0), 0))
-            by_node = numbers, predict(filters, beliefs), received
-            carry, _ = jax.lax.scan(correct, carry, by_node, unroll=min(stacked.nodes, UNROLLED))
-        assert carry is not None  # there is at least one node
-        _, distance, arrived = carry
-        return FusedDistance(jnp.where(arrived > 0, distance, jnp.nan), arrived)
+def _predict_by_first(
+    filters: AbstractFilter, states: PyTree, estimate: Gaussian, u: jax.Array, k: jax.Array
+) -> Gaussian:
+    """Return `estimate` predicted over step k by the first of some stacked filters."""
+    numbers, static = eqx.partition(filters, eqx.is_array)
+    head, state = jax.tree.map(lambda leaf: leaf[0], (numbers, states))
+    first: AbstractFilter = eqx.combine(head, static)
+    predicted: Gaussian = gaussian_of(first.predict(with_gaussian(state, estimate), u, k))
+    return predicted
+
+
+def _correct_in_turn(
+    corrected: _Corrected, filters: AbstractFilter, states: PyTree, received: jax.Array, u: jax.Array, k: jax.Array
+) -> _Corrected:
+    """Return x corrected by these nodes too, one after another, and with their innovations in the sums.
+
+    Args:
+        corrected: x and the sums over the nodes before.
+        filters: one of each node, stacked.
+        states: of the filters before the step; all that they hold beside x is predicted by each filter itself.
+        received: measurements (node, received).
+        u: inputs of the plant over the step.
+        k: number of the step.
+    """
+    numbers, static = eqx.partition(filters, eqx.is_array)
+
+    def correct(before: _Corrected, row: tuple[PyTree, PyTree, jax.Array]) -> tuple[_Corrected, None]:
+        """Correct x by one node's filter, and add its squared innovation."""
+        node_numbers, prior, z = row
+        after, innovation = eqx.combine(node_numbers, static).correct(with_gaussian(prior, before.x), z, k)
+        distance, arrived = innovation_distance(innovation)
+        return _Corrected(gaussian_of(after), before.distance + distance, before.arrived + arrived), None
+
+    predict = eqx.filter_vmap(lambda node, state: node.predict(state, u, k), in_axes=(eqx.if_array(0), 0))
+    by_node = numbers, predict(filters, states), received
+    corrected, _ = jax.lax.scan(correct, corrected, by_node, unroll=min(len(received), UNROLLED))
+    return corrected
 
 
 def following_prior(estimate: Estimate) -> Gaussian:
@@ -102,7 +141,7 @@ def following_prior(estimate: Estimate) -> Gaussian:
 
 
 def make_fused_innovations(network: Network, alike: Sequence[StackedFilters]) -> dict[str, FusedInnovation]:
-    """Return the tests of the network's fusions of estimates, by name, where there is one.
+    """Return the test of each fusion of estimates in the network, by name; `alike`: its filters, stacked by kind.
 
     There is none where a filter's state is more than a mean and a covariance of the plant's states (a mixture, or past
     signals behind a link of random delay), or where a fusion claims no covariance. Nor where nodes share a channel,
@@ -116,6 +155,7 @@ def make_fused_innovations(network: Network, alike: Sequence[StackedFilters]) ->
     for name, fusion in network.fused.items():
         if isinstance(fusion, Fusion) and claims[FUSED][name] != "none":
             sources, _ = find_source_filters(network, places, network.nodes_with(fusion.filter), fusion.filter)
+            # Each filter's state is to be a mean and a covariance of the plant's states, and no more.
             beliefs = [eqx.filter_eval_shape(alike[kind].init) for kind, _ in sources]
             if all(isinstance(b, WHOLE) and gaussian_of(b).mean.shape[-1] == len(network.states) for b in beliefs):
                 start = in_float64(from_covariance)(

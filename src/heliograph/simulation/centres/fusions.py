@@ -1,12 +1,15 @@
 """Fusion of the nodes' estimates inside a step: rules in parallel, reports, and the centres' knowledge of the nodes."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.filters.base import make_sizes
+from heliograph.fusion.all_reports import AllReports
 from heliograph.fusion.joint_covariance_fusion import AbstractInformedFusion
 from heliograph.fusion.network_fusion import Fusion
 from heliograph.fusion.quantizer import widen
@@ -16,20 +19,34 @@ from heliograph.model.over_time import at, first, stack, structure
 from heliograph.numerics.angle import Angles, wrap_angles, wrap_near
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, PyTree
-from heliograph.simulation.centres.centre import CentreFilter, FusionCentre, along_estimates
+from heliograph.simulation.centres.centre import (
+    CentreFilter,
+    FusionCentre,
+    NodesFilters,
+    along_estimates,
+    claim_of_reports,
+)
 from heliograph.simulation.centres.linearised import LinearisedCentre
 from heliograph.simulation.centres.observation_model import Apart, Together, describe_channel, stack_nodes
-from heliograph.simulation.centres.uplinks import InFlight, UplinkDraws, Uplinks
+from heliograph.simulation.centres.uplinks import InFlight, UplinkDraws, Uplinks, build_uplinks
 from heliograph.simulation.network import FUSED, Network
-from heliograph.simulation.node import Node
+from heliograph.simulation.network_index import EstimatePlace
+from heliograph.simulation.node import Node, ReceivingNode
 from heliograph.simulation.runs.side_by_side import initial_state, map_all
 
 
 class StackedFusions(Module):
-    """Fusions that differ in numbers alone, stacked: rules, and the quantizers on the estimates' way (fusion, node).
+    """Fusions that differ in numbers alone, stacked along a first axis of fusions.
 
-    `sources` of each fusion: (kind, number within the kind) of the filters whose estimates it fuses, one group of nodes
-    after another; `order` (fusion, node) brings what is gathered from them into the order of the fusion's nodes.
+    Args:
+        rules: by which each fuses.
+        quantizers: through which it receives each node's estimate (fusion, node); None where there are none.
+        order: brings what is gathered from the sources into the order of the fusion's nodes (fusion, node).
+        names: of the fusions.
+        sources: by fusion, (kind, number within the kind) of the filters whose estimates it fuses, one group of nodes
+            after another.
+        claims: of what each fuses.
+        angles: which states are angles, and their periods.
     """
 
     rules: AbstractFusion
@@ -41,7 +58,7 @@ class StackedFusions(Module):
     angles: Angles = eqx.field(static=True)
 
     def init(self, n: int) -> PyTree:
-        """Return the initial states of the quantizers."""
+        """Return the quantizers' states before the first step, for a plant of n states; () without quantizers."""
         if self.quantizers is None:
             return ()
         fusions, nodes = self.order.shape
@@ -50,9 +67,16 @@ class StackedFusions(Module):
     def step(
         self, states: PyTree, estimates: Sequence[Estimate], k: jax.Array
     ) -> tuple[PyTree, dict[str, Estimate], dict[str, PyTree]]:
-        """Fuse the filters' estimates at step k, arrays (filter, node, ...) by kind.
+        """Fuse the filters' estimates of step k.
 
-        Returns: the quantizers' next states, the fused estimates by fusion, and what the quantizers did by fusion.
+        Args:
+            states: of the quantizers before the step, (fusion, node, ...).
+            estimates: of the filters by kind, (filter, node, ...).
+            k: number of the step.
+
+        Returns:
+            The quantizers' states after the step, the fused estimates by name of the fusion, and by that name which
+            components "saturated" a quantizer and how many "symbols" it sent, (node, n).
         """
         # Means and covariances in the order of each fusion's nodes.
         means = self._gather([e.mean for e in estimates])
@@ -61,18 +85,22 @@ class StackedFusions(Module):
         # Quantized means, and covariances widened by the quantizers' errors.
         if self.quantizers is not None:
             fusions, nodes = self.order.shape
-            send = map_all(map_all(lambda q, s, mean: at(q, k).step(s, mean), nodes), fusions)
+            send_one_mean = map_all(lambda quantizer, state, mean: at(quantizer, k).step(state, mean), nodes)
+            send = map_all(send_one_mean, fusions)
             states, sent = send(self.quantizers, states, means)
             means, covariances = sent.value, jax.vmap(jax.vmap(widen))(covariances, sent.error)
             for i, name in enumerate(self.names):
                 uplinks[name] = {"saturated": sent.saturated[i], "symbols": sent.symbols[i]}
-        # Angles near those of the first node, then the rules in parallel.
+        # Angles are taken near those of the first node, so that they can be averaged; then the rules in parallel.
         means = wrap_near(means, means[:, :1], self.angles)
         combine = map_all(lambda rule, *parts: rule.combine(*parts), len(self.names))
         mean, covariance = combine(self.rules, means, covariances)
         mean = wrap_angles(mean, self.angles)
-        items = enumerate(zip(self.names, self.claims, strict=True))
-        return states, {name: Estimate(mean[i], covariance[i], claim) for i, (name, claim) in items}, uplinks
+        fused = {
+            name: Estimate(mean[i], covariance[i], claim)
+            for i, (name, claim) in enumerate(zip(self.names, self.claims, strict=True))
+        }
+        return states, fused, uplinks
 
     def _gather(self, parts: Sequence[jax.Array | np.ndarray]) -> jax.Array:
         """Return values of the filters, (filter, node, ...) by kind, as (fusion, node, ...) in each fusion's order."""
@@ -84,9 +112,14 @@ class StackedFusions(Module):
 
 
 class ReportFusion(Module):
-    """A fusion by reports: their uplinks, and the filter at the centre.
+    """A fusion by reports: nodes send their means over uplinks, and a filter at the centre receives them.
 
-    `sources` and `order` as in `FusionCentre`.
+    Args:
+        uplinks: from the nodes to the centre.
+        centre: filter of what arrives.
+        order: brings what is gathered from the sources into the order of the nodes.
+        sources: (kind, number within the kind) of the filters whose means are sent, one group of nodes after another.
+        nodes: their names.
     """
 
     uplinks: Uplinks
@@ -109,31 +142,112 @@ class ReportFusion(Module):
     ) -> tuple[tuple[InFlight, PyTree], Estimate, dict[str, jax.Array], tuple[jax.Array, Array]]:
         """Send the nodes' means as reports, and correct the centre's filter with those that arrive at step k.
 
-        Returns: the next state, the centre's estimate, what the quantizers did, and the reports sent with their delays.
+        Args:
+            state: of reports in transit and of the centre's filter, before the step.
+            estimates: of the nodes' filters by kind, (filter, node, ...).
+            drawn: what the uplinks do at this step.
+            u: inputs of the plant over the step.
+            k: number of the step.
+
+        Returns:
+            The state after the step; the centre's estimate; which components saturated a quantizer, and the symbols
+            sent (empty without quantizers); the reports sent (node, m) as they arrive, and their delays (node,).
         """
-        flying, known = state
+        flying, filter_state = state
         means = jnp.concatenate([estimates[kind].mean[f] for kind, f in self.sources])[self.order]
         flying, sent, traffic = self.uplinks.send(flying, means, drawn, k)
         flying, reports = self.uplinks.arrive(flying, sent, drawn.delay)
-        known, estimate = self.centre.step(known, jnp.ravel(reports)[np.array(self.centre.rows)], u, k)
-        return (flying, known), estimate, traffic, (sent, drawn.delay)
+        received = jnp.ravel(reports)[np.array(self.centre.rows)]  # of (age, node, m), those that can arrive
+        filter_state, estimate = self.centre.step(filter_state, received, u, k)
+        return (flying, filter_state), estimate, traffic, (sent, drawn.delay)
+
+
+def build_report_fusions(network: Network, step_filters: Callable[[Network], NodesFilters]) -> dict[str, ReportFusion]:
+    """Return the network's fusions by reports, by name, each with its uplinks and its centre.
+
+    `step_filters`: as of `build_centre_filter`.
+    """
+    results = {}
+    for name, fusion in network.fused.items():
+        if isinstance(fusion, Fusion) and fusion.by_report:
+            nodes = network.nodes_with(fusion.filter)
+            sources, order = find_source_filters(network, network.places, nodes, fusion.filter)
+            results[name] = ReportFusion(
+                uplinks=build_uplinks(fusion, nodes, len(network.states)),
+                centre=build_centre_filter(network, name, fusion, step_filters),
+                order=order,
+                sources=sources,
+                nodes=tuple(nodes),
+            )
+    return results
+
+
+def build_centre_filter(
+    network: Network, name: str, fusion: Fusion, step_filters: Callable[[Network], NodesFilters]
+) -> CentreFilter:
+    """Return the filter of the centre that receives reports for `fusion`, which has this name in the network.
+
+    `step_filters`: makes all filters of a network, to be stepped without data for the moments of their errors.
+    """
+    # The centre's claim, from those of the nodes' filters and what their uplinks do.
+    names = network.nodes_with(fusion.filter)
+    complete = {node: network.nodes[node].complete for node in names}
+    claim = claim_of_reports(type(fusion.rule).__name__, network.claims()[FUSED][name], fusion, complete)
+    # The nodes with that filter alone, for the moments of its errors.
+    alone = Network(
+        network.plant,
+        {node: _keep_one_filter(network.nodes[node], fusion.filter) for node in network.names},
+        {"all": Fusion(fusion.filter, AllReports())},
+        network.relays,
+        network.common,
+    )
+    # Reports are received in rows (age, node, component), of which `rows` are those that can arrive.
+    uplinks = build_uplinks(fusion, names, len(network.states))
+    return CentreFilter(
+        filters=step_filters(alone),
+        links=uplinks.links,
+        rows=tuple(uplinks.rows.tolist()),
+        ages=uplinks.delay.shape[1],
+        widest=max(uplinks.received),
+        quantized=uplinks.quantizers is not None,
+        **make_sizes(claim, network, len(uplinks.rows)),
+    )
+
+
+def _keep_one_filter(node: Node | ReceivingNode, name: str) -> Node | ReceivingNode:
+    """Return a node with the filter `name` alone of its filters, or with none if it has none of this name."""
+    filters = {label: filter for label, filter in node.filters.items() if label == name}
+    if isinstance(node, Node):
+        return Node(node.sensor, node.channel, filters)
+    return replace(node, filters=filters)
 
 
 def list_stacked_fusions(network: Network) -> tuple[StackedFusions, ...]:
-    """Return the fusions of the network, those of one structure stacked."""
-    alike: dict[object, list[str]] = {}
+    """Return the network's fusions of estimates by rules that know nothing of the nodes; of one structure, stacked.
+
+    Informed rules have centres instead (`list_centres`).
+    """
+    names_by_structure: dict[object, list[str]] = {}
     for name, fusion in network.fused.items():
         if isinstance(fusion, Fusion) and not isinstance(fusion.rule, AbstractInformedFusion):
             nodes = network.nodes_with(fusion.filter)
-            alike.setdefault(structure((fusion.rule, fusion.uplinks(nodes), (None,) * len(nodes))), []).append(name)
+            # Of one structure: rules and quantizers, for the same number of nodes.
+            key = structure((fusion.rule, fusion.uplinks(nodes), (None,) * len(nodes)))
+            names_by_structure.setdefault(key, []).append(name)
     places, claims = network.places, network.claims().get(FUSED, {})
-    return tuple(_stack_fusions(network, names, places, [claims[name] for name in names]) for names in alike.values())
+    return tuple(
+        _stack_fusions(network, names, places, [claims[name] for name in names])
+        for names in names_by_structure.values()
+    )
 
 
 def _stack_fusions(
-    network: Network, names: Sequence[str], places: Mapping[tuple[str, str], tuple[int, int, int]], claims: list[Claim]
+    network: Network, names: Sequence[str], places: Mapping[tuple[str, str], EstimatePlace], claims: list[Claim]
 ) -> StackedFusions:
-    """Stack fusions of one structure, with the places of the estimates that they fuse."""
+    """Return the fusions of these names, of one structure, stacked.
+
+    `places`: of all estimates, by (node, filter). `claims`: of each fusion.
+    """
     fusions = [fusion for fusion in (network.fused[name] for name in names) if isinstance(fusion, Fusion)]
     sources, orders, quantizers = [], [], []
     for fusion in fusions:
@@ -153,8 +267,11 @@ def _stack_fusions(
     )
 
 
-def centres_of(network: Network) -> tuple[FusionCentre | LinearisedCentre, ...]:
-    """Return the centres of the network, one for the informed fusions of each filter."""
+def list_centres(network: Network) -> tuple[FusionCentre | LinearisedCentre, ...]:
+    """Return the network's centres that know how the nodes' errors are correlated, one for each filter fused so.
+
+    A rule that needs this knowledge is called informed.
+    """
     rules: dict[str, dict[str, AbstractInformedFusion]] = {}
     for name, fusion in network.fused.items():
         if isinstance(fusion, Fusion) and isinstance(fusion.rule, AbstractInformedFusion) and not fusion.by_report:
@@ -165,14 +282,14 @@ def centres_of(network: Network) -> tuple[FusionCentre | LinearisedCentre, ...]:
 def _build_centre(
     network: Network, name: str, rules: dict[str, AbstractInformedFusion]
 ) -> FusionCentre | LinearisedCentre:
-    """Build the centre for the nodes that have the filter `name`."""
+    """Return the centre of the nodes that have the filter `name`, with its informed rules by name of the fusion."""
     places, claims = network.places, network.claims()[FUSED]
     nodes = network.nodes_with(name)
-    # Places of the nodes' filters, and the longest measurement.
+    # Where the nodes' filters stand, and the longest measurement.
     sources, order = find_source_filters(network, places, nodes, name)
     groups = [network.groups[network.kinds[kind].group] for kind, _ in sources]
     size = max(network.nodes[node].received for node in nodes)
-    claim = claims[next(iter(rules))]
+    claim = claims[next(iter(rules))]  # the same of all rules on one filter
     # Gains that depend on data: moments along the estimates.
     if along_estimates(network.parts_of(name)):
         return LinearisedCentre(network.plant, rules, order, sources, size, claim)
@@ -188,14 +305,22 @@ def _build_centre(
 
 
 def find_source_filters(
-    network: Network, places: Mapping[tuple[str, str], tuple[int, int, int]], nodes: Sequence[str], name: str
+    network: Network, places: Mapping[tuple[str, str], EstimatePlace], nodes: Sequence[str], name: str
 ) -> tuple[tuple[tuple[int, int], ...], np.ndarray]:
-    """Return (kind, number within the kind) of the filters of this name at the nodes, and the nodes' order in them.
+    """Return where the filters of this name stand in the stacks: (kind, number within the kind), and an order.
 
-    The estimates of the sources one after another, indexed by the order, are those of `nodes`.
+    The estimates of these sources (node, n), one source after another and indexed by the order, are those of `nodes`.
+
+    Args:
+        network: the network.
+        places: of all estimates, by (node, filter).
+        nodes: names of the nodes, each of which has the filter.
+        name: of the filter.
     """
-    sources = tuple({places[node, name][:2]: None for node in nodes})
+    found = [places[node, name] for node in nodes]
+    sources = tuple(dict.fromkeys((place.kind, place.filter) for place in found))  # each once, in order
     groups = [network.groups[network.kinds[kind].group] for kind, _ in sources]
+    # Nodes in the order in which the sources hold them.
     positions = {node: i for i, node in enumerate(node for names in groups for node in names)}
     return sources, np.array([positions[node] for node in nodes])
 
@@ -203,7 +328,15 @@ def find_source_filters(
 def _model_measurements(
     network: Network, nodes: Sequence[str], groups: Sequence[Sequence[str]], order: np.ndarray, size: int
 ) -> Apart | Together:
-    """Return the measurement models of these nodes for a centre."""
+    """Return the measurement models of these nodes for a centre.
+
+    Args:
+        network: the network.
+        nodes: their names.
+        groups: names of the nodes of each source, in the stacks' order.
+        order: brings these, one group after another, into the order of `nodes`.
+        size: length of the longest measurement, to which others are padded.
+    """
     if network.common is not None:
         rows = network.rows
         padded = [np.pad(rows[name], (0, size - len(rows[name])), constant_values=-1) for name in nodes]

@@ -28,7 +28,7 @@ from heliograph.simulation.centres.centre import gather_steps
 
 
 class FollowedFusion(NamedTuple):
-    """State of one fusion: moments of the errors, its last estimate, and its rule's state."""
+    """State of one fusion: moments of the nodes' errors, its last estimate `known` (n,), and its rule's state."""
 
     errors: ErrorMoments
     known: jax.Array
@@ -36,14 +36,15 @@ class FollowedFusion(NamedTuple):
 
 
 class LinearisedCentre(Module):
-    """A `Centre` of filters whose gains depend on data; its claim is nominal, as theirs are.
+    """A `FusionCentre` of filters whose gains depend on data; its claim is nominal, as theirs are.
 
     P_ij+ = F_i (A P_ij A' + Q) F_j' + K_i S_ij K_j', F_i = I - K_i C_i: K_i and C_i are derivatives of each filter's
     step, S_ij = 0, and S_ii is the innovation covariance less C_i P_i C_i'. A is common, the plant's derivative at the
     fusion's last estimate: with each filter's A, nodes that share an error would seem to differ by their linearisations
     alone, and weights of such differences claim information that is not there.
 
-    Fields as of `Centre`: `sources` are the stacked filters, `order` the nodes' order in what is gathered from them.
+    Fields as of `FusionCentre`: `sources` are the stacked filters, `order` the nodes' order in what is gathered from
+    them, `size` the length of the longest measurement.
     """
 
     plant: AnyPlant
@@ -53,10 +54,13 @@ class LinearisedCentre(Module):
     size: int = eqx.field(static=True)
     claim: Claim = eqx.field(static=True)
 
-    read = staticmethod(linearise_step)
+    compute_matrices = staticmethod(linearise_step)
 
     def init(self, starts: Sequence[jax.Array]) -> dict[str, FollowedFusion]:
-        """Return the state before the first step, from the initial means of each source's filters."""
+        """Return the states of all fusions before the first step, by name.
+
+        `starts`: initial means (node, n) of each source's filters.
+        """
         plant = at(self.plant, 0)
         errors = initial_errors(plant.initial_mean, plant.initial_covariance, jnp.concatenate(starts)[self.order])
         mean = jnp.asarray(plant.initial_mean)
@@ -70,26 +74,36 @@ class LinearisedCentre(Module):
         u: jax.Array,
         k: jax.Array,
     ) -> tuple[dict[str, FollowedFusion], dict[str, Estimate]]:
-        """Return the next state, and estimates by fusion, from the sources' matrices and means after the step."""
+        """Return the next state and the fused estimates of step k, both by name of the fusion.
+
+        Args:
+            state: before the step.
+            parts: derivatives of the sources' filters in the step, with a leading axis of nodes.
+            means: of their estimates after it (node, n), by source.
+            u: inputs of the plant over the step.
+            k: number of the step.
+        """
         linear, reports = gather_steps(parts, self.order, self.size), jnp.concatenate(means)[self.order]
-        # I - K_i C_i of all nodes.
         plant = at(self.plant, k)
+        # F_i = I - K_i C_i of all nodes (node, n, n).
         keep = jnp.eye(reports.shape[-1]) - linear.gain @ linear.output
         following, results = {}, {}
         for name, rule in self.rules.items():
             before = state[name]
-            # Common linearisation at the fusion's last estimate.
+            # x+ = A x + b + w, linearised for all nodes at the fusion's last estimate.
             matrix = jax.jacfwd(lambda x: plant.transition(x, u))(before.known)
             moved = plant.transition(before.known, u) + plant.noise_mean()
             motion = Motion(matrix, moved - matrix @ before.known, plant.noise_covariance(u))
             # Moments of the errors; the rule weights the reports by them.
             step = _make_shared_step(motion, keep, linear)
             errors = _keep_plant_moments(before.errors, propagate_errors_jointly(before.errors, step))
+            # `AllReports` estimates the errors themselves, so that their means matter too.
             if isinstance(rule, AllReports):
                 drift = _compute_drift(before.rule, matrix, moved, keep, linear)
                 step = step._replace(shift=jnp.concatenate([motion.shift, drift.reshape(-1)]))
-            known, (mean, covariance) = rule.fuse_step(before.rule, CentreStep(step, errors), reports)
-            following[name], results[name] = FollowedFusion(errors, mean, known), Estimate(mean, covariance, self.claim)
+            rule_state, (mean, covariance) = rule.fuse_step(before.rule, CentreStep(step, errors), reports)
+            following[name] = FollowedFusion(errors, known=mean, rule=rule_state)
+            results[name] = Estimate(mean, covariance, self.claim)
         return following, results
 
 
@@ -125,7 +139,14 @@ def _compute_drift(
 ) -> jax.Array:
     """Return F_i (E e_i- - A E e_i) (node, n): how far each mean error moves other than by the linear map A.
 
-    Each filter's prediction m_i- is known, so that E e_i- = E x- - m_i-; E x- is `moved`, A is `matrix`.
+    Each filter's prediction m_i- is known, so that E e_i- = E x- - m_i-.
+
+    Args:
+        state: the rule's, with the means E e_i before the step.
+        matrix: A (n, n).
+        moved: E x- (n,).
+        keep: F_i of all nodes (node, n, n).
+        linear: with the filters' predictions m_i- (node, n).
     """
     nodes, n, _ = keep.shape
     before = state.gaussian.mean[n:].reshape(nodes, n)

@@ -1,47 +1,42 @@
 """Fusions between neighbours, built from a network: graph, edges, models of the measurements and the rule's parts."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from heliograph.fusion.mesh.graph import graph_of
 from heliograph.model.over_time import stack
 from heliograph.numerics.check import fail
-from heliograph.simulation.centres.mesh import Mesh, MeshRows
+from heliograph.simulation.centres.mesh import Mesh
+from heliograph.simulation.centres.mesh_parts import NodeBucket
 from heliograph.simulation.centres.neighbour_edges import build_edges
 from heliograph.simulation.centres.observation_model import Apart, ObservationModel, stack_nodes
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
-DENSE = 200  # nodes whose joint covariance is propagated at every step
+DENSE = 200  # most nodes whose joint covariance is propagated at every step
 
 
 def build_mesh(network: Network, name: str) -> Mesh:
-    """Build the fusion `name` between neighbours of a network."""
+    """Return the fusion `name` between neighbours of a network, ready to be stepped: its graph, edges and models."""
     fusion = network.meshes[name]
     assert fusion.neighbours is not None
     nodes = network.mesh_nodes(name)
     graph = graph_of(fusion.neighbours, nodes)
-    # Models of the measurements, group after group.
+    # Rows of the graph, those of about as many neighbours together; a row's first sender is the node itself.
+    buckets = []
+    for rows in graph.buckets():
+        buckets.append(NodeBucket(fusion.rule.placed(rows), rows=rows.senders[:, 0], width=rows.senders.shape[1]))
+    # Kinds of the mesh's estimates, one for each group of nodes, and the places of their nodes in the mesh.
     index = {node: i for i, node in enumerate(nodes)}
-    groups: list[ObservationModel | None] = []
-    group_places: dict[str, int] = {}
-    for names in network.groups:
-        sensors = [node for node in map(network.nodes.__getitem__, names) if isinstance(node, Node)]
-        groups.append(stack_nodes([n.sensor for n in sensors], [n.channel for n in sensors]) if sensors else None)
-        group_places |= {node: len(group_places) + i for i, node in enumerate(names)}
-    # Kinds of its filters, and the places of their nodes in the mesh.
     kinds = [kind for kind in network.mesh_kinds if kind.filters == (name,)]
     kind_places = [tuple(index[node] for node in network.groups[kind.group]) for kind in kinds]
     return Mesh(
         plant=network.plant,
-        buckets=tuple(MeshRows(fusion.rule.placed(b), b.senders[:, 0], b.senders.shape[1]) for b in graph.buckets()),
-        ranks=np.argsort(np.concatenate([bucket.senders[:, 0] for bucket in graph.buckets()])),
+        buckets=tuple(buckets),
+        ranks=np.argsort(np.concatenate([bucket.rows for bucket in buckets])),
         edges=build_edges(fusion, graph),
-        observation_model=Apart(
-            groups=tuple(groups),
-            order=np.array([group_places[node] for node in nodes]),
-            size=max(1, *(node.received for node in network.nodes.values())),
-            counts=tuple(map(len, network.groups)),
-        ),
+        observation_model=_model_measurements(network, nodes),
         senders=graph.senders,
         places=tuple(kind_places),
         nodes=graph.nodes,
@@ -52,8 +47,24 @@ def build_mesh(network: Network, name: str) -> Mesh:
     )
 
 
+def _model_measurements(network: Network, nodes: Sequence[str]) -> Apart:
+    """Return the measurement models of these nodes of a network, in their order; those without a sensor have none."""
+    groups: list[ObservationModel | None] = []
+    places: dict[str, int] = {}  # of each node among all, group after group
+    for names in network.groups:
+        sensors = [node for node in map(network.nodes.__getitem__, names) if isinstance(node, Node)]
+        groups.append(stack_nodes([n.sensor for n in sensors], [n.channel for n in sensors]) if sensors else None)
+        places |= {node: len(places) + i for i, node in enumerate(names)}
+    return Apart(
+        groups=tuple(groups),
+        order=np.array([places[node] for node in nodes]),
+        size=max(1, *(node.received for node in network.nodes.values())),
+        counts=tuple(map(len, network.groups)),
+    )
+
+
 def build_meshes(network: Network) -> dict[str, Mesh]:
-    """Return the fusions between neighbours, by name, to be stepped.
+    """Return the network's fusions between neighbours by name, ready to be stepped.
 
     Raises:
         ValueError: too many nodes for a rule that follows the joint covariance of their errors.

@@ -1,6 +1,10 @@
-"""Errors of nodes that estimate from their neighbours, before any data: given what arrives, and in the mean over it."""
+"""Errors of nodes that estimate from their neighbours, before any data: given what arrives, and in the mean over it.
 
-from collections.abc import Iterator
+e_i+ = M_i e + F_i w - sum_l K_il v_l, with e the errors of all nodes, of joint covariance J; w the plant's noise, of
+covariance Q; and v_l the noise of node l's measurement, of covariance R_l. N = nodes n, for n states of the plant.
+"""
+
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,9 +30,10 @@ from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Bool, Float, PyTree
 from heliograph.simulation.arguments import key_of, read_plant_inputs
-from heliograph.simulation.centres.mesh import Mesh, MeshStep
+from heliograph.simulation.centres.mesh import Mesh
 from heliograph.simulation.centres.mesh_building import build_mesh
 from heliograph.simulation.centres.mesh_check import error_claim
+from heliograph.simulation.centres.mesh_parts import MeshStep
 from heliograph.simulation.centres.neighbour_edges import MeshEdges
 from heliograph.simulation.network import Network
 
@@ -83,10 +88,10 @@ def mesh_arrivals(network: Network, fusion: str, horizon: int, key: int | jax.Ar
 
 @quickly_compiled
 def _draw_arrivals(edges: MeshEdges, key: jax.Array, steps: np.ndarray) -> jax.Array:
-    """Draw what arrives by the edges alone, so that all rules share a program."""
+    """Draw what arrives at these steps (step, node, rounds, degree), by the edges alone: all rules share a program."""
 
     def draw_step(state: tuple[PyTree, ...], k: jax.Array) -> tuple[tuple[PyTree, ...], jax.Array]:
-        """Draw what arrives at step k."""
+        """Draw what arrives at step k: next states of the channels, and flags (node, rounds, degree)."""
         return edges.draw(state, key, k)
 
     drawn: jax.Array = jax.lax.scan(draw_step, edges.init(key), jnp.asarray(steps))[1]
@@ -118,18 +123,16 @@ def mesh_errors(
     """
     mesh = find_mesh(network, fusion)
     if mesh.alpha is not None or mesh.quantizer is not None:
-        by_data = (
-            "a quantizer" if mesh.alpha is None else f"alpha {mesh.alpha:g}, by which it depends on data what is sent"
-        )
+        by_data = "a quantizer" if mesh.alpha is None else f"alpha {mesh.alpha:g}, by which data decide what is sent"
         raise fail(f"errors of fusion {fusion!r} before any data", "estimates that are sent at every step, as they are",
                    by_data)  # fmt: skip
     flags = _check_arrivals(mesh, arrived)
     network.check_horizon(len(flags))
     u = read_plant_inputs(network, inputs, len(flags))
     actual, claimed, last = [], [], np.zeros(())
-    for joint, error, claim in errors_over_time(mesh, flags, u):
-        actual.append(error)
-        claimed.append(claim)
+    for joint, covariances, claims in propagate_errors_over_time(mesh, flags, u):
+        actual.append(covariances)
+        claimed.append(claims)
         last = joint
     nodes, n = len(mesh.nodes), actual[0].shape[-1]
     return MeshErrors(
@@ -141,53 +144,69 @@ def mesh_errors(
     )
 
 
-def errors_over_time(
+def propagate_errors_over_time(
     mesh: Mesh, flags: np.ndarray, u: np.ndarray
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield the joint covariance (N, N), its diagonal blocks and the nodes' claims (node, n, n) after each step."""
+    """Yield the joint covariance (N, N), its diagonal blocks and what nodes claim of these (node, n, n), step by step.
+
+    Args:
+        mesh: the fusion between neighbours.
+        flags: what arrives at each step (step, node, rounds, degree).
+        u: inputs of the plant (step, inputs).
+    """
     with jax.enable_x64(True):
         start = to_numpy(mesh.init())
+    # At first all errors are x_0 - E x_0.
     covariance, moments = start.covariance, start.plant
+    _, initial_covariance = start.plant
     nodes, n = start.mean.shape
-    joint = np.tile(moments[1], (nodes, nodes))
+    joint = np.tile(initial_covariance, (nodes, nodes))
     needs_joint = mesh.needs_joint
     for k, (arrived, u_k) in enumerate(zip(flags, u, strict=True)):
         blocks = np.asarray(blocks_of(joint.reshape(nodes, n, nodes, n), mesh.senders)) if needs_joint else None
         with jax.enable_x64(True):
-            parts = to_numpy(_compute_parts(mesh, covariance, blocks, moments, arrived, u_k, np.asarray(k)))
-        joint = _propagate_joint(mesh, joint, parts, arrived)
-        covariance, moments = parts.gains.covariance, parts.plant
-        error = np.einsum("iaib->iab", joint.reshape(nodes, n, nodes, n)).copy()
-        yield joint, error, error if needs_joint else covariance
+            step = to_numpy(_compute_step(mesh, covariance, blocks, moments, arrived, u_k, np.asarray(k)))
+        joint = _propagate_joint(mesh, joint, step, arrived)
+        covariance, moments = step.gains.covariance, step.plant
+        actual = np.einsum("iaib->iab", joint.reshape(nodes, n, nodes, n)).copy()
+        yield joint, actual, actual if needs_joint else covariance
 
 
 @quickly_compiled
-def _compute_parts(
+def _compute_step(
     mesh: Mesh, covariance: np.ndarray, blocks: np.ndarray | None, moments: PyTree, arrived: np.ndarray,
     u: np.ndarray, k: np.ndarray,
 ) -> MeshStep:  # fmt: skip
-    """Return step k without the estimates, with all components measured; arguments as of `Mesh.parts`."""
-    there = np.ones((len(mesh.senders), mesh.observation_model.size), dtype=bool)
-    return mesh.parts(covariance, blocks, moments, there, arrived, u, k)
+    """Return step k without the estimates, with all components measured.
+
+    Arguments as of `Mesh.compute_step_without_estimates`.
+    """
+    measured = np.ones((len(mesh.senders), mesh.observation_model.size), dtype=bool)
+    return mesh.compute_step_without_estimates(covariance, blocks, moments, measured, arrived, u, k)
 
 
-def _propagate_joint(mesh: Mesh, joint: np.ndarray, parts: MeshStep, arrived: np.ndarray) -> np.ndarray:
-    """Return the joint covariance (N, N) of all errors after a step, by sparse matrices; N = nodes n."""
-    gains, present, senders = parts.gains, mesh.edges.present, mesh.senders
-    # Rounds that only intersect: e_i + sum_j C_ij (e_j - e_i).
-    for number, weights in enumerate(parts.exchanges):
+def _propagate_joint(mesh: Mesh, joint: np.ndarray, step: MeshStep, arrived: np.ndarray) -> np.ndarray:
+    """Return the joint covariance (N, N) of all errors after a step, by sparse matrices, from J before it.
+
+    `arrived`: which messages arrive in it (node, rounds, degree).
+    """
+    gains, present, senders = step.gains, mesh.edges.present, mesh.senders
+    # Rounds that only intersect: e_i + sum_j C_ij (e_j - e_i), so that C_ii = I - sum_j C_ij.
+    for number, weights in enumerate(step.exchanges):
         mixing = np.where(arrived[:, number, :, None, None], weights.front[:, None] @ weights.parts, 0.0)
         mixing[:, 0] = np.eye(mixing.shape[-1]) - mixing[:, 1:].sum(axis=1)
         joint = np.asarray(propagate_by_mode(scatter_blocks(mixing, senders, present), joint, 0.0))
-    m = scatter_blocks(error_transitions(gains, parts.motion.matrix), senders, present)
-    # Measurements of neighbours, or of all whose measurement a node has after all rounds.
-    there = arrived[:, 0] & present
+    m = scatter_blocks(error_transitions(gains, step.motion.matrix), senders, present)
+    # Measurements of neighbours (node, degree), or (node, node) of all that a node has after several rounds.
+    known = arrived[:, 0] & present
     if mesh.edges.rounds > 1:
-        there = np.asarray(mesh.known(arrived))
-        senders = np.broadcast_to(np.arange(len(there)), there.shape)
-    measured = measurement_weights(gains.gain, there)
-    ws, w = (scatter_blocks(x, senders, there) for x in (measured @ parts.data.information[senders], measured))
-    return np.asarray(propagate_joint_covariance(joint, m, gains.innovation, parts.motion.noise, ws, w))
+        known = np.asarray(mesh.find_known_measurements(arrived))
+        senders = np.broadcast_to(np.arange(len(known)), known.shape)
+    # W_il of H_l' R_l^-1 z_l, so that K_il R_l K_jl' = W_il S_l W_jl'.
+    weights_of_data = measurement_weights(gains.gain, known)
+    ws = scatter_blocks(weights_of_data @ step.data.information[senders], senders, known)
+    w = scatter_blocks(weights_of_data, senders, known)
+    return np.asarray(propagate_joint_covariance(joint, m, gains.innovation, step.motion.noise, ws, w))
 
 
 def best_possible(
@@ -213,6 +232,7 @@ def best_possible(
     mesh = find_mesh(network, fusion)
     flags = _check_arrivals(mesh, arrived)
     u = read_plant_inputs(network, inputs, len(flags))
+    # Models of plant and measurements at each step.
     with jax.enable_x64(True):
         start = to_numpy(mesh.init())
         steps: list[MeshStep] = []
@@ -220,40 +240,53 @@ def best_possible(
         for k, u_k in enumerate(u):
             steps.append(to_numpy(compute_full_step(mesh, start.covariance, moments, u_k, np.asarray(k))))
             moments = steps[-1].plant
-    # Whose measurement of each age can have come, from the last step back.
+    # Riccati recursions of all nodes side by side, oldest measurement first: P- = A P A' + Q, P = (P-^-1 + S)^-1.
     count = len(mesh.nodes)
-    known: Any = scipy.sparse.csr_array(np.eye(count, dtype=np.int32))
-    information: list[np.ndarray] = []
-    for k in reversed(range(len(u))):
-        for number in reversed(range(mesh.edges.rounds)):
-            known = _extend_known_data(known, mesh, flags[k, :, number])
-        s = np.asarray(steps[k].data.information)
-        information.append((known @ s.reshape(count, -1)).reshape(s.shape))
-    # Riccati recursions of all nodes side by side, oldest measurement first.
     root = roots_of(np.asarray(start.covariance))
-    for model, total in zip(steps, reversed(information), strict=True):
+    for model, total in zip(steps, _sum_known_information(mesh, flags, steps), strict=True):
         a, process = np.asarray(model.motion.matrix), roots_of(np.asarray(model.motion.noise))
         process = np.broadcast_to(process, (count, *process.shape))
         root = observe_information(np.concatenate([a @ root, process], axis=-1), total).root
     return covariance_of_root(root)
 
 
+def _sum_known_information(mesh: Mesh, flags: np.ndarray, steps: Sequence[MeshStep]) -> list[np.ndarray]:
+    """Return for each step the information (node, n, n) in those of its measurements that reach each node by the end.
+
+    `flags`: what arrives (step, node, rounds, degree). `steps`: with the information in each node's measurements.
+    """
+    count = len(mesh.nodes)
+    # From the last step back: the more exchanges follow, the more nodes' measurements can have come.
+    known: Any = scipy.sparse.csr_array(np.eye(count, dtype=np.int32))
+    information: list[np.ndarray] = []
+    for step, arrived in zip(reversed(steps), reversed(flags), strict=True):
+        for number in reversed(range(mesh.edges.rounds)):
+            known = _extend_known_data(known, mesh, arrived[:, number])
+        s = np.asarray(step.data.information)
+        information.append((known @ s.reshape(count, -1)).reshape(s.shape))
+    return information[::-1]
+
+
 @quickly_compiled
 def compute_full_step(mesh: Mesh, covariance: np.ndarray, moments: PyTree, u: np.ndarray, k: np.ndarray) -> MeshStep:
-    """Return the parts of a step at which everything arrives, for the models of plant and measurements in it."""
+    """Return a step at which everything arrives, for the models of plant and measurements in it, not for its gains.
+
+    `covariance` (node, n, n): any regular one. Others as of `Mesh.compute_step_without_estimates`.
+    """
     lossless = mesh.edges.lossless()
-    there = np.ones((len(mesh.senders), mesh.observation_model.size), dtype=bool)
+    measured = np.ones((len(mesh.senders), mesh.observation_model.size), dtype=bool)
     blocks = None
     if mesh.needs_joint:
         degree, n = mesh.senders.shape[1], covariance.shape[-1]
         blocks = jnp.zeros((len(mesh.senders), degree, n, degree, n))
-    return mesh.parts(covariance, blocks, moments, there, lossless, u, k)
+    return mesh.compute_step_without_estimates(covariance, blocks, moments, measured, lossless, u, k)
 
 
 def _extend_known_data(known: Any, mesh: Mesh, present: np.ndarray) -> Any:
     """Return whose data each node has if one more exchange, before all others, is counted.
 
-    `known`: sparse (node, node), a one where the data of the column's node reach the row's.
+    `known`: sparse (node, node), a one where the data of the column's node reach the row's. `present`: which messages
+    arrive in that exchange (node, degree).
     """
     receiver, column = np.nonzero(present)
     ones = np.ones(len(receiver), dtype=np.int32)
@@ -293,20 +326,23 @@ def freeze(
     if check_count("last", last) > len(flags):
         raise fail("last", f"at most the {len(flags)} steps", last)
     u = read_plant_inputs(network, inputs, len(flags))
+    # Mean of each neighbourhood's block of J, from which weights are made, over the last steps.
     total: np.ndarray | None = None
     shape = (len(mesh.nodes), len(network.states)) * 2
-    for k, (joint, _, _) in enumerate(errors_over_time(mesh, flags, u)):
-        # Blocks before a step are what its weights are made from.
+    for k, (joint, _, _) in enumerate(propagate_errors_over_time(mesh, flags, u)):
         if k >= len(flags) - last:
             blocks = np.asarray(blocks_of(joint.reshape(shape), mesh.senders))
             total = blocks if total is None else total + blocks
-    assert total is not None
+    assert total is not None  # since 1 <= last <= steps
     frozen = Fusion(old.filter, FrozenWeights(old.rule, total / last), neighbours=old.neighbours, link=old.link)
     return Network(network.plant, network.nodes, {**network.fused, **network.meshes, fusion: frozen})
 
 
 def find_mesh(network: Network, fusion: str) -> Mesh:
-    """Return the fusion of this name between neighbours; raise if there is none, or if it has over 2,000 nodes."""
+    """Return the fusion of this name between neighbours, ready to be stepped; raise where there is none.
+
+    Also raises for one of over 2,000 nodes (SPARSE).
+    """
     instance("network", network, Network, "a Network")
     if not isinstance(fusion, str) or fusion not in network.meshes:
         raise fail("fusion", f"one between neighbours, of {list(network.meshes)}", repr(fusion))
@@ -317,7 +353,10 @@ def find_mesh(network: Network, fusion: str) -> Mesh:
 
 
 def _check_arrivals(mesh: Mesh, arrived: Any) -> Bool[np.ndarray, "horizon node rounds degree"]:
-    """Return checked flags of what arrives at each step; of a number of steps, those where everything does."""
+    """Return flags of what arrives at each step, of neighbours alone; raise where `arrived` does not fit the mesh.
+
+    `arrived`: flags of this shape, or a number of steps at which everything arrives.
+    """
     if mesh.edges.past:
         raise fail("errors between neighbours before any data", "messages that arrive at once or are lost", "late ones")
     shape = (len(mesh.senders), mesh.edges.rounds, mesh.senders.shape[1])

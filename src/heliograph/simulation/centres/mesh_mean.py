@@ -1,11 +1,13 @@
 """Errors of nodes that estimate from their neighbours, in the mean over independent losses, before any data.
 
-Where a node's gains depend on what arrives at this step alone, J is independent of them, and losses of different
-receivers of each other. For i != j
+In a step the errors become e_i+ = M_i e + F_i w - sum_l K_il v_l: e the errors of all nodes, of joint covariance J; w
+the plant's noise, of covariance Q; v_l the noise of node l's measurement, of covariance R_l. What arrives at node i
+decides its M_i, F_i and K_il. Where these depend on what arrives at this step alone, J is independent of them, and
+losses of different receivers of each other. For i != j
 
   J_ij+ = E[M_i] J E[M_j]' + E[F_i] Q E[F_j]' + sum_l E[K_il] R_l E[K_jl]'
 
-and the diagonal blocks are means over all patterns of what may arrive at one node.
+and the diagonal blocks are means over all patterns of what may arrive at one node. N = nodes n.
 """
 
 from itertools import product
@@ -26,6 +28,7 @@ from heliograph.fusion.mesh.joint_error_covariance import (
     scatter_blocks,
 )
 from heliograph.fusion.mesh.neighbour_rules import FrozenWeights
+from heliograph.fusion.network_fusion import Fusion
 from heliograph.fusion.rules import AbstractFusion
 from heliograph.linear.jump_system import propagate_by_mode
 from heliograph.model.channel import Channel
@@ -33,19 +36,24 @@ from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.simulation.arguments import read_plant_inputs
-from heliograph.simulation.centres.mesh import Mesh, MeshRows, MeshStep
+from heliograph.simulation.centres.mesh import Mesh
 from heliograph.simulation.centres.mesh_check import error_claim
 from heliograph.simulation.centres.mesh_errors import MeshErrors, compute_full_step, find_mesh
-from heliograph.simulation.centres.neighbour_edges import arrival_chance, edge_links
+from heliograph.simulation.centres.mesh_parts import MeshStep, NodeBucket
+from heliograph.simulation.centres.neighbour_edges import arrival_chance, links_by_edge
 from heliograph.simulation.network import Network
 
 NODES, DEGREE = 200, 10  # most nodes and neighbours of one node whose patterns are listed: 2^degree rows a node
 
 
 class ArrivalPatterns(NamedTuple):
-    """All patterns of what may arrive at each node, one row each, node after node, with their probabilities.
+    """All patterns of what may arrive at each node, one row each, node after node.
 
-    Shapes: node (row,), present (row, degree), probability (row,); start (node,): a node's first row.
+    Args:
+        node: number of the node (row,).
+        present: which of its messages arrive (row, degree), its own first.
+        probability: of the pattern (row,).
+        start: first row of each node (node,).
     """
 
     node: np.ndarray
@@ -78,43 +86,51 @@ def mean_mesh_errors(
     if not (between.rule.needs_joint or isinstance(between.rule, FrozenWeights)):
         expected = "best weights or diffusion (an intersection remembers losses: mesh_errors of drawn arrivals)"
         raise fail(f"mean errors of fusion {fusion!r}", expected, type(between.rule).__name__)
-    # P(pattern) = prod_j p_ij over the edges that deliver, 1 - p_ij over those that do not.
     network.check_horizon(check_count("horizon", horizon))
     u = read_plant_inputs(network, inputs, horizon)
-    names = mesh.nodes
-    graph = graph_of(between.neighbours or {}, names)
-    links = {} if between.link is None else edge_links(between.link, graph)
-    chances = [_get_known_probability(name, link) for name, link in links.items()] or [1.0] * len(graph.edges)
-    patterns = _list_patterns(mesh, np.array(chances))
-    rows = _repeat_by_pattern(mesh, between.rule.placed(graph), patterns)
+    patterns, rows = _list_patterns(mesh, between)
     with jax.enable_x64(True):
         start = to_numpy(mesh.init())
-    # J_k -> J_k+1 by the formula above: gains of every pattern from J_k, then means over the patterns.
-    joint, covariance, moments = np.tile(start.plant[1], (len(names),) * 2), start.covariance, start.plant
+    # J_k -> J_k+1: gains of every pattern from J_k, then means over the patterns. At first all errors are x_0 - E x_0.
+    nodes, n = start.mean.shape
+    covariance, moments = start.covariance, start.plant
+    _, initial_covariance = start.plant
+    joint = np.tile(initial_covariance, (nodes, nodes))
     errors = []
     for k, u_k in enumerate(u):
         with jax.enable_x64(True):
             step = to_numpy(compute_full_step(mesh, start.covariance, moments, u_k, np.asarray(k)))
-            shape = (len(names), len(network.states)) * 2
-            blocks = np.asarray(blocks_of(joint.reshape(shape), mesh.senders))
+            blocks = np.asarray(blocks_of(joint.reshape(nodes, n, nodes, n), mesh.senders))
             gains = to_numpy(_compute_gains(rows, covariance, blocks, patterns, step))
         joint, moments = _average_joint(mesh, joint, blocks, patterns, gains, step), step.plant
-        n = len(step.motion.shift)
-        errors.append(np.einsum("iaib->iab", joint.reshape(len(names), n, len(names), n)).copy())
+        errors.append(np.einsum("iaib->iab", joint.reshape(nodes, n, nodes, n)).copy())
+        # Diffusion alone reads it, and there it is the same in every pattern of a node.
         covariance = np.asarray(gains.covariance)[patterns.start]
     return MeshErrors(
-        nodes=names,
+        nodes=mesh.nodes,
         actual=np.stack(errors),
         claimed=np.stack(errors),
-        joint=joint.reshape(len(names), n, len(names), n),
+        joint=joint.reshape(nodes, n, nodes, n),
         claim=error_claim(fusion, between, network),
     )
 
 
+def _list_patterns(mesh: Mesh, fusion: Fusion) -> tuple[ArrivalPatterns, Mesh]:
+    """Return all patterns of what may arrive in a step of this fusion, and the mesh with a row for each of them."""
+    graph = graph_of(fusion.neighbours or {}, mesh.nodes)
+    links = {} if fusion.link is None else links_by_edge(fusion.link, graph)
+    chances = [_get_known_probability(name, link) for name, link in links.items()] or [1.0] * len(graph.edges)
+    patterns = _compute_pattern_probabilities(mesh, np.array(chances))
+    return patterns, _repeat_by_pattern(mesh, fusion.rule.placed(graph), patterns)
+
+
 def _repeat_by_pattern(mesh: Mesh, rule: AbstractFusion, patterns: ArrivalPatterns) -> Mesh:
-    """Return the mesh with a row for each pattern of each node; `rule`: placed on the nodes, its arrays' last axis."""
+    """Return the mesh with a row for each pattern of each node in place of one for each node.
+
+    `rule`: placed on the nodes, which are the last axis of its arrays.
+    """
     rule = jax.tree.map(lambda leaf: leaf[..., patterns.node] if eqx.is_array(leaf) else leaf, rule)
-    bucket = MeshRows(rule, np.arange(len(patterns.node)), mesh.senders.shape[1])
+    bucket = NodeBucket(rule, np.arange(len(patterns.node)), mesh.senders.shape[1])
     repeated: Mesh = eqx.tree_at(lambda m: (m.senders, m.buckets), mesh, (mesh.senders[patterns.node], (bucket,)))
     return repeated
 
@@ -123,30 +139,45 @@ def _repeat_by_pattern(mesh: Mesh, rule: AbstractFusion, patterns: ArrivalPatter
 def _compute_gains(
     rows: Mesh, covariance: np.ndarray, blocks: np.ndarray, patterns: ArrivalPatterns, step: MeshStep
 ) -> NodeGains:
-    """Return the gains of each pattern: what arrives of information is summed, and weights are solved for it.
+    """Return the gains of each pattern, with a leading axis of patterns: weights for what arrives in it.
 
-    Shapes: covariance (node, n, n) before the step, blocks (node, degree, n, degree, n) of J at each neighbourhood.
+    Args:
+        rows: the mesh, with a row for each pattern.
+        covariance: by which the nodes' estimates are weighed before the step (node, n, n).
+        blocks: of J at each neighbourhood (node, degree, n, degree, n).
+        patterns: what arrives.
+        step: at which everything arrives, for the models and the measurements' information.
     """
-    information = rows.sum_of(jnp.asarray(step.data.information), jnp.asarray(patterns.present))
+    information = rows.sum_over_messages(jnp.asarray(step.data.information), jnp.asarray(patterns.present))
     complete = jnp.asarray(step.information)[patterns.node]
     blocks_by_pattern = jnp.asarray(blocks)[patterns.node]
-    return rows.gains(jnp.asarray(covariance), blocks_by_pattern, jnp.asarray(patterns.present), step.motion,
+    return rows.compute_gains(jnp.asarray(covariance), blocks_by_pattern, jnp.asarray(patterns.present), step.motion,
                       information, complete)  # fmt: skip
 
 
 def _average_joint(
     mesh: Mesh, joint: np.ndarray, blocks: np.ndarray, patterns: ArrivalPatterns, gains: NodeGains, step: MeshStep
 ) -> np.ndarray:
-    """Return J+ (N, N): of two nodes by products of mean gains, of one node by the mean over its patterns."""
+    """Return J+ (N, N): of two nodes by products of mean gains, of one node by the mean over its patterns.
+
+    Args:
+        mesh: the fusion between neighbours.
+        joint: J (N, N).
+        blocks: of J at each neighbourhood (node, degree, n, degree, n).
+        patterns: what may arrive.
+        gains: of each pattern.
+        step: the plant over the step, and the measurements' information S_l = H_l' R_l^-1 H_l.
+    """
     count, degree = mesh.senders.shape
     q, s, n = np.asarray(step.motion.noise), np.asarray(step.data.information), len(step.motion.shift)
 
     def mean(values: np.ndarray) -> np.ndarray:
-        """Return E[value] of each node, sum_r p_r value_r over its patterns r."""
+        """Return E[value] of each node (node, ...), sum_r p_r value_r over its patterns r, from `values` (row, ...)."""
         weighted = values * patterns.probability.reshape(-1, *[1] * (values.ndim - 1))
         return np.asarray(np.add.reduceat(weighted, patterns.start, axis=0))
 
-    # Of every pattern r: M_r (the node itself first), F_r and the weights of what arrived, K_r H' R^-1.
+    # Of every pattern r: M_r (the node itself first), F_r, and the weights W_rl of H_l' R_l^-1 z_l for what arrived, so
+    # that K_rl = W_rl H_l' R_l^-1 and K_rl R_l K_rl' = W_rl S_l W_rl'.
     m, f = np.asarray(error_transitions(gains, step.motion.matrix)), np.asarray(gains.innovation)
     w = np.asarray(measurement_weights(gains.gain, patterns.present))
     # i != j: J_ij+ = E[M_i] J E[M_j]' + E[F_i] Q E[F_j]' + sum_l E[K_il] R_l E[K_jl]'.
@@ -156,7 +187,7 @@ def _average_joint(
     ]
     after = propagate_joint_covariance(joint, scattered[0], mean(f), q, *scattered[1:])
     # i = j: J_ii+ = E[M_r J M_r' + F_r Q F_r' + sum_l K_rl R_l K_rl'], with J of the neighbourhood of i.
-    flat = m.swapaxes(1, 2).reshape(len(m), n, degree * n)
+    flat = m.swapaxes(1, 2).reshape(len(m), n, degree * n)  # M_r as one matrix
     inside = blocks.reshape(count, degree * n, degree * n)[patterns.node]
     noise = np.einsum("rdab,rdbc,rdec->rae", w, s[mesh.senders][patterns.node], w)
     diagonal = mean(propagate_by_mode(flat, inside, propagate_by_mode(f, q, noise)))
@@ -166,10 +197,11 @@ def _average_joint(
     return np.asarray(after)
 
 
-def _list_patterns(mesh: Mesh, chances: np.ndarray) -> ArrivalPatterns:
+def _compute_pattern_probabilities(mesh: Mesh, chances: np.ndarray) -> ArrivalPatterns:
     """Return all patterns of what may arrive at every node, with their probabilities.
 
-    `chances`: probability of arrival of every edge, receiver after receiver.
+    P(pattern) = prod_j p_ij over the edges j to i that deliver, and 1 - p_ij over those that do not.
+    `chances`: p of every edge, receiver after receiver.
     """
     counts = mesh.edges.present[:, 1:].sum(axis=1)
     if len(counts) > NODES or counts.max() > DEGREE:
@@ -181,6 +213,7 @@ def _list_patterns(mesh: Mesh, chances: np.ndarray) -> ArrivalPatterns:
     start: list[int] = []
     for i, of_node in enumerate(np.split(chances, np.cumsum(counts)[:-1])):
         start.append(len(rows))
+        # What arrives for certain is not varied.
         for flags in product(*[[True] if p == 1 else [True, False] for p in of_node]):
             rows.append(i)
             present.append([True, *flags, *[False] * (mesh.senders.shape[1] - 1 - len(flags))])

@@ -7,7 +7,7 @@ from heliograph.fusion.network_fusion import Fusion
 from heliograph.numerics.check import fail, instance, text
 from heliograph.numerics.module import readable
 from heliograph.simulation.centres.node_filter import node_filter
-from heliograph.simulation.centres.uplinks import uplinks_of
+from heliograph.simulation.centres.uplinks import build_uplinks
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.stepping import centre_filter
 
@@ -76,9 +76,9 @@ def _find_at_centre(network: Network, name: str) -> NamedFilter:
 
 
 def _name_reports(network: Network, fusion: Fusion) -> list[str]:
-    """Return names of the reports' numbers, in the order in which the filter of the centre receives them."""
+    """Return names of the reports' numbers, as NODE_STATE, in the order in which the centre's filter receives them."""
     nodes = network.nodes_with(fusion.filter)
-    uplinks = uplinks_of(fusion, nodes, len(network.states))
+    uplinks = build_uplinks(fusion, nodes, len(network.states))
     names = []
     for age in range(uplinks.delay.shape[1]):
         late = f"_{age}_late" if age else ""
@@ -89,7 +89,10 @@ def _name_reports(network: Network, fusion: Fusion) -> list[str]:
 
 
 def _find_between_neighbours(network: Network, name: str, node: str) -> NamedFilter:
-    """Return the filter of one node of a fusion between neighbours, which receives their messages."""
+    """Return the filter of one node of the fusion `name` between neighbours, which receives their messages.
+
+    Of each it receives mean, covariance (row after row) and measurement, named NEIGHBOUR_mean_STATE and so on.
+    """
     names = list(network.nodes[node].received_names)
     for sender in (network.meshes[name].neighbours or {})[node]:
         pairs = [f"{a}_{b}" for a in network.states for b in network.states]

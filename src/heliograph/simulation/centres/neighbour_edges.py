@@ -1,4 +1,7 @@
-"""Edges between neighbours: a channel each, of which only matters what arrives."""
+"""Edges between neighbours: a channel each, of which only matters whether, and how late, a message arrives.
+
+`degree`: most messages that a node receives, its own counted first. `rounds`: exchanges of messages within a step.
+"""
 
 from collections.abc import Mapping, Sequence
 from types import UnionType
@@ -33,11 +36,15 @@ Recorded = Mapping[str, SentReports | ArrayLike]
 
 
 class MeshEdges(Module):
-    """All edges of a fusion between neighbours, by what arrives over them; without groups nothing is ever lost.
+    """All edges of a fusion between neighbours: draws of what arrives over them.
 
-    `present` (node, degree): whether the node has a neighbour there, itself at 0. `slots` (edge,): where an edge lies
-    in the flattened (node, degree). `rounds`: exchanges within a step. Where messages may be up to `past` steps late,
-    a flag is the age of the message that arrives, -1 where none does.
+    Args:
+        groups: the edges' channels, those of one structure stacked; without any, nothing is ever lost.
+        slots: where each edge lies in the flattened (node, degree), by edge.
+        present: whether the node has a neighbour there (node, degree), itself at 0.
+        rounds: exchanges within a step.
+        past: most steps by which a message may be late. If it is above 0, what arrives is given by ages in place of
+            flags: the age of the message in steps, -1 where none arrives.
     """
 
     groups: tuple[ChannelGroup, ...]
@@ -47,7 +54,7 @@ class MeshEdges(Module):
     past: int = eqx.field(static=True, default=0)
 
     def init(self, key: jax.Array) -> tuple[PyTree, ...]:
-        """Return the states of the channels before the first step."""
+        """Return the states of the channels before the first step of the run with this key, one for each group."""
 
         def start_group(group: ChannelGroup) -> PyTree:
             """Return the initial state of one channel of a stack."""
@@ -56,78 +63,111 @@ class MeshEdges(Module):
         return tuple(eqx.filter_vmap(start_group, in_axes=(eqx.if_array(0),))(group) for group in self.groups)
 
     def draw(self, states: tuple[PyTree, ...], key: jax.Array, k: jax.Array) -> tuple[tuple[PyTree, ...], jax.Array]:
-        """Draw what arrives at step k in each round: next states, and flags or ages (node, rounds, degree)."""
+        """Draw what arrives at step k of the run with this key, in each round of exchange.
+
+        Args:
+            states: of the channels before the step, one for each of `groups`.
+            key: of the run.
+            k: number of the step.
+
+        Returns:
+            The channels' states after the step, and which messages arrive (node, rounds, degree): flags, or their ages
+            in steps and -1 of none where messages may be late. A node's own message, at 0, always arrives.
+        """
         rounds = []
-        # One exchange after another, each with its draws; channels with memory go on from one to the next.
+        # One exchange after another; the channels go on from one to the next.
         for number in range(self.rounds):
-            flags, following = jnp.asarray(self.lossless()[:, 0]), []
+            arrives, following = jnp.asarray(self.lossless()[:, 0]), []
             for group, state in zip(self.groups, states, strict=True):
-
-                def deliver_once(edge: ChannelGroup, state: PyTree, count: jax.Array) -> tuple[PyTree, jax.Array]:
-                    """Send a message over one edge: the channel's next state, and the flag or age of what arrives."""
-                    channel = at(edge.channel, k)
-                    state, z = deliver_signal(channel, state, jnp.zeros(signal_size(channel)), key, count,
-                                              edge.checksums, edge.memories)  # fmt: skip
-                    arrives, late = ~jnp.any(jnp.isnan(z)), late_part(channel)
-                    if not self.past:
-                        return state, arrives
-                    age: jax.Array | int = 0
-                    if late is not None:
-                        age = z[-1].astype(int) if late.timestamped else late.times[0]
-                    # Nothing was sent before the first step.
-                    return state, jnp.where(arrives & (age <= count), age, -1)
-
-                # All channels of one kind at once; their flags go to the places of the edges.
-                deliver_all = eqx.filter_vmap(deliver_once, in_axes=(eqx.if_array(0), 0, None))
-                state, arrives = deliver_all(group, state, k * self.rounds + number)
-                following.append(state)
-                flags = flags.ravel().at[self.slots[group.places]].set(arrives).reshape(flags.shape)
+                after, by_edge = self._draw_group(group, state, key, k, k * self.rounds + number)
+                following.append(after)
+                # Each edge of the group has its place in the flattened (node, degree).
+                arrives = arrives.ravel().at[self.slots[group.places]].set(by_edge).reshape(arrives.shape)
             states = tuple(following)
-            rounds.append(flags)
+            rounds.append(arrives)
         return states, jnp.stack(rounds, axis=1)
 
-    def lossless(self) -> Bool[np.ndarray, "node rounds degree"] | Int[np.ndarray, "node rounds degree"]:
-        """Return the flags of a step at which everything arrives at once.
+    def _draw_group(
+        self, group: ChannelGroup, state: PyTree, key: jax.Array, k: jax.Array, count: jax.Array
+    ) -> tuple[PyTree, jax.Array]:
+        """Send one message over each channel of a group: return their next states, and flags or ages of what arrives.
 
-        Of messages that may be late they are ages, 0 of a neighbour and -1 of none; else whether there is a neighbour.
+        `count`: how many messages each edge sent before, which seeds the draws.
         """
-        module = library(self.present)
+
+        def deliver_once(edge: ChannelGroup, state: PyTree, count: jax.Array) -> tuple[PyTree, jax.Array]:
+            """Send a message over one edge: the channel's next state, and the flag or age of what arrives."""
+            # What is sent does not matter: lost numbers are NaN, and a time stamp is the last number.
+            channel = at(edge.channel, k)
+            state, z = deliver_signal(channel, state, jnp.zeros(signal_size(channel)), key, count,
+                                      edge.checksums, edge.memories)  # fmt: skip
+            arrives, late = ~jnp.any(jnp.isnan(z)), late_part(channel)
+            if not self.past:
+                return state, arrives
+            age: jax.Array | int = 0
+            if late is not None:
+                age = z[-1].astype(int) if late.timestamped else late.times[0]
+            # Nothing was sent before the first step.
+            return state, jnp.where(arrives & (age <= count), age, -1)
+
+        deliver_all = eqx.filter_vmap(deliver_once, in_axes=(eqx.if_array(0), 0, None))
+        after, arrives = deliver_all(group, state, count)
+        return after, arrives
+
+    def lossless(self) -> Bool[np.ndarray, "node rounds degree"] | Int[np.ndarray, "node rounds degree"]:
+        """Return the flags of a step at which everything arrives at once: whether there is a neighbour.
+
+        Where messages may be late they are ages: 0 of a neighbour, -1 where there is none.
+        """
+        module = library(self.present)  # NumPy outside of a trace, JAX inside
         flags = module.where(self.present, 0, -1) if self.past else self.present
         repeated: np.ndarray = module.repeat(flags[:, None], self.rounds, axis=1)
         return repeated
 
-    def recorded(
+    def read_recorded(
         self, name: str, nodes: Sequence[str], reports: Recorded | None, steps: int
     ) -> Bool[np.ndarray, "time node rounds degree"]:
         """Return the flags of each step, or ages where messages may be late, from a recording.
 
-        `reports`: for each node that has neighbours (steps, rounds times neighbours), NaN where nothing arrived.
+        Args:
+            name: of the fusion.
+            nodes: names of its nodes.
+            reports: for each node that has neighbours (steps, rounds times neighbours), NaN where nothing arrived, else
+                the message's age in steps (any number where none is late); None where none were recorded.
+            steps: number of steps.
 
         Raises:
-            ValueError: nodes without flags or the reverse, shapes that do not fit.
+            ValueError: nodes without flags or the reverse, shapes that do not fit, ages that the links do not have.
         """
-        flags = np.repeat(self.lossless()[None], steps, axis=0)
         # Everything arrives, unless a report says otherwise.
+        flags = np.repeat(self.lossless()[None], steps, axis=0)
         if reports is None and not self.groups:
             return flags
-        receivers = [node for node, there in zip(nodes, self.present, strict=True) if there[1:].any()]
+        # Reports of exactly the nodes that have a neighbour.
+        receivers = [node for node, row in zip(nodes, self.present, strict=True) if row[1:].any()]
         if reports is None or set(reports) != set(receivers):
             given = "none" if reports is None else list(reports)
             raise fail(f"reports of fusion {name!r}", f"what arrived from the neighbours of {receivers}", given)
         for i, node in enumerate(nodes):
-            if node not in reports:
-                continue
-            report = reports[node]
-            count = int(self.present[i, 1:].sum())
-            values = array(f"reports of node {node!r}", report.values if isinstance(report, SentReports) else report,
-                           (steps, self.rounds * count), missing=True)  # fmt: skip
-            values = values.reshape(steps, self.rounds, count)
-            if self.past and not np.isin(values[~np.isnan(values)], np.arange(self.past + 1)).all():
-                expected = f"ages of what arrives, from 0 to {self.past} steps, NaN where nothing does"
-                raise fail(f"reports of node {node!r}", expected, "other numbers")
-            ages = np.where(np.isnan(values), -1, values).astype(int)
-            flags[:, i, :, 1 : count + 1] = ages if self.past else ages >= 0
+            if node in reports:
+                ages = self._read_ages(node, reports[node], steps, neighbours=int(self.present[i, 1:].sum()))
+                flags[:, i, :, 1 : ages.shape[2] + 1] = ages if self.past else ages >= 0
         return flags
+
+    def _read_ages(
+        self, node: str, report: SentReports | ArrayLike, steps: int, neighbours: int
+    ) -> Int[np.ndarray, "steps rounds neighbours"]:
+        """Return the ages of what a node received, -1 where nothing arrived, from its report; raise where one is none.
+
+        `neighbours`: how many this node has.
+        """
+        recorded = report.values if isinstance(report, SentReports) else report
+        values = array(f"reports of node {node!r}", recorded, (steps, self.rounds * neighbours), missing=True)
+        values = values.reshape(steps, self.rounds, neighbours)
+        if self.past and not np.isin(values[~np.isnan(values)], np.arange(self.past + 1)).all():
+            expected = f"ages of what arrives, from 0 to {self.past} steps, NaN where nothing does"
+            raise fail(f"reports of node {node!r}", expected, "other numbers")
+        return np.where(np.isnan(values), -1, values).astype(int)
 
 
 def build_edges(fusion: Fusion, graph: Graph) -> MeshEdges:
@@ -138,7 +178,8 @@ def build_edges(fusion: Fusion, graph: Graph) -> MeshEdges:
     """
     if fusion.link is None:
         return MeshEdges((), np.zeros(0, dtype=int), graph.present, fusion.rounds)
-    links = edge_links(fusion.link, graph)
+    links = links_by_edge(fusion.link, graph)
+    # One channel under many names is checked once.
     for name, channel in {id(c): (name, c) for name, c in links.items()}.values():
         check_edge(f"link {name!r}" if isinstance(fusion.link, Mapping) else "link between neighbours", channel)
     slots = np.flatnonzero(graph.present & (np.arange(graph.present.shape[1]) > 0))
@@ -146,8 +187,11 @@ def build_edges(fusion: Fusion, graph: Graph) -> MeshEdges:
     return MeshEdges(channel_groups(links), slots, graph.present, fusion.rounds, past)
 
 
-def edge_links(link: Channel | Mapping[str, Channel], graph: Graph) -> dict[str, Channel]:
-    """Return the link of each edge by its name "SENDER to RECEIVER", receiver after receiver."""
+def links_by_edge(link: Channel | Mapping[str, Channel], graph: Graph) -> dict[str, Channel]:
+    """Return the link of each edge by its name "SENDER to RECEIVER", receiver after receiver.
+
+    `link`: one for all edges, or a link for each by this name.
+    """
     names = [f"{graph.nodes[sender]} to {graph.nodes[receiver]}" for sender, receiver in graph.edges]
     return dict(
         zip(names, spread_over_names("links between neighbours", link, names, "edge SENDER to RECEIVER"), strict=True)
@@ -158,19 +202,22 @@ def check_edge(what: str, link: Channel) -> None:
     """Refuse a link that changes a message, and losses or delays that the receiver does not know of."""
     instance(what, first(link), AbstractRandomAffine, "a channel such as erasure(perfect(), 0.8)")
     for step in unstack(link):
+        # Delays that are the same for all, or stamped on the message.
         late = late_part(step)
         if late is not None and not (late.constant or late.timestamped):
             raise fail(what, "delays that the receiver knows (timestamped=True)", "others")
-        inside = _open_link(step, Erasure | Delayed)[1]
-        for mode in (_open_link(m)[1] for m in (inside.maps if isinstance(inside, Modes) else [inside])):
+        # Inside losses and delays, and inside the losses of each mode: a link that changes nothing.
+        _, inside = _open_link(step, Erasure | Delayed)
+        for mode_link in inside.maps if isinstance(inside, Modes) else [inside]:
+            _, mode = _open_link(mode_link)
             if mode.remembers or mode.past or not _is_perfect(mode):
                 expected = "messages that arrive as they are or are lost, and the receiver knows (erasure of perfect())"
                 raise fail(what, expected, type(first(link)).__name__)
 
 
 def late_part(channel: AbstractRandomAffine) -> Delayed | None:
-    """Return the delay of a link, whose messages may also be lost; None of one without."""
-    inside = _open_link(channel)[1]
+    """Return the delay inside a link, whose messages may also be lost; None of a link without delay."""
+    _, inside = _open_link(channel)
     return inside if isinstance(inside, Delayed) else None
 
 
@@ -205,7 +252,7 @@ def find_loss_decay(channel: Channel | None) -> float | None:
     chances = [arrival_chance(mode) for mode in inside.maps]
     if inside.memory.name is not None or None in chances:
         return None
-    losses = 1 - float(arrival) * np.array(chances, dtype=float)
+    losses = 1 - float(arrival) * np.array(chances, dtype=float)  # l, by mode
     return float(np.abs(np.linalg.eigvals(losses[:, None] * np.asarray(inside.memory.transition))).max())
 
 

@@ -49,7 +49,12 @@ def find_moved_beyond(
 ) -> Bool[jax.Array, " node"]:  # fmt: skip
     """Return which nodes send: those whose estimate is off by d' P^-1 d > alpha n from what somebody received last.
 
-    `off`: d, a sender's estimate less what each node received of it last. `information`: P^-1.
+    Args:
+        alpha: threshold of the events.
+        off: d, for each node and place the sender's estimate less what the node received of it last.
+        information: P^-1 of the sender's estimate.
+        senders: of whom each node receives (node, degree), itself first.
+        present: where it has a neighbour (node, degree).
 
     Where the message arrives, the error of what was received last is then at most (1 + sqrt(alpha n))^2 P, whatever got
     lost before: E[(e + d) (e + d)'] <= (1 + 1/t) P + (1 + t) E[d d'], d d' <= alpha n P, any t.
@@ -63,7 +68,10 @@ def find_moved_beyond(
 def quantize_estimate(
     quantizer: AbstractQuantizer, mean: Float[jax.Array, " n"], covariance: Float[jax.Array, "n n"]
 ) -> tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]:
-    """Return what a node sends of an estimate: the mean quantized, NaN beyond the amplitude, and a wider covariance."""
+    """Return what a node sends of an estimate: the mean quantized, NaN if it saturates, and a covariance wider by that.
+
+    Without state, as a quantizer between neighbours has none.
+    """
     value = quantizer.step((), mean)[1]
     received = jnp.where(jnp.any(value.saturated), jnp.nan, value.value)
     return received, widen(covariance, jnp.asarray(quantizer.error(len(mean))))
@@ -73,12 +81,20 @@ def gather_messages(
     mean: jax.Array, covariance: jax.Array, way: MessagesOnTheWay, quantizer: AbstractQuantizer | None,
     senders: np.ndarray, ages: Int[jax.Array, "node rounds degree"],
 ) -> ArrivingEstimates:  # fmt: skip
-    """Return the estimates that arrive at a step; `ages` of the messages, -1 where none does.
+    """Return the estimates that arrive at a step.
 
-    Without a quantizer, estimates are sent as they are. One that saturates its quantizer never arrives; the
-    measurement sent with it arrives at once or not at all.
-    So data decide what is fused: E[e_i e_i'] given that x was beyond the amplitude may be far above P_i.
+    One that saturates its quantizer never arrives; the measurement sent with it arrives at once or not at all. So data
+    decide what is fused: E[e_i e_i'] given that x was beyond the amplitude may be far above P_i.
+
+    Args:
+        mean: estimates of the nodes now (node, n).
+        covariance: of their errors (node, n, n).
+        way: messages that were sent before.
+        quantizer: of the estimates that are sent, stacked by node; None where they are sent as they are.
+        senders: of whom each node receives (node, degree), itself first.
+        ages: of the messages that arrive, in steps, -1 where none does.
     """
+    # Rows: the nodes' own estimates, what they send now, then what they sent 1, 2, ... steps ago.
     sent = mean, covariance
     if quantizer is not None:
         sent = eqx.filter_vmap(quantize_estimate, in_axes=(eqx.if_array(0), 0, 0))(quantizer, *sent)
@@ -86,9 +102,9 @@ def gather_messages(
         jnp.concatenate([own, now, late.reshape(-1, *own.shape[1:])])
         for own, now, late in zip((mean, covariance), sent, way, strict=True)
     )
-    # Row of the message of age a from node j: after the nodes' own, (1 + a) nodes + j.
+    # The message of age a from node j is row (1 + a) nodes + j; where none arrives, age 0 stands in and is not used.
     rows = jnp.asarray(senders) + len(mean) * (1 + jnp.maximum(ages[:, -1], 0))
-    # In place of an estimate that saturated, the receiver's own, which is a number.
+    # In place of an estimate that saturated, the receiver's own, which is a number; in place 0 its own in any case.
     saturated = jnp.any(jnp.isnan(means), axis=1)[rows]
     rows = jnp.where(saturated, senders[:, :1], rows).at[:, 0].set(senders[:, 0])
     return ArrivingEstimates(
@@ -110,24 +126,31 @@ def step_messages_on_the_way(
 ) -> MessagesOnTheWay:
     """Return the estimates on the way after a step: those sent now join, corrected by the measurement sent with them.
 
-    Shapes: common (n,); weighted (node, n), H_j' R_j^-1 (z_j - H_j common); information (node, n, n).
+    Args:
+        messages: estimates that arrived in the step, of which rows nodes to 2 nodes are those sent now.
+        way: messages that were on the way before it.
+        motion: the plant over the step.
+        common: the state m about which measurements are taken (n,).
+        weighted: H_j' R_j^-1 (z_j - H_j m) of each node's measurement (node, n).
+        information: H_j' R_j^-1 H_j (node, n, n).
     """
-    nodes, (ages, count) = len(weighted), way.mean.shape[:2]
+    nodes, (ages, senders) = len(weighted), way.mean.shape[:2]
     a, shift = jnp.asarray(motion.matrix), jnp.asarray(motion.shift)
 
     def predict(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Predict estimates, one row each, by one step."""
+        """Return estimates (..., n) and their covariances (..., n, n) predicted by one step."""
         return mean @ a.T + shift, a @ covariance @ a.T + motion.noise
 
-    # What is sent now is corrected by the measurement that is sent with it; what was sent before is predicted.
-    mean, before = predict(messages.mean[nodes : 2 * nodes], messages.covariance[nodes : 2 * nodes])
-    covariance, _ = jax.vmap(correct_by_information)(before, information)
+    # What is sent now, predicted, and corrected by the measurement that is sent with it.
+    mean, predicted_covariance = predict(messages.mean[nodes : 2 * nodes], messages.covariance[nodes : 2 * nodes])
+    covariance, _ = jax.vmap(correct_by_information)(predicted_covariance, information)
     innovation = weighted - jnp.einsum("iab,ib->ia", information, mean - common)
     mean = mean + jnp.einsum("iab,ib->ia", covariance, innovation)
-    older = predict(*way) if ages else tuple(way)
+    # What was sent before, predicted.
+    older_mean, older_covariance = predict(way.mean, way.covariance) if ages else way
 
-    def first_ages(now: jax.Array, old: jax.Array) -> jax.Array:
-        """Put what is sent now before what is older, and drop the oldest."""
-        return jnp.concatenate([now[None], old])[:ages].reshape(ages, count, *now.shape[1:])
+    def put_before(older: jax.Array, now: jax.Array) -> jax.Array:
+        """Return what is sent now (node, ...) before what is older (age, node, ...), without the oldest."""
+        return jnp.concatenate([now[None], older])[:ages].reshape(ages, senders, *now.shape[1:])
 
-    return MessagesOnTheWay(first_ages(mean, older[0]), first_ages(covariance, older[1]))
+    return MessagesOnTheWay(put_before(older_mean, mean), put_before(older_covariance, covariance))

@@ -22,7 +22,8 @@ from heliograph.numerics.check import fail, instance, text
 from heliograph.numerics.float64 import compile_in_float64, in_float64
 from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.types import Array, ArrayLike
-from heliograph.simulation.centres.mesh import Mesh, MeshRows, MeshState
+from heliograph.simulation.centres.mesh import Mesh
+from heliograph.simulation.centres.mesh_parts import MeshState, NodeBucket
 from heliograph.simulation.centres.neighbour_edges import MeshEdges
 from heliograph.simulation.centres.neighbour_messages import MessagesOnTheWay, quantize_estimate
 from heliograph.simulation.centres.observation_model import Apart, stack_nodes
@@ -35,7 +36,13 @@ _quantize_message = compile_in_float64(quantize_estimate)
 
 
 class NodeState(NamedTuple):
-    """State of a node: `before` the last step, as its message of that step says it, the step's inputs, and `now`."""
+    """State of a node's filter, which keeps the last step's start, since messages of that step may still come.
+
+    Args:
+        before: state before the last step, as the node's message of that step says it.
+        inputs: of the plant over the last step.
+        now: state after it, with all that came.
+    """
 
     before: MeshState
     inputs: Array
@@ -43,7 +50,7 @@ class NodeState(NamedTuple):
 
 
 class NodeFilter(AbstractSizedFilter):
-    """Filter of one node of a fusion between neighbours; of the mesh it has one row and the neighbours' sensors.
+    """Filter of one node of a fusion between neighbours: of the mesh it has one row and the neighbours' sensors.
 
     The measurement is z of the node itself, then for each neighbour j the mean (n,) and covariance (n, n) of its
     estimate before the step and its z_j: NaN where the message did not come. Claim: as the fusion's, whatever comes.
@@ -62,7 +69,7 @@ class NodeFilter(AbstractSizedFilter):
 
     @in_float64
     def init(self) -> NodeState:
-        """Return the plant's initial law."""
+        """Return the state before the first step: the plant's initial law, and no message on the way."""
         start = self.mesh.init()
         n, count = start.mean.shape[1], len(self.measured)
         alone = start._replace(way=MessagesOnTheWay(jnp.zeros((0, count, n)), jnp.zeros((0, count, n, n))))
@@ -71,23 +78,27 @@ class NodeFilter(AbstractSizedFilter):
     @predicts
     def predict(self, state: NodeState, u: ArrayLike = (), k: Step = 0) -> NodeState:
         """Predict from the node's estimate alone, as if no message came."""
-        return self._make_state(state.now, jnp.full(self.received, jnp.nan), jnp.asarray(u), k)
+        return self._step_from(state.now, jnp.full(self.received, jnp.nan), jnp.asarray(u), k)
 
     @corrects
     def correct(self, state: NodeState, z: ArrayLike, k: Step = 0) -> tuple[NodeState, Innovation]:
-        """Fuse, predict and correct with what came; innovations of the measurements about the node's prediction."""
+        """Fuse, predict and correct from `state.before` with what came in z.
+
+        Returns the next state, and the innovation of all measurements in z about the node's prediction, `state.now`.
+        """
+        after = self._step_from(state.before, jnp.asarray(z), state.inputs, k)
+        # Measurements z_i = M_i x + o_i + nu_i of the node and its neighbours, without padding.
         mean, covariance = state.now.mean[0], state.now.covariance[0]
         observation = self.mesh.observation_model.observe(*state.now.plant, jnp.asarray(k))
-        sensed, _ = self._gather_measurements(jnp.asarray(z), state.before)
+        sensed, _ = self._take_apart(jnp.asarray(z), state.before)
         sensors = [(i, size) for i, size in enumerate(self.measured) if size]
         if not sensors:
-            return self._make_state(state.before, jnp.asarray(z), state.inputs, k), no_innovation()
-        gain, offset = (jnp.concatenate([stacked[i, :size] for i, size in sensors])
-                        for stacked in (observation.gain, observation.offset))  # fmt: skip
+            return after, no_innovation()
+        gain = jnp.concatenate([observation.gain[i, :size] for i, size in sensors])
+        offset = jnp.concatenate([observation.offset[i, :size] for i, size in sensors])
         noise = block_diag(*(observation.noise[i, :size, :size] for i, size in sensors))
         total = gain @ covariance @ gain.T + noise
-        innovation = gaussian_innovation(jnp.concatenate(sensed), gain @ mean + offset, total)
-        return self._make_state(state.before, jnp.asarray(z), state.inputs, k), innovation
+        return after, gaussian_innovation(jnp.concatenate(sensed), gain @ mean + offset, total)
 
     @estimates
     def estimate(self, state: NodeState) -> Estimate:
@@ -100,10 +111,11 @@ class NodeFilter(AbstractSizedFilter):
         message = before.mean[0], before.covariance[0]
         return message if self.quantizer is None else _quantize_message(self.quantizer, *message)
 
-    def _gather_measurements(self, z: jax.Array, before: MeshState) -> tuple[list[jax.Array], MeshState]:
-        """Take z apart: return the measurements of node and neighbours, and their estimates.
+    def _take_apart(self, z: jax.Array, before: MeshState) -> tuple[list[jax.Array], MeshState]:
+        """Return the measurements in z of the node and its neighbours, and `before` with their estimates in z too.
 
-        Where no message came, the mean is NaN, and the covariance any regular one: the node's own.
+        Rows of these: the node's own, then its neighbours'. Where no message came, the mean is NaN, and the covariance
+        any regular one: the node's own.
         """
         n, end = len(self.states), self.measured[0]
         sensed, means, covariances = [z[:end]], [before.mean[0]], [before.covariance[0]]
@@ -117,16 +129,22 @@ class NodeFilter(AbstractSizedFilter):
             covariances.append(jnp.where(arrives, symmetrize(covariance.reshape(n, n)), covariances[0]))
         return sensed, before._replace(mean=jnp.stack(means), covariance=jnp.stack(covariances))
 
-    def _make_state(self, before: MeshState, z: jax.Array, u: Array, k: Step) -> NodeState:
-        """Return the state after a step with measurement z: the state before, the inputs, and the new estimate."""
-        sensed, all_nodes = self._gather_measurements(z, before)
+    def _step_from(self, before: MeshState, z: jax.Array, u: Array, k: Step) -> NodeState:
+        """Return the state after step k from `before` with z, the node's measurement and its neighbours' messages."""
+        sensed, all_nodes = self._take_apart(z, before)
+        # What did not come is NaN, so that all is said to arrive.
         everything = jnp.ones((1, 1, len(sensed)), dtype=bool)
         now, _ = self.mesh.step(all_nodes, [x[None] for x in sensed], everything, jnp.asarray(u), jnp.asarray(k))
         return NodeState(before, u, now)
 
 
 def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
-    """Return the filter of a node of the fusion `fusion` between neighbours of `network`, on what its neighbours send.
+    """Return the filter of one node of a fusion between neighbours, on what its neighbours send.
+
+    Args:
+        network: the network.
+        fusion: name of its fusion between neighbours.
+        node: name of the node.
 
     Raises:
         ValueError: a rule that needs the joint covariance of all nodes' errors, more than one round, events, a plant
@@ -134,20 +152,46 @@ def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
     """
     between, nodes = network.meshes[fusion], network.mesh_nodes(fusion)
     _check_can_filter_alone(f"node {node!r} of fusion {fusion!r} by itself", network, between)
+    mesh = _build_row(network, fusion, node)
+    # The measurement: the node's own, then a message of each neighbour.
+    sizes = tuple(network.nodes[name].received for name in mesh.nodes)
+    own, *of_neighbours = sizes
+    alone = NodeFilter(
+        mesh=mesh,
+        measured=sizes,
+        quantizer=next(iter(between.quantizers((node,))), None),
+        receivers=tuple(name for name in nodes if node in (between.neighbours or {})[name]),
+        claim=mesh.claim,
+        states=network.states,
+        inputs=network.inputs,
+        received=own + sum(_count_numbers(len(network.states), size) for size in of_neighbours),
+    )
+    # The claim is that of the whole network, which stands here for the node's own part of it.
+    return on_premise(alone, find_premise(network, node))
+
+
+def _build_row(network: Network, fusion: str, node: str) -> Mesh:
+    """Return the part of a fusion between neighbours that estimates at one node, from itself and its neighbours.
+
+    All messages arrive in it; what does not is NaN. `fusion` and `node`: names.
+    """
+    between, nodes = network.meshes[fusion], network.mesh_nodes(fusion)
+    neighbours = between.neighbours or {}
     # The node's row of the graph: itself, then its neighbours.
-    graph, neighbours = graph_of(between.neighbours or {}, nodes), between.neighbours or {}
+    graph = graph_of(neighbours, nodes)
     i, count = nodes.index(node), 1 + len(neighbours[node])
-    row = Graph(nodes, graph.senders[i : i + 1, :count], np.ones((1, count), dtype=bool))
+    row = Graph(nodes, senders=graph.senders[i : i + 1, :count], present=np.ones((1, count), dtype=bool))
     names = (node, *neighbours[node])
-    sensors = [network.nodes[name] for name in names]
-    models = [stack_nodes([n.sensor], [n.channel]) if isinstance(n, Node) else None for n in sensors]
-    sizes = tuple(n.received for n in sensors)
-    mesh = Mesh(
+    # One group for each of them, since their models may differ.
+    members = [network.nodes[name] for name in names]
+    models = [stack_nodes([n.sensor], [n.channel]) if isinstance(n, Node) else None for n in members]
+    sizes = [n.received for n in members]
+    return Mesh(
         plant=network.plant,
-        buckets=(MeshRows(between.rule.placed(row), np.zeros(1, dtype=int), count),),
+        buckets=(NodeBucket(between.rule.placed(row), rows=np.zeros(1, dtype=int), width=count),),
         ranks=np.zeros(1, dtype=int),
         edges=MeshEdges((), np.zeros(0, dtype=int), row.present, 1),
-        observation_model=Apart(tuple(models), np.arange(count), max(1, *sizes), (1,) * count),
+        observation_model=Apart(tuple(models), order=np.arange(count), size=max(1, *sizes), counts=(1,) * count),
         senders=np.arange(count)[None],
         places=((0,),),
         nodes=names,
@@ -156,22 +200,10 @@ def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
         needs_joint=False,
         claim=network.claims()[node][fusion],
     )
-    alone = NodeFilter(
-        mesh=mesh,
-        measured=sizes,
-        quantizer=next(iter(between.quantizers((node,))), None),
-        receivers=tuple(name for name in nodes if node in neighbours[name]),
-        claim=mesh.claim,
-        states=network.states,
-        inputs=network.inputs,
-        received=sizes[0] + sum(_count_numbers(len(network.states), size) for size in sizes[1:]),
-    )
-    # The claim is that of the whole network, which stands here for the node's own part of it.
-    return on_premise(alone, find_premise(network, node))
 
 
 def _check_can_filter_alone(what: str, network: Network, between: Fusion) -> None:
-    """Raise ValueError where a node cannot filter without knowledge of all others."""
+    """Raise ValueError where a node of the fusion `between` neighbours cannot filter without knowing all others."""
     if between.rule.needs_joint:
         raise fail(what, "a rule that needs its neighbours' covariances alone (an intersection)",
                    type(between.rule).__name__)  # fmt: skip

@@ -17,13 +17,19 @@ from heliograph.random_affine.moments.second_moments import SecondOrder, second_
 
 
 class ObservationModel(Module):
-    """Sensors and channels of nodes of one structure, stacked; the nodes share none of them."""
+    """Measurement models of nodes of one structure, which share neither sensor nor channel: both stacked by node.
+
+    `channel`: moments of the channels where all of it arrives.
+    """
 
     sensor: AnySensor
     channel: SecondOrder | OverTime
 
     def observe(self, mean: jax.Array, covariance: jax.Array, k: jax.Array, size: int) -> JointObservation:
-        """Return the nodes' measurement models at step k for a plant with these moments, zero rows up to `size`."""
+        """Return the nodes' measurement models at step k, with zero rows up to `size` components.
+
+        `mean` (n,) and `covariance` (n, n): of the plant's state, on which the noise of a random gain depends.
+        """
 
         def observe_one(sensor: AnySensor, channel: SecondOrder | OverTime) -> JointObservation:
             """Return the measurement model of one node."""
@@ -46,9 +52,10 @@ def _linearise_observation(
     """Return M, o and Cov(z - M x) of z = G (C x + v) + n, G a random gain, for a plant with these moments.
 
     M = E[G] C and o = E[G] E v + E n; the covariance is that of noise through the mean gain, and of the gain's spread.
+    `mean` and `covariance`: of the plant's state x.
     """
     c, noise = jnp.asarray(sensor.matrix), jnp.asarray(sensor.noise.covariance)
-    signal = c @ mean + sensor.noise.mean
+    signal = c @ mean + sensor.noise.mean  # E y, y = C x + v
     second = augmented_second_moment(c @ covariance @ c.T + noise + jnp.outer(signal, signal), signal, 1.0)
     gain = jnp.asarray(channel.mean_gain)
     spread = channel.nominal.middle(second, jnp.ones(len(gain), dtype=bool))
@@ -56,9 +63,13 @@ def _linearise_observation(
 
 
 class Apart(Module):
-    """Measurement models of nodes that share nothing, by groups; `order` brings them into the order of the nodes.
+    """Measurement models of nodes that share nothing.
 
-    `counts` of the groups' nodes are needed where a group measures nothing, None among the groups.
+    Args:
+        groups: of the nodes of one structure, stacked; None of nodes that measure nothing.
+        order: brings the groups' nodes, one group after another, into the order of the nodes.
+        size: length of the longest measurement, to which others are padded.
+        counts: number of nodes in each group; needed where one measures nothing.
     """
 
     groups: tuple[ObservationModel | None, ...]
@@ -80,7 +91,7 @@ class Apart(Module):
 
 
 class Together(Module):
-    """Measurement models of nodes that share a sensor and a channel.
+    """Measurement models of nodes that share a sensor and a channel, of whose outputs each node receives some.
 
     `rows` (node, size): which outputs of the channel each node receives, -1 beyond its own.
     """

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -112,79 +113,118 @@ def relay_tree(
         alone = Network(plant, {"leaf": leaf}, {"all": Fusion(name, MatrixWeights())})
         alone.check_horizon(steps)
         u = read_plant_inputs(alone, inputs, steps)
-        # Leaves in blocks, whole relays each: covariances, weights, and the relays as nodes.
+        # Leaves in blocks, whole relays each: covariances, weights, and the relays above.
         width = degree * max(BLOCK // degree, 1)
         blocks = [_slice(numbers, slice(i, i + width)) for i in range(0, count, width)]
-        block_results = [to_numpy(_propagate_leaves((plant, name, node, degree), block, u)) for block in blocks]
-        covariances, weights, level = (list(leaves) for leaves in zip(*block_results, strict=True))
-        level_covariances, used, shared = [np.concatenate(covariances)], [np.concatenate(weights)], _join_blocks(level)
-        # ErrorSources by level up to the root.
-        while True:
-            level_covariances.append(np.asarray(shared.covariances()))
-            if len(level_covariances[-1]) == 1:
-                return RelayTree(degree, alone.claims()[FUSED]["all"], tuple(level_covariances), tuple(used))
-            groups = [_slice(shared, slice(i, i + degree)) for i in range(0, len(level_covariances[-1]), degree)]
-            outputs = [to_numpy(_relay(group)) for group in groups]
-            used.append(np.stack([_pad_to_degree(relay_weights, degree) for relay_weights, _ in outputs]))
-            shared = jax.tree.map(lambda *leaves: np.stack(leaves), *(relay for _, relay in outputs))
+        outputs = [to_numpy(_propagate_block(_Leaves(plant, name, node, degree), block, u)) for block in blocks]
+        covariances, weights, relays = (list(leaves) for leaves in zip(*outputs, strict=True))
+        # The relays' errors, level by level up to the root.
+        level_covariances, level_weights = [np.concatenate(covariances)], [np.concatenate(weights)]
+        errors = _join_blocks(relays)
+        while len(errors.independent) > 1:
+            level_covariances.append(np.asarray(errors.covariances()))
+            relay_weights, errors = _climb_level(errors, degree)
+            level_weights.append(relay_weights)
+        level_covariances.append(np.asarray(errors.covariances()))
+    return RelayTree(
+        degree=degree,
+        claim=alone.claims()[FUSED]["all"],
+        covariances=tuple(level_covariances),
+        weights=tuple(level_weights),
+    )
+
+
+class _Leaves(NamedTuple):
+    """What the leaves of a tree have in common.
+
+    Args:
+        plant: that they estimate.
+        filter: name of the filter that each has.
+        node: makes a leaf from its numbers.
+        degree: number of children of a relay.
+    """
+
+    plant: AnyPlant
+    filter: str
+    node: Callable[[object], Node]
+    degree: int
 
 
 @quickly_compiled
-def _propagate_leaves(
-    leaf: tuple[AnyPlant, str, Callable[[object], Node], int], numbers: PyTree, u: np.ndarray
-) -> tuple[Array, Array, ErrorSources]:
-    """Propagate the leaves of one block over all steps.
+def _propagate_block(leaves: _Leaves, numbers: PyTree, u: np.ndarray) -> tuple[Array, Array, ErrorSources]:
+    """Propagate the errors of a block of leaves over all steps, and fuse them at the relays above.
 
-    Returns: covariances of the leaves' errors (leaf, n, n), weights of the relays above them, and the relays' errors.
+    Args:
+        leaves: what all have in common.
+        numbers: of each leaf of the block, with a leading axis.
+        u: inputs of the plant (step, inputs).
+
+    Returns:
+        Covariances of the leaves' errors (leaf, n, n), weights of the relays above them (relay, n, child, n), and the
+        relays' errors.
     """
-    plant, name, node, degree = leaf
+    errors = _propagate_leaves(leaves, numbers, u)
+    # Full relays at once, then the last one if it has fewer children.
+    count, degree = len(errors.independent), leaves.degree
+    full = count - count % degree
+    weights, above = jax.vmap(_fuse)(jax.tree.map(lambda a: a[:full].reshape(-1, degree, *a.shape[1:]), errors))
+    if count > full:
+        last_weights, last_error = _fuse(jax.tree.map(lambda a: a[full:], errors))
+        last_weights = jnp.pad(last_weights, ((0, 0), (0, degree - last_weights.shape[1]), (0, 0)))
+        weights = jnp.concatenate([weights, last_weights[None]])
+        above = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), above, last_error)
+    return errors.covariances(), weights, above
+
+
+def _propagate_leaves(leaves: _Leaves, numbers: PyTree, u: np.ndarray) -> ErrorSources:
+    """Return the errors of a block of leaves after all steps, by their sources; arguments as of `_propagate_block`."""
     # All leaves of the block from their numbers.
-    nodes = eqx.filter_vmap(node)(numbers)
+    nodes = eqx.filter_vmap(leaves.node)(numbers)
     count = len(jax.tree.leaves(numbers)[0])
-    channels = eqx.filter_vmap(lambda values: describe_channel(node(values).channel))(numbers)
-    alike = StackedFilters(nodes.filters[name], 0, 1, count)
-    size = nodes.filters[name].received
+    channels = eqx.filter_vmap(lambda values: describe_channel(leaves.node(values).channel))(numbers)
+    filters = nodes.filters[leaves.filter]
+    alike = StackedFilters(filters=filters, group=0, count=1, nodes=count)
     centre = FusionCentre(
-        plant=plant,
-        observation_model=Apart((ObservationModel(nodes.sensor, channels),), np.arange(count), size),
+        plant=leaves.plant,
+        observation_model=Apart((ObservationModel(nodes.sensor, channels),), np.arange(count), filters.received),
         rules={},
         order=np.arange(count),
         sources=((0, 0),),
-        size=size,
+        size=filters.received,
         claim="exact",
     )
-    zeros = jnp.zeros((count, size))  # measurements: covariances depend on none
-
-    # Errors by their sources, over the horizon.
-    state = alike.init()
-    n = len(first(plant).states)
-    begin = initial_factors(centre.init([gaussian_of(state).mean]).errors, n * len(u))
-    factors = centre.factors(
-        (state, begin),
-        lambda states, u_k, k: alike.matrices(centre.read, states, 0, zeros, u_k, k),
-        lambda states, u_k, k: alike.step(states, zeros, u_k, k)[0],
-        u,
+    # Errors by their sources, over the horizon; covariances depend on no measurement, so that zeros do.
+    zeros = jnp.zeros((count, filters.received))
+    states = alike.init()
+    n = len(first(leaves.plant).states)
+    factors_before = initial_factors(centre.init([gaussian_of(states).mean]).errors, n * len(u))
+    factors = centre.propagate_error_factors(
+        (states, factors_before),
+        compute_matrices=lambda before, u_k, k: alike.compute_by_node(
+            centre.compute_matrices, before, 0, zeros, u_k, k
+        ),
+        step_filters=lambda before, u_k, k: alike.step(before, zeros, u_k, k)[0],
+        u=u,
     )
-    level = factors.errors
-    # Full relays at once, then the last one.
-    full = count - count % degree
-    weights, above = jax.vmap(_fuse)(jax.tree.map(lambda a: a[:full].reshape(-1, degree, *a.shape[1:]), level))
-    if count > full:
-        last, rest = _fuse(jax.tree.map(lambda a: a[full:], level))
-        last = jnp.pad(last, ((0, 0), (0, degree - last.shape[1]), (0, 0)))
-        weights = jnp.concatenate([weights, last[None]])
-        above = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), above, rest)
-    return level.covariances(), weights, above
+    return factors.errors
+
+
+def _climb_level(errors: ErrorSources, degree: int) -> tuple[np.ndarray, ErrorSources]:
+    """Return the weights (relay, n, child, n) and the errors of the relays above nodes with these errors."""
+    groups = [_slice(errors, slice(i, i + degree)) for i in range(0, len(errors.independent), degree)]
+    outputs = [to_numpy(_fuse_at_relay(group)) for group in groups]
+    weights = np.stack([_pad_to_degree(relay_weights, degree) for relay_weights, _ in outputs])
+    return weights, jax.tree.map(lambda *leaves: np.stack(leaves), *(error for _, error in outputs))
 
 
 @quickly_compiled
-def _relay(children: ErrorSources) -> tuple[jax.Array, ErrorSources]:
-    """Return the weights of a relay for its children, and the error of its estimate."""
+def _fuse_at_relay(children: ErrorSources) -> tuple[jax.Array, ErrorSources]:
+    """Return the weights of a relay for its children, and the error of its estimate: `_fuse`, compiled."""
     return _fuse(children)
 
 
 def _fuse(children: ErrorSources) -> tuple[jax.Array, ErrorSources]:
-    """Return the best weights (n, child, n) of these children, and the error of their weighted estimate."""
+    """Return the best weights (n, child, n) of children with these errors, and the error of their weighted estimate."""
     children = ErrorSources(*map(jnp.asarray, children))
     weights = matrix_weights(children.joint())
     return weights, ErrorSources(*children.weigh(weights))
@@ -201,7 +241,7 @@ def _pad_to_degree(weights: np.ndarray, degree: int) -> np.ndarray:
 
 
 def _slice(numbers: PyTree, rows: int | slice) -> PyTree:
-    """Return some rows of every array."""
+    """Return these rows of every array: of some leaves, or of one without the leading axis."""
     return jax.tree.map(lambda leaf: leaf[rows], numbers)
 
 

@@ -1,4 +1,8 @@
-"""Uplinks of a fusion by reports: quantizers, random channels and delays."""
+"""Uplinks of a fusion by reports: quantizers, random channels and delays.
+
+`n`: numbers in a report as a node sends it. `m`: numbers that arrive of the longest one; a node of which fewer arrive
+has NaN in the other rows. Age of a report: steps since it was sent.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -24,7 +28,7 @@ from heliograph.simulation.transmission.shared_fading import ChannelGroup, chann
 
 
 class UplinkDraws(NamedTuple):
-    """Draws of the uplinks at one step: z = G m + n, NaN where lost, received `delay` steps later.
+    """Draws of the uplinks at one step: of a report x arrives gain x + offset, NaN where lost, `delay` steps later.
 
     Shapes: gain (node, m, n), offset (node, m), NaN in rows that a node lacks, delay (node,).
     """
@@ -48,7 +52,13 @@ class SentReports(NamedTuple):
 
 
 class InFlight(NamedTuple):
-    """Reports in transit, by the steps since they were sent, from one; their delays; and the quantizers' states."""
+    """Reports in transit, and the quantizers' states.
+
+    Args:
+        values: what arrives of the reports sent 1, 2, ... steps ago (age, node, m), NaN of what is lost or not sent.
+        delays: after how many steps each arrives (age, node).
+        quantizers: states of the nodes' quantizers, stacked; () without quantizers.
+    """
 
     values: jax.Array
     delays: jax.Array
@@ -56,10 +66,16 @@ class InFlight(NamedTuple):
 
 
 class Uplinks(Module):
-    """All uplinks of one fusion: quantizers stacked, channels by structure, delays and intervals by node.
+    """All uplinks of one fusion by reports.
 
-    `delay` (node, ages): probability of each delay in steps. `every` (node,): steps from one report to the next.
-    `links`: the centre's model of them.
+    Args:
+        groups: the nodes' channels, those of one structure stacked; without any, nothing is drawn.
+        quantizers: of the nodes, stacked; None where reports are sent as they are.
+        links: the centre's model of the channels.
+        delay: probability of each delay in steps (node, ages).
+        every: steps from one report to the next, by node.
+        received: how many numbers arrive of each node's report.
+        n: how many numbers a report has when it is sent.
     """
 
     groups: tuple[ChannelGroup, ...]
@@ -72,20 +88,25 @@ class Uplinks(Module):
 
     @property
     def rows(self) -> np.ndarray:
-        """Places of the numbers that may arrive among (age, node, m) flattened."""
+        """Places among (age, node, m), flattened, of the numbers that may arrive: all but what pads shorter reports."""
         exists = np.arange(max(self.received)) < np.array(self.received)[:, None]
         return np.flatnonzero(np.broadcast_to(exists, (self.delay.shape[1], *exists.shape)))
 
     def init(self) -> InFlight:
         """Return the state with no report in transit."""
         nodes, ages = self.delay.shape
-        values = jnp.full((ages - 1, nodes, max(self.received)), jnp.nan)
-        begin = eqx.filter_vmap(lambda q: q.init(self.n), in_axes=(eqx.if_array(0),), axis_size=nodes)
-        start = () if self.quantizers is None else begin(self.quantizers)
-        return InFlight(values, jnp.zeros((ages - 1, nodes), dtype=int), start)
+        values = jnp.full((ages - 1, nodes, max(self.received)), jnp.nan)  # NaN: nothing was sent
+        begin_all = eqx.filter_vmap(
+            lambda quantizer: quantizer.init(self.n), in_axes=(eqx.if_array(0),), axis_size=nodes
+        )
+        quantizers = () if self.quantizers is None else begin_all(self.quantizers)
+        return InFlight(values, delays=jnp.zeros((ages - 1, nodes), dtype=int), quantizers=quantizers)
 
     def draw(self, key: jax.Array, k: jax.Array) -> UplinkDraws:
-        """Draw the uplinks of step k in the run with this key; the same for all fusions of the same nodes."""
+        """Draw the uplinks of step k in the run with this key; the same for all fusions of the same nodes.
+
+        Each channel at step k is a random matrix h = [gain, offset; 0, 1] of (m + 1, n + 1).
+        """
         nodes, m, n = len(self.received), max(self.received), self.n
         # Lossless links, where nothing is random.
         gain = jnp.zeros((nodes, m, n)) if self.groups else jnp.tile(jnp.eye(n), (nodes, 1, 1))
@@ -94,41 +115,44 @@ class Uplinks(Module):
         # Channels and delays, independently for each node.
         for group in self.groups:
             places = jnp.asarray(group.places)
-
-            def draw_link(channel: Channel, source: jax.Array, law: jax.Array) -> tuple[jax.Array, jax.Array]:
-                """Draw the channel's matrix (m + 1, n + 1) and the delay of one node, of probabilities `law`."""
-                of_channel, of_delay = jax.random.split(draw_key(key, k, source, CHANNEL))
-                return at(channel, k).sample(of_channel), jax.random.choice(of_delay, len(law), p=law)
-
-            draw_links = eqx.filter_vmap(draw_link, in_axes=(eqx.if_array(0), 0, 0))
-            h, late = draw_links(group.channel, group.checksums, jnp.asarray(self.delay)[places])
+            h, late = _draw_links(group, jnp.asarray(self.delay)[places], key, k)
             size = h.shape[1] - 1
             gain = gain.at[places, :size].set(h[:, :-1, :-1])
             offset = offset.at[places, :size].set(h[:, :-1, -1])
             delay = delay.at[places].set(late)
         return UplinkDraws(gain, offset, delay)
 
-    def undrawn(self) -> UplinkDraws:
-        """Return gains, offsets and delays of deterministic links."""
+    def lossless(self) -> UplinkDraws:
+        """Return gains, offsets and delays of links by which all reports arrive as they are, each after its delay."""
         nodes = len(self.received)
-        return UplinkDraws(np.tile(np.eye(self.n), (nodes, 1, 1)), np.zeros((nodes, self.n)), self.fixed_delay)
+        return UplinkDraws(
+            gain=np.tile(np.eye(self.n), (nodes, 1, 1)), offset=np.zeros((nodes, self.n)), delay=self.fixed_delay
+        )
 
-    def recorded(
+    def read_recorded(
         self, name: str, nodes: Sequence[str], reports: Mapping[str, SentReports | ArrayLike] | None, steps: int
     ) -> UplinkDraws:
-        """Return gains, offsets and delays of each step from a recording; (time, node, ...).
+        """Return gains, offsets and delays of each step from a recording, with a leading axis of time.
+
+        Args:
+            name: of the fusion.
+            nodes: names of its nodes.
+            reports: what arrived of each node's report by the step at which it was sent (steps, numbers), NaN where
+                lost, with delays where these are not fixed; None where none were recorded.
+            steps: number of steps.
 
         Raises:
             ValueError: nodes without reports or the reverse, shapes that do not fit, delays that the links do not
                 allow.
         """
         count, m = len(self.received), max(self.received)
+        # Without channels all that is sent arrives.
         if reports is None and not self.groups:
-            return UplinkDraws(*(np.broadcast_to(values, (steps, *np.shape(values))) for values in self.undrawn()))
+            return UplinkDraws(*(np.broadcast_to(values, (steps, *np.shape(values))) for values in self.lossless()))
         if reports is None or set(reports) != set(nodes):
             got = "none" if reports is None else list(reports)
             raise fail(f"reports of fusion {name!r}", f"those of {list(nodes)}", got)
-        # z = 0 m + offset: the recorded values are offsets of links without gain.
+        # The recorded values are offsets of links without gain.
         values, delay = np.full((steps, count, m), np.nan), np.tile(self.fixed_delay, (steps, 1))
         for i, node in enumerate(nodes):
             sent, size = reports[node], self.received[i]
@@ -154,17 +178,28 @@ class Uplinks(Module):
     def send(
         self, state: InFlight, means: jax.Array, drawn: UplinkDraws, k: jax.Array
     ) -> tuple[InFlight, jax.Array, dict[str, jax.Array]]:
-        """Send the reports of step k: next state, received values (node, m), whenever they arrive, and their traffic.
+        """Send the reports of step k: return the next state, what arrives of them, now or later, and their traffic.
 
         A value that saturates a quantizer becomes an infinite number: nothing is known of it, and the estimate shows
         that.
+
+        Args:
+            state: of reports in transit and of quantizers, before the step.
+            means: to be sent (node, n).
+            drawn: gains and offsets of the step.
+            k: number of the step.
+
+        Returns:
+            The state with the quantizers' next states; values that arrive (node, m); which components saturated a
+            quantizer, and how many symbols were sent for them (node, n), by these names; empty without quantizers.
         """
-        # Only every d-th step sends; a quotient of multiples is exact, and native code has no remainder by a variable.
+        # A node sends at steps d, 2 d, ... counted from 1, d = `every`; a quotient of multiples is exact, and native
+        # code has no remainder by a variable.
         step = jnp.asarray(k + 1, means.dtype)
         sending = (jnp.floor(step / self.every) * self.every == step)[:, None]
         values, traffic = jnp.where(sending, means, jnp.nan), {}
         saturated = jnp.zeros(len(means), dtype=bool)
-        # Quantized reports; an infinite number stands for one that saturated.
+        # Quantized reports.
         if self.quantizers is not None:
             quantize = eqx.filter_vmap(lambda q, s, mean: q.step(s, mean), in_axes=(eqx.if_array(0), 0, 0))
             quantizers, sent = quantize(self.quantizers, state.quantizers, values)
@@ -175,15 +210,34 @@ class Uplinks(Module):
         return state, jnp.where(saturated[:, None], jnp.inf, z), traffic
 
     def arrive(self, state: InFlight, sent: jax.Array, delay: Array) -> tuple[InFlight, jax.Array]:
-        """Return the next state, and what arrives now of this step's reports and earlier ones, (age, node, m)."""
+        """Return the next state, and what arrives now of this step's reports and earlier ones (age, node, m).
+
+        `sent` (node, m): values of this step's reports, which arrive `delay` (node,) steps later. NaN: nothing arrives.
+        """
         values = jnp.concatenate([sent[None], state.values])
         delays = jnp.concatenate([jnp.asarray(delay, dtype=state.delays.dtype)[None], state.delays])
-        due = delays == np.arange(len(values))[:, None]
+        due = delays == np.arange(len(values))[:, None]  # those whose age is their delay
         return state._replace(values=values[:-1], delays=delays[:-1]), jnp.where(due[..., None], values, jnp.nan)
 
 
-def uplinks_of(fusion: Fusion, nodes: Sequence[str], n: int) -> Uplinks:
-    """Build the uplinks of these nodes to a centre that receives reports of n numbers."""
+def _draw_links(group: ChannelGroup, delay: jax.Array, key: jax.Array, k: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Draw the matrices (channel, m + 1, n + 1) of a group's channels at step k, and the delays of what they carry.
+
+    `delay` (channel, ages): probability of each delay in steps.
+    """
+
+    def draw_link(channel: Channel, source: jax.Array, law: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Draw one channel, seeded by its number `source`, and a delay by the probabilities `law`."""
+        channel_key, delay_key = jax.random.split(draw_key(key, k, source, CHANNEL))
+        return at(channel, k).sample(channel_key), jax.random.choice(delay_key, len(law), p=law)
+
+    draw_links = eqx.filter_vmap(draw_link, in_axes=(eqx.if_array(0), 0, 0))
+    matrices, delays = draw_links(group.channel, group.checksums, delay)
+    return matrices, delays
+
+
+def build_uplinks(fusion: Fusion, nodes: Sequence[str], n: int) -> Uplinks:
+    """Return the uplinks of these nodes to the centre of a fusion by reports of n numbers."""
     links, quantizers = fusion.links(nodes), fusion.quantizers(nodes)
     ages = max(len(link.delay) for link in links)
     channels = [perfect(n) if link.channel is None else link.channel for link in links]
@@ -207,13 +261,20 @@ def uplinks_of(fusion: Fusion, nodes: Sequence[str], n: int) -> Uplinks:
 def _model_links(
     known: Sequence[SecondOrder | OverTime], received: Sequence[int], error: np.ndarray
 ) -> ReportModel | OverTime:
-    """Return the model of the uplinks for a centre, at each step if any varies."""
+    """Return the centre's model of the uplinks, one for each step if any varies.
+
+    `known`: moments of each node's channel. `received`: how many numbers arrive of its report. `error` (node, n): bound
+    on what its quantizer changes.
+    """
     model: ReportModel | OverTime = at_each_step(lambda *links: _gather_link_moments(links, received, error), *known)
     return model
 
 
 def _gather_link_moments(known: Sequence[PyTree], received: Sequence[int], error: np.ndarray) -> ReportModel:
-    """Return the moments of all uplinks as arrays, with zeros for what a node receives less than others."""
+    """Return the moments of all uplinks as arrays, padded with zeros where fewer numbers arrive of a node's report.
+
+    Arguments as of `_model_links`, `known` at one step.
+    """
     gains, offsets, spreads = [], [], []
     for link, size in zip(known, received, strict=True):
         padding = (0, max(received) - size)

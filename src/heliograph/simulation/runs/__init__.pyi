@@ -18,6 +18,8 @@ from .memory import explain_out_of_memory as explain_out_of_memory
 from .memory import size_of as size_of
 from .native import simulate_natively as simulate_natively
 from .side_by_side import StackedFilters as StackedFilters
+from .side_by_side import StepOutput as StepOutput
 from .side_by_side import filter_step as filter_step
 from .side_by_side import initial_state as initial_state
 from .side_by_side import map_all as map_all
+from .side_by_side import stack_by_kind as stack_by_kind

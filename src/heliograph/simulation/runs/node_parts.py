@@ -35,9 +35,9 @@ def is_apart(network: Network) -> bool:
 
 
 @cache_by_object
-def build_world(network: Network, smoothed_groups: tuple[int, ...] | None = None) -> World:
-    """Build the world of a network, once for all simulations of it; `smoothed_groups` as of `AllFilters`."""
-    return World(drop_identities(network.plant), make_reception(network), AllFilters(network, smoothed_groups))
+def build_world(network: Network, smoothed_kinds: tuple[int, ...] | None = None) -> World:
+    """Build the world of a network, once for all simulations of it; `smoothed_kinds` as of `AllFilters`."""
+    return World(drop_identities(network.plant), make_reception(network), AllFilters(network, smoothed_kinds))
 
 
 def count_parts(network: Network) -> int:

@@ -1,6 +1,6 @@
 """Filters of one kind in parallel: stacked along axes of filters and nodes, and vmapped."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import partial
 from typing import NamedTuple
 
@@ -13,14 +13,21 @@ from heliograph.filters.innovation import Weighed
 from heliograph.filters.plausibility import Judgement, Reason
 from heliograph.filters.smoother_step import SmootherStep
 from heliograph.model.estimate import Estimate, Innovation
+from heliograph.model.over_time import stack
+from heliograph.model.sensor import without_output_names
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
+from heliograph.simulation.network import Network
 
 
 class StepOutput(NamedTuple):
-    """Output of a filter's step: its estimate, and its smoother step and judgement if asked for.
+    """Output of a filter's step.
 
-    weighed: of a filter that judges and weighs.
+    Args:
+        estimate: after the step.
+        steps: what a smoother needs of the step; None unless asked for.
+        judgement: whether the data were plausible; None unless asked for.
+        weighed: the innovation by component, of a filter that judges its data and weighs components; None of others.
     """
 
     estimate: Estimate
@@ -39,10 +46,18 @@ def filter_step(
     judges: bool = False,
     skip: jax.Array | None = None,
 ) -> tuple[PyTree, StepOutput]:
-    """Step a filter, and return its output.
+    """Step a filter: return its next state, and its output.
 
-    `skip`: the reason not to use z, if any: then nothing of it arrived, and where the prediction itself is no number
-    the state before it stays.
+    Args:
+        filter: the filter.
+        state: before the step.
+        z: measurement (received,), NaN where a component is missing.
+        u: inputs of the plant over the step.
+        k: number of the step.
+        smooths: put out a smoother step too.
+        judges: put out a judgement of the data too.
+        skip: code of the reason not to use z, 0 if there is none: then nothing of it arrived, and where the prediction
+            itself is no number the state before it stays. None: use z.
     """
     # What is not used did not arrive.
     z = z if skip is None else jnp.where(skip > 0, jnp.nan, z)
@@ -68,17 +83,22 @@ def filter_step(
 
 
 def get_weighed(innovation: Innovation) -> Weighed | None:
-    """Return the innovation by component, of a filter that weighs; None of all others."""
+    """Return value, variance and weight of each component of an innovation, of a filter that weighs; None of others."""
     if innovation.weight is None:
         return None
     return Weighed(jnp.asarray(innovation.value), jnp.diagonal(innovation.covariance), jnp.asarray(innovation.weight))
 
 
 class StackedFilters(Module):
-    """Filters that differ in numbers alone, stacked along one axis, node after node for each of them.
+    """Filters that differ in numbers alone, stacked along one axis: filter after filter, and for each node after node.
 
-    `group`: of nodes that they belong to; `count` of filters at each of `nodes` nodes. `smooths`: each step returns its
-    smoother step.
+    Args:
+        filters: the stack (filter and node, ...).
+        group: number of the group of nodes that they belong to.
+        count: of filters at each node.
+        nodes: their number.
+        smooths: each step puts out a smoother step.
+        judges: each step puts out a judgement of its data.
     """
 
     filters: AbstractFilter
@@ -95,9 +115,14 @@ class StackedFilters(Module):
     def step(
         self, states: PyTree, z: jax.Array, u: jax.Array, k: jax.Array, skip: jax.Array | None = None
     ) -> tuple[PyTree, StepOutput]:
-        """Step each filter with the nodes' measurements (node, received); outputs (filter, node, ...).
+        """Step each filter: return the next states (filter and node, ...), and outputs (filter, node, ...).
 
-        `skip` (filter, node): reasons not to use them.
+        Args:
+            states: before the step (filter and node, ...).
+            z: measurements (node, received) of the group.
+            u: inputs of the plant over the step.
+            k: number of the step.
+            skip: codes of the reasons not to use them (filter, node), 0 where there is none; None: use all.
         """
 
         def step_one(
@@ -111,13 +136,23 @@ class StackedFilters(Module):
         after, outputs = step_all(self.filters, states, jnp.tile(z, (self.count, 1)), reasons)
         return after, jax.tree.map(lambda leaf: leaf.reshape(self.count, len(z), *leaf.shape[1:]), outputs)
 
-    def matrices(
-        self, read: Callable[..., object], states: PyTree, f: int, z: jax.Array, u: jax.Array, k: jax.Array
+    def compute_by_node(
+        self, function: Callable[..., object], states: PyTree, f: int, z: jax.Array, u: jax.Array, k: jax.Array
     ) -> PyTree:
-        """Return read(filter, state, z, u, k) of filter number f at each node, from the states before step k."""
+        """Return function(filter, state, z, u, k) of filter number f at each node, with a leading axis of nodes.
+
+        `states`: of all filters before step k. `z`: measurements (node, received).
+        """
+        filters, states = self.take_filter(f, states)
+        return map_all(lambda node, state, z: function(node, state, z, u, k), self.nodes)(filters, states, z)
+
+    def take_filter(self, f: int, states: PyTree) -> tuple[AbstractFilter, PyTree]:
+        """Return filter number f of each node and its state out of `states`, both with a leading axis of nodes."""
         rows = slice(f * self.nodes, (f + 1) * self.nodes)
-        filters, states = jax.tree.map(lambda leaf: leaf[rows] if eqx.is_array(leaf) else leaf, (self.filters, states))
-        return map_all(lambda node, state, z: read(node, state, z, u, k), self.nodes)(filters, states, z)
+        taken: tuple[AbstractFilter, PyTree] = jax.tree.map(
+            lambda leaf: leaf[rows] if eqx.is_array(leaf) else leaf, (self.filters, states)
+        )
+        return taken
 
 
 def initial_state(filter: AbstractFilter) -> PyTree:
@@ -148,3 +183,25 @@ def _apply_to_one(function: Callable[..., PyTree], *stacked: PyTree) -> PyTree:
         return jax.lax.expand_dims(leaf, (0,)) if eqx.is_array(leaf) else leaf
 
     return jax.tree.map(add_axis, function(*jax.tree.map(drop_axis, stacked)))
+
+
+def stack_by_kind(network: Network, smoothed_kinds: Collection[int], judges: bool) -> tuple[StackedFilters, ...]:
+    """Return the nodes' filters, those of each kind stacked, filter after filter and node after node for each.
+
+    `smoothed_kinds`: numbers of the kinds whose steps are to be smoothed. `judges`: filters judge their data.
+    """
+    alike = []
+    for number, kind in enumerate(network.kinds):
+        nodes = network.groups[kind.group]
+        filters = [without_output_names(network.nodes[node].filters[f]) for f in kind.filters for node in nodes]
+        alike.append(
+            StackedFilters(
+                filters=stack(filters),
+                group=kind.group,
+                count=len(kind.filters),
+                nodes=len(nodes),
+                smooths=number in smoothed_kinds,
+                judges=judges,
+            )
+        )
+    return tuple(alike)

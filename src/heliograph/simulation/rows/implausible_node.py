@@ -1,6 +1,7 @@
 """Which node a row's implausible values are of, where a central filter judges those of all nodes together."""
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -23,46 +24,61 @@ def refuse_centrally(
 ) -> dict[str, dict[int, str]]:
     """Give each row that all central filters find implausible to one of the nodes that have a value there.
 
+    It is the node without whose values the filters find the row plausible, as `Judgement.find_culprit` chooses it.
+
     Args:
         filters: the central filters, which receive from all nodes.
-        before: their states before each row.
-        z: measurements by node, in the order in which the filters receive them.
+        before: their states before each row, with a leading axis of rows.
+        z: measurements by node, in the order in which the filters receive them, NaN where one is missing.
         u: inputs by row.
         why: rows that are implausible, with the reason.
         nodes: those that no filter of their own judges.
 
     Returns:
-        the rows of each node that is to blame, with the reason.
+        The rows of each node that is to blame, with the reason.
     """
     # Each row once for each of these nodes that has a value in it, without the node's values.
-    removals = [(k, name) for k in why for name in nodes if not np.isnan(z[name][k]).all()]
-    rows = np.array([k for k, _ in removals], dtype=int)
-    without = [z[name][rows] for name in z]
-    for i, (_, name) in enumerate(removals):
-        without[list(z).index(name)][i] = np.nan
+    removals = [_Removal(k, name) for k in why for name in nodes if not np.isnan(z[name][k]).all()]
+    rows = np.array([removal.row for removal in removals], dtype=int)
+    without = {name: values[rows] for name, values in z.items()}
+    for i, removal in enumerate(removals):
+        without[removal.node][i] = np.nan
     # Whether the filters find the row plausible then.
-    votes = _judge_rows(filters, before, np.concatenate(without, axis=1), u, rows)
+    votes = _judge_rows(filters, before, np.concatenate(list(without.values()), axis=1), u, rows)
     plausible = {removal: Judgement.why_values(vote) is None for removal, vote in zip(removals, votes, strict=True)}
 
-    def find_largest(removal: tuple[int, str]) -> float:
+    def find_largest(removal: _Removal) -> float:
         """Return the largest size of the values removed."""
-        k, name = removal
-        return float(np.nanmax(np.abs(z[name][k])))
+        return float(np.nanmax(np.abs(z[removal.node][removal.row])))
 
     refused = dict[str, dict[int, str]]()
     for k, reason in why.items():
-        if candidates := [removal for removal in removals if removal[0] == k]:
-            _, name = Judgement.find_culprit(candidates, find_largest, plausible.__getitem__)
-            refused.setdefault(name, {})[k] = reason
+        if candidates := [removal for removal in removals if removal.row == k]:
+            culprit = Judgement.find_culprit(candidates, find_largest, plausible.__getitem__)
+            refused.setdefault(culprit.node, {})[k] = reason
     return refused
+
+
+class _Removal(NamedTuple):
+    """A row without the values of one node."""
+
+    row: int
+    node: str
 
 
 def _judge_rows(
     filters: Mapping[str, AbstractFilter], before: Mapping[str, PyTree], z: np.ndarray, u: np.ndarray, rows: np.ndarray
 ) -> Float[np.ndarray, "row filter 4"]:
-    """Return each filter's judgement of measurements of these rows, from its states before them.
+    """Return each filter's judgement of measurements for these rows, from its states before them.
 
     The last axis: the fields of a Judgement. By native code where there is any, else by XLA.
+
+    Args:
+        filters: by name.
+        before: their states before each row of all, by name.
+        z: measurements for `rows` alone, one row each.
+        u: inputs of all rows.
+        rows: numbers of the rows to be judged, in which one may stand several times.
     """
     votes = []
     for name, filter in filters.items():
@@ -70,19 +86,19 @@ def _judge_rows(
         arguments = filter, states, z, u[rows], rows
         with jax.enable_x64(True):
             code = choose_code(_judge_filter_step, arguments, (False, True, True, True, True))
-            judgement = to_numpy(_all_by_xla(*arguments, len(rows)) if code.code is None else code.results())
+            judgement = to_numpy(_judge_by_xla(*arguments, len(rows)) if code.code is None else code.results())
         votes.append(np.stack([np.broadcast_to(field, len(rows)) for field in judgement], axis=-1))
     return np.stack(votes, axis=1)
 
 
 def _judge_filter_step(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: jax.Array) -> Judgement:
     """Return a filter's judgement of measurement z in step k, from its state before."""
-    judgement = filter_step(filter, state, z, u, k, False, True)[1].judgement
-    assert judgement is not None  # as it judges
-    return judgement
+    _, output = filter_step(filter, state, z, u, k, smooths=False, judges=True)
+    assert output.judgement is not None  # as it judges
+    return output.judgement
 
 
 @quickly_compiled
-def _all_by_xla(filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree, count: int) -> PyTree:
-    """Return the judgements of `count` rows, compiled by XLA."""
+def _judge_by_xla(filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree, count: int) -> PyTree:
+    """Return a filter's judgements of `count` rows, arguments with a leading axis of these; compiled by XLA."""
     return map_all(lambda *row: _judge_filter_step(filter, *row), count)(state, z, u, k)
