@@ -50,15 +50,20 @@ def keep_cycles(graph: Graph, outputs: Sequence[Buffer]) -> dict[Any, None]:
     items = list_needed(outputs)
     for loop in [x for x in items if isinstance(x, Loop) and x.length is not None]:
         found = _find_recurring(loop, items)
+        if found is None:
+            continue
         kept = _list_needed_elsewhere(items, found)
-        if found.carried and len(found.nodes) > DEAR + len(kept):
+        if len(found.nodes) > DEAR + len(kept):
             _keep(graph, items, loop, found, kept)
             items = list_needed(outputs)
     return items
 
 
-def _find_recurring(loop: Loop, needed: Collection[Any]) -> Recurring:
-    """Find what of a loop's body follows from carried numbers that follow from themselves, and from tests of rows."""
+def _find_recurring(loop: Loop, needed: Collection[Any]) -> Recurring | None:
+    """Find what of a loop's body follows from carried numbers that follow from themselves, and from tests of rows.
+
+    None where that is not much: of a program with hundreds of small loops, `needed` is gone through for no such loop.
+    """
     body = loop.body
     nodes = [x for x in body.items if isinstance(x, Node) and x in needed]
     rows = _find_of_rows(loop, nodes)
@@ -75,6 +80,8 @@ def _find_recurring(loop: Loop, needed: Collection[Any]) -> Recurring:
         if closed == carried:
             break
         carried = closed
+    if not carried or len(found) <= DEAR:
+        return None
     _leave_fused_products(needed, found)
     used = {a for n in found for a in n.args} | {loop.following[k] for k in carried}
     own = [n for n in rows if n in tests and n in used]
