@@ -64,8 +64,8 @@ class Arrivals:
         """
         if self.declared_period is not None or self.of_messages:
             return None
-        rate, pattern = find_rate(self.arrived), find_pattern(self.arrived)
-        if rate is None or pattern is None:
+        rate = find_rate(self.arrived)
+        if rate is None or (pattern := find_pattern(self.arrived)) is None:
             return rate
         # In N rows N / period messages are due by the rate: the pattern's D due rows are more than one more than that
         # where D > N / period + 1, or period * D > N + period.

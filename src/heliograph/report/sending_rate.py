@@ -118,7 +118,8 @@ def _find_narrowest_line(frequency: float, rows: Int[np.ndarray, " arrivals"]) -
 
     def width(f: float) -> float:
         """Return how far phases are apart at a frequency."""
-        return float(np.ptp(f * rows - whole))
+        phases = f * rows - whole
+        return float(phases.max() - phases.min())
 
     low, high = frequency - 1 / np.ptp(rows), frequency + 1 / np.ptp(rows)
     for _ in range(STEPS):
