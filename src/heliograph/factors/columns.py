@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from heliograph.numerics.caching import cache_arrays
 from heliograph.numerics.linalg import WRITTEN, outer, scale, symmetric
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array
@@ -76,14 +77,20 @@ def zero_covariance(n: int) -> WeightedColumns:
 
 def unit_lower(entries: Array) -> Any:
     """Build L (..., n, n) from its n (n - 1) / 2 entries below the diagonal, row by row: ones on it, zeros above."""
-    xp, count = library(entries), entries.shape[-1]
+    xp, place = library(entries), _place_unit_lower(entries.shape[-1])
+    ends = np.broadcast_to(np.array([0.0, 1.0], np.dtype(entries.dtype)), (*entries.shape[:-1], 2))
+    whole = xp.concatenate([entries, ends], axis=-1)
+    return whole[..., place] if xp is np else _take_entries(whole, place)
+
+
+@cache_arrays
+def _place_unit_lower(count: int) -> np.ndarray:
+    """Return for each number of L which of its entries it is; `count` stands for a zero, and the next for a one."""
     n = (1 + int(np.sqrt(1 + 8 * count))) // 2
     place = np.full((n, n), count)
     place[np.tril_indices(n, -1)] = np.arange(count)
     np.fill_diagonal(place, count + 1)
-    ends = np.broadcast_to(np.array([0.0, 1.0], np.dtype(entries.dtype)), (*entries.shape[:-1], 2))
-    whole = xp.concatenate([entries, ends], axis=-1)
-    return whole[..., place] if xp is np else _take_entries(whole, place)
+    return place
 
 
 def below_diagonal(lower: jax.Array) -> jax.Array:
