@@ -60,7 +60,14 @@ def pytest_unconfigure(config):
         shutil.rmtree(config.compilations, ignore_errors=True)
 
 
-LONG = ("tests/studies/", "tests/test_docs.py", "tests/test_readme.py", "tests/serving/")
+LONG = (
+    "tests/studies/",
+    "tests/test_docs.py",
+    "tests/test_random_programs.py",
+    "tests/test_readme.py",
+    "tests/test_upper_claims.py",
+    "tests/serving/",
+)
 
 
 @pytest.hookimpl(trylast=True)
