@@ -140,7 +140,7 @@ def test_interrupted_writing_leaves_what_was_there(tmp_path, monkeypatch, name, 
 
 
 def test_error_between_rows_leaves_nothing(tmp_path, monkeypatch):
-    format_cells = heliograph.files.table._format_cells
+    format_cells = heliograph.files.table_writer._format_cells
 
     def breaks_at_the_end(column):
         if column[-1] == 99_999:
@@ -148,7 +148,7 @@ def test_error_between_rows_leaves_nothing(tmp_path, monkeypatch):
             raise RuntimeError("between rows")
         return format_cells(column)
 
-    monkeypatch.setattr("heliograph.files.table._format_cells", breaks_at_the_end)
+    monkeypatch.setattr("heliograph.files.table_writer._format_cells", breaks_at_the_end)
     with pytest.raises(RuntimeError, match="between rows"):
         write_table({"time": np.arange(100_000.0)}, tmp_path / "out.csv")
     assert not list(tmp_path.iterdir())
@@ -200,7 +200,7 @@ def test_a_full_disk_names_the_file(tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("heliograph.files.table._write_csv", full)
+    monkeypatch.setattr("heliograph.files.table_writer._write_csv_rows", full)
     with pytest.raises(OSError, match="No space left on device") as caught:
         write_table(COLUMNS, tmp_path / "out.csv")
     assert caught.value.filename == str(tmp_path / "out.csv") and not list(tmp_path.iterdir())

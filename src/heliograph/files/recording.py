@@ -1,16 +1,17 @@
 """Recordings in files: a table of times, inputs and measurements, whose rows follow one another in time."""
 
 import warnings
-from collections import Counter
-from collections.abc import Callable, Mapping
-from difflib import get_close_matches
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from heliograph.files.table import TIME, Rows, columns_of, read_back_name, read_rows, write_table
-from heliograph.files.table_rows import KeptRows, RowsAsColumns, keep_rows, order_rows
+from heliograph.files.recording_cells import RowChecks, list_received_columns, list_truth_columns, read_cells
+from heliograph.files.rows import Rows
+from heliograph.files.table import TIME, columns_of, read_rows, write_table
+from heliograph.files.table_rows import KeptRows, RowsAsColumns, join_cells, keep_rows, order_rows
+from heliograph.files.table_writer import read_back_name
 from heliograph.model.checks.inputs import find_time_step_fault
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail, flag, instance
@@ -106,18 +107,12 @@ def write_recording(recording: Recording, network: Network, path: str | Path) ->
     instance("recording", recording, Recording, "a Recording")
     instance("network", network, Network, "a Network")
     columns = {TIME: recording.time, **dict(zip(network.inputs, recording.inputs.T, strict=True))}
-    for node, names in _list_received_columns(network).items():
+    for node, names in list_received_columns(network).items():
         if node in recording.measurements:
             columns |= {name[0]: z for name, z in zip(names, recording.measurements[node].T, strict=True)}
     if recording.truth is not None:
-        columns |= dict(zip(_truth_columns(network).values(), recording.truth.T, strict=True))
+        columns |= dict(zip(list_truth_columns(network).values(), recording.truth.T, strict=True))
     write_table(columns, path)
-
-
-def _truth_columns(network: Network) -> dict[str, str]:
-    """Return the name of the column of each state's true value, unless a node's component has it."""
-    received = {name for node in _list_received_columns(network).values() for names in node for name in names}
-    return {state: f"truth.{state}" for state in network.states if f"truth.{state}" not in received}
 
 
 def _map_headers(network: Network) -> dict[str, str]:
@@ -149,19 +144,26 @@ class RowReader:
     Attributes:
         only: the columns that are read; None for all.
         refused: why rows were refused, in the order of the table.
-        notes: lines on what was put in order.
     """
 
     def __init__(self, network: Network, source: str, strict: bool, ignore_unknown: bool):
         self.network, self.source, self._strict = network, source, strict
         self._headers = _map_headers(network)
         self.only: Mapping[str, str] | None = self._headers if ignore_unknown else None
-        self.refused, self.notes = list[InputError](), list[str]()
+        self.refused = list[InputError]()
+        self._behind = 0  # rows that came after later ones
 
     @property
     def names(self) -> set[str]:
         """Return the names that a column may have."""
         return {TIME, *self._headers}
+
+    @property
+    def notes(self) -> list[str]:
+        """Return lines on what was put in order."""
+        if not self._behind:
+            return []
+        return [f"{self.source}: rows that came after later ones, used in the order of their times: {self._behind}"]
 
     def read(self, rows: Rows) -> Recording:
         """Return the rows that can be read.
@@ -178,19 +180,40 @@ class RowReader:
         Raises:
             ValueError: times that go backwards, where reading is strict or each row is a step in most cases.
         """
-        if not self._strict:
-            cells, refused, note = order_rows(cells, self.network, self.source)
-            self.refused += refused
-            self.notes += [note] if note else []
-        kept = keep_rows(cells.numbers, self.network)
+        return self.make_recording(self.put_in_order(cells))
+
+    def put_in_order(self, cells: RowsAsColumns) -> RowsAsColumns:
+        """Return rows in the order of their times, as far as that can be; where reading is strict, as they are."""
+        if self._strict:
+            return cells
+        cells, refused, behind = order_rows(cells, self.network, self.source)
+        self.refused += refused
+        self._behind += behind
+        return cells
+
+    def make_recording(self, cells: RowsAsColumns, before: RowsAsColumns | None = None) -> Recording:
+        """Return rows in the order of their times as a recording.
+
+        Args:
+            cells: the rows.
+            before: the last row before these, from which they go on: it has the time and the inputs that missing ones
+                are made of. None of the first ones.
+
+        Raises:
+            ValueError: times that go backwards, a time step that is none.
+        """
+        begin = 0 if before is None else 1
+        cells = cells if before is None else join_cells([before, cells])
+        kept = keep_rows(cells.numbers, self.network, 1 if before is None else int(before.numbers[0]))
         time = kept.fill_times(cells.time)
         u = _make_inputs(self.network, cells.inputs, time, kept, self.source)
-        measurements = {node: kept.fill(values) for node, values in cells.measurements.items()}
-        if not cells.truth:
-            return Recording(measurements, u, time)
-        unknown = np.full(len(cells.time), np.nan)
-        truth = [kept.fill(cells.truth.get(state, unknown)) for state in self.network.states]
-        return Recording(measurements, u, time, np.stack(truth, axis=1))
+        measurements = {node: kept.fill(values)[begin:] for node, values in cells.measurements.items()}
+        truth = None
+        if cells.truth:
+            unknown = np.full(len(cells.time), np.nan)
+            states = [kept.fill(cells.truth.get(state, unknown)) for state in self.network.states]
+            truth = np.stack(states, axis=1)[begin:]
+        return Recording(measurements, u[begin:], time[begin:], truth)
 
     def read_cells(self, rows: Rows) -> RowsAsColumns:
         """Return what stands in the rows that can be read, each by itself.
@@ -199,73 +222,10 @@ class RowReader:
             ValueError: what `read` refuses, but for times that go backwards.
         """
         columns = {self._headers.get(name, name): values for name, values in rows.columns.items()}
-        checks = _RowChecks(self.source, rows.numbers, self._strict)
-        cells = _read_cells(columns, self.network, checks)
+        checks = RowChecks(self.source, rows.numbers, self._strict)
+        cells = read_cells(columns, self.network, checks)
         self.refused += [*rows.refused, *checks.refused]
         return cells.of(checks.good)
-
-
-class _RowChecks:
-    """Refuses rows of a table that cannot be read: the first is an error, or each is noted with the reason.
-
-    Attributes:
-        good: of each row whether nothing was wrong so far.
-        refused: why rows were refused.
-    """
-
-    def __init__(self, source: str, numbers: np.ndarray, strict: bool):
-        self.source, self.numbers, self._strict = source, numbers, strict
-        self.good = np.ones(len(numbers), dtype=bool)
-        self.refused = list[InputError]()
-
-    def refuse(self, bad: np.ndarray, column: str, expected: str, came: Callable[[int], str]) -> None:
-        """Refuse the rows of a mask, unless they were refused before.
-
-        Args:
-            bad: the mask, (rows,).
-            column: name of the column that is wrong.
-            expected: what was expected there.
-            came: what stands in a row instead.
-
-        Raises:
-            ValueError: one of them, where reading is strict.
-        """
-        for row in np.flatnonzero(bad & self.good).tolist():
-            where = f"{self.source}, row {self.numbers[row]}, column {column!r}"
-            error = fail(where, expected, came(row))
-            if self._strict:
-                raise error
-            self.refused.append(error)
-        self.good &= ~bad
-
-
-def _read_cells(columns: Mapping[str, np.ndarray], network: Network, checks: _RowChecks) -> RowsAsColumns:
-    """Return what stands in the columns of a table; rows that cannot be read are refused by `checks`."""
-    inputs, received, source = network.inputs, _list_received_columns(network), checks.source
-    # A relay whose measurements are left out altogether loses its filter only.
-    for name in () if network.relays is None else network.relays.relays:
-        if not any(column in columns for names in received[name] for column in names):
-            del received[name]  # its own filter is left out
-    if TIME in inputs:
-        raise fail("input names", f"none called {TIME!r}, which is the recording's own column", list(inputs))
-    expected = [(TIME,), *((name,) for name in inputs), *(names for node in received.values() for names in node)]
-    truth_columns = _truth_columns(network)
-    _refuse_unknown(columns, [*expected, *((name,) for name in truth_columns.values())], source)
-    time = _read_times(columns, _find_column(columns, (TIME,), source), checks)
-    measurements = {}
-    for node, components in received.items():
-        found = [_find_column(columns, names, source) for names in components]
-        measurements[node] = np.stack([_read_measurements(columns, column, checks) for column in found], axis=1)
-    # An input dt may be left out.
-    given = {
-        name: _read_complete(columns, _find_column(columns, (name,), source), checks)
-        for name in inputs
-        if name != TIME_STEP or name in columns
-    }
-    truth = {
-        state: _read_measurements(columns, name, checks) for state, name in truth_columns.items() if name in columns
-    }
-    return RowsAsColumns(checks.numbers, time, measurements, given, truth)
 
 
 def _make_inputs(
@@ -288,51 +248,6 @@ def _make_inputs(
     return u
 
 
-def _list_received_columns(network: Network) -> dict[str, list[tuple[str, ...]]]:
-    """Return the allowed column names of each node's components, the preferred one first."""
-    names = {node: receiver.received_names for node, receiver in network.nodes.items()}
-    uses = Counter([TIME, *network.inputs])
-    for node, components in names.items():
-        uses.update([*components, *(f"{node}.{name}" for name in components)])
-
-    def allowed(node: str, name: str) -> tuple[str, ...]:
-        full = f"{node}.{name}"
-        if uses[name] > 1:
-            return (full,)
-        return (name, full) if len(names) == 1 else (full, name)
-
-    return {node: [allowed(node, name) for name in components] for node, components in names.items()}
-
-
-def _refuse_unknown(columns: Mapping[str, np.ndarray], expected: list[tuple[str, ...]], source: str) -> None:
-    """Raise one line with the closest known name if a column belongs to nothing of the network."""
-    known = [name for names in expected for name in names]
-    for column in columns:
-        if column not in known:
-            close = get_close_matches(column, known, 1)
-            closest = f" (closest: {close[0]!r})" if close else ""
-            listed = ", ".join(names[0] for names in expected)
-            raise fail(f"{source}, header", f"only the columns {listed}", f"the unknown {column!r}{closest}")
-
-
-def _find_column(columns: Mapping[str, np.ndarray], names: tuple[str, ...], source: str) -> str:
-    """Return which of these names a column has; raise unless exactly one does."""
-    present = [name for name in names if name in columns]
-    if len(present) != 1:
-        came = f"both {' and '.join(map(repr, present))}" if present else f"only {', '.join(columns)}"
-        raise fail(f"{source}, header", f"one column {names[0]!r}", came)
-    return present[0]
-
-
-def _read_times(columns: Mapping[str, np.ndarray], name: str, checks: _RowChecks) -> np.ndarray:
-    """Return the times of the rows, dates where the column holds dates."""
-    values = np.asarray(columns[name])
-    if values.dtype.kind != "M":
-        return _read_complete(columns, name, checks)
-    checks.refuse(np.isnat(values), name, "a date", lambda row: "an empty cell")
-    return values.astype("datetime64[ns]")
-
-
 def _warn_of_equal_times(time: np.ndarray, source: str) -> None:
     """Warn where most rows have the time of the row before: stamps that were cut or rounded look like this."""
     _, counts = np.unique(time, return_counts=True)
@@ -341,31 +256,5 @@ def _warn_of_equal_times(time: np.ndarray, source: str) -> None:
         warnings.warn(
             f"{source}, column {TIME!r}: {shared} of {len(time)} rows share their time with another row, as stamps do "
             f"that lost their digits; {len(counts)} times in all",
-            stacklevel=6,
+            stacklevel=7,
         )
-
-
-def _read_complete(columns: Mapping[str, np.ndarray], name: str, checks: _RowChecks) -> np.ndarray:
-    """Return the numbers of a column in which every cell has to have one."""
-    values = columns[name] if columns[name].dtype.kind == "i" else _read_numbers(columns, name, checks.source)
-    checks.refuse(~np.isfinite(values), name, "a finite number", _describe_cell(values))
-    return values
-
-
-def _read_measurements(columns: Mapping[str, np.ndarray], name: str, checks: _RowChecks) -> np.ndarray:
-    """Return the numbers of a column, NaN where a cell is empty."""
-    values = _read_numbers(columns, name, checks.source)
-    checks.refuse(np.isinf(values), name, "a finite number, or none where it did not arrive", _describe_cell(values))
-    return values
-
-
-def _read_numbers(columns: Mapping[str, np.ndarray], name: str, source: str) -> np.ndarray:
-    """Return a column as doubles; raise ValueError if it has dates."""
-    if columns[name].dtype.kind == "M":
-        raise fail(f"{source}, column {name!r}", "numbers", "dates")
-    return np.asarray(columns[name], dtype=np.float64)
-
-
-def _describe_cell(values: np.ndarray) -> Callable[[int], str]:
-    """Return what says in words what stands in a row of a column."""
-    return lambda row: "an empty cell" if np.isnan(values[row]) else f"{values[row]}"

@@ -24,8 +24,8 @@ class RowsAsColumns(NamedTuple):
     inputs: dict[str, np.ndarray]
     truth: dict[str, np.ndarray]
 
-    def of(self, good: np.ndarray) -> "RowsAsColumns":
-        """Return the rows of a mask, or of numbers."""
+    def of(self, good: np.ndarray | slice) -> "RowsAsColumns":
+        """Return the rows of a mask, of numbers, or of a slice."""
         parts = ({name: values[good] for name, values in part.items()} for part in self[2:])
         return RowsAsColumns(self.numbers[good], self.time[good], *parts)
 
@@ -39,8 +39,8 @@ def join_cells(parts: Sequence[RowsAsColumns]) -> RowsAsColumns:
     return RowsAsColumns(np.concatenate([p.numbers for p in parts]), np.concatenate([p.time for p in parts]), *named)
 
 
-def order_rows(cells: RowsAsColumns, network: Network, source: str) -> tuple[RowsAsColumns, list[InputError], str]:
-    """Return rows whose times do not go backwards, why others are refused, and a line on what was put in order.
+def order_rows(cells: RowsAsColumns, network: Network, source: str) -> tuple[RowsAsColumns, list[InputError], int]:
+    """Return rows whose times do not go backwards, why others are refused, and how many came after later ones.
 
     A time that is more than a year outside of all others was not set, and its row is refused alone. Where time is
     continuous the others are put in the order of their times. Where each row is a step the fewest without which times
@@ -53,7 +53,7 @@ def order_rows(cells: RowsAsColumns, network: Network, source: str) -> tuple[Row
         source: name of the table, for errors.
     """
     if backwards(cells.time) is None:
-        return cells, [], ""
+        return cells, [], 0
     dated = cells.time.dtype.kind == "M"
     stamps = cells.time.astype(np.int64) if dated else cells.time
     if TIME_STEP not in network.inputs:
@@ -64,15 +64,14 @@ def order_rows(cells: RowsAsColumns, network: Network, source: str) -> tuple[Row
             "a time that was set, near the others",
         )
     if TIME_STEP in cells.inputs or np.mean(out) >= MOST_OUT:
-        return cells, [], ""
+        return cells, [], 0
     refused = [
         fail(f"{source}, row {number}, column {TIME!r}", expected, str(time) if dated else f"{time:.10g}")
         for number, time in zip(cells.numbers[out].tolist(), cells.time[out], strict=True)
     ]
     cells = cells.of(~out)
     behind = int(np.count_nonzero(cells.time < np.maximum.accumulate(cells.time)))
-    note = f"{source}: rows that came after later ones, used in the order of their times: {behind}" if behind else ""
-    return cells.of(np.argsort(cells.time, kind="stable")), refused, note
+    return cells.of(np.argsort(cells.time, kind="stable")), refused, behind
 
 
 class KeptRows(NamedTuple):
@@ -107,10 +106,13 @@ class KeptRows(NamedTuple):
         return filled
 
 
-def keep_rows(numbers: np.ndarray, network: Network) -> KeptRows:
-    """Return the rows with these numbers; where each row is a step also those between them, as the row before each."""
+def keep_rows(numbers: np.ndarray, network: Network, first: int = 1) -> KeptRows:
+    """Return the rows with these numbers; where each row is a step also those between them, as the row before each.
+
+    Steps begin with the row of number `first`.
+    """
     if TIME_STEP in network.inputs or not len(numbers):
         return KeptRows(numbers, np.arange(len(numbers)), np.ones(len(numbers), dtype=bool))
-    steps = np.arange(1, numbers[-1] + 1)
+    steps = np.arange(first, numbers[-1] + 1)
     before = np.maximum(np.searchsorted(numbers, steps, side="right") - 1, 0)
     return KeptRows(steps, before, numbers[before] == steps)

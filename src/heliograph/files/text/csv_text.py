@@ -55,6 +55,11 @@ class CsvReader:
         self.number = 0
         self._open_lines: list[str] = []  # lines since one with a quote that is not closed
 
+    @property
+    def is_open(self) -> bool:
+        """Return whether a quote was opened that is not closed yet."""
+        return bool(self._open_lines)
+
     def add(self, line: str) -> list[CsvRow | InputError]:
         """Return the rows that a line completes, or why one cannot be read.
 

@@ -4,18 +4,21 @@ import codecs
 import gzip
 import re
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from io import BufferedReader, StringIO, TextIOWrapper
 from itertools import islice
 from pathlib import Path
-from typing import TextIO, TypeVar
+from typing import BinaryIO, TextIO, TypeAlias, TypeVar, cast
 
 from heliograph.numerics.check import InputError, fail
 
 T = TypeVar("T")
+Progress: TypeAlias = Callable[[int, int], None]  # called with how much is done, and how much there is
 PACKED = ".gz"
 GZIP = b"\x1f\x8b"  # the first bytes of what is packed
 WIDE = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+DAMAGE = (gzip.BadGzipFile, EOFError, zlib.error)  # of a packed file
 NO_TEXT = re.compile("[\x00\udc80-\udcff\ufffd]")  # bytes that are no text, as they are escaped
 
 
@@ -65,20 +68,80 @@ def open_text(path: Path) -> Iterator[TextIO]:
     Raises:
         CutOffError: a packed file that is damaged or cut off, from there on.
     """
-    with path.open("rb") as file:
-        packed = file.read(len(GZIP)) == GZIP
     try:
-        with gzip.open(path, "rb") if packed else path.open("rb") as file:
-            encoding = guess_encoding(file.read(len(WIDE[0])))
-        errors = "surrogateescape" if encoding == "utf-8-sig" else "replace"
-        if packed:
-            with gzip.open(path, "rt", newline="", encoding=encoding, errors=errors) as text:
+        with path.open("rb") as file, _unpack(file) as unpacked:
+            encoding = guess_encoding(unpacked.peek(len(WIDE[0])))
+            errors = "surrogateescape" if encoding == "utf-8-sig" else "replace"
+            with TextIOWrapper(unpacked, newline="", encoding=encoding, errors=errors) as text:
                 yield text
-        else:
-            with path.open(newline="", encoding=encoding, errors=errors) as text:
-                yield text
-    except (gzip.BadGzipFile, EOFError, zlib.error) as error:
-        raise CutOffError(str(fail(str(path), "a packed file without damage", _shorten(error)))) from None
+    except DAMAGE as error:
+        raise _describe_damage(path, error) from None
+
+
+def read_line_blocks(path: Path, size: int, progress: Progress | None = None) -> Iterator[bytes]:
+    """Yield the lines of a file of text in UTF-8, whatever it is in: whole ones, about `size` bytes of them at a time.
+
+    Bytes that are no text stay as they are, out of UTF-16 as U+FFFD.
+
+    Args:
+        path: the file, packed or not.
+        size: bytes.
+        progress: called with how many bytes of the file are read, and of how many (default none).
+
+    Raises:
+        CutOffError: a packed file that is damaged or cut off, behind the lines before that.
+    """
+    total, rest, ended, damage = path.stat().st_size, b"", False, None
+    with path.open("rb") as file, _unpack(file) as unpacked:
+        try:
+            decode = _choose_decoder(unpacked)
+        except DAMAGE as error:
+            raise _describe_damage(path, error) from None
+        while not ended:
+            part, ended, damage = _read_part(unpacked, size)
+            text = rest + decode(part, ended and damage is None)
+            end = len(text) if ended and damage is None else text.rfind(b"\n") + 1
+            if progress is not None:
+                progress(file.tell(), total)
+            if end:
+                yield text[:end]
+            rest = text[end:]
+    if damage is not None:
+        raise _describe_damage(path, damage)
+
+
+def _read_part(file: "gzip.GzipFile | BufferedReader", size: int) -> tuple[bytes, bool, Exception | None]:
+    """Return so many bytes, or those that are left; whether the file ends with them, and what is damaged there."""
+    parts, length = list[bytes](), 0
+    try:
+        while length < size and (part := file.read1(size - length)):
+            parts.append(part)
+            length += len(part)
+    except DAMAGE as error:
+        return b"".join(parts), True, error
+    return b"".join(parts), length < size, None
+
+
+def _unpack(file: BinaryIO) -> "gzip.GzipFile | BufferedReader":
+    """Return the same file, or what is packed in it."""
+    buffered = cast(BufferedReader, file)
+    return gzip.GzipFile(fileobj=file) if buffered.peek(len(GZIP)).startswith(GZIP) else buffered
+
+
+def _choose_decoder(text: "gzip.GzipFile | BufferedReader") -> Callable[[bytes, bool], bytes]:
+    """Return a function from the next bytes of a text, and whether these are the last, to bytes of UTF-8."""
+    encoding = guess_encoding(text.peek(len(WIDE[0])))
+    if encoding != "utf-8-sig":
+        wide = codecs.getincrementaldecoder(encoding)("replace")
+        return lambda part, ended: wide.decode(part, ended).encode()
+    if text.peek(len(codecs.BOM_UTF8)).startswith(codecs.BOM_UTF8):
+        text.read(len(codecs.BOM_UTF8))
+    return lambda part, ended: part
+
+
+def split_lines(text: bytes) -> list[str]:
+    """Return the lines of a text in UTF-8, each with its end; bytes that are no text are escaped."""
+    return list(StringIO(text.decode("utf-8", "surrogateescape"), newline=""))
 
 
 def yield_until_cut_off(parts: Iterable[T]) -> Iterator[T | CutOffError]:
@@ -98,6 +161,7 @@ def yield_until_cut_off(parts: Iterable[T]) -> Iterator[T | CutOffError]:
         yield error
 
 
-def _shorten(error: Exception) -> str:
+def _describe_damage(path: Path, error: Exception) -> CutOffError:
     """Return in words what is wrong with a packed file."""
-    return "one that was cut off" if isinstance(error, EOFError) else str(error)
+    came = "one that was cut off" if isinstance(error, EOFError) else str(error)
+    return CutOffError(str(fail(str(path), "a packed file without damage", came)))

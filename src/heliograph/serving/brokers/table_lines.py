@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from heliograph.files.csv_columns import CsvColumnReader
 from heliograph.files.messages.in_files import PAYLOAD, TOPIC, convert_row, typed_cells
 from heliograph.files.messages.own_form import NODE, OWN, SEQUENCE, OwnReader
 from heliograph.files.recording import RowReader
 from heliograph.files.sources.reading import Reading, Unread
-from heliograph.files.table import CsvColumnReader
 from heliograph.files.table_rows import RowsAsColumns, join_cells
 from heliograph.files.text.csv_text import ANNOTATIONS, CsvReader, CsvRow
 from heliograph.files.text.dialects import COMMENTS, names_in

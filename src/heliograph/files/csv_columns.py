@@ -1,0 +1,177 @@
+"""Rows of CSV as columns, a block of lines at a time: of plain numbers all at once, else cell by cell."""
+
+import re
+from collections.abc import Container, Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from heliograph.files.rows import EXACT, Rows
+from heliograph.files.text.csv_text import CsvReader, CsvRow, parse_cell
+from heliograph.files.text.dialects import NO_VALUE
+from heliograph.files.text.plain_numbers import parse_plain_lines
+from heliograph.files.text.text_file import CutOffError, Progress, read_line_blocks, split_lines, yield_until_cut_off
+from heliograph.numerics.check import InputError, fail, show_value
+from heliograph.numerics.times.dates import MISSING as NAT
+from heliograph.numerics.times.dates import looks_like_date, parse_moment
+from heliograph.numerics.types import Float
+
+WHOLE = re.compile(r"[+-]?\d{1,18}|[+-]?[1-8]\d{18}")  # numbers that 64 bits hold
+
+
+def read_csv_blocks(
+    path: Path, only: Container[str] | None, strict: bool, size: int, progress: Progress | None = None
+) -> Iterator[Rows]:
+    """Yield the rows of a CSV file in parts, each of about `size` bytes of lines, and why others cannot be read.
+
+    Args:
+        path: the file.
+        only: the columns that are read; None for all.
+        strict: whether what cannot be read is an error, or is refused alone.
+        size: bytes.
+        progress: called with how many bytes of the file are read, and of how many (default none).
+
+    Raises:
+        ValueError: a header that names no columns; where reading is strict, a row that cannot be read.
+    """
+    text, columns = CsvReader(str(path), path, marked=False), CsvColumnReader(str(path), path, only, strict)
+    blocks = read_line_blocks(path, size, progress)
+    for lines in blocks if strict else yield_until_cut_off(blocks):
+        yield columns.read([lines]) if isinstance(lines, CutOffError) else _read_lines(text, columns, lines)
+    yield columns.read(text.end())
+
+
+def _read_lines(text: CsvReader, columns: "CsvColumnReader", lines: bytes) -> Rows:
+    """Return the rows of some lines: all at once where they are plain, else by their cells, which say what is wrong."""
+    # The names of the columns first.
+    rows, begin = list[CsvRow | InputError](), 0
+    while begin < len(lines) and not text.header:
+        end = lines.find(b"\n", begin) + 1 or len(lines)
+        rows += [row for line in split_lines(lines[begin:end]) for row in text.add(line)]
+        begin = end
+    rest = lines[begin:] if begin else lines
+    if not rows and text.header and not text.is_open:
+        numbers = parse_plain_lines(rest, len(text.header))
+        if numbers is not None and columns.accepts_plain(text.header, numbers):
+            text.number += len(numbers)
+            return columns.take_plain(text.header, numbers, text.number - len(numbers) + 1)
+    return columns.read([*rows, *(row for line in split_lines(rest) for row in text.add(line))])
+
+
+class CsvColumnReader:
+    """Reads rows of CSV as columns, a part of a table at a time; a column is of dates if its first cell is one.
+
+    Args:
+        source: the name of the table, for errors.
+        path: the file, if it can be read again.
+        only: the columns that are read; None for all.
+        strict: whether what cannot be read is an error, or is refused alone.
+    """
+
+    def __init__(self, source: str, path: Path | None, only: Container[str] | None, strict: bool):
+        self.source, self.path, self._only, self._strict = source, path, only, strict
+        self.header: list[str] = []
+        self._dated = dict[str, bool]()  # by column whether it is of dates, once a cell has said so
+        self._zoned = dict[str, bool]()  # whether these have a zone
+
+    def read(self, rows: Iterable[CsvRow | InputError]) -> Rows:
+        """Return the rows that can be read, as columns; why the others cannot.
+
+        Raises:
+            ValueError: another header than before; where reading is strict, a row that cannot be read.
+        """
+        refused, numbers = list[InputError](), list[int]()
+        texts, values = list[list[str]](), list[list[float | int]]()
+        for row in rows:
+            try:
+                if isinstance(row, InputError):
+                    raise row
+                self._check_header(row)
+                values.append(self._read_numbers(row))
+            except InputError as error:
+                if self._strict:
+                    raise
+                refused.append(error)
+            else:
+                numbers.append(row.number)
+                texts.append(row.cells)
+        columns = dict[str, np.ndarray]()
+        for i, name in enumerate(self.header):
+            if self._only is None or name in self._only:
+                columns[name] = self._make_column(name, [row[i] for row in values], [cells[i] for cells in texts])
+        return Rows(columns, np.array(numbers, dtype=np.int64), refused)
+
+    def accepts_plain(self, header: list[str], numbers: Float[np.ndarray, "rows columns"]) -> bool:
+        """Return whether these numbers are what cells say: none in a column of dates, or too large for doubles."""
+        if self.header not in ([], header) or np.nanmax(np.abs(numbers), initial=0.0) >= EXACT:
+            return False
+        dated = [i for i, name in enumerate(header) if self._dated.get(name)]
+        return bool(np.isnan(numbers[:, dated]).all())
+
+    def take_plain(self, header: list[str], numbers: Float[np.ndarray, "rows columns"], first: int) -> Rows:
+        """Return numbers under this header as rows, the number of whose first one is `first`."""
+        self.header, columns = header, dict[str, np.ndarray]()
+        for name, values in zip(header, numbers.T, strict=True):
+            if self._only is not None and name not in self._only:
+                continue
+            if self._dated.get(name):
+                columns[name] = np.full(len(values), "NaT", "datetime64[ns]")
+                continue
+            columns[name] = values.copy()
+            if name not in self._dated and not np.isnan(values).all():
+                self._dated[name] = False
+        return Rows(columns, np.arange(first, first + len(numbers)), [])
+
+    def _check_header(self, row: CsvRow) -> None:
+        """Raise if a row stands under another header than the rows before it."""
+        if not self.header:
+            self.header = row.header
+        if row.header != self.header:
+            raise fail(row.where, f"the columns {', '.join(self.header)}", ", ".join(row.header))
+
+    def _read_numbers(self, row: CsvRow) -> list[float | int]:
+        """Return the number of each cell, nanoseconds of dates, NaN or NAT of empty ones and of columns not read.
+
+        The first cell of a column that is not empty says whether all are dates; of a row that is refused none does.
+        """
+        newly_dated = dict[str, bool]()
+        numbers: list[float | int] = []
+        for name, cell in zip(row.header, row.cells, strict=True):
+            if self._only is not None and name not in self._only:
+                numbers.append(np.nan)
+                continue
+            dated = self._dated.get(name)  # None: not known yet
+            if (looks_like_date(cell) if dated is None else dated) and not self._is_missing(cell):
+                numbers.append(self._read_moment(row, name, cell))
+                newly_dated[name] = True
+            elif dated:
+                numbers.append(NAT)
+            else:
+                numbers.append(parse_cell(row.where, name, cell, self.path))
+                if cell:
+                    newly_dated[name] = False
+        self._dated |= newly_dated
+        return numbers
+
+    @staticmethod
+    def _is_missing(cell: str) -> bool:
+        """Return whether a cell is empty, or says that there is no value."""
+        return not cell or NO_VALUE.fullmatch(cell) is not None
+
+    def _read_moment(self, row: CsvRow, name: str, cell: str) -> int:
+        """Return a date as nanoseconds; raise where dates of one column differ in having a zone."""
+        where = f"{row.where}, column {name!r}"
+        moment, zoned = parse_moment(cell, where)
+        if self._zoned.setdefault(name, zoned) != zoned:
+            raise fail(where, "a zone with every date or with none", show_value(cell))
+        return moment
+
+    def _make_column(self, name: str, values: list[float | int], cells: list[str]) -> np.ndarray:
+        """Return a column as dates, or as int64 if its cells are whole numbers that doubles cannot tell apart."""
+        if self._dated.get(name):
+            whole = [NAT if value != value else int(value) for value in values]  # before the first date all are empty
+            return np.array(whole, dtype=np.int64).view("datetime64[ns]")
+        numbers = np.array(values, dtype=np.float64)
+        if np.any(np.abs(numbers) >= EXACT) and all(map(WHOLE.fullmatch, cells)):
+            return np.array([int(cell) for cell in cells], dtype=np.int64)
+        return numbers

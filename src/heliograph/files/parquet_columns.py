@@ -1,0 +1,73 @@
+"""Rows of a Parquet file as columns, a block of rows at a time."""
+
+from collections.abc import Container, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from heliograph.files.rows import Rows, convert_to_nanoseconds, numbers_of
+from heliograph.files.text.dialects import check_distinct
+from heliograph.files.text.text_file import Progress
+from heliograph.numerics.check import fail
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+
+def read_parquet_blocks(
+    path: Path, only: Container[str] | None, rows: int, progress: Progress | None = None
+) -> Iterator[Rows]:
+    """Yield the rows of a Parquet file, so many at a time: numbers, NaN where null, and dates in nanoseconds.
+
+    Args:
+        path: the file.
+        only: the columns that are read; None for all.
+        rows: at most so many at a time.
+        progress: called with how many rows are read, and of how many (default none).
+
+    Raises:
+        ValueError: no Parquet, a column twice, one that is neither of numbers nor of dates.
+        ModuleNotFoundError: pyarrow is not installed (extra "tables").
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        with pq.ParquetFile(path) as file:
+            check_distinct(path, file.schema_arrow.names)
+            count, total = 0, file.metadata.num_rows
+            for batch in file.iter_batches(batch_size=rows):
+                first, count = count + 1, count + batch.num_rows
+                if progress is not None:
+                    progress(count, total)
+                yield _convert_table(pa.Table.from_batches([batch]), path, only, first)
+    except pa.ArrowInvalid as error:
+        raise fail(str(path), "a Parquet file", str(error).splitlines()[0]) from None
+
+
+def _convert_table(table: "pa.Table", path: Path, only: Container[str] | None, first: int) -> Rows:
+    """Return the rows of a table of Arrow; `first` is the number of its first one."""
+    import pyarrow as pa
+
+    columns = {}
+    for name, column in zip(table.column_names, table.columns, strict=True):
+        if only is not None and name not in only:
+            continue
+        # Timestamps keep their nanoseconds; other temporal types and nested ones are refused.
+        kind = column.type
+        if pa.types.is_timestamp(kind):
+            moments = np.array(column.cast(pa.timestamp(kind.unit)).to_numpy(), dtype=f"datetime64[{kind.unit}]")
+            columns[name] = convert_to_nanoseconds(moments, f"{path}, column {name!r}", first)
+            continue
+        if pa.types.is_date(kind):
+            days = column.cast(pa.date32()).to_numpy()
+            columns[name] = convert_to_nanoseconds(days, f"{path}, column {name!r}", first)
+            continue
+        if pa.types.is_integer(kind) and not column.null_count:
+            columns[name] = numbers_of(column.to_numpy())
+            continue
+        if not ((pa.types.is_primitive(kind) and not pa.types.is_temporal(kind)) or pa.types.is_null(kind)):
+            raise fail(f"{path}, row {first}, column {name!r}", "numbers", f"{kind} {column[:1].to_pylist()}")
+        columns[name] = np.array(column.cast(pa.float64(), safe=False).to_numpy(), dtype=np.float64)
+    return Rows(columns, np.arange(first, first + table.num_rows), [])

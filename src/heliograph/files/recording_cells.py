@@ -1,0 +1,153 @@
+"""Cells of a recording's rows: which column holds what, and which rows cannot be read."""
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from difflib import get_close_matches
+
+import numpy as np
+
+from heliograph.files.table import TIME
+from heliograph.files.table_rows import RowsAsColumns
+from heliograph.model.plant import TIME_STEP
+from heliograph.numerics.check import InputError, fail
+from heliograph.simulation.network import Network
+
+
+class RowChecks:
+    """Refuses rows of a table that cannot be read: the first is an error, or each is noted with the reason.
+
+    Attributes:
+        good: of each row whether nothing was wrong so far.
+        refused: why rows were refused.
+    """
+
+    def __init__(self, source: str, numbers: np.ndarray, strict: bool):
+        self.source, self.numbers, self._strict = source, numbers, strict
+        self.good = np.ones(len(numbers), dtype=bool)
+        self.refused = list[InputError]()
+
+    def refuse(self, bad: np.ndarray, column: str, expected: str, came: Callable[[int], str]) -> None:
+        """Refuse the rows of a mask, unless they were refused before.
+
+        Args:
+            bad: the mask, (rows,).
+            column: name of the column that is wrong.
+            expected: what was expected there.
+            came: what stands in a row instead.
+
+        Raises:
+            ValueError: one of them, where reading is strict.
+        """
+        for row in np.flatnonzero(bad & self.good).tolist():
+            where = f"{self.source}, row {self.numbers[row]}, column {column!r}"
+            error = fail(where, expected, came(row))
+            if self._strict:
+                raise error
+            self.refused.append(error)
+        self.good &= ~bad
+
+
+def read_cells(columns: Mapping[str, np.ndarray], network: Network, checks: RowChecks) -> RowsAsColumns:
+    """Return what stands in the columns of a table; rows that cannot be read are refused by `checks`."""
+    inputs, received, source = network.inputs, list_received_columns(network), checks.source
+    # A relay whose measurements are left out altogether loses its filter only.
+    for name in () if network.relays is None else network.relays.relays:
+        if not any(column in columns for names in received[name] for column in names):
+            del received[name]  # its own filter is left out
+    if TIME in inputs:
+        raise fail("input names", f"none called {TIME!r}, which is the recording's own column", list(inputs))
+    expected = [(TIME,), *((name,) for name in inputs), *(names for node in received.values() for names in node)]
+    truth_columns = list_truth_columns(network)
+    _refuse_unknown(columns, [*expected, *((name,) for name in truth_columns.values())], source)
+    time = _read_times(columns, _find_column(columns, (TIME,), source), checks)
+    measurements = {}
+    for node, components in received.items():
+        found = [_find_column(columns, names, source) for names in components]
+        measurements[node] = np.stack([_read_measurements(columns, column, checks) for column in found], axis=1)
+    # An input dt may be left out.
+    given = {
+        name: _read_complete(columns, _find_column(columns, (name,), source), checks)
+        for name in inputs
+        if name != TIME_STEP or name in columns
+    }
+    truth = {
+        state: _read_measurements(columns, name, checks) for state, name in truth_columns.items() if name in columns
+    }
+    return RowsAsColumns(checks.numbers, time, measurements, given, truth)
+
+
+def list_truth_columns(network: Network) -> dict[str, str]:
+    """Return the name of the column of each state's true value, unless a node's component has it."""
+    received = {name for node in list_received_columns(network).values() for names in node for name in names}
+    return {state: f"truth.{state}" for state in network.states if f"truth.{state}" not in received}
+
+
+def list_received_columns(network: Network) -> dict[str, list[tuple[str, ...]]]:
+    """Return the allowed column names of each node's components, the preferred one first."""
+    names = {node: receiver.received_names for node, receiver in network.nodes.items()}
+    uses = Counter([TIME, *network.inputs])
+    for node, components in names.items():
+        uses.update([*components, *(f"{node}.{name}" for name in components)])
+
+    def allowed(node: str, name: str) -> tuple[str, ...]:
+        full = f"{node}.{name}"
+        if uses[name] > 1:
+            return (full,)
+        return (name, full) if len(names) == 1 else (full, name)
+
+    return {node: [allowed(node, name) for name in components] for node, components in names.items()}
+
+
+def _refuse_unknown(columns: Mapping[str, np.ndarray], expected: list[tuple[str, ...]], source: str) -> None:
+    """Raise one line with the closest known name if a column belongs to nothing of the network."""
+    known = [name for names in expected for name in names]
+    for column in columns:
+        if column not in known:
+            close = get_close_matches(column, known, 1)
+            closest = f" (closest: {close[0]!r})" if close else ""
+            listed = ", ".join(names[0] for names in expected)
+            raise fail(f"{source}, header", f"only the columns {listed}", f"the unknown {column!r}{closest}")
+
+
+def _find_column(columns: Mapping[str, np.ndarray], names: tuple[str, ...], source: str) -> str:
+    """Return which of these names a column has; raise unless exactly one does."""
+    present = [name for name in names if name in columns]
+    if len(present) != 1:
+        came = f"both {' and '.join(map(repr, present))}" if present else f"only {', '.join(columns)}"
+        raise fail(f"{source}, header", f"one column {names[0]!r}", came)
+    return present[0]
+
+
+def _read_times(columns: Mapping[str, np.ndarray], name: str, checks: RowChecks) -> np.ndarray:
+    """Return the times of the rows, dates where the column holds dates."""
+    values = np.asarray(columns[name])
+    if values.dtype.kind != "M":
+        return _read_complete(columns, name, checks)
+    checks.refuse(np.isnat(values), name, "a date", lambda row: "an empty cell")
+    return values.astype("datetime64[ns]")
+
+
+def _read_complete(columns: Mapping[str, np.ndarray], name: str, checks: RowChecks) -> np.ndarray:
+    """Return the numbers of a column in which every cell has to have one."""
+    values = columns[name] if columns[name].dtype.kind == "i" else _read_numbers(columns, name, checks.source)
+    checks.refuse(~np.isfinite(values), name, "a finite number", _describe_cell(values))
+    return values
+
+
+def _read_measurements(columns: Mapping[str, np.ndarray], name: str, checks: RowChecks) -> np.ndarray:
+    """Return the numbers of a column, NaN where a cell is empty."""
+    values = _read_numbers(columns, name, checks.source)
+    checks.refuse(np.isinf(values), name, "a finite number, or none where it did not arrive", _describe_cell(values))
+    return values
+
+
+def _read_numbers(columns: Mapping[str, np.ndarray], name: str, source: str) -> np.ndarray:
+    """Return a column as doubles; raise ValueError if it has dates."""
+    if columns[name].dtype.kind == "M":
+        raise fail(f"{source}, column {name!r}", "numbers", "dates")
+    return np.asarray(columns[name], dtype=np.float64)
+
+
+def _describe_cell(values: np.ndarray) -> Callable[[int], str]:
+    """Return what says in words what stands in a row of a column."""
+    return lambda row: "an empty cell" if np.isnan(values[row]) else f"{values[row]}"

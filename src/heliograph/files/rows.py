@@ -1,0 +1,78 @@
+"""Rows of a table as columns of numbers and dates, a part of the table at a time or all of them."""
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.numerics.check import InputError, fail
+
+EXACT = 2**53  # up to here doubles hold every whole number
+
+
+class BlockSize(NamedTuple):
+    """How much of a table is read at a time: rows of Parquet, bytes of text."""
+
+    rows: int = 1 << 18
+    bytes: int = 1 << 24
+
+
+USUAL_BLOCK = BlockSize()
+
+
+class Rows(NamedTuple):
+    """Rows of a table that could be read, as columns; their numbers, from 1; and why others could not be read."""
+
+    columns: dict[str, np.ndarray]
+    numbers: np.ndarray
+    refused: list[InputError]
+
+
+def join_rows(parts: Iterable[Rows]) -> Rows:
+    """Return the rows of several parts of a table, one after the other."""
+    parts = list(parts)
+    filled = [part for part in parts if len(part.numbers)] or parts[-1:]
+    names = filled[0].columns if filled else ()
+    columns = {name: _join_column([part.columns[name] for part in filled]) for name in names}
+    numbers = np.concatenate([np.zeros(0, dtype=np.int64), *(part.numbers for part in filled)])
+    return Rows(columns, numbers, [error for part in parts for error in part.refused])
+
+
+def _join_column(parts: list[np.ndarray]) -> np.ndarray:
+    """Return the parts of a column as one, of a kind that holds all of them.
+
+    Before the first date of a column of dates all cells are empty; numbers that int64 alone tells apart stay so where
+    all are whole.
+    """
+    kinds = {part.dtype.kind for part in parts}
+    if "M" in kinds:
+        parts = [part if part.dtype.kind == "M" else np.full(len(part), "NaT", "datetime64[ns]") for part in parts]
+    elif kinds == {"i", "f"} and all(_is_whole(part) for part in parts):
+        parts = [part.astype(np.int64) for part in parts]
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+
+def _is_whole(numbers: np.ndarray) -> bool:
+    """Return whether all numbers are whole, and of a size at which doubles hold each."""
+    return numbers.dtype.kind == "i" or bool(np.all((np.abs(numbers) < EXACT) & (numbers == np.trunc(numbers))))
+
+
+def numbers_of(column: np.ndarray) -> np.ndarray:
+    """Return numbers as float64, or as int64 where that alone tells them apart."""
+    whole = column.dtype.kind in "iu" and column.size and np.abs(column.astype(np.float64)).max() >= EXACT
+    return np.asarray(column, dtype=np.int64 if whole and column.dtype != np.uint64 else np.float64)
+
+
+def convert_to_nanoseconds(column: np.ndarray, name: str, first: int = 1) -> np.ndarray:
+    """Return dates as datetime64[ns]; `first` is the number of their first row, for errors.
+
+    Raises:
+        ValueError: a date that 64 bits of nanoseconds cannot say, or a part of a nanosecond; one line with its row.
+    """
+    moments = column.astype("datetime64[ns]")
+    # Converted back, what overflowed or lost a part of a nanosecond is another date.
+    wrong = ~np.isnat(column) & (moments.astype(column.dtype) != column)
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise fail(f"{name}, row {first + row}", "a date in whole nanoseconds, from 1678 to 2261", column[row])
+    return np.asarray(moments)

@@ -1,0 +1,124 @@
+"""Tables to CSV and Parquet, a block of rows after the other; the file appears as a whole or not at all."""
+
+import csv
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, TextIO
+
+import msgspec
+import numpy as np
+
+from heliograph.disk.quoting import quote_for_cell, unquote_cell
+from heliograph.disk.whole_file import check_writable, format_of, whole_file
+from heliograph.files.text.dialects import check_distinct
+from heliograph.numerics.times.dates import format_dates
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+WITH_EXPONENT = 1e-5, 1e-4  # sizes of numbers that Python writes with an exponent, and JSON without
+LARGE = 1e16  # size from which on Python writes a sign before the exponent
+BLOCK = 4096  # rows whose cells are in memory as texts at a time
+
+Append = Callable[[Mapping[str, np.ndarray]], None]  # called with columns by name, all of one length
+
+
+@contextmanager
+def open_table(path: Path) -> Iterator[Append]:
+    """Open a CSV or Parquet file; yields a function that appends rows, in the same columns each time.
+
+    The file appears once the context ends, and not at all after an error or interrupt.
+
+    Raises:
+        ValueError: another format, or a folder that cannot be written.
+        ModuleNotFoundError: Parquet without pyarrow (extra "tables").
+    """
+    check_writable(path)
+    with whole_file(path) as partial, (_open_csv if format_of(path) == ".csv" else _open_parquet)(partial) as append:
+        yield append
+
+
+@contextmanager
+def _open_csv(path: Path) -> Iterator[Append]:
+    """Open a file of CSV."""
+    with path.open("x", newline="", encoding="utf-8") as file:
+
+        def append(columns: Mapping[str, np.ndarray]) -> None:
+            """Append rows, behind the names of the columns in the first line."""
+            if not file.tell():
+                check_distinct(f"columns of {path}", [read_back_name(name) for name in columns])
+                csv.writer(file).writerow(map(quote_for_cell, columns))
+            _write_csv_rows(columns, file)
+
+        yield append
+
+
+@contextmanager
+def _open_parquet(path: Path) -> Iterator[Append]:
+    """Open a Parquet file; dates are nanoseconds of UTC."""
+    import pyarrow.parquet as pq
+
+    writer: pq.ParquetWriter | None = None
+
+    def append(columns: Mapping[str, np.ndarray]) -> None:
+        """Append rows."""
+        nonlocal writer
+        rows = _make_arrow_table(columns)
+        if writer is None:
+            writer = pq.ParquetWriter(path, rows.schema)
+        writer.write_table(rows)
+
+    try:
+        yield append
+    finally:
+        if writer is not None:
+            writer.close()
+
+
+def _make_arrow_table(columns: Mapping[str, np.ndarray]) -> "pa.Table":
+    """Return columns as a table of Arrow."""
+    import pyarrow as pa
+
+    arrays = {name: pa.array(np.ascontiguousarray(c)) for name, c in columns.items()}
+    dated = {name: a.cast(pa.timestamp("ns", "UTC")) for name, a in arrays.items() if columns[name].dtype.kind == "M"}
+    return pa.table(arrays | dated)
+
+
+def _write_csv_rows(columns: Mapping[str, np.ndarray], file: TextIO) -> None:
+    """Write rows as lines, a block of them at a time."""
+    for start in range(0, len(next(iter(columns.values()))), BLOCK):
+        cells = [_format_cells(column[start : start + BLOCK]) for column in columns.values()]  # they need no quotes
+        file.writelines(f"{','.join(row)}\r\n" for row in zip(*cells, strict=True))
+
+
+def _format_cells(column: np.ndarray) -> list[str]:
+    """Write each value as Python does, a float with all digits that it takes to read it back.
+
+    Floats are written as JSON, in a tenth of the time and with the same digits, and made what Python writes where the
+    two differ: in exponents of one digit, where only one of them has an exponent at all, of NaN and of infinity.
+    """
+    if column.dtype.kind != "f":
+        return list(map(str, _plain(column).tolist()))
+    values, size = column.tolist(), np.abs(column.astype(np.float64))
+    text = msgspec.json.encode(values).decode().replace("]", ",")
+    for digit in "6789":  # of an exponent Python writes two digits
+        text = text.replace(f"e-{digit},", f"e-0{digit},")
+    # JSON and Python write these differently: numbers in a range of exponents, large ones, NaN (`~ <`) and infinity.
+    differs = ((size >= WITH_EXPONENT[0]) & (size < WITH_EXPONENT[1])) | ~(size < LARGE)
+    texts = text[1:-1].split(",")
+    for row in np.flatnonzero(differs).tolist():
+        texts[row] = repr(values[row])
+    return texts
+
+
+def read_back_name(name: str) -> str:
+    """Return the name of a column as it reads from a CSV file to which it was written: in one line, without margins."""
+    return unquote_cell(quote_for_cell(name).strip())
+
+
+def _plain(column: np.ndarray) -> np.ndarray:
+    """Return dates as texts, and true and false as 1 and 0; other numbers as they are."""
+    if column.dtype.kind == "M":
+        return format_dates(column)
+    return column.astype(np.int64) if column.dtype == np.bool_ else column
