@@ -7,8 +7,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from heliograph.files.rows import BlockSize, join_rows
-from heliograph.files.table import read_row_blocks, read_rows
+import heliograph.files.table
+
+tables = heliograph.files.table
 
 TEXTS = {
     "plain": "time,a,b\n0,1,2\n1,,3\n2,4,\n3,,\n4,5e-3,-6\n",
@@ -38,9 +39,9 @@ def outcome(path, block=None, strict=False):
     """The columns, the numbers of rows and the refusals of a table, or why it is none."""
     try:
         if block is None:
-            rows = read_rows(path, None, strict)
+            rows = tables.read_rows(path, None, strict)
         else:
-            rows = join_rows(read_row_blocks(path, None, strict, block))
+            rows = tables.join_rows(tables.read_row_blocks(path, None, strict, block))
             if not len(rows.numbers):
                 raise rows.refused[0] if rows.refused else ValueError("none")
     except ValueError as error:
@@ -62,14 +63,18 @@ def test_csv_in_blocks_of_any_size(tmp_path, case, strict):
         path.write_bytes(content)
         whole = outcome(path, strict=strict)
         for size in (1, 7, 20, 64):
-            assert outcome(path, BlockSize(bytes=size), strict) == whole, (name, size)
+            assert outcome(path, tables.BlockSize(bytes=size), strict) == whole, (name, size)
 
 
 def test_blocks_are_small(tmp_path):
     """A table of a hundred lines of ten bytes in blocks of some hundred bytes, and what of it is read is told."""
     (tmp_path / "data.csv").write_text("time,a\n" + "".join(f"{k:04},{k:04}\n" for k in range(1000, 1100)))
     told = list[tuple[int, int]]()
-    parts = list(read_row_blocks(tmp_path / "data.csv", None, False, BlockSize(bytes=100), lambda *of: told.append(of)))
+    parts = list(
+        tables.read_row_blocks(
+            tmp_path / "data.csv", None, False, tables.BlockSize(bytes=100), lambda *of: told.append(of)
+        )
+    )
     assert max(len(part.numbers) for part in parts) <= 20
     assert told[-1] == (1007, 1007) and told == sorted(told) and len(told) >= 10
     assert [n for part in parts for n in part.numbers] == list(range(1, 101))
@@ -82,10 +87,10 @@ def test_a_packed_file_that_was_cut_off(tmp_path):
     (tmp_path / "data.csv.gz").write_bytes(packed[:-5000])
     whole = outcome(tmp_path / "data.csv.gz")
     assert 1000 < len(whole[1]) < 3000 and "one that was cut off" in whole[2][0]
-    assert outcome(tmp_path / "data.csv.gz", BlockSize(bytes=500)) == whole
-    assert "one that was cut off" in outcome(tmp_path / "data.csv.gz", BlockSize(bytes=500), strict=True)
+    assert outcome(tmp_path / "data.csv.gz", tables.BlockSize(bytes=500)) == whole
+    assert "one that was cut off" in outcome(tmp_path / "data.csv.gz", tables.BlockSize(bytes=500), strict=True)
     (tmp_path / "data.csv.gz").write_bytes(packed[:20])
-    assert "one that was cut off" in outcome(tmp_path / "data.csv.gz", BlockSize(bytes=500))
+    assert "one that was cut off" in outcome(tmp_path / "data.csv.gz", tables.BlockSize(bytes=500))
 
 
 def test_parquet_in_blocks_of_any_size(tmp_path):
@@ -102,11 +107,11 @@ def test_parquet_in_blocks_of_any_size(tmp_path):
     whole = outcome(path)
     assert whole[0]["time"][0] == "<i8" and whole[0]["b"][0] == "<f8"
     for rows in (1, 2, 3, 4):
-        assert outcome(path, BlockSize(rows=rows)) == whole
+        assert outcome(path, tables.BlockSize(rows=rows)) == whole
     far = pa.array(np.array([0, 1, 2, 10**12], dtype="datetime64[s]"))
     pq.write_table(pa.table({"time": far}), path)
-    assert "row 4: expected a date" in outcome(path, BlockSize(rows=1)) == outcome(path)
+    assert "row 4: expected a date" in outcome(path, tables.BlockSize(rows=1)) == outcome(path)
     told = list[tuple[int, int]]()
     pq.write_table(pa.table({"time": [1.0, 2, 3]}), path)
-    list(read_row_blocks(path, None, False, BlockSize(rows=2), lambda *of: told.append(of)))
+    list(tables.read_row_blocks(path, None, False, tables.BlockSize(rows=2), lambda *of: told.append(of)))
     assert told == [(2, 3), (3, 3)]

@@ -103,3 +103,13 @@ def test_what_cannot_go_on_is_refused():
     record = hg.run(reports, {"near": z[:30], "far": z[:30]})
     with pytest.raises(ValueError, match=r"after: expected no fusion by reports.*reported"):
         hg.run(reports, {"near": rest, "far": rest}, after=record)
+
+
+def test_a_gap_between_two_blocks_is_an_unequal_step():
+    """Whose rows are a second apart: each block by itself has equal steps."""
+    item = hg.Network(WALK, {"near": hg.Node(PLACE, hg.perfect(), {"Kalman": hg.kalman_filter(WALK, PLACE)})})
+    day = np.datetime64("2026-03-29", "s")
+    first = hg.run(item, {"near": np.zeros(5)}, time=day + np.arange(5))
+    hg.run(item, {"near": np.zeros(5)}, time=day + np.arange(5, 10), after=first)
+    with pytest.warns(UserWarning, match="time: steps of 1 and 96 seconds"):
+        hg.run(item, {"near": np.zeros(5)}, time=day + np.arange(100, 105), after=first)

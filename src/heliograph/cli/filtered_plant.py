@@ -56,7 +56,7 @@ def filter_plant(
 ) -> FilteredPlant:
     """Filter a plant's rows; forecast as far `ahead`, and predict each row, where that is asked for."""
 
-    record, doubts = _filter_rows(network, data.recording, smooth)
+    record, doubts = filter_rows(network, data.recording, smooth)
     if data.events is not None and data.events.dated and record.origin is not None:
         record = record.with_units({"time": "s"} | record.units)
     said = [*_describe_doubted(network, record), *data.summary]
@@ -97,13 +97,19 @@ def place_of_plant(out: Path | StoreAddress, plant: str, several: bool) -> Path 
     return out.with_name(f"{out.stem}.{quote(plant, safe='')}{out.suffix}") if several else out
 
 
-def _filter_rows(
-    network: "Network", recording: "Recording", smooth: "FixedInterval | FixedLag | None"
+def filter_rows(
+    network: "Network",
+    recording: "Recording",
+    smooth: "FixedInterval | FixedLag | None" = None,
+    after: "Record | None" = None,
 ) -> tuple["Record", list[str]]:
-    """Return the record of the filtered rows, and the warnings that were given meanwhile as lines."""
+    """Return the record of the filtered rows, and the warnings that were given meanwhile as lines.
+
+    `after`: the record of the rows before these.
+    """
     with warnings.catch_warnings(record=True) as doubts:
         warnings.simplefilter("always", UserWarning)
-        record = heliograph.run(network, *recording, smooth=smooth)
+        record = heliograph.run(network, *recording, smooth=smooth, after=after)
     return record, [str(doubt.message) for doubt in doubts]
 
 

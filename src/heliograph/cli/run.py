@@ -9,6 +9,7 @@ from cyclopts import Parameter
 
 import heliograph
 from heliograph.cli.app import estimates_option, measured_option, path_option
+from heliograph.cli.filtered_blocks import WrittenRows, run_in_blocks
 from heliograph.cli.filtered_plant import FilteredPlant, filter_plant, place_of_plant, write_plant_estimates
 from heliograph.cli.reading import ReadingOptions, read_measured
 from heliograph.files.stores.address import StoreAddress
@@ -16,7 +17,6 @@ from heliograph.files.stores.address import StoreAddress
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from heliograph.model.estimate import Estimate
     from heliograph.report.progress import Advance
     from heliograph.simulation.network import Network
     from heliograph.simulation.results.record import Record
@@ -43,6 +43,9 @@ def run(
 ) -> None:
     """Run the filters of your own network over measured data.
 
+    A long table of rows, from 16 MiB of CSV or 262,144 rows of Parquet on, is filtered in blocks, in the memory of one.
+    --report, --smooth, --forecast and --predicted need all rows at once, and so do columns of the truth.
+
     A file of events has the columns node, sequence, time, arrival, and the measured values: in any order, late, twice.
     A bag (.mcap, .db3, .bag, or a folder), a vehicle's log (.mf4, .blf, .asc, .ulg), a log or a table of somebody
     else's making, or a folder of such files, each with a clock of its own, is events too, by the `sources` of the
@@ -63,11 +66,10 @@ def run(
 
     # Check the options before JAX is imported.
     later, options = _parse_smoothing(smooth), reading or ReadingOptions()
-    _check_options(measurements, out, report, lag, options)
+    given = {"--report": report, "--smooth": smooth, "--forecast": forecast, "--predicted": predicted}
+    wanted = [name for name, value in given.items() if value]
+    _check_options(measurements, out, report, lag, options, wanted)
     ahead = horizons_in(forecast) if forecast else None
-    if isinstance(out, Path) and out.suffix.lower() == ".mcap" and (forecast or predicted):
-        option = "--forecast" if forecast else "--predicted"
-        raise fail(option, "a table of estimates (--out FILE.csv or FILE.parquet)", str(out))
     with progress(4) as advance:
         advance("starting")
         from heliograph.files.network_file import load_module
@@ -76,7 +78,9 @@ def run(
         if not any(loaded.claims().values()):
             raise fail(f"network {network}", "at least one filter to run", "none")
         _refuse_replacing_inputs(measurements, out, loaded, module.get("sources"))
-        measured = read_measured(measurements, network, loaded, module, options, advance)
+        # A long table in blocks, anything else as a whole.
+        said = run_in_blocks(loaded, module, measurements, out, wanted, options, advance) if lag is None else None
+        measured = read_measured(measurements, network, loaded, module, options, advance) if said is None else []
         if lag is not None and measured[0].events is None:
             raise fail("--lag", "messages or events", f"rows of time in {measurements}")
         # Each plant by itself.
@@ -92,9 +96,9 @@ def run(
     # Report, then warnings and a summary.
     if report is not None:
         _write_report(network, loaded, [plant for plant, _ in done], report)
-    for plant, place in done:
-        lines = [*_describe_results(plant.written, place, report), *plant.said]
-        _print_lines(list(dict.fromkeys(plant.doubted)), lines)
+    lines = [(plant.doubted, [*_describe_results(plant.written, place, report), *plant.said]) for plant, place in done]
+    for doubted, summary in lines if said is None else [said]:
+        _print_lines(list(dict.fromkeys(doubted)), summary)
 
 
 def _parse_smoothing(word: str) -> "FixedInterval | FixedLag | None":
@@ -128,8 +132,9 @@ def _check_options(
     report: Path | None,
     lag: float | None,
     options: ReadingOptions,
+    wanted: "Sequence[str]",
 ) -> None:
-    """Check that the options fit together and files can be written."""
+    """Check that the options fit together and files can be written; `wanted`: the options by which more is written."""
     from heliograph.numerics.check import fail, scalar
 
     if out is None and report is None:
@@ -141,18 +146,18 @@ def _check_options(
             raise fail("lag", f"a number from 0 to the window, {window:g}", lag)
         if out is None:
             raise fail("--lag", "a file for the estimates (--out FILE)", "none")
+    more = [option for option in wanted if option in ("--forecast", "--predicted")]
+    if more and isinstance(out, Path) and out.suffix.lower() == ".mcap":
+        raise fail(more[0], "a table of estimates (--out FILE.csv or FILE.parquet)", str(out))
     _check_output_places(measurements, out, report)
 
 
 def _describe_results(record: "Record", out: Path | StoreAddress | None, report: Path | None) -> list[str]:
     """Return a line on what was written where, and one on the errors of each filter."""
-    filters = [
-        f"{node}/{name} ({_describe_claim(estimate)})"
-        for node, estimates in record.estimates.items()
-        for name, estimate in estimates.items()
-    ]
-    places = " and ".join(str(path) for path in (out, report and report / "report.html") if path is not None)
-    return [f"{places}: {len(record.time)} rows of {', '.join(filters)}", *_describe_errors(record)]
+    written = WrittenRows()
+    written.add(record)
+    places = [path for path in (out, report and report / "report.html") if path is not None]
+    return [written.describe(*places), *_describe_errors(record)]
 
 
 def _describe_errors(record: "Record") -> list[str]:
@@ -165,14 +170,6 @@ def _describe_errors(record: "Record") -> list[str]:
         nees = "" if isnan(errors.nees) else f"; NEES per state {errors.nees:.3g}"
         lines.append(f"{errors.node}/{errors.filter}: RMSE {', '.join(parts)}{nees}")
     return lines
-
-
-def _describe_claim(estimate: "Estimate") -> str:
-    """Return what estimates claim, and in how many rows they claim nothing, such as "exact, none of 3 rows"."""
-    without = int((estimate.claims == "none").sum())
-    if estimate.claim == "none" or not without:
-        return estimate.claim
-    return f"{estimate.claim}, none of {without} rows"
 
 
 def _check_output_places(

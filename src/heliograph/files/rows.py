@@ -13,8 +13,8 @@ EXACT = 2**53  # up to here doubles hold every whole number
 class BlockSize(NamedTuple):
     """How much of a table is read at a time: rows of Parquet, bytes of text."""
 
-    rows: int = 1 << 18
-    bytes: int = 1 << 24
+    rows: int = 1 << 17
+    bytes: int = 1 << 22
 
 
 USUAL_BLOCK = BlockSize()

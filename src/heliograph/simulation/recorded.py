@@ -32,8 +32,8 @@ from heliograph.simulation.recorded_rows import (
     Begin,
     FilteringTask,
     central_states_before_rows,
-    check_behind,
     filter_rows,
+    join_behind,
     origin_behind,
 )
 from heliograph.simulation.results.no_numbers import warn_of_no_numbers
@@ -112,9 +112,9 @@ def run(
     check_columns("truth", truth, network.states)
     true = None if truth is None else array("truth", truth, (steps, len(network.states)), missing=True)
     times = _find_times(measured, {"inputs": inputs, "truth": truth}, time, steps)
-    warn_of_unequal_steps(network.inputs, times)
     clock = first + np.arange(steps, dtype=np.float64) if times is None else times
-    check_behind(before, clock)
+    joined = join_behind(before, clock)
+    warn_of_unequal_steps(network.inputs, None if times is None else joined)
     refuse_shared_dithers(network, z)
     z, refused, said, repeats = screen_recording(network, z, u, {} if before is None else before.repeats)
     _warn_of_each((*said, *warn_beyond_a_turn(network, z)))

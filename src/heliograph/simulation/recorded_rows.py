@@ -70,17 +70,18 @@ def origin_behind(filters: AllFilters, after: Record, smooths: bool) -> Origin:
     return origin
 
 
-def check_behind(origin: Origin | None, clock: np.ndarray) -> None:
-    """Check that rows are not before the last one before them.
+def join_behind(origin: Origin | None, clock: np.ndarray) -> np.ndarray:
+    """Return the times of rows behind that of the last one before them, where there is one.
 
     Raises:
-        ValueError: their first time is, or is a date where that is a number, or the reverse.
+        ValueError: their first time is before it, or is a date where that is a number, or the reverse.
     """
     if origin is None:  # nothing is before them
-        return
+        return clock
     last, first = np.asarray(origin.time), clock[0]
     if last.dtype.kind != clock.dtype.kind or first < last:
         raise fail("time", f"rows behind {origin.time}, the last one before them", str(first))
+    return np.append(last, clock)
 
 
 def filter_rows(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool) -> PyTree:

@@ -1,0 +1,216 @@
+"""`heliograph run` over a recording too long to be held: its rows are filtered and written in blocks."""
+
+import re
+import sys
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from heliograph.cli.filtered_plant import filter_rows
+from heliograph.cli.reading import ReadingOptions, describe_refused
+from heliograph.files.rows import USUAL_BLOCK, BlockSize
+from heliograph.files.stores.address import StoreAddress
+
+if TYPE_CHECKING:
+    from heliograph.report.progress import Advance
+    from heliograph.simulation.network import Network
+    from heliograph.simulation.results.record import Record
+
+LONG = BlockSize(rows=1 << 18, bytes=1 << 24)  # a table beyond is filtered in blocks
+MOST = 1 << 25  # rows out of order that are held at once
+NUMBER = re.compile(r"(?<![\w'\"])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?![\w'\"])")  # that is no part of a name
+
+
+class AllRowsNeededError(Exception):
+    """Why all rows of a recording are held in memory at once, in words."""
+
+
+def run_in_blocks(
+    network: "Network",
+    module: Mapping[str, object],
+    measurements: Path | StoreAddress,
+    out: Path | StoreAddress | None,
+    others: Iterable[str],
+    options: ReadingOptions,
+    advance: "Advance",
+) -> tuple[list[str], list[str]] | None:
+    """Filter a long table of rows of time, and write the estimates to a table.
+
+    Args:
+        network: the network.
+        module: its file's names.
+        measurements: the file.
+        out: where the estimates go.
+        others: the options that are given and need all rows.
+        options: how the file is read.
+        advance: called with the progress.
+
+    Returns:
+        The warnings and the summary. None of a table that is not long or has no rows of time, and of one whose
+        rows have to be held at once: that is said.
+
+    Raises:
+        ValueError: what cannot be read; very many rows that are out of order.
+    """
+    from heliograph.files.messages.to_events import is_of_messages
+
+    if not isinstance(measurements, Path) or options.of_messages or not is_long(measurements):
+        return None
+    if is_of_messages(measurements, module.get("sources")):
+        return None
+    try:
+        _check_for_needs(network, out, others)
+        assert isinstance(out, Path)
+        return filter_in_blocks(network, measurements, out, options, advance)
+    except AllRowsNeededError as needed:
+        from heliograph.disk.quoting import visible
+
+        line = f"{measurements}: all rows are held in memory at once: {needed}"
+        print("heliograph:", visible(line), file=sys.stderr)
+        return None
+
+
+def is_long(path: Path, limit: BlockSize = LONG) -> bool:
+    """Return whether a table is beyond a limit: of bytes of CSV, of rows of Parquet."""
+    from heliograph.files.text.text_file import kind_of
+
+    if not path.is_file():
+        return False
+    if kind_of(path) != ".parquet":
+        return kind_of(path) == ".csv" and path.stat().st_size > limit.bytes
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        return int(pq.read_metadata(path).num_rows) > limit.rows
+    except (pa.ArrowInvalid, OSError):  # the reader says what is wrong
+        return False
+
+
+def _check_for_needs(network: "Network", out: Path | StoreAddress | None, others: Iterable[str]) -> None:
+    """Raise AllRowsNeededError where options, the output or the network need all rows at once."""
+    from heliograph.disk.whole_file import FORMATS
+    from heliograph.fusion.network_fusion import Fusion
+
+    if given := list(others):
+        raise AllRowsNeededError(f"{' and '.join(given)} {'need' if len(given) > 1 else 'needs'} them")
+    if not isinstance(out, Path) or out.suffix.lower() not in FORMATS:
+        raise AllRowsNeededError(f"blocks go to {' or '.join(FORMATS)} alone, not to {out}")
+    late = [name for name, fused in network.fused.items() if isinstance(fused, Fusion) and fused.by_report]
+    if late := [*network.meshes, *late]:
+        raise AllRowsNeededError(f"messages of the fusion {late[0]} may come rows later")
+
+
+def filter_in_blocks(
+    network: "Network",
+    path: Path,
+    out: Path,
+    options: ReadingOptions,
+    advance: "Advance",
+    block: BlockSize = USUAL_BLOCK,
+    most: int = MOST,
+) -> tuple[list[str], list[str]]:
+    """Filter the rows of a table and write the estimates, block by block; return the warnings and the summary.
+
+    Args:
+        network: the network.
+        path: the table, CSV or Parquet.
+        out: a file of one of these.
+        options: how the table is read.
+        advance: called with the progress.
+        block: how much is in memory at a time.
+        most: rows up to which those that are out of order are held at once.
+
+    Raises:
+        AllRowsNeededError: all rows are needed at once; nothing is written.
+        ValueError: what cannot be read; more than `most` rows that are out of order.
+    """
+    from heliograph.files.block_order import RowsNotInBlocksError
+    from heliograph.files.estimates.table import estimate_columns
+    from heliograph.files.recording_blocks import RecordingBlocks
+    from heliograph.files.table_writer import open_table
+    from heliograph.numerics.check import InputError
+
+    def progress(done: int, total: int) -> None:
+        advance(f"filtering {path}", done, total)
+
+    blocks = RecordingBlocks(path, network, options.strict, options.ignore_unknown, block, progress)
+    written, doubts, record = WrittenRows(), BlockLines(), None
+    try:
+        with open_table(out) as append:
+            for recording in blocks:
+                if recording.truth is not None:
+                    raise AllRowsNeededError("errors are of the truth in all of them")
+                record, given = filter_rows(network, recording, after=record)
+                if weighing := [f"{node}/{name}" for node, filters in record.weighed.items() for name in filters]:
+                    raise AllRowsNeededError(f"what {weighing[0]} weighs is judged by all of them")
+                append(estimate_columns(record))
+                written.add(record)
+                doubts.add([*record.failures(), *given], written.rows - len(record.time) + 1, written.rows)
+    except RowsNotInBlocksError as error:
+        if blocks.expected_rows > most:
+            limit = f"more than {most:,} rows are read in blocks of {block.rows:,}, and may be out of order within one"
+            raise InputError(f"{error}: {limit}: sort the file by time, or correct the row") from None
+        raise AllRowsNeededError(str(error)) from None
+    refused = [describe_refused(path, "rows", blocks.refused, list(map(str, blocks.reasons)))] if blocks.refused else []
+    return [*refused, *blocks.notes, *blocks.doubts, *doubts.list_lines()], [written.describe(out)]
+
+
+class WrittenRows:
+    """Counts of the rows whose estimates were written, and of those in which a filter claims nothing.
+
+    Attributes:
+        rows: how many there are.
+    """
+
+    def __init__(self) -> None:
+        self.rows = 0
+        self._claims, self._without = dict[str, str](), Counter[str]()
+
+    def add(self, record: "Record") -> None:
+        """Count the rows of a record."""
+        self.rows += len(record.time)
+        for node, filters in record.estimates.items():
+            for name, estimate in filters.items():
+                self._claims[f"{node}/{name}"] = estimate.claim
+                if estimate.claim != "none":
+                    self._without[f"{node}/{name}"] += int((estimate.claims == "none").sum())
+
+    def describe(self, *places: object) -> str:
+        """Return a line on what was written where, such as "out.csv: 3 rows of a/kf (exact, none of 2 rows)"."""
+        filters = []
+        for name, claim in self._claims.items():
+            without = f", none of {self._without[name]} rows" if self._without[name] else ""
+            filters.append(f"{name} ({claim}{without})")
+        return f"{' and '.join(map(str, places))}: {self.rows} rows of {', '.join(filters)}"
+
+
+class BlockLines:
+    """Lines on blocks of rows: those that differ in their numbers alone are one, of the first block that has it."""
+
+    def __init__(self) -> None:
+        self._blocks = 0
+        self._first = dict[str, tuple[str, str]]()  # by the line without its numbers: rows, line
+        self._more = Counter[str]()
+
+    def add(self, lines: Iterable[str], first: int, last: int) -> None:
+        """Add the lines on a block, in which rows count from 1; `first` and `last` are the numbers of its rows."""
+        self._blocks += 1
+        here = set[str]()
+        for line in lines:
+            kind = NUMBER.sub("0", line)
+            if kind not in self._first:
+                self._first[kind] = f"of the rows {first} to {last}, counted from 1: ", line
+            elif kind not in here:
+                self._more[kind] += 1
+            here.add(kind)
+
+    def list_lines(self) -> list[str]:
+        """Return the lines, which name the rows of their block if there are several."""
+        if self._blocks == 1:
+            return [line for _, line in self._first.values()]
+        return [
+            f"{rows}{line}{f' (likewise in {self._more[kind]} later blocks)' if self._more[kind] else ''}"
+            for kind, (rows, line) in self._first.items()
+        ]

@@ -1,0 +1,102 @@
+"""Order of rows that are read in blocks: whether blocks put in order by themselves are in the order of all rows."""
+
+from pathlib import Path
+
+import numpy as np
+
+from heliograph.files.table import TIME
+from heliograph.files.table_rows import RowsAsColumns
+from heliograph.model.plant import TIME_STEP
+from heliograph.numerics.check import InputError, fail
+from heliograph.numerics.times.row_order import SECOND, YEAR
+from heliograph.numerics.times.row_times import backwards, backwards_text
+from heliograph.simulation.network import Network
+
+
+class RowsNotInBlocksError(InputError):
+    """Rows of which only all together say in which order they are, or of which kind: one line that names the first."""
+
+
+class BlockOrder:
+    """Compares blocks, each in the order of its times by itself, with what `order_rows` makes of all rows together.
+
+    Sorted blocks of which each begins where the one before it ended are all rows sorted. Where each row is a step the
+    fewest rows are left out of all if they are of each block, and none falls behind the block before it. Where time is
+    continuous a stamp is left out that is more than a year outside of all others: a block says so of its own rows, so
+    what it left out has to be outside of those of all blocks, and there may be no steps of a year beside rows out of
+    order, since these may be stretches of stamps that were not set.
+
+    Args:
+        path: the file, for errors.
+        network: the network that the rows belong to.
+
+    Attributes:
+        last: the last row so far; None before the first.
+    """
+
+    def __init__(self, path: Path, network: Network):
+        self._path, self._counted = path, TIME_STEP not in network.inputs
+        self.last: RowsAsColumns | None = None
+        self._first: RowsAsColumns | None = None
+        self._disordered: RowsAsColumns | None = None  # two rows of which the second came after a later one
+        self._jump: RowsAsColumns | None = None  # two rows between which is more than a year
+        self._left_out = list[RowsAsColumns]()  # of each block those with the least and the greatest time
+
+    def add(self, came: RowsAsColumns, ordered: RowsAsColumns) -> None:
+        """Go on with the rows of a block as they came, and those that are left in the order of their times.
+
+        Raises:
+            RowsNotInBlocksError: only all rows together say in which order they are.
+        """
+        if self.last is not None and self.last.time.dtype != ordered.time.dtype:
+            where, before = f"{self._path}, row {ordered.numbers[0]}, column {TIME!r}", self.last.time.dtype
+            raise RowsNotInBlocksError(str(fail(where, f"numbers of the kind before, {before}", ordered.time.dtype)))
+        rows = ordered if self.last is None else _append(self.last, ordered)
+        if (row := backwards(rows.time)) is not None:
+            raise self._refuse(rows.of(slice(row - 1, row + 1)), "a time that does not go backwards")
+        self.last = ordered.of(slice(-1, None))
+        if self._first is None:
+            self._first = ordered.of(slice(1))
+        if self._counted:
+            return
+        year = _year(rows.time)
+        if len(jumps := np.flatnonzero(np.diff(rows.time) > year)):
+            self._jump = rows.of(slice(int(jumps[0]), int(jumps[0]) + 2))
+        if (row := backwards(came.time)) is not None:
+            self._disordered = came.of(slice(row - 1, row + 1))
+        if self._jump is not None and self._disordered is not None:
+            raise self._refuse(self._disordered, "times in order, in a recording with steps of more than a year")
+        left_out = came.of(~np.isin(came.numbers, ordered.numbers))
+        if len(left_out.numbers):
+            self._left_out.append(left_out.of(np.array([np.argmin(left_out.time), np.argmax(left_out.time)])))
+
+    def end(self) -> None:
+        """Check what was left out against all rows.
+
+        Raises:
+            RowsNotInBlocksError: something that is not outside of them.
+        """
+        if self._first is None or self.last is None:
+            return
+        first, last = self._first.time[0], self.last.time[0]
+        year = _year(self._first.time)
+        for rows in self._left_out:
+            for row in range(2):
+                if first - year <= rows.time[row] <= last + year:
+                    raise self._refuse(_append(self.last, rows.of(slice(row, row + 1))), "times in order")
+
+    def _refuse(self, rows: RowsAsColumns, expected: str) -> RowsNotInBlocksError:
+        """Return the error that names the second of two rows."""
+        where = f"{self._path}, row {rows.numbers[1]}, column {TIME!r}"
+        return RowsNotInBlocksError(str(fail(where, expected, backwards_text(rows.time, 1))))
+
+
+def _append(before: RowsAsColumns, after: RowsAsColumns) -> RowsAsColumns:
+    """Return the numbers and times of rows behind others."""
+    numbers, time = (np.concatenate([before[i], after[i]]) for i in range(2))
+    return RowsAsColumns(numbers, time, {}, {}, {})
+
+
+def _year(time: np.ndarray) -> np.timedelta64 | float:
+    """Return a year in the unit of times."""
+    return np.timedelta64(YEAR, "ns") if time.dtype.kind == "M" else YEAR / SECOND

@@ -1,0 +1,145 @@
+"""Recordings too long to be held: the rows of a file in blocks, each of which goes on where the one before it ended."""
+
+import warnings
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from heliograph.files.block_order import BlockOrder
+from heliograph.files.recording import Recording, RowReader
+from heliograph.files.rows import USUAL_BLOCK, BlockSize, Rows
+from heliograph.files.table import read_row_blocks
+from heliograph.files.text.text_file import Progress
+from heliograph.numerics.check import InputError, fail
+from heliograph.simulation.network import Network
+
+SHOWN = 3  # rows that were refused and are kept, with the reason
+
+
+class RecordingBlocks:
+    """Rows of a CSV or Parquet file, read in blocks: one after another they are the recording of the whole file.
+
+    Iterating reads them. A row that cannot be read is refused alone unless reading is strict; within a block rows are
+    put in the order of their times. Inputs and time steps go on from block to block, and so do the steps of rows that
+    did not arrive.
+
+    Args:
+        path: the file.
+        network: the network that the columns belong to.
+        strict: whether a row that cannot be read is an error, or is refused alone.
+        ignore_unknown: whether columns that the network does not know are left out.
+        block: how much is read at a time; each block but the last has so many rows.
+        progress: called with how much of the file is read, and of how much (default none).
+
+    Attributes:
+        refused: how many rows were refused so far.
+        reasons: why, of the first of them.
+        rows: how many rows were given out so far.
+        doubts: warnings that reading gave.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        network: Network,
+        strict: bool,
+        ignore_unknown: bool,
+        block: BlockSize = USUAL_BLOCK,
+        progress: Progress | None = None,
+    ):
+        self._path, self._strict, self._block, self._progress = path, strict, block, progress
+        self._reader = RowReader(network, str(path), strict, ignore_unknown)
+        self._last_number, self._done, self._total = 0, 0, 0
+        self.refused, self.reasons, self.rows, self.doubts = 0, list[InputError](), 0, list[str]()
+
+    @property
+    def notes(self) -> list[str]:
+        """Return lines on what was put in order."""
+        return self._reader.notes
+
+    @property
+    def expected_rows(self) -> int:
+        """Return how many rows the file has, as far as the part of it says that is read."""
+        return round(self._last_number * self._total / max(self._done, 1))
+
+    def __iter__(self) -> Iterator[Recording]:
+        """Yield the blocks.
+
+        Raises:
+            RowsNotInBlocksError: only all rows together say in which order they are, or of which kind their times.
+            ValueError: what `read_recording` refuses.
+        """
+        parts = read_row_blocks(self._path, self._reader.only, self._strict, self._block, self._note_progress)
+        for block in cut_recordings(self._arrange(parts), self._block.rows):
+            yield block
+            self.rows += len(block.time)
+        if not self.rows:
+            raise self.reasons[0] if self.reasons else fail(str(self._path), "at least one row", "none")
+
+    def _arrange(self, parts: Iterable[Rows]) -> Iterator[Recording]:
+        """Yield parts of a table as recordings, each behind the last row of the one before it."""
+        order = BlockOrder(self._path, self._reader.network)
+        for rows in parts:
+            self._last_number = int(rows.numbers[-1]) if len(rows.numbers) else self._last_number
+            if not len(rows.numbers):
+                self._note_refused(rows.refused)
+                continue
+            came = self._reader.read_cells(rows)
+            cells = self._reader.put_in_order(came)
+            self._note_refused(self._reader.refused)
+            self._reader.refused = []
+            if not len(cells.numbers):
+                continue
+            before = order.last
+            order.add(came, cells)
+            with warnings.catch_warnings(record=True) as doubts:
+                warnings.simplefilter("always", UserWarning)
+                recording = self._reader.make_recording(cells, before)
+            self.doubts += [str(doubt.message) for doubt in doubts]
+            yield recording
+        order.end()
+
+    def _note_progress(self, done: int, total: int) -> None:
+        """Keep how much of the file is read, and tell it."""
+        self._done, self._total = done, total
+        if self._progress is not None:
+            self._progress(done, total)
+
+    def _note_refused(self, errors: list[InputError]) -> None:
+        """Count rows that were refused, and keep the first reasons."""
+        self.refused += len(errors)
+        self.reasons += errors[: SHOWN - len(self.reasons)]
+
+
+def cut_recordings(parts: Iterable[Recording], rows: int) -> Iterator[Recording]:
+    """Yield a recording that comes in parts in blocks of so many rows, of which the last may have fewer."""
+    held, count = list[Recording](), 0
+    for part in parts:
+        held.append(part)
+        count += len(part.time)
+        if count < rows:
+            continue
+        joined = _join_recordings(held)
+        for begin in range(0, count - rows + 1, rows):
+            yield _select_rows(joined, slice(begin, begin + rows))
+        held, count = [_select_rows(joined, slice(count - count % rows, None))], count % rows
+    if count:
+        yield _join_recordings(held)
+
+
+def _join_recordings(parts: list[Recording]) -> Recording:
+    """Return the rows of several recordings, one after the other."""
+    if len(parts) == 1:
+        return parts[0]
+    measurements = {node: np.concatenate([part.measurements[node] for part in parts]) for node in parts[0].measurements}
+    inputs, time = (np.concatenate([part[i] for part in parts]) for i in (1, 2))
+    truth = None if parts[0].truth is None else np.concatenate([np.asarray(part.truth) for part in parts])
+    return Recording(measurements, inputs, time, truth)
+
+
+def _select_rows(recording: Recording, rows: slice) -> Recording:
+    """Return some rows of a recording."""
+    measurements = {node: values[rows] for node, values in recording.measurements.items()}
+    truth = None if recording.truth is None else recording.truth[rows]
+    return Recording(measurements, recording.inputs[rows], recording.time[rows], truth)
