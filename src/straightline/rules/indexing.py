@@ -1,9 +1,11 @@
 """Rule of gather at known places, or at places that data select."""
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from jax.extend.core import JaxprEqn
+from jax.lax import GatherDimensionNumbers
 
 from straightline.limits import FEW
 from straightline.lowering import RULES, Lowering, known_integers
@@ -45,16 +47,26 @@ def _gather_clipped(equation: JaxprEqn, lowering: Lowering, x: np.ndarray, indic
     known = known_integers(indices)
     if known is None:
         return _gather_by_cases(lowering, equation, x, indices)
-    # Places in the flat array: axes of the indices, then those of the window, moved to where the result has them.
-    params, numbers = equation.params, equation.params["dimension_numbers"]
-    batching = list(zip(numbers.operand_batching_dims, numbers.start_indices_batching_dims, strict=True))
-    removed = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
-    index_map = numbers.start_index_map
-    places = find_window_places(x.shape, params["slice_sizes"], known, index_map, batching, removed, clips=True)
-    first = known.ndim - 1
-    places = np.moveaxis(places, range(first, places.ndim), numbers.offset_dims)
+    sizes, numbers = tuple(equation.params["slice_sizes"]), equation.params["dimension_numbers"]
+    places = _find_gathered_places(x.shape, sizes, known.tobytes(), known.shape, numbers)
     gathered: np.ndarray = x.ravel()[places.ravel()].reshape(places.shape)
     return gathered
+
+
+@lru_cache(1000)
+def _find_gathered_places(
+    shape: tuple[int, ...], sizes: tuple[int, ...], indices: bytes, of: tuple[int, ...], numbers: GatherDimensionNumbers
+) -> np.ndarray:
+    """Return the places in the flat array that a gather takes at known indices: a filter has each a dozen times.
+
+    They have the axes of the indices, of shape `of`, then those of the window, moved to where the result has them.
+    """
+    known = np.frombuffer(indices, dtype=np.int64).reshape(of)
+    batching = list(zip(numbers.operand_batching_dims, numbers.start_indices_batching_dims, strict=True))
+    removed = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
+    places = find_window_places(shape, sizes, known, numbers.start_index_map, batching, removed, clips=True)
+    first = known.ndim - 1
+    return np.moveaxis(places, range(first, places.ndim), numbers.offset_dims)
 
 
 def _gather_by_cases(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices: np.ndarray) -> np.ndarray:
