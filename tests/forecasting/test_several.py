@@ -1,6 +1,7 @@
 """Forecasts of many sources side by side: bit by bit those of each alone, and for the cost of a prediction each."""
 
 import time
+from functools import partial
 
 import numpy as np
 import pytest
@@ -53,11 +54,9 @@ def test_inputs_are_those_of_all_or_of_each():
         same(one.of_source(i), hg.forecast(source, 4, inputs=rows[1]))
 
 
-@pytest.mark.parametrize(
-    "make", [hg.filters.imm_filter, pytest.param(hg.filters.particle_filter, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("make", [hg.filters.imm_filter, partial(hg.filters.particle_filter, particles=20)])
 def test_modes_and_particles_are_mixtures_side_by_side(make):
-    """Also where XLA computes (particles), whose sums have another order side by side."""
+    """Also where sums of many (particles) have another order side by side."""
     plant, sensor = hg.LinearPlant([[1.0]], 1.0, [0.0], 4.0), hg.LinearSensor([[1.0]], 0.1)
     filter = make(plant, sensor, hg.markov_fading([1.0, -1.0], [[0.95, 0.05], [0.05, 0.95]], noise=0.1))
     sources = [filter.run([[value]]) for value in (9.0, -2.0)]

@@ -58,10 +58,10 @@ def test_modes_of_motion_are_those_of_all_paths(drawn):
 
 def test_modes_are_summed_before_one_is_drawn():
     # At the first row every particle has the same past, and the weight of all modes, states and noises: none is drawn.
-    filter = hg.filters.particle_filter(MOTION, hg.LinearSensor([[1.0, 0.0]], 0.5), hg.perfect(), 50, drawn=[])
+    filter = hg.filters.particle_filter(MOTION, hg.LinearSensor([[1.0, 0.0]], 0.5), hg.perfect(), 12, drawn=[])
     run = filter.run(Z[:1])
     assert run.log_likelihood == pytest.approx(by_all_paths(Z[:1])[3], abs=1e-12)
-    assert run.effective_numbers[0] == pytest.approx(50)
+    assert run.effective_numbers[0] == pytest.approx(12)
 
 
 def test_nothing_drawn_of_one_law_is_the_kalman_filter():
@@ -160,7 +160,7 @@ def test_it_runs_in_a_network_with_a_sensor_that_gets_stuck():
 def test_a_row_that_no_particle_explains_is_not_used():
     plant = hg.Plant(lambda x, u: jnp.stack([x[0], x[1] + x[0]]), 0.1 * np.eye(2), [1.0, 0.0], 0.1 * np.eye(2))
     sensor = hg.Sensor(lambda x: jnp.sqrt(x[:1] - 50) + x[1:], 0.1)  # no number where the particles are
-    filter = hg.filters.particle_filter(plant, sensor, hg.perfect(), 20, drawn=["x0"])
+    filter = hg.filters.particle_filter(plant, sensor, hg.perfect(), 12, drawn=["x0"])
     state = filter.predict(filter.init())
     after, innovation = filter.correct(state, [1.0])
     np.testing.assert_array_equal(after.gaussian.mean, state.gaussian.mean)

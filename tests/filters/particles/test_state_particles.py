@@ -152,7 +152,7 @@ def test_an_angle_has_its_mean_direction():
 def test_a_row_that_no_particle_explains_is_not_used_and_named():
     plant = hg.Plant(lambda x, u: x, 0.1, [1.0], [[0.1]])
     sensor = hg.Sensor(lambda x: jnp.sqrt(x - 50), 0.1)  # no number where the particles are
-    filter = hg.filters.particle_filter(plant, sensor, hg.perfect(), 20, proposal="prior")
+    filter = hg.filters.particle_filter(plant, sensor, hg.perfect(), 12, proposal="prior")
     state = filter.predict(filter.init())
     after, innovation = filter.correct(state, [1.0])
     np.testing.assert_array_equal(after.position, state.position)
@@ -208,7 +208,7 @@ def test_a_heading_that_nothing_measures():
 
 def test_it_runs_in_a_network():
     plant, sensor = curved(0.1)
-    filters = {"particles": hg.filters.particle_filter(plant, sensor, hg.perfect(), 100)}
+    filters = {"particles": hg.filters.particle_filter(plant, sensor, hg.perfect(), 12)}
     network = hg.Network(plant, {"node": hg.Node(sensor, hg.perfect(), filters)})
     record = hg.monte_carlo(network, horizon=5, runs=4, key=0)
     assert np.isfinite(record.estimates["node"]["particles"].mean).all()
