@@ -64,7 +64,8 @@ def test_the_log_likelihood_is_that_of_statsmodels_by_the_formula(name):
 
 
 def exact(values):
-    return np.array([[Fraction(v).limit_denominator(1000) for v in row] for row in np.atleast_2d(values)], dtype=object)
+    """Return fractions near these numbers, of one denominator, so that those computed of them stay short."""
+    return np.array([[Fraction(round(v * 1024), 1024) for v in row] for row in np.atleast_2d(values)], dtype=object)
 
 
 def solve(a, b):
