@@ -25,9 +25,12 @@ IN_A_HURRY = (
 
 jaxtyping.jaxtyped = where_shaped  # what the import hook decorates the checked packages with
 
-MOST, GROWTH = 1.6e9, 0.2e9  # bytes of a process before it lets go after a file, and since it last did
+# Bytes of this machine; 0 where the system does not say.
+MEMORY = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else 0
+# Bytes of a process before it lets go after a file, which takes a second, and since it last did.
+MOST, GROWTH = min(max(MEMORY / 8, 1.6e9), 3e9), 0.2e9
 PROGRAMS = 300  # in one context of the compiler
-WITHIN = 1.8e9  # before it lets go between two tests of a file, which share programs
+WITHIN = MOST + GROWTH  # before it lets go between two tests of a file, which share programs
 
 
 def pytest_configure(config):
@@ -151,7 +154,7 @@ def memory_left():
 
 @pytest.fixture(autouse=True, scope="module")
 def bounded_memory(memory_left):
-    """Compiled programs are let go of when they, and what the compiler left, are most of 1.6 GB: it takes time."""
+    """Compiled programs are let go of when they, and what the compiler left, are much: it takes time."""
     yield
     bound_memory(memory_left, MOST)
 
