@@ -15,7 +15,7 @@ A sensor that is read every tenth row makes a cycle too.
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Collection, Container, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import partial, reduce
 from typing import Any, NamedTuple
 
@@ -69,14 +69,15 @@ def _find_recurring(loop: Loop, needed: Collection[Any]) -> Recurring | None:
     rows = _find_of_rows(loop, nodes)
     tests = {n for n in rows if n.type == "bool" and all(a.type != "bool" for a in n.args)}
     carried = [k for k, parameter in enumerate(loop.parameters) if parameter in needed]
+    operations = [(n, _list_inner(n.args, body)) for n in nodes if n.op not in REFERRING and n not in tests]
     while True:
-        known = tests | {loop.parameters[k] for k in carried}
-        found = dict[Node, None]()
-        for n in nodes:
-            if n.op not in REFERRING and n not in tests and all(_is_known(a, body, known, found) for a in n.args):
+        known, found = tests | {loop.parameters[k] for k in carried}, dict[Node, None]()
+        for n, arguments in operations:
+            if known.issuperset(arguments):
+                known.add(n)
                 found[n] = None
         # A carried number whose next value is none of these is none itself: once more without it.
-        closed = [k for k in carried if _is_known(loop.following[k], body, known, found)]
+        closed = [k for k in carried if known.issuperset(_list_inner([loop.following[k]], body))]
         if closed == carried:
             break
         carried = closed
@@ -90,19 +91,20 @@ def _find_recurring(loop: Loop, needed: Collection[Any]) -> Recurring | None:
     return Recurring({n: None for n in found if n not in sources}, carried, own, sources)
 
 
-def _is_known(node: Node, body: Block, *sets: Container[Any]) -> bool:
-    """Test whether a number is one of these, or is computed before the loop."""
-    return node.block is not body or any(node in known for known in sets)
+def _list_inner(nodes: Sequence[Node], body: Block) -> list[Node]:
+    """Return those of the numbers that are computed in a loop's body: all others are there before it."""
+    return [n for n in nodes if n.block is body]
 
 
 def _find_of_rows(loop: Loop, nodes: Sequence[Node]) -> dict[Node, None]:
     """Return which numbers of a body follow from memory that is filled before the loop and from the turn's number."""
-    results = dict[Node, None]()
+    results, known = dict[Node, None](), {loop.counter}
     for n in nodes:
         buffer = n.value[0].owner[0] if n.op == "load" else None
         filled = buffer is None or (buffer.kind != "carried" and n.value[0].block is not loop.body)
         plain = n.op == "load" or n.op not in REFERRING
-        if plain and filled and all(_is_known(a, loop.body, results, [loop.counter]) for a in n.args):
+        if plain and filled and known.issuperset(_list_inner(n.args, loop.body)):
+            known.add(n)
             results[n] = None
     return results
 

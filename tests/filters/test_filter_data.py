@@ -1,5 +1,6 @@
 """A filter over rows of data: its estimates and innovations against its steps, one by one."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -29,6 +30,47 @@ def test_it_is_the_steps_of_the_filter(item):
     np.testing.assert_allclose(by_rows.log_likelihood, hg.log_likelihood(item, Z, U), rtol=1e-12)
     assert np.isnan(by_rows.innovations).tolist() == np.isnan(Z).tolist()
     assert by_rows.claim == item.claim == "exact"
+
+
+class Traced(hg.filters.AbstractFilter):
+    """A filter around another, which notes each time that its correction is traced."""
+
+    base: hg.filters.AbstractFilter
+    noted: list = eqx.field(static=True)
+    claim: str = eqx.field(static=True, default="exact")
+    states: tuple = eqx.field(static=True, default=PLANT.states)
+    inputs: tuple = eqx.field(static=True, default=PLANT.inputs)
+    received: int = eqx.field(static=True, default=2)
+
+    def init(self):
+        return self.base.init()
+
+    @hg.filters.predicts
+    def predict(self, state, u=(), k=0):
+        return self.base.predict(state, u, k)
+
+    @hg.filters.corrects
+    def correct(self, state, z, k=0):
+        self.noted.append(k)
+        return self.base.correct(state, z, k)
+
+    def estimate(self, state):
+        return self.base.estimate(state)
+
+
+class Notes(list):
+    """Notes that a filter may hold as a part that is no array: known by what they are, not by what stands in them."""
+
+    __hash__, __eq__ = object.__hash__, object.__eq__
+
+
+def test_a_step_is_traced_once_for_recordings_of_any_length_and_alone():
+    item = Traced(hg.linear_filter(PLANT, SENSOR, RELAY), Notes())
+    item.run(Z, U)
+    item.run(Z[:5], U[:5])
+    state, _ = item.step(item.init(), Z[0], U[0])
+    assert len(item.noted) == 1
+    np.testing.assert_allclose(item.estimate(state).mean, item.run(Z, U).means[0], rtol=1e-13)  # another program
 
 
 def test_native_code_computes_it(monkeypatch):

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from heliograph.numerics import cholesky, psd_solve
+from heliograph.numerics import cholesky, diagonal, psd_solve
 
 WRITTEN = 24  # rows up to which a matrix is written out
 FACTOR = jax.jit(cholesky)
@@ -60,3 +60,10 @@ def test_a_component_known_exactly_leaves_the_derivatives_of_the_others(n):
     expected[:-1, :-1] = np.linalg.cholesky(2.0 * b) / 4
     for slope in slopes:
         np.testing.assert_allclose(slope, expected, atol=1e-13)
+
+
+@pytest.mark.parametrize("n", [0, 1, 3])
+def test_the_diagonal_is_that_of_numpy(n):
+    a = np.arange(float(n * n)).reshape(n, n)
+    with jax.enable_x64(True):
+        assert diagonal(a).tolist() == np.diagonal(a).tolist()

@@ -17,6 +17,7 @@ from heliograph.numerics import float64
 from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.process.garbage_collector import pause_collector
 from heliograph.numerics.process.interpreter_stack import reserve_stack
+from heliograph.numerics.trace_settings import trace_settings
 from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import PyTree
 from straightline import Unsupported, compile
@@ -135,13 +136,18 @@ def compile_on_call(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a function that is called now and then, once per structure and shapes of its arguments.
 
     Native code computes it if it is short, else XLA as by `float64.compiled`; both in double precision, from numbers
-    and to NumPy arrays. Inside a trace it is the plain function.
+    and to NumPy arrays. Inside a trace it is the plain function; of arguments that are all traced it is traced once for
+    equal structures and shapes, so that a step alone and one in a loop over rows, however many, share a trace.
     """
     by_xla = float64.compile_in_float64(function)
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         """Compute the function by native code or XLA."""
+        leaves, structure = jax.tree.flatten(args)
+        if leaves and not kwargs and all(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+            traced: R = _trace_once(function, structure, trace_settings())(*args, **kwargs)
+            return traced
         if kwargs or is_traced(*args):
             return by_xla(*args, **kwargs)
         float64.refuse_forked_process()
@@ -149,6 +155,21 @@ def compile_on_call(function: Callable[P, R]) -> Callable[P, R]:
         return returned
 
     return call
+
+
+@lru_cache(COMPILED)
+def _trace_once(function: Callable[P, R], structure: Any, settings: object) -> Callable[P, R]:
+    """Return the function as JAX inlines it into a trace, from its own trace for the same shapes.
+
+    One for each structure of its arguments, so that a trace is forgotten with it: JAX keeps that as long as the
+    function. And one for all settings that what is traced depends on.
+    """
+
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        return function(*args, **kwargs)
+
+    program: Callable[P, R] = jax.jit(call, inline=True)
+    return program
 
 
 def read_setting() -> str:

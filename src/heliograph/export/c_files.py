@@ -15,12 +15,11 @@ from heliograph.disk.whole_file import check_writable, whole_files
 from heliograph.export.program import RESERVED, Real, write_step_program
 from heliograph.export.text import CText, TextOptions, write_c_text
 from heliograph.export.window import check_window
-from heliograph.factors.columns import use_precision
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.scheduled import ScheduledFilter
 from heliograph.model.over_time import first
 from heliograph.numerics.check import InputError, fail, instance, show_value
-from heliograph.numerics.short_programs import write_short_programs
+from heliograph.numerics.trace_settings import use_precision, write_short_programs
 from heliograph.simulation.centres.named_filter import find_filter_by_name
 from heliograph.simulation.network import Network
 

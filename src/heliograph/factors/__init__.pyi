@@ -16,7 +16,6 @@ from .columns import square_root as square_root
 from .columns import triangularise as triangularise
 from .columns import unit_lower as unit_lower
 from .columns import unit_of as unit_of
-from .columns import use_precision as use_precision
 from .columns import zero_covariance as zero_covariance
 from .diffuse import Diffuse as Diffuse
 from .diffuse import as_gaussian as as_gaussian

@@ -9,9 +9,6 @@ A known zero of a matrix stays a known zero through a matrix product, not throug
 NaN: so products of rows and columns are written as matrix products here.
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from contextvars import ContextVar
 from typing import Any, NamedTuple
 
 import jax
@@ -20,7 +17,8 @@ import numpy as np
 from jax import lax
 
 from heliograph.numerics.caching import cache_arrays
-from heliograph.numerics.linalg import WRITTEN, outer, scale, symmetric
+from heliograph.numerics.linalg import WRITTEN, diagonal, outer, scale, symmetric
+from heliograph.numerics.trace_settings import precision_in_use
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array
 from straightline import operation
@@ -112,17 +110,20 @@ def is_positive(x: jax.Array) -> jax.Array:
     return x > float(np.finfo(np.dtype(x.dtype)).tiny)
 
 
+@jax.jit
 def reciprocal_or_one(x: jax.Array) -> jax.Array:
     """Return 1 / x of a positive number, and 1 of 0: for a factor of what is 0 then."""
     return 1 / jnp.where(is_positive(x), x, 1.0)
 
 
+@jax.jit
 def reciprocal_or_zero(x: jax.Array) -> jax.Array:
     """Return 1 / x of a positive number, and 0 of 0."""
     positive = is_positive(x)
     return jnp.where(positive, 1 / jnp.where(positive, x, 1.0), 0.0)
 
 
+@jax.jit
 def square_root(x: jax.Array) -> jax.Array:
     """Return the root of x, with the derivative 0 at 0: times the infinite one a derivative of 0 would be NaN."""
     positive = x > 0
@@ -197,7 +198,7 @@ def eliminate(covariance: jax.Array, least: float = 0.0) -> WeightedColumns:
     A pivot is known to eps of its own variance, of which rounding may leave less than nothing, as it may of a variance
     of zero: it is at least `least` times the variance's size.
     """
-    pivots = least * jnp.abs(jnp.diagonal(covariance))
+    pivots = least * jnp.abs(diagonal(covariance))
     return (_eliminate_by_loop if len(covariance) > WRITTEN else _eliminate_column_by_column)(covariance, pivots)
 
 
@@ -309,25 +310,9 @@ def noise_beside_repeated(sizes: Array) -> Array:
     return unit_of(sizes) * sizes**2
 
 
-_precision: ContextVar[type[np.floating[Any]]] = ContextVar("precision", default=np.float64)
-
-
-@contextmanager
-def use_precision(precision: type[np.floating[Any]]) -> Iterator[None]:
-    """Take numbers to be rounded to another precision than the arrays' own within the block.
-
-    C in single precision is written from functions that are traced in double precision.
-    """
-    token = _precision.set(precision)
-    try:
-        yield
-    finally:
-        _precision.reset(token)
-
-
 def unit_of(numbers: Array) -> float:
     """Return eps of the precision in which these numbers are computed."""
-    return max(float(np.finfo(np.dtype(numbers.dtype)).eps), float(np.finfo(_precision.get()).eps))
+    return max(float(np.finfo(np.dtype(numbers.dtype)).eps), float(np.finfo(precision_in_use()).eps))
 
 
 def _bound_below(pivot: jax.Array, floor: jax.Array) -> jax.Array:

@@ -41,7 +41,7 @@ from heliograph.factors.scalar_update import (
 )
 from heliograph.numerics.gaussian_density import LOG_TURN
 from heliograph.numerics.linalg import OFF_SUPPORT, OFF_VALUE, PIVOT_TOLERANCE, rounding, symmetric
-from heliograph.numerics.short_programs import writes_short_programs
+from heliograph.numerics.trace_settings import writes_short_programs
 from heliograph.numerics.traced import is_traced, library
 from heliograph.numerics.types import Array, Float
 

@@ -10,7 +10,7 @@ from jax import lax
 from heliograph.factors.columns import is_positive, reciprocal_or_one
 from heliograph.factors.repeated import noise_beside_rounding, rounding_of_products
 from heliograph.numerics.linalg import WRITTEN
-from heliograph.numerics.short_programs import writes_short_programs
+from heliograph.numerics.trace_settings import writes_short_programs
 
 
 def measure_scalar(

@@ -81,6 +81,7 @@ from .linalg import PIVOT_TOLERANCE as PIVOT_TOLERANCE
 from .linalg import WRITTEN as WRITTEN
 from .linalg import cholesky as cholesky
 from .linalg import contract as contract
+from .linalg import diagonal as diagonal
 from .linalg import factor as factor
 from .linalg import find_not_finite as find_not_finite
 from .linalg import outer as outer
@@ -121,9 +122,6 @@ from .rotation import matrix_of as matrix_of
 from .rotation import quaternion_of as quaternion_of
 from .rotation import rotation_vector_of as rotation_vector_of
 from .rotation import turn as turn
-from .short_programs import evaluate_at_points as evaluate_at_points
-from .short_programs import write_short_programs as write_short_programs
-from .short_programs import writes_short_programs as writes_short_programs
 from .times.data_rows import check_rows as check_rows
 from .times.dates import MISSING as MISSING
 from .times.dates import UNITS as UNITS
@@ -143,6 +141,11 @@ from .times.row_times import backwards as backwards
 from .times.row_times import backwards_text as backwards_text
 from .times.row_times import check_times as check_times
 from .times.row_times import row_dates as row_dates
+from .trace_settings import evaluate_at_points as evaluate_at_points
+from .trace_settings import precision_in_use as precision_in_use
+from .trace_settings import use_precision as use_precision
+from .trace_settings import write_short_programs as write_short_programs
+from .trace_settings import writes_short_programs as writes_short_programs
 from .traced import DOUBLE as DOUBLE
 from .traced import EQUAL as EQUAL
 from .traced import as_real as as_real

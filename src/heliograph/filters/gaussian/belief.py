@@ -38,6 +38,7 @@ from heliograph.model.unknown_start import UnknownStart
 from heliograph.numerics.angle import Angles, wrap_angles
 from heliograph.numerics.check import array, covariance
 from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.linalg import diagonal
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.noise import AbstractNoise
 
@@ -102,16 +103,16 @@ def second_moments_at_start(plant: AnyPlant, start: HasStart | None = None) -> F
     mean = jnp.asarray(start.initial_mean)
     spread = start.initial_covariance
     known = spread.known if isinstance(spread, UnknownStart) else spread
-    size = mean * mean + jnp.diagonal(jnp.asarray(known))
+    size = mean * mean + diagonal(known)
     if isinstance(first_step.noise, AbstractNoise):
-        size = size + jnp.diagonal(jnp.asarray(first_step.noise.covariance))
+        size = size + diagonal(first_step.noise.covariance)
     return jnp.asarray(size)
 
 
 def process_noise(plant: AbstractPlant, u: jax.Array, start: jax.Array) -> WeightedColumns:
     """Return factors of Cov w plus the rounding of a state that had the second moments `start`, (n,)."""
     w = plant.noise.columns if isinstance(plant.noise, AbstractNoise) else columns_of(plant.noise_covariance(u))
-    return triangularise(join_columns(w, rounding_of(start + jnp.diagonal(plant.noise_covariance(u)))))
+    return triangularise(join_columns(w, rounding_of(start + diagonal(plant.noise_covariance(u)))))
 
 
 def image_of(plant: AbstractPlant, transform: AbstractTransform, x: Gaussian, u: jax.Array) -> Image:

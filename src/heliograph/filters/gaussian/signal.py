@@ -24,7 +24,7 @@ from heliograph.model.estimate import Innovation
 from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor, LinearSensor
 from heliograph.numerics.angle import Angles, continue_angles, wrap_near
-from heliograph.numerics.linalg import contract
+from heliograph.numerics.linalg import contract, diagonal
 from heliograph.numerics.types import Array
 from heliograph.random_affine.moments.second_moments import SecondOrder
 
@@ -93,7 +93,7 @@ def signal_of(
         image = transform.image(plant.manifold.chart(measure, prior.mean), prior)
     mean, noise = image.mean + law.mean, join_columns(law.columns if noise is None else noise, image.curvature)
     second = join_columns(image.explained, noise).covariance + jnp.outer(mean, mean)
-    size = signal_size_at_start(sensor, start) if isinstance(sensor, LinearSensor) else jnp.diagonal(second)
+    size = signal_size_at_start(sensor, start) if isinstance(sensor, LinearSensor) else diagonal(second)
     return Signal(prior, mean, image.slopes, noise, second, size)
 
 
@@ -105,8 +105,8 @@ def signal_size_at_start(sensor: LinearSensor, start: jax.Array) -> jax.Array:
     """
     law = sensor.noise
     reach = jnp.abs(jnp.asarray(sensor.matrix)) @ square_root(start) + jnp.abs(jnp.asarray(law.mean))
-    variances: jax.Array = jnp.diagonal(jnp.asarray(law.covariance))
-    return reach**2 + variances
+    size: jax.Array = reach**2 + diagonal(law.covariance)
+    return size
 
 
 def make_received_noise(signal: Signal, channel: SecondOrder) -> WeightedColumns:

@@ -13,7 +13,7 @@ from heliograph.factors.columns import WeightedColumns, decorrelate, eliminate, 
 from heliograph.factors.gaussian import Gaussian, Image, from_covariance, image_by_slopes
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.module import Module, readable, unwritten
-from heliograph.numerics.short_programs import evaluate_at_points
+from heliograph.numerics.trace_settings import evaluate_at_points
 from heliograph.numerics.types import Array
 
 POINT_LIMIT = 20_000  # points of a tensor rule: more is refused with the number

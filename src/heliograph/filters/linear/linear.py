@@ -40,7 +40,7 @@ from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.model.words.encoder import Words
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.linalg import symmetric
+from heliograph.numerics.linalg import diagonal, symmetric
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.base import check_maps
 from heliograph.random_affine.memory import is_modal
@@ -150,7 +150,7 @@ def signal_before_data(state: LinearBelief, sensor: LinearSensor, start: jax.Arr
     """
     matrix, law = jnp.asarray(sensor.matrix), sensor.noise
     mean, explained = matrix @ state.state_mean + law.mean, matrix @ state.state_covariance @ matrix.T
-    noise = law.given_signal(mean, jnp.diagonal(explained))
+    noise = law.given_signal(mean, diagonal(explained))
     second = explained + noise.covariance + jnp.outer(mean, mean)
     slopes = matrix @ state.gaussian.root
     return Signal(state.gaussian, mean, slopes, noise.columns, symmetric(second), signal_size_at_start(sensor, start))

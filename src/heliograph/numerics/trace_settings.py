@@ -1,0 +1,59 @@
+"""Settings of what is traced: programs that are to be short rather than fast, and the precision numbers are rounded to.
+
+A trace that is kept holds for the settings it was made under (`trace_settings`).
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Any
+
+import jax
+import numpy as np
+
+_short: ContextVar[bool] = ContextVar("short", default=False)
+_precision: ContextVar[type[np.floating[Any]]] = ContextVar("precision", default=np.float64)
+
+
+def trace_settings() -> tuple[object, ...]:
+    """Return all settings now, as part of the key of a trace that is kept."""
+    return _short.get(), _precision.get()
+
+
+@contextmanager
+def write_short_programs(short: bool = True) -> Iterator[None]:
+    """Write what is traced within as short programs, if `short`: what is the same for many points once, in a loop."""
+    token = _short.set(short)
+    try:
+        yield
+    finally:
+        _short.reset(token)
+
+
+def evaluate_at_points(function: Callable[[jax.Array], jax.Array], points: jax.Array) -> jax.Array:
+    """Return f of each point (points, n), as rows (points, p): side by side, or one after another in a loop."""
+    values: jax.Array = jax.lax.map(function, points) if _short.get() else jax.vmap(function)(points)
+    return values
+
+
+def writes_short_programs() -> bool:
+    """Return whether what is traced is written as short programs."""
+    return _short.get()
+
+
+@contextmanager
+def use_precision(precision: type[np.floating[Any]]) -> Iterator[None]:
+    """Take numbers to be rounded to another precision than the arrays' own within the block.
+
+    C in single precision is written from functions that are traced in double precision.
+    """
+    token = _precision.set(precision)
+    try:
+        yield
+    finally:
+        _precision.reset(token)
+
+
+def precision_in_use() -> type[np.floating[Any]]:
+    """Return the precision that numbers are rounded to, unless that of their arrays is less."""
+    return _precision.get()
