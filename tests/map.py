@@ -47,6 +47,10 @@ BORDERS = [
     "learning/likelihood",
     "live/stored",
     "filters/event",
+    "filters/modes",
+    "filters/particles",
+    "filters/words",
+    "filters/wrappers",
     "fusion/mesh",
     "simulation/centres",
     "planning/paths",
@@ -67,15 +71,39 @@ def parsed(path: Path) -> ast.Module:
 
 
 @cache
+def names_taken_by(path: Path) -> list[tuple[str, str]]:
+    """What a file imports, module and name; also where it asks a folder for a name, which is loaded only then.
+
+    The latter is `import heliograph.filters.modes as modes`, and somewhere `modes.modal_filter`.
+    """
+    nodes = list(ast.walk(parsed(path)))
+    imports = [node for node in nodes if isinstance(node, ast.ImportFrom) and node.module]
+    asked = {
+        alias.asname: alias.name
+        for node in nodes
+        if isinstance(node, ast.Import)
+        for alias in node.names
+        if alias.asname and alias.name.startswith("heliograph.")
+    }
+    attributes = [node for node in nodes if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name)]
+    named = {(asked[node.value.id], node.attr) for node in attributes if node.value.id in asked}
+    return [(node.module, alias.name) for node in imports for alias in node.names] + [
+        (home_of(folder, name), name) for folder, name in sorted(named)
+    ]
+
+
+def home_of(folder: str, name: str) -> str:
+    """The module of a folder, written with dots, that defines a name."""
+    for path in (SOURCE.parent / folder.replace(".", "/")).glob("*.py"):
+        if any(getattr(node, "name", None) == name for node in parsed(path).body):
+            return f"{folder}.{path.stem}"
+    raise ValueError(f"{folder}: expected a function or class {name}")
+
+
+@cache
 def imported_names() -> list[tuple[Path, str, str]]:
     """Every import of the library: the file, the module and the name."""
-    return [
-        (path, node.module, alias.name)
-        for path in SOURCE.rglob("*.py")
-        for node in ast.walk(parsed(path))
-        if isinstance(node, ast.ImportFrom) and node.module
-        for alias in node.names
-    ]
+    return [(path, module, name) for path in SOURCE.rglob("*.py") for module, name in names_taken_by(path)]
 
 
 @cache

@@ -5,7 +5,6 @@ import inspect
 import re
 import textwrap
 from collections import Counter
-from functools import cache
 from graphlib import TopologicalSorter
 from importlib import import_module
 from pathlib import Path
@@ -13,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import heliograph
-from tests.map import BORDERS, parsed
+from tests.map import BORDERS, names_taken_by, parsed
 
 SOURCE = Path(heliograph.__file__).parent
 PACKAGES = SOURCE, SOURCE.parent / "straightline", SOURCE.parents[1] / "studies"
@@ -77,21 +76,9 @@ def rank(module: str) -> int | None:
     return None
 
 
-@cache
-def statements(path: Path) -> list[ast.ImportFrom]:
-    return [node for node in ast.walk(parsed(path)) if isinstance(node, ast.ImportFrom)]
-
-
 def imports(path: Path) -> set[str]:
-    result = set()
-    for node in statements(path):
-        if node.module and node.module.startswith("heliograph."):
-            module = node.module.removeprefix("heliograph.")
-            result |= {
-                f"{module}.{alias.name}" if rank(f"{module}.{alias.name}") is not None else module
-                for alias in node.names
-            }
-    return result
+    taken = [(m.removeprefix("heliograph."), name) for m, name in names_taken_by(path) if m.startswith("heliograph.")]
+    return {f"{module}.{name}" if rank(f"{module}.{name}") is not None else module for module, name in taken}
 
 
 FILES = [p for p in SOURCE.rglob("*.py") if p != SOURCE / "__init__.py"]
@@ -108,7 +95,7 @@ def test_imports_flow_with_the_data(path):
 def import_graph() -> dict[str, set[str]]:
     """Return the modules that each module of the library imports, for type checkers and inside functions too."""
     named = {".".join(path.relative_to(SOURCE.parent).with_suffix("").parts): path for path in FILES}
-    return {name: {node.module for node in statements(path)} & set(named) for name, path in named.items()}
+    return {name: {module for module, _ in names_taken_by(path)} & set(named) for name, path in named.items()}
 
 
 def test_imports_never_go_round():

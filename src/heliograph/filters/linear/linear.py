@@ -10,6 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+import heliograph.filters.modes as modes
+import heliograph.filters.words as words
+import heliograph.filters.wrappers as wrappers
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.gaussian.belief import second_moments_at_start
 from heliograph.filters.gaussian.gaussian import correct_signal, describe_channel_moments
@@ -19,13 +22,7 @@ from heliograph.filters.linear.belief import LinearBelief, motion_of_plant, pred
 from heliograph.filters.linear.given_record import LinearFilterOfRecord
 from heliograph.filters.linear.likelihood_scores import ScoreRecursion
 from heliograph.filters.linear.plan import plan_filter
-from heliograph.filters.modes.additive import additive_modal_filter, independent_terms
-from heliograph.filters.modes.modal import modal_filter
-from heliograph.filters.modes.side_information import side_information_filter
-from heliograph.filters.modes.uncertain_chain import uncertain_modal_filter
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
-from heliograph.filters.words.linear import build_behind_words
-from heliograph.filters.wrappers.delay import build_behind_delays, deliver_line_as_current
 from heliograph.filters.wrappers.reported_law import accept_told_numbers
 from heliograph.filters.wrappers.sensor_inputs import accept_sensor_inputs
 from heliograph.filters.wrappers.state_limits import accept_limits
@@ -210,10 +207,10 @@ def linear_filter(
     Source: De Koning (1984), for multiplicative noise; Costa (1994), for modes.
     """
     if encoder is not None:
-        return build_behind_words(plant, sensor, channel, encoder, partial(linear_filter, update=update))
+        return words.build_behind_words(plant, sensor, channel, encoder, partial(linear_filter, update=update))
     # Delays: the same filter for the system enlarged by past signals.
     if check_maps("channel", [first(channel)])[0].past:
-        return build_behind_delays(plant, sensor, channel, partial(linear_filter, update=update))
+        return wrappers.build_behind_delays(plant, sensor, channel, partial(linear_filter, update=update))
     for moves, senses in product(models_of(first(plant)), models_of(first(sensor))):
         check_linear("linear filter", moves, senses)
         check_link(senses, first(channel), len(moves.states))
@@ -249,11 +246,15 @@ def _make_filter_behind_memory(plant: AnyPlant, sensor: AnySensor, channel: Chan
     if is_modal(first(plant)) or is_modal(first(sensor)):
         return _make_jump_system_filter(plant, sensor, channel)
     if first(channel).erases:
-        return side_information_filter(plant, sensor, channel)
+        return modes.side_information_filter(plant, sensor, channel)
     if uncertain_chain(channel):
-        return uncertain_modal_filter(plant, sensor, channel)
-    terms = independent_terms(channel)
-    return additive_modal_filter(plant, sensor, terms) if len(terms) > 1 else modal_filter(plant, sensor, channel)
+        return modes.uncertain_modal_filter(plant, sensor, channel)
+    terms = modes.independent_terms(channel)
+    return (
+        modes.additive_modal_filter(plant, sensor, terms)
+        if len(terms) > 1
+        else modes.modal_filter(plant, sensor, channel)
+    )
 
 
 def _make_jump_system_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> AbstractFilter:
@@ -264,7 +265,7 @@ def _make_jump_system_filter(plant: AnyPlant, sensor: AnySensor, channel: Channe
     if uncertain_chain(channel):
         expected = "known transitions where plant or sensor has modes"
         raise fail("channel of a linear filter", expected, "a radius of uncertainty")
-    return modal_filter(plant, sensor, channel)
+    return modes.modal_filter(plant, sensor, channel)
 
 
 @believes
@@ -300,7 +301,7 @@ def memoryless_filter(
 
     # Delays: the same filter for the system enlarged by past signals.
     is_late = check_maps("channel", [first(forgets)])[0].past
-    return build_behind_delays(plant, sensor, forgets, make) if is_late else make(plant, sensor, forgets)
+    return wrappers.build_behind_delays(plant, sensor, forgets, make) if is_late else make(plant, sensor, forgets)
 
 
 def as_current_filter(
@@ -323,7 +324,7 @@ def as_current_filter(
     Source: the usual mistake; De Koning (1984), with y_k in place of y_{k-d}.
     """
     check_linear("filter that takes delayed signals as current", plant, sensor)
-    ignoring = linear_filter(plant, sensor, without_memory(deliver_line_as_current(channel)), update)
+    ignoring = linear_filter(plant, sensor, without_memory(wrappers.deliver_line_as_current(channel)), update)
     assert isinstance(ignoring, LinearFilter)  # a channel without delay or memory has no other
     return _claim_nominal(ignoring) if first(channel).past or memory_matters(channel) else ignoring
 

@@ -1,1 +1,5 @@
 """Filters of words of finite length."""
+
+from heliograph.numerics.names import lazy_names
+
+__getattr__, __dir__, __all__ = lazy_names(__name__, __file__)

@@ -18,6 +18,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+import heliograph.filters.particles as particles
 from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.base import (
     AbstractFilter,
@@ -29,7 +30,6 @@ from heliograph.filters.base import (
     make_sizes,
     predicts,
 )
-from heliograph.filters.particles.state_particles import StateParticles
 from heliograph.filters.remark import Remark
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, gaussian_of, with_gaussian
 from heliograph.filters.truncation import PlacedLimits, hold_mean_within_limits, truncate_to_limits
@@ -152,7 +152,7 @@ class LimitedFilter(AbstractSizedFilter):
         if hasattr(state, "believed"):  # of a gate that may give in to its rival
             log_mass, inner = self._condition_with_mass(state.believed)
             return log_mass, state._replace(believed=inner)
-        if isinstance(state, StateParticles):
+        if isinstance(state, particles.StateParticles):
             return self._condition_particles(state)
         held = self._hold(state)
         x = Gaussian(*map(jnp.asarray, gaussian_of(held)))
@@ -170,7 +170,7 @@ class LimitedFilter(AbstractSizedFilter):
         log_mass = jnp.where(is_possible, jnp.log(jnp.where(is_possible, mass, 1.0)), -jnp.inf)
         return log_mass, held._replace(gaussian=inside, weight=weight)
 
-    def _condition_particles(self, state: StateParticles) -> tuple[jax.Array, StateParticles]:
+    def _condition_particles(self, state: "particles.StateParticles") -> tuple[jax.Array, "particles.StateParticles"]:
         """Leave out the particles that are not within; mirror all at the limits that they are beyond if hardly any is.
 
         Up to n particles of n states have no covariance: those beyond a limit stand then for states as far within it.
@@ -194,7 +194,7 @@ class LimitedFilter(AbstractSizedFilter):
 
 def _is_particles(state: PyTree) -> bool:
     """Return whether a filter's state, or that of the filter within one of sensor inputs, is of particles."""
-    return isinstance(getattr(state, "base", state), StateParticles)
+    return isinstance(getattr(state, "base", state), particles.StateParticles)
 
 
 def without_limits(plant: AnyPlant) -> AnyPlant:
