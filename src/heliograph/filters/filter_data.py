@@ -152,7 +152,7 @@ def run_over_data(filter: SteppedFilter, z: ArrayLike, u: ArrayLike | None, afte
     before = None if after is None else _find_origin(filter, after)
     begin = 0 if before is None else int(before.step)
     rows_z, rows_u = check_data(filter, z, u, begin)
-    dates = common_dates(_tables(z, u))
+    dates = common_dates(_name_tables(z, u))
     dates = None if dates is None or not len(dates) else dates  # a table without rows says no time
     if before is not None and dates is not None:
         _check_later(before, dates)
@@ -257,7 +257,7 @@ def check_data(
     Dates by which the rows of a table are known are judged: in order, the same in both, of equal steps or with dt.
     `begin` rows were before them.
     """
-    judge_dates(filter.inputs, _tables(measurements, inputs))
+    judge_dates(filter.inputs, _name_tables(measurements, inputs))
     z = check_rows("measurements", measurements, None, filter.received or None, missing=True)
     z = z if filter.received else z[:, :0]
     given = np.zeros((len(z), 0)) if inputs is None and not filter.inputs else inputs
@@ -268,6 +268,6 @@ def check_data(
     return z, u
 
 
-def _tables(measurements: object, inputs: object) -> dict[str, object]:
+def _name_tables(measurements: object, inputs: object) -> dict[str, object]:
     """Return the tables of a call by the names that errors use."""
     return {"measurements": measurements, "inputs": inputs}

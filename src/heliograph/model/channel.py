@@ -39,6 +39,7 @@ from heliograph.random_affine.superposed import Superposed
 Channel = TypeAliasType("Channel", AbstractRandomAffine | OverTime)  # an OverTime holds one channel per step
 
 
+# A hop by itself; one with a delay; and one whose receiver is told the gain, which stands below z in a stack.
 @overload
 def hop(
     gain: LawLike,

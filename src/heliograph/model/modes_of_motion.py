@@ -372,6 +372,7 @@ def _read_chain(
     Raises:
         ValueError: both or neither of `transition` and `modes`, another number of modes, uncertain transitions.
     """
+    # One of both: a transition, or another model whose only memory is a chain.
     if (transition is None) == (modes is None):
         raise fail("chain of the modes", "transition=, or modes= of a model that has them",
                    "none" if modes is None else "both")  # fmt: skip
@@ -380,6 +381,7 @@ def _read_chain(
         if len(held) != 1 or not isinstance(held[0], MarkovChain):
             raise fail("modes", "a plant, sensor or link that has one chain", show_value(modes))
         transition = held[0]
+    # A chain as it is, or one made of probabilities.
     if isinstance(transition, MarkovChain):
         if initial is not None or name is not None:
             raise fail("initial and name", "none beside a chain, which has its own", "one")

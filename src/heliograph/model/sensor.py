@@ -150,7 +150,7 @@ class Sensor(AbstractSensor):
         self.noise = as_noise("sensor noise", law, dimension)
         self.outputs = names("sensor outputs", outputs, dimension, "y")
         # A variance alone says nothing of the number of outputs, so the function is asked.
-        shape = (1,) if outputs is not None or count_components(law) is not None else _find_shape(measure)
+        shape = (1,) if outputs is not None or count_components(law) is not None else _find_output_shape(measure)
         if shape != (1,):
             expected = "one output, as a variance without names means (outputs=[...] names more)"
             raise fail("measure of a sensor", expected, f"shape {shape}")
@@ -278,7 +278,7 @@ def _require_constant(name: str, value: object) -> Any:
     return value
 
 
-def _find_shape(measure: Callable[[jax.Array], ArrayLike]) -> tuple[int, ...]:
+def _find_output_shape(measure: Callable[[jax.Array], ArrayLike]) -> tuple[int, ...]:
     """Return the shape of h(x) where it is that of every state it takes; (1,) where that depends on the state.
 
     What slices x gives another shape at each of two lengths; what unpacks x takes a state of one length alone.

@@ -40,6 +40,7 @@ def check_turns(
     """
     if not (given.angles or given.rotations) or is_traced(center):
         return
+    # Angles: the center with a full turn more in each of them.
     center = np.asarray(center)
     turned = center + TURN * np.eye(len(center))[list(given.angles)]
     _compare_turned(f"{name} with circular states", function, center, turned, results, rest)
@@ -73,10 +74,12 @@ def _compare_turned(
     """
     if not len(turned):
         return
+    # f at the state and at each of its other forms, by one compiled program.
     try:
         start, *values = compute_once(_values_at, _values_by_xla, (function, np.stack([center, *turned]), rest))
     except jax.errors.TracerArrayConversionError:  # the function holds a traced number
         return
+    # Differences but for full turns, beyond the rounding of 2 pi in a steep function.
     for value, other in zip(values, turned, strict=True):
         change = np.abs(results.difference(np.asarray(value), np.asarray(start)))
         if np.any(change > SAME * (1 + np.abs(start))):

@@ -164,7 +164,7 @@ def known_turn(
     named = two_axes(axes)
     mean = np.zeros(4) if initial_mean is None else initial_mean
     start = WIDE * np.eye(4) if initial_covariance is None else initial_covariance
-    states = _with_units(_states_of(named, 2))
+    states = _with_units(_name_states(named, 2))
     return continuous_plant(motion, q * np.diag([0.0, 1.0, 0.0, 1.0]), mean, start, dt=dt, states=states)
 
 
@@ -191,7 +191,7 @@ def _make_intensity(order: int, value: ArrayLike) -> Any:
     return q * np.diag([0.0] * (order - 1) + [1.0])
 
 
-def _states_of(axes: Sequence[str], order: int) -> list[str]:
+def _name_states(axes: Sequence[str], order: int) -> list[str]:
     """Return the names of positions, velocities and accelerations, axis by axis."""
     named = []
     for axis in axes:
@@ -228,6 +228,7 @@ def _repeat_on_axes(
     named = name_list("axes", axes)
     if not named:
         raise fail("axes", "at least one name", "none")
+    # Block-diagonal matrices, one block an axis.
     order, count = len(intensity), len(named)
     variances = np.full(order, WIDE) if start is None else start
     xp = library(variances)
@@ -237,5 +238,5 @@ def _repeat_on_axes(
         np.zeros(order * count) if initial_mean is None else initial_mean,
         block_diagonal([xp.diag(variances)] * count) if initial_covariance is None else initial_covariance,
         dt=dt,
-        states=_states_of(named, order),
+        states=_name_states(named, order),
     )

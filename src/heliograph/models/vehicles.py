@@ -209,6 +209,7 @@ def _make_vehicle_plant(
         dt: length of every step; None where the input "dt" says it.
         axes: names of both positions.
     """
+    # The length of a step is a number, or None where the last input says it: then the noise is a function of it.
     step = None if dt is None else scalar("length of a step", dt, 0.0)
     spread = covariance("noise intensity", intensity, 3)
     inputs = ["speed", steered_by]

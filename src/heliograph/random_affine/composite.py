@@ -83,9 +83,9 @@ class AbstractUniform(AbstractRandomAffine):
         return results.pop()
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
-        """Visit the hops of each map, and return them with the position behind the map of most hops.
+        """Return the map with `visit` applied to each hop of each of its maps, and the position behind the longest.
 
-        All begin at `position`, since hops of equal places are the same transmitters in each map.
+        All maps begin at `position`: hops at equal places are the same transmitters in each of them.
         """
         pairs = [affine.visit_hops(visit, position) for affine in self.maps]
         visited: AbstractRandomAffine = replace_inner_maps(self, [affine for affine, _ in pairs])

@@ -337,6 +337,7 @@ def _join_links_behind_delay(links: Sequence[AbstractRandomAffine]) -> AbstractR
 
     A constant delay may be moved to the front past links that forget: their gains and noises are independent over time.
     """
+    # Links each late by itself, if at all.
     delays = [link for link in links if isinstance(link, Delayed)]
     if not delays:
         return Series(links)
@@ -354,9 +355,11 @@ def _join_links_behind_delay(links: Sequence[AbstractRandomAffine]) -> AbstractR
     for link in links[:last]:
         if link.remembers:
             raise fail("link before a delay", "one that forgets", f"{type(link).__name__}, which remembers")
+    # The links without delays behind one delay: the first link's own, and the constant ones.
     chain = Series([link.link if isinstance(link, Delayed) else link for link in links])
-    more = sum(link.times[0] for link in added)
-    return Delayed(chain, more if first is None else _add_delay(first, more), any(timestamped))
+    constant_steps = sum(link.times[0] for link in added)
+    delay = constant_steps if first is None else _add_delay(first, constant_steps)
+    return Delayed(chain, delay, timestamped=any(timestamped))
 
 
 def _add_delay(link: Delayed, more: int) -> Delay:

@@ -109,7 +109,7 @@ class EventFilter(AbstractSizedFilter):
 
     def _pad_sum(self, one: GaussianSum) -> GaussianSum:
         """Return a sum of one Gaussian, padded to the filter's number of Gaussians with copies of no weight."""
-        count = self._count_known_references + (self.lost if self.reference_may_be_lost else 0)
+        count = self._known_reference_count + (self.lost if self.reference_may_be_lost else 0)
         copies: GaussianSum = jax.tree.map(lambda leaf: jnp.repeat(leaf, count, axis=0), one)
         return copies._replace(log_weight=jnp.where(jnp.arange(count) == 0, one.log_weight[0], -jnp.inf))
 
@@ -119,11 +119,11 @@ class EventFilter(AbstractSizedFilter):
         return SilentRegion(len(self.states), self.trigger, self.outputs, self.known)
 
     @property
-    def _count_known_references(self) -> int:
-        """Number of Gaussians of known reference: pieces of the interval, and of the outside if it may be silent."""
+    def _known_reference_count(self) -> int:
+        """Number of Gaussians of known reference: pieces of the region, and of its outside if a loss may hide there."""
         if not self.loses or self.reference_may_be_lost:
             return self.known
-        return self.known + self.region.outside_parts(self.senders[0])
+        return self.known + self.region.count_outside_parts(self.senders[0])
 
     @predicts
     def predict(self, state: EventBelief, u: ArrayLike = (), k: Step = 0) -> EventBelief:
@@ -220,7 +220,7 @@ class EventFilter(AbstractSizedFilter):
         """
         # Why it may be silent, as labels (K, M, A, C) of each Gaussian: link mode, steps since the last transmission,
         # transmissions lost.
-        unsent, due = self._label_sending(augmented.label[:, s], begun)
+        unsent, due = self._split_label_by_sending(augmented.label[:, s], begun)
         loss = self._loss_probability(channel, s)[:, None, None]
         dropped, forced = (relabel_sent(sent * loss, lost=True) for sent in (unsent, due))
         if self.trigger.losses == "known":  # told of a loss: it was sent; told of none: it was not
@@ -243,13 +243,14 @@ class EventFilter(AbstractSizedFilter):
         if self.loses:
             sent = augmented.relabel_sender(s, labels.dropped + labels.forced)
             outside = self.region.truncate_outside(sent, sender, 1.0)
-            pieces = concatenate([pieces, merge_groups(outside, self.region.outside_parts(sender))])
+            pieces = concatenate([pieces, merge_groups(outside, self.region.count_outside_parts(sender))])
         return pieces.select_components(state_and_reference)
 
     def _truncate_with_lost_references(self, augmented: GaussianSum, s: int, labels: SilentLabels) -> GaussianSum:
         """Return the sum over (x, r) given silence of sender s, where a value that was lost is the next reference.
 
         First the Gaussians of known reference, joined piece by piece, then at most `lost` whose reference was lost.
+        `augmented`: the sum over (x, r, y), the first `known` of them with a known reference r.
         """
         n, sender = len(self.states), self.senders[s]
         state_and_reference = np.arange(n + self.outputs)
@@ -259,7 +260,7 @@ class EventFilter(AbstractSizedFilter):
         # Sent and lost: y is the new reference, outside of the region, or anywhere where a heartbeat was due.
         outside = merge_groups(
             self.region.truncate_outside(augmented.relabel_sender(s, labels.dropped), sender, 1.0),
-            self.region.outside_parts(sender),
+            self.region.count_outside_parts(sender),
         )
         anywhere = merge_groups(augmented.relabel_sender(s, labels.forced))
         fresh = concatenate([outside, anywhere]).select_components(self._find_new_reference(sender))
@@ -329,15 +330,15 @@ class EventFilter(AbstractSizedFilter):
 
         Returns one sum of the pieces outside, of a floor where these have next to no probability, and of those due.
         """
-        waiting, due = self._label_sending(used.label[:, s], begun)
+        waiting, due = self._split_label_by_sending(used.label[:, s], begun)
         event = used.relabel_sender(s, waiting)
         outside = self.region.truncate_outside(event, self.senders[s], 1 - RIM)
-        mass = jnp.max(outside.log_weight.reshape(self.region.outside_parts(self.senders[s]), -1), axis=0)
+        mass = jnp.max(outside.log_weight.reshape(self.region.count_outside_parts(self.senders[s]), -1), axis=0)
         lowest = event.log_weight + np.log(FLOOR)
         floor = event._replace(log_weight=jnp.where(mass < lowest, lowest, -jnp.inf))
         return concatenate([outside, floor, used.relabel_sender(s, due)])
 
-    def _label_sending(self, label: jax.Array, begun: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def _split_label_by_sending(self, label: jax.Array, begun: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Split a sender's label (K, M, A, C) into steps where only |y - r| > delta sends, and where it must send."""
         heartbeat = self.trigger.heartbeat
         oldest = (jnp.arange(self.ages) == (-1 if heartbeat is None else heartbeat))[:, None]

@@ -177,7 +177,7 @@ def _has_same_law_in_every_mode(channel: SideInformation) -> bool:
     for a, modes in enumerate(possible.T):
         if not channel.present[a].any() or not modes.any():
             continue
-        for moment in (np.asarray(channel.mean), np.asarray(channel.spread)):
+        for moment in (np.asarray(channel.mean), np.asarray(channel.spread)):  # (mode, pattern, ...) each
             by_mode = moment[modes, a]
             if not np.array_equal(by_mode, np.broadcast_to(by_mode[:1], by_mode.shape)):
                 return False

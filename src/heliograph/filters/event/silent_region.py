@@ -34,8 +34,8 @@ class SilentRegion(NamedTuple):
         """True if the region is a ball of several components."""
         return self.trigger.region == "ball" and self.outputs > 1
 
-    def outside_parts(self, sender: slice) -> int:
-        """Count the pieces that what is outside of a sender's region is cut into."""
+    def count_outside_parts(self, sender: slice) -> int:
+        """Return the number of pieces that the outside of a sender's region is cut into."""
         return 2 * len(range(self.outputs)[sender]) + self.is_ball
 
     def _error_directions(self, sender: slice) -> list[tuple[jax.Array, jax.Array]]:
@@ -79,7 +79,7 @@ class SilentRegion(NamedTuple):
         return merge_groups(cut.take(0, count), self.known), cut.take(count)
 
     def truncate_outside(self, parts: GaussianSum, sender: slice, scale: float) -> GaussianSum:
-        """Truncate each Gaussian to |y - r| > scale delta, as `outside_parts` pieces, one after the other.
+        """Truncate each Gaussian to |y - r| > scale delta, as `count_outside_parts` pieces, one after the other.
 
         Two pieces for each component: it is above or below, and those before it are inside. Of a ball these are what
         is outside of the box around it; one piece more is what the ball leaves of the box.

@@ -141,10 +141,12 @@ class StochasticEventFilter(AbstractSizedFilter):
             reference: r, with which the sender compares y (m,).
             log_silent: log P(silent) before the value.
         """
+        # How z's predicted moments change by it; where a component is missing nothing does, and any numbers will do.
         value, covariance = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
         is_complete = ~jnp.any(jnp.isnan(value))
         shift, change = self._change_by_sending(link, signal, reference, log_silent)
         complete = jnp.where(is_complete, value, 0.0), jnp.where(is_complete, covariance, jnp.eye(len(value)))
+        # p(z | sent) is in proportion to p(z) P(sent | z).
         gain, _ = link
         log_sent = self._log_probability_sent(gain, signal, reference, *complete)
         return Innovation(

@@ -175,6 +175,7 @@ def _weigh_residuals(
     `noise`: variances of the noise; `scaled_law`: its branches with these variances; `center`: its mean; `variance`:
     its nominal variances, in which precisions are counted. Others as of `_variational_update`.
     """
+    # Branches: their expected precision is the weight, and their mean by it is taken off.
     if scaled_law is not None:
         weight, shift = branch_precision(predicted, e + center, variance, scaled_law)
         residual = jnp.where(arrived, e + center - shift, 0.0)
@@ -182,7 +183,7 @@ def _weigh_residuals(
     if rule is not None:
         weight, reported = rule.iterate(predicted, _make_independent_noise(noise), e, arrived)
         return WeighedResiduals(residual=e, weight=weight, reported=reported, received=arrived & (weight > SMALLEST))
-    ones = jnp.ones_like(e)
+    ones = jnp.ones_like(e)  # a filter that weighs nothing
     return WeighedResiduals(residual=e, weight=ones, reported=ones, received=arrived)
 
 

@@ -44,6 +44,7 @@ class SequentialFilter(AbstractSizedFilter):
 
     def angles_used(self) -> FilterAngles:
         """Return the angles of the plant, and those of all nodes' measurements, one after another."""
+        # First row of each node among all that is received, and then their number.
         starts = np.cumsum([0, *(filter.received for filter in self.filters)])
         parts = [filter.angles_used() for filter in self.filters]
         received = [int(start) + i for start, part in zip(starts, parts, strict=False) for i in part.received]

@@ -95,7 +95,7 @@ class PolynomialFilter(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: CentredState, z: ArrayLike, k: Step = 0) -> tuple[CentredState, Innovation]:
-        """Lift z and correct the inner filter."""
+        """Correct the inner filter with all monomials of z up to `degree`, less the mean where one is subtracted."""
         z = _subtract_mean(self.centre, z, state.mean, k)
         after, innovation = self.inner.correct(state.inner, evaluate_monomials(z, self.degree)[:-1], k)
         return CentredState(after, state.mean), _select_degree_one(innovation, z, self.degree)

@@ -166,6 +166,7 @@ def mix_and_predict(
         start: E[x_i^2] before any data (n,).
     """
     share = normalise_columns(weight)
+    # Through a nonlinear plant each mixture goes as one Gaussian.
     if not isinstance(plant, LinearPlant):
         mixtures = jax.vmap(partial(merge_mixture, parts), in_axes=1)(share)
         return jax.vmap(lambda x: predict_gaussian(plant, transform, x, u, start))(mixtures)
@@ -224,21 +225,23 @@ def move_by_law(
     return joined
 
 
-class Moments(NamedTuple):
+class MixtureMoments(NamedTuple):
     """Means (parts, n) and covariances (parts, n, n)."""
 
     mean: jax.Array
     covariance: jax.Array
 
 
-def mix_moments(parts: Gaussian, share: jax.Array) -> Moments:
+def mix_moments(parts: Gaussian, share: jax.Array) -> MixtureMoments:
     """Return the moments of mixtures of Gaussians, by their shares (components, mixtures)."""
     covariances = jax.vmap(lambda x: x.covariance)(parts)
-    return Moments(*jax.vmap(lambda weights: moments_of_mixture(parts.mean, covariances, weights), in_axes=1)(share))
+    return MixtureMoments(
+        *jax.vmap(lambda weights: moments_of_mixture(parts.mean, covariances, weights), in_axes=1)(share)
+    )
 
 
 def _predict_each(
-    plant: AbstractPlant, transform: AbstractTransform, x: Moments, u: jax.Array, start: jax.Array
+    plant: AbstractPlant, transform: AbstractTransform, x: MixtureMoments, u: jax.Array, start: jax.Array
 ) -> Gaussian:
     """Return f(x, u) + w of each of some moments; a linear plant moves the moments themselves."""
     if not isinstance(plant, LinearPlant):

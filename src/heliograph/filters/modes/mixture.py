@@ -245,6 +245,7 @@ def _list_combinations(
         added_variance: variance that is added to each component of each noise.
     """
     assert isinstance(sensor, LinearSensor)  # checked before
+    # In each mode the atoms of sensor and link in series; those of probability 0 are left out where it is known.
     sensed = GainAndNoise(Constant(1.0), sensor.matrix, sensor.noise)
     atoms, modes = [], []
     for mode, link in enumerate(now.maps):

@@ -225,7 +225,7 @@ class MultipleModelFilter(AbstractSizedFilter):
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the step of smoothing by pairs of modes, with the moments of the whole mixture around the update."""
         plants, modes = models_of(at(self.plant, step.k)), len(self.initial)
-        law = self._law_of(step.after)
+        law = self._find_law_by_mode(step.after)
         known, pairs, weights, ways = self._describe_pairs(step, law)
         merged = step.map_states(_merge_mixture)
         moments: Any = None
@@ -237,7 +237,7 @@ class MultipleModelFilter(AbstractSizedFilter):
             weights=weights,
         )  # fmt: skip
 
-    def _law_of(self, state: ModalBeliefs) -> ModalLaw:
+    def _find_law_by_mode(self, state: ModalBeliefs) -> ModalLaw:
         """Return the law of a state after a correction, mode by mode."""
         return ModalLaw(self.merging.by_mode(state.gaussian, state.weight), state.law)
 
@@ -247,7 +247,7 @@ class MultipleModelFilter(AbstractSizedFilter):
         The Gaussians are those that the smoothed modes are compared with: predicted ones, or filtered ones where pairs
         take z before they are merged. The pairs are those that observe what the future says.
         """
-        modes, k, before = len(self.initial), step.k, self._law_of(step.before)
+        modes, k, before = len(self.initial), step.k, self._find_law_by_mode(step.before)
         plants, start = models_of(at(self.plant, k)), second_moments_at_start(self.plant)
         moved = move_pairs(
             plants, np.array(self.plant_modes), self.transform, before.gaussian, jnp.asarray(step.u), start

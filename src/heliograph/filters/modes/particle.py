@@ -198,6 +198,8 @@ def particle_filter(
         2001; Gordon, Salmond and Smith (1993) and Doucet, Godsill and Andrieu (2000) of the state; Schoen, Gustafsson
         and Nordlund, Marginalized particle filters for mixed linear/nonlinear state-space models (2005).
     """
+    # Modes of plant or sensor, or named states: some states drawn. No memory in the link: the whole state drawn. Else
+    # modes of links alone, with a Gaussian of the state in each particle.
     of_modes = isinstance(plant, ModalPlant) or isinstance(sensor, ModalSensor)
     if drawn is not None or of_modes:
         count = MANY if particles is None else particles

@@ -265,7 +265,7 @@ def _describe_received(
     def describe_noise(
         gain: jax.Array, spread: jax.Array, link: WeightedColumns, x: WeightedColumns, p: jax.Array
     ) -> WeightedColumns:
-        """Return the noise of z in one mode, of probability p."""
+        """Return the noise of z in one mode, of probability p: of sensor and link, rounding, spread of the gain."""
         sent = x.through(measure).covariance + p * noise
         plain = join_columns(sensor.noise.columns.through(gain[:, :-1]), link).times(p)
         rounding = rounding_of((jnp.abs(gain[:, :-1]) @ square_root(size)) ** 2).times(p)

@@ -114,14 +114,14 @@ def _degree_of_arithmetic(name: str, params: dict[str, Any], x: list[_TracedArra
             return x[0].degree
         case "reduce_sum":
             return np.max(x[0].degree, axis=tuple(params["axes"]), initial=KNOWN)
-        case "mul":
+        case "mul":  # of numbers of which one is given; a known zero makes the product zero
             zero = x[0].is_zero | x[1].is_zero
             return np.where(zero, GIVEN, _of_product(x[0].degree, x[1].degree))
         case "div":
             return np.where(x[1].degree <= GIVEN, x[0].degree, OTHER)
         case "integer_pow" if params["y"] == 1:
             return x[0].degree
-        case "select_n":
+        case "select_n":  # a choice by the first operand among the others
             cases = np.max([one.degree for one in x[1:]], axis=0)
             return np.where(x[0].degree <= GIVEN, cases, OTHER)
         case "dot_general":

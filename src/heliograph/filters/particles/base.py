@@ -33,7 +33,7 @@ class ResampledParticles(NamedTuple):
     log_weight: jax.Array
 
 
-class Weighed(NamedTuple):
+class WeighedParticles(NamedTuple):
     """Particles that were weighed by z.
 
     Args:

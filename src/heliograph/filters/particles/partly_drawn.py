@@ -17,7 +17,12 @@ from heliograph.engine.choice import compile_on_call
 from heliograph.factors.columns import WeightedColumns, factor_covariances, join_columns
 from heliograph.factors.gaussian import Gaussian, condition_on_observation, from_columns, from_covariance
 from heliograph.filters.base import Step, corrects, estimates, predicts
-from heliograph.filters.particles.base import AbstractStateParticleFilter, Weighed, keep_unused, relative_to_largest
+from heliograph.filters.particles.base import (
+    AbstractStateParticleFilter,
+    WeighedParticles,
+    keep_unused,
+    relative_to_largest,
+)
 from heliograph.filters.particles.cloud import Cloud, PartlyDrawn, repeat_for_modes, sum_clouds, sum_clouds_apart
 from heliograph.filters.particles.drawn_states import (
     condition_on_draw,
@@ -194,7 +199,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
 
     def weigh(
         self, particles: Cloud, law: None, numbers: jax.Array | None, key: jax.Array, z: jax.Array, k: Step
-    ) -> Weighed:
+    ) -> WeighedParticles:
         """Draw mode and drawn states of particles (B,) with z, and weigh them by p(z) p / q."""
         sensors, (gaussian, log_mode) = models_of(at(self.sensor, k)), particles
         atoms, chance = at(self.density, k).given_arrivals(z)
@@ -209,7 +214,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         x = x._replace(mean=wrap_angles(x.mean, self._angles_in_order(plant)))
         certain = jnp.where(jnp.arange(modes) == mode[:, None], 0.0, -jnp.inf)
         predicted = jax.vmap(partial(self._expect, sensors, received))(gaussian, log_mode)
-        return Weighed(Cloud(repeat_for_modes(x, modes), certain), log_ratio, tuple(predicted))
+        return WeighedParticles(Cloud(repeat_for_modes(x, modes), certain), log_ratio, tuple(predicted))
 
     def _describe_received(self, z: jax.Array, atoms: ReceivedAtoms) -> ReceivedByMode:
         """Return what arrived, with the atoms of each mode, and with one Gaussian in their place."""

@@ -82,16 +82,16 @@ def propose_particles(
         slope = jnp.asarray(sensor.matrix) if isinstance(sensor, LinearSensor) else jax.jacfwd(sensor.measure)(center)
         columns = jnp.where(arrived[:, None], gain @ slope @ moved.root, 0.0)
         innovation = wrap_near(z - gain @ sensor.measure(center) - offset, jnp.zeros(len(z)), angles)
-        # The law of e given z, by its precision L L'.
+        # The law of e given z, N(mean, (L L')^-1), by its precision L L' = I + C' R^-1 C, and a draw of it.
         scaled = jnp.linalg.solve(noise, columns)
         lower = jnp.linalg.cholesky(jnp.eye(len(center)) + columns.T @ scaled)
-        # As matrices, which are the same of all particles where the sensor is linear.
+        # As matrices, which are the same for all particles where the sensor is linear.
         kalman_gain = jax.scipy.linalg.cho_solve((lower, True), scaled.T)
         spread = jax.scipy.linalg.solve_triangular(lower.T, jnp.eye(len(center)), lower=False)
         mean = kalman_gain @ jnp.where(arrived, innovation, 0.0)
         from_posterior = mean + spread @ draw
         e = jnp.where(from_prior | ~jnp.all(jnp.isfinite(from_posterior)), draw, from_posterior)
-        # log N(e; 0, I) - log q(e), without the constants that both have.
+        # log N(e; 0, I) - log q(e), without the constants that both have; q with its share of N(0, I).
         log_prior = -e @ e / 2
         log_q = -jnp.sum((lower.T @ (e - mean)) ** 2) / 2 + jnp.sum(jnp.log(jnp.diagonal(lower)))
         if not is_exact:

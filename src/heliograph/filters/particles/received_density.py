@@ -49,6 +49,7 @@ class ReceivedAtoms(Module):
 
         def compute_log_density(gain: jax.Array, offset: jax.Array, noise: jax.Array) -> jax.Array:
             """Return log N(z; gain y + offset, noise) of one atom (N,)."""
+            # z - E z, 0 for what did not arrive and for an E z that is no number.
             expected = y @ gain.T + offset
             valid = jnp.all(jnp.isfinite(expected) | ~present, axis=1)
             value = wrap_near(z - expected, jnp.zeros(len(z)), angles)
@@ -59,6 +60,7 @@ class ReceivedAtoms(Module):
             log_determinant = 2 * jnp.sum(jnp.log(jnp.diagonal(factor))) + LOG_TURN * jnp.sum(present)
             return jnp.where(valid, -(jnp.sum(white**2, axis=1) + log_determinant) / 2, -jnp.inf)
 
+        # log of the weighted sum over the atoms.
         atoms = jnp.asarray(self.gain), jnp.asarray(self.offset), jnp.asarray(self.noise)
         by_atom = jax.vmap(compute_log_density)(*atoms)
         joint = jnp.log(jnp.asarray(self.weight))[:, None] + by_atom

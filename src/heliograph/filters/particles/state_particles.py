@@ -9,7 +9,12 @@ import numpy as np
 from heliograph.engine.choice import compile_on_call
 from heliograph.factors.columns import WeightedColumns, columns_of, join_columns, square_root, triangularise
 from heliograph.filters.base import Step, corrects, estimates, make_sizes, predicts
-from heliograph.filters.particles.base import AbstractStateParticleFilter, Weighed, keep_unused, relative_to_largest
+from heliograph.filters.particles.base import (
+    AbstractStateParticleFilter,
+    WeighedParticles,
+    keep_unused,
+    relative_to_largest,
+)
 from heliograph.filters.particles.expected_measurement import ExpectedMeasurement
 from heliograph.filters.particles.moments import FirstSums, StateSums, first_sums, second_sums
 from heliograph.filters.particles.proposal import MoveLaw, noise_columns, propose_particles
@@ -160,7 +165,7 @@ class StateParticleFilter(AbstractStateParticleFilter):
 
     def weigh(
         self, position: jax.Array, law: MoveLaw | None, numbers: jax.Array | None, key: jax.Array, z: jax.Array, k: Step
-    ) -> Weighed:
+    ) -> WeighedParticles:
         """Weigh particles (B, n) by z, after they are drawn anew with it where the law of their move is given.
 
         They expected h(x) before z was known (B, p).
@@ -173,7 +178,7 @@ class StateParticleFilter(AbstractStateParticleFilter):
             position, correction = wrap_angles(drawn.position, at(self.plant, k).angles), drawn.correction
             received = jax.vmap(sensor.measure)(position)
         likelihood = atoms.log_densities(received, z, self.observed_angles) + correction
-        return Weighed(position, likelihood, (predicted,))
+        return WeighedParticles(position, likelihood, (predicted,))
 
     def atoms_of(self, z: jax.Array, k: Step) -> ReceivedAtoms:
         """Return the atoms of what is received given h(x)."""

@@ -141,25 +141,28 @@ def infer_sent_bits(link: AbstractRandomAffine, received: Pairs) -> Pairs:
         case Flips():
             p = jnp.asarray(link.error.moment(1))
             return (1 - p) * received + p * received[..., ::-1]
-        case GainAndNoise():
+        case GainAndNoise():  # a selection: each input's copies are the rows that take it
             rows = np.asarray(link.matrix) > 0
-            into = [_multiply([received[i] for i in np.flatnonzero(column)], received.shape[1:]) for column in rows.T]
+            into = [
+                _multiply_likelihoods([received[i] for i in np.flatnonzero(column)], received.shape[1:])
+                for column in rows.T
+            ]
             return jnp.stack(into)
         case Series():
             for part in reversed(link.maps):
                 received = infer_sent_bits(part, received)
             return received
-        case Stack():
+        case Stack():  # all parts take the same inputs
             ends = np.cumsum([part.outputs for part in link.maps])[:-1]
             pieces = zip(link.maps, jnp.split(received, ends), strict=True)
-            return _multiply([infer_sent_bits(part, piece) for part, piece in pieces], ())
-        case Erasure():
+            return _multiply_likelihoods([infer_sent_bits(part, piece) for part, piece in pieces], ())
+        case Erasure():  # what is lost has likelihoods 1 already
             return infer_sent_bits(link.base, received)
     raise refuse_link(type(link).__name__)
 
 
-def _multiply(factors: Sequence[jax.Array], shape: tuple[int, ...]) -> jax.Array:
-    """Return the product; ones of nothing."""
+def _multiply_likelihoods(factors: Sequence[jax.Array], shape: tuple[int, ...]) -> jax.Array:
+    """Return the product of likelihoods entry by entry; ones of this shape if there are none."""
     result = jnp.ones(shape) if not factors else factors[0]
     for factor in factors[1:]:
         result = result * factor

@@ -94,6 +94,7 @@ def _sum_blocks(
     for _ in range(2**MERGED - 1):
         bell.append(bell[-1] * step)
         step = step * factor**2
+    # Coefficients of the polynomials (cells of a block, 3): of likelihood, and times j and j^2.
     places = np.arange(2.0**MERGED)
     table = tabulate(pairs[:MERGED]) * jnp.stack(bell)
     coefficients = jnp.stack([table, table * places, table * places**2], axis=1)
@@ -106,10 +107,11 @@ def _sum_blocks(
         inside = coefficients[-1]
         for row in range(2**MERGED - 2, -1, -1):
             inside = inside * ratio + coefficients[row]
+        # Times e^(-a^2 / (2 v)) and the likelihood of the bits above; cell j is at a + j w.
         inside = inside * (density * multiply_bits(pairs[MERGED:], number + block))
         first, second = inside[1] * width, inside[2] * width**2
         sums = sums.plus(LikelihoodSums(inside[0], a * inside[0] + first, a * (a * inside[0] + 2 * first) + second))
-        power = ratio
+        power = ratio  # r^J, J = 2^MERGED
         for _ in range(MERGED):
             power = power**2
         return (sums, density * power * once, ratio * shrink, a + 2**MERGED * width), None

@@ -210,6 +210,7 @@ def effect_of_bits(
         prior: of y.
         dither: of the encoder.
     """
+    # Few bits: all words.
     if grid.bits <= TABLE:
         blocks = 2 ** max(grid.bits - BLOCK, 0)
         return find_effect_from_sums(sum_neighbours(pairs, weights, jnp.zeros(()), blocks, grid, prior, dither))
@@ -219,7 +220,7 @@ def effect_of_bits(
         return find_effect_from_sums(sum_window(pairs, weights, received, grid, prior, dither))
 
     def change_by_fine_words() -> WordEffect:
-        """Sum over cells of several words each."""
+        """Sum over cells of several words each, and over the overloads beyond the ends."""
         wider, wide = widen_by_dither(prior, grid, dither)
         sums = [sum_merged(pair, received, grid, wider).plus(sum_overloads(pair, grid, wider)) for pair in pairs]
         merged = LikelihoodSums(*(weights @ jnp.stack(terms) for terms in zip(*sums, strict=True)))

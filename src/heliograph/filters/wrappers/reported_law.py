@@ -144,12 +144,12 @@ class ToldFilter(AbstractWrapper):
     def _split(self, z: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return values and numbers of a message; no value where a number is missing that it needs."""
         numbers = z[np.array(self.numbers)]
-        suffices = ~jnp.isnan(numbers) | self._optional
+        suffices = ~jnp.isnan(numbers) | self._may_be_missing
         is_usable = jnp.all(suffices | ~numbers_of_outputs(first(self.link)), axis=1)
         return jnp.where(is_usable, z[np.array(self.values)], jnp.nan), numbers
 
     @property
-    def _optional(self) -> jax.Array:
+    def _may_be_missing(self) -> jax.Array:
         """True for the numbers that may be missing, of all that are told (numbers,)."""
         return jnp.concatenate([jnp.full(m.memory.announced, m.optional) for m in told_maps(first(self.link))])
 
@@ -160,7 +160,7 @@ class ToldFilter(AbstractWrapper):
         """
         link = at(self.link, k)
         typical = jnp.concatenate([jnp.asarray(affine.typical) for affine in told_maps(link)])
-        complete = jnp.where(jnp.isnan(numbers) & ~self._optional, typical, numbers)
+        complete = jnp.where(jnp.isnan(numbers) & ~self._may_be_missing, typical, numbers)
         return self.make(self.plant, at(self.sensor, k), believe_told(link, complete)), give_law(link, complete)
 
 

@@ -68,12 +68,12 @@ class LimitedFilter(AbstractSizedFilter):
     @predicts
     def predict(self, state: PyTree, u: ArrayLike = (), k: Step = 0) -> PyTree:
         """Predict from the most likely point within the limits; of particles, from those within."""
-        return self.base.predict(self._enter(state), u, k)
+        return self.base.predict(self._state_before_prediction(state), u, k)
 
     @corrects
     def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
         """Correct the prediction, its mean held within the limits."""
-        prior = state if _is_particles(state) else self._hold(state)
+        prior = state if _is_particles(state) else self._hold_means(state)
         after, innovation = self.base.correct(prior, z, k)
         # log P(within | z) - log P(within); nothing where one of them is 0 to rounding.
         log_after, log_before = self._condition_with_mass(after)[0], self._condition_with_mass(state)[0]
@@ -84,11 +84,11 @@ class LimitedFilter(AbstractSizedFilter):
     @estimates
     def estimate(self, state: PyTree) -> Estimate:
         """Return the mean and covariance given that the state lies within the limits."""
-        return self._claimed(self.base.estimate(self.condition(state)))
+        return self._with_own_claim(self.base.estimate(self.condition(state)))
 
     def after_step(self, state: PyTree, k: Step) -> Estimate:
         """Return the mean and covariance after step k, given that the state lies within the limits."""
-        return self._claimed(self.base.after_step(self.condition(state), k))
+        return self._with_own_claim(self.base.after_step(self.condition(state), k))
 
     def condition(self, state: PyTree) -> PyTree:
         """Return the state of the filter within, given that the plant's state lies within the limits."""
@@ -96,7 +96,7 @@ class LimitedFilter(AbstractSizedFilter):
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the smoother step of the filter within, whose estimates are then conditioned on the limits."""
-        inner = self.base.smoother_step(step.map_states(self._hold))
+        inner = self.base.smoother_step(step.map_states(self._hold_means))
         return replace(inner, limits=self.limits, claim=weakest([inner.claim, "nominal"]))
 
     def angles_used(self) -> FilterAngles | None:
@@ -117,20 +117,20 @@ class LimitedFilter(AbstractSizedFilter):
         """True if the filter within is a mixture over atoms."""
         return self.base.of_atoms
 
-    def _claimed(self, estimate: Estimate) -> Estimate:
+    def _with_own_claim(self, estimate: Estimate) -> Estimate:
         """Return the estimate with this filter's claim."""
         return replace(estimate, claim=self.claim)
 
-    def _enter(self, state: PyTree) -> PyTree:
+    def _state_before_prediction(self, state: PyTree) -> PyTree:
         """Return the state from which the next prediction starts."""
-        return self.condition(state) if _is_particles(state) else self._hold(state)
+        return self.condition(state) if _is_particles(state) else self._hold_means(state)
 
-    def _hold(self, state: PyTree) -> PyTree:
+    def _hold_means(self, state: PyTree) -> PyTree:
         """Return a filter's state with the means of its Gaussians held within the limits."""
         if isinstance(state, StateUnderInputs):
-            return state._replace(base=self._hold(state.base))
+            return state._replace(base=self._hold_means(state.base))
         if hasattr(state, "believed"):  # of a gate that may give in to its rival
-            return state._replace(believed=self._hold(state.believed), rival=self._hold(state.rival))
+            return state._replace(believed=self._hold_means(state.believed), rival=self._hold_means(state.rival))
         if _is_particles(state):
             return state
         x = Gaussian(*map(jnp.asarray, gaussian_of(state)))
@@ -154,7 +154,7 @@ class LimitedFilter(AbstractSizedFilter):
             return log_mass, state._replace(believed=inner)
         if isinstance(state, particles.StateParticles):
             return self._condition_particles(state)
-        held = self._hold(state)
+        held = self._hold_means(state)
         x = Gaussian(*map(jnp.asarray, gaussian_of(held)))
         if x.mean.ndim == 1:
             log_mass, inside = truncate_to_limits(jax.tree.map(lambda leaf: leaf[None], x), self.limits)

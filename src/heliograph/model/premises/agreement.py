@@ -181,7 +181,7 @@ def _same_sensor(a: AbstractSensor, b: AbstractSensor, order: int | None) -> boo
     if matrices[0] is not None and matrices[1] is not None:
         return equal_to_rounding(*matrices)
     # Sensors do not know how many states they measure: any number that both take will do.
-    return any(same_function(a.measure, b.measure, (n,)) for n in _states_of(a, b))
+    return any(same_function(a.measure, b.measure, (n,)) for n in _find_common_length(a, b))
 
 
 def _same_sensor_of_inputs(a: AbstractSensor, b: AbstractSensor, order: int | None) -> bool:
@@ -195,7 +195,7 @@ def _same_sensor_of_inputs(a: AbstractSensor, b: AbstractSensor, order: int | No
     elif not same_function(_noise_given(a), _noise_given(b), u):
         return False
     # Sensors do not know how many states they measure: any number that both take will do.
-    return any(same_function(_measure_given(a), _measure_given(b), (n,), u) for n in _states_of(a, b))
+    return any(same_function(_measure_given(a), _measure_given(b), (n,), u) for n in _find_common_length(a, b))
 
 
 def _noise_given(sensor: AbstractSensor) -> Callable[[jax.Array], object]:
@@ -208,7 +208,7 @@ def _measure_given(sensor: AbstractSensor) -> Callable[[jax.Array, jax.Array], o
     return lambda x, u: sensor.given(u).measure(x)
 
 
-def _states_of(*sensors: AbstractSensor) -> list[int]:
+def _find_common_length(*sensors: AbstractSensor) -> list[int]:
     """Return the least number of states up to 32 that both sensors take, in a list; [] if there is none."""
     return [n for n in range(1, 33) if all(_takes_states(sensor, n) for sensor in sensors)][:1]
 

@@ -160,7 +160,7 @@ class CentredNoise(AbstractNoise):
         return self.source.sample(key) - jnp.asarray(self.source.mean)
 
     def moment(self, powers: Exponents) -> Number:
-        """Return sum_b prod_i C(a_i, b_i) (-E n_i)^(a_i - b_i) E[n^b]."""
+        """Return E prod_i (n_i - E n_i)^a_i = sum_{b <= a} prod_i C(a_i, b_i) (-E n_i)^(a_i - b_i) E[n^b]."""
         total: Number = 0.0
         for b in product(*(range(a + 1) for a in powers)):
             weights = [
