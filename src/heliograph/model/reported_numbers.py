@@ -1,4 +1,7 @@
-"""What comes with a message: gains, readings of gains and numbers of quality that the receiver is told."""
+"""What comes with a message: gains, readings of gains and numbers of quality that the receiver is told.
+
+A channel that tells delivers z, and then the told numbers, of which the law of its link is a function.
+"""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeVar, cast

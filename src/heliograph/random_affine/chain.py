@@ -1,4 +1,7 @@
-"""Memories of links: a Markov chain of modes, or a Gaussian fading that drifts; neither depends on what is sent."""
+"""Memories of links: a Markov chain of modes, or a Gaussian fading that drifts; neither depends on what is sent.
+
+A memory has a state that moves from step to step. Given its state a link forgets: gain and noise are drawn anew.
+"""
 
 from collections.abc import Iterable
 from copy import copy

@@ -1,4 +1,8 @@
-"""Maps whose law depends on numbers that the receiver is told with each message: gains, readings of gains, quality."""
+"""Maps whose law depends on numbers that the receiver is told with each message: gains, readings of gains, quality.
+
+The world draws the numbers from a memory (`FreshNumbers`, a chain of modes); a told map is given them, and its receiver
+is told them, or readings of them.
+"""
 
 from abc import abstractmethod
 from collections.abc import Callable

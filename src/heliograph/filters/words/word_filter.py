@@ -1,4 +1,8 @@
-"""The filter behind words that knows what a rounded number and a flipped bit are: exact moments of a Gaussian prior."""
+"""The filter behind words that knows what a rounded number and a flipped bit are: exact moments of a Gaussian prior.
+
+A word is a number that was rounded to low + i D, i = 0, 1, ..., and is sent as the bits of i. A dither is a random
+number that was added before the rounding; both ends know it where it is to be taken off.
+"""
 
 from typing import NamedTuple
 

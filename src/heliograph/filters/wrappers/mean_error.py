@@ -1,4 +1,7 @@
-"""Mean error of a filter that is told numbers, before any: a bound without drawing them."""
+"""Mean error of a filter that is told numbers, before any: a bound without drawing them.
+
+Told numbers come with a message and say what the link did to it, such as its gain or a reading of that.
+"""
 
 from typing import NamedTuple
 

@@ -1,4 +1,7 @@
-"""Filters of links whose law is told with each message: for each the filter of the law that its numbers give."""
+"""Filters of links whose law is told with each message: for each the filter of the law that its numbers give.
+
+Told numbers come with a message and say what the link did to it, such as its gain; a law is that of gain and noise.
+"""
 
 import inspect
 from collections.abc import Callable
