@@ -241,7 +241,7 @@ def _judge_value(innovation: Innovation, z: Float[Array, " m"], of_atoms: bool) 
     free = jnp.where(larger & ~determined, squares, 0.0)
     most = greatest_distance(value.dtype)
     far = jnp.any((free > most) | (larger & jnp.isinf(value))) | (jnp.sum(free) > most)
-    # Excluded: all determined, and one of them differs.
+    # Excluded: all determined, and one of them differs; or no atom has a density at it, though its distance is finite.
     excluded = jnp.any(jnp.isinf(every) & certain) & ~jnp.any(~certain & present)
     if of_atoms:
         excluded |= (jnp.asarray(innovation.log_likelihood) == -jnp.inf) & jnp.isfinite(distance)

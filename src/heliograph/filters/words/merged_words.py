@@ -58,13 +58,16 @@ def sum_merged(pairs: jax.Array, received: jax.Array, grid: WordGrid, prior: Sig
         """Return how far the mean of a cell is from the prior's, in the prior's deviations."""
         return (grid.low + (cell * size + mean) * grid.step - prior.mean) / prior.deviation
 
+    # Likelihoods of the bits of the cells' numbers, and the cell of the received word.
     upper, received_cell = _shift_bits(pairs, level), jnp.floor(received / size)
     sums = _sum_blocks(upper, start / block, away_of(start), width, wide)
     # The cell of the received word, where it is none of them.
     is_outside = (received_cell < start) | (received_cell >= start + BLOCKS * block)
     likelihood = multiply_bits(upper, received_cell) * is_outside
     likelihood = likelihood * jnp.exp(-(away_of(received_cell) ** 2) / (2 * wide))
-    mass, first, second = (total + likelihood * away_of(received_cell) ** power for power, total in enumerate(sums))
+    mass, first, second = (
+        sum_over_cells + likelihood * away_of(received_cell) ** power for power, sum_over_cells in enumerate(sums)
+    )
     # Of the product of both Gaussians: E t = a / wide, E t^2 = a^2 / wide^2 + 1 - 1 / wide.
     scale = inner * grid.step / (prior.deviation * ROOT_TWO_PI * jnp.sqrt(wide))
     first, second = first / wide, second / wide**2
