@@ -80,7 +80,10 @@ class Judgement(NamedTuple):
     def judge_prediction(
         claim: Claim, states: tuple[PyTree, PyTree], estimates: tuple[Estimate, Estimate], spoilt: Array
     ) -> "Judgement":
-        """Judge a prediction by itself, from states and estimates before and after it, as a step without data."""
+        """Judge a prediction by itself, as a step without data; arguments as of `judge_step`.
+
+        `states`, `estimates`: before and after the prediction. `spoilt`: whether its inputs were no numbers.
+        """
         (before, prior), (estimate_before, prediction), no_data = states, estimates, jnp.zeros(0)
         empty = Innovation(no_data, jnp.zeros((0, 0)), jnp.zeros(()))
         three = estimate_before, prediction, prediction  # before, after prediction, after a correction by nothing
@@ -91,7 +94,7 @@ class Judgement(NamedTuple):
         claim: Claim, states: tuple[PyTree, PyTree], estimates: tuple[Estimate, Estimate], innovation: Innovation,
         z: Float[Array, " m"], of_atoms: bool,
     ) -> "Judgement":  # fmt: skip
-        """Judge a correction by itself, from states and estimates before and after it."""
+        """Judge a correction by itself, from states and estimates before and after it; arguments as of `judge_step`."""
         (prior, after), (expected, corrected) = states, estimates
         return judge_step(claim, (prior, prior, after), (expected, expected, corrected), innovation, z, of_atoms)
 

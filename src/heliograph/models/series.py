@@ -291,8 +291,8 @@ def regression(
 def stationary(x: "Float[ArrayLike, ' p']") -> Any:
     """Return the coefficients of a stationary autoregression, any of which comes of just one x of real numbers.
 
-    The partial autocorrelations are x / sqrt(1 + x^2); Durbin and Levinson's recursion makes coefficients of them. Less
-    them, they are those of an invertible moving average.
+    The partial autocorrelations are x / sqrt(1 + x^2); Durbin and Levinson's recursion makes coefficients of them. With
+    the opposite sign they are coefficients of an invertible moving average.
 
     Args:
         x: any numbers (p,), such as free ones of a fit.

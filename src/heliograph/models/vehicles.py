@@ -30,7 +30,7 @@ class TurnMotion(StepLength):
     """The motion of (x, vx, y, vy, w) over a step: the velocity turns by the angle w dt."""
 
     def __call__(self, x: jax.Array, u: jax.Array) -> jax.Array:
-        """Return the state after a step."""
+        """Return (x, vx, y, vy, w) after a step: the velocity turned by w dt, its integral added to the position."""
         dt = self.length(u)
         angle = x[4] * dt
         along, across = dt * sine_ratio(angle), dt * cosine_ratio(angle)
@@ -64,7 +64,7 @@ class ArcMotion(StepLength):
     wheelbase: Any
 
     def __call__(self, x: jax.Array, u: jax.Array) -> jax.Array:
-        """Return the state after a step."""
+        """Return (x, y, heading) after a step: the chord of the arc, in the direction half way of the turn."""
         dt, speed = self.length(u), u[0]
         rate = u[1] if self.wheelbase is None else speed * jnp.tan(u[1]) / self.wheelbase
         half = rate * dt / 2

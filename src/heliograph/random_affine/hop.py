@@ -186,7 +186,7 @@ class GainAndNoise(AbstractHop):
         return disturb_hop(np.asarray(self.matrix), (float(self.law.moment(1)), float(self.law.moment(2))), root)
 
     def in_words(self) -> str:
-        """Return the law, the gain where that is one known number, and whether the hop adds noise."""
+        """Return the hop in words, such as "Rician hop", "hop 1.1" or "known gain 1.1"; "" if it passes y as it is."""
         matrix = np.asarray(self.matrix)
         silent = not (np.any(np.asarray(self.noise.covariance)) or np.any(np.asarray(self.noise.mean)))
         if not matrix.any():

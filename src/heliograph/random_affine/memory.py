@@ -72,7 +72,10 @@ def condition_on_memories(channel: T, states: Sequence[int | float | jax.Array |
 
 
 def condition_on_states(channel: T, by_identity: Mapping[str, int | float | jax.Array | np.ndarray]) -> T:
-    """Return `condition_on_memories` for states by the identity of their memory, among which there may be others."""
+    """Return the map, or tree of maps, without memory that it is for these states of its memories.
+
+    `by_identity`: the state of each memory by its identity; states of other memories may be among them.
+    """
 
     def condition(leaf: PyTree) -> PyTree:
         """Return a map with a memory as it is in the memory's state, anything else as it is."""

@@ -204,7 +204,10 @@ class StochasticEventFilter(AbstractSizedFilter):
     def _log_probability_sent(
         self, gain: jax.Array, signal: Signal, reference: jax.Array, value: jax.Array, covariance: jax.Array
     ) -> jax.Array:
-        """Return log P(sent | z) = log(1 - P(silent | z)), by the law of y given z with this innovation."""
+        """Return log P(sent | z) = log(1 - P(silent | z)), by the law of y given z.
+
+        z = gain y + noise has the innovation `value`, of this covariance; silence is by y and the reference.
+        """
         y = _law_of_signal(signal)
         slopes = gain @ y.root
         noise = factor_spread(covariance - WeightedColumns(slopes, y.variances).covariance)

@@ -146,7 +146,10 @@ class StudentVB(AbstractWeights):
     def iterate(
         self, before: PredictedMeasurement, noise: WeightedColumns, e: jax.Array, present: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Return the weights of the last update, and those that it would give the next one."""
+        """Return the weights (m,) of the last of `iterations` updates, and those that it would give the next one.
+
+        w_i = (nu + 1) / (nu + E[(e_i - t_i)^2] / r_i) for nu degrees and noise of variance r_i, from weights of 1.
+        """
         scale = noise.diagonal
         used = w = jnp.broadcast_to(jnp.ones_like(scale), e.shape)
         for _ in range(self.iterations):

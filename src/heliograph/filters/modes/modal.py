@@ -296,7 +296,10 @@ def sum_of_modes(n: int, modes: int) -> Float[np.ndarray, "n N"]:
 def observe_modes(
     x: Gaussian, centred: jax.Array, output: MeasurementModel, z: ArrayLike
 ) -> tuple[Gaussian, Innovation]:
-    """Condition zeta on the components of z that arrived; `centred` is its mean less P(mode) c."""
+    """Return zeta, the state times the indicator of each mode, given the components of z that arrived; the innovation.
+
+    `centred`: the mean of zeta less P(mode) c, c the centre. `output`: z = common + matrix zeta + noise.
+    """
     expected = output.common + output.matrix @ centred
     return condition_on_measurement(x, output.matrix @ x.root, output.noise, jnp.asarray(z), expected)
 

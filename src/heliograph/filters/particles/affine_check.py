@@ -135,7 +135,11 @@ def _of_product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _degree_of_contraction(a: _TracedArray, b: _TracedArray, dimensions: Any) -> np.ndarray:
-    """Return the degrees of sums of products, in which a known zero takes its product away."""
+    """Return the degrees of the sums of products that a contraction (dot_general) of a and b makes.
+
+    A product with a known zero is none. A sum is AFFINE where some product has one AFFINE factor, and OTHER where a
+    factor is OTHER or both are AFFINE; else GIVEN. `dimensions`: JAX's numbers of the contracted and batch axes.
+    """
 
     def count(of_a: np.ndarray, of_b: np.ndarray) -> np.ndarray:
         """Return for each sum how many of its products have both of these properties."""

@@ -44,7 +44,7 @@ class ExpectedMeasurement(NamedTuple):
         apart = wrap_near(value - self.base, jnp.zeros(len(self.z)), self.angles)
         return both.ravel(), apart.reshape(-1, len(self.z))
 
-    def innovation(self, first: FirstSums, second: jax.Array, density: jax.Array) -> Innovation:
+    def compute_innovation(self, first: FirstSums, second: jax.Array, density: jax.Array) -> Innovation:
         """Return mean and covariance of the innovation, and log p(z).
 
         Args:

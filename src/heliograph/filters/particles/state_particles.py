@@ -203,7 +203,7 @@ class StateParticleFilter(AbstractStateParticleFilter):
         density: jax.Array,
     ) -> Innovation:
         """Return z less its mean over particles and atoms, the covariance of these, and the log-likelihood."""
-        return ExpectedMeasurement(self.atoms_of(z, k), z, reference[0], self.observed_angles).innovation(
+        return ExpectedMeasurement(self.atoms_of(z, k), z, reference[0], self.observed_angles).compute_innovation(
             *received, density
         )
 

@@ -59,7 +59,7 @@ class DisturbedGain(NamedTuple):
 
 
 def noise_gain(mean: Float[np.ndarray, " m"], covariance: Float[np.ndarray, "m m"]) -> np.ndarray:
-    """Return a root N of a noise's covariance, (m, rank).
+    """Return a root N (m, rank) of a noise's covariance, N N' = covariance, each column of a sum that is not negative.
 
     Raises:
         ValueError: a mean of the noise that N cannot make.

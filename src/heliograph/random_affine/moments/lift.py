@@ -57,7 +57,10 @@ class Lift(AbstractMapWrapper):
         return state, jnp.asarray(symmetric_power(h, self.degree))
 
     def moments(self, order: int) -> JointMoments:
-        """Return the rows and columns of E[Sym^(degree order)(H)], spread over the repeated products."""
+        """Return the moments of this order of the lifted map, out of those of order degree x order of the map.
+
+        A monomial of degree degree x order is a product of `order` lifted inputs in several ways: each gets its share.
+        """
         check_forgets("moments of a map", self)
         inner = self.base.moments(order * self.degree).matrix
         rows = _find_product_positions(self.base.outputs + 1, self.degree, order)

@@ -48,7 +48,10 @@ def push_moments(channel: AbstractRandomAffine, order: int, moments: Array1) -> 
 
 @push_moments.register
 def _push_through_hop(channel: GainAndNoise, order: int, moments: Array1) -> Array1:
-    """Return (A y)^b, then E[g^|b|], then sum_b C(a, b) E[n^(a-b)] (A y)^b."""
+    """Return E[mono(z)] of z = g A y + n from E[mono(y)].
+
+    E[z^a] = sum_{b <= a} C(a, b) E[n^(a-b)] E[g^|b|] E[(A y)^b].
+    """
     known = push_through_known_map(affine_matrix(channel.matrix), order, _check_moments(channel, order, moments))
     scaled = known * gain_moments(channel.law, order)[degrees(channel.outputs, order)]
     row, column, noise, weight = plan_binomial_sums(channel.outputs, order)

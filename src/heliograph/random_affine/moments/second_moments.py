@@ -73,8 +73,9 @@ def describe_second_moments(
 
 
 def split_off_noise(spread: Tensor) -> tuple[Tensor, WeightedColumns]:
-    """Split the covariances of (A, n), (m, m, n + 1, n + 1) by output, into those of A and m columns of Cov n.
+    """Return the covariances of a random gain A alone, and m columns of Cov n, from those of (A, n).
 
+    spread (m, m, p + 1, p + 1): [i, j] is the covariance of the rows i and j of (A, n), the last entry that of n.
     Where A and n are correlated nothing is split: the covariances as they are, and columns of zero.
     """
     xp, covariance = library(spread), spread[..., -1, -1]
