@@ -107,7 +107,10 @@ ROWS = 30  # of the printed table; the file has all
 
 @contextmanager
 def show_campaign_progress(workers: int) -> Iterator[Progress]:
-    """Show a progress bar on stderr; a line each minute where stderr is no terminal."""
+    """Show a campaign's progress as a bar on stderr, or a line each minute where stderr is no terminal.
+
+    The context provides a function of (what is being done, how many chunks are done, how many there are).
+    """
     countdown = Countdown(workers)
     with show_countdown(countdown) as show:
 
@@ -123,7 +126,7 @@ def show_campaign_progress(workers: int) -> Iterator[Progress]:
 
 
 def print_scores(campaign: Campaign, scores: Sequence[Score]) -> None:
-    """Print the first rows of the table: words to the left, numbers, which begin after three names, to the right."""
+    """Print the first ROWS rows of the table of scores: names to the left, numbers to the right."""
     table = rich.table.Table(box=rich.box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     first_number = len(campaign.parameters) + 3
     for i, header in enumerate(score_headers(campaign)):

@@ -197,7 +197,7 @@ def run_on_cluster(campaign: str, store: Path, address: str, timeout: float = ma
 
 
 def _leave(client: Untyped) -> None:
-    """Close the client; errors of a client whose scheduler is gone are ignored, since that was reported before."""
+    """Close the client of a cluster; errors are ignored, since a scheduler that is gone was reported before."""
     with suppress(OSError, RuntimeError, TimeoutError):
         client.close(timeout=CONNECT)
 

@@ -77,7 +77,7 @@ def perform_job(campaign: str, store: str, setting: int, chunk: int | None) -> R
 
 
 def compute_chunk(campaign: Campaign, network: Network, chunk: Chunk, store: Path) -> None:
-    """Simulate a chunk of runs and write it.
+    """Simulate a chunk of runs of a network, and write their errors into the store.
 
     Every chunk is simulated at full width, so that the last one of a setting needs no compilation of its own.
     """

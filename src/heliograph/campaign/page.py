@@ -36,7 +36,7 @@ def write_report(campaign: Campaign, scores: Sequence[Score], out: Path) -> Path
 
 
 def write_campaign_page(campaign: Campaign, scores: Sequence[Score], failures: Sequence[Failure]) -> Page:
-    """Return the report of a campaign with its scores and failures."""
+    """Return the page of a campaign with its scores and failures."""
     name = Path(campaign.path).name
     computed = sum({score.setting: score.runs for score in scores}.values())
     # Failures first, so that nobody reads the results without them.

@@ -54,7 +54,7 @@ class NetworkDescription(TypedDict):
 
 
 def describe_network(network: Network) -> NetworkDescription:
-    """Return labels and claims of one network."""
+    """Return labels of one network (states, nodes, filters, longest measurement) and claims of its filters."""
     claims: Claims = {node: dict(filters) for node, filters in network.claims().items()}
     labels = LabelsAsJson(
         states=network.states,
@@ -224,7 +224,10 @@ def _create_array(
 
 
 def _open(group: zarr.Group, name: str) -> zarr.Array[Any]:
-    """Open an array that writes a chunk's file even if it has only fill values: the file marks the chunk as done."""
+    """Return an array of the store that writes a chunk's file even if it has only fill values.
+
+    The file marks the chunk as done.
+    """
     array = group[name]
     assert isinstance(array, zarr.Array)
     return array.with_config({"write_empty_chunks": True})
@@ -279,7 +282,10 @@ def _is_whole(file: Path) -> bool:
 
 
 def _find_chunk_files(folder: Path, indices: int) -> dict[tuple[int, ...], Path]:
-    """Return the files of chunks, named "c.0.3.0", by so many of the first indices of the chunk, here (0, 3)."""
+    """Return {first indices: file} of the files of chunks, named such as "c.0.3.0"; here of two indices (0, 3).
+
+    `indices`: how many of the first indices of a chunk are the key.
+    """
     found = {}
     for name in os.listdir(folder):
         start, *parts = name.split(".")

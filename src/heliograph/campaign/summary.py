@@ -112,7 +112,7 @@ def summarize(store: Path, campaign: Campaign) -> list[Score]:
 
 
 def _average_over_time(group: zarr.Group, setting: int, runs: slice, claims: np.ndarray) -> np.ndarray:
-    """Return squared error summed over the state and NEES per dimension, averaged over time, (2, run, node, filter).
+    """Return squared errors summed over states, and NEES per dimension, as means over time, (2, run, node, filter).
 
     The error is NaN in runs whose claimed variance is not finite, of filters that claim one.
     """

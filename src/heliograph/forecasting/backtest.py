@@ -18,7 +18,7 @@ from heliograph.forecasting.scores import (
     MixtureLaws,
     ScoreMean,
     average_overlapping,
-    below,
+    compute_probability_below,
     crps,
     log_score,
 )
@@ -144,7 +144,7 @@ def backtest(
     refit: Refit | None = None,
     every: int = 50,
 ) -> Backtest:
-    """Return the forecast from each row of a recording, and score what was said against what came: a rolling origin.
+    """Return scores of the forecasts from each row of a recording, against what came later: a rolling origin.
 
     Filters run over the rows once, as by `hg.run`; behind each row they predict as if nothing more arrived, with the
     inputs that the recording has. Scored is what arrived later, and the true states where they are known.
@@ -174,25 +174,26 @@ def backtest(
     if not ahead or ahead[-1] + first >= rows:
         raise fail("backtest", f"horizons that, behind {first} skipped rows, end within the {rows} rows of data", ahead)
     u = read_plant_inputs(network, inputs, rows)
-    # Networks with the row from which each forecasts, and their targets.
-    known = [(0, network)] if refit is None else [
-        (row, _refit(refit, row, network)) for row in range(first, rows, check_count("every", every))
-    ]  # fmt: skip
-    segments = [
-        (row, list_targets(_origin(fitted, record, measurements, inputs, time, truth))) for row, fitted in known
+    # The network that forecasts from each of these rows on, up to the next.
+    networks = {0: network}
+    if refit is not None:
+        starts = range(first, rows, check_count("every", every))
+        networks = {row: _refit(refit, row, network) for row in starts}
+    # By such a row the filters of its network; then of each filter the scores over all of these.
+    targets = [
+        list_targets(_find_origin(fitted, record, measurements, inputs, time, truth)) for fitted in networks.values()
     ]
     scores = list[Score]()
-    for several in zip(*(targets for _, targets in segments), strict=True):
-        if (several[0].node, several[0].filter) in filtered_places(network):
-            starts = [row for row, _ in segments]
-            scores += _score_filter(list(zip(starts, several, strict=True)), record, u, ahead, first)
+    for of_filter in zip(*targets, strict=True):
+        if (of_filter[0].node, of_filter[0].filter) in filtered_places(network):
+            scores += _score_filter(list(zip(networks, of_filter, strict=True)), record, u, ahead, first)
     if not scores:
         raise fail("backtest", "a filter that claims a covariance, and data to compare with", "none")
     return Backtest(tuple(ahead), rows, tuple(scores))
 
 
 def _refit(refit: Refit, rows: int, network: Network) -> Network:
-    """Return the network as it is known from the first rows.
+    """Return the network as it is known from so many first rows, by the user's function `refit`.
 
     Raises:
         ValueError: no network, or one of other nodes and filters.
@@ -203,23 +204,23 @@ def _refit(refit: Refit, rows: int, network: Network) -> Network:
     return fitted
 
 
-def _origin(network: Network, record: Record, *data: Any) -> Origin:
-    """Return where a network's forecasts start; it is run where the record is not its own."""
-    own = record.origin
-    if not isinstance(own, Origin) or own.model is not network:
-        own = run(network, *data).origin
-    assert isinstance(own, Origin)  # hg.run sets it
-    return own
+def _find_origin(network: Network, record: Record, *data: Any) -> Origin:
+    """Return where a network's forecasts start; it is run over the data where the record is not its own."""
+    origin = record.origin
+    if not isinstance(origin, Origin) or origin.model is not network:
+        origin = run(network, *data).origin
+    assert isinstance(origin, Origin)  # hg.run sets it
+    return origin
 
 
 def filtered_places(network: Network) -> set[tuple[str, str]]:
-    """Return the estimates that are those of a filter, which can be stepped by itself."""
+    """Return (node, filter) of the estimates that are those of a filter, which can be stepped by itself."""
     central = {(FUSED, name) for name, fusion in network.fused.items() if hasattr(fusion, "predict")}
     return set(network.places) | central
 
 
 def measured_by(target: ForecastTarget, record: Record) -> np.ndarray:
-    """Return the measurements of a filter (steps, received)."""
+    """Return the measurements that a filter receives (steps, received), of a central one those of all nodes."""
     z = record.measurements.get(target.node)
     if z is None:  # of a central filter, all nodes' numbers
         z = np.concatenate([record.measurements[name] for name in record.measurements], axis=1)
@@ -229,8 +230,9 @@ def measured_by(target: ForecastTarget, record: Record) -> np.ndarray:
 class _ComparedForecasts(NamedTuple):
     """Forecasts from each row, and what came: of the numbers that a filter receives, or of its states.
 
-    part "received" or "state", names of the numbers, moments of their forecasts, came (rows, numbers), and the places
-    of the angles among them.
+    part: "received" or "state". names: of the numbers. moments: of their forecasts (rows, horizons, ...). came: what
+    came
+    (rows, numbers). angles: indices of the angles among them.
     """
 
     part: str
@@ -243,19 +245,20 @@ class _ComparedForecasts(NamedTuple):
 def _score_filter(
     segments: list[tuple[int, ForecastTarget]], record: Record, u: np.ndarray, ahead: list[int], first: int
 ) -> list[Score]:
-    """Score what one filter says ahead of each number that it receives, and of each state whose truth is known.
+    """Return the scores of one filter: of each number that it receives, and each state whose truth is known.
 
     Args:
-        segments: rows from which the filter is another one, refitted, and the filter as it is from there on.
+        segments: (row, filter as it is from there on), more than one if it is refitted.
         record: of the run that is scored.
         u: inputs (rows, inputs).
-        ahead: horizons.
+        ahead: horizons, in rows.
         first: first row from which a forecast counts.
     """
-    target = segments[0][1]
+    _, target = segments[0]
     filter, node = target.outlook.filter, target.node
     if filter.claim == "none":
         return []
+    # Forecasts from each row, and what came.
     z = measured_by(target, record)
     states, received = _roll_segments(segments, z, u, ahead)
     angles = filter.angles_used() or FilterAngles((), ())
@@ -264,20 +267,25 @@ def _score_filter(
         compared.append(_ComparedForecasts("received", target.received, received, z, angles.received))
     if record.truth is not None:
         compared.append(_ComparedForecasts("state", filter.states, states, record.truth, angles.states))
+    # A score for each number at each horizon.
     scores = list[Score]()
-    for c in compared:
-        for i, name in enumerate(c.names):
-            of = node, target.filter, c.part, name
+    for forecasts in compared:
+        for i, name in enumerate(forecasts.names):
+            number = node, target.filter, forecasts.part, name
+            came, is_angle = forecasts.came[:, i], i in forecasts.angles
             for j, horizon in enumerate(ahead):
-                law = _law(c.moments, i, j)
-                scores.append(_score_number(of, horizon, law, c.came[:, i], first, is_angle=i in c.angles))
+                law = _select_law(forecasts.moments, i, j)
+                scores.append(_score_number(number, horizon, law, came, first, is_angle))
     return scores
 
 
 def _roll_segments(
     segments: list[tuple[int, ForecastTarget]], z: np.ndarray, u: np.ndarray, ahead: list[int]
 ) -> tuple[Moments, Moments | None]:
-    """Return forecasts from each row, as of `roll_forecasts`, by the filter of the segment that the row lies in."""
+    """Return forecasts from each row, as `roll_forecasts` does, by the filter of the segment in which the row lies.
+
+    `segments`: (first row, filter as it is from there on); z: measurements, u: inputs, both by row; `ahead`: horizons.
+    """
     rolled = [roll_forecasts(target.outlook, z, u, ahead) for _, target in segments]
     ends = [*(row for row, _ in segments[1:]), len(z)]
     bounds = list(zip([0, *ends[:-1]], ends, strict=True))
@@ -290,8 +298,8 @@ def _roll_segments(
     return joined
 
 
-def _law(moments: Moments, number: int, horizon: int) -> MixtureLaws:
-    """Return the law of one number at one horizon, from each row."""
+def _select_law(moments: Moments, number: int, horizon: int) -> MixtureLaws:
+    """Return the law of one number at one horizon (its index), from each row."""
     means, variances = np.asarray(moments.means), np.asarray(moments.covariances)
     return MixtureLaws(
         np.asarray(moments.weights)[:, horizon], means[:, horizon, :, number], variances[:, horizon, :, number]
@@ -299,22 +307,39 @@ def _law(moments: Moments, number: int, horizon: int) -> MixtureLaws:
 
 
 def _score_number(
-    of: tuple[str, str, str, str], horizon: int, law: MixtureLaws, values: np.ndarray, first: int, is_angle: bool
+    number: tuple[str, str, str, str], horizon: int, law: MixtureLaws, values: np.ndarray, first: int, is_angle: bool
 ) -> Score:
-    """Score forecasts from each row against the number `horizon` rows later.
+    """Return the score of forecasts from each row of the number `horizon` rows later.
 
-    `of` says which number: its node, filter, part and name; `law` is its forecast from each row, `values` what it was.
+    Args:
+        number: its node, filter, part and name.
+        horizon: rows ahead.
+        law: the forecast from each row.
+        values: the number in each row (rows,), NaN where it did not come.
+        first: first row from which a forecast counts.
+        is_angle: whether it is an angle.
     """
+    # The forecasts that count, and what came `horizon` rows later.
     law, came = MixtureLaws(*(part[first:-horizon] for part in law)), values[first + horizon :]
     # An angle within half a turn of what was expected.
     came = law.mean + wrap_angles((came - law.mean)[:, None], (0,) if is_angle else ())[:, 0]
-    came = np.where(np.isfinite(law.variances).all(axis=1), came, np.nan)  # of what nothing was heard yet: none
-    error, chance = came - law.mean, below(law, came)
-    known = np.where(np.isnan(error), np.nan, 0.0)
-    coverage = tuple(average_overlapping((np.abs(chance - 0.5) <= level / 2) + known, horizon) for level in LEVELS)
-    bias, mse = average_overlapping(error, horizon), average_overlapping(error**2, horizon)
-    density, ranked = (average_overlapping(score(law, came), horizon) for score in (log_score, crps))
-    return Score(*of, horizon, int(np.sum(~np.isnan(error))), bias, mse, coverage, density, ranked)
+    # Nothing was forecast yet where the start is unknown (infinite variances).
+    came = np.where(np.isfinite(law.variances).all(axis=1), came, np.nan)
+    error, probability_below = came - law.mean, compute_probability_below(law, came)
+    absent = np.where(np.isnan(error), np.nan, 0.0)
+    coverage = tuple(
+        average_overlapping((np.abs(probability_below - 0.5) <= level / 2) + absent, horizon) for level in LEVELS
+    )
+    return Score(
+        *number,
+        horizon=horizon,
+        compared=int(np.sum(~np.isnan(error))),
+        bias=average_overlapping(error, horizon),
+        mse=average_overlapping(error**2, horizon),
+        coverage=coverage,
+        log_score=average_overlapping(log_score(law, came), horizon),
+        crps=average_overlapping(crps(law, came), horizon),
+    )
 
 
 def roll_forecasts(
@@ -336,30 +361,37 @@ def roll_forecasts(
 def _forecast_from_each_row(
     outlook: Outlook, z: jax.Array, u: jax.Array, windows: jax.Array, places: jax.Array
 ) -> PyTree:
-    """Filter a recording, and predict from each of its rows those ahead; return the moments at `places` among these.
+    """Return the moments that a filter forecasts from each row of a recording: of the states, and of what arrives.
 
-    `windows` (rows, ahead, inputs) holds the inputs ahead of each row.
+    (rows, places, K, ...), with variances in the place of covariances.
+
+    Args:
+        outlook: how the filter is read ahead.
+        z: measurements (rows, received).
+        u: inputs (rows, inputs).
+        windows: inputs of the rows ahead of each row (rows, ahead, inputs).
+        places: which of the rows ahead are returned, from 0.
     """
     filter, length = outlook.filter, windows.shape[1]
 
-    def with_variances(moments: Moments | None) -> Moments | None:
-        """Return the moments at `places`, with variances in the place of covariances."""
+    def select(moments: Moments | None) -> Moments | None:
+        """Return the moments at `places` of all rows ahead, with variances in the place of covariances."""
         if moments is None:
             return None
         variances = jnp.diagonal(moments.covariances, axis1=-2, axis2=-1)
         return Moments(moments.weights[places], moments.means[places], variances[places])
 
-    def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:
-        """Return the state after a row, and the moments ahead of it."""
+    def filter_and_forecast(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:
+        """Return the filter's state after row k, and the moments that it forecasts from there."""
         k, z_k, u_k, window = row
         after, _ = filter.correct(filter.predict(state, u_k, k), z_k, k)
-        numbers = k + 1 + jnp.arange(length)
-        _, (states, _, received) = jax.lax.scan(lambda s, ahead: outlook.step(s, *ahead), after, (window, numbers))
-        return after, (with_variances(states), with_variances(received))
+        steps_ahead = k + 1 + jnp.arange(length)
+        _, (states, _, received) = jax.lax.scan(lambda s, ahead: outlook.step(s, *ahead), after, (window, steps_ahead))
+        return after, (select(states), select(received))
 
     start = jax.tree.map(jnp.asarray, filter.init())
     rows = jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u), jnp.asarray(windows)
-    return jax.lax.scan(body, start, rows)[1]
+    return jax.lax.scan(filter_and_forecast, start, rows)[1]
 
 
 _by_xla = quickly_compiled(_forecast_from_each_row)

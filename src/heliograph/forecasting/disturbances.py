@@ -96,7 +96,7 @@ class Disturbances:
         return [self._describe(row, residuals[row], p[row], int(size[row].argmax())) for row in rows]
 
     def _describe(self, row: int, residuals: np.ndarray, p: np.ndarray, place: int) -> Shock:
-        """Return the shock of a row: one of its residuals."""
+        """Return the shock of a row: the residual number `place` of its residuals, with its probability."""
         kind: Literal["break", "outlier"] = "outlier" if place < len(self.outputs) else "break"
         return Shock(row, kind, (*self.outputs, *self.states)[place], float(residuals[place]), float(p[place]))
 
@@ -125,13 +125,22 @@ def disturbances(
     predicted = predict_rows(filter, rows, inputs)
     if not _is_received_unchanged(predicted):
         raise fail("disturbances", "a filter whose channel hands on what is measured", "one with gains or noise")
+    # Both noises given all data, from the innovations e of the filter's predictions.
     C, R = np.asarray(sensor.matrix), np.asarray(sensor.noise.covariance)
     A, Q = np.asarray(plant.matrix), np.asarray(plant.noise.covariance)  # type: ignore[union-attr]  # a Gaussian's
     assert predicted.received is not None
     e = np.asarray(rows) - predicted.received.mean
-    noise, motion = _smooth_noises(A, C, Q, R, e, predicted.states.covariance)
-    sensed, moved = (_with_deviation(mean, covariance) for mean, covariance in (noise, motion))
-    return Disturbances(tuple(predicted.received.names), tuple(filter.states), *sensed, *moved)
+    of_outputs, of_plant = _smooth_noises(A, C, Q, R, e, predicted.states.covariance)
+    output_noise, output_deviation = _with_deviation(*of_outputs)
+    state_noise, state_deviation = _with_deviation(*of_plant)
+    return Disturbances(
+        outputs=tuple(predicted.received.names),
+        states=tuple(filter.states),
+        output_noise=output_noise,
+        output_deviation=output_deviation,
+        state_noise=state_noise,
+        state_deviation=state_deviation,
+    )
 
 
 def _find_model(filter: AbstractFilter) -> tuple[LinearPlant, LinearSensor]:
@@ -156,7 +165,7 @@ def _find_model(filter: AbstractFilter) -> tuple[LinearPlant, LinearSensor]:
 
 
 def _is_received_unchanged(predicted: Forecast) -> bool:
-    """Return whether what arrives is what is measured."""
+    """Return whether the prediction of what arrives is that of what is measured: the channel hands it on unchanged."""
     sent, came = predicted.outputs, predicted.received
     return (
         sent is not None
@@ -170,39 +179,55 @@ def _is_received_unchanged(predicted: Forecast) -> bool:
 def _smooth_noises(
     A: np.ndarray, C: np.ndarray, Q: np.ndarray, R: np.ndarray, e: np.ndarray, P: np.ndarray
 ) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """Return means and covariances of both noises, by innovations e (steps, m) and predicted covariances P.
+    """Return the outputs' noise and the plant's given all data, each as means (steps, size) and covariances.
 
-    Backward with r, N = Cov(r) behind a row: S = C P C' + R, K = P C' S^-1; of the outputs R (S^-1 e - K' r), of the
-    states Q r before the row, where r <- C' S^-1 e + (I - K C)' r, and then r <- A' r. Rows of C that did not arrive
-    are left out, and what lies before the first row at which all of an unknown start had been heard.
+    Backward over the rows with r and N = Cov r, which hold what all later rows tell: with S = C P C' + R and
+    K = P C' S^-1 the outputs' noise has the mean R (S^-1 e - K' r) and the covariance R (S^-1 + K' N K) R; then
+    r <- C' S^-1 e + (I - K C)' r, the plant's noise on the way to the row has the mean Q r and the covariance Q N Q,
+    and r <- A' r. Rows of C that did not arrive are left out, and so is what lies before the first row at which all of
+    an unknown start had been heard: NaN there.
+
+    Args:
+        A: transition (n, n).
+        C: matrix of the sensor (m, n).
+        Q: covariance of the plant's noise.
+        R: covariance of the sensor's noise.
+        e: innovations (steps, m), NaN where nothing arrived.
+        P: predicted covariances (steps, n, n).
     """
     steps, m = e.shape
     n = len(A)
-    noise, motion = ((np.full((steps, size), np.nan), np.full((steps, size, size), np.nan)) for size in (m, n))
-    r, N, known = np.zeros(n), np.zeros((n, n)), np.isfinite(P).all(axis=(1, 2))
-    for k in reversed(range(int(np.argmax(known)) if known.any() else steps, steps)):
-        came = np.flatnonzero(~np.isnan(e[k]))
-        H, W = C[came], R[np.ix_(came, came)]
-        S = H @ P[k] @ H.T + W
-        weighed, K = np.linalg.solve(S, e[k, came]), np.linalg.solve(S, H @ P[k]).T
-        noise[0][k, came] = W @ (weighed - K.T @ r)
-        noise[1][k][np.ix_(came, came)] = W @ (np.linalg.inv(S) + K.T @ N @ K) @ W
-        B = np.eye(n) - K @ H
-        r, N = H.T @ weighed + B.T @ r, H.T @ np.linalg.solve(S, H) + B.T @ N @ B
-        motion[0][k], motion[1][k] = Q @ r, Q @ N @ Q
+    output_mean, output_covariance = np.full((steps, m), np.nan), np.full((steps, m, m), np.nan)
+    plant_mean, plant_covariance = np.full((steps, n), np.nan), np.full((steps, n, n), np.nan)
+    is_known = np.isfinite(P).all(axis=(1, 2))
+    first_known = int(np.argmax(is_known)) if is_known.any() else steps
+    r, N = np.zeros(n), np.zeros((n, n))
+    for k in reversed(range(first_known, steps)):
+        arrived = np.flatnonzero(~np.isnan(e[k]))
+        C_k, R_k = C[arrived], R[np.ix_(arrived, arrived)]
+        S = C_k @ P[k] @ C_k.T + R_k
+        weighed, K = np.linalg.solve(S, e[k, arrived]), np.linalg.solve(S, C_k @ P[k]).T  # S^-1 e and K
+        output_mean[k, arrived] = R_k @ (weighed - K.T @ r)
+        output_covariance[k][np.ix_(arrived, arrived)] = R_k @ (np.linalg.inv(S) + K.T @ N @ K) @ R_k
+        B = np.eye(n) - K @ C_k
+        r, N = C_k.T @ weighed + B.T @ r, C_k.T @ np.linalg.solve(S, C_k) + B.T @ N @ B
+        plant_mean[k], plant_covariance[k] = Q @ r, Q @ N @ Q
         r, N = A.T @ r, A.T @ N @ A
-    return noise, motion
+    return (output_mean, output_covariance), (plant_mean, plant_covariance)
 
 
 def _with_deviation(mean: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return means and deviations, NaN where the variance is none but rounding."""
+    """Return means (steps, size) and their deviations, NaN where the variance is none but rounding.
+
+    `covariance`: (steps, size, size).
+    """
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     known = variance > ROUNDING * np.max(variance, axis=0, where=np.isfinite(variance), initial=0.0)
     return np.where(known, mean, np.nan), np.sqrt(np.where(known, variance, np.nan))
 
 
 def _find_peaks(size: np.ndarray, marked: np.ndarray) -> list[int]:
-    """Return of marked rows side by side that whose size is largest."""
+    """Return the rows at which the size is largest, one of each stretch of `marked` rows side by side."""
     rows = np.flatnonzero(marked)
     runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if len(rows) else []
     return [int(run[np.argmax(size[run])]) for run in runs]

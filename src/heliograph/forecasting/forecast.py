@@ -66,7 +66,10 @@ def forecast(source: Sources, horizons: Horizons, inputs: Inputs = None) -> Fore
 
 
 def forecasts_from(origin: Origin, horizons: Horizons, inputs: Inputs) -> Forecasts:
-    """Forecast each estimate of an origin, by node and filter; a single filter is called ""."""
+    """Return the forecast of each estimate of an origin, by node and filter; a single filter is called "".
+
+    `horizons` and `inputs` are those of `forecast`.
+    """
     model = origin.model
     assert isinstance(model, Network | AbstractFilter)  # nothing else makes one
     ahead = find_rows_ahead(origin, model.inputs, horizons, inputs)
@@ -102,34 +105,52 @@ def find_target(origin: Origin, node: str | None, filter: str | None) -> Forecas
 
 
 def list_targets(origin: Origin) -> list[ForecastTarget]:
-    """List the estimates that an origin has."""
+    """Return what is forecast from an origin: each of its estimates, with the filter and state that are predicted.
+
+    A single filter has one, of node and filter "".
+    """
     model = origin.model
     if isinstance(model, AbstractFilter):
         outlook = outlook_of(model)
         outputs = () if outlook.sensor is None else tuple(first(outlook.sensor).outputs)
         return [ForecastTarget("", "", outlook, origin.state, name_values(outputs, model.received))]
     assert isinstance(model, Network)
-    kinds, central, *_ = origin.state
-    found = []
+    targets = []
     for node, filters in origin.estimates.items():
         for name, estimate in filters.items():
-            if (node, name) in model.places:
-                kind, f, i = model.places[node, name]
-                place = f * len(model.groups[model.kinds[kind].group]) + i
-                filter, state = model.nodes[node].filters[name], _entry(kinds[kind], place, origin.several)
-            elif name in central:
-                known = model.fused[name]
-                assert isinstance(known, AbstractFilter)
-                filter, state = known, central[name]
-            else:
-                filter, state = _predict_without_nodes(model, estimate)
+            filter, state = _find_filter(model, origin, node, name, estimate)
             outlook = outlook_of(filter, _find_sensor(model, node), model.plant)
-            found.append(ForecastTarget(node, name, outlook, state, _received(model, node)))
-    return found
+            targets.append(ForecastTarget(node, name, outlook, state, _name_received(model, node)))
+    return targets
 
 
-def _entry(stacked: PyTree, place: int, several: bool) -> PyTree:
-    """Return one of the states of filters that are stacked, behind the axis of several plants."""
+def _find_filter(
+    network: Network, origin: Origin, node: str, name: str, estimate: Estimate
+) -> tuple[AbstractFilter, PyTree]:
+    """Return the filter that makes an estimate, and its state in the origin; of a fusion one that only predicts.
+
+    Args:
+        network: the origin's model.
+        origin: with states of the nodes' filters, those of one kind stacked, and of central filters by name.
+        node: of the estimate.
+        name: of its filter or fusion.
+        estimate: where the prediction of a fusion begins.
+    """
+    by_kind, central, *_ = origin.state
+    if (node, name) in network.places:
+        # The states of a kind are stacked filter by filter, and for each over the nodes of its group.
+        kind, filter_of_kind, node_of_group = network.places[node, name]
+        place = filter_of_kind * len(network.groups[network.kinds[kind].group]) + node_of_group
+        return network.nodes[node].filters[name], _take_state(by_kind[kind], place, origin.several)
+    if name in central:
+        filter = network.fused[name]
+        assert isinstance(filter, AbstractFilter)
+        return filter, central[name]
+    return _predict_without_nodes(network, estimate)
+
+
+def _take_state(stacked: PyTree, place: int, several: bool) -> PyTree:
+    """Return one of the states of filters that are stacked along the first axis, or if `several` plants the second."""
     return jax.tree.map(lambda leaf: np.take(leaf, place, axis=int(several)), stacked)
 
 
@@ -159,15 +180,15 @@ def _find_sensor(network: Network, node: str) -> AnySensor | None:
     return None if len(sensors) < len(network.nodes) else joint_sensor(sensors)
 
 
-def _received(network: Network, node: str) -> tuple[str, ...]:
-    """Return the names of the numbers that a node receives, or all nodes together."""
+def _name_received(network: Network, node: str) -> tuple[str, ...]:
+    """Return the names of the numbers that a node receives, or if it is "fused" those of all nodes."""
     if node != FUSED:
         return network.nodes[node].received_names
     return tuple(f"{name}_{part}" for name in network.names for part in network.nodes[name].received_names)
 
 
 def check_covered(filter: AbstractFilter, step: int | np.ndarray, count: int) -> None:
-    """Raise ValueError where what varies over time ends before these steps ahead."""
+    """Raise ValueError where what varies over time ends before `count` steps ahead of `step`."""
     last = int(np.max(step))
     if filter.horizon is not None and last + count > filter.horizon:
         left = max(filter.horizon - last, 0)
@@ -175,7 +196,10 @@ def check_covered(filter: AbstractFilter, step: int | np.ndarray, count: int) ->
 
 
 def _forecast_target(target: ForecastTarget, origin: Origin, ahead: RowsAhead) -> Forecast:
-    """Return the forecast of one filter."""
+    """Return the forecast of one estimate at the horizons: states, and where they can be told outputs and what arrives.
+
+    `ahead`: inputs of the rows ahead, and the row of each horizon.
+    """
     outlook, filter = target.outlook, target.outlook.filter
     check_ahead(filter.inputs, ahead, filter, origin.step)
     look = look_ahead_of_each if origin.several else look_ahead

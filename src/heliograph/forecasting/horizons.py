@@ -32,9 +32,13 @@ class HasInputs(Protocol):
 
 
 class RowsAhead(NamedTuple):
-    """Rows to predict over: u (rows, inputs), the number of the row that ends at each horizon, and their times.
+    """Rows to predict over, and which of them the horizons are.
 
-    Of several plants u and times have a leading axis.
+    u: inputs of each row. rows: number of the row that ends at each horizon. steps: how far each horizon is, in steps
+    or in
+    the unit of dt. time: of each, on the clock of the data. inputs: whether they are "given", "held" or there are none.
+
+    Of several plants u and time have a leading axis.
     """
 
     u: Float[np.ndarray, "... rows inputs"]
@@ -45,59 +49,69 @@ class RowsAhead(NamedTuple):
 
 
 def find_rows_ahead(origin: Origin, names: Sequence[str], horizons: Horizons, inputs: Inputs) -> RowsAhead:
-    """Return the rows of inputs from an origin to each horizon.
+    """Return the rows of inputs over which a filter predicts from an origin to each horizon.
 
     Where time counts steps there is a row a step; where the plant has an input dt, a row from each horizon to the next.
+
+    Args:
+        origin: where the data end.
+        names: of the plant's inputs.
+        horizons: how far ahead.
+        inputs: those of the rows ahead but dt; "held" for those of the last row; None of a plant without others.
 
     Raises:
         ValueError: a horizon that is not behind the one before, or behind the data; inputs that are not those of the
             rows, none of a plant that has some, or none to hold.
     """
-    continuous = TIME_STEP in names
-    distances = _convert_to_times(origin, horizons) if continuous else _convert_to_steps(origin, horizons)
+    is_continuous = TIME_STEP in names
+    distances = _convert_to_times(origin, horizons) if is_continuous else _convert_to_steps(origin, horizons)
     if np.any(np.diff(distances, prepend=0.0) <= 0):
         raise fail("horizons", "times after the data, each later than the one before", show_value(horizons))
-    count = len(distances) if continuous else int(distances[-1])
+    time = _place_on_clock(origin, distances, is_continuous)
+    # A row for each horizon, with dt from the one before; else one for each step up to the last.
+    count = len(distances) if is_continuous else int(distances[-1])
     others = [name for name in names if name != TIME_STEP]
-    given, said = _complete_inputs(origin, names, others, inputs, count)
-    u = given
-    if continuous:
-        u = np.insert(given, list(names).index(TIME_STEP), np.diff(distances, prepend=0.0), axis=-1)
-    rows = np.arange(count) if continuous else distances.astype(int) - 1
-    return RowsAhead(
-        u,
-        rows,
-        distances if continuous else distances.astype(int),
-        _place_on_clock(origin, distances, continuous),
-        said,
-    )
+    u, source = _complete_inputs(origin, names, others, inputs, count)
+    if is_continuous:
+        u = np.insert(u, list(names).index(TIME_STEP), np.diff(distances, prepend=0.0), axis=-1)
+        return RowsAhead(u, rows=np.arange(count), steps=distances, time=time, inputs=source)
+    steps = distances.astype(int)
+    return RowsAhead(u, rows=steps - 1, steps=steps, time=time, inputs=source)
 
 
 def _convert_to_steps(origin: Origin, horizons: Horizons) -> np.ndarray:
-    """Return the horizons as numbers of steps."""
+    """Return how many steps ahead each horizon is (horizons,): numbers of steps, spans of time, or dates.
+
+    A whole number stands for each step up to it.
+    """
     if is_whole(horizons):
         return np.arange(1.0, _check_steps(horizons) + 1)
-    steps = []
-    for horizon in _list_horizons(horizons):
-        if origin.months and isinstance(horizon, datetime | np.datetime64) and _convert_to_seconds(origin, horizon):
-            steps.append(_count_months(origin, horizon))
-            continue
-        if (seconds := _convert_to_seconds(origin, horizon)) is None:
-            steps.append(float(_check_steps(horizon)))
-            continue
-        if not origin.spacing > 0:
-            raise fail("horizons", "numbers of steps, where the time between them is not known", show_value(horizon))
-        count = seconds / origin.spacing
-        if abs(count - round(count)) > OFF:
-            raise fail(
-                "horizons", f"whole steps of {origin.spacing:g} s", f"{show_value(horizon)}, {count:.4g} steps ahead"
-            )
-        steps.append(float(round(count)))
-    return np.array(steps)
+    return np.array([_convert_horizon_to_steps(origin, horizon) for horizon in _list_horizons(horizons)])
+
+
+def _convert_horizon_to_steps(origin: Origin, horizon: object) -> float:
+    """Return how many steps ahead one horizon is: a number of steps, a span of time or a date.
+
+    Raises:
+        ValueError: no whole number of steps, or a time where that of a step is not known.
+    """
+    seconds = _convert_to_seconds(origin, horizon)
+    if seconds is None:  # a number
+        return float(_check_steps(horizon))
+    # Steps of whole months are not of equal length.
+    if origin.months and isinstance(horizon, datetime | np.datetime64):
+        return _count_months(origin, horizon)
+    if not origin.spacing > 0:
+        raise fail("horizons", "numbers of steps, where the time between them is not known", show_value(horizon))
+    count = seconds / origin.spacing
+    if abs(count - round(count)) > OFF:
+        expected = f"whole steps of {origin.spacing:g} s"
+        raise fail("horizons", expected, f"{show_value(horizon)}, {count:.4g} steps ahead")
+    return float(round(count))
 
 
 def _count_months(origin: Origin, date: datetime | np.datetime64) -> float:
-    """Return how many steps of whole months a date lies ahead."""
+    """Return how many steps, each of `origin.months` whole months, a date lies ahead."""
     apart = np.datetime64(date).astype("datetime64[M]") - _find_end_of_data(origin, date).astype("datetime64[M]")
     steps, left = divmod(int(apart.astype(int)), origin.months)
     if left or not steps:
@@ -106,21 +120,19 @@ def _count_months(origin: Origin, date: datetime | np.datetime64) -> float:
 
 
 def _convert_to_times(origin: Origin, horizons: Horizons) -> np.ndarray:
-    """Return the horizons as times ahead in the unit of dt, of dates in seconds.
+    """Return how far ahead each horizon is in the unit of dt (horizons,); spans of time and dates in seconds.
 
-    A single whole number counts steps of the usual size.
+    A single whole number stands for each step of the usual size up to it.
     """
     if is_whole(horizons):
         if not origin.spacing > 0:
             raise fail("horizons", "times ahead, such as [1.0, 5.0], where no step is usual", horizons)
         return origin.spacing * np.arange(1, _check_steps(horizons) + 1)
-    listed = [(horizon, _convert_to_seconds(origin, horizon)) for horizon in _list_horizons(horizons)]
-    return np.array(
-        [
-            float(array("horizon", cast(ArrayLike, horizon), ())) if seconds is None else seconds
-            for horizon, seconds in listed
-        ]
-    )
+    times = []
+    for horizon in _list_horizons(horizons):
+        seconds = _convert_to_seconds(origin, horizon)
+        times.append(float(array("horizon", cast(ArrayLike, horizon), ())) if seconds is None else seconds)
+    return np.array(times)
 
 
 def _check_steps(value: object) -> int:
@@ -132,7 +144,7 @@ def _check_steps(value: object) -> int:
 
 
 def _list_horizons(horizons: object) -> list[object]:
-    """Return horizons as a list, one of them as a list of one."""
+    """Return horizons as a list; a single time or date as a list of one."""
     single = isinstance(horizons, float | timedelta | datetime | np.timedelta64 | np.datetime64)
     listed: list[object] = [horizons] if single else list(horizons) if rank("horizons", horizons) == 1 else []  # type: ignore[call-overload]
     if not listed:
@@ -141,7 +153,7 @@ def _list_horizons(horizons: object) -> list[object]:
 
 
 def _convert_to_seconds(origin: Origin, horizon: object) -> float | None:
-    """Return the seconds ahead of a span of time or a date; None of a number."""
+    """Return how many seconds ahead a span of time or a date is; None of a number."""
     if isinstance(horizon, timedelta | np.timedelta64):
         unit = units_in(origin.model.inputs).get(TIME_STEP, "s") if isinstance(origin.model, HasInputs) else "s"
         if unit != "s":
@@ -174,7 +186,15 @@ def _find_end_of_data(origin: Origin, horizon: datetime | np.datetime64) -> np.d
 def _complete_inputs(
     origin: Origin, names: Sequence[str], others: Sequence[str], inputs: Inputs, count: int
 ) -> tuple[np.ndarray, InputsAhead]:
-    """Return the rows of inputs other than dt, and whether they were given or held; of several plants for each."""
+    """Return the inputs of the rows ahead but dt, ([plants,] count, others), and whether they were given or held.
+
+    Args:
+        origin: has the inputs of the last row; `several` where it is of several plants.
+        names: of all inputs.
+        others: those but dt.
+        inputs: an array (count, others), or one for each plant; "held" for those of the last row; None for none.
+        count: number of rows.
+    """
     plants = (len(origin.inputs),) if origin.several else ()
     if isinstance(inputs, str) and inputs != "held":
         raise fail("inputs ahead", 'an array, or "held"', repr(inputs))
@@ -184,20 +204,25 @@ def _complete_inputs(
         return np.zeros((*plants, count, 0)), "none"
     if inputs is None:
         raise fail("inputs ahead", f'rows of {list(others)} for {count} steps, or "held"', "none")
+    # Given: one axis is one input over the rows; the same rows hold for all plants unless there are three axes.
     if not isinstance(inputs, str):
         axes = rank("inputs ahead", inputs)
         rows = np.reshape(inputs, (-1, 1)) if len(others) == 1 and axes == 1 else inputs
         shape = (count, len(others))
         given = array("inputs ahead", rows, (*plants, *shape) if axes == 3 and plants else shape)
         return np.broadcast_to(given, (*plants, *shape)), "given"
-    held = origin.inputs[..., [list(names).index(name) for name in others]]
-    if np.isnan(held).any():
+    # Held: those of the last row, again and again.
+    last = origin.inputs[..., [list(names).index(name) for name in others]]
+    if np.isnan(last).any():
         raise fail("inputs ahead", "rows, as there is no last step whose inputs could be held", '"held"')
-    return np.repeat(held[..., None, :], count, axis=-2), "held"
+    return np.repeat(last[..., None, :], count, axis=-2), "held"
 
 
 def check_ahead(names: Sequence[str], ahead: RowsAhead, models: object, step: int | np.ndarray) -> None:
-    """Refuse inputs for which a function of the plant returns what it must not."""
+    """Raise ValueError at inputs ahead for which a function of the models returns what it must not.
+
+    `names`: of the inputs; `step`: that of the last row, of several plants for each.
+    """
     count, width = ahead.u.shape[-2:]
     if width:
         steps = np.asarray(step)[..., None] + np.arange(count)
@@ -205,7 +230,10 @@ def check_ahead(names: Sequence[str], ahead: RowsAhead, models: object, step: in
 
 
 def _place_on_clock(origin: Origin, distances: np.ndarray, continuous: bool) -> np.ndarray:
-    """Return the time of each horizon on the clock of the data."""
+    """Return the time of each horizon on the clock of the data ([plants,] horizons): numbers or dates.
+
+    `distances`: how far ahead each is, in steps or if `continuous` in the unit of dt.
+    """
     spacing = 1.0 if continuous else origin.spacing
     end = np.asarray(origin.time)[..., None]
     if end.dtype.kind != "M":

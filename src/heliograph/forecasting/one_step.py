@@ -82,7 +82,10 @@ def predict_record(record: Record, inputs: Float[ArrayLike, "steps inputs"] | No
 
 
 def _make_forecast(outlook: Outlook, z: np.ndarray, u: np.ndarray, names: tuple[str, ...]) -> Forecast:
-    """Return the forecast of each row from those before it; `names` are those of what arrives."""
+    """Return the forecast of each row from those before it; z: measurements, u: inputs (rows, ...).
+
+    `names`: of the numbers that arrive.
+    """
     filter, sensor = outlook.filter, first(outlook.sensor)
     states, outputs, received = compute_once(_predict_each_row, _by_xla, (outlook, z, u))
     angles = filter.angles_used() or FilterAngles((), ())
@@ -94,7 +97,7 @@ def _make_forecast(outlook: Outlook, z: np.ndarray, u: np.ndarray, names: tuple[
 
 
 def _predict_each_row(outlook: Outlook, z: jax.Array, u: jax.Array) -> PyTree:
-    """Filter a recording; return the moments predicted for each row from those before it."""
+    """Return the moments that a filter predicts for each row of a recording from those before it, (rows, K, ...)."""
 
     def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:
         """Return the state after a row, and the moments that were predicted for it."""

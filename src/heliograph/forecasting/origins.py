@@ -16,7 +16,7 @@ Sources: TypeAlias = HasOrigin | Sequence[HasOrigin]
 
 
 def origin_of(source: object) -> Origin:
-    """Return where a forecast starts.
+    """Return where a forecast from a result or live object starts: its states, and the time of its last row.
 
     Raises:
         ValueError: something without an origin, or a record whose filters' states were not kept.
@@ -34,7 +34,7 @@ def origin_of(source: object) -> Origin:
 
 
 def origin_of_sources(source: Sources) -> Origin:
-    """Return where a forecast starts, of a list of sources all their origins side by side.
+    """Return where a forecast starts; of a list of sources their origins as one, with an axis over the sources.
 
     Raises:
         ValueError: what `origin_of` refuses, an empty list, sources of other models or other steps.
@@ -47,32 +47,37 @@ def origin_of_sources(source: Sources) -> Origin:
 
 
 def _stack_origins(origins: list[Origin]) -> Origin:
-    """Return the origins of sources of one model as one, with a leading axis.
+    """Return the origins of several sources of one model as one, whose arrays lead with an axis over the sources.
 
     Raises:
         ValueError: another model than the first, steps of another size.
     """
     head = origins[0]
     for number, origin in enumerate(origins):
-        name = f"forecast, source {number}"
-        if origin.model is not head.model:
-            raise fail(name, "the filter or network of the source before it", "another one")
-        if not np.array_equal([head.spacing, head.months], [origin.spacing, origin.months], equal_nan=True):
-            raise fail(name, f"steps of {head.spacing:g}, as of the source before it", f"{origin.spacing:g}")
-        if isinstance(origin.time, np.datetime64) != isinstance(head.time, np.datetime64):
-            raise fail(name, "times as those of the source before it: dates, or numbers", str(origin.time))
+        _check_like_first(f"forecast, source {number}", head, origin)
+    estimates = {
+        node: {name: _stack_estimates([origin.estimates[node][name] for origin in origins]) for name in filters}
+        for node, filters in head.estimates.items()
+    }
     return replace(
         head,
         state=_stack_trees([origin.state for origin in origins]),
         step=np.array([origin.step for origin in origins]),
         inputs=np.stack([origin.inputs for origin in origins]),
         time=np.array([origin.time for origin in origins]),
-        estimates={
-            node: {name: _stack_estimates([o.estimates[node][name] for o in origins]) for name in filters}
-            for node, filters in head.estimates.items()
-        },
+        estimates=estimates,
         several=True,
     )
+
+
+def _check_like_first(name: str, head: Origin, origin: Origin) -> None:
+    """Raise ValueError unless an origin has the model, the steps and the kind of times of the first one, `head`."""
+    if origin.model is not head.model:
+        raise fail(name, "the filter or network of the source before it", "another one")
+    if not np.array_equal([head.spacing, head.months], [origin.spacing, origin.months], equal_nan=True):
+        raise fail(name, f"steps of {head.spacing:g}, as of the source before it", f"{origin.spacing:g}")
+    if isinstance(origin.time, np.datetime64) != isinstance(head.time, np.datetime64):
+        raise fail(name, "times as those of the source before it: dates, or numbers", str(origin.time))
 
 
 def _stack_trees(trees: list[PyTree]) -> PyTree:
@@ -81,7 +86,7 @@ def _stack_trees(trees: list[PyTree]) -> PyTree:
 
 
 def _stack_estimates(estimates: list[Estimate]) -> Estimate:
-    """Return single estimates as one of several plants, with the claim of the first that has any."""
+    """Return estimates of single plants as one of several plants, with the claim of the first that claims anything."""
     claimed = next((one for one in estimates if one.claim != "none"), estimates[0])
     covariances = [
         np.asarray(one.covariance) if one.claim == claimed.claim else np.full(np.shape(claimed.covariance), np.nan)

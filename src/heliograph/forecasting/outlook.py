@@ -59,7 +59,10 @@ class Outlook(Module):
     receives: bool = eqx.field(static=True)
 
     def mixture(self, state: PyTree) -> Moments:
-        """Return the moments of the states: a part for each of the filter's, only means if nothing is claimed."""
+        """Return the moments of the states as a mixture: the filter's own if it has one, else of one part.
+
+        Covariances are zero where the filter claims nothing.
+        """
         filter = self.filter
         if isinstance(filter, LimitedFilter):  # each part within the limits
             state, filter = filter.condition(state), filter.base
@@ -74,10 +77,19 @@ class Outlook(Module):
 
     def moments(self, state: PyTree) -> Moments:
         """Return the moments of the states as they are now, as NumPy arrays."""
-        return _now(self, state)
+        return _compute_moments_now(self, state)
 
-    def measured(self, prior: PyTree, states: Moments, u: jax.Array, k: jax.Array) -> Moments | None:
-        """Return the moments of what the sensor would measure under u, part by part; where modes change it, in each."""
+    def predict_measured(self, prior: PyTree, states: Moments, u: jax.Array, k: jax.Array) -> Moments | None:
+        """Return the moments of what the sensor would measure at step k, as a mixture; None where there is no sensor.
+
+        There is a part for each part of the states, or if modes change what is measured for each mode.
+
+        Args:
+            prior: the filter's state, predicted for step k.
+            states: moments of the states then.
+            u: inputs of the step (inputs,).
+            k: the step.
+        """
         if self.sensor is None or self.plant is None:
             return None
         if isinstance(self.filter, MultipleModelFilter) and memories((self.plant, self.sensor)):
@@ -100,7 +112,7 @@ class Outlook(Module):
         return Moments(states.weights, means, covariances)
 
     def received(self, prior: PyTree, k: jax.Array) -> Moments | None:
-        """Return the moments of what would arrive; None where the filter does not say them.
+        """Return the moments of what would arrive at step k, by the predicted state; None where the filter cannot tell.
 
         Of z = 0 the innovation is minus what is expected, with the covariance of what arrives.
         """
@@ -113,7 +125,7 @@ class Outlook(Module):
         """Predict over step k; return the state there, and the moments of states, outputs and received numbers."""
         prior = self.filter.predict(state, u, k)
         states = self.mixture(prior)
-        outputs = self.measured(prior, states, u, k)
+        outputs = self.predict_measured(prior, states, u, k)
         # From an unknown start the sensor is received as it is, and there is no innovation of what nobody knows.
         received = outputs if isinstance(prior, Diffuse) else self.received(prior, k)
         return prior, (states, outputs, received)
@@ -136,13 +148,16 @@ def outlook_of(filter: AbstractFilter, sensor: AnySensor | None = None, plant: A
 
 
 @compile_on_call
-def _now(outlook: Outlook, state: PyTree) -> Moments:
+def _compute_moments_now(outlook: Outlook, state: PyTree) -> Moments:
     """Return the moments of the states at the row where the outlook begins."""
     return outlook.mixture(state)
 
 
 def look_ahead(outlook: Outlook, state: PyTree, u: np.ndarray, step: int | np.ndarray) -> tuple[Moments | None, ...]:
-    """Return the moments at each row ahead (rows, K, ...), by native code where it supports the filter."""
+    """Return the moments of states, outputs and what arrives at each row ahead (rows, K, ...).
+
+    By native code where it supports the filter. `state`: that of the filter at `step`; `u`: inputs (rows, inputs).
+    """
     arguments = outlook, state, np.asarray(u, dtype=float), np.asarray(step)
     moments: tuple[Moments | None, ...] = compute_once(_look_ahead, _by_xla, arguments)
     return moments
@@ -151,7 +166,10 @@ def look_ahead(outlook: Outlook, state: PyTree, u: np.ndarray, step: int | np.nd
 def look_ahead_of_each(
     outlook: Outlook, state: PyTree, u: np.ndarray, step: int | np.ndarray
 ) -> tuple[Moments | None, ...]:
-    """Return the moments of several plants (plants, rows, K, ...), side by side: state, u and step lead with them."""
+    """Return the moments of several plants at each row ahead (plants, rows, K, ...), computed side by side.
+
+    state, u and step lead with an axis over the plants.
+    """
     arguments = jax.tree.map(np.asarray, (state, np.asarray(u, dtype=float), step))
     with jax.enable_x64(True):
         choice = choose_code(_look_ahead, (outlook, *arguments), [False, True, True, True])
@@ -169,7 +187,10 @@ def look_ahead_of_each(
 
 
 def _look_ahead(outlook: Outlook, state: PyTree, u: jax.Array, step: jax.Array) -> PyTree:
-    """Return the moments of each step ahead, from a state, under inputs `u` (steps, inputs)."""
+    """Return the moments of states, outputs and what arrives at each step ahead (steps, K, ...).
+
+    From a state at `step`, under inputs `u` (steps, inputs).
+    """
 
     def body(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
         """Return the state a row ahead, and the moments there."""
@@ -208,7 +229,7 @@ def prediction_of(moments: Moments, names: tuple[str, ...], claim: Claim, angles
 
 
 def output_claim(filter: AbstractFilter, outlook: Outlook) -> Claim:
-    """Return the claim of outputs: that of the states, by a linear sensor without angles; nominal by any other."""
+    """Return the claim of predicted outputs: that of the states behind a linear sensor, else nominal at most."""
     sensor = first(outlook.sensor)
     plain = isinstance(sensor, LinearSensor) and not sensor.circular
     return filter.claim if plain or filter.claim == "none" else weakest([filter.claim, "nominal"])

@@ -91,6 +91,9 @@ def draw_paths(
         node: whose filter, "fused" for a fused estimate; by default the only one.
         filter: name of the filter; by default the only one.
 
+    Returns:
+        The paths: states (draws, times, n) and outputs (draws, times, m) at the horizons.
+
     Raises:
         ValueError: what `hg.forecast` refuses; several filters and no name; a filter that does not say what its plant
             is, or that claims no covariance; modes of plant or sensor of which it has no probabilities; an unknown
@@ -105,12 +108,18 @@ def draw_paths(
     if plant is None:
         raise fail("paths", "a filter that says what its plant is", type(target.outlook.filter).__name__)
     count, key = check_count("draws", draws), jax.random.key(check_seed("seed", seed))
-    start, modes = _draw_starts(target, count, np.random.default_rng(seed))
+    # States and modes at the start, then states and outputs in all rows ahead, of which the horizons are kept.
+    starts = _draw_starts(target, count, np.random.default_rng(seed))
     keys, step = jax.random.split(key, count), np.asarray(origin.step)
-    x, y = _draw_from_starts(plant, sensor, (start, modes), ahead.u, keys, step, _switching_of(target))
-    outputs = () if sensor is None else tuple(first(sensor).outputs)
-    states = target.outlook.filter.states
-    return Paths(ahead.steps, ahead.time, states, outputs, np.asarray(x)[:, ahead.rows], np.asarray(y)[:, ahead.rows])
+    x, y = _draw_from_starts(plant, sensor, starts, ahead.u, keys, step, _find_switching(target))
+    return Paths(
+        steps=ahead.steps,
+        time=ahead.time,
+        states=target.outlook.filter.states,
+        outputs=() if sensor is None else tuple(first(sensor).outputs),
+        x=np.asarray(x)[:, ahead.rows],
+        y=np.asarray(y)[:, ahead.rows],
+    )
 
 
 class Switching(NamedTuple):
@@ -120,14 +129,17 @@ class Switching(NamedTuple):
     moved: Bool[Array, ""]
 
     def draw_next(self, key: jax.Array, mode: jax.Array, u: jax.Array, k: jax.Array, is_first: jax.Array) -> jax.Array:
-        """Draw the mode of step k from that of the step before; at the first of all steps it is the one drawn."""
+        """Return the mode of step k, drawn by the chain from that of the step before, or that one itself.
+
+        It stays at the first of all steps unless the chain has `moved` before. `u`: inputs of the step.
+        """
         plant, channel = at(self.filter.plant, k), at(self.filter.channel, k)
         rows = transition_over(plant, u, jnp.asarray(channel.transition))
         stays = is_first & ~jnp.asarray(self.moved)
         return jnp.where(stays, mode, jax.random.categorical(key, jnp.log(rows[mode])))
 
     def choose_models(self, plant: Any, sensor: Any, mode: jax.Array) -> tuple[Any, Any]:
-        """Return plant and sensor as they are in a joint mode."""
+        """Return plant and sensor of one step as they are in a joint mode."""
         plant_mode, sensor_mode = (jnp.asarray(x)[mode] for x in (self.filter.plant_modes, self.filter.sensor_modes))
         return (
             plant.given(plant_mode) if isinstance(plant, ModalPlant) else plant,
@@ -135,21 +147,24 @@ class Switching(NamedTuple):
         )
 
 
-def _switching_of(target: ForecastTarget) -> Switching | None:
+def _find_switching(target: ForecastTarget) -> Switching | None:
     """Return how the modes of plant and sensor move; None where these have none."""
     filter, plant, sensor = target.outlook.filter, target.outlook.plant, target.outlook.sensor
     if not memories((plant, sensor)):
         return None
     if not isinstance(filter, MultipleModelFilter):
-        taken = "a filter that has the modes' probabilities (imm_filter, gpb1_filter, gpb2_filter)"
-        raise fail("paths of a plant or sensor with modes", taken, type(filter).__name__)
+        expected = "a filter that has the modes' probabilities (imm_filter, gpb1_filter, gpb2_filter)"
+        raise fail("paths of a plant or sensor with modes", expected, type(filter).__name__)
     return Switching(filter, target.state.moved)
 
 
 def _draw_starts(target: ForecastTarget, draws: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Draw states (draws, n) and modes from the last estimate: a part of its mixture by its weight, then its Gaussian.
+    """Return states (draws, n) and modes (draws,) drawn from the last estimate, a mixture of Gaussians.
 
-    The modes are 0 where the filter has none.
+    Each is drawn from a part that is drawn by its weight. The modes are 0 where the filter has none.
+
+    Raises:
+        ValueError: a filter that claims no covariance, a state of which not all is known.
     """
     filter = target.outlook.filter
     if filter.claim == "none":
@@ -158,10 +173,13 @@ def _draw_starts(target: ForecastTarget, draws: int, generator: np.random.Genera
     if not np.isfinite(covariances).all():
         raise fail("paths", "a state that is known", "one of which not all has been heard yet (hg.diffuse)")
     part = generator.choice(len(weights), size=draws, p=weights / weights.sum())
+    # The mode of each part by its probability there, by inversion of the cumulated ones.
     modes: np.ndarray = np.zeros(draws, dtype=int)
-    if isinstance(target.state, ModalBeliefs):  # the mode of each component, by its probability there
-        law = np.cumsum(np.asarray(target.state.weight), axis=1)[part]
-        modes = np.minimum((generator.random(draws)[:, None] * law[:, -1:] > law).sum(axis=1), law.shape[1] - 1)
+    if isinstance(target.state, ModalBeliefs):
+        cumulated = np.cumsum(np.asarray(target.state.weight), axis=1)[part]
+        uniform = generator.random(draws)[:, None] * cumulated[:, -1:]
+        modes = np.minimum((uniform > cumulated).sum(axis=1), cumulated.shape[1] - 1)
+    # A root of the part's covariance times standard normal numbers; attitudes are turned by these.
     values, vectors = np.linalg.eigh(covariances)
     roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     changes = np.einsum("dij,dj->di", roots[part], generator.normal(size=(draws, means.shape[1])))
@@ -171,31 +189,47 @@ def _draw_starts(target: ForecastTarget, draws: int, generator: np.random.Genera
 
 @compile_in_float64
 def _draw_from_starts(
-    plant: AnyPlant, sensor: AnySensor | None, starts: tuple[Array, Array], u: Array, keys: jax.Array, step: Array,
+    plant: AnyPlant,
+    sensor: AnySensor | None,
+    starts: tuple[Array, Array],
+    u: Array,
+    keys: jax.Array,
+    step: Array,
     switching: Switching | None,
-) -> tuple[jax.Array, jax.Array]:  # fmt: skip
-    """Return the states and outputs of each path (draws, rows, ...), from its state and mode."""
+) -> tuple[jax.Array, jax.Array]:
+    """Return the states (draws, rows, n) and outputs (draws, rows, m) of drawn paths; m = 0 without a sensor.
+
+    Args:
+        plant: of the paths.
+        sensor: what measures them; None for none.
+        starts: state (draws, n) and mode (draws,) before the first row.
+        u: inputs (rows, inputs).
+        keys: a random key for each path (draws,).
+        step: number of the first row.
+        switching: how modes move; None where there are none.
+    """
+
+    def move(before: tuple[jax.Array, jax.Array], row: tuple[jax.Array, jax.Array], key: jax.Array) -> tuple[Any, Any]:
+        """Return state and mode after row k, and state and output there."""
+        (x, mode), (u_k, k) = before, row
+        key_of_row = jax.random.fold_in(key, k)
+        key_of_plant, key_of_sensor = jax.random.split(key_of_row)
+        plant_k, sensor_k = at(plant, k), None if sensor is None else at(sensor, k)
+        if switching is not None:
+            key_of_mode = jax.random.fold_in(key_of_row, 1)
+            mode = switching.draw_next(key_of_mode, mode, u_k, k, k == jnp.asarray(step))
+            plant_k, sensor_k = switching.choose_models(plant_k, sensor_k, mode)
+        x = plant_k.plus(plant_k.transition(x, u_k), plant_k.sample_noise(key_of_plant, u_k))
+        if sensor_k is None:
+            return (x, mode), (x, jnp.zeros(0))
+        measuring = sensor_k.under(plant_k.inputs, u_k)
+        y = wrap_angles(measuring.measure(x) + measuring.noise.sample(key_of_sensor), measuring.angles)
+        return (x, mode), (x, y)
 
     def draw_path(start: tuple[jax.Array, jax.Array], key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Draw one path: what plant and sensor do over the steps of u, with the draws of this key."""
-
-        def move_path(now: tuple[jax.Array, jax.Array], row: tuple[jax.Array, jax.Array]) -> tuple[Any, Any]:
-            """Move mode and state over a step; return them, and state and output."""
-            (x, mode), (u_k, k) = now, row
-            of_step = jax.random.fold_in(key, k)
-            moving, measuring = jax.random.split(of_step)
-            plant_k, sensor_k = at(plant, k), None if sensor is None else at(sensor, k)
-            if switching is not None:
-                mode = switching.draw_next(jax.random.fold_in(of_step, 1), mode, u_k, k, k == jnp.asarray(step))
-                plant_k, sensor_k = switching.choose_models(plant_k, sensor_k, mode)
-            x = plant_k.plus(plant_k.transition(x, u_k), plant_k.sample_noise(moving, u_k))
-            if sensor_k is None:
-                return (x, mode), (x, jnp.zeros(0))
-            eye = sensor_k.under(plant_k.inputs, u_k)
-            return (x, mode), (x, wrap_angles(eye.measure(x) + eye.noise.sample(measuring), eye.angles))
-
+        """Return the states (rows, n) and outputs (rows, m) of one path."""
         rows = jnp.asarray(u), jnp.asarray(step) + jnp.arange(len(u))
-        path: tuple[jax.Array, jax.Array] = jax.lax.scan(move_path, start, rows)[1]
+        path: tuple[jax.Array, jax.Array] = jax.lax.scan(lambda before, row: move(before, row, key), start, rows)[1]
         return path
 
     paths: tuple[jax.Array, jax.Array] = jax.vmap(draw_path)(jax.tree.map(jnp.asarray, starts), keys)

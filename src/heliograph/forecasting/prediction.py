@@ -68,13 +68,12 @@ class Prediction:
         low, high = each.min(axis=-2), each.max(axis=-2)
         for _ in range(HALVINGS if means.shape[-2] > 1 else 0):
             middle = (low + high) / 2
-            below = self._below(middle) < p
-            low, high = np.where(below, middle, low), np.where(below, high, middle)
+            is_below = self._find_probability_below(middle) < p
+            low, high = np.where(is_below, middle, low), np.where(is_below, high, middle)
         return np.where(np.isnan(self.deviation), np.nan, (low + high) / 2)
 
     def interval(self, coverage: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
-        """Return both ends (horizons, m) of the interval that holds each number with this probability, half outside
-        on each side.
+        """Return both ends (horizons, m) of the central interval that holds each number with this probability.
 
         Args:
             coverage: probability inside, between 0 and 1.
@@ -95,10 +94,10 @@ class Prediction:
         if numbers.shape not in ((), self.mean.shape[-1:], self.mean.shape):
             raise fail("values", f"one, or shape {self.mean.shape[-1:]} or {self.mean.shape}", f"shape {numbers.shape}")
         limits = np.broadcast_to(array("values", numbers, numbers.shape), self.mean.shape)
-        return np.where(np.isfinite(self.deviation), self._below(limits), np.nan)
+        return np.where(np.isfinite(self.deviation), self._find_probability_below(limits), np.nan)
 
     def map_arrays(self, change: Callable[[np.ndarray, int], np.ndarray]) -> "Prediction":
-        """Return the prediction with each array changed.
+        """Return the prediction with each of its arrays replaced by what `change` makes of it.
 
         Args:
             change: function of an array and of its number of axes behind that of horizons.
@@ -112,8 +111,11 @@ class Prediction:
             part_variances=change(self.part_variances, 2),
         )
 
-    def _below(self, limits: np.ndarray) -> np.ndarray:
-        """Return the sum of weight_k P(part k < limit), a part without variance being its mean."""
+    def _find_probability_below(self, limits: np.ndarray) -> np.ndarray:
+        """Return P(number < limit) (horizons, m), the sum of weight_k P(part k < limit).
+
+        A part without variance is its mean, which counts half at the limit itself.
+        """
         away = limits[..., None, :] - self.part_means
         spread = np.sqrt(self.part_variances)
         certain = np.where(away > 0, np.inf, np.where(away < 0, -np.inf, 0.0))
@@ -176,7 +178,10 @@ class Forecast:
         return self._map_arrays(lambda array, _: array[number])
 
     def _map_arrays(self, change: Callable[[np.ndarray, int], np.ndarray]) -> "Forecast":
-        """Return the forecast with each array changed by a function of it and of its axes behind the horizons."""
+        """Return the forecast with each of its arrays replaced by what `change` makes of it.
+
+        `change`: function of an array and of its number of axes behind that of horizons.
+        """
         states, outputs, received = (
             part and part.map_arrays(change) for part in (self.states, self.outputs, self.received)
         )

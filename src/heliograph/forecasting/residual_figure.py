@@ -45,6 +45,8 @@ def draw_residuals(
 ) -> "Figure":
     """Return a figure with a row of three panels for each output, the first twenty of them.
 
+    They are residuals over time, autocorrelations by lag, and residuals in order beside the quantiles of a normal law.
+
     Args:
         names: of the outputs.
         values: residuals (steps, m).
@@ -57,12 +59,12 @@ def draw_residuals(
     count = min(len(names), MOST)
     figure = Figure(figsize=(9.0, 0.5 + 1.9 * count), layout="constrained")
     grid = figure.subplots(count, 3, squeeze=False, width_ratios=[2, 1, 1])
+    lags = np.arange(1, len(autocorrelation) + 1)
     for i, (over_time, by_lag, in_order) in enumerate(grid):
         over_time.plot(time, values[:, i], ".", markersize=3, color=COLOURS[0])
         for level in (-2, 0, 2):
             over_time.axhline(level, color="0.6", linewidth=0.8, linestyle="-" if level == 0 else ":")
         over_time.set_ylabel(names[i])
-        lags = np.arange(1, len(autocorrelation) + 1)
         by_lag.bar(lags, autocorrelation[:, i], 0.5, color=COLOURS[0])
         by_lag.axhspan(-band[i], band[i], color="0.85", zorder=0)
         quantiles = compare_quantiles(values[:, i])
@@ -70,9 +72,8 @@ def draw_residuals(
         in_order.plot(quantiles.normal, quantiles.residuals, ".", markersize=3, color=COLOURS[0])
         for panel in (over_time, by_lag, in_order):
             panel.spines[["top", "right"]].set_visible(False)
-    for panel, title in zip(
-        grid[0], ("residuals in deviations", "autocorrelation", "quantiles, of a normal law"), strict=True
-    ):
+    titles = "residuals in deviations", "autocorrelation", "quantiles, of a normal law"
+    for panel, title in zip(grid[0], titles, strict=True):
         panel.set_title(title, fontsize=10, loc="left")
     for panel, label in zip(grid[-1], ("row or time", "rows apart", "normal quantile"), strict=True):
         panel.set_xlabel(label)

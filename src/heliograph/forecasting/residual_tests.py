@@ -126,7 +126,7 @@ def residuals(
 def record_residuals(
     record: Record, inputs: Float[ArrayLike, "steps inputs"] | None = None
 ) -> dict[str, dict[str, Residuals]]:
-    """Standardise what the filters of a record did not predict, as `residuals` does of one filter.
+    """Return the standardised one-step prediction errors of each filter of a record, as `residuals` of one filter.
 
     Args:
         record: what `hg.run` returned.
@@ -144,53 +144,64 @@ def record_residuals(
     found: dict[str, dict[str, Residuals]] = {}
     for target in list_targets(origin_of(record)):
         prediction = predicted.get(target.node, {}).get(target.filter)
+        if prediction is None:
+            continue
         angles = (target.outlook.filter.angles_used() or FilterAngles((), ())).received
-        judged = None if prediction is None else _standardise(prediction, measured_by(target, record), angles, LAGS)
-        if judged is not None:
-            found.setdefault(target.node, {})[target.filter] = judged
+        of_filter = _standardise(prediction, measured_by(target, record), angles, LAGS)
+        if of_filter is not None:
+            found.setdefault(target.node, {})[target.filter] = of_filter
     return found
 
 
 def _standardise(predicted: Forecast, rows: np.ndarray, angles: Angles, lags: int) -> Residuals | None:
-    """Return the residuals of rows (steps, received) and their tests; None where nothing is claimed of what arrives."""
+    """Return the residuals of rows (steps, received) and their tests; None where nothing is claimed of what arrives.
+
+    `predicted`: one step ahead, of each row; `angles`: indices of the angles among the received numbers.
+    """
     law = predicted.received
     if law is None or law.claim == "none":
         return None
-    known = np.where(np.isfinite(law.deviation), law.deviation, np.nan)  # of what nothing was heard yet: none
-    values = (wrap_near(rows, law.mean, angles) - law.mean) / known
+    # Infinite deviations are those of numbers of which nothing was heard yet.
+    deviation = np.where(np.isfinite(law.deviation), law.deviation, np.nan)
+    values = (wrap_near(rows, law.mean, angles) - law.mean) / deviation
     columns = [values[:, i] for i in range(values.shape[1])]
-    correlations = np.stack([_autocorrelation(e, lags) for e in columns], axis=1)
-    came = np.maximum([int(np.sum(~np.isnan(e))) for e in columns], 1)
-    white = np.array([_test_correlation(e, lags) for e in columns])
-    normal, steady = (np.array([test(e) for e in columns]) for test in (_test_normality, _test_same_variance))
-    band = NORMAL / np.sqrt(came)
-    return Residuals(law.names, values, predicted, correlations, band, white, normal, steady)
+    counts = np.maximum([int(np.sum(~np.isnan(e))) for e in columns], 1)
+    return Residuals(
+        names=law.names,
+        values=values,
+        predicted=predicted,
+        autocorrelation=np.stack([_compute_autocorrelation(e, lags) for e in columns], axis=1),
+        band=NORMAL / np.sqrt(counts),
+        ljung_box=np.array([_test_correlation(e, lags) for e in columns]),
+        normality=np.array([_test_normality(e) for e in columns]),
+        variance=np.array([_test_same_variance(e) for e in columns]),
+    )
 
 
 def _multiply_pairs(e: np.ndarray, lag: int) -> np.ndarray:
-    """Return the products of residuals this far apart, of which both came."""
+    """Return the products e_t e_(t+lag) of residuals (steps,) of which both came."""
     products = e[lag:] * e[: len(e) - lag]
     return np.asarray(products[~np.isnan(products)])
 
 
-def _autocorrelation(e: np.ndarray, lags: int) -> np.ndarray:
-    """Return r_l = sum e_t e_(t+l) / sum e_t^2 over the pairs that came."""
+def _compute_autocorrelation(e: np.ndarray, lags: int) -> np.ndarray:
+    """Return r_l = sum e_t e_(t+l) / sum e_t^2 over the pairs that came, for each lag from 1 on (lags,)."""
     e = e - np.nanmean(e) if np.any(~np.isnan(e)) else e
     total = np.nansum(e**2)
     return np.array([_multiply_pairs(e, lag).sum() / total if total > 0 else np.nan for lag in range(1, lags + 1)])
 
 
 def _test_correlation(e: np.ndarray, lags: int) -> float:
-    """Return the P-value of n (n + 2) sum r_l^2 / n_l, n_l pairs of lag l, which is chi-squared."""
+    """Return the p-value of n (n + 2) sum_l r_l^2 / n_l, n_l pairs of lag l: chi-squared if all r_l are zero."""
     n = int(np.sum(~np.isnan(e)))
     if n < LEAST:
         return float("nan")
     counts = np.array([max(len(_multiply_pairs(e, lag)), 1) for lag in range(1, lags + 1)])
-    return float(chi2.sf(n * (n + 2) * np.sum(_autocorrelation(e, lags) ** 2 / counts), lags))
+    return float(chi2.sf(n * (n + 2) * np.sum(_compute_autocorrelation(e, lags) ** 2 / counts), lags))
 
 
 def _test_normality(e: np.ndarray) -> float:
-    """Return the P-value of n (S^2 + (K - 3)^2 / 4) / 6, S the skewness and K the kurtosis."""
+    """Return the p-value of n (S^2 + (K - 3)^2 / 4) / 6, S the skewness and K the kurtosis of residuals (steps,)."""
     came = e[~np.isnan(e)]
     if len(came) < LEAST:
         return float("nan")
@@ -199,7 +210,7 @@ def _test_normality(e: np.ndarray) -> float:
 
 
 def _test_same_variance(e: np.ndarray) -> float:
-    """Return P-value, of both sides, of the ratio of the sums of squares in the last and in the first third."""
+    """Return the two-sided p-value of the ratio of the sums of squares in the last and in the first third."""
     came = e[~np.isnan(e)]
     h = len(came) // 3
     if h < LEAST // 2:

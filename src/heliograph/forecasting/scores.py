@@ -24,8 +24,8 @@ class MixtureLaws(NamedTuple):
         return np.asarray(np.sum(self.weights * self.means, axis=1))
 
 
-def below(law: MixtureLaws, values: np.ndarray) -> np.ndarray:
-    """Return the probability that each lies below what came (rows,): uniform on (0, 1) where the laws are right."""
+def compute_probability_below(law: MixtureLaws, values: np.ndarray) -> np.ndarray:
+    """Return P(less than what came) of each row (rows,): uniform on (0, 1) where the laws are right."""
     return np.asarray(np.sum(law.weights * ndtr((values[:, None] - law.means) / np.sqrt(law.variances)), axis=1))
 
 
@@ -56,7 +56,7 @@ def crps(law: MixtureLaws, values: np.ndarray) -> np.ndarray:
 
 
 def _mean_size(mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """Return E|Y| of a Gaussian Y."""
+    """Return E|Y| of a Gaussian Y of this mean and variance."""
     deviation = np.sqrt(variance)
     t = mean / deviation
     return np.asarray(mean * (2 * ndtr(t) - 1) + 2 * deviation * np.exp(-(t**2) / 2) / np.sqrt(2 * np.pi))

@@ -98,7 +98,19 @@ def crossing(
     """
     limit = float(scalar("level", level))
     paths = draw_paths(source, horizons, inputs, draws, seed, node, filter)
-    beyond = paths.is_beyond(name, limit, above)
-    shares = beyond.mean(axis=0), np.logical_or.accumulate(beyond, axis=1).mean(axis=0)
-    (now, now_error), (ever, ever_error) = ((p, np.sqrt(p * (1 - p) / draws)) for p in shares)
-    return Crossing(name, limit, above, paths.steps, paths.time, now, now_error, ever, ever_error, draws)
+    # Shares of the paths that are beyond at each time, and that have been by then.
+    is_beyond = paths.is_beyond(name, limit, above)
+    beyond, by = is_beyond.mean(axis=0), np.logical_or.accumulate(is_beyond, axis=1).mean(axis=0)
+    beyond_error, by_error = (np.sqrt(p * (1 - p) / draws) for p in (beyond, by))
+    return Crossing(
+        name=name,
+        level=limit,
+        above=above,
+        steps=paths.steps,
+        time=paths.time,
+        beyond=beyond,
+        beyond_error=beyond_error,
+        by=by,
+        by_error=by_error,
+        draws=draws,
+    )

@@ -140,10 +140,9 @@ class Fit:
 
         Source: Wald (1943).
         """
-        entries = self.description.parameters.entries
-        at = self.description.parameters.entries_at(self.best.x)
-        names = [entry.name for entry in entries]
-        return wald_test(dict(zip(names, at.tolist(), strict=True)), self.covariance, values)
+        names = [entry.name for entry in self.description.parameters.entries]
+        estimates = self.description.parameters.entries_at(self.best.x).tolist()
+        return wald_test(dict(zip(names, estimates, strict=True)), self.covariance, values)
 
     @property
     def table(self) -> tuple[Row, ...]:

@@ -135,7 +135,7 @@ class FreeNumberCollector:
         return mark_checked(start, self.marks[-1].report)
 
     def parameters(self) -> Parameters:
-        """Return all marks as parameters; one without a name is called after its place."""
+        """Return all free numbers that were marked as parameters; one without a name is called after its place."""
         taken = {mark.given for mark in self.marks if mark.given is not None}
         results = []
         for mark in self.marks:
@@ -187,7 +187,7 @@ class Description:
     named: tuple[bool, ...]
 
     def at(self, values: Mapping[str, object]) -> Network:
-        """Build the network with these values, {name: value}.
+        """Return the network, built with these values of its free numbers, {name: value}.
 
         Raises:
             ValueError: operations on a free number that derivatives cannot pass, a function that returns no network.
@@ -211,7 +211,7 @@ class Description:
 
 
 def describe(network: Build) -> Description:
-    """Find what is free in the network that a function returns.
+    """Return what is free in the network that a function returns: its numbers, and how to build it with others.
 
     Args:
         network: a function without arguments that returns a Network, with `hg.free(...)` in place of numbers.

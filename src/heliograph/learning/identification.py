@@ -106,7 +106,10 @@ def identifiable(network: Build, inputs: ArrayLike | None = None, horizon: int =
 
 
 def identify_by_recording(surface: LikelihoodSurface, start: Float[np.ndarray, " p"], seed: int) -> Identifiability:
-    """Return the identifiability by a recording, at three points around a start."""
+    """Return what a recording identifies of the free numbers, by its information at three points around a start (p,).
+
+    Points at which that is not finite are left out.
+    """
     points = _choose_points(start, seed)
     late = surface.evaluations(np.stack(points)).late
     sound = [i for i in range(len(points)) if np.isfinite(late[i]).all()]
@@ -117,7 +120,7 @@ def identify_by_recording(surface: LikelihoodSurface, start: Float[np.ndarray, "
 
 
 def _choose_points(start: np.ndarray, seed: int) -> list[np.ndarray]:
-    """Return POINTS points drawn near a start, within AROUND, or less of coordinates that are small."""
+    """Return POINTS points (p,) drawn near a start (p,), within AROUND, or less of coordinates that are small."""
     rng = np.random.default_rng([seed, 1])
     reach = np.minimum(1.0, 0.2 + np.abs(start))
     return [start + rng.uniform(-AROUND, AROUND, len(start)) * reach for _ in range(POINTS)]
@@ -297,9 +300,10 @@ def _is_route_constant(sensor: AbstractSensor, channel: Channel) -> bool:
 
 
 def _compute_link_moments(sensor: AbstractSensor, link: AbstractRandomAffine) -> jax.Array:
-    """Return mean gain, gain variance and noise of each output, (outputs, 3).
+    """Return mean gain, gain variance and noise variance of each output behind a link, (outputs, 3).
 
-    The noise is that of the sensor and of the channel together: the diagonal of M R M' + spread of the constant part.
+    Of each output the gain is that of the measured value of which it has most. The noise is that of sensor and channel
+    together: the diagonal of M R M' + spread of the constant part, with the mean gain M and the sensor's covariance R.
     """
     moments, r = second_order(link), jnp.asarray(sensor.noise.covariance)
     mean, p = jnp.asarray(moments.mean_gain), moments.mean_gain.shape[1]

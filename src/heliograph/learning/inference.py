@@ -64,7 +64,7 @@ def compare_likelihoods(larger: float, smaller: float, freedom: int) -> FitTest:
 def wald_test(
     estimates: Mapping[str, float], covariance: Float[np.ndarray, "entries entries"], values: Values
 ) -> FitTest:
-    """Return Wald's test that some numbers have given values: d' C^-1 d.
+    """Return Wald's test that some numbers have given values: d' C^-1 d, of the distance d and its covariance C.
 
     Args:
         estimates: by name, in the order of the covariance.

@@ -163,6 +163,6 @@ def allowed_fall(level: float) -> float:
 
 
 def sandwich(hessian: Float[np.ndarray, "p p"], scores: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
-    """Return the covariance H^-1 J H^-1 of estimates, by the Hessian H and the covariance J of the sum of scores."""
+    """Return the covariance H^-1 J H^-1 of estimates, H the Hessian of -l and J the covariance of summed scores."""
     half = np.linalg.solve(hessian, scores)
     return np.asarray(np.linalg.solve(hessian, half.T))

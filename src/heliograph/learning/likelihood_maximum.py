@@ -178,7 +178,7 @@ class Solution:
 
     @cached_property
     def few(self) -> Bool[np.ndarray, " active"]:
-        """Return which active coordinates are real numbers told by a few stretches of the data, as a step is."""
+        """Which active coordinates are real numbers told by a few stretches of the data, as a step is (active,)."""
         places = np.flatnonzero(self.active & self.surface.domains.free)
         few = np.zeros(len(self.active), dtype=bool)
         if len(places) and not self.rank.flat.size:
@@ -202,7 +202,7 @@ class Solution:
         return np.asarray(self.basis @ sandwich(self.hessian, estimate.covariance) @ self.basis.T), estimate.freedom
 
     def rows(self, method: Method = "cosines", level: float = LEVEL) -> tuple[Row, ...]:
-        """Return the table by this form, computed at the first call."""
+        """Return the table of estimates by this form with intervals by a method, computed at the first call."""
         key = method, level
         if key not in self._tables:
             self._tables[key] = self._make_rows(method, level)

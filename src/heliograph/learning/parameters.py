@@ -63,7 +63,7 @@ class Parameter:
 
     @property
     def entry_domains(self) -> tuple[Domain, ...]:
-        """Return the domain of each entry."""
+        """Return the domain of each of its entries in the table."""
         if self.domain.kind == "simplex":
             return (PROBABILITY,) * self.start.size
         if self.domain.kind == "covariance":
@@ -131,7 +131,7 @@ class Parameters:
         }
 
     def known(self, x: Float[np.ndarray, " p"]) -> dict[str, Any]:
-        """Return the numbers at a point of the line by name, as plain numbers and arrays."""
+        """Return the free numbers at a point x (p,) of the line, {name: number}, as plain floats and arrays."""
         with jax.enable_x64(True):
             return {name: plain_number(value) for name, value in self.values(np.asarray(x)).items()}
 

@@ -133,7 +133,7 @@ def fit_sender(
 
     def likelihood(x: Float[np.ndarray, " p"]) -> float:
         """Return the log-likelihood of all recordings at a point of the line; -1e300 where they are impossible."""
-        filter = filter_at(description.at_point(x))
+        filter = make_event_filter(description.at_point(x))
         recordings = zip(data.measurements, data.inputs, data.lengths, strict=True)
         total = sum(float(log_likelihood(filter, z[:steps], u[:steps])) for z, u, steps in recordings)
         return total if np.isfinite(total) else -1e300
@@ -186,7 +186,7 @@ def _search_starts(likelihood: Likelihood, points: Sequence[Float[np.ndarray, " 
     return max(ends, key=lambda end: end.total)
 
 
-def filter_at(network: Network) -> AbstractFilter:
+def make_event_filter(network: Network) -> AbstractFilter:
     """Return the event filter of the network's only node, whose likelihood is maximised."""
     (node,) = network.nodes.values()
     if not isinstance(node, Node) or node.trigger is None:

@@ -43,7 +43,7 @@ DOUBLINGS = 100  # of a power without limit, until it reaches a target
 
 
 def adds_up(network: object) -> bool:
-    """Decide whether the one node of a network receives a sum of links."""
+    """Return whether a network is one node that receives a sum of links."""
     if not isinstance(network, Network) or network.relays is not None or network.common is not None:
         return False
     nodes = list(network.nodes.values())

@@ -144,7 +144,7 @@ def _find_bit_gain(name: str, node: Node) -> float:
 
 
 def _take_information(senders: _Senders, bits: Sequence[int] | np.ndarray) -> Float[np.ndarray, " senders"]:
-    """Return the information j_i of each sender's word of so many bits."""
+    """Return the information j_i (senders,) of each sender's word of so many bits."""
     found: np.ndarray = senders.information[np.arange(len(senders.rows)), np.asarray(bits)]
     return found
 

@@ -48,7 +48,7 @@ class Budget(Module):
 
 
 def check_budget(value: object) -> Budget:
-    """Return the budget from one, or from a number: that of the total power."""
+    """Return a budget; a plain number is one of the total power."""
     if isinstance(value, Budget):
         return value
     try:
@@ -59,7 +59,7 @@ def check_budget(value: object) -> Budget:
 
 
 def _check_limit(name: str, value: ArrayLike | Mapping[str, float] | None) -> PerTransmitter:
-    """Return a limit of powers: a number for all transmitters, or one for each of some by name."""
+    """Return a checked limit of powers: a number for all transmitters, or {name: number} for some; None for none."""
     if value is None:
         return None
     if isinstance(value, Mapping):

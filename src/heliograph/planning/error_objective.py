@@ -123,7 +123,7 @@ class Criterion(NamedTuple):
         return float(self.shares @ np.linalg.eigvalsh(root @ p @ root)[:, -1])
 
     def supporting(self, p: Matrices) -> "Criterion":
-        """Return the linear function <V, P> that touches the number at p and is a lower bound of it everywhere."""
+        """Return the criterion <V, P> that touches this one at p and is a lower bound of it everywhere."""
         if self.sharpness is None:
             return self
         weights, root = self._differentiate_steps(p)[1], np.linalg.pinv(_root(self.weight))

@@ -330,7 +330,7 @@ def _find_threshold(
 
 
 def _check_scalar(plant: AnyPlant, sensor: AnySensor) -> _ScalarSystem:
-    """Return the four numbers of a linear plant and sensor; ValueError unless they have one state and one output."""
+    """Return a, q, c and r of a linear plant and sensor; ValueError unless they have one state and one output."""
     expected = "a LinearPlant and LinearSensor of one state and output"
     if not isinstance(plant, LinearPlant) or not isinstance(sensor, LinearSensor):
         raise fail("rate before any data", expected, f"{type(plant).__name__} and {type(sensor).__name__}")
@@ -347,7 +347,7 @@ def _check_scalar(plant: AnyPlant, sensor: AnySensor) -> _ScalarSystem:
 
 
 def _make_quadrature(edges: list[float], unit: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return Gauss-Legendre nodes and weights over the parts between `edges`, cut to lengths of at most 8 units."""
+    """Return Gauss-Legendre nodes and weights over the line between `edges`, cut to parts of at most 8 units."""
     x, w = np.polynomial.legendre.leggauss(NODES)
     parts = []
     for a, b in pairwise(edges):

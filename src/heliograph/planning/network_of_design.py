@@ -111,7 +111,10 @@ def add_best_filter(plant: AnyPlant, node: Node, channel: Channel) -> Node:
 
 
 def _select_node(name: str, powers: Mapping[str, Float[np.ndarray, "steps"]], k: int) -> dict[str, float]:
-    """Return the powers at step k of a node's transmitters, by their names within the node ("hop1")."""
+    """Return the powers at step k of the transmitters of a node, by their names within it ("hop1").
+
+    `powers`: of all transmitters, {"node.hop1": (steps,)}.
+    """
     start = f"{name}."
     return {key.removeprefix(start): float(power[k]) for key, power in powers.items() if key.startswith(start)}
 

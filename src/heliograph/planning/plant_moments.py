@@ -22,7 +22,7 @@ EPS = float(np.finfo(np.float64).eps)
 
 
 def check_stable(transition: Float[np.ndarray, "n n"]) -> None:
-    """Raise ValueError where a plant's second moments grow without limit."""
+    """Raise ValueError where the second moments of a plant with this transition grow without limit."""
     if (radius := spectral_radius(transition)) >= 1:
         expected = "a stable plant, or a horizon, or feedback: what is sent of an unstable plant grows without limit"
         raise fail("steady power", expected, f"spectral radius {radius:.6g}")
@@ -138,7 +138,7 @@ def measurement_moment(sensor: AnySensor, second: Float[Array, "n1 n1"], step: i
 
 
 def _extend(matrix: Float[Array, "m n"], shift: Float[Array, "m"]) -> Float[Array, "m1 n1"]:
-    """Return the matrix of (x, 1) -> (M x + shift, 1)."""
+    """Return the matrix (m + 1, n + 1) of the map from (x, 1) to (M x + shift, 1)."""
     last = np.eye(1, matrix.shape[1] + 1, matrix.shape[1])
     xp = library(matrix, shift)
     extended: Array = xp.concatenate([xp.concatenate([matrix, shift[:, None]], axis=1), last])

@@ -237,7 +237,7 @@ def _squares_at_end(
     truth: Float[np.ndarray, "runs steps n"],
     exact: bool,
 ) -> Float[np.ndarray, "runs n"]:
-    """Return the squared error of each state after the last step of each run, or its variance where that is exact.
+    """Return the squared error of each state after the last step of each run (runs, n), or if `exact` its variance.
 
     One run stands for all where variances are exact and the same rows arrive in all of them.
     """

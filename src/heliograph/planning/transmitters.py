@@ -40,11 +40,11 @@ def transmitter_names(channel: AbstractRandomAffine) -> list[str]:
     """Return the names of the transmitters, in order of appearance."""
     names: dict[str, None] = {}
 
-    def note(name: str, hop: AbstractHop, signal: SignalMoment | None) -> AbstractHop:
+    def note_name(name: str, hop: AbstractHop, signal: SignalMoment | None) -> AbstractHop:
         names.setdefault(name)
         return hop
 
-    visit_hops(channel, note)
+    visit_hops(channel, note_name)
     return list(names)
 
 
@@ -159,14 +159,15 @@ def set_transmitter_powers(
 def amplify_transmitter(channel: AbstractRandomAffine, name: str, factor: float | None) -> AbstractRandomAffine:
     """Return the channel in which a transmitter amplifies by this factor more; None: it sends just what it receives."""
 
-    def change(hop_name: str, hop: AbstractHop, signal: SignalMoment | None) -> AbstractHop:
+    def amplify(hop_name: str, hop: AbstractHop, signal: SignalMoment | None) -> AbstractHop:
+        """Return the hop of this name amplified, any other as it is."""
         if hop_name != name:
             return hop
         matrix = np.eye(*np.shape(hop.matrix)) if factor is None else np.asarray(hop.matrix) * factor
         changed: AbstractHop = eqx.tree_at(lambda h: h.matrix, hop, matrix)
         return changed
 
-    return visit_hops(channel, change)
+    return visit_hops(channel, amplify)
 
 
 def find_free_transmitters(

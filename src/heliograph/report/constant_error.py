@@ -42,7 +42,7 @@ class ConstantError(NamedTuple):
     nothing_else: bool = False
 
     def __str__(self) -> str:
-        """Name the output and its error, such as "c: y, of 0.93 ± 0.04"."""
+        """Return the output and its error, such as "c: y, of 0.93 ± 0.04"."""
         half = 1.96 * self.standard_error
         size = f"{round_to(self.error, self.standard_error)} ± {round_to(half, self.standard_error)}"
         return f"{' or '.join(self.outputs)}, of {size}"

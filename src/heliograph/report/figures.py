@@ -63,7 +63,7 @@ def place_legend_above(figure: Figure, axes: Axes, columns: int = 4) -> None:
 
 @matplotlib.rc_context(STYLE)
 def png(figure: Figure, dots_per_inch: int = 150) -> bytes:
-    """Export the figure as PNG.
+    """Return the bytes of a figure as a PNG file.
 
     Args:
         figure: a figure of matplotlib.
@@ -85,7 +85,9 @@ def png(figure: Figure, dots_per_inch: int = 150) -> bytes:
 
 @matplotlib.rc_context(STYLE)
 def svg(figure: Figure) -> bytes:
-    """Export the figure as SVG, text as outlines and dense lines as pixels, the same bytes for the same figure.
+    """Return the bytes of a figure as an SVG file: the same bytes for the same figure.
+
+    Text is drawn as outlines, dense lines as pixels.
 
     Args:
         figure: a figure of matplotlib.
@@ -105,7 +107,7 @@ def svg(figure: Figure) -> bytes:
 
 
 def _rasterise_dense(figure: Figure) -> None:
-    """Let lines and bands of more points than DENSE be pixels, so that no length of data makes a file long."""
+    """Have lines and bands of more points than DENSE drawn as pixels, so that no length of data makes a file long."""
     for line in figure.findobj(Line2D):
         assert isinstance(line, Line2D)
         line.set_rasterized(len(np.atleast_1d(line.get_xdata())) > DENSE)

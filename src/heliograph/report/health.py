@@ -319,7 +319,7 @@ def _examine_filter(network: Network, listener: ListeningFilter, record: Record,
 
 
 def _doubt_time_unit(network: Network, health: Health, inputs: np.ndarray) -> str:
-    """Say that the times are in another unit, by the first filter of which something is doubtful; else ""."""
+    """Return the sentence that times are in another unit, by the first filter that is doubtful; else ""."""
     tested = [judged for judged in health.doubted() if judged.test is not None]
     if not tested:
         return ""
@@ -353,7 +353,7 @@ def _name_time_unit(record: Record) -> str:
 
 
 def _check_run(network: Network, record: Record) -> None:
-    """Refuse a record of other filters, or of several runs."""
+    """Raise ValueError at a record of other filters than the network's, or of several runs."""
     instance("network", network, Network, "a Network")
     instance("record", record, Record, "a Record")
     filters = {node: set(network.nodes[node].filters) for node in network.names}

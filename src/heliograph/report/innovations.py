@@ -116,7 +116,7 @@ def make_innovations_section(health: Health, drawings: Mapping[str, bytes]) -> S
 
 
 def _make_tests_table(health: Health) -> Table:
-    """Return size, correlation and p-value of each filter's innovations, a row each, the fused ones first."""
+    """Return the table of tests of innovations: size, correlation and p-value of each filter, the fused ones first."""
     rows = []
     for judged in _sort_fused_first(health.filters):
         cells = ["–", "–", "–"]
@@ -205,7 +205,7 @@ def _make_class_rows(judgement: DeclaredJudgement) -> list[list[str]]:
 
 
 def choose_picture(pictures: Mapping[str, Picture]) -> list[Picture | PictureChoice]:
-    """Return pictures by node one below the other, or as a choice where there are many."""
+    """Return the pictures, by node, one below the other; of more than FEW a single choice among them."""
     if len(pictures) <= FEW:
         return [*pictures.values()]
     return [PictureChoice("Node", list(map(visible, pictures)), list(pictures.values()))]
@@ -219,7 +219,7 @@ def say_not_drawn(names: Sequence[str], where: str) -> list[Text]:
 
 
 def label_time_axis(record: Record, axes: Axes) -> None:
-    """Name the axis of time, with its unit."""
+    """Write the name of time, with its unit in the record, at the axis."""
     if record.time.dtype.kind == "M":
         axes.set_xlabel("time (UTC)")
     else:

@@ -78,7 +78,7 @@ class LossLaw(NamedTuple):
         )
 
     def log_chance_within(self, due: Bool[np.ndarray, " rows"], count: int) -> float:
-        """Bound the log probability that `count` arrivals after a first one are all in rows that are due.
+        """Return a bound of the log probability that `count` arrivals after a first one are all in rows that are due.
 
         With z > 0 for each arrival, backwards over the rows from the end, where all are 1:
         stay(r) = z (follows due(r + 1) stay(r + 1) + (1 - follows) later(r)), where

@@ -19,11 +19,11 @@ FALSE_ALARM = 1e-6  # probability that a correct object fails, shared by all num
 def check_random_affine(channel: AbstractRandomAffine, seed: int = 0, samples: int = 20_000, highest: int = 4) -> float:
     """Compare a channel's samples with its joint moments, E[mono_k(z) | y] for k = 1 .. highest, at two points y.
 
-    Wrong moments are found when they differ by more than about 6 standard errors, so more samples make the test
-    stricter. Of a map with modes two draws are taken one after the other: their moments are compared under the laws of
-    the modes, and jointly E[H_1 x H_2] and E[mono_i(z_1) mono_j(z_2)] for i, j = 1 .. highest / 2, which a wrong
-    transition changes. A map with another kind of memory has no such moments; only `init` and `draw` are tested: a
-    state that keeps its structure and shapes.
+    mono_k(z) are all products of k of the numbers of (z, 1). Wrong moments are found when they differ by more than
+    about 6 standard errors, so more samples make the test stricter. Of a map with modes two draws are taken one after
+    the other: their moments are compared under the laws of the modes, and jointly E[H_1 x H_2] and
+    E[mono_i(z_1) mono_j(z_2)] for i, j = 1 .. highest / 2, which a wrong transition changes. A map with another kind of
+    memory has no such moments; only `init` and `draw` are tested: a state that keeps its structure and shapes.
 
     Args:
         channel: the channel to test.
@@ -38,20 +38,21 @@ def check_random_affine(channel: AbstractRandomAffine, seed: int = 0, samples: i
         AssertionError: a moment that differs from the samples by more than chance, shapes that disagree.
     """
     generator = np.random.default_rng(seed)
-    first, second = _draw_twice(channel, seed, samples)
+    # Draws of H = [[G, n], [0, 1]]; its upper rows map (y, 1) to z = G y + n.
+    first, second = (h[:, :-1] for h in _draw_twice(channel, seed, samples))
     points = [channel.example_input(generator), channel.example_input(generator)]
-    # With modes: two successive draws, compared jointly.
+    # With modes: two successive draws, compared jointly. Another kind of memory has no moments.
     if channel.remembers:
         if not memories(channel):
             return 0.0
         modes = joint_modes(channel, order=-(-highest // 2))
-        now, later = (h[:, :-1] @ np.append(y, 1.0) for h, y in zip((first, second), points, strict=True))
-        worst = _compare_draw_pairs(modes, first[:, :-1], second[:, :-1])
+        now, later = (map_of_y @ np.append(y, 1.0) for map_of_y, y in zip((first, second), points, strict=True))
+        worst = _compare_draw_pairs(modes, first, second)
         return max(worst, _compare_modes(modes, points, now, later, highest))
     # Without memory: E[mono_k(z) | y], order by order.
     worst = 0.0
     for y in points:
-        z = first[:, :-1] @ np.append(y, 1.0)
+        z = first @ np.append(y, 1.0)
         for order in range(1, highest + 1):
             expected = channel.moments(order).expect(evaluate_monomials(y, order))
             worst = max(worst, _compare_means(f"order {order}", expected, _evaluate_rows(z, order)))
@@ -66,8 +67,8 @@ def _compare_draw_pairs(modes: JointModes, now: np.ndarray, later: np.ndarray) -
 
     Args:
         modes: the channel's modes.
-        now: first draws (sample, outputs, inputs + 1).
-        later: second draws (sample, outputs, inputs + 1).
+        now: first draws (samples, outputs, inputs + 1).
+        later: second draws (samples, outputs, inputs + 1).
 
     Returns:
         The largest difference between samples and moments, in standard errors.
@@ -107,36 +108,43 @@ def _compare_modes(
 
 
 def _draw_twice(channel: AbstractRandomAffine, seed: int, samples: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return first and second draws of H = [[G, n], [0, 1]], after testing the contract of `init`, `draw`, `sample`."""
+    """Return first and second draws of H = [[G, n], [0, 1]] (samples, outputs + 1, inputs + 1).
 
-    def two_steps(words: jax.Array) -> PyTree:
-        """Return the first state, that after a draw, the draw, the same of a second draw, and what `sample` draws."""
+    The contract of `init`, `draw` and `sample` is tested on the way.
+
+    Raises:
+        AssertionError: naming what is broken.
+    """
+
+    def draw_two(words: jax.Array) -> PyTree:
+        """Return state, state after a draw, that draw, the same of a second draw, and what `sample` draws first."""
         key = jax.random.wrap_key_data(words)
         start = channel.init(jax.random.fold_in(key, 2))
-        state, h = channel.draw(start, key)
+        after_first, h_1 = channel.draw(start, key)
         sampled = () if channel.remembers else channel.sample(key)
-        return start, state, h, *channel.draw(state, jax.random.fold_in(key, 1)), sampled
+        return start, after_first, h_1, *channel.draw(after_first, jax.random.fold_in(key, 1)), sampled
 
-    # Contract: a state of constant structure, and `draw` equal to `sample` without memory.
+    # A state of constant structure, and `draw` equal to `sample` without memory.
     with jax.enable_x64(True):
         words = np.asarray(jax.random.key_data(jax.random.split(jax.random.key(seed), samples)))
-        start, state, h, following, later, sampled = over_runs(two_steps, words)
+        start, after_first, h_1, after_second, h_2, sampled = over_runs(draw_two, words)
         assert channel.remembers or start == (), f"init: expected () of a map that forgets, got {start}"
-        shapes = [jax.tree.map(lambda leaf: (leaf.shape, str(leaf.dtype)), s) for s in (start, state, following)]
+        states = start, after_first, after_second
+        shapes = [jax.tree.map(lambda leaf: (leaf.shape, str(leaf.dtype)), state) for state in states]
         assert shapes[0] == shapes[1] == shapes[2], f"draw: expected a state like init's {shapes[0]}, got {shapes[1]}"
-        same = channel.remembers or np.array_equal(h, sampled, equal_nan=True)
-        assert same, "draw: expected what sample draws from the same key"
-    # Contract: H = [[G, n], [0, 1]].
-    drawn = np.asarray(h)
+        is_same = channel.remembers or np.array_equal(h_1, sampled, equal_nan=True)
+        assert is_same, "draw: expected what sample draws from the same key"
+    # Draws of the right shape, whose last row is [0, 1].
+    drawn = np.asarray(h_1)
     expected_shape = (samples, channel.outputs + 1, channel.inputs + 1)
     assert drawn.shape == expected_shape, f"draw: expected shape {expected_shape[1:]}, got {drawn.shape[1:]}"
     bottom = np.eye(1, channel.inputs + 1, channel.inputs)
     assert np.array_equal(drawn[:, -1:], np.broadcast_to(bottom, drawn[:, -1:].shape)), "last row: expected [0, 1]"
-    return drawn, np.asarray(later)
+    return drawn, np.asarray(h_2)
 
 
 def _evaluate_rows(z: np.ndarray, order: int) -> np.ndarray:
-    """Return the monomials up to an order of each row of z, (sample, monomials)."""
+    """Return the monomials of an order of (z, 1), of each row of z (samples, outputs), as (samples, monomials)."""
     values = np.column_stack([z, np.ones(len(z))])
     columns = np.arange(values.shape[1])
     powers = list_exponents(len(columns), order)
@@ -144,9 +152,12 @@ def _evaluate_rows(z: np.ndarray, order: int) -> np.ndarray:
 
 
 def _compare_means(what: str, expected: np.ndarray | jax.Array, seen: np.ndarray) -> float:
-    """Compare means over samples (sample, number) with expected ones; return the largest |difference| / standard error.
+    """Compare means over samples (samples, numbers) with expected ones (numbers,); return the largest difference.
 
-    The standard error is that of each mean. A number that does not vary has to agree to rounding.
+    It is in standard errors of the mean. A number that does not vary has to agree to rounding.
+
+    Raises:
+        AssertionError: a difference that is more than chance.
     """
     error = seen.std(axis=0) / np.sqrt(len(seen))
     difference = np.abs(seen.mean(axis=0) - expected)

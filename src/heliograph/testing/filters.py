@@ -42,28 +42,39 @@ def check_filter(filter: AbstractFilter, inputs: ArrayLike = (), steps: int = 5,
     data[-1] = np.nan
     u = np.broadcast_to(np.asarray(inputs, dtype=float), (steps, len(filter.inputs)))
     state, total = filter.init(), 0.0
-    structure = str(jax.tree.structure(state))
     for k, z in enumerate(data):
-        # Each step twice: determinism, structure, estimate, prediction + correction, vmap.
-        arguments = filter, state, z, u[k], np.asarray(k)
-        once, again = (compute_once(_step_each_way, _step_each_way_by_xla, arguments) for _ in range(2))
-        (following, estimate), (corrected, estimate_of_parts, innovation), means_in_vmap = once
-        (_, estimate_again), *_ = again
-        same = np.array_equal(estimate.mean, estimate_again.mean)
-        assert same, "step: expected the same estimate from the same arguments"
-        for belief in (following, corrected):
-            assert str(jax.tree.structure(belief)) == structure, "step: expected a state of init's structure"
-        _check_estimate(estimate, len(filter.states), k)
-        _check_same(f"step {k}: the prediction, corrected", estimate_of_parts, estimate)
-        _check_innovation(innovation, z, filter, k)
-        gap = np.abs(means_in_vmap - estimate.mean).max()
-        scale = 1 + np.abs(estimate.mean).max()
-        assert gap <= ROUNDING * scale, f"step {k}: expected the same estimate inside vmap, off by {gap:g}"
-        state, total = following, total + float(innovation.log_likelihood)
+        state, log_density = _check_step(filter, state, z, u[k], k)
+        total += log_density
     # log p(z_1, ..., z_N) = sum of the innovations' log-likelihoods.
     whole = float(log_likelihood(filter, data, u))
-    same = abs(whole - total) <= ROUNDING * (1 + abs(total)) or bool(np.isnan(whole) and np.isnan(total))
-    assert same, f"log_likelihood: expected the sum over the steps {total:g}, got {whole:g}"
+    is_sum = abs(whole - total) <= ROUNDING * (1 + abs(total)) or bool(np.isnan(whole) and np.isnan(total))
+    assert is_sum, f"log_likelihood: expected the sum over the steps {total:g}, got {whole:g}"
+
+
+def _check_step(filter: AbstractFilter, state: PyTree, z: np.ndarray, u: np.ndarray, k: int) -> tuple[PyTree, float]:
+    """Check one step of a filter from a state; return the state after it, and the innovation's log-likelihood.
+
+    The step is computed twice, each time in three ways: as a step, as a prediction and a correction, inside vmap.
+
+    Raises:
+        AssertionError: naming the rule that is broken.
+    """
+    arguments = filter, state, z, u, np.asarray(k)
+    once, again = (compute_once(_step_each_way, _step_each_way_by_xla, arguments) for _ in range(2))
+    (stepped, estimate), (corrected, estimate_of_parts, innovation), means_in_vmap = once
+    (_, estimate_again), *_ = again
+    is_same = np.array_equal(estimate.mean, estimate_again.mean)
+    assert is_same, "step: expected the same estimate from the same arguments"
+    structure = str(jax.tree.structure(filter.init()))
+    for after in (stepped, corrected):
+        assert str(jax.tree.structure(after)) == structure, "step: expected a state of init's structure"
+    _check_estimate(estimate, len(filter.states), k)
+    _check_same(f"step {k}: the prediction, corrected", estimate_of_parts, estimate)
+    _check_innovation(innovation, z, filter, k)
+    gap = np.abs(means_in_vmap - estimate.mean).max()
+    scale = 1 + np.abs(estimate.mean).max()
+    assert gap <= ROUNDING * scale, f"step {k}: expected the same estimate inside vmap, off by {gap:g}"
+    return stepped, float(innovation.log_likelihood)
 
 
 def _step(filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree) -> tuple[PyTree, Estimate]:
@@ -100,21 +111,29 @@ def _step_each_way_by_xla(*arguments: PyTree) -> tuple[PyTree, ...]:
 
 
 def _check_sizes(filter: AbstractFilter, inputs: ArrayLike) -> None:
-    """Check that a filter has a claim and names, and refuses measurements, inputs and steps that do not fit it."""
+    """Check that a filter has a claim and names, and refuses measurements, inputs and steps that do not fit it.
+
+    `inputs`: of the plant, one step's.
+
+    Raises:
+        AssertionError: naming what is broken.
+    """
     assert filter.claim in STRENGTH, f"claim: expected one of {list(STRENGTH)}, got {filter.claim!r}"
     assert filter.states and len(set(filter.states)) == len(filter.states), "states: expected distinct names"
     assert filter.received >= 0, "received: expected a length"
     # Calls with wrong sizes or infinite values, each with the name that the error must begin with.
     state, fitting = filter.init(), np.zeros(filter.received)
     wrong: list[tuple[str, Callable[[], object]]] = [
-        ("inputs", lambda: filter.predict(state, np.zeros(len(filter.inputs) + 1)))
+        ("inputs", lambda: filter.predict(state, np.zeros(len(filter.inputs) + 1))),
+        ("step", lambda: filter.step(state, fitting, inputs, -1)),
     ]
     if filter.received:
-        longer = np.zeros(filter.received + 1)
-        wrong.append(("measurement", lambda: filter.correct(state, longer)))
-        wrong.append(("measurement", lambda: filter.step(state, np.full(filter.received, np.inf), inputs)))
-        wrong.append(("measurement", lambda: filter.step(state, longer, inputs)))
-    wrong.append(("step", lambda: filter.step(state, fitting, inputs, -1)))
+        longer, infinite = np.zeros(filter.received + 1), np.full(filter.received, np.inf)
+        wrong += [
+            ("measurement", lambda: filter.correct(state, longer)),
+            ("measurement", lambda: filter.step(state, infinite, inputs)),
+            ("measurement", lambda: filter.step(state, longer, inputs)),
+        ]
     for name, call in wrong:
         try:
             call()

@@ -31,17 +31,20 @@ def check_fusion(rule: AbstractFusion, count: int = 3, n: int = 2, seed: int = 0
     """
     generator = np.random.default_rng(seed)
     claims: list[Claim] = ["exact", "upper", "nominal"]
+    others: list[Claim] = ["exact"] * (count - 1)
     for claim in claims:
-        fused = rule.claim([claim, *claims[:1] * (count - 1)])
+        fused = rule.claim([claim, *others])
         assert STRENGTH[fused] <= STRENGTH[claim], f"claim: expected at most {claim!r}, got {fused!r}"
     for _ in range(10):
+        # A joint covariance of the errors, (input, state, input, state), whose blocks on the diagonal are the bounds.
         root = generator.normal(size=(count * n, count * n))
         joint = (root @ root.T).reshape(count, n, count, n)
         bounds = np.stack([joint[i, :, i] for i in range(count)])
         alike = _fuse_bounds(rule, np.ones((count, n)), np.broadcast_to(bounds[0], bounds.shape))
         _check_close("identical estimates", alike.mean, np.ones(n))
         _check_close("identical bounds", alike.covariance, bounds[0])
-        # The mean is linear in the means, so unit means give the gain of each input.
+        # The fused mean is linear in the means, so unit means, one for each number of each input and all fused
+        # together in a vmap, give the gains side by side (n, count n).
         units = np.moveaxis(np.eye(count * n).reshape(count * n, count, n), 1, 0)
         together = _fuse_bounds(rule, units, np.broadcast_to(bounds[:, None], (count, count * n, n, n)))
         _check_close("fusing inside vmap", together.mean[0], _fuse_bounds(rule, units[:, 0], bounds).mean)
@@ -116,12 +119,15 @@ def check_quantizer(quantizer: AbstractQuantizer, n: int = 2, steps: int = 20, s
 
 
 def _check_quantizer_steps(quantizer: AbstractQuantizer, n: int, steps: int, generator: np.random.Generator) -> None:
-    """Check a quantizer on random values, each of which follows the last from the state that it left.
+    """Check a quantizer Q on random values (n,), each of which follows the last from the state that it left.
 
-    Its errors hold, Q(Q(x)) = Q(x) from the same state, and it does the same under jit and vmap.
+    What is delivered has the stated error, Q(Q(x)) = Q(x) from the same state, and Q does the same under jit and vmap.
+
+    Raises:
+        AssertionError: naming the rule that is broken.
     """
     state = quantizer.init(n)
-    structure, compiled = str(jax.tree.structure(state)), jax.jit(jax.vmap(quantizer.step))
+    structure, in_vmap = str(jax.tree.structure(state)), jax.jit(jax.vmap(quantizer.step))
     for k in range(steps):
         # Values over seven decades, some components NaN.
         value = generator.normal(size=n) * 10.0 ** generator.integers(-3, 4, size=n)
@@ -129,18 +135,18 @@ def _check_quantizer_steps(quantizer: AbstractQuantizer, n: int, steps: int, gen
         following, sent = quantizer.step(state, value)
         assert str(jax.tree.structure(following)) == structure, "step: expected a state of init's structure"
         _check_quantized(sent, value, n)
-        # Idempotence: Q(Q(x)) = Q(x) where not saturated.
+        # Q(Q(x)) = Q(x) where a component is not saturated, which then has a finite error.
         again = np.asarray(quantizer.step(state, sent.value)[1].value)
-        usable = np.isfinite(sent.error)
-        off = np.abs(again - sent.value)[usable] > ROUNDING * np.abs(value)[usable]
-        assert not np.any(off), f"step {k}: expected what was delivered to be delivered again"
-        # The same compiled and batched.
+        is_usable = np.isfinite(sent.error)
+        is_off = np.abs(again - sent.value)[is_usable] > ROUNDING * np.abs(value)[is_usable]
+        assert not np.any(is_off), f"step {k}: expected what was delivered to be delivered again"
+        # The same compiled, for two equal values in a batch.
         batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), (state, jnp.asarray(value)))
-        _, twice = compiled(*batch)
+        _, twice = in_vmap(*batch)
         for name, delivered in sent._asdict().items():
             both = np.asarray(getattr(twice, name))
-            same = np.allclose(both, delivered, rtol=ROUNDING, atol=0, equal_nan=True)
-            assert same, f"step {k}, {name}: expected the same under jit and vmap"
+            is_same = np.allclose(both, delivered, rtol=ROUNDING, atol=0, equal_nan=True)
+            assert is_same, f"step {k}, {name}: expected the same under jit and vmap"
         state = following
 
 

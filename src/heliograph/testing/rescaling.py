@@ -77,7 +77,10 @@ class Units(NamedTuple):
 
 
 def rescale_filter(filter: AbstractFilter, units: Units) -> AbstractFilter:
-    """Return the filter whose estimate is S xhat from Q z and U u, where `filter` has xhat from z and u.
+    """Return the filter of the same model in other units: it estimates S xhat from Q z and U u.
+
+    `filter` estimates xhat from measurements z and inputs u; S, Q and U are the diagonal matrices of the factors of
+    states, measurements and inputs in `units`.
 
     Raises:
         ValueError: a filter of an unknown kind.
@@ -139,7 +142,10 @@ def _require_gaussian(filter: AbstractFilter) -> GaussianFilter:
 
 
 def _rescale_parts(filter: SequentialFilter, units: Units) -> list[AbstractFilter]:
-    """Return the filters of the parts in other units; factors of their outputs and measurements follow one another."""
+    """Return the filters of a sequential filter's parts in other units.
+
+    Factors of the parts' outputs, and of their measurements, follow one another in `units`.
+    """
     parts, output, received = [], 0, 0  # where those of the next part begin
     for part in filter.filters:
         next_output, next_received = output + len(first(part.sensor).outputs), received + part.received
@@ -150,35 +156,32 @@ def _rescale_parts(filter: SequentialFilter, units: Units) -> list[AbstractFilte
 
 
 def _rescale_noise(law: AbstractNoise, factors: Float[np.ndarray, " n"]) -> AbstractNoise:
-    """Return the law of S w: mean S m, covariance S Q S."""
+    """Return the law of the noise in other units, S w with S = diag(factors): mean S m, covariance S Q S."""
     if isinstance(law, Gaussian):
         return Gaussian(np.outer(factors, factors) * law.covariance, factors * law.mean)
     return Shaped(np.diag(factors), law)
 
 
 def rescale_plant(plant: AnyPlant, units: Units) -> AnyPlant:
-    """Return the plant of S x, with inputs U u."""
+    """Return the plant in other units: of states S x, with inputs U u."""
     rescaled: AnyPlant = at_each_step(lambda step: _rescale_plant(step, units), plant)
     return rescaled
 
 
 def _rescale_plant(plant: AbstractPlant, units: Units) -> AbstractPlant:
-    """Return the plant whose states and inputs are counted in other units: S f(S^-1 x, U^-1 u), S W S.
+    """Return the plant whose states and inputs are counted in other units: S f(S^-1 x, U^-1 u) with noise S w.
 
-    f is the transition, W the covariance of the noise. The initial law is that of a deviation from its center.
+    f is the transition and w the noise, of covariance S W S; S and U are diagonal, of the factors of states and inputs.
     """
     s, u = units.states, units.inputs
-    law: AbstractNoise | np.ndarray = np.outer(s, s) * plant.initial_covariance
-    center = s * plant.initial_mean
-    if plant.deviation is not None:
-        law, center = _rescale_noise(plant.deviation, s), s * (plant.initial_mean - plant.deviation.mean)
+    center, law = _rescale_initial_law(plant, s)
     noise: AbstractNoise | FunctionInUnits
     if isinstance(plant.noise, AbstractNoise):
         noise = _rescale_noise(plant.noise, s)
     else:
         noise = FunctionInUnits(plant.noise, np.outer(s, s), (u,))
-    size = dict(zip(plant.states, s, strict=True))
-    limits = {name: (size[name] * low, size[name] * high) for name, (low, high) in plant.limits}
+    factor = dict(zip(plant.states, s, strict=True))
+    limits = {name: (factor[name] * low, factor[name] * high) for name, (low, high) in plant.limits}
     names = plant.states, plant.inputs, plant.circular
     if isinstance(plant, LinearPlant):
         matrix = _rescale_matrix(plant.matrix, s, s, u)
@@ -188,10 +191,20 @@ def _rescale_plant(plant: AbstractPlant, units: Units) -> AbstractPlant:
     return Plant(move, noise, center, law, *names, attitude=plant.attitude, limits=limits)
 
 
+def _rescale_initial_law(plant: AbstractPlant, s: np.ndarray) -> tuple[np.ndarray, AbstractNoise | np.ndarray]:
+    """Return center and law (or covariance) of the initial state S x_0, S = diag(s).
+
+    A law is that of the deviation from a center, which is the mean less the deviation's own mean.
+    """
+    if plant.deviation is None:
+        return s * plant.initial_mean, np.outer(s, s) * plant.initial_covariance
+    return s * (plant.initial_mean - plant.deviation.mean), _rescale_noise(plant.deviation, s)
+
+
 def _rescale_matrix(
     matrix: OfInputs | ArrayLike, out: np.ndarray, into: np.ndarray, inputs: np.ndarray
 ) -> FunctionInUnits | np.ndarray:
-    """Return the matrix out A / into, a function of the inputs if A is one: element ij is out_i A_ij / into_j."""
+    """Return the matrix with elements out_i A_ij / into_j, a function of the inputs if A is one."""
     factor = out[:, None] / into
     if isinstance(matrix, OfInputs):
         return FunctionInUnits(matrix.function, factor, (inputs,))
@@ -199,7 +212,7 @@ def _rescale_matrix(
 
 
 def rescale_sensor(sensor: AnySensor, units: Units) -> AnySensor:
-    """Return the sensor that measures R y of S x."""
+    """Return the sensor in other units: it measures R y of states S x."""
     rescaled: AnySensor = at_each_step(lambda step: _rescale_sensor(step, units), sensor)
     return rescaled
 
@@ -217,13 +230,16 @@ def _rescale_sensor(sensor: AbstractSensor, units: Units) -> AbstractSensor:
 
 
 def _rescale_moments(channel: SecondOrder | OverTime, units: Units) -> SecondOrder | OverTime:
-    """Return the description of z = Q G R^-1 y + Q n, at each step."""
+    """Return the second moments of a channel z = G y + n in other units, z = Q G R^-1 y + Q n, at each step."""
     rescaled: SecondOrder | OverTime = at_each_step(lambda step: rescale_channel(step, units), channel)
     return rescaled
 
 
 def rescale_channel(channel: SecondOrder, units: Units) -> SecondOrder:
-    """Return the description of z = Q G R^-1 y + Q n."""
+    """Return the second moments of a channel z = G y + n in other units: of outputs R y and measurements Q z.
+
+    It is z = Q G R^-1 y + Q n then; R and Q are diagonal, of the factors in `units`.
+    """
     q, (_, factor) = units.received, _scale_channel(units)
 
     def scaled(quadratic: QuadraticMap) -> QuadraticMap:
@@ -237,13 +253,13 @@ def rescale_channel(channel: SecondOrder, units: Units) -> SecondOrder:
 
 
 def _scale_channel(units: Units) -> tuple[Float[np.ndarray, "m p1"], Float[np.ndarray, "m m p1 p1"]]:
-    """Return the factors of M = (G, n), element ia, and of a tensor of second moments E[M_ia M_jb], element ijab."""
+    """Return the factors of M = (G, n), element ia, and of its second moments E[M_ia M_jb], element ijab."""
     q, r = units.received, np.append(units.outputs, 1.0)
     return q[:, None] / r, (q[:, None] * q)[:, :, None, None] / (r[:, None] * r)
 
 
 def _rescale_by_mode(channel: Modes | OverTime, units: Units) -> Modes | OverTime:
-    """Return the description of z = Q G R^-1 y + Q n for each mode."""
+    """Return the description of a channel z = G y + n by mode in other units: z = Q G R^-1 y + Q n in each."""
     values: Modes = stacked(channel)
     of_mean, of_spread = _scale_channel(units)
     noise = WeightedColumns(units.received[:, None] * values.noise.matrix, values.noise.weights)
@@ -303,6 +319,6 @@ def _rescale_system(filter: LinearSystemFilter, degree: int, units: Units) -> Li
 
 
 def _scale_monomials(factors: Float[np.ndarray, " n"], degree: int) -> Float[np.ndarray, " N"]:
-    """Return the factors of the monomials up to `degree` of numbers with these factors, the constant 1 left out."""
+    """Return the factors (N,) of monomials up to `degree` of numbers with these factors, without the constant 1."""
     table = np.array(list_exponents(len(factors) + 1, degree))[:-1, :-1]
     return np.asarray(np.prod(factors**table, axis=1))

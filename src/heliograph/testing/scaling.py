@@ -33,14 +33,15 @@ MISSING = 0.2  # share of the components that do not arrive
 def check_scaling(
     network: Network, inputs: ArrayLike | None = None, steps: int = 5, seed: int = 0, trials: int = 1
 ) -> float:
-    """Rescale every state, output, measurement and input of a network, and compare all estimates.
+    """Compare all estimates of a network with those of the same network in other units.
 
-    Factors from 1e-9 to 1e9 are drawn for each; every filter gets the model in the new units and the same simulated
-    measurements, some missing. Means and covariances must agree to 1e-8 of each component's own scale. A rule that
-    minimises a trace (covariance intersection, a bound with free scalars) adds squares of different units by
-    definition: for it all states get one factor, and the weights that it optimises agree to 1e-6. The same holds for
-    the descriptions of the channels that filters are made from. From a row on that a filter holds for impossible, with
-    a log-likelihood of -inf, rounding decides what it makes of it: nominal estimates are compared before that row.
+    Factors from 1e-9 to 1e9 are drawn for each state, output, measurement and input; every filter gets the model in the
+    new units and the same simulated measurements, some missing. Means and covariances must agree to 1e-8 of each
+    component's own scale. A rule that minimises a trace (covariance intersection, a bound with free scalars) adds
+    squares of different units by definition: for it all states get one factor, and the weights that it optimises agree
+    to 1e-6. The same holds for the descriptions of the channels that filters are made from. From a row on that a filter
+    holds for impossible, with a log-likelihood of -inf, rounding decides what it makes of it: nominal estimates are
+    compared before that row.
 
     Args:
         network: the network to test.
@@ -97,7 +98,7 @@ def _draw_units(network: Network, random: np.random.Generator, one_factor: bool)
     """
 
     def draw(count: int) -> np.ndarray:
-        """Draw factors."""
+        """Return so many factors, from 10^-DECADES to 10^DECADES."""
         return np.asarray(10.0 ** random.uniform(-DECADES, DECADES, size=count))
 
     n = len(network.states)
@@ -105,7 +106,7 @@ def _draw_units(network: Network, random: np.random.Generator, one_factor: bool)
     inputs, units = draw(len(network.inputs)), {}
     for name in network.names:
         node = network.nodes[name]
-        units[name] = Units(states, draw(len(node.outputs)), draw(node.received), inputs)
+        units[name] = Units(states, outputs=draw(len(node.outputs)), received=draw(node.received), inputs=inputs)
     outputs = np.concatenate([units[name].outputs for name in network.names])
     received = np.concatenate([units[name].received for name in network.names])
     return units | {Network.FUSED: Units(states, outputs, received, inputs)}
@@ -121,14 +122,19 @@ def _compare_runs(
 ) -> float:
     """Run the network in other units; return the largest difference of an estimate, as a share of what is allowed.
 
+    Estimates on the way to which a trace is minimised, a sum of squares of different units, end elsewhere in other
+    units by definition: they are compared, to SEARCHED, only where all states have one factor; all others to DIGITS.
+
     Args:
         network: the network.
         z: measurements by node (steps, received).
         u: inputs (steps, inputs).
-        plain: estimates in its own units, by node and filter.
+        plain: estimates in the old units, by node and filter.
         units: the other units, as `_draw_units` returns them.
-        one_factor: whether all states have one factor. Estimates for which a trace is minimised, a sum of squares of
-            different units, are compared only then.
+        one_factor: whether all states have one factor in these.
+
+    Raises:
+        AssertionError: an estimate that differs by more than is allowed.
     """
     nodes = {name: _rescale_node(name, node, units[name]) for name, node in _list_nodes(network).items()}
     fused = {name: _rescale_fusion(name, fusion, units[Network.FUSED]) for name, fusion in network.fused.items()}
@@ -139,12 +145,14 @@ def _compare_runs(
     for node, filters in plain.items():
         for name, estimate in filters.items():
             searches = _has_search_in_estimate(network, node, name)
-            if one_factor or not searches:
-                allowed = SEARCHED if searches else DIGITS
-                difference = _find_difference(estimate, estimates[node][name], units[node].states) / allowed
-                if np.any(difference > 1) and estimate.claim == "nominal":
-                    difference = difference[: _count_possible_rows(network, node, name, z, u)]
-                worst = max(worst, _check_differences(f"{node}/{name}", difference))
+            if searches and not one_factor:
+                continue
+            allowed = SEARCHED if searches else DIGITS
+            difference = _find_difference(estimate, estimates[node][name], units[node].states) / allowed
+            # What a nominal filter makes of a row that it holds for impossible is left to rounding, from there on.
+            if np.any(difference > 1) and estimate.claim == "nominal":
+                difference = difference[: _count_possible_rows(network, node, name, z, u)]
+            worst = max(worst, _check_differences(f"{node}/{name}", difference))
     return worst
 
 
@@ -172,20 +180,21 @@ def _check_differences(name: str, differences: np.ndarray) -> float:
 
 
 def _find_difference(a: Estimate, b: Estimate, s: np.ndarray) -> np.ndarray:
-    """Return the largest difference at each step of `a`, and `b` in units s, relative to each component's scale.
+    """Return the largest difference of `a` and of `b`, in units s (n,), at each step (steps,).
 
-    The scale of a component is its largest mean plus its largest deviation, over all steps.
+    Relative to the scale of each component, its largest mean plus its largest deviation over all steps.
     """
     mean, mean_b = np.asarray(a.mean), np.asarray(b.mean) / s
     covariance, covariance_b = np.asarray(a.covariance), np.asarray(b.covariance) / np.outer(s, s)
-    claimed = a.claim != "none"
+    is_claimed = a.claim != "none"
     assert np.all(np.isfinite(mean)), "expected finite means"
-    assert not claimed or np.all(np.isfinite(covariance)), "expected finite covariances"
-    deviation = np.sqrt(np.abs(np.diagonal(covariance, axis1=1, axis2=2)).max(axis=0)) if claimed else 0.0
+    assert not is_claimed or np.all(np.isfinite(covariance)), "expected finite covariances"
+    deviation = np.sqrt(np.abs(np.diagonal(covariance, axis1=1, axis2=2)).max(axis=0)) if is_claimed else 0.0
     size = deviation + np.abs(mean).max(axis=0)
     size = np.where(size > 0, size, 1.0)
+    # What is not finite in `b` differs by infinitely much.
     difference = np.nan_to_num(np.abs(mean - mean_b) / size, nan=np.inf).max(axis=1)
-    if claimed:
+    if is_claimed:
         of_covariance = np.abs(covariance - covariance_b) / np.outer(size, size)
         difference = np.maximum(difference, np.nan_to_num(of_covariance, nan=np.inf).max(axis=(1, 2)))
     return np.asarray(difference)
@@ -216,17 +225,18 @@ def _measure_difference(a: SecondOrder, b: SecondOrder) -> float:
 
     The scale of an entry of M = (G, n) is the root of its mean square, that of a product the product of its two.
     """
-    ends = [_find_ends(a), _find_ends(b)]
-    spread, _, power, _ = ends[0]
+    moments_of_a, moments_of_b = _find_largest_moments(a), _find_largest_moments(b)
+    spread, _, power, _ = moments_of_a
     squares = np.einsum("iiaa->ia", np.abs(spread) + np.abs(power))
     scale = np.sqrt(squares + np.abs(np.concatenate([a.mean_gain, a.offset[:, None]], axis=1)) ** 2)
     size = np.einsum("ia,jb->ijab", scale, scale)
     size = size + size.swapaxes(2, 3)
     size = np.where(size > 0, size, 1.0)
-    return max(float(np.max(np.abs(one - other) / size, initial=0.0)) for one, other in zip(*ends, strict=True))
+    pairs = zip(moments_of_a, moments_of_b, strict=True)
+    return max(float(np.max(np.abs(one - other) / size, initial=0.0)) for one, other in pairs)
 
 
-def _find_ends(described: SecondOrder) -> list[np.ndarray]:
+def _find_largest_moments(described: SecondOrder) -> list[np.ndarray]:
     """Return the largest that spread, shift, power and nominal second moments may be, (m, m, p + 1, p + 1) each."""
     quadratics = described.spread, described.shift, described.power, described.nominal
     return [np.asarray(quadratic.center + quadratic.radius) for quadratic in quadratics]
@@ -254,7 +264,7 @@ def _has_search_in_estimate(network: Network, node: str, name: str) -> bool:
 
 
 def _has_search(filter: AbstractFilter) -> bool:
-    """Return whether a filter minimises a trace by a search, so that its answers depend on units by the tolerance."""
+    """Return whether a filter minimises a trace by a search: other units change its answers by its tolerance."""
     match filter:
         case GaussianFilter() | LinearFilter():
             return bool(first(filter.channel).uncertain)

@@ -80,7 +80,7 @@ class Objective:
         return hash((_identity_of(self.description.build)[0], self.form))
 
     def _list_distinctions(self) -> tuple[object, ...]:
-        """Return all by which one objective may differ from another."""
+        """Return a tuple of all by which one objective may differ from another, to be compared."""
         description = self.description
         return self.form, _identity_of(description.build), description.parameters, description.named, description.start
 
@@ -98,6 +98,7 @@ class Objective:
         filter = self.filter(x)
 
         def judged(state: PyTree, innovation: Innovation, k: jax.Array) -> tuple[jax.Array, jax.Array]:
+            """Return a row's innovation and its covariance, NaN after which the filter has no estimate."""
             is_lost = jnp.any(jnp.isnan(jnp.asarray(filter.estimate(state).mean)))
             value, covariance = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
             return jnp.where(is_lost, 0.0, value), jnp.where(is_lost, jnp.nan, covariance)
@@ -114,6 +115,7 @@ class Objective:
         filter, angles = self.filter(x), first(self.description.start.plant).angles
 
         def claimed(state: PyTree, innovation: Innovation, k: jax.Array) -> tuple[jax.Array, jax.Array]:
+            """Return mean and claimed covariance of the estimate after a row."""
             estimate = filter.estimate(state)
             return jnp.asarray(estimate.mean), jnp.asarray(estimate.covariance)
 

@@ -98,7 +98,7 @@ class Predictive(NamedTuple):
 
 
 def signal_filter(plant: AnyPlant, sensor: AnySensor, channel: AbstractRandomAffine) -> Any:
-    """Return the filter that expects the sensor's signals, of a plant and a sensor of one law.
+    """Return the filter that predicts what the sensor sends (`expect_signals`), of one law of motion and measuring.
 
     Raises:
         ValueError: a plant or sensor with modes, or an unknown start.
@@ -170,7 +170,10 @@ class ChannelDensities(tuple[StackPartDensity, ...]):
 
     @staticmethod
     def of(channel: AbstractRandomAffine, nodes: int) -> "ChannelDensities":
-        """Return the combinations of each part of a stack, of everything else as a whole."""
+        """Return a channel as the combinations of gains of each of its parts, each gain's law taken as `nodes` values.
+
+        A stack has several parts, anything else is one.
+        """
         parts = channel.in_parallel
         return ChannelDensities(_stack_combinations(discretise_laws(affine, nodes).list_atoms()) for affine in parts)
 

@@ -173,7 +173,7 @@ def _choose_law(significant: set[str], held_out: dict[str, HeldOutScores]) -> st
 
 
 def _fit_laws(parts: Fates, intervals: bool) -> dict[str, AbstractLossLaw]:
-    """Return the five laws fitted to stretches, by name."""
+    """Return the five laws fitted to stretches of fates, by name; intervals of their numbers only if asked for."""
     return {
         INDEPENDENT: IndependentLosses.fit(parts),
         "markov": MarkovLosses.fit(parts, intervals=intervals),

@@ -36,7 +36,7 @@ class BetweenArrivals(np.ndarray):
 
     @staticmethod
     def of(fates: np.ndarray) -> "BetweenArrivals":
-        """Return the fates (packets,), marked as those between arrivals."""
+        """Return fates (packets,) marked as those of a stretch that was chosen to begin and end with an arrival."""
         marked = fates.view(BetweenArrivals)
         marked.chosen = True
         return marked

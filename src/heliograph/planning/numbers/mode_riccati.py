@@ -111,7 +111,7 @@ def _run_riccati(m: ModeSystem, parts: Float[np.ndarray, "_ n n"]) -> tuple[Part
 
 
 def _update_riccati(m: ModeSystem, k: int, parts: Float[np.ndarray, "_ n n"]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the best gain K_k,j (modes, n, m) of step k and X (modes, n, n) after it, from X before it."""
+    """Return the best gain K (modes, n, m) of step k and the covariances X (modes, n, n) after it, by X before."""
     law = m.law[k][:, None, None]
     prior = JumpSystem(m.chain[k], m.transition[k], law * m.process[k]).step(parts)
     # A mode that never occurs has X = 0, so with any regular noise its gain is zero.

@@ -168,7 +168,7 @@ class PowerTask(NamedTuple):
         )
 
     def of_paths(self, powers: Powers) -> Float[np.ndarray, "time path"]:
-        """Return the power that the free hops of each path send together."""
+        """Return the power of the free hops of each path together (time, path), from theirs (time, free)."""
         total = np.zeros(self.problem.paths.second.shape)
         np.add.at(total.T, self.problem.path, powers.T)
         return total

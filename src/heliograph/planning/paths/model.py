@@ -49,7 +49,7 @@ class RiccatiMap(NamedTuple):
 
 
 def compose(first: RiccatiMap, second: RiccatiMap) -> RiccatiMap:
-    """Return the composition of two such maps, the first applied first: again such a map."""
+    """Return the map of two steps of the filter, the first applied first: again a map A X (I + G X)^-1 A' + H."""
     inner = np.linalg.inv(np.eye(len(first.h)) + first.h @ second.g)
     through = inner @ first.a
     g = first.g + first.a.T @ second.g @ through
@@ -58,7 +58,7 @@ def compose(first: RiccatiMap, second: RiccatiMap) -> RiccatiMap:
 
 
 def solve_fixed_point(step: RiccatiMap) -> Float[np.ndarray, "n n"]:
-    """Return the limit of X+ = A X (I + G X)^-1 A' + H from X = 0, by doubling: 2^k steps after k doublings.
+    """Return the limit X of X+ = A X (I + G X)^-1 A' + H from X = 0, by doubling: 2^k steps after k doublings.
 
     Raises:
         ValueError: covariances that grow without limit.

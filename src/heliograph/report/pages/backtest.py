@@ -71,7 +71,7 @@ class FilterVerdict:
 
 
 def make_backtest_results(found: "heliograph.forecasting.Backtest", network: str, refit: int = 0) -> Results:
-    """Return the content of the results folder.
+    """Return the content of the results folder of a backtest: its figure, page and summary.
 
     Args:
         found: the scores.

@@ -90,7 +90,7 @@ def make_summary(results: DesignResults) -> dict[str, Json]:
 
 
 def draw_figures(results: DesignResults) -> dict[str, Figure]:
-    """Return the front, the powers, and the map if there is one, by file name."""
+    """Return by file name the figures of the front, the powers, and the map if there is one."""
     drawn = {"front": draw_front(results.front, {"this design": (results.design.total, results.design.error)})}
     drawn["powers"] = draw_powers(results.before, mean_powers(results.design))
     if results.map is not None:
@@ -153,7 +153,7 @@ def draw_map(sites: SiteMap) -> Figure:
 
 
 def make_page(results: DesignResults, drawings: Mapping[str, bytes]) -> Page:
-    """Return the report; `drawings` holds each figure as SVG."""
+    """Return the page of a design; `drawings` holds each figure as SVG."""
     design = results.design
     sections = [_make_result_section(results), _make_front_section(drawings), _make_powers_section(results, drawings)]
     if results.map is not None:

@@ -150,7 +150,7 @@ def _draw_pits(received: list[Uniformity]) -> Figure:
 
 
 def make_fit_page(learned: FitResults, drawings: Mapping[str, bytes]) -> Page:
-    """Return the report; `drawings` holds each figure as SVG."""
+    """Return the page of a fit; `drawings` holds each figure as SVG."""
     return Page(
         kicker="Heliograph fit",
         title=_write_headline(learned),

@@ -98,7 +98,7 @@ def run_figures(health: Health) -> dict[str, Figure]:
         health: what `examine` returned.
 
     Raises:
-        ValueError: what is no diagnosis.
+        ValueError: `health` is not what `examine` returns.
     """
     instance("health", health, Health, "what examine returns")
     drawn: dict[str, Figure] = {}
@@ -122,7 +122,7 @@ def _map_name(kind: str) -> str:
 
 
 def _collect_estimates(health: Health) -> list[tuple[str, Record]]:
-    """Return the filtered estimates, and the smoothed ones if there are any, by kind."""
+    """Return ("estimates", record), and ("smoothed", smoothed record) if there is one."""
     later = health.record.smoothed
     return [("estimates", health.record)] + ([] if later is None else [("smoothed", later)])
 
@@ -306,7 +306,7 @@ def _count_in_words(count: int, what: str) -> str:
 
 
 def _describe_span(record: Record) -> str:
-    """Return the time that the recording covers, in words."""
+    """Return the times that the recording covers as text, such as "from 0 to 10 s"."""
     time, unit = record.time, record.units.get("time", "")
     if time.dtype.kind == "M":
         return f"{str(time[0])[:19]} to {str(time[-1])[:19]} UTC"
@@ -322,7 +322,7 @@ def _list_doubts(doubts: list[str]) -> list[Points | Text]:
 
 
 def _list_baseline_remarks(health: Health) -> list[Text | Points]:
-    """Return what the recording says of baselines, filters to compare with; it is no doubt of the network."""
+    """Return the doubts about filters that are there to be compared with (baselines): no doubts of the network."""
     lines = [visible(line) for line in health.remarks()]
     text = "Of filters that are there to be compared with, on which the network does not rely:"
     return [Text([text]), Points(lines)] if lines else []
