@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from heliograph.report.figures import AMBER, INK, MUTED, PALE, STYLE, WIDTH, stacked_panels
+from heliograph.report.figures import AMBER, INK, MUTED, PALE, STYLE, WIDTH, make_stacked_panels
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Panel:
 @matplotlib.rc_context(STYLE)
 def curves_over_time(time: np.ndarray, panels: Sequence[Panel], label: str = "step") -> Figure:
     """Plot panels one above the other over the same time; curves are named at the mean of their last tenth."""
-    figure, grid = stacked_panels(len(panels), 2.4, 0.4)
+    figure, grid = make_stacked_panels(len(panels), 2.4, 0.4)
     for axes, panel in zip(grid, panels, strict=True):
         for curve in panel.curves:
             axes.plot(time, curve.values, color=curve.colour, linewidth=1.4)

@@ -6,15 +6,15 @@ from scipy import optimize
 
 import heliograph as hg
 from heliograph.learning.intervals import (
-    covariance_by_model,
     draw_block_sums,
     estimate_by_bartlett,
     estimate_by_cosines,
     estimate_if_white,
     find_numbers_told_by_few,
+    remove_predicted_scores,
 )
 from heliograph.learning.likelihood.trust_region import maximise
-from heliograph.learning.unidentified import find_confounded, format_sum, product_text, rank_of_information
+from heliograph.learning.unidentified import find_confounded, find_information_rank, format_product, format_sum
 
 RNG = np.random.default_rng(0)
 
@@ -91,7 +91,7 @@ def informed(known, parameters, points):
         values, turned = parameters.entries_at(x), parameters.jacobian(x)
         step = 1e-6 * np.eye(len(values))
         rows = np.stack([(known(values + h) - known(values - h)) / 2e-6 for h in step], axis=1) @ turned
-        ranks.append(rank_of_information(rows.T @ rows + 0.0))
+        ranks.append(find_information_rank(rows.T @ rows + 0.0))
     return ranks
 
 
@@ -105,12 +105,12 @@ def groups_of(known, *kinds):
 def test_a_product_is_found_and_put_in_words():
     (group,) = groups_of(lambda v: np.array([v[0] * v[1], v[2]]), "real", "positive", "positive")
     assert group.places == (0, 1) and group.fix == 1
-    assert product_text(["a", "b"], group.exponents[0]) == "a * b"
+    assert format_product(["a", "b"], group.exponents[0]) == "a * b"
 
 
 def test_a_power_and_a_sum():
     (group,) = groups_of(lambda v: np.array([v[0] ** 2 * v[1]]), "real", "positive")
-    assert product_text(["a", "b"], group.exponents[0]) == "a^2 * b"
+    assert format_product(["a", "b"], group.exponents[0]) == "a^2 * b"
     (group,) = groups_of(lambda v: np.array([0.5 * v[0] + v[1]]), "positive", "positive")
     assert not len(group.exponents)
     assert format_sum(["a", "b"], group.weights[0]) == "a + 2 b"
@@ -119,7 +119,7 @@ def test_a_power_and_a_sum():
 def test_two_ridges_apart_one_that_is_neither_and_nothing_at_all():
     first, second = groups_of(lambda v: np.array([v[0] * v[1], v[2] / v[3]]), *("positive",) * 4)
     assert (first.places, second.places) == ((0, 1), (2, 3))
-    assert product_text(["c", "d"], second.exponents[0]) == "c / d"
+    assert format_product(["c", "d"], second.exponents[0]) == "c / d"
     (group,) = groups_of(lambda v: np.array([v[0] * v[1] + v[2]]), *("positive",) * 3)
     assert group.fix == 2 and not len(group.exponents) and not len(group.weights)
     (group,) = groups_of(lambda v: np.array([v[0], 0 * v[1]]), *("positive",) * 2)
@@ -139,6 +139,6 @@ def test_of_a_true_model_the_parts_of_scores_add_up_to_its_information():
     """s = L e, e white: of s - H_.K H_KK^-1 s_K and of what the model says of the rest the sum is H = L L'."""
     lower = np.array([[1.0, 0.0, 0.0], [0.7, 1.2, 0.0], [-0.4, 0.3, 0.8]])
     rows = np.linalg.qr(np.random.default_rng(1).normal(size=(50, 3)))[0] @ lower.T
-    rest, known = covariance_by_model([rows], lower @ lower.T, np.array([False, True, False]))
+    rest, known = remove_predicted_scores([rows], lower @ lower.T, np.array([False, True, False]))
     np.testing.assert_allclose(estimate_if_white(rest).covariance + known, lower @ lower.T, atol=1e-14)
     np.testing.assert_allclose(rest[0][:, 1], 0.0, atol=1e-15)

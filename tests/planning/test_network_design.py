@@ -5,7 +5,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.planning import Budget, Error, paths_of
-from heliograph.planning.paths.model import path_information
+from heliograph.planning.paths.model import compute_path_information
 from tests.planning.published import FIRST, KAPPA, NAMES, NOISES, ROWS, A, Q, one_hop, path_problem, two_hops
 
 
@@ -143,7 +143,7 @@ def test_drawn_runs_have_the_designed_error_and_power(single):
     pi = np.linalg.solve(np.eye(9) - np.kron(A, A), Q.ravel()).reshape(3, 3)
     amplify = np.sqrt(power / (np.einsum("ia,ab,ib->i", ROWS, pi, ROWS) + NOISES))
     paths, _ = paths_of(single, Error())
-    information = path_information(paths, power[None]).information[0]
+    information = compute_path_information(paths, power[None]).information[0]
     gain, mean = p @ ROWS.T * information, FIRST**-1.5
     x = draws.multivariate_normal(np.zeros(3), pi, runs)
     e = draws.multivariate_normal(np.zeros(3), p, runs)

@@ -26,7 +26,7 @@ def recorded():
     return z
 
 
-def weighed_outputs(network, z):
+def summarise_weighed_outputs(network, z):
     """What is said of the outputs by the filters that weigh."""
     health = examine(network, hg.run(network, {"tank": z}), np.zeros((STEPS, 0)))
     return [item for item in health.outputs if item.weighs]
@@ -39,7 +39,7 @@ def test_only_filters_that_weigh_say_that_they_do():
 
 
 def test_the_output_with_outliers_is_to_blame(recorded):
-    left, right = weighed_outputs(NETWORK, recorded)
+    left, right = summarise_weighed_outputs(NETWORK, recorded)
     arrived = ~np.isnan(recorded)
     assert (left.judged.summary.received, right.judged.summary.received) == tuple(arrived.sum(axis=0))
     # Of the 20 rows with 15 more (14 deviations of an innovation) those that arrived, and the law's own 2 %.
@@ -55,7 +55,7 @@ def test_only_a_filter_that_the_network_relies_on_blames_an_output_where_it_weig
     """Of two that weigh the network relies on the first; of `FILTERS` on the one that does not weigh."""
     two = {"robust": FILTERS["robust"], "again": FILTERS["robust"]}
     network = hg.Network(PLANT, {"tank": hg.Node(SENSOR, LINK, two)})
-    items = weighed_outputs(network, recorded)
+    items = summarise_weighed_outputs(network, recorded)
     assert [(item.filter, item.judged.output) for item in items if item.judged.to_blame] == [("robust", "left")]
     assert items[0].judged.summary == items[2].judged.summary
 

@@ -17,8 +17,8 @@ from heliograph.campaign.store import (
     CLAIM,
     STORE,
     AxisLabels,
-    done_chunks,
-    parameter_values,
+    find_done_chunks,
+    list_parameter_values,
     read_labels,
     restore_campaign,
 )
@@ -56,7 +56,7 @@ def list_state_scores(
 ) -> list[StateScore]:
     """Return the scores of every state of every filter in these settings: over all steps, then at each given step."""
     group, labels = zarr.open_group(store, mode="r"), read_labels(store)
-    claims, done = np.asarray(group[CLAIM]), done_chunks(store, campaign)
+    claims, done = np.asarray(group[CLAIM]), find_done_chunks(store, campaign)
     results: list[StateScore] = []
     for setting in settings:
         chunks = [chunk for chunk in campaign.chunks(setting) if (setting, chunk.number) in done]
@@ -299,7 +299,7 @@ def _make_steps_table(campaign: Campaign, rows: Sequence[StateScore]) -> Explore
 
 def _make_columns(campaign: Campaign, rows: Sequence[StateScore], fields: Sequence[str]) -> dict[str, list[Value]]:
     """Return the columns of a table: settings, their parameters, names, and these fields of the scores, row by row."""
-    parameters = {name: parameter_values(campaign, name).tolist() for name in campaign.parameters}
+    parameters = {name: list_parameter_values(campaign, name).tolist() for name in campaign.parameters}
     return {
         "setting": [row.setting for row in rows],
         **{name: [_round_value(values[row.setting]) for row in rows] for name, values in parameters.items()},

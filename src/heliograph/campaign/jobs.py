@@ -17,8 +17,8 @@ from heliograph.campaign.store import (
     NetworkDescription,
     check_within,
     describe_network,
-    labels_from,
     read_labels,
+    restore_labels,
     write_chunk,
 )
 from heliograph.model.estimate import Estimate
@@ -84,7 +84,7 @@ def compute_chunk(campaign: Campaign, network: Network, chunk: Chunk, store: Pat
     if not store.is_dir():
         raise fail("results folder", f"a folder {store} that this machine sees", "nothing of that name")
     labels = read_labels(store)
-    check_within(labels_from(describe_network(network)["labels"]), labels, chunk.setting)
+    check_within(restore_labels(describe_network(network)["labels"]), labels, chunk.setting)
     # Full width, whatever the chunk has; only its own runs are written.
     recorded = monte_carlo(
         network,

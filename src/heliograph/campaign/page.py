@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from heliograph.campaign.failures import FAILURES, Failure, read_failures
 from heliograph.campaign.plan import BITWISE, Campaign, Setting, canonical
-from heliograph.campaign.store import parameter_values
+from heliograph.campaign.store import list_parameter_values
 from heliograph.campaign.summary import SUMMARY, Score, score_headers, score_row
 from heliograph.disk.quoting import quote_for_figure, visible
 from heliograph.report.figures import COLOURS, INK, STYLE, WIDTH, svg
@@ -153,7 +153,7 @@ def draw_campaign_figures(campaign: Campaign, scores: Sequence[Score]) -> dict[s
 
 def _can_be_axis(campaign: Campaign, name: str) -> bool:
     """Return whether a parameter is always a finite number, and at least two settings differ in nothing but it."""
-    values = parameter_values(campaign, name)
+    values = list_parameter_values(campaign, name)
     if values.dtype.kind not in "if" or not np.all(np.isfinite(values)):
         return False
     rests = [canonical(_drop_parameter(setting, name)) for setting in campaign.settings]
@@ -171,7 +171,7 @@ def plot_by_parameter(campaign: Campaign, scores: Sequence[Score], parameter: st
 
     There is one panel for each node and each choice of the other parameters, PANELS at most.
     """
-    values = parameter_values(campaign, parameter)  # by setting
+    values = list_parameter_values(campaign, parameter)  # by setting
     shown = dict(list(_group_into_panels(campaign, scores, parameter).items())[:PANELS])
     figure, grid = _make_panels(len(shown), 2.5)
     colours = _assign_colours(scores)

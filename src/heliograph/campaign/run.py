@@ -17,12 +17,12 @@ from heliograph.campaign.store import (
     check_same_campaign,
     check_within,
     create_store,
-    done_chunks,
     find_described,
-    labels_from,
+    find_done_chunks,
     read_labels,
     remove_damaged,
     remove_partial,
+    restore_labels,
     unite_labels,
     write_claims,
 )
@@ -142,7 +142,7 @@ def _clean_store(store: Path, campaign: Campaign) -> tuple[set[tuple[int, ...]],
     check_same_campaign(store, campaign)
     damaged = remove_damaged(store, campaign)
     remove_partial(store)
-    return done_chunks(store, campaign), damaged
+    return find_done_chunks(store, campaign), damaged
 
 
 def _compute_settings(
@@ -203,7 +203,7 @@ def _prepare_store(
         lacking = list(range(len(campaign.settings)))
     else:
         # Claims of the settings to compute, and of those that were begun: they may have been removed as damaged.
-        begun = {setting for setting, _ in done_chunks(store, campaign)}
+        begun = {setting for setting, _ in find_done_chunks(store, campaign)}
         lacking = sorted((settings | begun) - {setting for (setting,) in find_described(store)})
     jobs = [Job(setting) for setting in lacking]
     described: dict[int, NetworkDescription] = {}
@@ -219,7 +219,7 @@ def _prepare_store(
         first = next(iter(failed.values()))
         raise fail("campaign", "a setting whose network can be built", f"none: setting 0 gave {first.error}")
     # The axes of a new store are the union of all settings; later settings must fit into them.
-    labels = {setting: labels_from(described[setting]["labels"]) for setting in sorted(described)}
+    labels = {setting: restore_labels(described[setting]["labels"]) for setting in sorted(described)}
     if is_new:
         create_store(store, campaign, unite_labels(labels))
     for setting, of_setting in labels.items():

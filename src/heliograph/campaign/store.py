@@ -65,7 +65,7 @@ def describe_network(network: Network) -> NetworkDescription:
     return {"labels": labels, "claims": claims}
 
 
-def labels_from(table: LabelsAsJson) -> AxisLabels:
+def restore_labels(table: LabelsAsJson) -> AxisLabels:
     """Restore labels from the form that `describe_network` returns."""
     return AxisLabels(tuple(table["states"]), tuple(table["nodes"]), tuple(table["filters"]), table["received"])
 
@@ -158,11 +158,11 @@ def _make_coordinates(campaign: Campaign, labels: AxisLabels) -> dict[str, np.nd
     }
     names = {"node": labels.nodes, "filter": labels.filters, "state": labels.states}
     received = {"received": np.arange(labels.received)} if campaign.keep == "trajectories" else {}
-    parameters = {name: parameter_values(campaign, name) for name in campaign.parameters}
+    parameters = {name: list_parameter_values(campaign, name) for name in campaign.parameters}
     return steps | {name: np.array(value) for name, value in names.items()} | received | parameters
 
 
-def parameter_values(campaign: Campaign, name: str) -> np.ndarray:
+def list_parameter_values(campaign: Campaign, name: str) -> np.ndarray:
     """Return a parameter by setting: numbers or booleans where all values are, else text; NaN or "" if absent."""
     values = [setting.get(name) for setting in campaign.settings]
     if all(isinstance(value, bool) for value in values):
@@ -256,7 +256,7 @@ def _sync(folder: Path, start: str) -> None:
     sync(folder)
 
 
-def done_chunks(path: Path, campaign: Campaign) -> set[tuple[int, ...]]:
+def find_done_chunks(path: Path, campaign: Campaign) -> set[tuple[int, ...]]:
     """Return {(setting, chunk)} of the chunks of a campaign whose files all exist in the store."""
     return set.intersection(*(set(_find_chunk_files(path / name, 2)) for name in variables(campaign)))
 
@@ -305,7 +305,7 @@ def remove_partial(path: Path) -> None:
 def read_labels(path: Path) -> AxisLabels:
     """Return the labels that the store was created with."""
     stored: Any = zarr.open_group(path, mode="r").attrs["labels"]
-    return labels_from(stored)
+    return restore_labels(stored)
 
 
 def restore_campaign(path: Path) -> Campaign:

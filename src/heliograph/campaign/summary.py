@@ -10,7 +10,7 @@ import numpy as np
 import zarr
 
 from heliograph.campaign.plan import Campaign
-from heliograph.campaign.store import CLAIM, STORE, done_chunks, read_labels
+from heliograph.campaign.store import CLAIM, STORE, find_done_chunks, read_labels
 from heliograph.disk.quoting import quote_for_cell, unquote_cell
 from heliograph.disk.whole_file import name_path_in_errors, replace
 from heliograph.numerics.check import fail, file_path
@@ -91,7 +91,7 @@ def read_summary(path: str | Path) -> list[Score]:
 def summarize(store: Path, campaign: Campaign) -> list[Score]:
     """Return the scores of every filter by setting and node; the store is read chunk by chunk."""
     group, labels = zarr.open_group(store, mode="r"), read_labels(store)
-    claims, done = np.asarray(group[CLAIM]), done_chunks(store, campaign)  # (setting, node, filter), "" of none
+    claims, done = np.asarray(group[CLAIM]), find_done_chunks(store, campaign)  # (setting, node, filter), "" of none
     scores = []
     for setting in range(len(campaign.settings)):
         # Squared error and NEES of each run, averages over time (run, node, filter), of the chunks that are done.

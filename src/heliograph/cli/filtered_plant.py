@@ -115,9 +115,9 @@ def filter_rows(
 
 def _describe_doubted(network: "Network", record: "Record") -> list[str]:
     """Say of each output how many of its values the filters that weigh them doubted, and their bias, a line each."""
-    from heliograph.report.outputs import weighed_outputs
+    from heliograph.report.outputs import summarise_weighed_outputs
 
-    return [str(output) for output in weighed_outputs(network, record)]
+    return [str(output) for output in summarise_weighed_outputs(network, record)]
 
 
 def _select_rows(record: "Record", rows: "np.ndarray | None") -> "Record":

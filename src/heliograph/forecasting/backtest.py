@@ -185,7 +185,7 @@ def backtest(
     ]
     scores = list[Score]()
     for of_filter in zip(*targets, strict=True):
-        if (of_filter[0].node, of_filter[0].filter) in filtered_places(network):
+        if (of_filter[0].node, of_filter[0].filter) in list_filtered_places(network):
             scores += _score_filter(list(zip(networks, of_filter, strict=True)), record, u, ahead, first)
     if not scores:
         raise fail("backtest", "a filter that claims a covariance, and data to compare with", "none")
@@ -213,13 +213,13 @@ def _find_origin(network: Network, record: Record, *data: Any) -> Origin:
     return origin
 
 
-def filtered_places(network: Network) -> set[tuple[str, str]]:
+def list_filtered_places(network: Network) -> set[tuple[str, str]]:
     """Return (node, filter) of the estimates that are those of a filter, which can be stepped by itself."""
     central = {(FUSED, name) for name, fusion in network.fused.items() if hasattr(fusion, "predict")}
     return set(network.places) | central
 
 
-def measured_by(target: ForecastTarget, record: Record) -> np.ndarray:
+def select_measurements(target: ForecastTarget, record: Record) -> np.ndarray:
     """Return the measurements that a filter receives (steps, received), of a central one those of all nodes."""
     z = record.measurements.get(target.node)
     if z is None:  # of a central filter, all nodes' numbers
@@ -259,7 +259,7 @@ def _score_filter(
     if filter.claim == "none":
         return []
     # Forecasts from each row, and what came.
-    z = measured_by(target, record)
+    z = select_measurements(target, record)
     states, received = _roll_segments(segments, z, u, ahead)
     angles = filter.angles_used() or FilterAngles((), ())
     compared = list[_ComparedForecasts]()

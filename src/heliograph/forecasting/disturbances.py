@@ -131,8 +131,8 @@ def disturbances(
     assert predicted.received is not None
     e = np.asarray(rows) - predicted.received.mean
     of_outputs, of_plant = _smooth_noises(A, C, Q, R, e, predicted.states.covariance)
-    output_noise, output_deviation = _with_deviation(*of_outputs)
-    state_noise, state_deviation = _with_deviation(*of_plant)
+    output_noise, output_deviation = _compute_deviations(*of_outputs)
+    state_noise, state_deviation = _compute_deviations(*of_plant)
     return Disturbances(
         outputs=tuple(predicted.received.names),
         states=tuple(filter.states),
@@ -216,7 +216,7 @@ def _smooth_noises(
     return (output_mean, output_covariance), (plant_mean, plant_covariance)
 
 
-def _with_deviation(mean: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _compute_deviations(mean: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return means (steps, size) and their deviations, NaN where the variance is none but rounding.
 
     `covariance`: (steps, size, size).

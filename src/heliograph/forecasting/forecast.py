@@ -10,13 +10,13 @@ from heliograph.factors.gaussian import from_covariance
 from heliograph.filters.base import AbstractFilter, FilterAngles
 from heliograph.filters.gaussian.belief import open_loop_filter
 from heliograph.forecasting.horizons import Horizons, Inputs, RowsAhead, check_ahead, find_rows_ahead
-from heliograph.forecasting.origins import Sources, origin_of_sources
+from heliograph.forecasting.origins import Sources, find_common_origin
 from heliograph.forecasting.outlook import (
     Outlook,
+    find_output_claim,
     look_ahead,
     look_ahead_of_each,
-    outlook_of,
-    output_claim,
+    make_outlook,
     prediction_of,
 )
 from heliograph.forecasting.prediction import Forecast
@@ -60,12 +60,12 @@ def forecast(source: Sources, horizons: Horizons, inputs: Inputs = None) -> Fore
 
     Source: the prediction step of the filter, repeated.
     """
-    origin = origin_of_sources(source)
-    forecasts = forecasts_from(origin, horizons, inputs)
+    origin = find_common_origin(source)
+    forecasts = forecast_from_origin(origin, horizons, inputs)
     return forecasts if isinstance(origin.model, Network) else forecasts[""][""]
 
 
-def forecasts_from(origin: Origin, horizons: Horizons, inputs: Inputs) -> Forecasts:
+def forecast_from_origin(origin: Origin, horizons: Horizons, inputs: Inputs) -> Forecasts:
     """Return the forecast of each estimate of an origin, by node and filter; a single filter is called "".
 
     `horizons` and `inputs` are those of `forecast`.
@@ -111,7 +111,7 @@ def list_targets(origin: Origin) -> list[ForecastTarget]:
     """
     model = origin.model
     if isinstance(model, AbstractFilter):
-        outlook = outlook_of(model)
+        outlook = make_outlook(model)
         outputs = () if outlook.sensor is None else tuple(first(outlook.sensor).outputs)
         return [ForecastTarget("", "", outlook, origin.state, name_values(outputs, model.received))]
     assert isinstance(model, Network)
@@ -119,7 +119,7 @@ def list_targets(origin: Origin) -> list[ForecastTarget]:
     for node, filters in origin.estimates.items():
         for name, estimate in filters.items():
             filter, state = _find_filter(model, origin, node, name, estimate)
-            outlook = outlook_of(filter, _find_sensor(model, node), model.plant)
+            outlook = make_outlook(filter, _find_sensor(model, node), model.plant)
             targets.append(ForecastTarget(node, name, outlook, state, _name_received(model, node)))
     return targets
 
@@ -208,7 +208,9 @@ def _forecast_target(target: ForecastTarget, origin: Origin, ahead: RowsAhead) -
     assert states is not None
     angles, sensor = filter.angles_used() or FilterAngles((), ()), first(outlook.sensor)
     claim = filter.claim
-    measured = outputs and prediction_of(outputs, tuple(sensor.outputs), output_claim(filter, outlook), sensor.angles)
+    measured = outputs and prediction_of(
+        outputs, tuple(sensor.outputs), find_output_claim(filter, outlook), sensor.angles
+    )
     arriving = received and prediction_of(received, target.received, claim, angles.received)
     whole = prediction_of(states, filter.states, claim, angles.states)
     return Forecast(ahead.steps, ahead.time, whole, measured, arriving, ahead.inputs)

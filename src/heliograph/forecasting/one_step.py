@@ -9,10 +9,10 @@ import numpy as np
 from heliograph.engine.choice import compute_once
 from heliograph.filters.base import AbstractFilter, FilterAngles
 from heliograph.filters.filter_data import check_data
-from heliograph.forecasting.backtest import filtered_places, measured_by
+from heliograph.forecasting.backtest import list_filtered_places, select_measurements
 from heliograph.forecasting.forecast import Forecasts, list_targets
 from heliograph.forecasting.origins import origin_of
-from heliograph.forecasting.outlook import Outlook, outlook_of, output_claim, prediction_of
+from heliograph.forecasting.outlook import Outlook, find_output_claim, make_outlook, prediction_of
 from heliograph.forecasting.prediction import Forecast, InputsAhead
 from heliograph.model.over_time import first
 from heliograph.numerics.check import fail, instance
@@ -46,7 +46,7 @@ def predict_rows(
     rows, inputs = check_data(filter, z, u)
     if not len(rows):
         raise fail("measurements", "at least one row", "none")
-    outlook = outlook_of(filter)
+    outlook = make_outlook(filter)
     sensor = first(outlook.sensor)
     names = name_values(() if sensor is None else tuple(sensor.outputs), filter.received)
     return _make_forecast(outlook, np.asarray(rows), np.asarray(inputs), names)
@@ -72,11 +72,11 @@ def predict_record(record: Record, inputs: Float[ArrayLike, "steps inputs"] | No
     """
     network = origin_of(instance("record", record, Record, "a Record")).model
     assert isinstance(network, Network)  # nothing else makes a record with an origin
-    u, filtered = read_plant_inputs(network, inputs, len(record.time)), filtered_places(network)
+    u, filtered = read_plant_inputs(network, inputs, len(record.time)), list_filtered_places(network)
     found: Forecasts = {}
     for target in list_targets(origin_of(record)):
         if (target.node, target.filter) in filtered:
-            predicted = _make_forecast(target.outlook, measured_by(target, record), u, target.received)
+            predicted = _make_forecast(target.outlook, select_measurements(target, record), u, target.received)
             found.setdefault(target.node, {})[target.filter] = replace(predicted, time=record.time)
     return found
 
@@ -89,7 +89,9 @@ def _make_forecast(outlook: Outlook, z: np.ndarray, u: np.ndarray, names: tuple[
     filter, sensor = outlook.filter, first(outlook.sensor)
     states, outputs, received = compute_once(_predict_each_row, _by_xla, (outlook, z, u))
     angles = filter.angles_used() or FilterAngles((), ())
-    measured = outputs and prediction_of(outputs, tuple(sensor.outputs), output_claim(filter, outlook), sensor.angles)
+    measured = outputs and prediction_of(
+        outputs, tuple(sensor.outputs), find_output_claim(filter, outlook), sensor.angles
+    )
     arriving = received and prediction_of(received, names, filter.claim, angles.received)
     whole = prediction_of(states, filter.states, filter.claim, angles.states)
     given: InputsAhead = "given" if filter.inputs else "none"

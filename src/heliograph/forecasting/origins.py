@@ -33,7 +33,7 @@ def origin_of(source: object) -> Origin:
     return origin
 
 
-def origin_of_sources(source: Sources) -> Origin:
+def find_common_origin(source: Sources) -> Origin:
     """Return where a forecast starts; of a list of sources their origins as one, with an axis over the sources.
 
     Raises:

@@ -131,7 +131,7 @@ class Outlook(Module):
         return prior, (states, outputs, received)
 
 
-def outlook_of(filter: AbstractFilter, sensor: AnySensor | None = None, plant: AnyPlant | None = None) -> Outlook:
+def make_outlook(filter: AbstractFilter, sensor: AnySensor | None = None, plant: AnyPlant | None = None) -> Outlook:
     """Return the outlook of a filter, by the plant and sensor that it believes in, or by these if it does not say."""
     premise = filter.premise
     plant = plant if premise is None else premise.plant
@@ -228,7 +228,7 @@ def prediction_of(moments: Moments, names: tuple[str, ...], claim: Claim, angles
     return Prediction(names, wrapped, covariance, claim, weights, means + whole_turns, variances)
 
 
-def output_claim(filter: AbstractFilter, outlook: Outlook) -> Claim:
+def find_output_claim(filter: AbstractFilter, outlook: Outlook) -> Claim:
     """Return the claim of predicted outputs: that of the states behind a linear sensor, else nominal at most."""
     sensor = first(outlook.sensor)
     plain = isinstance(sensor, LinearSensor) and not sensor.circular

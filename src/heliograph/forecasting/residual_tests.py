@@ -8,7 +8,7 @@ from scipy.stats import chi2, f
 
 from heliograph.filters.base import AbstractFilter, FilterAngles
 from heliograph.filters.filter_data import check_data
-from heliograph.forecasting.backtest import measured_by
+from heliograph.forecasting.backtest import select_measurements
 from heliograph.forecasting.forecast import list_targets
 from heliograph.forecasting.one_step import predict_record, predict_rows
 from heliograph.forecasting.origins import origin_of
@@ -147,7 +147,7 @@ def record_residuals(
         if prediction is None:
             continue
         angles = (target.outlook.filter.angles_used() or FilterAngles((), ())).received
-        of_filter = _standardise(prediction, measured_by(target, record), angles, LAGS)
+        of_filter = _standardise(prediction, select_measurements(target, record), angles, LAGS)
         if of_filter is not None:
             found.setdefault(target.node, {})[target.filter] = of_filter
     return found

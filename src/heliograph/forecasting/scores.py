@@ -47,15 +47,15 @@ def crps(law: MixtureLaws, values: np.ndarray) -> np.ndarray:
 
     Source: Gneiting and Raftery, Strictly proper scoring rules (2007); Grimit et al. (2006) for mixtures.
     """
-    away = np.sum(law.weights * _mean_size(values[:, None] - law.means, law.variances), axis=1)
+    away = np.sum(law.weights * _compute_mean_size(values[:, None] - law.means, law.variances), axis=1)
     between = np.zeros(len(values))
     for i in range(law.weights.shape[1]):
-        pair = _mean_size(law.means[:, i : i + 1] - law.means, law.variances[:, i : i + 1] + law.variances)
+        pair = _compute_mean_size(law.means[:, i : i + 1] - law.means, law.variances[:, i : i + 1] + law.variances)
         between += law.weights[:, i] * np.sum(law.weights * pair, axis=1)
     return np.asarray(away - between / 2)
 
 
-def _mean_size(mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
+def _compute_mean_size(mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
     """Return E|Y| of a Gaussian Y of this mean and variance."""
     deviation = np.sqrt(variance)
     t = mean / deviation

@@ -8,7 +8,7 @@ import scipy
 from scipy.special import ndtr
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.learning.intervals import mean_and_error
+from heliograph.learning.intervals import estimate_mean_and_error
 from heliograph.learning.likelihood.predictive_density import Predictive, predictive
 from heliograph.model.over_time import OverTime, first
 from heliograph.numerics.check import InputError, fail, instance
@@ -179,6 +179,6 @@ def compare_laws(a: Predictive, b: Predictive) -> Comparison:
 
 def compare_mean(differences: Float[np.ndarray, " steps"]) -> Comparison:
     """Return the test of whether the mean of differences (steps,), correlated over time, is zero."""
-    mean, error = mean_and_error(differences)
+    mean, error = estimate_mean_and_error(differences)
     z = mean / error if error > 0 else 0.0
     return Comparison(mean, error, float(z), float(2 * scipy.stats.norm.sf(abs(z))))

@@ -18,9 +18,9 @@ from heliograph.learning.unidentified import (
     Confounded,
     InformationRank,
     find_confounded,
+    find_information_rank,
+    format_product,
     format_sum,
-    product_text,
-    rank_of_information,
 )
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, first
@@ -101,7 +101,7 @@ def identifiable(network: Build, inputs: ArrayLike | None = None, horizon: int =
     for i, x in enumerate(points):
         z = _draw_data(objective, x, u, check_seed("seed", seed) + i)
         data = LikelihoodData(z[None], u[None], (len(z),))
-        ranks.append(rank_of_information(LikelihoodSurface(objective, data).evaluations(x[None]).late[0]))
+        ranks.append(find_information_rank(LikelihoodSurface(objective, data).evaluations(x[None]).late[0]))
     return _judge_identifiability(description.parameters, points, ranks)
 
 
@@ -115,7 +115,7 @@ def identify_by_recording(surface: LikelihoodSurface, start: Float[np.ndarray, "
     sound = [i for i in range(len(points)) if np.isfinite(late[i]).all()]
     if not sound:
         points, late, sound = [start], surface.evaluations(start[None]).late, [0]
-    ranks = [rank_of_information(late[i]) for i in sound]
+    ranks = [find_information_rank(late[i]) for i in sound]
     return _judge_identifiability(surface.objective.description.parameters, [points[i] for i in sound], ranks)
 
 
@@ -169,7 +169,7 @@ def _describe_group(parameters: Parameters, group: Confounded, solution: "Soluti
     # Products x^a y^b and sums a x + b y that are identified, each with its interval.
     combinations = []
     for row in group.exponents:
-        combinations.append(product_text(names, row) + _format_interval(parameters, group, row, solution, log=True))
+        combinations.append(format_product(names, row) + _format_interval(parameters, group, row, solution, log=True))
     for row in group.weights:
         combinations.append(format_sum(names, row) + _format_interval(parameters, group, row, solution, log=False))
     # Of n numbers, of which k must be fixed, n - k combinations are identified; some are neither product nor sum.

@@ -8,15 +8,15 @@ import scipy
 from heliograph.numerics.types import Bool, Float
 
 
-def long_run_deviation(values: Float[np.ndarray, " steps"]) -> float:
+def estimate_long_run_deviation(values: Float[np.ndarray, " steps"]) -> float:
     """Return sqrt(Var(sum of T values) / T) of a series (steps,), correlated over time, by Bartlett's weights."""
     total = estimate_by_bartlett([values[:, None] - values.mean()]).covariance
     return float(np.sqrt(max(total[0, 0], 0.0) / len(values)))
 
 
-def mean_and_error(values: Float[np.ndarray, " steps"]) -> tuple[float, float]:
+def estimate_mean_and_error(values: Float[np.ndarray, " steps"]) -> tuple[float, float]:
     """Return the mean of a series (steps,), and its standard error."""
-    return float(values.mean()), long_run_deviation(values) / float(np.sqrt(len(values)))
+    return float(values.mean()), estimate_long_run_deviation(values) / float(np.sqrt(len(values)))
 
 
 Method = Literal["cosines", "bartlett", "white", "hessian", "bootstrap", "profile"]
@@ -56,7 +56,7 @@ def find_numbers_told_by_few(information: list[Float[np.ndarray, "steps k"]]) ->
     return np.asarray(stretches.sum(axis=0) ** 2 < FEW * len(stretches) * np.sum(stretches**2, axis=0))
 
 
-def covariance_by_model(
+def remove_predicted_scores(
     scores: Scores, hessian: Float[np.ndarray, "p p"], few: Bool[np.ndarray, " p"]
 ) -> tuple[Scores, Float[np.ndarray, "p p"]]:
     """Return scores less what the scores of a few numbers K predict of them, and the covariance of that prediction.
@@ -157,7 +157,7 @@ def quantile(freedom: float, level: float = LEVEL) -> float:
     return float(scipy.stats.t.ppf((1 + level) / 2, freedom))
 
 
-def allowed_fall(level: float) -> float:
+def find_allowed_fall(level: float) -> float:
     """Return by how many nats a profile likelihood is lower at the ends of an interval: half a chi-square quantile."""
     return float(scipy.stats.chi2.ppf(level, 1)) / 2
 

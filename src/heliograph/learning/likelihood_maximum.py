@@ -11,12 +11,12 @@ from heliograph.learning.intervals import (
     LEVEL,
     Method,
     Scores,
-    allowed_fall,
-    covariance_by_model,
     draw_block_sums,
     estimate_long_run_covariance,
+    find_allowed_fall,
     find_numbers_told_by_few,
     quantile,
+    remove_predicted_scores,
     sandwich,
 )
 from heliograph.learning.likelihood.multistart import FURTHER, HighestPoint
@@ -24,7 +24,7 @@ from heliograph.learning.likelihood.objective import Form
 from heliograph.learning.likelihood.surface import LikelihoodSurface
 from heliograph.learning.likelihood.transforms import link, unlink, unlink_slope
 from heliograph.learning.parameters import Parameters, TableEntry
-from heliograph.learning.unidentified import InformationRank, rank_of_information
+from heliograph.learning.unidentified import InformationRank, find_information_rank
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Bool, Float
 
@@ -152,7 +152,7 @@ class Solution:
     @cached_property
     def rank(self) -> InformationRank:
         """Flat directions at the maximum, among active coordinates, as many as the ridges."""
-        return rank_of_late_rows(
+        return find_rank_of_late_rows(
             self.surface.evaluations(self.top.x[None]).late[0][np.ix_(self.active, self.active)], self.ridges
         )
 
@@ -195,7 +195,7 @@ class Solution:
         if self.few.any():
             # The Hessian of all active coordinates from that along the directions, which are as many.
             inverse = np.linalg.inv(self.basis)
-            scores, by_model = covariance_by_model(scores, inverse.T @ self.hessian @ inverse, self.few)
+            scores, by_model = remove_predicted_scores(scores, inverse.T @ self.hessian @ inverse, self.few)
         estimate = estimate_long_run_covariance(method, [s @ self.basis for s in scores], self.hessian)
         if method != "hessian":
             estimate = estimate._replace(covariance=estimate.covariance + self._reduce(by_model))
@@ -291,7 +291,7 @@ class Solution:
             hardly_known = self.surface.domains.single[coordinate] and error > WIDE
             if hardly_known or method == "profile":
                 first = min(error, WIDE) * np.array([-2.0, 2.0])  # where the search for either end begins
-                low, high = self._cut_profile(coordinate, first, allowed_fall(level))
+                low, high = self._cut_profile(coordinate, first, find_allowed_fall(level))
                 return low, high
             is_told_by_few = bool(self.few[np.count_nonzero(self.active[:coordinate])])
         center = float(link(entry.domain, value))
@@ -334,7 +334,7 @@ class Solution:
         """
         assert entry.coordinate is not None
         outward = self.top.ends[entry.coordinate]  # -1 or 1
-        (end,) = self._cut_profile(entry.coordinate, np.array([-outward * FURTHER]), allowed_fall(2 * level - 1))
+        (end,) = self._cut_profile(entry.coordinate, np.array([-outward * FURTHER]), find_allowed_fall(2 * level - 1))
         limit = float(unlink(entry.domain, end)) if np.isfinite(end) else float(unlink(entry.domain, -outward * np.inf))
         return Row(
             name=entry.name,
@@ -370,12 +370,12 @@ def _make_unidentified_row(entry: TableEntry, value: float, form: Form) -> Row:
     )
 
 
-def rank_of_late_rows(late: Float[np.ndarray, "p p"], ridges: int) -> InformationRank:
+def find_rank_of_late_rows(late: Float[np.ndarray, "p p"], ridges: int) -> InformationRank:
     """Return the rank of the information of a recording's second half (p, p), with `ridges` flat directions.
 
     What is known before the first step pins a ridge weakly; that does not grow with the data, and is not used.
     """
-    rank = rank_of_information(late)
+    rank = find_information_rank(late)
     if rank.flat.shape[1] == ridges:
         return rank
     # The directions of the least eigenvalues, in units of each coordinate's standard error, are the flat ones.

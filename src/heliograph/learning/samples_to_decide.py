@@ -7,12 +7,12 @@ import numpy as np
 import scipy
 
 from heliograph.filters.gaussian.belief import open_loop_filter
-from heliograph.learning.intervals import long_run_deviation
+from heliograph.learning.intervals import estimate_long_run_deviation
 from heliograph.learning.likelihood.predictive_density import (
     NODES,
     ChannelDensities,
     evaluate_predictive,
-    signal_filter,
+    make_signal_filter,
 )
 from heliograph.numerics.check import check_count, check_seed, fail, instance, scalar
 from heliograph.numerics.module import are_same, readable
@@ -87,7 +87,7 @@ def samples_to_tell(
         log_densities = [_predict_densities(network, node, channel, z, u, nodes) for channel in (true, other)]
         ratio = np.asarray(log_densities[0] - log_densities[1])  # (runs, steps)
         means.append(float(ratio.mean()))
-        deviations.append(float(np.sqrt(np.mean([long_run_deviation(run) ** 2 for run in ratio]))))
+        deviations.append(float(np.sqrt(np.mean([estimate_long_run_deviation(run) ** 2 for run in ratio]))))
     # n = (z (sqrt V_a + sqrt V_b) / (I_a + I_b))^2; no number of steps is enough where the laws look alike.
     gain = sum(means)
     needed = (scipy.stats.norm.isf(level) * sum(deviations) / gain) ** 2 if gain > 0 else np.inf
@@ -147,7 +147,7 @@ def _predict_densities(
         nodes: number of values that stand for the law.
     """
     received = channel.condition_on_arrival()
-    filter, parts = signal_filter(network.plant, node.sensor, received), ChannelDensities.of(received, nodes)
+    filter, parts = make_signal_filter(network.plant, node.sensor, received), ChannelDensities.of(received, nodes)
     # Mean and covariance of the expected signal, and the measurement, with all steps of all runs in one axis.
     expected = filter.expect_signals(z, u)
     y, covariance, measured = (np.asarray(array).reshape(-1, *array.shape[2:]) for array in expected)

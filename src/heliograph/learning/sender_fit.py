@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.event.factory import event_filter
 from heliograph.learning.free_network import Description
-from heliograph.learning.intervals import LEVEL, allowed_fall
+from heliograph.learning.intervals import LEVEL, find_allowed_fall
 from heliograph.learning.likelihood.data import gather_data
 from heliograph.learning.likelihood_maximum import Row
 from heliograph.learning.losses.delays import DelaysByNode
@@ -145,7 +145,7 @@ def fit_sender(
     # An interval for each number, as far as Ctrl-C lets the search come.
     rows, stopped = list[Row](), top.stopped
     for i in range(len(parameters.entries)):
-        row = _row_without_ends(description, top.x, i)
+        row = _make_row_without_interval(description, top.x, i)
         try:
             rows.append(row if stopped else _add_interval(row, description, likelihood, top, i))
         except KeyboardInterrupt:
@@ -228,7 +228,7 @@ def _climb_simplex(
     return np.asarray(optimum.x), -float(optimum.fun), bool(optimum.success)
 
 
-def _row_without_ends(description: Description, x: Float[np.ndarray, " p"], index: int) -> Row:
+def _make_row_without_interval(description: Description, x: Float[np.ndarray, " p"], index: int) -> Row:
     """Return the table's row of free number `index` at the maximum x (p,), without an interval and standard error."""
     return Row(
         name=description.parameters.entries[index].name,
@@ -254,7 +254,7 @@ def _add_interval(row: Row, description: Description, likelihood: Likelihood, to
     """
     entry = description.parameters.entries[index]
     coordinate = index if entry.coordinate is None else entry.coordinate
-    profile = _Profile(likelihood, coordinate, top.total - allowed_fall(LEVEL))
+    profile = _Profile(likelihood, coordinate, top.total - find_allowed_fall(LEVEL))
     ends = []
     for side in (-1.0, 1.0):
         # The entry of the table where its coordinate is at the end.

@@ -45,7 +45,7 @@ class InformationRank(NamedTuple):
     weakest: float
 
 
-def rank_of_information(information: Float[np.ndarray, "p p"]) -> InformationRank:
+def find_information_rank(information: Float[np.ndarray, "p p"]) -> InformationRank:
     """Return the flat and the other directions of information I (p, p), in units 1 / sqrt(I_ii) of each coordinate.
 
     A direction is flat where the eigenvalue of I_ij / sqrt(I_ii I_jj) is below NOTHING; a coordinate of which nothing
@@ -171,7 +171,7 @@ def _reduce_to_echelon(rows: np.ndarray) -> np.ndarray:
     return reduced
 
 
-def product_text(names: list[str], exponents: Float[np.ndarray, " places"]) -> str:
+def format_product(names: list[str], exponents: Float[np.ndarray, " places"]) -> str:
     """Return the text of a product of powers, such as "a * b^2 / c"."""
     above = [_format_power(n, e) for n, e in zip(names, exponents, strict=True) if e > 0]
     below = [_format_power(n, -e) for n, e in zip(names, exponents, strict=True) if e < 0]

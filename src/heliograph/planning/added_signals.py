@@ -91,7 +91,7 @@ class SumTask(NamedTuple):
         links = self.links
         return min(self.limits.total, float((self.caps**2 * links.unit)[self.free].sum()))
 
-    def error_of_amplitudes(self, amplitudes: Vector) -> float:
+    def compute_error(self, amplitudes: Vector) -> float:
         """Return the error with these amplitudes of all links."""
         return self.error(self.covariance(self.links.information(amplitudes)))
 
@@ -131,7 +131,7 @@ class SumTask(NamedTuple):
             return amplitudes
 
         def error_at(x: Vector) -> float:
-            return self.error_of_amplitudes(amplitudes_at(x))
+            return self.compute_error(amplitudes_at(x))
 
         generator, best, least = np.random.default_rng(self.seed), links.present, np.inf
         points = [generator.uniform(-1.0, 1.0, len(scale)) for _ in range(starts)]
@@ -179,9 +179,9 @@ def design_sum_of_links(problem: DesignProblem, network: Network) -> PowerDesign
     return PowerDesign(
         problem=problem,
         powers={name: np.array([power]) for name, power in zip(names, amplitudes**2 * links.unit, strict=True)},
-        error=task.error_of_amplitudes(amplitudes),
+        error=task.compute_error(amplitudes),
         certificate=certificate,
-        present=task.error_of_amplitudes(links.present),
+        present=task.compute_error(links.present),
         covariance=task.covariance(links.information(amplitudes))[None],
         sensitivity=dict.fromkeys(names, float("nan")),
         price=float("nan"),
@@ -219,10 +219,10 @@ def _find_least_error_amplitudes(task: SumTask, total: float) -> tuple[Vector, C
     """Return the amplitudes (links,) of the least error with a total power of the free links, and the certificate."""
     solution = task.solve_closed_form(total)
     if solution is not None:
-        error = task.error_of_amplitudes(solution)
+        error = task.compute_error(solution)
         return solution, Certificate(convex=True, value=error, bound=error, stationarity=0.0, starts=1, unit="error")
     found = task.search_amplitudes(total, task.starts)
-    error = task.error_of_amplitudes(found)
+    error = task.compute_error(found)
     bound = min(task.bound_error(min(total, task.largest_total)), error)
     return found, Certificate(
         convex=False, value=error, bound=bound, stationarity=np.nan, starts=task.starts, unit="error"
@@ -240,7 +240,7 @@ def _find_least_power_amplitudes(task: SumTask, target: float) -> tuple[Vector, 
     for _ in range(HALVINGS if certificate.convex else SEARCHES):
         middle = (low + high) / 2
         tried = _try_power(task, middle, best)
-        if task.error_of_amplitudes(tried) <= target:
+        if task.compute_error(tried) <= target:
             high, best = middle, tried
         else:
             low = middle

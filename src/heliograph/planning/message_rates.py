@@ -249,7 +249,7 @@ def _compute_rate_on_grid(system: _ScalarSystem, delta: float, share: float) -> 
     cells_each_side, cells_of_delta, h = _choose_cells(system, delta, share)
     # Probabilities of a cell given the middle of another, which sum to 1: move[new, old], noise[x, z].
     x = np.arange(-cells_each_side, cells_each_side + 1) * h
-    move, noise = _cell_probabilities(x, a * x, np.sqrt(q)).T, _cell_probabilities(x, x, np.sqrt(r))
+    move, noise = _compute_cell_probabilities(x, a * x, np.sqrt(q)).T, _compute_cell_probabilities(x, x, np.sqrt(r))
     # quiet[i, j] = P(no message) of x in cell i, with the value of cell j sent last.
     quiet = ndtr((x + delta - x[:, None]) / np.sqrt(r)) - ndtr((x - delta - x[:, None]) / np.sqrt(r))
     size = len(x)
@@ -262,7 +262,7 @@ def _compute_rate_on_grid(system: _ScalarSystem, delta: float, share: float) -> 
     # The stationary law is the eigenvector of a step for its largest eigenvalue, 1: power iterations (Arnoldi) from the
     # law of the state and a value that was just sent.
     deviation = np.sqrt(q / (1 - a * a))
-    start = _cell_probabilities(x, np.zeros(1), deviation).T * noise
+    start = _compute_cell_probabilities(x, np.zeros(1), deviation).T * noise
     operator = LinearOperator((size**2, size**2), matvec=move_and_send, dtype=np.float64)
     try:
         _, vectors = eigs(operator, 1, v0=start.ravel(), maxiter=int(PRODUCTS / size**3 / 20) + 2, tol=1e-9)
@@ -290,7 +290,7 @@ def _send_part(f: np.ndarray, noise: np.ndarray, cells_of_delta: int) -> np.ndar
     return np.asarray(far * noise)
 
 
-def _cell_probabilities(x: np.ndarray, means: np.ndarray, deviation: float) -> np.ndarray:
+def _compute_cell_probabilities(x: np.ndarray, means: np.ndarray, deviation: float) -> np.ndarray:
     """Return the probabilities [i, j] that a Gaussian of mean i falls into the cell around x[j].
 
     Cells end halfway between neighbours; the outermost reach to infinity.

@@ -19,7 +19,7 @@ from heliograph.numerics.lapack import spectral_radius
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.planning.plant_moments import measurement_moment, moments_over, steady_moment
-from heliograph.planning.transmitters import compute_sent_powers, steady_powers
+from heliograph.planning.transmitters import compute_sent_powers, compute_steady_powers
 from heliograph.relays.design import given_design
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
@@ -152,7 +152,11 @@ def _compute_hop_powers(
 
 def _compute_powers_at(channel: Channel, k: int, moment: np.ndarray, horizon: int | None) -> dict[str, float]:
     """Return the powers sent at step k for `moment` = E (y, 1)(y, 1)', or in the long run if there is no horizon."""
-    return steady_powers(at(channel, k), moment) if horizon is None else compute_sent_powers(at(channel, k), moment, k)
+    return (
+        compute_steady_powers(at(channel, k), moment)
+        if horizon is None
+        else compute_sent_powers(at(channel, k), moment, k)
+    )
 
 
 def _list_sources(network: Network) -> Sources:

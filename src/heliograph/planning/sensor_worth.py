@@ -137,7 +137,7 @@ def worth_of_sensors(
     errors: list[ErrorWithout] = []
     for case in cases:
         used = np.where(np.repeat(case.used, sizes, axis=1), z, np.nan)
-        squares = _squares_at_end(filter_of_all, used, u, truth, is_exact)
+        squares = _compute_squares_at_end(filter_of_all, used, u, truth, is_exact)
         errors.append(_describe_error(case.name, squares, errors[0].error if errors else None))
     return SensorWorth(network.states, complete=errors[0], cases=tuple(errors[1:]), exact=is_exact, added=tuple(added))
 
@@ -217,7 +217,7 @@ def _make_filter_of_all(network: Network, nodes: Mapping[str, Node]) -> Abstract
     # of bursts, a loss tells of the next one: the channel stays.
     plant = network.plant
     channels = [
-        node.channel if first(node.channel).remembers else at_each_step(_given_arrival, node.channel)
+        node.channel if first(node.channel).remembers else at_each_step(_condition_on_arrival, node.channel)
         for node in nodes.values()
     ]
     sensor, channel = join_links({name: node.sensor for name, node in nodes.items()}, channels)
@@ -225,12 +225,12 @@ def _make_filter_of_all(network: Network, nodes: Mapping[str, Node]) -> Abstract
     return likelihood_filter(plant, sensor, channel, linear=on_line and is_linear(plant, sensor))
 
 
-def _given_arrival(channel: AbstractRandomAffine) -> AbstractRandomAffine:
+def _condition_on_arrival(channel: AbstractRandomAffine) -> AbstractRandomAffine:
     """Return the channel given that what it carries arrives."""
     return channel.condition_on_arrival() if channel.erases else channel
 
 
-def _squares_at_end(
+def _compute_squares_at_end(
     filter: AbstractFilter,
     z: Float[np.ndarray, "runs steps received"],
     u: Float[np.ndarray, "steps inputs"],

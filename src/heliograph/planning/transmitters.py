@@ -75,10 +75,10 @@ def compute_sent_powers(channel: AbstractRandomAffine, second: Second, step: int
     """
     joint = joint_modes(channel, order=2)
     law = joint.initial @ library(joint.transition).linalg.matrix_power(joint.transition, step)
-    return powers_of_law(channel, second, law)
+    return compute_powers_of_law(channel, second, law)
 
 
-def steady_powers(channel: AbstractRandomAffine, second: Second) -> dict[str, Any]:
+def compute_steady_powers(channel: AbstractRandomAffine, second: Second) -> dict[str, Any]:
     """Return {name: power} of each transmitter in the long run, in the stationary law of the channel's modes.
 
     A start that is stationary is kept: where a chain has several closed classes, it says how probable each is.
@@ -86,10 +86,10 @@ def steady_powers(channel: AbstractRandomAffine, second: Second) -> dict[str, An
     """
     joint = joint_modes(channel, order=2)
     unchanged = np.allclose(joint.initial @ joint.transition, joint.initial, rtol=0.0, atol=UNCHANGED)
-    return powers_of_law(channel, second, joint.initial if unchanged else stationary(joint.transition))
+    return compute_powers_of_law(channel, second, joint.initial if unchanged else stationary(joint.transition))
 
 
-def powers_of_law(channel: AbstractRandomAffine, second: Second, law: Float[Array, "modes"]) -> dict[str, Any]:
+def compute_powers_of_law(channel: AbstractRandomAffine, second: Second, law: Float[Array, "modes"]) -> dict[str, Any]:
     """Return the power of each transmitter of a channel by name, where the channel's modes have this law.
 
     A channel without memory has one mode. The mean is that over the modes in which a transmitter is received: in the

@@ -45,7 +45,7 @@ STYLE: Any = {  # of matplotlib's rcParams
 }
 
 
-def stacked_panels(count: int, height: float, margin: float, sharex: bool = True) -> tuple[Figure, list[Axes]]:
+def make_stacked_panels(count: int, height: float, margin: float, sharex: bool = True) -> tuple[Figure, list[Axes]]:
     """Return a figure with `count` panels of this height in inches one below the other, and a margin for its words."""
     figure = Figure(figsize=(WIDTH, margin + height * count), layout="constrained")
     return figure, list(figure.subplots(count, 1, squeeze=False, sharex=sharex)[:, 0])

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from heliograph.disk.quoting import quote_for_figure, visible
-from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, STYLE, VERMILION, stacked_panels
+from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, STYLE, VERMILION, make_stacked_panels
 from heliograph.report.health import FilterHealth, Health
 from heliograph.report.outputs import OutputHealth, round_to
 from heliograph.report.pages.page import Picture, PictureChoice, Section, Table, Text
@@ -24,7 +24,7 @@ BAND = 2.0  # deviations
 LOOK = STYLE | {"axes.prop_cycle": cycler(color=COLOURS), "date.converter": "concise"}
 
 
-def tested_by_figure(health: Health) -> dict[str, list[FilterHealth]]:
+def group_tested_by_figure(health: Health) -> dict[str, list[FilterHealth]]:
     """Return the filters in each figure of innovations by its name: one of all, or one of each node of many."""
     tested = _sort_fused_first(filter for filter in health.filters if filter.white is not None)
     if len(tested) <= FEW:
@@ -38,7 +38,7 @@ def tested_by_figure(health: Health) -> dict[str, list[FilterHealth]]:
 @matplotlib.rc_context(LOOK)
 def draw_innovations(health: Health, tested: Sequence[FilterHealth]) -> Figure:
     """Draw the innovations of each filter over time, in claimed deviations, with lines at two of them."""
-    figure, grid = stacked_panels(len(tested), 1.5, 0.6)
+    figure, grid = make_stacked_panels(len(tested), 1.5, 0.6)
     names = _name_components(health)
     for axes, judged in zip(grid, tested, strict=True):
         white = np.asarray(judged.white)  # (time, outputs)
@@ -87,7 +87,7 @@ def make_innovations_section(health: Health, drawings: Mapping[str, bytes]) -> S
             "fuses are tested here, and itself on the live page of `heliograph serve`."
         )
     # Pictures by node; one figure with all filters counts as that of the first one's node.
-    figures = {name: filters for name, filters in tested_by_figure(health).items() if name in drawings}
+    figures = {name: filters for name, filters in group_tested_by_figure(health).items() if name in drawings}
     text = (
         f"Innovations in claimed standard deviations, one colour an output (of more than {len(COLOURS)} one for all); "
         f"5 of 100 may lie beyond ±{BAND:g}."

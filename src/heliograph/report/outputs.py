@@ -283,7 +283,7 @@ class RecentOutputs:
         return results
 
 
-def weighed_outputs(network: Network, record: Record) -> list[OutputHealth]:
+def summarise_weighed_outputs(network: Network, record: Record) -> list[OutputHealth]:
     """Return what the innovations of all filters that weigh what arrives say of each output of a recording."""
     outputs: list[OutputHealth] = []
     for listener in list_listeners(network, record):

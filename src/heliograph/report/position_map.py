@@ -18,7 +18,7 @@ ELLIPSES = 12  # of the claimed covariance along the path
 SIGMAS = 2.0
 
 
-def coordinates_of(states: Sequence[str]) -> tuple[int, int] | None:
+def find_coordinates(states: Sequence[str]) -> tuple[int, int] | None:
     """Return the indices of two states that are a position in a plane, by their names; None where there are none."""
     plain = [state.split("(")[0].strip().lower() for state in states]
     for first, second in PAIRS:
@@ -31,9 +31,9 @@ def coordinates_of(states: Sequence[str]) -> tuple[int, int] | None:
 def draw_position_map(record: Record, node: str, names: Sequence[str]) -> Figure:
     """Draw the paths that filters of a node estimate, with ellipses of two claimed deviations, and the true path.
 
-    `names`: of the filters. The record's states have to be a position in a plane (`coordinates_of`).
+    `names`: of the filters. The record's states have to be a position in a plane (`find_coordinates`).
     """
-    coordinates = coordinates_of(record.states)
+    coordinates = find_coordinates(record.states)
     assert coordinates is not None  # only then is a map drawn
     i, j = coordinates
     figure = Figure(figsize=(WIDTH, WIDTH), layout="constrained")

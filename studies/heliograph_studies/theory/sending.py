@@ -21,7 +21,7 @@ import heliograph as hg
 from heliograph.factors.roots import observe_information, roots_of
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.planning.paths.model import Paths, PlantSteps, error_covariances, path_information
+from heliograph.planning.paths.model import Paths, PlantSteps, compute_error_covariances, compute_path_information
 from heliograph.planning.paths.relaxation import compute_envelope, split_paths
 
 Steps = tuple[tuple[int, ...], ...]  # the sensors of each step
@@ -70,7 +70,7 @@ class Bursts(NamedTuple):
 def steady_error(paths: Paths, information: Float[np.ndarray, "time path"]) -> float:
     """Mean trace of the error over steps that repeat for ever, at each of which the paths carry this information."""
     a, q = (np.repeat(m, len(information), axis=0) for m in (paths.plants.transition, paths.plants.process))
-    covariances = error_covariances(paths._replace(plants=PlantSteps(a, q, None)), information)
+    covariances = compute_error_covariances(paths._replace(plants=PlantSteps(a, q, None)), information)
     return float(np.trace(covariances, axis1=1, axis2=2).mean())
 
 
@@ -86,7 +86,7 @@ def information_at(paths: Paths, powers: ArrayLike) -> Float[np.ndarray, "path"]
     p = np.asarray(powers, dtype=np.float64)
     if p.shape not in ((), (hops,)) or not np.all(np.isfinite(p) & (p >= 0)):
         raise fail("powers", f"one number or one for each of {hops} hops, of at least zero", p)
-    result: Float[np.ndarray, "path"] = path_information(paths, np.broadcast_to(p, (1, hops))).information[0]
+    result: Float[np.ndarray, "path"] = compute_path_information(paths, np.broadcast_to(p, (1, hops))).information[0]
     return result
 
 

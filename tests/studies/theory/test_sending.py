@@ -8,7 +8,7 @@ from scipy.optimize import minimize
 
 import heliograph as hg
 from heliograph.planning import Error, independent_paths, split_power
-from heliograph.planning.paths.model import path_information
+from heliograph.planning.paths.model import compute_path_information
 from heliograph_studies.theory.sending import (
     best_schedule,
     burst_sending,
@@ -34,7 +34,7 @@ def test_choices_are_the_best_by_enumeration():
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_the_bound_of_a_choice_is_the_least_error_of_shares(count):
     """By a plain descent in the shares, which knows no paths whose powers are shares."""
-    information = path_information(PATHS, np.full((1, 6), 6.0)).information
+    information = compute_path_information(PATHS, np.full((1, 6), 6.0)).information
     descent = minimize(
         lambda shares: steady_error(PATHS, shares * information),
         np.full(6, count / 6),
@@ -93,7 +93,7 @@ def test_no_powers_over_time_come_below_the_bound_of_bursts():
         over_time = 4 * mean * draw.dirichlet(np.full(4, 0.3), 3).T  # (4, 3)
         share = draw.uniform(0.2, 0.8, (4, 3))
         hops = np.stack([over_time * share, over_time * (1 - share)], axis=-1).reshape(4, 6)
-        information = np.concatenate([path_information(paths, p[None]).information for p in hops])
+        information = np.concatenate([compute_path_information(paths, p[None]).information for p in hops])
         errors.append(steady_error(paths, information))
     assert bound < min(errors) < 1.3 * bound  # or the draws would say little
 

@@ -83,7 +83,7 @@ def _evaluate_in_chunks(objective: Objective, x: np.ndarray, data: LikelihoodDat
 
     It cannot where recordings are short, true states are learned from, or the filter's gains are random.
     """
-    kalman = _kalman_of(objective) if data.truth is None else None
+    kalman = _find_kalman_filter(objective) if data.truth is None else None
     if kalman is None:
         return None
     recursion = kalman.score_rows(objective.filter, x, np.asarray(data.measurements.shape[1] // 2))
@@ -141,7 +141,7 @@ def evaluate_recording(objective: Objective, x: Array, z: Array, u: Array, truth
     """
     half = jnp.asarray(len(z) // 2)
     # A linear filter with known gains has a recursion of its own for these derivatives.
-    kalman = _kalman_of(objective) if truth is None else None
+    kalman = _find_kalman_filter(objective) if truth is None else None
     if kalman is not None:
         return Evaluation(*kalman.score_rows(objective.filter, x, half).scan(z, u))
     e, s, de, ds = _differentiate_errors(objective, x, z, u, truth)
@@ -180,7 +180,7 @@ def _differentiate_errors(
 
 
 @lru_cache
-def _kalman_of(objective: Objective) -> Any:
+def _find_kalman_filter(objective: Objective) -> Any:
     """Return the filter at the objective's start if it is linear with known gains (it has `score_rows`); else None."""
     start = filter_of(objective.description.start, objective.form)
     return start if start.has_known_gain else None

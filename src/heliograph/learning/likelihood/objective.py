@@ -77,12 +77,18 @@ class Objective:
         return isinstance(other, Objective) and are_same(self._list_distinctions(), other._list_distinctions())
 
     def __hash__(self) -> int:
-        return hash((_identity_of(self.description.build)[0], self.form))
+        return hash((_list_identity(self.description.build)[0], self.form))
 
     def _list_distinctions(self) -> tuple[object, ...]:
         """Return a tuple of all by which one objective may differ from another, to be compared."""
         description = self.description
-        return self.form, _identity_of(description.build), description.parameters, description.named, description.start
+        return (
+            self.form,
+            _list_identity(description.build),
+            description.parameters,
+            description.named,
+            description.start,
+        )
 
     def filter(self, x: Array) -> AbstractFilter:
         """Return the filter of this form at a point x (p,) of the line."""
@@ -123,7 +129,7 @@ class Objective:
         return wrap_near(jnp.asarray(truth), mean, angles) - mean, covariance
 
 
-def _identity_of(build: Build) -> tuple[object, ...]:
+def _list_identity(build: Build) -> tuple[object, ...]:
     """Return what makes two functions the same, their code and all that they close over; of another callable itself."""
     if not isinstance(build, FunctionType):
         return (build,)

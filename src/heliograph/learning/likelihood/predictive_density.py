@@ -40,7 +40,7 @@ def approximate_law_by_nodes(law: AbstractLaw, count: int) -> Discrete:
         return Discrete(law.values, law.probabilities)
     if law.constant is not None:
         return Discrete([float(law.constant)], [1.0])
-    probabilities, weights = _normal_nodes(count)
+    probabilities, weights = _make_normal_nodes(count)
     return Discrete(law.quantile(probabilities), weights)
 
 
@@ -60,7 +60,7 @@ def discretise_laws(channel: Map, count: int) -> Map:
 
 
 @cache
-def _normal_nodes(count: int) -> tuple[np.ndarray, np.ndarray]:
+def _make_normal_nodes(count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return Phi(t), the normal distribution function, at `count` nodes t of equal distance, and their weights."""
     t = np.linspace(-REACH, REACH, count)
     weights = np.exp(-(t**2) / 2)
@@ -97,7 +97,7 @@ class Predictive(NamedTuple):
         return float(test.statistic), float(test.pvalue)
 
 
-def signal_filter(plant: AnyPlant, sensor: AnySensor, channel: AbstractRandomAffine) -> Any:
+def make_signal_filter(plant: AnyPlant, sensor: AnySensor, channel: AbstractRandomAffine) -> Any:
     """Return the filter that predicts what the sensor sends (`expect_signals`), of one law of motion and measuring.
 
     Raises:
@@ -142,7 +142,7 @@ def predictive(
     check_forgets("channel of a predictive likelihood", channel)
     # Given that something arrived, as the rows in which nothing did say nothing.
     received = channel.condition_on_arrival()
-    filter = signal_filter(plant, sensor, received)
+    filter = make_signal_filter(plant, sensor, received)
     judge_dates(filter.inputs, {"measurements": measurements, "inputs": inputs})
     z = check_rows("measurements", measurements, None, filter.received, missing=True)
     given_inputs = np.zeros((len(z), 0)) if inputs is None else inputs

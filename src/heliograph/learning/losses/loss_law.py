@@ -66,10 +66,10 @@ class AbstractLossLaw(Module):
         with np.errstate(divide="ignore"):
             logs: Packets = np.where(is_trial(fate), np.where(fate == 1, np.log(p), np.log1p(-p)), np.nan)
         if fate[-1] == CHOSEN and len(fate) > 2:
-            logs[-1] = np.log1p(-p[-1]) - np.log(self._arrives_again(len(fate) - 1))
+            logs[-1] = np.log1p(-p[-1]) - np.log(self._compute_return_probability(len(fate) - 1))
         return logs
 
-    def _arrives_again(self, steps: int) -> float:
+    def _compute_return_probability(self, steps: int) -> float:
         """Return P(arrived after so many steps | arrived now), whatever became of the packets between."""
         fate = np.full(steps + 1, np.nan)
         fate[0] = 0.0
@@ -180,14 +180,14 @@ class MarkovLosses(AbstractLossLaw):
             probabilities[selected] = p[past[selected] & (2**known - 1)]
         return probabilities
 
-    def _arrives_again(self, steps: int) -> float:
+    def _compute_return_probability(self, steps: int) -> float:
         """Return P(arrived after so many steps | arrived now), whatever became of the packets between.
 
         Of order 1 in closed form, (b + a (1 - a - b)^steps) / (a + b) with a = P(lost | arrived), b = P(arrived |
         lost).
         """
         if self.order > 1:
-            return super()._arrives_again(steps)
+            return super()._compute_return_probability(steps)
         a, b = self.predicted(np.array([0.0, np.nan]))[1], 1 - self.predicted(np.array([1.0, np.nan]))[1]
         return float((b + a * (1 - a - b) ** steps) / (a + b))
 

@@ -7,7 +7,7 @@ import numpy as np
 import scipy
 from scipy.special import expit, xlogy
 
-from heliograph.learning.intervals import mean_and_error
+from heliograph.learning.intervals import estimate_mean_and_error
 from heliograph.learning.losses.hidden_losses import HiddenModeLosses
 from heliograph.learning.losses.loss_law import AbstractLossLaw, IndependentLosses, MarkovLosses, Packets
 from heliograph.learning.losses.packet_fates import CheckedFates, Fates, check_fates, fill_ends, is_trial
@@ -70,7 +70,7 @@ class LossMemory(NamedTuple):
         # The likelihood ratio of a chain of order one and independent losses.
         counts = MarkovLosses.fit(fates, intervals=False).counts
         both = counts.sum(axis=0)
-        ratio = max(2 * (_maximum_log_likelihood(counts) - _maximum_log_likelihood(both[None])), 0.0)
+        ratio = max(2 * (_compute_maximum_log_likelihood(counts) - _compute_maximum_log_likelihood(both[None])), 0.0)
         # Wald and Wolfowitz: the number of runs less its mean 1 + 2 n1 n0 / n, given n1 losses of n, and its variance.
         excess, variance = 0.0, 0.0
         for stretch in check_fates(fates):
@@ -196,12 +196,12 @@ def _score_held_out(parts: Fates, known: np.ndarray, cut: int) -> dict[str, Held
     log_likelihoods = {name: law.log_likelihoods(parts)[late] for name, law in laws.items()}
     scores = {}
     for name, logs in log_likelihoods.items():
-        gain, error = mean_and_error(logs - log_likelihoods[INDEPENDENT])
+        gain, error = estimate_mean_and_error(logs - log_likelihoods[INDEPENDENT])
         scores[name] = HeldOutScores(log_likelihood=float(logs.mean()), gain=gain, gain_error=error)
     return scores
 
 
-def _maximum_log_likelihood(counts: np.ndarray) -> float:
+def _compute_maximum_log_likelihood(counts: np.ndarray) -> float:
     """Return the maximum of the log-likelihood of counts n_ab (past a, fate b): sum n_ab log(n_ab / n_a)."""
     rows = counts.sum(axis=1, keepdims=True)
     return float(np.sum(xlogy(counts, counts / np.where(rows > 0, rows, 1.0))))

@@ -25,9 +25,9 @@ from heliograph.planning.numbers.mode_riccati import ModeSolution, ModeSystem, l
 from heliograph.planning.numbers.reception import (
     check_time_variation,
     list_sources,
+    list_transmitters,
     make_mode_system,
     means_are_known,
-    transmitters_of,
 )
 from heliograph.planning.plant_moments import check_stable
 from heliograph.planning.quadratic_programme import DescentProblem, Evaluation
@@ -259,7 +259,7 @@ class NumberProblem:
         sources = list_sources(network).items()
         if not all(means_are_known(name, first(source.channel)) for name, source in sources):
             self.young, self.numbers = True, FreeNumbers(numbers.by_name | {YOUNG: young_scalars(error.steps)})
-        self.names, self.criterion = transmitters_of(network), error.criterion(network.states)
+        self.names, self.criterion = list_transmitters(network), error.criterion(network.states)
         self._system, self._slopes = programs(TracedNetwork(build, self.numbers, error, self.young, network))
         self._last: dict[tuple[bytes, int | None], EvaluatedPoint] = {}
 

@@ -25,7 +25,7 @@ from heliograph.numerics.types import Array, Bool, Float
 from heliograph.planning.error_objective import Error
 from heliograph.planning.numbers.mode_riccati import ModeSystem
 from heliograph.planning.plant_moments import check_design_plant, measurement_moment, moments_over, steady_moment
-from heliograph.planning.transmitters import powers_of_law, transmitter_names
+from heliograph.planning.transmitters import compute_powers_of_law, transmitter_names
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.chain import stationary
 from heliograph.random_affine.combine import Stack
@@ -96,7 +96,7 @@ def list_sources(network: Network) -> dict[str, SensorAndChannel]:
     return sources
 
 
-def transmitters_of(network: Network) -> tuple[str, ...]:
+def list_transmitters(network: Network) -> tuple[str, ...]:
     """Return the names of all transmitters, in the order of `ModeSystem.powers`."""
     sources = list_sources(network).items()
     return tuple(f"{name}.{hop}" for name, source in sources for hop in transmitter_names(first(source.channel)))
@@ -296,7 +296,7 @@ def _describe_steps(
 
     def compute_powers(moment: Array, law: Array) -> Array:
         """Return the powers (hops,) of a step with E (y, 1)(y, 1)' = moment, and this law of the modes (M,)."""
-        powers = [jnp.asarray(power) for power in powers_of_law(channel, moment, law).values()]
+        powers = [jnp.asarray(power) for power in compute_powers_of_law(channel, moment, law).values()]
         return jnp.stack(powers) if powers else jnp.zeros(0)
 
     # What a channel without memory loses it sends nevertheless: to its transmitters it has one mode.

@@ -12,9 +12,9 @@ from heliograph.planning.error_objective import Criterion
 from heliograph.planning.paths.model import (
     PathInformation,
     Paths,
-    error_covariances,
-    path_information,
-    path_sensitivities,
+    compute_error_covariances,
+    compute_path_information,
+    compute_path_sensitivities,
 )
 from heliograph.planning.paths.relaxation import SplitPaths, compute_envelope, split_paths
 from heliograph.planning.paths.water_filling import water_filling
@@ -51,7 +51,7 @@ class PathProblem(NamedTuple):
 
     def covariances(self, powers: Powers) -> Float[np.ndarray, "time n n"]:
         """Return the error covariance P after each step."""
-        return error_covariances(self.paths, self.information(powers).information)
+        return compute_error_covariances(self.paths, self.information(powers).information)
 
     def exact(self, powers: Powers) -> float:
         """Return the error at these powers, without smoothing of an eigenvalue."""
@@ -63,9 +63,9 @@ class PathProblem(NamedTuple):
         By one adjoint recursion, at the free powers p (time, free).
         """
         information, slope = self.information(powers)
-        p = error_covariances(self.paths, information)
+        p = compute_error_covariances(self.paths, information)
         value, weights = self.criterion.smooth(p)
-        by_information = path_sensitivities(self.paths, information, p, weights)[:, self.path]
+        by_information = compute_path_sensitivities(self.paths, information, p, weights)[:, self.path]
         return value, by_information, -by_information * slope
 
     def evaluate(self, x: Vector, sharpness: int | None) -> Evaluation:
@@ -204,7 +204,7 @@ def make_power_task(
         """Return the information of all paths and its slope by the free powers, the others being fixed."""
         every = fixed.copy()
         every[:, free] = powers
-        of_paths = path_information(paths, every)
+        of_paths = compute_path_information(paths, every)
         return PathInformation(of_paths.information, of_paths.slope[:, free])
 
     total = limits.total if np.isfinite(limits.total) else _choose_total(limits, paths)
@@ -258,7 +258,7 @@ def choose_supports(path: Int[np.ndarray, "free"], steps: int, starts: int, seed
     return [whole, *(on.reshape(steps, len(distinct))[:, column] for on in choices if np.any(on))]
 
 
-def least_error_powers(task: PowerTask) -> tuple[Powers, Certificate]:
+def find_least_error_powers(task: PowerTask) -> tuple[Powers, Certificate]:
     """Return the powers (time, free) of the least error within the limits of a task, and the certificate."""
     problem, starts = task.problem, task.starts
     # Water filling solves a convex problem of the trace but for rounding; the descent goes on from there.
@@ -297,7 +297,7 @@ def least_power(task: PowerTask, target: float) -> tuple[Powers, Certificate]:
         raise fail("target error", "one that some start reaches (give more starts)", f"{target:.6g}")
     total = float(powers.mean(axis=0).sum())
     if total > limits.total * (1 + MET):
-        least = least_error_powers(task)[1].value
+        least = find_least_error_powers(task)[1].value
         raise fail("target error", f"at least {least:.6g}, the least found within the budget", f"{target:.6g}")
     # What the tangent at these powers says that less would do; of a convex error that is a bound.
     bound = unlimited.problem.bound_least_total(powers, target)
@@ -372,12 +372,12 @@ def design_paths(problem: DesignProblem, task: PowerTask, target: float | None, 
         target: the target error; None for the least error.
         present: error of the network as it is.
     """
-    powers, certificate = least_error_powers(task) if target is None else least_power(task, target)
+    powers, certificate = find_least_error_powers(task) if target is None else least_power(task, target)
     paths = task.problem.paths
     every = task.fixed.copy()
     every[:, task.free] = powers
     # Derivatives (time, hop) by the powers of all hops, of those that are not free too.
-    all_free = task.problem._replace(path=paths.path, information=lambda p: path_information(paths, p))
+    all_free = task.problem._replace(path=paths.path, information=lambda p: compute_path_information(paths, p))
     _, _, gradient = all_free.sensitivity(every)
     return PowerDesign(
         problem=problem,

@@ -257,7 +257,7 @@ def share_of_signal(powers: Powers, alpha: Powers) -> Powers:
     return np.asarray(np.divide(powers, total, out=np.ones_like(powers), where=total > 0))
 
 
-def path_information(paths: Paths, powers: Powers) -> PathInformation:
+def compute_path_information(paths: Paths, powers: Powers) -> PathInformation:
     """Return the information j of each path at each step, and dj/dp of each hop, at these powers (time, hop).
 
     j = F / (s K - t F) and dj/dp_h = s K / (s K - t F)^2 dF/dp_h, where F is the product of p / (p + alpha) along the
@@ -275,17 +275,17 @@ def path_information(paths: Paths, powers: Powers) -> PathInformation:
     return PathInformation(product / left, slope)
 
 
-def information_matrix(paths: Paths, information: PathValues) -> Float[np.ndarray, "time n n"]:
+def compute_information_matrix(paths: Paths, information: PathValues) -> Float[np.ndarray, "time n n"]:
     """Return the information J = sum_i j_i c_i' c_i of each step (time, n, n), from j of each path (time, path)."""
     return np.asarray(np.swapaxes(paths.rows, 1, 2) @ (information[:, :, None] * paths.rows))
 
 
-def error_covariances(paths: Paths, information: PathValues) -> Float[np.ndarray, "time n n"]:
+def compute_error_covariances(paths: Paths, information: PathValues) -> Float[np.ndarray, "time n n"]:
     """Return the error covariance of the best linear filter after each step (time, n, n), from j of each path."""
-    return compute_covariances(paths.plants, information_matrix(paths, information))
+    return compute_covariances(paths.plants, compute_information_matrix(paths, information))
 
 
-def path_sensitivities(
+def compute_path_sensitivities(
     paths: Paths,
     information: PathValues,
     p: Float[np.ndarray, "time n n"],
@@ -299,6 +299,6 @@ def path_sensitivities(
         p: the error covariance P after each step.
         weights: derivative of the cost by P of each step.
     """
-    ahead = adjoint(paths.plants, information_matrix(paths, information), p, weights)
+    ahead = adjoint(paths.plants, compute_information_matrix(paths, information), p, weights)
     projected = paths.rows @ p
     return np.asarray(np.sum((projected @ ahead) * projected, axis=-1))

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from heliograph.disk.quoting import quote_for_figure, visible
-from heliograph.report.figures import COLOURS, MUTED, STYLE, place_legend_above, stacked_panels
+from heliograph.report.figures import COLOURS, MUTED, STYLE, make_stacked_panels, place_legend_above
 from heliograph.report.outputs import round_to
 from heliograph.report.pages.page import Page, Picture, Points, Section, Table
 from heliograph.report.results import Json, Results
@@ -107,7 +107,7 @@ def _draw_coverage(found: "heliograph.forecasting.Backtest") -> Figure:
     numbers = list(dict.fromkeys((s.node, s.part, s.name) for s in found.scores))[:PANELS]
     filters = list(dict.fromkeys(s.filter for s in found.scores))
     nodes = {node for node, _, _ in numbers}
-    figure, panels = stacked_panels(len(numbers), 1.3, 0.9)
+    figure, panels = make_stacked_panels(len(numbers), 1.3, 0.9)
     for axes, (node, part, name) in zip(panels, numbers, strict=True):
         for i, filter in enumerate(filters):
             scores = [s for s in found.scores if (s.node, s.part, s.name, s.filter) == (node, part, name, filter)]

@@ -61,7 +61,7 @@ def write_networks(results: DesignResults, folder: Path) -> None:
     (folder / DESIGNED).write_text(results.written, encoding="utf-8")
 
 
-def mean_powers(design: PowerDesign) -> dict[str, float]:
+def compute_mean_powers(design: PowerDesign) -> dict[str, float]:
     """Return the mean power of each transmitter, zero where it is only rounding of the total."""
     mean = {name: float(np.mean(power)) for name, power in design.powers.items()}
     return {name: power if power > ROUNDING * design.total else 0.0 for name, power in mean.items()}
@@ -92,7 +92,7 @@ def make_summary(results: DesignResults) -> dict[str, Json]:
 def draw_figures(results: DesignResults) -> dict[str, Figure]:
     """Return by file name the figures of the front, the powers, and the map if there is one."""
     drawn = {"front": draw_front(results.front, {"this design": (results.design.total, results.design.error)})}
-    drawn["powers"] = draw_powers(results.before, mean_powers(results.design))
+    drawn["powers"] = draw_powers(results.before, compute_mean_powers(results.design))
     if results.map is not None:
         drawn["map"] = draw_map(results.map)
     return drawn
@@ -200,7 +200,7 @@ def _make_front_section(drawings: Mapping[str, bytes]) -> Section:
 
 def _make_powers_section(results: DesignResults, drawings: Mapping[str, bytes]) -> Section:
     """Return the section on the powers by transmitter, before and after, and what one more watt saves at each."""
-    after, slope = mean_powers(results.design), results.design.sensitivity
+    after, slope = compute_mean_powers(results.design), results.design.sensitivity
     rows = [
         [visible(name), f"{results.before.get(name, float('nan')):.4g}", f"{power:.4g}",
          f"{np.max(results.design.powers[name]):.4g}", f"{max(-slope[name], 0.0):.3g}"]

@@ -23,8 +23,8 @@ from heliograph.report.figures import (
     PALE,
     STYLE,
     VERMILION,
+    make_stacked_panels,
     place_legend_above,
-    stacked_panels,
 )
 from heliograph.report.pages.page import Code, KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
 
@@ -83,7 +83,7 @@ def _draw_estimates(learned: FitResults) -> Figure:
     # The form that counts is last: it is drawn first, on top.
     forms = [solution.form for solution in reversed(learned.fit.solutions)]
     by_form = [learned.fit.rows(form=form) for form in forms]
-    figure, grid = stacked_panels(len(rows), 0.62, 0.6, sharex=False)
+    figure, grid = make_stacked_panels(len(rows), 0.62, 0.6, sharex=False)
     for i, (axes, row) in enumerate(zip(grid, rows, strict=True)):
         for height, estimates in enumerate(by_form):
             color, width = (BLUE, 3.0) if height == 0 else (MUTED, 1.5)
@@ -113,7 +113,7 @@ def _draw_estimate(axes: Axes, row: Row, height: float, color: str, width: float
 @matplotlib.rc_context(STYLE)
 def _draw_correlations(tested: list[Change]) -> Figure:
     """Draw the correlations of innovations some rows apart, before and after learning, with 95 % intervals."""
-    figure, grid = stacked_panels(len(tested), 1.6, 0.7)
+    figure, grid = make_stacked_panels(len(tested), 1.6, 0.7)
     for axes, change in zip(grid, tested, strict=True):
         sides = ((-0.17, AMBER, change.before.test, "before"), (0.17, BLUE, change.after.test, "after"))
         for shift, color, test, label in sides:
@@ -133,7 +133,7 @@ def _draw_correlations(tested: list[Change]) -> Figure:
 @matplotlib.rc_context(STYLE)
 def _draw_pits(received: list[Uniformity]) -> Figure:
     """Draw the histogram of each node's probability integral transforms, with the band of 95 % of a uniform law."""
-    figure, grid = stacked_panels(len(received), 1.5, 0.7)
+    figure, grid = make_stacked_panels(len(received), 1.5, 0.7)
     edges = np.linspace(0, 1, BINS + 1).tolist()
     for axes, transforms in zip(grid, received, strict=True):
         values = transforms.pit[~np.isnan(transforms.pit)]

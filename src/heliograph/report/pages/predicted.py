@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 import heliograph
 from heliograph.disk.quoting import quote_for_figure, visible
-from heliograph.report.figures import INK, place_legend_above, stacked_panels
+from heliograph.report.figures import INK, make_stacked_panels, place_legend_above
 from heliograph.report.health import Health
 from heliograph.report.innovations import BAND, COLOURS, LOOK, MOST, choose_picture, label_time_axis, say_not_drawn
 from heliograph.report.pages.page import Picture, Section, Text
@@ -16,7 +16,7 @@ from heliograph.report.pages.page import Picture, Section, Text
 PANELS = 12  # numbers of a node that are drawn; the table of estimates has all
 
 
-def predicted_figures(health: Health) -> dict[str, Figure]:
+def draw_predicted_figures(health: Health) -> dict[str, Figure]:
     """Return {file name: figure} of predictions by node, and of residuals by filter; none unless asked for."""
     figures = {f"predicted_{i}": _draw_predicted(health, node) for i, node in enumerate(_list_nodes(health)[:MOST])}
     for i, (_, judged) in enumerate(_list_residuals(health)[:MOST]):
@@ -24,10 +24,10 @@ def predicted_figures(health: Health) -> dict[str, Figure]:
     return figures
 
 
-def predicted_sections(health: Health, drawings: Mapping[str, bytes]) -> list[Section]:
+def make_predicted_sections(health: Health, drawings: Mapping[str, bytes]) -> list[Section]:
     """Return the sections of a run's page on predictions and residuals; none unless predictions were asked for.
 
-    `drawings`: each figure as SVG, by the names of `predicted_figures`.
+    `drawings`: each figure as SVG, by the names of `draw_predicted_figures`.
     """
     if not health.predicted:
         return []
@@ -93,7 +93,7 @@ def _draw_predicted(health: Health, node: str) -> Figure:
     names = next(iter(laws.values())).names
     z = record.measurements.get(node)
     data = np.concatenate(list(record.measurements.values()), axis=1) if z is None else z
-    figure, panels = stacked_panels(min(len(names), PANELS), 1.7, 0.8)
+    figure, panels = make_stacked_panels(min(len(names), PANELS), 1.7, 0.8)
     for i, panel in enumerate(panels):
         for (name, law), colour in zip(laws.items(), COLOURS, strict=False):
             mean, band = law.mean[:, i], BAND * law.deviation[:, i]

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from heliograph.disk.quoting import visible
 from heliograph.numerics.check import instance
-from heliograph.report.figures import BLUE, GREEN, VERMILION, place_legend_above, stacked_panels
+from heliograph.report.figures import BLUE, GREEN, VERMILION, make_stacked_panels, place_legend_above
 from heliograph.report.forecasts import draw_forecasts, forecast_tables
 from heliograph.report.health import Health
 from heliograph.report.innovations import (
@@ -21,10 +21,10 @@ from heliograph.report.innovations import (
     MOST,
     choose_picture,
     draw_innovations,
+    group_tested_by_figure,
     label_time_axis,
     make_innovations_section,
     say_not_drawn,
-    tested_by_figure,
 )
 from heliograph.report.mode_probabilities import PREFIX, draw_modes_of_nodes
 from heliograph.report.outputs import compare_with_truth, round_to
@@ -40,9 +40,9 @@ from heliograph.report.pages.page import (
     Table,
     Text,
 )
-from heliograph.report.pages.predicted import predicted_figures, predicted_sections
+from heliograph.report.pages.predicted import draw_predicted_figures, make_predicted_sections
 from heliograph.report.pages.run_summary import run_summary
-from heliograph.report.position_map import coordinates_of, draw_position_map
+from heliograph.report.position_map import draw_position_map, find_coordinates
 from heliograph.report.results import Json, Results, write_into_folder
 from heliograph.simulation.network import Network
 from heliograph.simulation.results.record import Record
@@ -102,15 +102,15 @@ def run_figures(health: Health) -> dict[str, Figure]:
     """
     instance("health", health, Health, "what examine returns")
     drawn: dict[str, Figure] = {}
-    if coordinates_of(health.record.states) is not None:
+    if find_coordinates(health.record.states) is not None:
         for kind, record in _collect_estimates(health):
             node = _nodes_to_draw(record)[0]
             drawn[_map_name(kind)] = draw_position_map(record, node, list(record.estimates[node])[: len(COLOURS)])
     for kind, record in _collect_estimates(health):
         drawn |= {f"{kind}_{i}": _draw_estimates(health, record, node) for i, node in enumerate(_nodes_to_draw(record))}
         drawn |= draw_modes_of_nodes(record, kind, _nodes_to_draw(record))
-    drawn |= {name: draw_innovations(health, tested) for name, tested in tested_by_figure(health).items()}
-    drawn |= predicted_figures(health)
+    drawn |= {name: draw_innovations(health, tested) for name, tested in group_tested_by_figure(health).items()}
+    drawn |= draw_predicted_figures(health)
     if health.links:
         drawn["links"] = draw_deliveries(health)
     return drawn
@@ -141,7 +141,7 @@ def _sort_nodes(record: Record) -> list[str]:
 @matplotlib.rc_context(LOOK)
 def _draw_estimates(health: Health, record: Record, node: str) -> Figure:
     """Draw a node's estimates with their bands, one panel a state, and its forecasts behind them."""
-    figure, grid = stacked_panels(len(record.states), 1.7, 0.8)
+    figure, grid = make_stacked_panels(len(record.states), 1.7, 0.8)
     names = list(record.estimates[node])[: len(COLOURS)]
     record.plot(node, names, axes=grid, sigmas=BAND)
     if record is health.record:
@@ -182,7 +182,7 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
             Section("At a glance", glance),
             Section("Estimates", [*make_errors_table(record), *_list_pictures(health, drawings)]),
             *forecasts,
-            *predicted_sections(health, drawings),
+            *make_predicted_sections(health, drawings),
             make_innovations_section(health, drawings),
             Section("Links", make_links_blocks(health, drawings)),
         ],
@@ -232,7 +232,7 @@ def _find_headline(health: Health) -> str:
     estimate = record.estimates[node][name]
     mean = np.asarray(estimate.mean)[-1]
     deviation = np.sqrt(np.maximum(np.diagonal(np.asarray(estimate.covariance)[-1]), 0.0))
-    shown_states = coordinates_of(record.states) or tuple(range(min(len(mean), 2)))
+    shown_states = find_coordinates(record.states) or tuple(range(min(len(mean), 2)))
     numbers = []
     for i in shown_states:
         band = f" ± {round_to(BAND * deviation[i], deviation[i])}" if estimate.claim != "none" else ""

@@ -24,16 +24,16 @@ def run_summary(health: Health) -> dict[str, Json]:
     instance("health", health, Health, "what examine returns")
     filters: dict[str, dict[str, Json]] = {}
     for tested in health.filters:
-        filters.setdefault(tested.node, {})[tested.filter] = _filter_numbers(tested)
+        filters.setdefault(tested.node, {})[tested.filter] = _list_filter_numbers(tested)
     outputs: dict[str, dict[str, dict[str, Json]]] = {}
     for output in health.outputs:
         by_output = outputs.setdefault(output.node, {}).setdefault(output.filter, {})
         by_output[output.judged.output] = summarise_output(output)
     links: dict[str, dict[str, Json]] = {}
     for link in health.links:
-        links.setdefault(link.node, {})[link.component] = _link_numbers(link)
+        links.setdefault(link.node, {})[link.component] = _list_link_numbers(link)
     overloads: dict[str, dict[str, Json]] = {
-        node: {name: _overload_numbers(*overload) for name, overload in by_filter.items()}
+        node: {name: _list_overload_numbers(*overload) for name, overload in by_filter.items()}
         for node, by_filter in health.record.overloads.items()
     }
     return {
@@ -42,7 +42,7 @@ def run_summary(health: Health) -> dict[str, Json]:
         "remarks": health.remarks(),
         "filters": filters,
         "outputs": outputs,
-        "errors": _error_numbers(health.record),
+        "errors": _list_error_numbers(health.record),
         "links": links,
         "refused": _list_refused(health),
         "overloads": overloads,
@@ -60,7 +60,7 @@ def _list_refused(health: Health) -> list[Json]:
     ]
 
 
-def _filter_numbers(tested: FilterHealth) -> dict[str, Json]:
+def _list_filter_numbers(tested: FilterHealth) -> dict[str, Json]:
     """Return the numbers on one filter by name: its claim, tests of its innovations, and of what messages declare."""
     numbers: dict[str, Json] = {"claim": tested.claim}
     if tested.test is not None:
@@ -75,7 +75,7 @@ def _filter_numbers(tested: FilterHealth) -> dict[str, Json]:
     return numbers
 
 
-def _error_numbers(record: Record) -> dict[str, dict[str, Json]]:
+def _list_error_numbers(record: Record) -> dict[str, dict[str, Json]]:
     """Return RMSE by state and NEES of each filter, by node and filter; nothing where the truth is not known."""
     errors: dict[str, dict[str, Json]] = {}
     for of_filter in compare_with_truth(record):
@@ -85,12 +85,12 @@ def _error_numbers(record: Record) -> dict[str, dict[str, Json]]:
     return errors
 
 
-def _overload_numbers(probability: np.ndarray, bound: np.ndarray) -> dict[str, Json]:
+def _list_overload_numbers(probability: np.ndarray, bound: np.ndarray) -> dict[str, Json]:
     """Return by name how probably each component's words overload, and the bound on the claim (None if infinite)."""
     return {"probability": probability.tolist(), "bound": float(bound) if np.isfinite(bound) else None}
 
 
-def _link_numbers(link: Arrivals) -> dict[str, Json]:
+def _list_link_numbers(link: Arrivals) -> dict[str, Json]:
     """Return by name what share of a component's messages arrived, its longest gap, and when it is due."""
     numbers: dict[str, Json] = {"arrived": None if link.due is None else link.share, "longest_gap": link.longest_gap}
     if link.period is not None:

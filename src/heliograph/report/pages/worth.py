@@ -9,7 +9,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocato
 from heliograph.disk.quoting import label_with_unit, quote_for_figure
 from heliograph.numerics.types import units_in
 from heliograph.planning.sensor_worth import SensorWorth
-from heliograph.report.figures import BLUE, GREEN, INK, STYLE, VERMILION, stacked_panels
+from heliograph.report.figures import BLUE, GREEN, INK, STYLE, VERMILION, make_stacked_panels
 
 BAR = 0.6  # height of a bar
 NARROW = 4.0  # between the ends of an axis, below which 1, 2, 5, 10, ... would be one tick or two
@@ -27,7 +27,7 @@ def draw_worth(worth: SensorWorth, title: str) -> Figure:
         title: how errors were found, in words.
     """
     rows = len(worth.cases)
-    figure, panels = stacked_panels(len(worth.states), 0.55 + 0.26 * rows, 0.5)
+    figure, panels = make_stacked_panels(len(worth.states), 0.55 + 0.26 * rows, 0.5)
     figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     units, limits = units_in(worth.states), _find_limits(worth)
     for panel, i in zip(panels, range(len(worth.states)), strict=True):
