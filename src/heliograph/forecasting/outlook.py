@@ -1,4 +1,7 @@
-"""A filter stepped without data: its states ahead, what its sensor would measure, and what would arrive."""
+"""A filter stepped without data: its states ahead, what its sensor would measure, and what would arrive.
+
+A filter's claim is what it says of its covariance: "exact", "upper", "nominal" or "none". Mixtures have K parts.
+"""
 
 from typing import NamedTuple, Protocol, runtime_checkable
 

@@ -1,4 +1,8 @@
-"""Maximum of one form of the likelihood: where it is, what is at a limit or a ridge, and how well it is known."""
+"""Maximum of one form of the likelihood: where it is, what is at a limit or a ridge, and how well it is known.
+
+The line: free numbers as unbounded coordinates, logarithms or logits of those whose domain has ends. A coordinate is
+active if its number is not at such an end. A ridge is a direction in which the likelihood does not change.
+"""
 
 from dataclasses import dataclass, field
 from functools import cached_property

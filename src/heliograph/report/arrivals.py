@@ -1,4 +1,8 @@
-"""Arrivals of one received number over a recording: when it was due, how often it came, how often it was lost."""
+"""Arrivals of one received number over a recording: when it was due, how often it came, how often it was lost.
+
+A message is due in a row if its sender would send one then. A slot is a time at which one may come: a row, or of a
+sender with a period of its own one in each period.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,4 +1,9 @@
-"""Diagnosis of a network from a recording: reliability of its links, and tests of its filters' claims."""
+"""Diagnosis of a network from a recording: reliability of its links, and tests of its filters' claims.
+
+A filter claims what its covariance is: exact, an upper bound, nominal (without a guarantee), or nothing ("none"). Its
+innovations are white in units of that claim where it is right: of variance 1, and independent over time. An output is
+held, or stuck, if it repeats one value for longer than its noise allows.
+"""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace

@@ -1,4 +1,8 @@
-"""Innovations of a run by output: values down-weighted, bias, which to blame; and errors of its filters."""
+"""Innovations of a run by output: values down-weighted, bias, which to blame; and errors of its filters.
+
+A filter weighs if it gives what arrives weights from 0 to 1, by how far it lies from what was expected; a value is
+down-weighted below 1/2. A listener is a filter with what it receives.
+"""
 
 from collections import Counter, defaultdict, deque
 from collections.abc import Iterator, Mapping, Sequence

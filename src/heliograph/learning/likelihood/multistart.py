@@ -1,4 +1,8 @@
-"""Search for the maximum of a likelihood: climbs from several starts, ends of domains, and a proof by the Hessian."""
+"""Search for the maximum of a likelihood: climbs from several starts, ends of domains, and a proof by the Hessian.
+
+Free numbers are searched as coordinates on the line, where each is unbounded: an end of a number's domain, such as a
+variance of 0, lies at minus infinity of its logarithm.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field

@@ -1,4 +1,7 @@
-"""Likelihood of recordings over the free numbers: climbed, cut along one of them, and measured at its top."""
+"""Likelihood of recordings over the free numbers: climbed, cut along one of them, and measured at its top.
+
+A point is a vector of coordinates on the line, where each free number is unbounded; l is the log-likelihood there.
+"""
 
 from dataclasses import dataclass, field
 from functools import cached_property

@@ -1,4 +1,8 @@
-"""Trust-region search for the maximum of a likelihood, bounded in standard errors, from several starts side by side."""
+"""Trust-region search for the maximum of a likelihood, bounded in standard errors, from several starts side by side.
+
+A lane is one of these searches. Coordinates are those of the line, where each free number is unbounded: logarithms and
+logits, or plain real numbers, which are called free of a scale. A point is a vector of them (p,).
+"""
 
 from collections.abc import Callable
 from typing import NamedTuple

@@ -1,4 +1,8 @@
-"""Fates of packets, 0 arrived, 1 lost, NaN unknown, in stretches between which nothing is known."""
+"""Fates of packets, 0 arrived, 1 lost, NaN unknown, in stretches between which nothing is known.
+
+A stretch that was chosen to begin and end with an arrival, as between the first and the last sequence number that came,
+has ends that are no trials: they arrived since otherwise the stretch would have other ends.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, cast
