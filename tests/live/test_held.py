@@ -129,7 +129,7 @@ def test_a_service_says_it_once_and_its_page_and_metrics_name_each_plant():
     assert len(said) == 1 and said[0].startswith("warning: plant 'p', a: v is stuck, or has no noise: 100 equal")
     assert said[0].endswith("stuck=10 refuses such; not said again, nor of other plants")
     words = "a: 1 times equal for longer than its noise allows: it is stuck, or has no noise"
-    assert watch.view("q")["warnings"][-1] == words and watch.links()["a"]["held"] == 2
+    assert watch.make_page_data("q")["warnings"][-1] == words and watch.links()["a"]["held"] == 2
 
 
 def test_a_sensor_with_modes_is_not_watched():

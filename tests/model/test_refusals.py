@@ -89,5 +89,5 @@ def test_a_service_counts_flags_and_counters_too():
     for reason in ("limits", "code", "stuck", "flag", "counter"):
         assert f'heliograph_refused_total{{filter="",node="a",reason="{reason}"}} 1.0' in text
     assert 'heliograph_refused_total{filter="g",node="a",reason="gate"} 1.0' in text
-    warnings = watch.view("")["warnings"]
+    warnings = watch.make_page_data("")["warnings"]
     assert "a: 1 refused, of a message that says it cannot be trusted" in warnings

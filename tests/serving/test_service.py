@@ -201,7 +201,7 @@ def test_robust_and_adaptive_filters_say_what_they_made_of_each_number():
         for part, expected in (("value", item.innovations), ("weight", item.weights)):
             got = np.array([row[part] for row in rows], dtype=float)
             np.testing.assert_allclose(got, expected[: len(got)], rtol=1e-9, atol=1e-9)
-    said = {(row["filter"], row["output"]): row for row in watch.view(None)["outputs"]}
+    said = {(row["filter"], row["output"]): row for row in watch.make_page_data(None)["outputs"]}
     assert set(said) == {(name, output) for name in ("robust", "adaptive") for output in ("left", "right")}
     assert said["robust", "left"]["to_blame"] and not said["robust", "right"]["to_blame"]
     assert "down-weighted" in said["robust", "left"]["words"]

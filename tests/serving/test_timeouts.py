@@ -113,8 +113,9 @@ def test_after_a_restart_it_is_told_again_and_the_page_and_metrics_know(program,
     assert watched.take([]) == []  # messages that waited come first
     monkeypatch.setattr("heliograph.serving.silence.GRACE", -1.0)
     assert dead(watched.take([])) == ["nothing came for 30 s, and its timeout is 5 s"]
-    assert watch.view("p")["warnings"] == ["a: its sender is dead: nothing came for 30 s, and its timeout is 5 s"]
-    assert [wrong.dead for wrong in watch.worst()] == [("a",)] and watch.dead_senders()["a"] == 1
+    warnings = ["a: its sender is dead: nothing came for 30 s, and its timeout is 5 s"]
+    assert watch.make_page_data("p")["warnings"] == warnings
+    assert [wrong.dead for wrong in watch.list_worst_plants()] == [("a",)] and watch.dead_senders()["a"] == 1
     send(watched, 40.0, "a", 2)
     assert watch.links()["a"]["timeouts"] == 1
-    assert watch.view("p")["warnings"] == ["a: 1 times silent for longer than its timeout, and back"]
+    assert watch.make_page_data("p")["warnings"] == ["a: 1 times silent for longer than its timeout, and back"]

@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from math import inf
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from heliograph.live.fleet import Fleet
 from heliograph.live.network_program import NetworkProgram
@@ -26,6 +26,9 @@ from heliograph.serving.settings import NOTHING, SHORTEST, ServiceSettings
 from heliograph.serving.storage.store_protocol import AwayError, InMemoryStore, StoreProtocol, identity, report_damage
 from heliograph.serving.waiting_service import WaitingService, retry_while_away
 from heliograph.simulation.network import Network
+
+if TYPE_CHECKING:
+    from heliograph.serving.storage.store import Store
 
 STANDARD_INPUT = 0
 Serve = Callable[[int, asyncio.Event], Coroutine[object, object, None]]
@@ -47,6 +50,7 @@ def make_transport(address: Address, part: Part = WHOLE, translator: Translator 
     instance("part", part, Part, "a Part")
     if translator is not None:
         instance("translator", translator, Translator, "a Translator, or None")
+    # Each client is imported only where it is used: they are optional packages.
     if address.kind == "opc.tcp":
         if translator is None:
             raise fail(f"{address}", "sources in the network's file, by identifiers of variables", "none")
@@ -57,15 +61,15 @@ def make_transport(address: Address, part: Part = WHOLE, translator: Translator 
         from heliograph.serving.brokers.mqtt import Mqtt
 
         return Mqtt(address, part, translator)
-    if address.kind != "nats":
-        make = find_plugin(BROKERS, address.kind)
-        if make is None:
-            raise fail(f"{address}", "mqtt, nats, opc.tcp, or a package that offers the broker", address.kind)
-        transport: Transport = make(address, part, translator)
-        return transport
-    from heliograph.serving.brokers.nats import Nats
+    if address.kind == "nats":
+        from heliograph.serving.brokers.nats import Nats
 
-    return Nats(address, part, translator)
+        return Nats(address, part, translator)
+    make = find_plugin(BROKERS, address.kind)
+    if make is None:
+        raise fail(f"{address}", "mqtt, nats, opc.tcp, or a package that offers the broker", address.kind)
+    transport: Transport = make(address, part, translator)
+    return transport
 
 
 class PartLeases(Protocol):
@@ -119,7 +123,26 @@ async def serve_leased_parts(leases: PartLeases, serve: Serve) -> None:
 
 async def _serve_exactly(parts: dict[int, _Part], leases: PartLeases, serve: Serve) -> None:
     """Start and stop services so that `parts`, by number those that are served, are exactly the leased ones."""
-    # Parts whose service ended by itself: another process took them over, or it failed.
+    _drop_ended(parts)
+    try:
+        leased = await asyncio.to_thread(leases.renew)
+    except AwayError as error:  # nobody else can lease them either
+        LOG.warning("%s; trying again", error)
+        return
+    # Stop those that are no longer leased, all at once, and only then release each.
+    gone = [number for number in parts if number not in leased]
+    await asyncio.gather(*[parts[number].end() for number in gone])
+    for number in gone:
+        del parts[number]
+        await asyncio.to_thread(leases.release, number)
+    # Start the new ones.
+    for number in sorted(leased - parts.keys()):
+        stop = asyncio.Event()
+        parts[number] = _Part(asyncio.ensure_future(serve(number, stop)), stop)
+
+
+def _drop_ended(parts: dict[int, _Part]) -> None:
+    """Remove the parts whose service ended by itself; raise what it failed with, unless another process took it."""
     for number, part in list(parts.items()):
         if part.work.done():
             del parts[number]
@@ -127,20 +150,6 @@ async def _serve_exactly(parts: dict[int, _Part], leases: PartLeases, serve: Ser
                 part.work.result()
             except TakenOverError as error:
                 LOG.warning("%s", error)
-    # Stop those that are no longer leased, then release them; start the new ones.
-    try:
-        expected = await asyncio.to_thread(leases.renew)
-    except AwayError as error:  # nobody else has them either
-        LOG.warning("%s; trying again", error)
-        return
-    gone = [number for number in parts if number not in expected]
-    await asyncio.gather(*[parts[number].end() for number in gone])
-    for number in gone:
-        del parts[number]
-        await asyncio.to_thread(leases.release, number)
-    for number in sorted(expected - parts.keys()):
-        ending = asyncio.Event()
-        parts[number] = _Part(asyncio.ensure_future(serve(number, ending)), ending)
 
 
 async def run(settings: ServiceSettings) -> None:
@@ -200,35 +209,48 @@ async def _watching(settings: ServiceSettings) -> AsyncIterator[WrapService]:
 
 
 async def _serve_alone(settings: ServiceSettings, program: NetworkProgram, wrap: WrapService) -> None:
-    """Serve all plants in this process; `wrap` shows the service on the page."""
+    """Serve all plants in this process, until the messages end or a signal; `wrap` shows the service on the page."""
     stop = asyncio.Event()
-    reads = None if settings.sources is None else Translator(settings.sources, settings.network, settings.others)
-    step = settings.options.step if reads is None else reads.sources.step
+    # The reader of messages that others make; where it has sources, they say how long a step is.
+    reader = None if settings.sources is None else Translator(settings.sources, settings.network, settings.others)
+    step = settings.options.step if reader is None else reader.sources.step
     fleet = Fleet(program, settings.options._replace(step=step))
-    fleet.periods = {} if reads is None else reads.sources.periods
+    fleet.periods = {} if reader is None else reader.sources.periods
     with set_stop_on_signals(stop), contextlib.ExitStack() as owning:
         # The store first, whose state the service goes on from.
         store = await asyncio.to_thread(retry_while_away, lambda: _open_store(settings, fleet, owning), stop)
-        ahead = settings.forecast, settings.thresholds
-        resumed, service = store.count() > 0, Service(fleet, store, _say, settings.every, *ahead)
+        has_plants = store.count() > 0
+        service = Service(fleet, store, _say, settings.every, settings.forecast, settings.thresholds)
         try:
             service.resume()
-            broker = settings.broker
-            transport = _open_pipe(settings, reads) if broker is None else make_transport(broker, translator=reads)
-            transport = _add_states(settings, transport)
-            patience = None if step is None else max(step, SHORTEST)
-            if patience is None and fleet.shortest_timeout < inf:
-                patience = SHORTEST
-            shown = wrap(service) if reads is None else LastWordsService(wrap(service), reads.sources.words, store)
-            await serve_until(stop, WaitingService(shown, stop), transport, patience)
+            transport = _open_transport(settings, reader)
+            shown = wrap(service) if reader is None else LastWordsService(wrap(service), reader.sources.words, store)
+            await serve_until(stop, WaitingService(shown, stop), transport, _choose_patience(fleet))
         finally:
             store.close()
     # What was not used, in words.
-    for left in [] if reads is None else reads.left_out():
-        _say(left)
-    if resumed and service.known:
+    for line in [] if reader is None else reader.left_out():
+        _say(line)
+    if has_plants and service.known:
         anew = f"to begin anew, delete {store.name} or name another --store"
         _say(f"{service.known} messages were known already or came after what was final; {anew}")
+
+
+def _choose_patience(fleet: Fleet) -> float | None:
+    """Return after how many seconds without a message its silence is used; None where silence says nothing.
+
+    That is after a step, where steps have a length; else as soon as may be, where nodes have a timeout.
+    """
+    if fleet.options.step is not None:
+        return max(fleet.options.step, SHORTEST)
+    return SHORTEST if fleet.shortest_timeout < inf else None
+
+
+def _open_transport(settings: ServiceSettings, reader: Translator | None) -> Transport:
+    """Return the transport of all plants: a broker, or standard input and output; with single states if asked for."""
+    if settings.broker is None:
+        return _add_states(settings, _open_pipe(settings, reader))
+    return _add_states(settings, make_transport(settings.broker, translator=reader))
 
 
 def _add_states(settings: ServiceSettings, transport: Transport) -> Transport:
@@ -249,7 +271,10 @@ def _open_pipe(settings: ServiceSettings, reads: Translator | None) -> Pipe:
 def _open_store(settings: ServiceSettings, fleet: Fleet, owning: contextlib.ExitStack | None = None) -> StoreProtocol:
     """Open the store, with the snapshot and the plants to begin anew, and report its state.
 
-    `owning` holds it for this service alone; None where processes share it.
+    Args:
+        settings: which store, which snapshot, which plants.
+        fleet: the plants of the network.
+        owning: holds the store for this service alone until it is closed; None where processes share it.
     """
     if settings.store is None:
         return InMemoryStore()
@@ -260,12 +285,14 @@ def _open_store(settings: ServiceSettings, fleet: Fleet, owning: contextlib.Exit
     from heliograph.live.stored.migration import PlantMigration
     from heliograph.serving.storage.store import Store
 
+    # Plants of another network are carried over where that is allowed.
     mine = identity(fleet)
-    carrier = PlantMigration(fleet, mine, _say) if settings.accept_changes else None
-    store = Store(settings.store, mine, settings.process, carrier=carrier)
+    migration = PlantMigration(fleet, mine, _say) if settings.accept_changes else None
+    store = Store(settings.store, mine, settings.process, carrier=migration)
     if settings.snapshot is not None:
-        store.begin_from(settings.snapshot, mine, carrier)
+        store.begin_from(settings.snapshot, mine, migration)
     store.begin_anew(settings.anew)
+    # Its state, in words.
     if store.damaged:
         _say(f"store {store.name}: {report_damage(store.damaged)}")
     _say(f"the state is kept in {store.name}, plants so far: {store.count()} (--store {NOTHING} keeps nothing)")
@@ -278,39 +305,53 @@ def _say(what: str) -> None:
 
 
 async def _serve_shared(settings: ServiceSettings, program: NetworkProgram, wrap: WrapService, parts: int) -> None:
-    """Serve the parts that this process leases, as one of several processes; `wrap` shows services on the page."""
+    """Serve the parts that this process leases, as one of several processes; `wrap` shows services on the page.
+
+    `parts`: into how many the plants are divided.
+    """
     from heliograph.serving.storage.database import open_database
     from heliograph.serving.storage.leases import Leases
     from heliograph.serving.storage.owner import name_of_process
     from heliograph.serving.storage.store import Store
 
-    store_name, broker = str(settings.store), settings.broker
-    assert broker is not None  # as Wanted checked
+    # The store is checked once, before any part is served.
     fleet = Fleet(program, settings.options)
-    # Check the store once, before any part is served.
-    first = await asyncio.to_thread(retry_while_away, lambda: _open_store(settings, fleet), asyncio.Event())
-    assert isinstance(first, Store)  # as Wanted checked
-    first.close()
-    mine = identity(fleet)
+    checked = await asyncio.to_thread(retry_while_away, lambda: _open_store(settings, fleet), asyncio.Event())
+    assert isinstance(checked, Store)  # the settings require one
+    checked.close()
 
     async def serve(number: int, stop: asyncio.Event) -> None:
-        """Serve one part until `stop` is set."""
-        # The journal of a part continues with whichever process serves it.
-        store = Store(store_name, mine, f"part {number} of {parts}", opened=first)
-        try:
-            ahead = settings.forecast, settings.thresholds
-            service = wrap(Service(Fleet(program, settings.options), store, _say, None, *ahead))
-            # A silent step is not used by processes that share plants; a timeout is told all the same.
-            patience = SHORTEST if fleet.shortest_timeout < inf and not fleet.deciding else None
-            transport = make_transport(broker, Part(number, parts))
-            await serve_until(stop, WaitingService(service, stop), transport, patience)
-        finally:
-            store.close()
+        """Serve the part with this number until `stop` is set."""
+        await _serve_part(settings, program, wrap, Part(number, parts), stop, checked)
 
     # Lease parts under a name that is unique to this process.
-    name = settings.process or name_of_process()
-    engine = open_database(store_name)
+    engine = open_database(str(settings.store))
     try:
-        await serve_leased_parts(Leases(engine, name, parts), serve)
+        leases = Leases(engine, settings.process or name_of_process(), parts)
+        await serve_leased_parts(leases, serve)
     finally:
         engine.dispose()
+
+
+async def _serve_part(
+    settings: ServiceSettings,
+    program: NetworkProgram,
+    wrap: WrapService,
+    part: Part,
+    stop: asyncio.Event,
+    checked: "Store",
+) -> None:
+    """Serve one part of the plants until `stop` is set; `checked` is the store, open before and without damage."""
+    from heliograph.serving.storage.store import Store
+
+    assert settings.broker is not None  # the settings require one
+    fleet = Fleet(program, settings.options)
+    # The journal of a part continues with whichever process serves it.
+    store = Store(str(settings.store), identity(fleet), f"part {part.number} of {part.of}", opened=checked)
+    try:
+        service = wrap(Service(fleet, store, _say, None, settings.forecast, settings.thresholds))
+        # A silent step is not used by processes that share plants; a timeout is told all the same.
+        patience = SHORTEST if fleet.shortest_timeout < inf and not fleet.deciding else None
+        await serve_until(stop, WaitingService(service, stop), make_transport(settings.broker, part), patience)
+    finally:
+        store.close()

@@ -30,26 +30,34 @@ class EstimateWriter:
     """
 
     def __init__(self, program: NetworkProgram):
-        self._n, n = len(program.network.states), len(program.network.states)
+        n = self._n = len(program.network.states)
         self._nodes: dict[str, list[FilterColumns]] = {}
         for columns in program.places:
             self._nodes.setdefault(columns.node, []).append(columns)
-        # Columns that decide whether the template fits.
+        # Columns of the outputs that decide whether the template fits: variances, reasons not to use what arrived, and
+        # all that has to be finite.
         claimed = [columns.covariance for columns in program.places if columns.claim != "none"]
-        self._variances = [begin + i * (n + 1) for begin in claimed for i in range(n)]
+        self._variances = [begin + i * (n + 1) for begin in claimed for i in range(n)]  # of a covariance row by row
         self._reasons = [columns.judgement.reason for columns in program.places if columns.judgement is not None]
         self._finite = [i for columns in program.places for i in range(columns.mean, columns.mean + n)]
         self._finite += [i for columns in program.places for i in range(columns.covariance, columns.covariance + n * n)]
         self._finite += [columns.tested.distance for columns in program.places if columns.tested is not None]
-        # The template, the columns that fill it, and which of these are whole numbers.
-        numbered = FIRST + np.arange(float(program.step_rows.outputs.size))
-        numbered[self._reasons] = 0.0
+        self._template, self._order, self._whole = self._make_template(program.step_rows.outputs.size)
+
+    def _make_template(self, size: int) -> tuple[bytes, list[int], list[int]]:
+        """Return a line of a row with `size` outputs, with %b or %d for each number, and what fills it.
+
+        That is the outputs' columns in the order in which the line has them, and which of its places take whole
+        numbers. The line is written from a row that has FIRST + its column number in each column.
+        """
+        numbered = FIRST + np.arange(float(size))
+        numbered[self._reasons] = 0.0  # nothing is refused
         written = encode_line(self._write_estimates(numbered.tolist()))
-        filled = COLUMN.findall(written)
+        filled = COLUMN.findall(written)  # (digits, ".0" or nothing)
         form = COLUMN.sub(lambda match: b"%b" if match[2] else b"%d", written.replace(b"%", b"%%"))
-        self._template = HEAD + form + b"}"
-        self._order = [int(digits) - FIRST for digits, _ in filled]
-        self._whole = [i for i, (_, point) in enumerate(filled) if not point]
+        order = [int(digits) - FIRST for digits, _ in filled]
+        whole = [i for i, (_, point) in enumerate(filled) if not point]
+        return HEAD + form + b"}", order, whole
 
     def write_lines(
         self, kind: bytes, rows: Sequence[tuple[str, float | str]], outputs: Float[np.ndarray, "row outputs"]
@@ -66,14 +74,16 @@ class EstimateWriter:
         # The template fits rows whose numbers are finite, variances not negative, and nothing refused.
         fits = np.isfinite(outputs[:, self._finite]).all(axis=1) & (outputs[:, self._variances] >= 0).all(axis=1)
         fits &= (outputs[:, self._reasons] <= 0).all(axis=1)
-        # All numbers as texts, row by row; then by place in the template, of which some are whole numbers.
+        # All numbers as texts at once, row after row; then by place in the template, with a text for each row.
         width, numbers = len(self._order), _write_numbers(outputs[:, self._order].ravel().tolist())
         columns: list[Sequence[bytes | int]] = [numbers[i::width] for i in range(width)]
         for i in self._whole:
             columns[i] = outputs[:, self._order[i]].astype(int).tolist()
+        # Before them kind, plant and time of each row.
         names = {plant: encode_line(plant) for plant in {plant for plant, _ in rows}}
         head = [kind] * len(rows), [names[plant] for plant, _ in rows], _write_numbers([moment for _, moment in rows])
         lines = [*map(self._template.__mod__, zip(*head, *columns, strict=True))]
+        # Rows that the template does not fit, filter by filter.
         for i in np.flatnonzero(~fits).tolist():
             estimates = self._write_estimates(outputs[i].tolist())
             lines[i] = HEAD % tuple(column[i] for column in head) + encode_line(estimates) + b"}"
@@ -87,22 +97,35 @@ class EstimateWriter:
         }
 
     def _tabulate_estimate(self, columns: FilterColumns, outputs: list[float]) -> dict[str, object]:
-        """Return one filter's estimate, its claim, and what it made of what arrived, as a table for JSON."""
-        n, mean, begin, judged = self._n, columns.mean, columns.covariance, columns.judgement
-        # Estimate, without a claim where it is no number.
-        covariance = None if columns.claim == "none" else [outputs[i : i + n] for i in range(begin, begin + n * n, n)]
-        numbers = all(map(isfinite, (*outputs[mean : mean + n], *outputs[begin : begin + n * n])))
-        negative = columns.claim != "none" and min(outputs[begin : begin + n * n : n + 1]) < 0
-        claim = columns.claim if numbers and not negative else "none"
-        results: dict[str, object] = {"mean": outputs[mean : mean + n], "covariance": covariance, "claim": claim}
+        """Return one filter's estimate, its claim, and what it made of what arrived, as a table for JSON.
+
+        `columns` are the filter's among `outputs`, the numbers of a row.
+        """
+        n, begin = self._n, columns.covariance
+        mean, covariance = outputs[columns.mean : columns.mean + n], outputs[begin : begin + n * n]  # row by row
+        # What is no number, or has a negative variance, is no estimate that claims something.
+        claim = columns.claim
+        if claim != "none" and (not all(map(isfinite, (*mean, *covariance))) or min(covariance[:: n + 1]) < 0):
+            claim = "none"
+        rows = None if columns.claim == "none" else [covariance[i : i + n] for i in range(0, n * n, n)]
+        results: dict[str, object] = {"mean": mean, "covariance": rows, "claim": claim}
         if columns.modes is not None:
             results["modes"] = outputs[slice(*columns.modes)]
+        return results | self._tabulate_innovation(columns, outputs)
+
+    def _tabulate_innovation(self, columns: FilterColumns, outputs: list[float]) -> dict[str, object]:
+        """Return what a filter made of what arrived: nis, how many numbers it received; {} if it judges nothing.
+
+        Of one that weighs also each output's value, variance and weight, and of a measurement not used the reason.
+        """
         # Normalised innovation squared: of a fusion that of what its nodes received, of a filter as it judged it.
         if columns.tested is not None:
             nis, received = (outputs[column] for column in columns.tested)
-            return results | {"nis": nis, "received": int(received) if isfinite(nis) else 0}
+            return {"nis": nis, "received": int(received) if isfinite(nis) else 0}
+        judged = columns.judgement
         if judged is None:
-            return results
+            return {}
+        results: dict[str, object] = {}
         if columns.weighed is not None:
             parts = columns.weighed._asdict().items()
             results["outputs"] = {name: [outputs[i] for i in places] for name, places in parts}

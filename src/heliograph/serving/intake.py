@@ -4,7 +4,7 @@ from collections import OrderedDict
 from collections.abc import Container, Sequence
 from datetime import UTC, datetime, time
 from math import floor, inf
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,14 +17,31 @@ from heliograph.live.plant import PlantState, WithdrawnEvent
 from heliograph.numerics.check import InputError
 from heliograph.serving.message import AnyMessage, Read, UnreadMessage, convert_time_to_seconds
 
-# Of a message: its plant (None if it began none), a verdict (None if it could not be read), the reason, and notes on
-# parts that were left out of a used message.
-Outcome: TypeAlias = tuple[PlantState | None, Verdict | None, str, Sequence[str]]
-NOTHING: Outcome = None, None, "", ()
+
+class Outcome(NamedTuple):
+    """What became of a message.
+
+    Attributes:
+        plant: its plant; None if it began none.
+        verdict: the verdict on it; None if it could not be read.
+        why: the reason, where it was not used; else "".
+        notes: on parts that were left out of a used message.
+    """
+
+    plant: PlantState | None = None
+    verdict: Verdict | None = None
+    why: str = ""
+    notes: Sequence[str] = ()
 
 
 class PlantBefore(NamedTuple):
-    """State of a plant before a batch: whether it was in memory, its time and its counts."""
+    """State of a plant before a batch.
+
+    Attributes:
+        known: whether it was in memory.
+        clock: its newest arrival, and the leap in time that led there, if any (`PlantState.clock`).
+        links: by node the fields of its `LinkCounts`.
+    """
 
     known: bool
     clock: tuple[float, Leap | None]
@@ -58,6 +75,7 @@ class BatchIntake:
         self.fleet, self.plants, self._judges = fleet, plants, JudgementReader(fleet)
         # Why something is refused, by the number of its message and whether it is the message's inputs.
         self._refused: dict[tuple[int, bool], str] = {}
+        # Of the present round: plants as they were, by name, and the events that they used, to be judged.
         self._before: dict[str, PlantBefore] = {}
         self._taken: list[Candidate] = []
         self._anew: dict[str, int] = {}  # versions of plants that began anew in this batch
@@ -70,45 +88,53 @@ class BatchIntake:
         had never arrived.
         """
         self._refused, self._anew, self.replaced = self._find_implausible_inputs(messages), {}, []
-        outcomes = [NOTHING] * len(messages)
+        outcomes = [Outcome()] * len(messages)
         # One plant after another, so that its memory is near; the messages of a plant in their order.
-        by_plant: dict[str, list[int]] = {}
+        numbers_by_plant: dict[str, list[int]] = {}
         for i, message in enumerate(messages):
-            if (name := plant_of(message)) is None or name not in damaged:
-                by_plant.setdefault(name or "", []).append(i)
-        waiting = [i for numbers in by_plant.values() for i in numbers]
+            name = plant_of(message)
+            if name is None or name not in damaged:
+                numbers_by_plant.setdefault(name or "", []).append(i)
+        waiting = [i for numbers in numbers_by_plant.values() for i in numbers]
         # Each round refuses at least one message, restores its plant, and gives the plant its other messages again.
         while waiting:
             self._before, self._taken = {}, []
             for i in waiting:
                 outcomes[i] = self._take_one(i, messages[i], wall)
-            self.fleet.step({taken.plant.name: taken.plant for taken in self._taken}.values())
-            implausible = self._judges.find_implausible(self._taken)
-            # Plants that took an implausible message go back.
-            restored = set()
-            for i, why in implausible.items():
-                taken = self._taken[i]
-                self._refused[taken.number, taken.event.node_index < 0] = why
-                restored.add(taken.plant.name)
-            for name in restored:
-                self._restore_plant(name)
+            restored = self._refuse_implausible()
             waiting = [i for i in waiting if plant_of(messages[i]) in restored]
         self._taken = []
         return outcomes
 
+    def _refuse_implausible(self) -> set[str]:
+        """Step what was taken, note what is implausible in `_refused`, and restore its plants; return their names."""
+        self.fleet.step({taken.plant.name: taken.plant for taken in self._taken}.values())
+        restored = set[str]()
+        for i, why in self._judges.find_implausible(self._taken).items():
+            taken = self._taken[i]
+            is_inputs = taken.event.node_index < 0
+            self._refused[taken.number, is_inputs] = why
+            restored.add(taken.plant.name)
+        for name in restored:
+            self._restore_plant(name)
+        return restored
+
     def _take_one(self, number: int, message: Read, wall: datetime) -> Outcome:
         """Give a message to its plant, as far as it was read; return its outcome."""
         if isinstance(message, str):
-            return None, None, message, ()
+            return Outcome(why=message)
         if isinstance(message, UnreadMessage):
-            return self._count_unread(message), None, message.why, ()
+            return Outcome(self._count_unread(message), why=message.why)
         try:
             return self._use_message(number, message, wall)
         except InputError as error:  # of another kind than its plant expects
-            return self._count_unread(UnreadMessage(message, str(error))), None, str(error), ()
+            return Outcome(self._count_unread(UnreadMessage(message, str(error))), why=str(error))
 
     def _find_implausible_inputs(self, messages: Sequence[Read]) -> dict[tuple[int, bool], str]:
-        """Return which inputs lead to no valid prediction from the state before the batch, as `_refused` has them."""
+        """Return {(number of a message, True): why its inputs lead to no valid prediction}, as `_refused` has it.
+
+        They are predicted with from the state before the batch.
+        """
         numbers, plants, inputs = list[int](), list[PlantState | None](), []
         for i, message in enumerate(messages):
             if isinstance(message, str | UnreadMessage):
@@ -122,40 +148,49 @@ class BatchIntake:
         return {(i, True): why for i, why in zip(numbers, reasons, strict=True) if why}
 
     def _use_message(self, number: int, message: AnyMessage, wall: datetime) -> Outcome:
-        """Give a message to its plant; the outcome has no plant if one would begin with a refused message."""
+        """Give a message to its plant; the outcome has no plant if one would begin with a refused message.
+
+        `number`: of the message in the batch. `wall`: the time by this machine's clock.
+        """
         plant = self._find_plant(message, wall)
         timed = self._read_events(message, plant, wall)
-        at, arrival, event, inputs = timed.at, timed.arrival, timed.event, timed.inputs
         # Values beyond limits do not count as received; an event of such values only is implausible.
-        screened = self.fleet.screen_event(message.node, event, plant)
-        event, why, why_inputs = screened.event, screened.why if screened.is_empty else "", None
+        screened = self.fleet.screen_event(message.node, timed.event, plant)
+        why, why_inputs = screened.why if screened.is_empty else "", None
         if self._refused:  # as most often nothing is
-            why = self._refused.get((number, event.node_index < 0)) or why
-            why_inputs = self._refused.get((number, True)) if inputs is not None else None
+            why = self._refused.get((number, timed.event.node_index < 0)) or why
+            why_inputs = self._refused.get((number, True)) if timed.inputs is not None else None
         # A new plant begins with a message that is plausible and of a right clock.
-        if plant is None and at > arrival + self.fleet.options.ahead:
-            return None, "future", "", ()
-        if plant is None and why and (inputs is None or why_inputs):
-            return None, "implausible", why, ()
-        given = message.arrival is not None
         if plant is None:
-            begins = make_first_leap(arrival, ARRIVAL) if given else make_first_leap(at, message.node)
-            plant = self._begin_plant(message.plant, at, timed.origin, begins)
-        plant = self._note_before(plant, at)
+            if timed.at > timed.arrival + self.fleet.options.ahead:
+                return Outcome(verdict="future")
+            if why and (timed.inputs is None or why_inputs):
+                return Outcome(verdict="implausible", why=why)
+            is_dated = message.arrival is not None  # its arrival has a time by another clock
+            leap = make_first_leap(timed.arrival, ARRIVAL) if is_dated else make_first_leap(timed.at, message.node)
+            plant = self._begin_plant(message.plant, timed.at, timed.origin, leap)
+        plant = self._note_before(plant, timed.at)
         # Inputs and measurement are used or refused independently.
-        notes: list[str] = []
-        if inputs is not None and why_inputs is None:
-            self._give_to_plant(number, plant, inputs, given, timed.clock, message.node)
-        elif why_inputs is not None:
-            plant.link(INPUTS).implausible += 1
-            notes.append(f"inputs {message.inputs}: {why_inputs}; the rest is used")
+        notes = self._use_inputs(number, plant, message, timed, why_inputs)
         verdict: Verdict = "implausible"
         if not why:
-            verdict = self._give_to_plant(number, plant, event, given, timed.clock, message.node)
+            verdict = self._give_to_plant(number, plant, message, screened.event, timed.clock)
         self.fleet.count_event(plant, message.node, screened, verdict)
         if screened.why and verdict == "used":
             notes.append(f"{screened.why}; the rest is used")
-        return plant, verdict, why, notes
+        return Outcome(plant, verdict, why, notes)
+
+    def _use_inputs(
+        self, number: int, plant: PlantState, message: AnyMessage, timed: TimedEvents, why_refused: str | None
+    ) -> list[str]:
+        """Give a measurement's inputs to its plant, if it has any; return a note if they are refused, for a reason."""
+        if timed.inputs is None:
+            return []
+        if why_refused is None:
+            self._give_to_plant(number, plant, message, timed.inputs, timed.clock)
+            return []
+        plant.link(INPUTS).implausible += 1
+        return [f"inputs {message.inputs}: {why_refused}; the rest is used"]
 
     def _read_events(self, message: AnyMessage, plant: PlantState | None, wall: datetime) -> TimedEvents:
         """Return the events of a message, its measurement and inputs, with times as numbers of its plant."""
@@ -164,9 +199,10 @@ class BatchIntake:
         if origin is not None or not isinstance(at, float):
             at = self._time_as_number(at, origin, message.plant)
         # Without a time of arrival it arrived when measured, or, if late, when the plant's newest message did.
-        now = at if plant is None else plant.confirmed
-        came = message.arrival
-        arrival = max(now, at) if came is None else self._time_as_number(came, origin, message.plant)
+        if message.arrival is None:
+            arrival = at if plant is None else max(plant.confirmed, at)
+        else:
+            arrival = self._time_as_number(message.arrival, origin, message.plant)
         clock = None if origin is None else self._time_as_number(wall, origin, message.plant)
         event, inputs = self.fleet.convert_message(message.node, message.sequence, at, message.values, arrival), None
         if message.inputs is not None:
@@ -217,21 +253,23 @@ class BatchIntake:
         That is so where the message goes on from before the leap with which the plant began, and where that is in the
         future of the clock on the wall, with which the message agrees.
         """
-        plant, leap = self.plants.get(message.plant), self.fleet.options.leap
+        plant, longest_gap = self.plants.get(message.plant), self.fleet.options.leap
         if plant is None or isinstance(message.time, datetime) != (plant.origin is not None):
             return plant
         at = self._time_as_number(message.time, plant.origin, plant.name)
-        said = self._time_as_number(message.arrival, plant.origin, plant.name) if message.arrival is not None else at
-        # The leap with which the plant began: its message takes that back if it goes on from before.
-        first, newest = find_leap(plant.leap, plant.now, said, leap) or (None, at)
-        begins = first is not None and first.now == -inf and not plant.holds(first, at, leap)
-        clock = message.node if message.arrival is None else ARRIVAL
-        if first is not None and begins and first.taken_back_by(clock, said, newest):
+        # The clock that decides: that of arrivals, where one was given, else the sender's; and what it says.
+        clock, clock_time = message.node, at
+        if message.arrival is not None:
+            clock, clock_time = ARRIVAL, self._time_as_number(message.arrival, plant.origin, plant.name)
+        # The leap with which the plant began: the message takes that back if it goes on from before.
+        first, newest = find_leap(plant.leap, plant.now, clock_time, longest_gap) or (None, at)
+        began_with_it = first is not None and first.now == -inf and not plant.holds(first, at, longest_gap)
+        if first is not None and began_with_it and first.taken_back_by(clock, clock_time, newest):
             return None
         # The clock on the wall agrees with the message, and not with the plant.
         if plant.origin is not None:
             now = self._time_as_number(wall, plant.origin, plant.name)
-            if plant.confirmed > now + leap and abs(at - now) <= leap:
+            if plant.confirmed > now + longest_gap and abs(at - now) <= longest_gap:
                 return None
         return plant
 
@@ -254,29 +292,30 @@ class BatchIntake:
         return plant
 
     def _give_to_plant(
-        self, number: int, plant: PlantState, event: CheckedEvent, given: bool, wall: float | None, clock: str
+        self, number: int, plant: PlantState, message: AnyMessage, event: CheckedEvent, wall: float | None
     ) -> Verdict:
-        """Let the plant judge an event; note it as taken if it is used.
+        """Let the plant judge an event and return the verdict; note the event as taken if it is used.
 
         Args:
             number: number of its message in the batch.
             plant: the plant.
+            message: its message, by whose node's clock it is dated.
             event: the event.
-            given: whether its arrival is known by another clock than the sender's.
             wall: time by the clock on the wall, None if it is not known.
-            clock: name of the node by whose clock it is dated.
         """
-        verdict = self.fleet.take_event(plant, event, given, wall, clock)
+        is_dated = message.arrival is not None
+        verdict = self.fleet.take_event(plant, event, is_dated, wall, message.node)
         if verdict == "used":
-            self._taken.append(Candidate(number, plant, event, plant.changes[-1][0]))
+            row, _ = plant.changes[-1]  # that which holds it now
+            self._taken.append(Candidate(number, plant, event, row))
         return verdict
 
     def _restore_plant(self, name: str) -> None:
         """Restore a plant to its state before the batch."""
-        plant, (known, clock, links) = self.plants[name], self._before[name]
-        if known:
-            self.fleet.undo_events(plant, clock)
-            plant.links = {name: LinkCounts(*counts) for name, counts in links.items()}
+        plant, before = self.plants[name], self._before[name]
+        if before.known:
+            self.fleet.undo_events(plant, before.clock)
+            plant.links = {node: LinkCounts(*counts) for node, counts in before.links.items()}
         else:
             self.fleet.end_plant(self.plants.pop(name))
 

@@ -1,5 +1,6 @@
 """Outputs of a service: estimates, provisional and final, and refusals."""
 
+import json
 from typing import Annotated, Literal, NamedTuple
 
 from pydantic import BaseModel, Field, TypeAdapter
@@ -209,3 +210,9 @@ AnyOutput = Annotated[Estimates | Refused, Field(discriminator="kind")]
 def schema() -> dict[str, object]:
     """Return the JSON schema of an output line."""
     return TypeAdapter(AnyOutput).json_schema()
+
+
+def parse_output(line: str) -> Output:
+    """Return the output that a line of the journal, its body of JSON, stands for."""
+    parts = json.loads(line)
+    return Output(parts["id"], parts["plant"] or "", parts["kind"], line.encode())

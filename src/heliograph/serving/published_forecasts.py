@@ -85,17 +85,18 @@ class ForecastPublisher:
         covered = [i for i, row in enumerate(rows) if row.key[0] <= limit]
         if not covered:
             return results
+        # Forecasts by node and filter, each of all covered rows; then what is published of them.
         slots, times = [rows[i].slot for i in covered], np.array([float(rows[i].key[0]) for i in covered])
         start = ForecastStart(make_row_origin(self._fleet, slots, times))
-        found = heliograph.forecast(start, self.horizons, inputs="held")
-        assert isinstance(found, dict)  # of a network
+        forecasts = heliograph.forecast(start, self.horizons, inputs="held")
+        assert isinstance(forecasts, dict)  # of a network
         bodies = {
             node: {name: _write_forecasts(forecast) for name, forecast in filters.items()}
-            for node, filters in found.items()
+            for node, filters in forecasts.items()
         }
         for number, i in enumerate(covered):
             if self._thresholds:
-                self._add_crossings(rows[i], found, bodies, number)
+                self._add_crossings(rows[i], forecasts, bodies, number)
             results[i] = self._arrange_by_horizon(float(rows[i].key[0]), bodies, number)
         return results
 
@@ -149,24 +150,29 @@ class ForecastPublisher:
 def _write_forecasts(forecast: "heliograph.forecasting.Forecast") -> Bodies:
     """Return what is published of one filter's forecast, by row and horizon.
 
-    A covariance that is not finite is published as null, with the claim "none".
+    That is mean, covariance and claim of the states, and mean and deviation of each output. A covariance that is not
+    finite is published as null, with the claim "none".
     """
     states, outputs = forecast.states, forecast.outputs
-    known = np.isfinite(states.covariance).all(axis=(-2, -1)) & (states.claim != "none")
-    numbers = known.tolist(), states.mean.tolist(), states.covariance.tolist()
+    is_claimed = np.isfinite(states.covariance).all(axis=(-2, -1)) & (states.claim != "none")  # (row, horizon)
+    numbers = is_claimed.tolist(), states.mean.tolist(), states.covariance.tolist()
     bodies: Bodies = [
         [
-            {"mean": mean, "covariance": covariance if has else None, "claim": states.claim if has else "none"}
-            for has, mean, covariance in zip(*of_row, strict=True)
+            {"mean": mean, "covariance": covariance if claimed else None, "claim": states.claim if claimed else "none"}
+            for claimed, mean, covariance in zip(*of_row, strict=True)
         ]
         for of_row in zip(*numbers, strict=True)
     ]
     if outputs is not None:
-        rows = zip(bodies, outputs.mean.tolist(), outputs.deviation.tolist(), strict=True)
-        for of_row in rows:
-            for body, means, deviations in zip(*of_row, strict=True):
-                body["outputs"] = {
-                    name: {"mean": mean, "deviation": None if isnan(deviation) else deviation}
-                    for name, mean, deviation in zip(outputs.names, means, deviations, strict=True)
-                }
+        _add_outputs(bodies, outputs.names, outputs.mean, outputs.deviation)
     return bodies
+
+
+def _add_outputs(bodies: Bodies, names: Sequence[str], mean: np.ndarray, deviation: np.ndarray) -> None:
+    """Add the outputs' means and deviations, each (row, horizon, output), to `bodies`; a NaN deviation as null."""
+    for bodies_of_row, *numbers_of_row in zip(bodies, mean.tolist(), deviation.tolist(), strict=True):
+        for body, means, deviations in zip(bodies_of_row, *numbers_of_row, strict=True):
+            body["outputs"] = {
+                name: {"mean": mean_of_output, "deviation": None if isnan(of_output) else of_output}
+                for name, mean_of_output, of_output in zip(names, means, deviations, strict=True)
+            }

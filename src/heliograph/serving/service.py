@@ -9,7 +9,7 @@ from math import inf
 from time import perf_counter
 from typing import NamedTuple
 
-from heliograph.live.event import INPUTS, Verdict
+from heliograph.live.event import INPUTS
 from heliograph.live.fleet import Fleet as Fleet
 from heliograph.live.fleet import Options as Options
 from heliograph.live.fleet_remarks import FleetRemarks, FleetRepeatWatch
@@ -26,20 +26,13 @@ from heliograph.serving.message import AnyMessage, Message, Payload, Read, Unrea
 from heliograph.serving.neighbour_exchange import NeighbourMessenger
 from heliograph.serving.output import Output
 from heliograph.serving.published_forecasts import ForecastPublisher, Spans
+from heliograph.serving.refusals import WHY, refuse_message, write_refusal
 from heliograph.serving.silence import SilenceWatch, find_dead_senders
 from heliograph.serving.storage.store_protocol import ConflictError, Entry, StoredPlant, StoreProtocol
 from heliograph.serving.thresholds import Thresholds
 
 LARGE, MILLION = 1000, 1_000_000  # messages of a batch; between two searches for garbage among what such batches made
 ROWS = 200_000  # held in memory before the plants with the oldest messages leave it for the store
-WHY: dict[Verdict, str] = {
-    "duplicate": "held already",
-    "conflict": "held already with other values, which stay",
-    "late": "before what is final",
-    "future": "later than it can be: a clock is wrong",
-    "implausible": "no filter could use it",
-}
-
 LEAPT = "a leap in time that no other message confirms: a clock is wrong; it had been used, and is taken back"
 
 
@@ -84,14 +77,17 @@ class Service:
         thresholds: Thresholds = (),
     ):
         instance("fleet", fleet, Fleet, "a Fleet")
-        self.fleet, self.store, self._say = fleet, store, say
+        self.fleet, self.store = fleet, store
         self.plants = OrderedDict[str, PlantState]()  # those in memory, in order of their newest message
+        # Counts over all batches, and of the last one.
         self.malformed, self.known, self.last = 0, 0, BatchStatistics(0, 0, 0.0, 0.0, 0.0)
+        # What takes messages, and what makes outputs: estimates, messages to neighbours, what silence means, forecasts.
         self._writer, self._intake = EstimateWriter(fleet.program), BatchIntake(fleet, self.plants)
         self._exchange, self._silence = NeighbourMessenger(fleet, self._time_in_messages), SilenceWatch(fleet, every)
-        self._angles, self._remarks, self._doubt = FleetAngles(fleet), FleetRemarks(fleet), say
-        self._held = FleetRepeatWatch(fleet)
         self._ahead = None if forecast is None else ForecastPublisher(fleet, forecast, thresholds)
+        # What is said of plants, and to whom: of an implausible message only once, after which `_say` is None.
+        self._angles, self._remarks, self._held = FleetAngles(fleet), FleetRemarks(fleet), FleetRepeatWatch(fleet)
+        self._say, self._doubt = say, say
         self._unsearched = 0  # messages since the last search for garbage
         self._published: int | None = None  # number of the newest output published since the last commit
         self._damage = dict[str, str]()  # what is wrong with plants of the last batch that the store cannot give
@@ -123,12 +119,12 @@ class Service:
             names = self.store.names()
             for i in range(0, len(names), LARGE):
                 if self.fleet.pool.used < ROWS:
-                    self._load(names[i : i + LARGE])
+                    self._load_plants(names[i : i + LARGE])
             self._silence.resume(self.plants)
 
     def _tell_timeouts(self, now: datetime) -> list[Output]:
         """Tell the estimates by now of plants of which a sender has timed out; nothing is committed."""
-        late = self._silence.overdue(self.plants.values(), now)
+        late = self._silence.find_overdue(self.plants.values(), now)
         self.fleet.pass_silence(late)
         return self._write_provisional([(plant, plant.silence) for plant, _ in late if plant.silence is not None])
 
@@ -140,6 +136,7 @@ class Service:
         if self._exchange.sends:  # each of its steps is a message to the neighbours
             steps = self._make_step_messages(now)
             return self._take_batch(steps) if steps else []
+        # Rows that are final by the clock, and events whose clocks it shows to be wrong.
         due = self._silence.find_due(self.plants.values(), now)
         for plant, step in due:
             self.fleet.advance_time(plant, step)
@@ -147,6 +144,7 @@ class Service:
         changed = {each.plant.name: each.plant for each in finalised if each.left}
         entries = [entry for each in finalised for entry in self._write_withdrawn(each.plant, each.withdrawn)]
         entries += self._write_finals(finalised)
+        # Estimates of the present, where they have changed.
         self.fleet.pass_silence(due)
         rows = [(plant, plant.silence) for plant, _ in due if plant.silence is not None]
         provisional = self._write_provisional(self._silence.select_for_publication(rows)) if rows else []
@@ -154,7 +152,7 @@ class Service:
         try:
             return (self._commit(changed, entries, 0) if changed else []) + provisional
         except ConflictError:  # another process has them now
-            self._load(changed)
+            self._load_plants(changed)
             return []
 
     def _make_step_messages(self, now: datetime) -> list[Message]:
@@ -172,21 +170,23 @@ class Service:
         begun = perf_counter()
         messages = read_messages(payloads)
         names = {name for message in messages if (name := plant_of(message)) is not None}
-        self._load(names)
+        self._load_plants(names)
         # If another process has committed one of the plants, read it again and repeat.
         while True:
             try:
                 outputs, committed = self._take_messages(messages, payloads)
                 break
             except ConflictError:
-                self._load(names)
+                self._load_plants(names)
         took = perf_counter() - begun
-        # Age of the oldest message.
+        # Age of the oldest message that has a date.
         dates = [
             message.time for message in messages if isinstance(message, Message) and isinstance(message.time, datetime)
         ]
         lag = (datetime.now(UTC) - min(dates)).total_seconds() if dates else took
-        self.last = BatchStatistics(len(payloads), len(outputs), took, committed, lag)
+        self.last = BatchStatistics(
+            messages=len(payloads), outputs=len(outputs), took=took, committed=committed, lag=lag
+        )
         return outputs
 
     def dead_senders(self) -> dict[str, int]:
@@ -228,24 +228,22 @@ class Service:
         return self._commit({}, entries, 0)
 
     def _take_messages(self, messages: Sequence[Read], payloads: Sequence[Payload]) -> tuple[list[Output], float]:
-        """Use messages and commit; return the outputs to publish, and the seconds of the commit."""
+        """Use messages and commit; return the outputs to publish, and the seconds of the commit.
+
+        `payloads`: what the messages were read from, one each.
+        """
         outcomes = self._intake.apply_batch(messages, self._damage, datetime.now(UTC))
-        touched = {plant.name: plant for plant, _, _, _ in outcomes if plant is not None}
-        used = {plant.name for plant, verdict, _, _ in outcomes if plant is not None and verdict == "used"}
-        if self._doubt is not None:
-            plants = list(touched.values())
-            for name, line in (*self._angles.find_new(plants), *self._held.find_new(plants)):
-                self._doubt(f"warning: plant {name!r}, {line}; not said again, nor of other plants")
-        for name, line in self._remarks.find_new(touched.values()):
-            if self._doubt is not None:
-                self._doubt(f"warning: plant {name!r}, {line}")
-        entries, malformed, known = self._refuse_unused(messages, payloads, outcomes)
+        touched = {outcome.plant.name: outcome.plant for outcome in outcomes if outcome.plant is not None}
+        self._tell_doubts(list(touched.values()))
+        entries, malformed, known = self._report_unused(messages, payloads, outcomes)
         # Step what is due; estimates of final rows are committed, provisional ones and messages only published.
         sent = self._exchange.messages(touched.values())
         finalised = self.fleet.finalise_plants(touched.values())
         withdrawn = [*self._intake.replaced, *((each.plant, each.withdrawn) for each in finalised)]
         entries += [entry for plant, events in withdrawn for entry in self._write_withdrawn(plant, events)]
         entries += self._write_finals(finalised)
+        # Of plants that used a message, the estimate after the newest row.
+        used = {each.plant.name for each in outcomes if each.plant is not None and each.verdict == "used"}
         newest = [(each.plant, each.newest) for each in finalised if each.plant.name in used]
         provisional = self._write_provisional(newest)
         self.fleet.free_slots(finalised)
@@ -256,35 +254,54 @@ class Service:
         self.known += known
         return outputs + sent + provisional, committed
 
-    def _refuse_unused(
+    def _tell_doubts(self, plants: Sequence[PlantState]) -> None:
+        """Say what is new of these plants: angles known too little, readings that repeat, remarks of filters."""
+        if self._doubt is not None:
+            for name, line in (*self._angles.find_new(plants), *self._held.find_new(plants)):
+                self._doubt(f"warning: plant {name!r}, {line}; not said again, nor of other plants")
+        for name, line in self._remarks.find_new(plants):  # which counts them too
+            if self._doubt is not None:
+                self._doubt(f"warning: plant {name!r}, {line}")
+
+    def _report_unused(
         self, messages: Sequence[Read], payloads: Sequence[Payload], outcomes: Sequence[Outcome]
     ) -> tuple[list[Entry], int, int]:
         """Return entries on messages that were not used, or not wholly; how many were malformed, and how many known.
 
-        Known are duplicates, and late ones, which a store may have used before it was closed.
+        Known are duplicates, and late ones, which a store may have used before it was closed. `payloads` and `outcomes`
+        have one for each message.
         """
         entries, malformed, known = list[Entry](), 0, 0
-        for message, payload, (_, verdict, why, notes) in zip(messages, payloads, outcomes, strict=True):
-            if verdict == "used" and not notes:  # as most are
+        for message, payload, outcome in zip(messages, payloads, outcomes, strict=True):
+            if outcome.verdict == "used" and not outcome.notes:  # as most are
                 continue
             # Of a plant that is damaged in the store.
-            if (damage := self._damage.get(plant_of(message) or "")) and not isinstance(message, str):
-                entries.append(_refuse(message, "damaged", damage))
+            damage = self._damage.get(plant_of(message) or "")
+            if damage and not isinstance(message, str):
+                entries.append(refuse_message(message, "damaged", damage))
                 continue
             # Not read, or of another kind than its plant expects.
-            if isinstance(message, str | UnreadMessage) or verdict is None:
+            if isinstance(message, str | UnreadMessage) or outcome.verdict is None:
                 malformed += 1
-                said = why if isinstance(payload, str | UnreadMessage) else f"{why}: {show_value(payload)}"
-                entries.append(_refuse(message, "malformed", said))
+                is_explained = isinstance(payload, str | UnreadMessage)
+                why = outcome.why if is_explained else f"{outcome.why}: {show_value(payload)}"
+                entries.append(refuse_message(message, "malformed", why))
                 continue
-            # Refused with the reason; or used except for parts, on which there are notes.
-            if verdict != "used":
-                known += verdict in ("duplicate", "late")
-                entries.append(_refuse(message, verdict, why or WHY[verdict]))
-            entries += [_refuse(message, "implausible", note) for note in notes]
-            if verdict == "implausible" or notes:
-                self._warn(message, why or notes[0])
+            known += outcome.verdict in ("duplicate", "late")
+            entries += self._explain_refusal(message, outcome)
         return entries, malformed, known
+
+    def _explain_refusal(self, message: AnyMessage, outcome: Outcome) -> list[Entry]:
+        """Return an entry on a message that was refused, and on each part of one that was left out; warn of the first.
+
+        `outcome` has a verdict other than "used", or notes on parts of the message.
+        """
+        entries = [refuse_message(message, "implausible", note) for note in outcome.notes]
+        if outcome.verdict is not None and outcome.verdict != "used":
+            entries.insert(0, refuse_message(message, outcome.verdict, outcome.why or WHY[outcome.verdict]))
+        if outcome.verdict == "implausible" or outcome.notes:
+            self._warn(message, outcome.why or outcome.notes[0])
+        return entries
 
     def _warn(self, message: AnyMessage, why: str) -> None:
         """Report the first implausible message, once."""
@@ -298,12 +315,14 @@ class Service:
         """Commit the changed plants and entries; return the outputs to publish.
 
         If that fails, the plants are forgotten in memory: what the store has is true.
+
+        Args:
+            touched: the changed plants, by name.
+            entries: estimates and reports for the journal.
+            malformed: how many messages could not be read.
         """
-        stored = {}
-        if self.store.keeps:
-            stored = {
-                name: StoredPlant(plant.version, pack_plant(plant, self.fleet)) for name, plant in touched.items()
-            }
+        bodies = {name: pack_plant(plant, self.fleet) for name, plant in touched.items()} if self.store.keeps else {}
+        stored = {name: StoredPlant(touched[name].version, body) for name, body in bodies.items()}
         try:
             outputs = self.store.commit(stored, entries, malformed, self._published)
         except BaseException:
@@ -316,7 +335,8 @@ class Service:
             plant.version += 1
             self.plants.move_to_end(name)
         while self.store.keeps and self.fleet.pool.used > ROWS:
-            self._forget_plant(next(iter(self.plants)))
+            oldest = next(iter(self.plants))
+            self._forget_plant(oldest)
         return outputs
 
     def _forget_plant(self, name: str) -> None:
@@ -324,8 +344,8 @@ class Service:
         self.fleet.end_plant(self.plants.pop(name))
         self._silence.forget(name)
 
-    def _load(self, names: Iterable[str]) -> None:
-        """Load the plants of these names from the store, if it keeps any."""
+    def _load_plants(self, names: Iterable[str]) -> None:
+        """Load the plants of these names that are not in memory from the store; note which of them are damaged."""
         self._damage = {}
         for name, stored in self.store.load([name for name in names if name not in self.plants]).items():
             if stored.damage:
@@ -336,7 +356,7 @@ class Service:
             self._remarks.note_said(plant)
 
     def _write_finals(self, finalised: Iterable[FinalisedPlant]) -> list[Entry]:
-        """Return final estimates, each published once: of rows that are final now and received a measurement."""
+        """Return entries with final estimates: of rows that are final now and received a measurement."""
         rows = [(each.plant, row) for each in finalised for row in each.final if row.has_data()]
         names = (plant.name for plant, _ in rows)
         return [*map(Entry._make, zip(names, repeat("final"), self._write_estimates(b"final", rows)))]
@@ -346,7 +366,7 @@ class Service:
         for node, sequence, time in events:
             name = INPUTS if node < 0 else self.fleet.network.names[node]
             parts = {"node": name, "sequence": sequence, "time": self._time_in_messages(plant, time)}
-            yield _write_refusal(plant.name, parts, "future", LEAPT)
+            yield write_refusal(plant.name, parts, "future", LEAPT)
 
     def _write_provisional(self, rows: Sequence[tuple[PlantState, HeldRow]]) -> list[Output]:
         """Return outputs with the estimates after these rows, their forecasts, and what the senders' silence means."""
@@ -368,7 +388,7 @@ class Service:
         return outputs
 
     def _write_estimates(self, kind: bytes, rows: Sequence[tuple[PlantState, HeldRow]]) -> list[bytes]:
-        """Write the estimates of these rows, a line each."""
+        """Return the estimates after these rows as lines of JSON, one each; `kind` is "final" or "provisional"."""
         moments = [(plant.name, row.key[0] if plant.origin is None else self._time_in_messages(plant, row.key[0]))
                    for plant, row in rows]  # fmt: skip
         return self._writer.write_lines(kind, moments, self.fleet.outputs([row.slot for _, row in rows]))
@@ -377,19 +397,3 @@ class Service:
         """Return the time of a row as messages have it."""
         unit = self.fleet.options.step or 1.0
         return at if plant.origin is None else (plant.origin + timedelta(seconds=at * unit)).isoformat()
-
-
-def _refuse(message: Read, why: str, detail: str) -> Entry:
-    """Return the refusal of a message, with what names it as far as it was read."""
-    if isinstance(message, str):
-        return _write_refusal(None, {}, why, detail)
-    read = message.read if isinstance(message, UnreadMessage) else message
-    moment = read.time.isoformat() if isinstance(read.time, datetime) else read.time
-    parts = {"node": read.node, "sequence": read.sequence, "time": moment}
-    return _write_refusal(read.plant, parts, why, detail)
-
-
-def _write_refusal(plant: str | None, parts: dict[str, object], why: str, detail: str) -> Entry:
-    """Return the refusal of a message as an entry for the store; `parts`: node, sequence and time, if known."""
-    results = {"kind": "refused", "plant": plant, "node": None, "sequence": None, "time": None}
-    return Entry(plant or "", "refused", encode_line(results | parts | {"reason": why, "detail": detail}))

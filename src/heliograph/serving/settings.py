@@ -74,7 +74,7 @@ class ServiceSettings:
     states: "StateTopics | None" = None
 
     def __post_init__(self) -> None:
-        """Raise one line if options contradict each other, or need one that is not given."""
+        """Raise ValueError, in one line, if options contradict each other, or need one that is not given."""
         if self.hosts and self.page is None:
             raise fail("--host", "a page for this host name (--page PORT)", "none")
         if self.every is not None:
@@ -90,14 +90,16 @@ class ServiceSettings:
             raise fail("--anew", "a store that has the plants (--store FILE)", "none")
         if self.parts is not None:
             check_count("--parts", self.parts)
-            if self.states is not None:
-                raise fail("--states", "one process, whose end says offline (no --parts)", "--parts")
-            if self.store is None or self.broker is None:
-                raise fail("--parts", "a store and a broker that all processes share", "not both")
-            if self.sources is not None:
-                raise fail(
-                    "--parts", "messages in our own form, which name their part", "sources in the network's file"
-                )
+            self._check_sharing()
+
+    def _check_sharing(self) -> None:
+        """Raise ValueError if something asked for does not go with processes that share the plants in parts."""
+        if self.states is not None:
+            raise fail("--states", "one process, whose end says offline (no --parts)", "--parts")
+        if self.store is None or self.broker is None:
+            raise fail("--parts", "a store and a broker that all processes share", "not both")
+        if self.sources is not None:
+            raise fail("--parts", "messages in our own form, which name their part", "sources in the network's file")
 
 
 def store_of(network: str, given: str | None, parts: int | None, node: str | None = None) -> str | None:
@@ -113,6 +115,10 @@ def store_of(network: str, given: str | None, parts: int | None, node: str | Non
 def settings_of_node(settings: ServiceSettings, node: str) -> ServiceSettings:
     """Return the settings of one node of a fusion between neighbours, at the topic of its name below the broker's.
 
+    Args:
+        settings: those of the whole network.
+        node: name of the node.
+
     Raises:
         ValueError: no such node, no broker between the nodes, parts that processes share.
     """
@@ -122,24 +128,33 @@ def settings_of_node(settings: ServiceSettings, node: str) -> ServiceSettings:
     states = settings.states
     if states is not None:
         states = states._replace(address=_below(states.address, node))
-    # The sources of its own messages, by topic; the seconds of a step are those of all nodes.
-    table, step = settings.sources, settings.options.step
-    if isinstance(table, Mapping):
-        rows_of = {topic: list(rows) if isinstance(rows, Sequence) else [rows] for topic, rows in table.items()}
-        step = next((row.step for rows in rows_of.values() for row in rows if isinstance(row, Source)), step)
-        measures = node in settings.network.nodes and settings.network.nodes[node].received > 0
-        of_node = {topic: [row for row in rows if _concerns(row, node, measures)] for topic, rows in rows_of.items()}
-        table = {topic: rows for topic, rows in of_node.items() if rows} or None
+    sources, step = _select_sources(settings, node)
     return replace(
         settings,
         network=node_network(settings.network, node),
         options=settings.options._replace(step=step),
         broker=_below(settings.broker, node),
         states=states,
-        sources=table,
+        sources=sources,
         others=tuple(name for name in settings.network.names if name != node),
         name=f"{settings.name} {node}",
     )
+
+
+def _select_sources(settings: ServiceSettings, node: str) -> tuple[object, float | None]:
+    """Return the sources of a node's own messages, by topic (None: it has none), and the seconds of a step.
+
+    The latter are those of all nodes, as any source says them; else as the settings have them.
+    """
+    sources, step = settings.sources, settings.options.step
+    if not isinstance(sources, Mapping):
+        return sources, step
+    # One source stands for a list of one.
+    by_topic = {topic: list(rows) if isinstance(rows, Sequence) else [rows] for topic, rows in sources.items()}
+    step = next((row.step for rows in by_topic.values() for row in rows if isinstance(row, Source)), step)
+    measures = node in settings.network.nodes and settings.network.nodes[node].received > 0
+    of_node = {topic: [row for row in rows if _concerns(row, node, measures)] for topic, rows in by_topic.items()}
+    return {topic: rows for topic, rows in of_node.items() if rows} or None, step
 
 
 def _concerns(row: object, node: str, measures: bool) -> bool:

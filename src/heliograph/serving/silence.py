@@ -4,6 +4,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import datetime, timedelta
 from math import floor, inf
 from time import monotonic
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,6 +15,20 @@ from heliograph.serving.settings import SHORTEST
 
 MOVED = 0.1  # deviations by which a mean has to move to be published again, and share by which a deviation has to
 GRACE = 10.0  # seconds after a start in which messages that waited come first
+
+
+class PublishedEstimate(NamedTuple):
+    """The newest estimate of a plant that was published.
+
+    Attributes:
+        outputs: outputs of all filters, (outputs,).
+        dead: nodes whose senders were dead then.
+        time: the row's, in steps or in the unit of dt.
+    """
+
+    outputs: np.ndarray
+    dead: tuple[str, ...]
+    time: float
 
 
 class SilenceWatch:
@@ -28,8 +43,9 @@ class SilenceWatch:
     """
 
     def __init__(self, fleet: Fleet, every: float | None):
-        self.fleet, self.every, self._begun, self._looked = fleet, every, monotonic(), -inf
-        self._published: dict[str, tuple[np.ndarray, tuple[str, ...], float]] = {}  # outputs, dead senders, step
+        self.fleet, self.every = fleet, every
+        self._begun, self._looked = monotonic(), -inf  # when this started, and when timeouts were looked for last
+        self._published: dict[str, PublishedEstimate] = {}  # by plant, the newest
         self._resumed = set[str]()  # plants of before this start, of which messages may wait somewhere
         # Columns (filter, state) of each filter's mean, and of the diagonal of its covariance, which is row by row.
         n, places = len(fleet.network.states), fleet.program.places
@@ -54,7 +70,7 @@ class SilenceWatch:
                 due.append((plant, float(passed)))
         return due
 
-    def overdue(self, plants: Iterable[PlantState], now: datetime) -> list[tuple[PlantState, float]]:
+    def find_overdue(self, plants: Iterable[PlantState], now: datetime) -> list[tuple[PlantState, float]]:
         """Return the plants of which a sender has been silent for longer than its timeout since it was told last.
 
         With the present moment by the clock: its step, or the time where time is continuous.
@@ -91,7 +107,7 @@ class SilenceWatch:
         if self.fleet.watched:
             outputs = self.fleet.outputs([row.slot for _, row in rows])
             for (plant, row), output in zip(rows, outputs, strict=True):
-                self._published[plant.name] = output, self._dead_senders(plant), row.key[0]
+                self._published[plant.name] = PublishedEstimate(output, self._dead_senders(plant), row.key[0])
                 self._resumed.discard(plant.name)
 
     def forget(self, name: str) -> None:
@@ -106,14 +122,15 @@ class SilenceWatch:
     def _is_news(self, plant: PlantState, row: HeldRow, output: np.ndarray) -> bool:
         """Return whether a row is worth publishing: a sender died, `every` is over, a mean or deviation has moved."""
         published = self._published.get(plant.name)
-        if published is None or published[1] != self._dead_senders(plant):
+        if published is None or published.dead != self._dead_senders(plant):
             return True
         step = self.fleet.options.step or 1.0
-        if self.every is not None and (row.key[0] - published[2]) * step >= self.every:
+        if self.every is not None and (row.key[0] - published.time) * step >= self.every:
             return True
-        before = np.sqrt(np.maximum(published[0][self._variances], 0.0))
+        # Means and deviations (filter, state), now and before, in units of the deviations before.
+        before = np.sqrt(np.maximum(published.outputs[self._variances], 0.0))
         now = np.sqrt(np.maximum(output[self._variances], 0.0))
-        moved = np.abs(output[self._means] - published[0][self._means]) > MOVED * before
+        moved = np.abs(output[self._means] - published.outputs[self._means]) > MOVED * before
         return bool((moved | (np.abs(now - before) > MOVED * before)).any())
 
     def _dead_senders(self, plant: PlantState, now: float = -inf) -> tuple[str, ...]:
@@ -122,7 +139,7 @@ class SilenceWatch:
 
     def _told_dead(self, plant: PlantState) -> tuple[str, ...]:
         """Return the senders of a plant that were told to be dead."""
-        return self._published[plant.name][1] if plant.name in self._published else ()
+        return self._published[plant.name].dead if plant.name in self._published else ()
 
 
 def find_dead_senders(fleet: Fleet, plants: Mapping[str, PlantState]) -> dict[str, list[str]]:

@@ -157,6 +157,6 @@ def test_what_a_gate_left_out_does_not_count_against_it():
         filters["gate"]["outputs"] = weighed
         body = to_json({"kind": "final", "plant": "p", "time": k, "estimates": {"a": filters}})
         watch.note([Output(k, "p", "final", body)], None)
-    assert watch.tests("p")["a", "gate"].doubt() is None and not watch.worst()
+    assert watch.tests("p")["a", "gate"].explain_doubt() is None and not watch.list_worst_plants()
     none = {"nis": 100.0, "received": 1, "outputs": {"value": [10.0], "variance": [1.0], "weight": [0.0]}}
     assert read_nis(none) == (None, 0) and read_nis({"nis": 2.0, "received": 2}) == (2.0, 2)

@@ -87,7 +87,7 @@ def test_an_honest_filter_stays_in_its_band_and_a_wrong_one_does_not():
         item = RunningNis(claim)
         for squared in scale * rng.chisquare(2, 600):
             item.add(squared, 2)
-        assert (item.doubt() is not None) == doubted
+        assert (item.explain_doubt() is not None) == doubted
 
 
 def test_a_door_that_others_reach_needs_a_token():
@@ -199,7 +199,7 @@ def test_many_nodes_have_one_warning_of_a_kind():
     watch.wrap(service).take([b"0"])
     for i, link in enumerate(service.plants["mower"].links.values()):
         link.late, link.future = i, int(i == 3)
-    late, clock = watch.view(None)["warnings"]
+    late, clock = watch.make_page_data(None)["warnings"]
     assert late.startswith("node 1, node 2, node 3, node 4: 10 came too late") and clock.startswith(
         "node 3: 1 of a time that is not yet"
     )
@@ -249,9 +249,9 @@ def test_a_fusion_of_estimates_is_judged_by_what_it_fuses_and_a_dead_sender_is_a
     assert watch_of(stepping(), "tank").fused == {"both": ("upper", [("a", "linear"), ("b", "linear")])}
     for scale, doubted in ((1.0, False), (3.0, True)):
         watch = observer_of(["x", "v"], "tank")
-        assert watch.view(None)["tests"] == []  # nothing to judge by yet
+        assert watch.make_page_data(None)["tests"] == []  # nothing to judge by yet
         watch.wrap(Scripted(scale, nodes=2, senders=SENDERS)).take([str(i).encode() for i in range(300)])
-        view = watch.view(None)
+        view = watch.make_page_data(None)
         fused = view["tests"][-1]
         assert (fused["node"], fused["filter"], fused["claim"], fused["doubt"]) == ("fused", "both", "upper", doubted)
         assert fused["by"] == ["node 0/cubature", "node 1/cubature"] and fused["numbers"] == 2 * 600

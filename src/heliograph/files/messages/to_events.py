@@ -229,9 +229,9 @@ def _append_message(
                 sources.stored += 1
                 continue
             if came is None and reading.time is not None and events.dated:
-                sources.clocks.note(topic, content, reading.time, (single.source for single in sources.of(topic)))
+                sources.clocks.note_time(topic, content, reading.time, (single.source for single in sources.of(topic)))
             events.add(sources.date_as_original(reading, came), arrival)
-            sources.senders.note(topic, reading.plant, reading.node, content, sources.list_fields(topic))
+            sources.senders.note_fields(topic, reading.plant, reading.node, content, sources.list_fields(topic))
     except InputError as error:
         events.refuse(error, strict)
 

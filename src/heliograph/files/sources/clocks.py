@@ -43,7 +43,7 @@ class TopicClocks:
     def __init__(self) -> None:
         self._by_topic: dict[str, TopicClock] = {}
 
-    def note(self, topic: str, content: object, time: int, sources: Iterable[Source]) -> None:
+    def note_time(self, topic: str, content: object, time: int, sources: Iterable[Source]) -> None:
         """Note the time of a message, in nanoseconds since 1970."""
         clock = self._by_topic.get(topic)
         if clock is None:

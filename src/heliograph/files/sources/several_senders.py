@@ -21,7 +21,7 @@ class SenderCounter:
         self._names: dict[str, bool] = {}
         self._noted, self._said = 0, set[tuple[str, str]]()
 
-    def note(self, topic: str, plant: str, node: str, message: object, asked: Collection[str]) -> None:
+    def note_fields(self, topic: str, plant: str, node: str, message: object, asked: Collection[str]) -> None:
         """Count the fields of a message that was read as one of a node of a plant.
 
         Fields that are `asked` for by a source tell senders apart already, or are values.

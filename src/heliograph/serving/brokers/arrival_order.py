@@ -4,6 +4,7 @@ from collections import defaultdict
 from collections.abc import Sequence
 from datetime import datetime
 from heapq import heappop, heappush, heappushpop
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,6 +13,14 @@ from heliograph.numerics.times.row_order import SECOND, YEAR, find_unset_stamps
 from heliograph.serving.message import Message, NumberedMessage, Payload, UnreadMessage
 
 HELD = 250_000  # messages that wait for earlier ones
+
+
+class HeldPayload(NamedTuple):
+    """A payload that waits: the moment by which it is ordered, its number among all, and itself."""
+
+    moment: float
+    number: int
+    payload: Payload
 
 
 class ArrivalOrder:
@@ -28,45 +37,46 @@ class ArrivalOrder:
 
     def __init__(self, source: str, steps: bool) -> None:
         self._source, self._steps = source, steps
-        self._held = list[tuple[float, int, Payload]]()
-        self._count, self._last = 0, float("-inf")
+        self._held = list[HeldPayload]()  # a heap
+        self._count, self._last = 0, float("-inf")  # of all payloads so far; moment of the newest
 
-    def add(self, payloads: Sequence[Payload]) -> list[Payload]:
+    def add_messages(self, payloads: Sequence[Payload]) -> list[Payload]:
         """Take messages; return those that no longer wait, since more than HELD would."""
         results = list[Payload]()
         for payload in payloads:
             self._last = self._moment(payload)
-            entry = self._last, self._count, payload
+            entry = HeldPayload(self._last, self._count, payload)
             self._count += 1
             if len(self._held) < HELD:
                 heappush(self._held, entry)
             else:
-                results.append(heappushpop(self._held, entry)[2])
+                results.append(heappushpop(self._held, entry).payload)
         return results
 
     def end(self) -> list[Payload]:
         """Return all messages that still wait, in order."""
         if self._count == len(self._held):  # all are here, so that times can be compared with all others
-            self._refuse_astray()
-        return [heappop(self._held)[2] for _ in range(len(self._held))]
+            self._refuse_unset_times()
+        return [heappop(self._held).payload for _ in range(len(self._held))]
 
-    def _refuse_astray(self) -> None:
+    def _refuse_unset_times(self) -> None:
         """Put errors in the place of messages whose times were not set."""
-        nodes = defaultdict[tuple[str, str, bool], list[tuple[float, int, Payload]]](list)
-        for entry in sorted(self._held, key=lambda entry: entry[1]):
-            if isinstance(message := entry[2], Message | NumberedMessage):
-                nodes[message.plant, message.node, isinstance(message.time, datetime)].append(entry)
-        for (_, node, dated), entries in nodes.items():
-            known = any(getattr(message, "arrival", None) is not None for *_, message in entries)
-            if known or (self._steps and not dated):
+        # In the order of the lines; dates and numbers of a node apart.
+        by_node = defaultdict[tuple[str, str, bool], list[HeldPayload]](list)
+        for entry in sorted(self._held, key=lambda entry: entry.number):
+            if isinstance(message := entry.payload, Message | NumberedMessage):
+                by_node[message.plant, message.node, isinstance(message.time, datetime)].append(entry)
+        for (_, node, dated), entries in by_node.items():
+            has_arrivals = any(getattr(entry.payload, "arrival", None) is not None for entry in entries)
+            if has_arrivals or (self._steps and not dated):
                 continue
-            times = np.array([moment for moment, *_ in entries])
+            times = np.array([entry.moment for entry in entries])
             for i in np.flatnonzero(find_unset_stamps(times, YEAR / SECOND)):
-                moment, number, message = entries[i]
-                time = getattr(message, "time", moment)
+                entry = entries[i]
+                time = getattr(entry.payload, "time", entry.moment)
                 where, expected = f"{self._source}, {node}", "a time that was set, near the others in order"
                 error = str(fail(where, expected, time.isoformat() if isinstance(time, datetime) else time))
-                self._held[self._held.index(entries[i])] = (moment, number, error)
+                self._held[self._held.index(entry)] = entry._replace(payload=error)
 
     def _moment(self, payload: Payload) -> float:
         """Return when a payload arrived, or else was measured; for what is no message, the moment of the one before."""

@@ -59,21 +59,21 @@ class _Examination:
         self._numbers = count()
 
     async def check_all(self) -> bool:
-        """Check each promise in turn, with one service after another."""
+        """Check each promise in turn, with one service after another; return whether redelivery keeps the order."""
         # First service: new messages arrive in order, and all are acknowledged.
         async with self._open_transport() as transport:
             await self._start_listening(transport)
             sent = await self._send_new()
             assert await self._receive_until(transport, sent) == sent, "receive: expected new messages in order"
             await self._drain_copies(transport)
+        # Second service: none of them arrives again; the next messages, half of them received, stay unacknowledged.
         async with self._open_transport() as transport:
-            # Second service: none of them arrives again; half of the next messages are left unacknowledged.
             again = await self._receive_for_a_while(transport)
             assert not again, f"acknowledge: expected nothing to come again, got {len(again)} messages"
             sent = await self._send_new()
             await self._receive_until(transport, sent[: len(sent) // 2], acknowledge=False)
             await self._receive_for_a_while(transport)
-        # Third service: these arrive again, with those that were sent while nobody was reading.
+        # Third service: all of these arrive again, with those that were sent while nobody was reading.
         sent += await self._send_new()
         async with self._open_transport() as transport:
             received = await self._receive_until(transport, sent)

@@ -51,17 +51,20 @@ class LineReader:
         path = None if path is None else file_path("path", path)
         ignore_unknown = flag("ignore_unknown", ignore_unknown)
         self.source = "standard input" if path is None else str(path)
+        # Readers of what lines may be: messages that others make, and the topic of those that name none; messages in
+        # our own form; a table.
         self._translator = translator
         self._topic = None if translator is None else translator.topic_of(path)
         self._own = OwnReader(network, self.source, ignore_unknown, table=False)
         self._table = TableLineReader(network, translator, path, ignore_unknown)
         self._is_table: bool | None = None  # known once a message or the names of columns came
         self._document: list[bytes] | None = None  # lines of a document that has not ended
-        self._number = 0
+        self._number = 0  # of the newest line, for errors
+        # Messages of a file are put in order of arrival; those of a pipe go on as they come.
         self._order = None if path is None else ArrivalOrder(self.source, TIME_STEP not in network.inputs)
 
     def read(self, lines: Sequence[bytes]) -> list[Payload]:
-        """Return the messages of lines, which are not empty.
+        """Return the messages of lines, which are not empty; those of a file may be held back until earlier ones came.
 
         Raises:
             ValueError: a table whose header names no columns, or others than expected; one line.
@@ -76,7 +79,7 @@ class LineReader:
                 self._number += 1
                 payloads += self._read_line(line)
         payloads += self._table.read(rows) if rows else []
-        return payloads if self._order is None else self._order.add(payloads)
+        return payloads if self._order is None else self._order.add_messages(payloads)
 
     def end(self) -> list[Payload]:
         """Return the messages that are left when no more lines come."""
@@ -84,7 +87,7 @@ class LineReader:
             rest = self._table.end()
         else:
             rest = [] if self._document is None else self._read_document_or_lines(self._document)
-        return rest if self._order is None else [*self._order.add(rest), *self._order.end()]
+        return rest if self._order is None else [*self._order.add_messages(rest), *self._order.end()]
 
     def _read_line(self, line: bytes) -> list[Payload]:
         """Return the messages of a line that is none of a table; [] while a document over several lines goes on."""

@@ -37,21 +37,30 @@ def listen(address: Address, seconds: float) -> dict[str, Topic]:
 
 
 def _listen_mqtt(address: Address, seconds: float, topics: dict[str, Topic]) -> None:
-    """Note all messages of an MQTT broker by topic for some seconds, except those that it had stored before."""
+    """Note all messages of an MQTT broker by topic for some seconds, except those that it had stored before.
+
+    Args:
+        address: the broker.
+        seconds: how long to listen.
+        topics: by name, to which what comes is added.
+
+    Raises:
+        ValueError: no connection, or a refused one.
+    """
     from paho.mqtt.client import Client, ConnectFlags, MQTTMessage
     from paho.mqtt.enums import CallbackAPIVersion
     from paho.mqtt.properties import Properties
     from paho.mqtt.reasoncodes import ReasonCode
 
-    ready, refused = threading.Event(), list[str]()
+    answered, refusals = threading.Event(), list[str]()
 
     def subscribe(client: Client, data: object, flags: ConnectFlags, code: ReasonCode, more: Properties | None) -> None:
         """Ask for all topics once connected, or note why the broker refuses; say that it has answered."""
         if code.is_failure:
-            refused.append(str(code))
+            refusals.append(str(code))
         else:
             client.subscribe("#", 0)
-        ready.set()
+        answered.set()
 
     def note_message(client: Client, data: object, message: MQTTMessage) -> None:
         """Note a message under its topic, with the time of its arrival."""
@@ -68,10 +77,10 @@ def _listen_mqtt(address: Address, seconds: float, topics: dict[str, Topic]) -> 
     client.connect_async(address.host, address.port)
     client.loop_start()
     try:
-        if not ready.wait(WAIT):
+        if not answered.wait(WAIT):
             raise fail(f"broker {address}", "a connection", f"none within {WAIT:g} s")
-        if refused:
-            raise fail(f"broker {address}", "a connection", f"a refusal: {refused[0]}")
+        if refusals:
+            raise fail(f"broker {address}", "a connection", f"a refusal: {refusals[0]}")
         time.sleep(seconds)
     finally:
         client.disconnect()
@@ -79,7 +88,16 @@ def _listen_mqtt(address: Address, seconds: float, topics: dict[str, Topic]) -> 
 
 
 async def _listen_nats(address: Address, seconds: float, topics: dict[str, Topic]) -> None:
-    """Note each message of a NATS server under its topic for some seconds."""
+    """Note each message of a NATS server under its topic for some seconds.
+
+    Args:
+        address: the server.
+        seconds: how long to listen.
+        topics: by name, to which what comes is added.
+
+    Raises:
+        ValueError: no connection.
+    """
     import nats
     from nats.aio.msg import Msg
     from nats.errors import Error
@@ -92,7 +110,7 @@ async def _listen_nats(address: Address, seconds: float, topics: dict[str, Topic
     async def ignore(error: Exception) -> None:
         """Do nothing at an error, which the client would log with a traceback; what it raises is one line."""
 
-    # Connect, listen for a while, and leave.
+    # A user without a password is a token.
     try:
         client = await nats.connect(
             f"nats://{address.host}:{address.port}",
@@ -108,6 +126,7 @@ async def _listen_nats(address: Address, seconds: float, topics: dict[str, Topic
         )
     except (Error, OSError, TimeoutError) as error:
         raise fail(f"broker {address}", "a connection", type(error).__name__) from None
+    # Listen for a while, and leave.
     try:
         await client.subscribe(">", cb=note_message)
         await asyncio.sleep(seconds)

@@ -6,6 +6,7 @@ import threading
 from collections import deque
 from collections.abc import Sequence
 from datetime import UTC, datetime
+from typing import NamedTuple
 
 from paho.mqtt.client import Client, ConnectFlags, DisconnectFlags, MQTTMessage, MQTTv311
 from paho.mqtt.enums import CallbackAPIVersion
@@ -100,6 +101,14 @@ class Connection:
         self.client.loop_stop()
 
 
+class HeldMessage(NamedTuple):
+    """A message that waits to be received: the number of the connection by which it came, itself, and its arrival."""
+
+    connection: int
+    message: MQTTMessage
+    arrival: datetime
+
+
 class _Reader(Connection):
     """Connection that receives messages and holds them until `receive` takes them."""
 
@@ -108,32 +117,36 @@ class _Reader(Connection):
         self._topics_below = f"{part.number}/#" if part.of > 1 else "#"
         self._loop, self._some_held = asyncio.get_running_loop(), asyncio.Event()
         self._prefix, self._translator = f"{address.topic}/in/", translator
-        self._held: deque[tuple[int, MQTTMessage, datetime]] = deque()
-        self._connection = 0
+        self._held: deque[HeldMessage] = deque()
+        self._connection = 0  # counts connections, and their ends
         self.client.on_message = self._hold_message
         self.start()
 
     async def receive(self) -> Batch:
         """Wait for messages, and return those that the service reads; acknowledging the batch acknowledges them all."""
-        batch, payloads = list[tuple[int, MQTTMessage, datetime]](), list[Payload]()
+        batch, payloads = list[HeldMessage](), list[Payload]()
         # Wait until there are messages that the service reads: `_some_held` may be set although the batch before took
         # all, and messages of topics that no source reads are acknowledged at once.
         while not payloads:
-            for connection, message, _ in batch:
-                self._acknowledge(connection, message)
+            self._acknowledge(batch)
             await self._some_held.wait()
-            with self.changed:
-                batch = [self._held.popleft() for _ in range(min(MOST, len(self._held)))]
-                if not self._held:
-                    self._some_held.clear()
-                self.changed.notify_all()
-            payloads = [payload for _, message, arrival in batch for payload in self._read_payloads(message, arrival)]
+            batch = self._take_held()
+            payloads = [payload for held in batch for payload in self._read_payloads(held.message, held.arrival)]
 
         async def acknowledge() -> None:
-            for connection, message, _ in batch:
-                self._acknowledge(connection, message)
+            """Acknowledge all messages of the batch."""
+            self._acknowledge(batch)
 
         return Batch(payloads, acknowledge)
+
+    def _take_held(self) -> list[HeldMessage]:
+        """Return at most MOST of the messages that are held, which the client's thread may then replace by others."""
+        with self.changed:
+            batch = [self._held.popleft() for _ in range(min(MOST, len(self._held)))]
+            if not self._held:
+                self._some_held.clear()
+            self.changed.notify_all()
+        return batch
 
     def _read_payloads(self, message: MQTTMessage, arrival: datetime) -> Sequence[Payload]:
         """Return a message in our form as it is, and of another topic what the sources read in it."""
@@ -141,19 +154,20 @@ class _Reader(Connection):
             return [bytes(message.payload)]
         return self._translator.read(message.topic, bytes(message.payload), arrival, message.retain)
 
-    def _acknowledge(self, connection: int, message: MQTTMessage) -> None:
-        """Acknowledge a message of the present connection; one of an earlier connection comes again.
+    def _acknowledge(self, batch: Sequence[HeldMessage]) -> None:
+        """Acknowledge the messages of the present connection; those of an earlier connection come again.
 
-        Its number may by now be that of another message.
+        The number of one of these may by now be that of another message.
         """
-        if connection == self._connection:
-            self.client.ack(message.mid, message.qos)
+        for held in batch:
+            if held.connection == self._connection:
+                self.client.ack(held.message.mid, held.message.qos)
 
     def _hold_message(self, client: Client, data: object, message: MQTTMessage) -> None:
         """Hold a message; while too many are held, block the client's thread so that no more are read."""
         with self.changed:
             self.changed.wait_for(lambda: len(self._held) < HELD or not self.open)
-            self._held.append((self._connection, message, datetime.now(UTC)))
+            self._held.append(HeldMessage(self._connection, message, datetime.now(UTC)))
             if self.open:
                 self._loop.call_soon_threadsafe(self._some_held.set)
 

@@ -70,32 +70,42 @@ class Nats:
         self._retry, self._opening = Retry(str(address)), asyncio.Lock()
 
     async def receive(self) -> Batch | None:
-        """Wait for messages, connecting anew where needed; a gap in their count means that they are read again."""
+        """Wait for messages and return them, connecting anew where needed; a gap in their count has them read again."""
         while True:
             raise_if_cancelled()
-            # A request that times out is repeated; a broken connection gets a new consumer.
             reader = await self._repeat_while_away(self._open_reader)
-            try:
-                messages = await reader.fetch(MOST, WAIT)
-            except TimeoutError:
-                messages = []
-            except AWAY as error:
-                self._reader = None
-                await self._retry.wait(error)
+            messages = await self._fetch(reader)
+            # None where none came meanwhile, or the connection broke, which `_open_reader` sees.
+            if not messages or self._has_gap(messages):
                 continue
-            if not messages:  # none came meanwhile, or the connection broke, which `_open_reader` sees
-                continue
-            # The consumer counts what it sends: a gap means that messages were lost, and we read again from the last
-            # one that was acknowledged.
-            count = messages[-1].metadata.sequence.consumer
-            if count != self._read + len(messages):  # some were lost on the way here
-                self._reader = None
-                continue
-            self._read = count
             payloads = [payload for message in messages for payload in self._read_payloads(message)]
             if payloads:
                 return Batch(payloads, partial(self._acknowledge, messages[-1]))
             await self._acknowledge(messages[-1])  # topics that nobody reads
+
+    async def _fetch(self, reader: JetStreamContext.PullSubscription) -> list[Msg]:
+        """Return the next messages, [] where none came for a while; a broken connection gets a new consumer."""
+        try:
+            messages: list[Msg] = await reader.fetch(MOST, WAIT)
+        except TimeoutError:
+            return []
+        except AWAY as error:
+            self._reader = None
+            await self._retry.wait(error)
+            return []
+        return messages
+
+    def _has_gap(self, messages: Sequence[Msg]) -> bool:
+        """Return whether messages were lost on the way before the last of these; else count them as read.
+
+        The consumer counts what it sends. After a gap all is read again from the last message that was acknowledged.
+        """
+        count = messages[-1].metadata.sequence.consumer
+        if count != self._read + len(messages):
+            self._reader = None
+            return True
+        self._read = count
+        return False
 
     def _read_payloads(self, message: Msg) -> Sequence[Payload]:
         """Return a message in our form as it is, and of another subject what the sources read in it."""
@@ -152,34 +162,13 @@ class Nats:
         return self._client.is_connected
 
     async def _open(self) -> JetStreamContext:
-        """Return the connection, opened anew if it is broken."""
+        """Return the connection, opened anew if it is broken; raise the server's error if it cannot be."""
         async with self._opening:
             if self._server is not None and self._client.is_connected:
                 return self._server
-            # Connect without the client's reconnection, after which messages would arrive out of order.
             await self.close()
             self._client, self._server, self._reader = Client(), None, None
-            failures = list[Exception]()  # the client reports these by a callback and raises another error
-
-            async def note_failure(error: Exception) -> None:
-                """Keep an error of the connection that is being made."""
-                failures.append(error)
-
-            connecting = self._client.connect(
-                f"nats://{self.address.host}:{self.address.port}",
-                error_cb=note_failure,
-                user=self.address.user if self.address.password else None,
-                password=self.address.password,
-                token=None if self.address.password else self.address.user,
-                tls=self.address.tls(),
-                allow_reconnect=False,
-                connect_timeout=5,
-                reconnect_time_wait=FIRST,  # type: ignore[arg-type]  # between attempts at a server that is away
-            )
-            try:
-                await connecting
-            except NoServersError as error:
-                raise (failures[0] if failures and isinstance(failures[0], AWAY) else error) from None
+            await self._connect()
             LOG.info("%s: connected", self.address)
             # The stream of outputs that are published exactly once.
             server = self._client.jetstream(timeout=ANSWER)
@@ -188,26 +177,55 @@ class Nats:
             self._server = server
             return server
 
+    async def _connect(self) -> None:
+        """Connect the client, without its own reconnection, after which messages would arrive out of order."""
+        failures = list[Exception]()  # the client reports these by a callback and raises another error
+
+        async def note_failure(error: Exception) -> None:
+            """Keep an error of the connection that is being made."""
+            failures.append(error)
+
+        # A user without a password is a token.
+        connecting = self._client.connect(
+            f"nats://{self.address.host}:{self.address.port}",
+            error_cb=note_failure,
+            user=self.address.user if self.address.password else None,
+            password=self.address.password,
+            token=None if self.address.password else self.address.user,
+            tls=self.address.tls(),
+            allow_reconnect=False,
+            connect_timeout=5,
+            reconnect_time_wait=FIRST,  # type: ignore[arg-type]  # between attempts at a server that is away
+        )
+        try:
+            await connecting
+        except NoServersError as error:
+            raise (failures[0] if failures and isinstance(failures[0], AWAY) else error) from None
+
     async def _open_reader(self) -> JetStreamContext.PullSubscription:
-        """Return a consumer of this part that begins after the last acknowledged message; remove all others."""
+        """Return a consumer of this part that begins after the last acknowledged message; remove all others.
+
+        Raises:
+            TakenOverError: another process reads this part by now.
+        """
         if self._reader is not None and self._is_connected():
             return self._reader
         server = await self._open()
         newest = await self._make_stream(server)
         # Another process has taken over this part if our consumer is gone and there is another.
         prefix = f"part-{self.part.number}-of-{self.part.of}-"
-        of_part = [c for c in await server.consumers_info(self.stream) if c.name.startswith(prefix)]
-        if self._name and of_part and self._name not in [c.name for c in of_part]:
+        consumers = [each for each in await server.consumers_info(self.stream) if each.name.startswith(prefix)]
+        if self._name and consumers and self._name not in [each.name for each in consumers]:
             raise TakenOverError(f"{self.address}, part {self.part.number}: expected one reader, another took over")
         # Begin after the last message that any reader acknowledged.
-        floors = [c.ack_floor.stream_seq for c in of_part if c.ack_floor is not None]
-        own_floor = self._acknowledged if of_part else 0  # a stream without its consumers is a new one
-        self._acknowledged = min(max([own_floor, *floors]), newest)
+        acknowledged = [each.ack_floor.stream_seq for each in consumers if each.ack_floor is not None]
+        here = self._acknowledged if consumers else 0  # a stream without its consumers is a new one
+        self._acknowledged = min(max([here, *acknowledged]), newest)
         # Make the new consumer before the old ones are removed.
         self._name, self._read = prefix + uuid.uuid4().hex[:12], 0
         await server.add_consumer(self.stream, self._configure_consumer())
         self._reader = await server.pull_subscribe_bind(self._name, self.stream)
-        for old in of_part:
+        for old in consumers:
             await server.delete_consumer(self.stream, old.name)
         return self._reader
 

@@ -89,23 +89,31 @@ async def _read_rule(node: Node) -> Reporting:
     """Return the rule by which a variable is reported, 0 for what the server does not state."""
     interval = await _read_attribute(node, ua.AttributeIds.MinimumSamplingInterval)  # milliseconds; negative: unknown
     seconds = max(interval, 0.0) / 1e3
-    # The deviation is a property of the variable, or of its historical configuration.
-    places = [node]
+    # The deviation is a property of the variable, or of its historical configuration: the first that states one counts.
+    stating = [node]
     with contextlib.suppress(UaError):
-        places += await node.get_referenced_nodes(ua.ObjectIds.HasHistoricalConfiguration)
-    for stated_by in places:
-        deviation = await _read_property(stated_by, "ExceptionDeviation")
-        if deviation is None:
-            continue
-        # Absolute, or a share of the variable's range.
-        kind = await _read_property(stated_by, "ExceptionDeviationFormat")
-        bounds = await _read_property(node, "EURange")
-        if kind in (None, ABSOLUTE):
-            return Reporting(float(str(deviation)), seconds)
-        if int(str(kind)) == OF_RANGE and isinstance(bounds, ua.Range):
-            share = float(str(deviation)) / 100
-            return Reporting(share * (bounds.High - bounds.Low), seconds)
+        stating += await node.get_referenced_nodes(ua.ObjectIds.HasHistoricalConfiguration)
+    for owner in stating:
+        deadband = await _read_deadband(owner, node)
+        if deadband is not None:
+            return Reporting(deadband, seconds)
     return Reporting(0.0, seconds)
+
+
+async def _read_deadband(owner: Node, node: Node) -> float | None:
+    """Return the deadband of the variable `node`, in its unit, as `owner` states it; None if it does not.
+
+    It is the property ExceptionDeviation: absolute, or in percent of the variable's EURange.
+    """
+    deviation = await _read_property(owner, "ExceptionDeviation")
+    if deviation is None:
+        return None
+    kind, bounds = await _read_property(owner, "ExceptionDeviationFormat"), await _read_property(node, "EURange")
+    if kind in (None, ABSOLUTE):
+        return float(str(deviation))
+    if int(str(kind)) == OF_RANGE and isinstance(bounds, ua.Range):
+        return float(float(str(deviation)) / 100 * (bounds.High - bounds.Low))
+    return None
 
 
 class OpcUa:

@@ -47,31 +47,42 @@ class Pipe:
 
     def __init__(self, source: int = 0, target: int = 1, reader: MessageReader | None = None):
         self.source, self.target, self._reader = source, target, reader
-        self._rest, self._skipping, self._said = b"", False, False
+        self._rest = b""  # the begin of a line that has not ended
+        self._skipping = False  # whether the rest of a line is left out that was too long
+        self._said = False  # whether it was warned of what could not be unpacked
         self._newline: bytes | None = None  # what ends a line; known once something follows one
         self._text = TextStream("standard input" if reader is None else reader.source)
 
     async def receive(self) -> Batch | None:
         """Wait for lines of standard input, and return their messages; None at its end."""
-        loop = asyncio.get_running_loop()
         while True:
+            # What is unpacked goes on as long as the bytes read before have more in them.
             data, ended = b"", False
             if not self._text.more:
-                await _wait_until_ready(self.source, loop.add_reader, loop.remove_reader)
-                with name_path_in_errors("standard input"):
-                    data = self._read()
+                data = await self._wait_for_bytes()
                 ended = not data
             lines = self._split_lines(self._text.feed(data, ended), ended and not self._text.more)
             payloads: list[Payload] = list(lines) if self._reader is None else self._reader.read(lines)
-            if ended and self._reader is not None:
-                payloads += self._reader.end()
-            if ended and self._text.broken and not self._said:
-                self._said = True
-                LOG.warning("%s", self._text.broken)
+            if ended:
+                payloads += [] if self._reader is None else self._reader.end()
+                self._warn_if_broken()
             if payloads:
                 return Batch(payloads, nothing)
             if ended:
                 return None
+
+    async def _wait_for_bytes(self) -> bytes:
+        """Return the next bytes of the source, once there are any; b"" at its end."""
+        loop = asyncio.get_running_loop()
+        await _wait_until_ready(self.source, loop.add_reader, loop.remove_reader)
+        with name_path_in_errors("standard input"):
+            return self._read()
+
+    def _warn_if_broken(self) -> None:
+        """Warn, once, that what came could not be unpacked to its end."""
+        if self._text.broken and not self._said:
+            self._said = True
+            LOG.warning("%s", self._text.broken)
 
     def _read(self) -> bytes:
         """Read what is there; of a sender that is ahead also what it sends next."""

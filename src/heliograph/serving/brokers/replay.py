@@ -141,28 +141,41 @@ def simulate_link(events: Sequence[Event], link: Link, seed: int) -> list[Event]
     chance = np.random.default_rng(check_seed("seed", seed))
     loss, twice = scalar("loss", link.loss, 0, 1), scalar("duplicates", link.duplicates, 0, 1)
     scalar("delay", link.delay, 0, FAR)
-    # Markov chain of losses with stationary probability pi = loss: P(loss | no loss) = pi P(no loss | loss) / (1 - pi).
-    # With run 1 losses are independent: both probabilities are pi.
-    after_loss = 1 - 1 / scalar("run", link.run, 1)
-    after_success = loss
-    if loss == 1:
-        after_success = 1.0
-    elif link.run > 1:
-        after_success = loss * (1 - after_loss) / (1 - loss)
-    if after_success > 1:
-        raise fail("run", f"at least {loss / (1 - loss):g}, for so many losses", link.run)
-    arriving, lost = list[Event](), dict[str, bool]()
+    after_loss, after_success = _find_loss_probabilities(loss, scalar("run", link.run, 1))
+    arriving, lost = list[Event](), dict[str, bool]()  # of each node whether its newest message was lost
     for event in events:
         if event.node == INPUTS:
             arriving.append(_delay_event(event, 0.0))
             continue
         # The first state of the chain is drawn from the stationary law.
         lost_before = lost.get(event.node, chance.random() < loss)
-        is_lost = chance.random() < (after_loss if lost_before and link.run > 1 else after_success)
+        is_lost = chance.random() < (after_loss if lost_before else after_success)
         lost[event.node] = is_lost
         copies = 0 if is_lost else 1 + (chance.random() < twice)
         arriving += [_delay_event(event, chance.exponential(link.delay)) for _ in range(copies)]
     return _sort_events(arriving)
+
+
+def _find_loss_probabilities(loss: float, run: float) -> tuple[float, float]:
+    """Return P(loss | loss) and P(loss | no loss) of the chain of losses.
+
+    Args:
+        loss: its stationary probability pi of a loss.
+        run: mean number of consecutive losses: P(loss | loss) = 1 - 1/run. With 1 losses are independent.
+
+    Raises:
+        ValueError: losses so frequent that their runs are longer.
+    """
+    if run == 1:
+        return loss, loss
+    after_loss = 1 - 1 / run
+    if loss == 1:
+        return after_loss, 1.0
+    # Balance of the stationary law: (1 - pi) P(loss | no loss) = pi P(no loss | loss).
+    after_success = loss * (1 - after_loss) / (1 - loss)
+    if after_success > 1:
+        raise fail("run", f"at least {loss / (1 - loss):g}, for so many losses", run)
+    return after_loss, after_success
 
 
 def delay_as_traced(events: Sequence[Event], trace: Path) -> list[Event]:

@@ -82,24 +82,36 @@ def make_discovery_messages(topic: str, states: Sequence[str], body: bytes, pref
     plant = str(estimate["plant"])
     device = {"identifiers": [f"{topic.replace('/', '-')}-{encode_name(plant).replace('%', '_')}"],
               "name": plant or topic, "manufacturer": "heliograph"}  # fmt: skip
+    nodes_with_senders = _read_dead(estimate).keys()
     for place, i, _ in _iterate_states(topic, states, estimate):
-        common: dict[str, Any] = {
-            "state_topic": place.topic,
-            "availability_topic": availability_topic(topic),
-            "device": device,
-        }
-        number = {"state_class": "measurement", **({"unit_of_measurement": u} if (u := unit_of(states[i])) else {})}
-        parts = [
-            ("sensor", "value", place.label, number),
-            ("sensor", "deviation", f"{place.label} deviation", number | {"entity_category": "diagnostic"}),
-        ]
-        if place.node in _read_dead(estimate):
-            dead = {"payload_on": "1", "payload_off": "0", "device_class": "problem"}
-            parts.append(("binary_sensor", "dead", f"{place.label} sender dead", dead))
-        for kind, key, name, more in parts:
-            identity = f"{place.identity}-{key}"
-            said = {"name": name, "unique_id": identity, "value_template": f"{{{{ value_json.{key} }}}}"}
-            yield StateMessage(f"{prefix}/{kind}/{identity}/config", json.dumps(said | common | more).encode())
+        common = {"state_topic": place.topic, "availability_topic": availability_topic(topic), "device": device}
+        for sensor in _list_sensors(place, unit_of(states[i]), place.node in nodes_with_senders):
+            identity = f"{place.identity}-{sensor.key}"
+            named = {"name": sensor.name, "unique_id": identity, "value_template": f"{{{{ value_json.{sensor.key} }}}}"}
+            content = json.dumps(named | common | sensor.settings).encode()
+            yield StateMessage(f"{prefix}/{sensor.kind}/{identity}/config", content)
+
+
+class _Sensor(NamedTuple):
+    """A sensor that Home Assistant shows: its kind there, the key of its value in a state's message, name, settings."""
+
+    kind: str
+    key: str
+    name: str
+    settings: dict[str, Any]
+
+
+def _list_sensors(place: _State, unit: str | None, has_sender: bool) -> list[_Sensor]:
+    """Return the sensors of a state: its value and deviation, and a dead sender, if its node has one that may be."""
+    number = {"state_class": "measurement"} | ({"unit_of_measurement": unit} if unit else {})
+    sensors = [
+        _Sensor("sensor", "value", place.label, number),
+        _Sensor("sensor", "deviation", f"{place.label} deviation", number | {"entity_category": "diagnostic"}),
+    ]
+    if has_sender:
+        dead = {"payload_on": "1", "payload_off": "0", "device_class": "problem"}
+        sensors.append(_Sensor("binary_sensor", "dead", f"{place.label} sender dead", dead))
+    return sensors
 
 
 def _read_dead(estimate: Mapping[str, Any]) -> dict[str, int]:

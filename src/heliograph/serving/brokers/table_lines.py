@@ -105,37 +105,50 @@ class TimeRowReader:
     """
 
     def __init__(self, network: Network, header: list[str], text: CsvReader, ignore_unknown: bool):
-        self._network, self._steps = network, TIME_STEP not in network.inputs
+        self._network, self._steps = network, TIME_STEP not in network.inputs  # the latter: time counts steps
         self._rows = RowReader(network, text.source, strict=False, ignore_unknown=ignore_unknown)
         self._columns = CsvColumnReader(text.source, text.path, self._rows.only, strict=False)
         self._columns.header = header
         self._given = [name for name in network.inputs if name != TIME_STEP]
-        self._origin: np.datetime64 | None = None
+        self._origin: np.datetime64 | None = None  # date of the first row, from which times are counted
         self._before: float | None = None  # time of the row before
-        self._whole = text.path is not None
+        self._is_file = text.path is not None
         self._cells = list[RowsAsColumns]()  # those of a file, until it ends
 
     def read(self, rows: Sequence[CsvRow | InputError]) -> list[Payload]:
-        """Return the messages of rows, as a replay of them has them, and why others cannot be read."""
+        """Return the messages of rows, as a replay of them has them, and why others cannot be read.
+
+        Those of a file are kept until its end, and only the latter returned.
+        """
         cells = self._rows.read_cells(self._columns.read(rows))
         refused, self._rows.refused = [str(error) for error in self._rows.refused], []
         count = len(cells.numbers)
-        if not count or self._whole:
+        if not count or self._is_file:
             self._cells += [cells] if count else []
             return [*refused]
         time = self._time_of_messages(cells.time, cells.numbers)
         if TIME_STEP in cells.inputs:
-            # With the time of the row before, so that the first step can be checked too; the check takes no step and
-            # number of that row, in whose place those of the first row stand.
-            dt, before = cells.inputs[TIME_STEP], [] if self._before is None else [self._before]
-            numbers = np.concatenate([cells.numbers[: len(before)], cells.numbers])
-            steps = np.concatenate([dt[: len(before)], dt])
-            check_time_steps(steps, np.concatenate([before, time]), numbers, self._rows.source)
+            self._check_time_steps(cells, time)
         inputs = np.stack([cells.inputs[name] for name in self._given], axis=1) if self._given else np.zeros((count, 0))
         events = row_events(cells.numbers - 1, time, inputs, cells.measurements, self._before, self._steps)
         lines = [json.dumps(encode_event(event, "", self._origin)).encode() for event in events]
         self._before = float(time[-1])
         return [*lines, *refused]
+
+    def _check_time_steps(self, cells: RowsAsColumns, time: np.ndarray) -> None:
+        """Raise ValueError where a row's time step is not the time since the row before; `time`: times of the rows.
+
+        With the time of the row before them, the first step can be checked too. The check takes no step and no number
+        of that row, in whose place those of the first row stand.
+        """
+        before = [] if self._before is None else [self._before]
+        steps = cells.inputs[TIME_STEP]
+        check_time_steps(
+            np.concatenate([steps[: len(before)], steps]),
+            np.concatenate([before, time]),
+            np.concatenate([cells.numbers[: len(before)], cells.numbers]),
+            self._rows.source,
+        )
 
     def end(self) -> list[Payload]:
         """Return the messages of the rows of a file."""

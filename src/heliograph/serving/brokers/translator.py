@@ -149,17 +149,21 @@ class Translator:
             for reading in self.sources.read(topic, content, where):
                 if isinstance(reading, Unread):
                     results.append(self._explain_unread(where, reading, arrival, repeatable))
-                    continue
-                if stored and reading.time is None:
+                elif stored and reading.time is None:  # only its arrival would date it
                     self._stored += 1
-                    continue
-                results.append(self._make_message(where, reading, arrival, repeatable))
-                self.sources.senders.note(topic, reading.plant, reading.node, content, self.sources.list_fields(topic))
-                for said in self.sources.senders.lines_now_and_then():
-                    LOG.warning("%s", said)
+                else:
+                    results.append(self._make_message(where, reading, arrival, repeatable))
+                    self._watch_for_several_senders(topic, reading, content)
         except InputError as error:
             results.append(str(error))
         return results
+
+    def _watch_for_several_senders(self, topic: str, reading: Reading, content: object) -> None:
+        """Note the fields of a message, by which several senders of one node can be told; warn of them now and then."""
+        senders = self.sources.senders
+        senders.note_fields(topic, reading.plant, reading.node, content, self.sources.list_fields(topic))
+        for line in senders.lines_now_and_then():
+            LOG.warning("%s", line)
 
     def _explain_unread(
         self, topic: str, unread: Unread, known: datetime | None, repeatable: bool
@@ -185,40 +189,56 @@ class Translator:
             repeatable: whether a copy of it may come again.
         """
         if len(reading.plant) > NAME or "\0" in reading.plant:
-            raise fail(
-                f"{topic}, plant", f"a name of at most {NAME} characters, without NUL", show_value(reading.plant)
-            )
+            expected = f"a name of at most {NAME} characters, without NUL"
+            raise fail(f"{topic}, plant", expected, show_value(reading.plant))
         arrival = datetime.now(UTC) if known is None else known
-        reading = self.sources.date_as_original(
-            reading, None if known is None else (arrival - EPOCH) // MICROSECOND * 1000
-        )
-        time: datetime | float = arrival
-        came: datetime | None = None
-        if reading.time is not None and self.sources.steps and self.sources.step is None:
-            time = float(reading.time)
-        elif reading.time is not None:
-            time = date_of(reading.time)
-            if known is not None and (arrival - time) // MICROSECOND * 1000 > YEAR:
-                what = f"{topic}, time"
-                raise fail(what, f"a time that was set, near that of arrival, {arrival.isoformat()}", time.isoformat())
-            # A log's arrival is told; of what comes now, only that it cannot have been measured later than it came.
-            came = arrival if time > arrival or (known is not None and not repeatable) else None
-        sequence, name = reading.sequence, (reading.plant, reading.node)
-        if sequence is None:
-            sequence = (
-                self._counts[name] if reading.time is None else self._number_among_simultaneous(reading, repeatable)
-            )
-            self._counts[name] += 1
+        nanoseconds = None if known is None else (known - EPOCH) // MICROSECOND * 1000
+        reading = self.sources.date_as_original(reading, nanoseconds)
+        time = self._date_reading(topic, reading, arrival, is_known=known is not None)
+        # A log's arrival is told; of what comes now, only that it cannot have been measured later than it came.
+        told_arrival: datetime | None = None
+        if reading.time is not None and isinstance(time, datetime):
+            is_log = known is not None and not repeatable
+            told_arrival = arrival if time > arrival or is_log else None
         # Checked already, and dates are no texts here.
         return Message.model_construct(
             plant=reading.plant,
             node=reading.node,
-            sequence=sequence,
+            sequence=self._count_reading(reading, repeatable),
             time=time,
             values=[None if value != value else value for value in reading.values.tolist()],
             inputs=None,
-            arrival=came,
+            arrival=told_arrival,
         )
+
+    def _date_reading(self, topic: str, reading: Reading, arrival: datetime, is_known: bool) -> datetime | float:
+        """Return when a reading was measured: a date, or a number of steps; without a time, when it arrived.
+
+        Raises ValueError, which names the topic, at a date of more than a year before a known arrival.
+        """
+        if reading.time is None:
+            return arrival
+        if self.sources.steps and self.sources.step is None:
+            return float(reading.time)
+        time = date_of(reading.time)
+        if is_known and (arrival - time) // MICROSECOND * 1000 > YEAR:
+            expected = f"a time that was set, near that of arrival, {arrival.isoformat()}"
+            raise fail(f"{topic}, time", expected, time.isoformat())
+        return time
+
+    def _count_reading(self, reading: Reading, repeatable: bool) -> int:
+        """Return a reading's own count, or else a number: among those of its node and time, or of its node.
+
+        `repeatable`: whether a copy of it may come again, which gets the same number.
+        """
+        if reading.sequence is not None:
+            return reading.sequence
+        name = reading.plant, reading.node
+        number = self._counts[name]
+        if reading.time is not None:
+            number = self._number_among_simultaneous(reading, repeatable)
+        self._counts[name] += 1
+        return number
 
     def _number_among_simultaneous(self, reading: Reading, repeatable: bool) -> int:
         """Return the sequence number of a message without a count: how many of its node and time came before it.

@@ -75,23 +75,29 @@ def parse_address(url: str, environment: Mapping[str, str] | None = None) -> Add
     # Scheme, host and port; nothing of a URL that cannot be read is printed, since it may contain a password.
     try:
         parts = urlsplit(url)
-        host, port = parts.hostname, parts.port
+        scheme, host, port = parts.scheme, parts.hostname, parts.port
     except ValueError:
         raise fail("broker", shape, "an address that cannot be read") from None
-    is_known = parts.scheme in PORTS
-    is_offered = not is_known and bool(parts.scheme) and find_plugin(BROKERS, parts.scheme) is not None
+    is_known = scheme in PORTS
+    is_offered = not is_known and bool(scheme) and find_plugin(BROKERS, scheme) is not None
     if not (is_known or is_offered) or not host or parts.query or parts.fragment:
-        raise fail("broker", shape, f"{parts.scheme}://{host or ''}")
+        raise fail("broker", shape, f"{scheme}://{host or ''}")
     user = environment.get(USER) or (unquote(parts.username) if parts.username else None)
     password = environment.get(PASSWORD) or (unquote(parts.password) if parts.password else None)
-    if parts.scheme == "opc.tcp":
-        path = unquote(parts.path).strip("/")
-        return Address("opc.tcp", host, port or PORTS[parts.scheme], path, False, user, password)
-    # Words of the topic must be valid in MQTT and NATS.
-    topic = unquote(parts.path).strip("/") or TOPIC
+    path = unquote(parts.path).strip("/")
+    return Address(
+        kind={"mqtts": "mqtt", "nats+tls": "nats"}.get(scheme, scheme),
+        host=host,
+        port=port or PORTS.get(scheme, 0),
+        topic=path if scheme == "opc.tcp" else _check_topic(path or TOPIC),
+        secure=scheme in SECURE,
+        user=user,
+        password=password,
+    )
+
+
+def _check_topic(topic: str) -> str:
+    """Return a topic if its words are valid in MQTT and NATS; raise ValueError otherwise."""
     if any(sign in topic for sign in "*>+#.$ ") or not topic.isprintable():
         raise fail("broker, topic", "words between slashes, without . * > + # $ and spaces", topic)
-    if is_offered:
-        return Address(parts.scheme, host, port or 0, topic, False, user, password)
-    kind = "mqtt" if parts.scheme.startswith("mqtt") else "nats"
-    return Address(kind, host, port or PORTS[parts.scheme], topic, parts.scheme in SECURE, user, password)
+    return topic

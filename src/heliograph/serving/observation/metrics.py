@@ -19,6 +19,14 @@ NIS = {
     "nis_low": "Least that is expected of an honest filter.",
     "nis_high": "Most that is expected of an honest filter.",
 }
+OUTPUTS = {
+    "weight": "Mean weight of an output's values, of the last rows of a filter that weighs; 1 counts in full.",
+    "share": "Share of an output's values that were down-weighted, below a weight of 1/2.",
+    "share_low": "Lower end of its interval of 95 %.",
+    "share_high": "Upper end of its interval of 95 %.",
+    "bias": "Median of an output's innovations, in its unit.",
+    "squared": "Mean square of an output's innovations over their variance; 1.",
+}
 
 
 class ServiceMetrics(Collector):
@@ -51,7 +59,7 @@ class ServiceMetrics(Collector):
 
 def _collect_plants(watch: Watch) -> Iterable[Metric]:
     """Yield the tests of each plant where there are few, else of the worst, and how many plants are wrong."""
-    worst, labels = watch.worst(), ["plant", "node", "filter"]
+    worst, labels = watch.list_worst_plants(), ["plant", "node", "filter"]
     wrong = GaugeMetricFamily("heliograph_plants_wrong", "Plants with something wrong.", labels=["what"])
     wrong.add_metric(["dead sender"], sum(bool(item.dead) for item in worst))
     wrong.add_metric(["doubted claim"], sum(bool(item.doubts) for item in worst))
@@ -81,15 +89,20 @@ def _collect_crossings(watch: Watch) -> Metric:
 
 
 def _collect_links(watch: Watch) -> Iterable[Metric]:
-    """Return the metrics of the nodes' messages: by verdict, lost, what was refused by reason, and timeouts."""
+    """Return the metrics of the nodes' messages: by verdict, lost, what was refused by reason, and timeouts.
+
+    Nodes whose messages carry no count have no number of lost ones.
+    """
+    # The metrics, with the labels of each.
     messages = CounterMetricFamily("heliograph_messages", "Messages by node and verdict.", labels=["node", "verdict"])
     lost = GaugeMetricFamily("heliograph_lost", "Gaps in a node's sequence numbers, now.", labels=["node"])
     what = "Values that count as not arrived, by reason; of flag and counter messages. A gate is of a filter."
     refused = CounterMetricFamily("heliograph_refused", what, labels=["node", "filter", "reason"])
-    quiet = "Silences longer than a node's timeout that have ended; heliograph_dead_senders has those that last."
-    timeouts = CounterMetricFamily("heliograph_timeouts", quiet, labels=["node"])
-    said = "Runs of equal readings longer than noise allows, of a node that does not refuse them (stuck=)."
-    held = CounterMetricFamily("heliograph_held", said, labels=["node"])
+    what = "Silences longer than a node's timeout that have ended; heliograph_dead_senders has those that last."
+    timeouts = CounterMetricFamily("heliograph_timeouts", what, labels=["node"])
+    what = "Runs of equal readings longer than noise allows, of a node that does not refuse them (stuck=)."
+    held = CounterMetricFamily("heliograph_held", what, labels=["node"])
+    # Their values, by node; what a gate left out by filter.
     for node, tally in watch.links().items():
         for verdict in VERDICTS:
             messages.add_metric([node, verdict], tally[verdict] or 0)
@@ -99,8 +112,8 @@ def _collect_links(watch: Watch) -> Iterable[Metric]:
             refused.add_metric([node, "", reason], tally[reason] or 0)
         timeouts.add_metric([node], tally["timeouts"] or 0)
         held.add_metric([node], tally["held"] or 0)
-    for (node, filter), count in watch.outputs.left_out.items():
-        refused.add_metric([node, filter, "gate"], count)
+    for (node, filter_name), count in watch.outputs.left_out.items():
+        refused.add_metric([node, filter_name, "gate"], count)
     return messages, lost, refused, timeouts, held
 
 
@@ -146,20 +159,11 @@ def _collect_nis(watch: Watch) -> Iterable[Metric]:
 
 
 def _collect_outputs(watch: Watch) -> Iterable[Metric]:
-    """Return the metrics of each output of filters that weigh: weight, share down-weighted, its innovations' bias."""
-    what = {
-        "weight": "Mean weight of an output's values, of the last rows of a filter that weighs; 1 counts in full.",
-        "share": "Share of an output's values that were down-weighted, below a weight of 1/2.",
-        "share_low": "Lower end of its interval of 95 %.",
-        "share_high": "Upper end of its interval of 95 %.",
-        "bias": "Median of an output's innovations, in its unit.",
-        "squared": "Mean square of an output's innovations over their variance; 1.",
-    }
+    """Return the metrics of each output of filters that weigh, in OUTPUTS; none where there are too few rows."""
     metrics = {
         name: GaugeMetricFamily(f"heliograph_output_{name}", words, labels=["node", "filter", "output"])
-        for name, words in what.items()
+        for name, words in OUTPUTS.items()
     }
-    # Numbers of each output of each filter that weighs; none where there are too few rows.
     for output in watch.outputs.summarise_outputs():
         numbers = summarise_output(output)
         for name, metric in metrics.items():

@@ -60,7 +60,7 @@ class TroubleOverview:
         """Note that a plant has had a message, or that its silence has changed."""
         self.touched.add(plant)
 
-    def worst(
+    def list_worst_plants(
         self,
         tests: Mapping[str, Mapping[Name, RunningNis]],
         dead: Mapping[str, Sequence[str]],
@@ -92,7 +92,7 @@ def find_doubts(tests: Mapping[Name, RunningNis]) -> Iterable[FilterDoubt]:
         if test.numbers < FEWEST or (test.ratio - 1.0) ** 2 * test.mean**2 < NEAR**2 * test.variance:
             continue
         low, high = test.band()
-        if test.doubt() is not None:
+        if test.explain_doubt() is not None:
             doubts.append(FilterDoubt(node, name, test.ratio, low, high))
     return sorted(doubts, key=lambda doubt: doubt.size, reverse=True)
 

@@ -97,7 +97,7 @@ def _is_loopback(host: str) -> bool:
 
 def make_overview_page(watch: Watch) -> str:
     """Return the page of all plants, the worst first."""
-    return make_plants_page(watch.title, {name for name, _ in watch.plants()}, watch.worst(), LISTED)
+    return make_plants_page(watch.title, {name for name, _ in watch.plants()}, watch.list_worst_plants(), LISTED)
 
 
 def make_application(watch: Watch, token: str | None, stopped: asyncio.Event, hosts: Sequence[str] = ()) -> Starlette:
@@ -105,18 +105,18 @@ def make_application(watch: Watch, token: str | None, stopped: asyncio.Event, ho
 
     Without a token, or where `hosts` are given, it answers to these names and those of this machine alone.
     """
-    tallies = ServiceMetrics(watch)
+    counts = ServiceMetrics(watch)
     overview = LastAnswers(watch.lock, lambda _: make_overview_page(watch), make_overview_page(watch))
 
     def page(request: Request) -> Response:
         """Answer with the page, the first view in place of its only "null"; all others come from /events."""
         # Without a "<" no name ends the element that the view stands in.
-        first = json.dumps(watch.view(request.query_params.get("plant"))).replace("<", "\\u003c")
+        first = json.dumps(watch.make_page_data(request.query_params.get("plant"))).replace("<", "\\u003c")
         return Response(_read_page_file("page.html").replace("null", first, 1), media_type="text/html", headers=POLICY)
 
     def metrics(_: Request) -> Response:
         """Answer with all counts, in the text format of Prometheus."""
-        return Response(tallies.text(), media_type=CONTENT_TYPE_LATEST)
+        return Response(counts.text(), media_type=CONTENT_TYPE_LATEST)
 
     def events(request: Request) -> Response:
         """Answer with a stream of views, a server-sent event each."""
@@ -133,14 +133,23 @@ def make_application(watch: Watch, token: str | None, stopped: asyncio.Event, ho
             return PlainTextResponse(f"a batch has been taken for {busy:.0f} s", 503)
         return PlainTextResponse("ok")
 
-    # The token is checked for every other route; a page of elsewhere that names itself 127.0.0.1 does not get in.
+    answers = {"/": page, "/metrics": metrics, "/events": events, "/plants": plants, HEALTH: health}
+    answers |= {f"/{name}": send_page_file for name in KINDS}
+    routes = [Route(path, answer) for path, answer in answers.items()]
+    return Starlette(routes=routes, middleware=_make_middleware(token, hosts))
+
+
+def _make_middleware(token: str | None, hosts: Sequence[str]) -> list[Middleware]:
+    """Return what each request passes: the check of the token, and before it, where it is needed, that of the host.
+
+    Without a token a page of elsewhere that names itself 127.0.0.1 does not get in; nor where `hosts` are given one
+    that asks for another.
+    """
     middleware = [Middleware(TokenMiddleware, token)]
     if token is None or hosts:
         allowed = [*LOOPBACK, *hosts]
         middleware.insert(0, Middleware(TrustedHostMiddleware, allowed_hosts=allowed, www_redirect=False))
-    routes = [Route("/", page), Route("/metrics", metrics), Route("/events", events), Route("/plants", plants)]
-    routes.append(Route(HEALTH, health))
-    return Starlette(routes=[*routes, *(Route(f"/{name}", send_page_file) for name in KINDS)], middleware=middleware)
+    return middleware
 
 
 def _read_page_file(name: str) -> str:
@@ -158,7 +167,7 @@ async def _yield_events(watch: Watch, request: Request, stopped: asyncio.Event) 
     """Yield the view whenever it has changed, else a comment, so that we notice a reader that has gone."""
     plant, since, before = request.query_params.get("plant"), 0, None
     while not (stopped.is_set() or await request.is_disconnected()):
-        view = await asyncio.to_thread(watch.view, plant, since)
+        view = await asyncio.to_thread(watch.make_page_data, plant, since)
         plant, since = view["plant"] if view["points"] else plant, view["newest"]
         known = json.dumps(view)
         yield f"data: {known}\n\n" if known != before else ": \n\n"
@@ -214,6 +223,10 @@ class _PageServer(uvicorn.Server):
 async def serve_page(watch: Watch, at: PageAddress) -> AsyncIterator[int]:
     """Serve the page for the duration of a block, which receives its port.
 
+    Args:
+        watch: the observer of the services.
+        at: where; port 0 takes any that is free.
+
     Raises:
         ValueError: an address that is taken, or not this machine's.
     """
@@ -222,19 +235,18 @@ async def serve_page(watch: Watch, at: PageAddress) -> AsyncIterator[int]:
     except OSError as error:
         why = str(error.strerror).split(" (")[0]  # without the address again
         raise fail("page", "a free port of this machine", f"{at.host}:{at.port}, {why}") from None
+    # Readers of the page would hold the server: they are told when it stops, and have three seconds.
     stopped = asyncio.Event()
-    config = uvicorn.Config(
-        make_application(watch, at.token, stopped, at.hosts),
-        log_level="warning",
-        access_log=False,
-        timeout_graceful_shutdown=3,
+    application = make_application(watch, at.token, stopped, at.hosts)
+    server = _PageServer(
+        uvicorn.Config(application, log_level="warning", access_log=False, timeout_graceful_shutdown=3)
     )
-    server = _PageServer(config)
     serving = asyncio.ensure_future(server.serve([listener]))
     try:
-        yield int(listener.getsockname()[1])
+        _, port, *_ = listener.getsockname()
+        yield int(port)
     finally:
-        stopped.set()  # readers of the page would hold the server
+        stopped.set()
         server.should_exit = True
         await serving
 

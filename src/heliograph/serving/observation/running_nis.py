@@ -51,7 +51,7 @@ class RunningNis:
         low, high = gammaincinv(shape, [DOUBT / 2, 1 - DOUBT / 2]) / shape
         return float(low), float(high)
 
-    def doubt(self) -> str | None:
+    def explain_doubt(self) -> str | None:
         """Explain why the claim is doubtful, or return None."""
         low, high = self.band()
         if self.numbers < FEWEST:

@@ -6,17 +6,18 @@ from contextlib import contextmanager
 from shlex import quote
 from typing import Any
 
-from sqlalchemy import Column, Connection, Table, delete, func, inspect, select, update
+from sqlalchemy import Connection, Table, delete, func, inspect, select, update
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import SQLAlchemyError
 
 from heliograph.live.stored.migration import DESCRIPTION, LISTED, PlantMigration, list_changes
 from heliograph.live.stored.snapshot import Identity, check_same_network, versions
 from heliograph.numerics.check import InputError, fail, table
-from heliograph.serving.output import Output
+from heliograph.serving.output import Output, parse_output
 from heliograph.serving.storage.database import is_away, open_database
 from heliograph.serving.storage.store_protocol import AwayError, ConflictError, Damage, Entry, StoredPlant
 from heliograph.serving.storage.tables import (
+    AT_ONCE,
     CARRIED,
     IDENTITY_TABLE,
     JOURNAL,
@@ -28,13 +29,13 @@ from heliograph.serving.storage.tables import (
     checksum,
     is_named,
     is_whole,
+    select_plants,
     with_checksum,
 )
 
 PUBLISHED, NEWEST, MALFORMED = "published to the reader of {}", "journal", "malformed"
 WORD, TOPIC = "last word on ", 200  # longest topic of which a word is kept
 IDENTITY = "identity"
-AT_ONCE = 500  # names in one question
 MEND = "its plants go on in a new store with --store NEW --from-snapshot"
 
 
@@ -69,20 +70,15 @@ class Store:
         opened: "Store | None" = None,
         carrier: PlantMigration | None = None,
     ):
-        self.process, self.journal, self.identity = process, journal, {}
+        self.process, self.journal = process, journal
+        self.identity: Identity = {}
+        mine = None if mine is None else table("identity of a store", mine, "texts") | {LAYOUT_KEY: LAYOUT}
         self._engine = open_database(location)
         self._insert: Any = postgresql.insert if self._engine.dialect.name == "postgresql" else sqlite.insert
-        mine = None if mine is None else table("identity of a store", mine, "texts") | {LAYOUT_KEY: LAYOUT}
+        # A store that cannot be used is closed.
         try:
             with self._name_store_in_errors("a database that can be written"):
-                self.identity = self._read_identity(mine)
-                self._check_layout(carrier is not None or mine is None)
-                # The network must be the same, unless its plants are carried over or any will do.
-                if carrier is None and mine is not None:
-                    self._check_network(mine)
-                self.damaged: dict[str, Damage] = self._find_damaged() if opened is None else opened.damaged
-                if carrier is not None and self.identity != carrier.mine | {LAYOUT_KEY: LAYOUT}:
-                    self.carry(carrier, f"store {self.name}", self.identity)
+                self._open_state(mine, opened, carrier)
         except AwayError:
             self.close()
             raise
@@ -91,6 +87,26 @@ class Store:
             fits = carrier is None and self.identity.get(LAYOUT_KEY) in CARRIED
             more = "; --accept-changes goes on with what fits" if fits else ""
             raise InputError(f"{error}; to begin anew, name another{more}") from None
+
+    def _open_state(self, mine: Identity | None, opened: "Store | None", carrier: PlantMigration | None) -> None:
+        """Read the identity and check that the state can be used; find damage, and carry plants over where asked to.
+
+        Args:
+            mine: identity of the network, with the layout of this version; None opens any.
+            opened: a store open on the same location, which has already looked for damage.
+            carrier: carries the plants of another network over; None refuses these.
+
+        Raises:
+            ValueError: a state that cannot be used.
+        """
+        self.identity = self._read_identity(mine)
+        self._check_layout(carrier is not None or mine is None)
+        # The network must be the same, unless its plants are carried over or any will do.
+        if carrier is None and mine is not None:
+            self._check_network(mine)
+        self.damaged: dict[str, Damage] = self._find_damaged() if opened is None else opened.damaged
+        if carrier is not None and self.identity != carrier.mine | {LAYOUT_KEY: LAYOUT}:
+            self.carry(carrier, f"store {self.name}", self.identity)
 
     def _check_network(self, mine: Identity) -> None:
         """Raise ValueError, which names what differs, if the store's state is of another network than `mine`."""
@@ -120,18 +136,21 @@ class Store:
             raise fail(f"store {self.name}", expected, str(said)) from None
 
     def _read_identity(self, mine: Identity | None) -> Identity:
-        """Return the identity that the store was made with; a new store takes `mine`."""
+        """Return the identity that the store was made with; a new store takes `mine`.
+
+        Raises:
+            ValueError: a store that is damaged, or is new where there is no `mine`.
+        """
         # All tables are there, or none: a store with some missing is damaged.
-        there = set(inspect(self._engine).get_table_names()) & set(TABLES.tables)
-        if there and there != set(TABLES.tables):
-            raise self._fail_unreadable(f"no table {', '.join(sorted(set(TABLES.tables) - there))}")
+        tables = set(inspect(self._engine).get_table_names()) & set(TABLES.tables)
+        if tables and tables != set(TABLES.tables):
+            raise self._fail_unreadable(f"no table {', '.join(sorted(set(TABLES.tables) - tables))}")
         TABLES.create_all(self._engine)
         with self._engine.begin() as connection:
-            # A store without an identity is new, unless it has counted something.
-            stored = connection.execute(
-                select(IDENTITY_TABLE.c.value).where(IDENTITY_TABLE.c.name == IDENTITY)
-            ).scalar()
+            this = select(IDENTITY_TABLE.c.value).where(IDENTITY_TABLE.c.name == IDENTITY)
+            stored = connection.execute(this).scalar()
             if stored is None:
+                # A store without an identity is new, unless it has counted something.
                 if connection.execute(select(func.count()).select_from(NUMBERS)).scalar():
                     raise self._fail_unreadable("no network that it is of")
                 if mine is None:
@@ -142,7 +161,7 @@ class Store:
             identity = dict(json.loads(stored))
         except (ValueError, TypeError):
             raise self._fail_unreadable("no network that it is of") from None
-        return {LAYOUT_KEY: "1"} | identity
+        return {LAYOUT_KEY: "1"} | identity  # the first layout did not name itself
 
     def _check_layout(self, carried: bool) -> None:
         """Raise ValueError at a store of another layout, unless its plants are `carried` over and its layout can be."""
@@ -181,7 +200,7 @@ class Store:
         """Load the stored plants of these names; of some only damage may be left."""
         names = list(names)
         with self._name_store_in_errors("a database that can be read"), self._engine.connect() as connection:
-            rows = _select_plants(connection, list(PLANTS.c), names)
+            rows = select_plants(connection, list(PLANTS.c), names)
         results = {}
         for name, version, body, written in rows:
             if is_whole(written, name, version, body):
@@ -225,24 +244,31 @@ class Store:
     def _commit_at_once(
         self, plants: Mapping[str, StoredPlant], entries: Sequence[Entry], malformed: int, published: int | None
     ) -> list[Output]:
-        """Commit in one transaction: check the versions, then write plants, journal and counts."""
+        """Commit in one transaction: check the versions, then write plants, journal and counts; return the outputs.
+
+        Args:
+            plants: the changed plants, by name, with the versions that they were read with.
+            entries: what goes into the journal.
+            malformed: how many more messages could not be read.
+            published: number of the newest output that was published; None if none was since the last commit.
+        """
         with self._engine.begin() as connection:
             # The count locks the store for the other processes, which then see the new versions.
-            newest = self._count(connection, NEWEST, len(entries))
-            versions = dict(_select_plants(connection, (PLANTS.c.name, PLANTS.c.version), list(plants)))
+            newest = self._add_to_count(connection, NEWEST, len(entries))
+            versions = dict(select_plants(connection, (PLANTS.c.name, PLANTS.c.version), list(plants)))
             if any(versions.get(name, 0) != plant.version for name, plant in plants.items()):
                 raise ConflictError
             outputs = Entry.numbered(entries, newest - len(entries) + 1)
             # Plants with their next version, the batch in the journal, and the counts.
             if plants:
-                after = ((name, plant.version + 1, plant.body) for name, plant in plants.items())
-                self._put(connection, PLANTS, [with_checksum(PLANTS, *row) for row in after])
+                next_versions = ((name, plant.version + 1, plant.body) for name, plant in plants.items())
+                self._put(connection, PLANTS, [with_checksum(PLANTS, *row) for row in next_versions])
             if outputs:
                 lines = b"\n".join([output.body for output in outputs]).decode()
                 connection.execute(JOURNAL.insert(), [with_checksum(JOURNAL, newest, self.process, lines)])
                 connection.execute(delete(JOURNAL).where(JOURNAL.c.last <= newest - self.journal))
             if malformed:
-                self._count(connection, MALFORMED, malformed)
+                self._add_to_count(connection, MALFORMED, malformed)
             if published is not None:
                 self._put(connection, NUMBERS, [with_checksum(NUMBERS, PUBLISHED.format(self.process), published)])
         return outputs
@@ -270,7 +296,7 @@ class Store:
                     got = f"damage in those up to number {last}; {MEND} {self.name}"
                     raise fail(f"store {self.name}, journal", "entries as they were written", got)
                 if process in (None, by):
-                    outputs += [_parse_output(line) for line in lines.split("\n")]
+                    outputs += [parse_output(line) for line in lines.split("\n")]
         return outputs
 
     def number(self, name: str) -> int:
@@ -312,9 +338,10 @@ class Store:
         with self._engine.begin() as connection:
             names = [name for (name,) in connection.execute(select(PLANTS.c.name)) if name not in self.damaged]
             for i in range(0, len(names), AT_ONCE):
-                rows = {row[0]: row[1:3] for row in _select_plants(connection, list(PLANTS.c), names[i : i + AT_ONCE])}
-                bodies = carrier.migrate({name: body for name, (_, body) in rows.items()})
-                after = [with_checksum(PLANTS, name, rows[name][0] + 1, body) for name, body in bodies.items()]
+                rows = select_plants(connection, list(PLANTS.c), names[i : i + AT_ONCE])
+                versions = {name: version for name, version, _, _ in rows}
+                bodies = carrier.migrate({name: body for name, _, body, _ in rows})
+                after = [with_checksum(PLANTS, name, versions[name] + 1, body) for name, body in bodies.items()]
                 self._put(connection, PLANTS, after)
             this = IDENTITY_TABLE.c.name == IDENTITY
             connection.execute(update(IDENTITY_TABLE).where(this).values(value=json.dumps(mine)))
@@ -348,7 +375,7 @@ class Store:
         """Close the database."""
         self._engine.dispose()
 
-    def _count(self, connection: Connection, name: str, more: int) -> int:
+    def _add_to_count(self, connection: Connection, name: str, more: int) -> int:
         """Add to a stored count, which locks it until the commit; return the new value."""
         new = self._insert(NUMBERS).values(with_checksum(NUMBERS, name, more))
         locked = new.on_conflict_do_update(index_elements=["name"], set_={"value": NUMBERS.c.value + more})
@@ -365,20 +392,6 @@ class Store:
         new = self._insert(table)
         others = {column.name: new.excluded[column.name] for column in table.c if not column.primary_key}
         connection.execute(new.on_conflict_do_update(index_elements=["name"], set_=others), rows)
-
-
-def _select_plants(connection: Connection, columns: Sequence[Column[object]], names: list[str]) -> list[Any]:
-    """Select columns of the plants of these names."""
-    results: list[Any] = []
-    for i in range(0, len(names), AT_ONCE):
-        results += connection.execute(select(*columns).where(PLANTS.c.name.in_(names[i : i + AT_ONCE]))).all()
-    return results
-
-
-def _parse_output(line: str) -> Output:
-    """Parse a line of the journal."""
-    parts = json.loads(line)
-    return Output(parts["id"], parts["plant"] or "", parts["kind"], line.encode())
 
 
 def _strip_description(identity: Identity) -> Identity:

@@ -4,12 +4,13 @@ from collections.abc import Sequence
 from typing import Any
 from zlib import crc32
 
-from sqlalchemy import BigInteger, Column, LargeBinary, MetaData, String, Table, Text
+from sqlalchemy import BigInteger, Column, Connection, LargeBinary, MetaData, String, Table, Text, select
 
 # Of these tables: those of layout 1 had no checksums, of 2 no description of the network, of 3 covariances in states,
 # of 4 the parts of a state's Gaussian beside its others.
 LAYOUT, CARRIED = "5", ("3", "4", "5")  # that of now, and those whose plants can be carried over
 LAYOUT_KEY = "layout of the store"
+AT_ONCE = 500  # rows that are asked for at once
 TABLES = MetaData()
 PLANTS = Table("plants", TABLES, Column("name", String(200), primary_key=True), Column("version", BigInteger),
                Column("body", LargeBinary), Column("checksum", BigInteger))  # fmt: skip
@@ -50,3 +51,11 @@ def with_checksum(table: Table, *values: Any) -> dict[str, object]:
     """Return a row of a table, with its checksum, by column."""
     columns = [column.name for column in table.c]
     return dict(zip(columns, (*values, checksum(*values)), strict=True))
+
+
+def select_plants(connection: Connection, columns: Sequence[Column[object]], names: list[str]) -> list[Any]:
+    """Return rows with these columns of the plants of these names, AT_ONCE in one question."""
+    results: list[Any] = []
+    for i in range(0, len(names), AT_ONCE):
+        results += connection.execute(select(*columns).where(PLANTS.c.name.in_(names[i : i + AT_ONCE]))).all()
+    return results

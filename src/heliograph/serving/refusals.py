@@ -1,0 +1,32 @@
+"""Reports of a service on messages that it refused, as entries for the store."""
+
+from datetime import datetime
+
+from heliograph.live.event import Verdict
+from heliograph.serving.estimate_writer import encode_line
+from heliograph.serving.message import Read, UnreadMessage
+from heliograph.serving.storage.store_protocol import Entry
+
+WHY: dict[Verdict, str] = {
+    "duplicate": "held already",
+    "conflict": "held already with other values, which stay",
+    "late": "before what is final",
+    "future": "later than it can be: a clock is wrong",
+    "implausible": "no filter could use it",
+}
+
+
+def refuse_message(message: Read, why: str, detail: str) -> Entry:
+    """Return the refusal of a message, with what names it as far as it was read."""
+    if isinstance(message, str):
+        return write_refusal(None, {}, why, detail)
+    read = message.read if isinstance(message, UnreadMessage) else message
+    moment = read.time.isoformat() if isinstance(read.time, datetime) else read.time
+    parts = {"node": read.node, "sequence": read.sequence, "time": moment}
+    return write_refusal(read.plant, parts, why, detail)
+
+
+def write_refusal(plant: str | None, parts: dict[str, object], why: str, detail: str) -> Entry:
+    """Return the refusal of a message as an entry for the store; `parts`: node, sequence and time, if known."""
+    results = {"kind": "refused", "plant": plant, "node": None, "sequence": None, "time": None}
+    return Entry(plant or "", "refused", encode_line(results | parts | {"reason": why, "detail": detail}))
