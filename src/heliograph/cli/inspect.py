@@ -30,7 +30,7 @@ def inspect(
         or opc.tcp://.
     """
     from heliograph.disk.quoting import visible
-    from heliograph.files.inspection import suggest_sources
+    from heliograph.files.source_suggestions import suggest_sources
     from heliograph.numerics.check import TINY, scalar
 
     scalar("--seconds", seconds, TINY, 86400)
@@ -89,6 +89,6 @@ def _print_table(topics: "dict[str, Topic]") -> None:
         "topic", "type", "messages", "rate", "largest gap", "late (s): median, 95 %, most", box=None
     )
     for name, topic in sorted(topics.items()):
-        table.add_row(*map(rich.markup.escape, map(visible, (name, *topic.row()))))
+        table.add_row(*map(rich.markup.escape, map(visible, (name, *topic.format_row()))))
     console = rich.console.Console(width=None if sys.stdout.isatty() else 160, highlight=False)
     console.print(table if topics else "no messages")

@@ -45,17 +45,10 @@ def lock_folder(folder: Path) -> Iterator[bool]:
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / LOCK
     try:
-        while True:
-            # Lock the file that is opened.
-            handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
-            if not _try_lock(handle):
-                os.close(handle)
-                yield False
-                return
-            # The path must still name the locked file: a holder before us may have removed the one that we opened.
-            if _is_path_of_handle(path, handle):
-                break
-            os.close(handle)
+        handle = _open_locked(path)
+        if handle is None:
+            yield False
+            return
         try:
             yield True
         finally:
@@ -65,6 +58,19 @@ def lock_folder(folder: Path) -> Iterator[bool]:
         for missing in made:
             with suppress(OSError):  # something is in it
                 missing.rmdir()
+
+
+def _open_locked(path: Path) -> int | None:
+    """Return the handle of the lock file at `path`, made if needed and locked; None if somebody else holds the lock."""
+    while True:
+        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
+        if not _try_lock(handle):
+            os.close(handle)
+            return None
+        # The path must still name the locked file: a holder before us may have removed the one that we opened.
+        if _is_path_of_handle(path, handle):
+            return handle
+        os.close(handle)
 
 
 def _is_path_of_handle(path: Path, handle: int) -> bool:
@@ -134,11 +140,11 @@ def whole_files(paths: Sequence[Path]) -> Iterator[list[Path]]:
     partials = [path.with_name(f".{path.name}.{os.getpid()}.partial") for path in paths]
     for path in paths:
         _clear_partial(path)
-    replaced: list[tuple[Path, bytes | None]] = []
+    replaced: list[tuple[Path, bytes | None]] = []  # with the earlier contents, None of a file that is new
     try:
         with name_path_in_errors(paths[0]):
             yield partials
-        # Replace one by one, with the earlier contents of all but the last.
+        # One by one; that of the last is the end, after which nothing is undone.
         with hold_signals():
             for partial, path in zip(partials, paths, strict=True):
                 before = path.read_bytes() if path != paths[-1] and path.exists() else None
@@ -232,31 +238,35 @@ def whole_folder(target: Path) -> Iterator[Path]:
     """
     remove_leftover_folders(target)
     made = [folder for folder in target.parents if not folder.exists()]
-    partial, lock = target.parent, ExitStack()  # the parent until there is a temporary folder
+    temporary: Path | None = None  # a folder in the same file system; a lock on it says that we run
+    lock = ExitStack()
     try:
-        # Write to a temporary folder in the same file system.
         with hold_signals():
             target.parent.mkdir(parents=True, exist_ok=True)
-            partial = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
-            (partial / "new").mkdir()
-            lock.enter_context(try_lock(partial))
+            temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+            (temporary / "new").mkdir()
+            lock.enter_context(try_lock(temporary))
         with lock, name_path_in_errors(target):
-            yield partial / "new"
-            sync_tree(partial / "new")
+            yield temporary / "new"
+            sync_tree(temporary / "new")
         with hold_signals():
-            _replace_folder(partial, target)
+            _replace_folder(temporary, target)
     except BaseException:
-        # Undo: restore earlier results, remove everything that was made.
         with hold_signals():
             lock.close()
-            if (partial / "old").exists() and not target.exists():
-                (partial / "old").rename(target)
-            if partial != target.parent:
-                shutil.rmtree(partial, ignore_errors=True)
+            if temporary is not None:
+                _restore_old(temporary, target)
             for folder in made:
                 with suppress(OSError):  # somebody else's files came into it meanwhile
                     folder.rmdir()
         raise
+
+
+def _restore_old(temporary: Path, target: Path) -> None:
+    """Put earlier results that were moved aside back in place of `target`, and remove the temporary folder."""
+    if (temporary / "old").exists() and not target.exists():
+        (temporary / "old").rename(target)
+    shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _replace_folder(partial: Path, target: Path) -> None:

@@ -103,8 +103,8 @@ class DeviceStatuses:
         matching = [several for pattern, several in self._by_pattern.items() if match_topic(topic, pattern)]
         return [condition for several in matching for condition in several]
 
-    def take_word(self, topic: str, payload: object, where: str) -> bool:
-        """Take the word of a message, and return whether it is one.
+    def take_last_word(self, topic: str, payload: object, where: str) -> bool:
+        """Note the last word of a device if a message is one; return whether it is.
 
         Args:
             topic: the topic of the message.

@@ -52,33 +52,12 @@ def read_design(path: Path) -> DesignFile:
     Raises:
         ValueError: no TOML, unknown keys or values, a network that cannot be loaded; one line with the key.
     """
-    if not path.is_file():
-        raise fail(f"design {path}", "a TOML file", "a folder" if path.is_dir() else "no file of that name")
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise fail(f"design {path.name}", "TOML", str(error)) from None
-    # Unknown keys, at the top and in the tables.
-    _check_keys(path.name, table, KEYS)
-    for key, known in TABLES.items():
-        if isinstance(table.get(key), dict):
-            _check_keys(f"{path.name}, {key}", table[key], known)
-    # Network and problem.
+    table = _read_toml(path)
     file, name = _find_python_file(path, table.get("network"), "network")
-    free = table.get("free")
-    if free is not None and (not isinstance(free, list) or not all(isinstance(name, str) for name in free)):
-        raise fail(f"{path.name}, free", "a list of names", repr(free))
+    # What is designed, and the further results that are asked for: front, exponent of the path loss, map.
+    free = _read_free(path, table)
     network = load_network(f"{file}:{name}" if name else str(file))
-    problem = DesignProblem(
-        network=network,
-        free=None if free is None else tuple(free),
-        error=Error(**_read_table(path, table, "error")) if "error" in table else None,
-        budget=_read_budget(path, table),
-        target_error=_number(path, table, "target_error"),
-        starts=check_count(f"{path.name}, starts", table.get("starts", 64)),
-        seed=check_seed(f"{path.name}, seed", table.get("seed", 0)),
-    )
-    # Further results: front, exponent of the path loss, map.
+    problem = _read_problem(path, table, network, free)
     front = table.get("front")
     return DesignFile(
         reference=f"{file.name}:{name}" if name else file.name,
@@ -86,12 +65,52 @@ def read_design(path: Path) -> DesignFile:
         network=network,
         problem=problem,
         front=None if front is None else tuple(array(f"{path.name}, front", front, (None,)).tolist()),
-        exponent=_number(path, table, "path_loss_exponent"),
+        exponent=_read_number(path, table, "path_loss_exponent"),
         map=_read_map(path, table) if "map" in table else None,
     )
 
 
-def _number(path: Path, table: Mapping[str, Any], key: str) -> float | None:
+def _read_toml(path: Path) -> dict[str, Any]:
+    """Return the content of a design file, of which only keys are checked: those at the top and in its tables."""
+    if not path.is_file():
+        raise fail(f"design {path}", "a TOML file", "a folder" if path.is_dir() else "no file of that name")
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise fail(f"design {path.name}", "TOML", str(error)) from None
+    _check_keys(path.name, table, KEYS)
+    for key, known in TABLES.items():
+        if isinstance(table.get(key), dict):
+            _check_keys(f"{path.name}, {key}", table[key], known)
+    return table
+
+
+def _read_free(path: Path, table: Mapping[str, Any]) -> tuple[str, ...] | None:
+    """Return the names of the transmitters whose powers are free; None where the design file does not say it."""
+    free = table.get("free")
+    if free is None:
+        return None
+    if not isinstance(free, list) or not all(isinstance(name, str) for name in free):
+        raise fail(f"{path.name}, free", "a list of names", repr(free))
+    return tuple(free)
+
+
+def _read_problem(
+    path: Path, table: Mapping[str, Any], network: Network, free: tuple[str, ...] | None
+) -> DesignProblem:
+    """Return the design problem of a network as the content `table` of the design file `path` states it."""
+    return DesignProblem(
+        network=network,
+        free=free,
+        error=Error(**_read_table(path, table, "error")) if "error" in table else None,
+        budget=_read_budget(path, table),
+        target_error=_read_number(path, table, "target_error"),
+        starts=check_count(f"{path.name}, starts", table.get("starts", 64)),
+        seed=check_seed(f"{path.name}, seed", table.get("seed", 0)),
+    )
+
+
+def _read_number(path: Path, table: Mapping[str, Any], key: str) -> float | None:
     """Return the number under a key, which is not negative; None if it is not there."""
     return float(scalar(f"{path.name}, {key}", table[key], 0.0)) if key in table else None
 
@@ -147,7 +166,13 @@ def _check_keys(where: str, table: Mapping[str, object], known: tuple[str, ...])
 
 
 def write_designed_source(file: DesignFile, source: str, powers: Mapping[str, np.ndarray]) -> str:
-    """Return Python source of the network with these powers; it loads the original from `source` in the same folder."""
+    """Return Python source of a designed network, which loads the original from a file in its own folder.
+
+    Args:
+        file: the design file.
+        source: name of the file with the original network.
+        powers: the designed powers by transmitter, (steps,) each: of a period or the horizon.
+    """
     error = file.problem.criterion
     _, colon, name = file.reference.rpartition(":")
     # The original is loaded relative to the file, so that the folder can be moved.

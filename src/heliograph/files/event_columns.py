@@ -48,12 +48,13 @@ class NodeEvents:
         self.time, self.arrival = (array("d" if self.numbers else "q") for _ in range(2))
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray, Int[np.ndarray, " events"]]:
-        """Return times, arrivals and counts."""
+        """Return times, arrivals and counts of the events, (events,) each."""
         return np.array(self.time), np.array(self.arrival), np.array(self.sequence, dtype=np.int64)
 
     def keep(self, which: np.ndarray) -> None:
-        """Keep only the events of a mask."""
+        """Keep only the events of the mask `which`, (events,)."""
         columns, matrix = self.arrays(), self.matrix()[which]
+        # NumPy's name of 64-bit integers is "l" on some systems, that of `array` is "q".
         self.time, self.arrival, self.sequence = (array(c.dtype.char.replace("l", "q"), c[which]) for c in columns)
         self.values = array("d", matrix.ravel())
 
@@ -99,27 +100,32 @@ class NodeEvents:
         missing = np.isnan(table[rows, -1]) & has_count
         table[rows[missing], -1] = gaps[missing]
 
-    def doubt_count(self, name: str) -> list[str]:
+    def describe_doubtful_count(self, name: str) -> list[str]:
         """Return a line if a count begins at 0 again sooner than its bits say, and one if it stands still.
 
         It begins sooner where it fell at least three times, each time from the largest number, which is 2^b - 1.
+        `name`: of the node, with which each line begins.
         """
         if not self.period or not len(self.time):
             return []
+        # Counts in order of time, and from each to the next.
         time, _, sequence = self.arrays()
         order = np.lexsort((sequence, time))
-        numbers, steps = sequence[order], np.diff(sequence[order])
-        top, falls, lines = int(numbers.max()), numbers[:-1][steps < 0], list[str]()
-        bits = (top + 1).bit_length() - 1
-        if top + 1 < self.period and top + 1 == 1 << bits and len(falls) >= 3 and np.all(falls == top):
+        counts, steps = sequence[order], np.diff(sequence[order])
+        lines = list[str]()
+        largest, before_falls = int(counts.max()), counts[:-1][steps < 0]
+        bits = (largest + 1).bit_length() - 1
+        is_full = largest + 1 == 1 << bits and largest + 1 < self.period
+        if is_full and len(before_falls) >= 3 and np.all(before_falls == largest):
             lines.append(
-                f"{name}: the count begins at 0 again after {top}, not after {self.period - 1}: bits={bits}; until "
+                f"{name}: the count begins at 0 again after {largest}, not after {self.period - 1}: bits={bits}; until "
                 "then what is lost is counted wrongly"
             )
-        stands = int(np.sum((steps == 0) & (np.diff(time[order]) > 0)))
-        if stands:
+        # The same count at a later time.
+        repeated = int(np.sum((steps == 0) & (np.diff(time[order]) > 0)))
+        if repeated:
             lines.append(
-                f"{name}: the count of {stands} messages is that of the one before: repeated, not measured anew"
+                f"{name}: the count of {repeated} messages is that of the one before: repeated, not measured anew"
             )
         return lines
 
@@ -128,36 +134,46 @@ class NodeEvents:
         count, distinct = len(self.time), len(np.unique(np.array(self.time)))
         return [f"{name}: {count} events have {distinct} stamps"] if count > 3 and 2 * distinct <= count else []
 
-    def drop_unset(self, name: str) -> tuple[str, str, int]:
+    def drop_unset_stamps(self, name: str) -> tuple[str, str, int]:
         """Remove events whose stamps were not set; return a note on the clock, why some were removed, and how many.
 
         A stamp that is more than a year before its arrival was not set; where most are, they are of another clock, and
         each event arrives when it was measured. Where arrivals are not known, neither was one that is more than a year
-        away from the messages before and after it, which go on from one to the other. Numbers are seconds.
+        away from the messages before and after it, which go on from one to the other. Numbers are seconds. `name`: of
+        the node. Both texts are "" where there is nothing to say.
         """
-        time, arrival, sequence = self.arrays()
+        time, arrival, _ = self.arrays()
         late, year = arrival - time, YEAR / SECOND if self.numbers else YEAR
         if not len(time):
             return "", "", 0
         if np.median(late) > year:
             self.arrival = array(self.time.typecode, self.time)
             return f"{name}: stamps and arrivals are of two clocks: each event arrives when it was measured", "", 0
-        known = bool(late.any())
-        near = "that of arrival" if known else "the others in order"
-        unset = late > year if known else find_unset_stamps(time, year)
+        # An arrival that is no event's own time is known.
+        are_arrivals_known = bool(late.any())
+        unset = late > year if are_arrivals_known else find_unset_stamps(time, year)
         count = int(np.count_nonzero(unset))
         if not count:
             return "", "", 0
+        self._note_unset(unset, are_arrivals_known)
         first = time[np.argmax(unset)]
         moment = f"{first:.10g}" if self.numbers else str(np.datetime64(int(first), "ns"))
-        got = f"{moment} in {count} of {len(time)} messages"
-        # Without a stamp or arrival they came when the last set one before them did, or else the first set one.
-        set_before = np.maximum.accumulate(np.where(unset, -1, np.arange(len(time))))
-        near_them = time[np.where(set_before < 0, np.argmin(unset), set_before)]
-        moments = (arrival if known else near_them)[unset]
-        self.unread += zip(moments.tolist(), sequence[unset].tolist(), strict=True)
+        near = "that of arrival" if are_arrivals_known else "the others in order"
+        why = fail(name, f"a time that was set, near {near}", f"{moment} in {count} of {len(time)} messages")
         self.keep(~unset)
-        return "", str(fail(name, f"a time that was set, near {near}", got)), count
+        return "", str(why), count
+
+    def _note_unset(self, unset: Bool[np.ndarray, " events"], are_arrivals_known: bool) -> None:
+        """Note events with unset stamps as messages that came and are no events: moments near them, and counts.
+
+        Without arrivals each came when the last set one before it did, or else the first set one.
+        """
+        time, moments, sequence = self.arrays()
+        if not are_arrivals_known:
+            last_set = np.maximum.accumulate(np.where(unset, -1, np.arange(len(time))))
+            first_set = np.argmin(unset)
+            moments = time[np.where(last_set < 0, first_set, last_set)]
+        self.unread += zip(moments[unset].tolist(), sequence[unset].tolist(), strict=True)
 
 
 class ArrivedEvents(NamedTuple):
@@ -209,9 +225,10 @@ def judge_events(
     # itself may stand, which is then a copy.
     newest_final = _find_newest_final(some, rank, window)
     verdicts[candidates[rank <= newest_final if joint else rank < newest_final]] = LATE
+    # Copies, of one identity, and rivals: events of a node in one row. Most have neither.
     rivals = _rank_rows(some.time, some.node) if joint else identity
-    contested: Bool[np.ndarray, " names"] = np.bincount(rivals, minlength=1) > 1
-    contenders = np.flatnonzero(contested[rivals] & (rank >= newest_final))
+    has_rivals: Bool[np.ndarray, " rows"] = np.bincount(rivals, minlength=1) > 1
+    contenders = np.flatnonzero(has_rivals[rivals] & (rank >= newest_final))
     _judge_copies(verdicts, candidates[contenders], identity[contenders], rivals[contenders], values, joint)
     return verdicts
 
@@ -234,25 +251,26 @@ def _judge_copies(
         values: the values of the event with a number.
         joint: whether all events of one time are one row.
     """
-    first_of_identity, components_filled = dict[int, int](), dict[int, np.ndarray]()
+    first_of_identity = dict[int, int]()  # the number of the first event of each identity, which stays
+    filled = dict[int, np.ndarray]()  # by row and node the mask of the components that have a value
     for k, name, row in zip(numbers.tolist(), identity.tolist(), rivals.tolist(), strict=True):
-        present = ~np.isnan(values(k))
         if name in first_of_identity:
             same = np.array_equal(values(k), values(first_of_identity[name]), equal_nan=True)
             verdicts[k] = DUPLICATE if same else CONFLICT
         elif verdicts[k] == USED:
-            filled = components_filled.get(row)
-            if joint and filled is not None and np.any(present & filled):
+            present = ~np.isnan(values(k))
+            filled_before = filled.get(row, np.zeros_like(present))
+            if joint and np.any(present & filled_before):
                 verdicts[k] = CONFLICT
             else:
                 first_of_identity[name] = k
-                components_filled[row] = present if filled is None else present | filled
+                filled[row] = present | filled_before
 
 
 def count_verdicts(
     node: Int[np.ndarray, " events"], verdicts: Int[np.ndarray, " events"]
 ) -> dict[int, dict[Verdict, int]]:
-    """Count the verdicts of each node."""
+    """Return {number of a node: {verdict: how many of its events have it}}; both arrays have one for each event."""
     return {
         int(n): {verdict: int(np.sum(verdicts[node == n] == i)) for i, verdict in enumerate(VERDICTS)}
         for n in np.unique(node)
@@ -319,6 +337,35 @@ def counts_losses(network: Network, name: str) -> bool:
     if not isinstance(node, Node) or node.trigger is None or node.trigger.losses != "numbered":
         return False
     return node.trigger.side_information(len(node.outputs)) == 1
+
+
+def number_rows(time: np.ndarray, steps: bool, joint: bool) -> tuple[Int[np.ndarray, " events"], np.ndarray]:
+    """Return the number of the row of each event, from 0, and the times of the rows.
+
+    Args:
+        time: times of the events, in order, at least one.
+        steps: whether times are steps, each of which is a row, also without an event.
+        joint: whether all events of one time are one row.
+    """
+    if steps:
+        return time.astype(np.int64), np.arange(int(time[-1]) + 1)
+    begins_row = np.ones(len(time), dtype=bool)
+    begins_row[1:] = time[1:] != time[:-1] if joint else True
+    return np.cumsum(begins_row) - 1, time[begins_row]
+
+
+def place_in_rows(
+    values: Float[np.ndarray, "events size"], row: Int[np.ndarray, " events"], count: int
+) -> Float[np.ndarray, "rows size"]:
+    """Return the values of events in their rows, of which there are `count`; NaN where none arrived.
+
+    Of several events in a row each component has the last value that is not NaN.
+    """
+    table = np.full((count, values.shape[1]), np.nan)
+    for i in range(values.shape[1]):
+        present = ~np.isnan(values[:, i])
+        table[row[present], i] = values[present, i]
+    return table
 
 
 def fill_forward(values: Float[np.ndarray, "rows given"]) -> Float[np.ndarray, "rows given"]:

@@ -15,6 +15,8 @@ from heliograph.files.event_columns import (
     judge_events,
     lead_to_rows,
     number_equal_rows,
+    number_rows,
+    place_in_rows,
 )
 from heliograph.files.recording import Recording
 from heliograph.files.sources.reading import Reading, Unread
@@ -178,9 +180,9 @@ class EventTable:
         by_node = [node for plant in self._plants.values() for node in plant.items()]
         # Steps are no stamps; neither are numbers of a network that counts steps.
         for name, columns in by_node if self.dated or not self.steps else ():
-            note, reason, count = columns.drop_unset(f"{source}, {name}")
+            note, reason, count = columns.drop_unset_stamps(f"{source}, {name}")
             self.notes += [note] if note else []
-            self.notes += columns.doubt_count(f"{source}, {name}")
+            self.notes += columns.describe_doubtful_count(f"{source}, {name}")
             if reason:
                 self.refuse(InputError(reason), strict)
                 self.refused += count - 1
@@ -229,7 +231,7 @@ class EventTable:
 
     def sort_events(self) -> Iterator[Event]:
         """Yield the events in order of arrival, with times in seconds from the origin, in steps, or as they are."""
-        events, matrices, names = self._sort_by_arrival(), self._matrices(), [*self.network.names, INPUTS]
+        events, matrices, names = self._sort_by_arrival(), [*self._matrices().values()], [*self.network.names, INPUTS]
         origin, unit = self.origin, self._unit
         # Exact differences of whole nanoseconds before they are floats.
         for node, time, arrival, sequence, place in zip(*(column.tolist() for column in events), strict=True):
@@ -291,8 +293,8 @@ class EventTable:
             ahead: how much later than its arrival the time of an event may be (default a tenth of a second).
         """
         events, verdicts = self._judge_events(window, ahead)
-        counts, nodes = {}, [*enumerate(self.network.names), (-1, INPUTS)]
-        for (node, name), matrix in zip(nodes, self._matrices(), strict=True):
+        counts = {}
+        for node, (name, matrix) in zip((*range(len(self.network.names)), -1), self._matrices().items(), strict=True):
             used = events.place[(events.node == node) & (verdicts == USED)]
             counts[name] = int(np.sum(np.isnan(matrix[used]).all(axis=1)))
         return counts
@@ -327,44 +329,41 @@ class EventTable:
         events = events.of(verdicts == USED)
         if not len(events.time):
             raise fail("events", "at least one that is used", "none")
-        # Rows in order: inputs first at each time.
+        # In order; inputs, of number -1, first at each time.
         events = events.of(np.lexsort((events.sequence, events.node, events.time)))
-        new = np.ones(len(events.time), dtype=bool)
-        new[1:] = events.time[1:] != events.time[:-1] if self._joint else True
-        row, times = np.cumsum(new) - 1, events.time[new]
-        if self.steps:
-            if times[-1] >= MOST_STEPS:
-                raise fail("time of an event", f"a step below {MOST_STEPS:,}", int(times[-1]))
-            row, times = events.time.astype(np.int64), np.arange(int(times[-1]) + 1)
-        # Values of each node in its row.
-        tables = []
-        for n, matrix in zip((*range(len(self.network.names)), -1), self._matrices(), strict=True):
-            of_node, table = events.node == n, np.full((len(times), matrix.shape[1]), np.nan)
-            for i in range(table.shape[1]):
-                values = matrix[events.place[of_node], i]
-                present = ~np.isnan(values)
-                table[row[of_node][present], i] = values[present]
-            tables.append(table)
-        for n, name in enumerate(self.network.names):
-            if counts_losses(self.network, name):
-                self.columns[name].fill_losses(tables[n], row[events.node == n], events.sequence[events.node == n])
-        inputs = fill_forward(tables.pop())
+        if self.steps and events.time[-1] >= MOST_STEPS:  # each step is a row
+            raise fail("time of an event", f"a step below {MOST_STEPS:,}", int(events.time[-1]))
+        row, times = number_rows(events.time, self.steps, self._joint)
+        tables = self._fill_tables(events, row, len(times))
+        inputs = fill_forward(tables.pop(INPUTS))
         if not self.steps:
             inputs = lead_to_rows(inputs, times, self._unit, self.network.inputs.index(TIME_STEP))
-        origin = self.origin
-        time = times.astype(np.float64) if self.steps or self.numbers else (times - origin) / SECOND
+        time = times.astype(np.float64) if self.steps or self.numbers else (times - self.origin) / SECOND
         measured = np.zeros(len(times), dtype=bool)
         measured[row[events.node >= 0]] = True
-        return Recording(dict(zip(self.network.names, tables, strict=True)), inputs, time), measured
+        return Recording(tables, inputs, time), measured
+
+    def _fill_tables(self, events: ArrivedEvents, row: np.ndarray, count: int) -> dict[str, np.ndarray]:
+        """Return the values of each node, and of the inputs, in their rows, (rows, values); NaN where none arrived.
+
+        `row`: number of the row of each event, of `count` rows.
+        """
+        tables = {}
+        for n, (name, matrix) in zip((*range(len(self.network.names)), -1), self._matrices().items(), strict=True):
+            of_node = events.node == n
+            table = tables[name] = place_in_rows(matrix[events.place[of_node]], row[of_node], count)
+            if n >= 0 and counts_losses(self.network, name):
+                self.columns[name].fill_losses(table, row[of_node], events.sequence[of_node])
+        return tables
 
     @property
     def _joint(self) -> bool:
         """Return whether all events of one time are one row."""
         return self.steps or self.network.common is not None
 
-    def _matrices(self) -> list[np.ndarray]:
-        """Return the values of each node, and last those of the inputs, whose number is -1."""
-        return [self.columns[name].matrix() for name in (*self.network.names, INPUTS)]
+    def _matrices(self) -> dict[str, np.ndarray]:
+        """Return the values of each node, (events, values), and last those of the inputs, whose number is -1."""
+        return {name: self.columns[name].matrix() for name in (*self.network.names, INPUTS)}
 
     def _sort_by_arrival(self) -> ArrivedEvents:
         """Return the events in order of arrival; those without a count are told apart by their order at a time."""
@@ -387,9 +386,10 @@ class EventTable:
 
     def _judge_events(self, window: float, ahead: float) -> tuple[ArrivedEvents, Int[np.ndarray, " events"]]:
         """Return the events in order of arrival, and what a timeline with this window would do with each."""
-        events, matrices = self._sort_by_arrival(), self._matrices()
+        events, matrices = self._sort_by_arrival(), [*self._matrices().values()]
 
         def values(i: int) -> np.ndarray:
+            """Return the values of the event with number i."""
             return np.asarray(matrices[events.node[i]][events.place[i]])
 
         limits = [limit if limit == np.inf or self._unit == 1 else round(limit * SECOND) for limit in (window, ahead)]

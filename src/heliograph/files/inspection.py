@@ -3,11 +3,11 @@
 import re
 import struct
 from array import array
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -27,10 +27,11 @@ from heliograph.files.sources.fields import TimeUnit, convert_time, decode_json,
 from heliograph.numerics.check import InputError, error_text, fail
 from heliograph.numerics.times.dates import UNITS, looks_like_date
 
+if TYPE_CHECKING:  # an extra
+    from rosbags.highlevel import AnyReader
+
 SECOND = 1e9  # nanoseconds
 STAMP = "header.stamp"
-DEGREES = ("deg", "degs", "degree", "degrees", "°")  # of an angle
-FEW = 6  # fields that a suggestion lists
 # What messages of devices say of themselves, and not of what they measure; words of a dotted path.
 HOUSEKEEPING = re.compile(
     r"battery|batt|bat|voltage|linkquality|rssi|lqi|snr|link|signal|f_port|fport|port|channel|frequency|bandwidth|"
@@ -120,7 +121,7 @@ class Topic:
         """Return the fields, those first that look like measurements."""
         return sorted((path for path in self.fields if path not in (self.count, *self.units)), key=_rank_field)
 
-    def row(self) -> list[str]:
+    def format_row(self) -> list[str]:
         """Return type, count, rate, largest gap and lateness (median, 95 %, largest), as text."""
         self.choose_time()
         times = np.sort(np.array(self.logged, dtype=np.int64))
@@ -147,15 +148,17 @@ def inspect_bag(path: Path, progress: Progress | None = None) -> tuple[dict[str,
 
 
 def _inspect_part(path: Path, topics: dict[str, Topic], progress: Progress | None) -> str:
-    """Add the topics of one bag of ROS, and return where and why reading it ended early, "" if it did not."""
-    # Types first, then each message's times, of which a header is read without decoding the rest.
+    """Add the topics of one bag of ROS, and return where and why reading it ended early, "" if it did not.
+
+    Args:
+        path: the bag.
+        topics: by name, to which those of the bag are added.
+        progress: called with the numbers of messages read and to be read.
+    """
     with open_bag(path) as (reader, cut):
+        # Types first, then each message's times, of which a header is read without decoding the rest.
         for connection in reader.connections:
-            fields = list(list_fields(reader, connection.msgtype))
-            numbers = [name for name, kind in fields if kind not in NO_NUMBERS and not name.startswith("header.")]
-            stamped = any(name == f"{STAMP}.sec" for name, _ in fields) and reader.is2
-            topics.setdefault(connection.topic, Topic(connection.msgtype, numbers, STAMP if stamped else None))
-        # When each message was logged, and how late by its stamp.
+            topics.setdefault(connection.topic, _describe_type(reader, connection.msgtype))
         total, done = reader.message_count, 0
         try:
             for done, (connection, logged, data) in enumerate(bag_messages(reader, reader.connections), 1):
@@ -168,6 +171,14 @@ def _inspect_part(path: Path, topics: dict[str, Topic], progress: Progress | Non
         except Exception as error:  # whatever damage makes a reader do
             return str(fail(f"{path}, after message {done}", "a bag without damage", error_text(error)))
         return cut
+
+
+def _describe_type(reader: "AnyReader", kind: str) -> Topic:
+    """Return a topic of messages of a type of ROS: its fields of numbers, and its stamp, which only ROS 2 has first."""
+    fields = list(list_fields(reader, kind))
+    numbers = [name for name, basic in fields if basic not in NO_NUMBERS and not name.startswith("header.")]
+    has_stamp = any(name == f"{STAMP}.sec" for name, _ in fields) and reader.is2
+    return Topic(kind, numbers, STAMP if has_stamp else None)
 
 
 def _inspect_mcap(path: Path, topics: dict[str, Topic]) -> str:
@@ -192,7 +203,15 @@ def note(topics: dict[str, Topic], name: str, payload: str | bytes, arrival: int
 
 
 def _note_message(topics: dict[str, Topic], name: str, content: object, kind: str, arrival: int | None) -> None:
-    """Count a message under its topic; note its fields of numbers, and its dates with how late it came."""
+    """Count a message under its topic; note its fields of numbers, and its dates with how late it came.
+
+    Args:
+        topics: by name, to which a new one is added.
+        name: of the message's topic.
+        content: the message, decoded; None where it could not be.
+        kind: type of the message, of a new topic.
+        arrival: in nanoseconds since 1970; None where it is not known.
+    """
     topic = topics.setdefault(name, Topic(kind))
     topic.messages += 1
     if arrival is not None:
@@ -202,20 +221,26 @@ def _note_message(topics: dict[str, Topic], name: str, content: object, kind: st
             topic.fields.append(path)
         if arrival is None and isinstance(value, int | float) and _counts_from_start(path, value):
             topic.clocks.setdefault(path, array("d")).append(value)
-        # A date in a message may be the time of its measurement: a stamp, a text, or a number of these years.
-        if is_stamp(value) or (isinstance(value, str) and looks_like_date(value)):
-            unit: TimeUnit | None = "s"
-        else:
-            unit = _unit_of_date(value)
-        if unit is not None:
-            with suppress(InputError):
-                time = convert_time(value, unit, path)
-                moments, late = topic.dates.setdefault(path, (array("q"), array("d")))
-                moments.append(time)
-                if arrival is not None:
-                    late.append((arrival - time) / SECOND)
-                if not isinstance(value, str):
-                    topic.units[path] = unit
+        _note_date(topic, path, value, arrival)
+
+
+def _note_date(topic: Topic, path: str, value: object, arrival: int | None) -> None:
+    """Note a value as a date of its field, which may be the time of measurement, if it is one: a stamp, text or number.
+
+    `arrival`: of its message, in nanoseconds since 1970; None where it is not known.
+    """
+    is_date = is_stamp(value) or (isinstance(value, str) and looks_like_date(value))
+    unit: TimeUnit | None = "s" if is_date else _unit_of_date(value)
+    if unit is None:
+        return
+    with suppress(InputError):
+        time = convert_time(value, unit, path)
+        moments, late = topic.dates.setdefault(path, (array("q"), array("d")))
+        moments.append(time)
+        if arrival is not None:
+            late.append((arrival - time) / SECOND)
+        if not isinstance(value, str):
+            topic.units[path] = unit
 
 
 def _named_clock(path: str) -> re.Match[str] | None:
@@ -254,16 +279,16 @@ def inspect_file(path: Path) -> tuple[dict[str, Topic], str]:
             broken = broken or str(message)
             continue
         name = message.topic or message_name(path)
-        came = None
+        arrival = None
         with suppress(InputError):
-            came = None if message.arrival is None else parse_arrival(message.arrival, message.where)
-        if message.topic is not None and isinstance(message.content, str) and came is not None:
-            note(topics, name, message.content, came)
+            arrival = None if message.arrival is None else parse_arrival(message.arrival, message.where)
+        if message.topic is not None and isinstance(message.content, str) and arrival is not None:
+            note(topics, name, message.content, arrival)
             continue
         try:
-            _note_message(topics, name, decode_payload(message), "JSON" if is_message_file(path) else "row", came)
+            _note_message(topics, name, decode_payload(message), "JSON" if is_message_file(path) else "row", arrival)
         except InputError:
-            _note_message(topics, name, None, "no JSON", came)
+            _note_message(topics, name, None, "no JSON", arrival)
     return topics, broken
 
 
@@ -307,61 +332,6 @@ def inspect_log(path: Path, dbc: Path | None) -> tuple[dict[str, Topic], str]:
     if topics and not log.units:
         broken = broken or str(fail(str(path), "the database of its frames, to list signals (--dbc car.dbc)", "none"))
     return topics, broken
-
-
-def suggest_sources(topics: Mapping[str, Topic], names: Mapping[str, Sequence[str]]) -> str:
-    """Return sources to paste into a network's file: a line for each topic that has numbers.
-
-    Args:
-        topics: the topics.
-        names: outputs by node, and the inputs; empty if no network is known.
-    """
-    lines = [f"# {node}: {', '.join(outputs)}" for node, outputs in names.items()]
-    lines.append("sources = {")
-    for topic in topics.values():
-        topic.choose_time()
-    dated = any(topic.dates or (topic.logged and not topic.own_clock) for topic in topics.values())
-    for name, topic in sorted(topics.items()):
-        fields = topic.list_measured()
-        if not fields:
-            continue
-        options = _suggest_options(topic, dated)
-        source = f"hg.files.json_field({fields[0]!r}, node='NODE', output='OUTPUT'{options})"
-        lines.append(f"    {name!r}: {source},{_say_unit(topic, fields[0])}")
-        others = [f"{path}{_say_unit(topic, path, '')}" for path in fields[1:FEW]]
-        more = ", ".join(others) + (", ..." if len(fields) > FEW else "")
-        lines += [f"    #   or {more}"] if more else []
-    return "\n".join([*lines, "}"])
-
-
-def _suggest_options(topic: Topic, dated: bool) -> str:
-    """Return a source's options for a topic's time and count; `dated`: whether there are dates in any topic."""
-    options = ""
-    if topic.time is not None:
-        options += f", time={_describe_time(topic, dated)}"
-        unit = topic.units.get(topic.time, "s")
-        options += "" if unit == "s" else f", time_unit={unit!r}"
-    if topic.count is not None:
-        options += f", sequence={_describe_count(topic, topic.count)}"
-    return options
-
-
-def _describe_time(topic: Topic, dated: bool) -> str:
-    """Return a time as a source has it: beside dates a clock that counts from its own start has the date of that."""
-    return f"hg.files.Stamp({topic.time!r}, start='DATE')" if topic.own_clock and dated else repr(topic.time)
-
-
-def _describe_count(topic: Topic, path: str) -> str:
-    """Return a running count as a source has it: with its bits, where the file says them."""
-    return f"hg.files.Count({path!r}, bits={topic.bits[path]})" if path in topic.bits else repr(path)
-
-
-def _say_unit(topic: Topic, path: str, mark: str = "  #") -> str:
-    """Return the unit of a field as a comment, "" if the file names none; of degrees, what makes them radians."""
-    if path not in topic.measured_in:
-        return ""
-    unit = topic.measured_in[path]
-    return f"{mark} {unit}{' (of an angle: scale=np.pi / 180)' * (unit.lower().strip() in DEGREES)}"
 
 
 def _rank_field(path: str) -> int:

@@ -58,26 +58,34 @@ def load_module(reference: str) -> tuple[Network, Mapping[str, object]]:
 
 
 def load_function(path: Path, source: str, name: str) -> Callable[..., Network]:
-    """Load the function `name`, which returns a network, from a source; `path` is the file that the source is of.
+    """Load a function that returns a network from Python source, which need not be the file's present one.
 
-    The source need not be the file's present one. The module finds others in the file's folder, when it is loaded and
-    when the function is called.
+    The module finds others in the file's folder, when it is loaded and when the function is called.
+
+    Args:
+        path: the file that the source is of.
+        source: its text.
+        name: name of the function in it.
+
+    Returns:
+        The function; what it is called with it takes, and the network that it returns is checked to be one.
 
     Raises:
         ValueError: as `load_network`; calling the function raises the same.
     """
     reference = f"{path.name}:{name}"
-    # The module itself, then the function in it.
+    # Run the source as a module, and find the function in it.
     with _import_from(path.parent):
         module = _call_user_code(lambda: _run_source(path, source), path.name, path)
     function = getattr(module, name, None)
     if not callable(function):
-        came = "an unknown name" if function is None else type(function).__name__
-        raise fail(f"network {reference}", "a function that returns a heliograph.Network", came)
+        got = "an unknown name" if function is None else type(function).__name__
+        raise fail(f"network {reference}", "a function that returns a heliograph.Network", got)
 
     # Each call may import more modules of the folder, and may fail in the user's code.
     @wraps(function)
     def build(*args: object, **kwargs: object) -> Network:
+        """Return the network that the function returns, checked."""
         with _import_from(path.parent):
             network = _call_user_code(lambda: function(*args, **kwargs), reference, path)
         if not isinstance(network, Network):

@@ -9,7 +9,7 @@ pytest.importorskip("asyncua")
 from asyncua import Server, ua
 
 import heliograph as hg
-from heliograph.files.inspection import suggest_sources
+from heliograph.files.source_suggestions import suggest_sources
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.network_program import NetworkProgram
 from heliograph.serving import make_transport
@@ -196,7 +196,7 @@ def test_inspect_lists_the_variables_of_a_server_and_suggests_sources():
 
     topics = asyncio.run(work())
     assert list(topics) == [VARIABLE] and topics[VARIABLE].kind == "Double, deadband 0.5, 0.1 s"
-    count, rate, _, late = topics[VARIABLE].row()[1:]
+    count, rate, _, late = topics[VARIABLE].format_row()[1:]
     assert int(count) >= 4 and 2.5 < float(rate.removesuffix(" Hz")) < 7.5  # five a second, on a busy machine
     assert 0 <= float(late.split()[0]) < 1.0
     line = f"    {VARIABLE!r}: hg.files.json_field('value', node='NODE', output='OUTPUT', time='source_time'),"

@@ -73,22 +73,21 @@ def read_bag(
     """
     with open_bag(path) as (reader, cut):
         events.broken = cut
-        counts = Counter[str]()
+        counts = Counter[str]()  # messages by topic
         for connection in reader.connections:
             counts[connection.topic] += connection.msgcount
         if cut and not counts:
             raise fail(str(path), "a bag with messages", "one that was cut off before its first part was whole")
         used = [topic for topic in counts if sources.of(topic)]
         if not used:
-            raise fail(
-                f"{path}", f"a topic of the sources, {_join_names(sources.topics)}", f"only {_join_names(counts)}"
-            )
+            expected = f"a topic of the sources, {_join_names(sources.topics)}"
+            raise fail(f"{path}", expected, f"only {_join_names(counts)}")
         _check_mapped_fields(path, reader, sources)
         # Messages become events, many at once where all of them can.
         total, done, decoder = sum(counts[topic] for topic in used), 0, Decoder(reader, sources)
         try:
             for batch in batch_messages(read_raw_messages(path, reader, used)):
-                if not decoder.add(batch, events):
+                if not decoder.append_events(batch, events):
                     _append_messages(path, reader, sources, batch, done, events, strict)
                 done += len(batch)
                 if progress is not None:
@@ -97,10 +96,17 @@ def read_bag(
             if strict:
                 raise
             events.broken = f"{error}; what was read before it stays"
-    # Say which topics of either side were left out.
-    rest = {topic: count for topic, count in counts.items() if topic not in used}
-    if rest:
-        events.notes.append(f"{path}: not among the sources: {_join_counts(rest)}")
+    _note_other_topics(path, sources, counts, events)
+
+
+def _note_other_topics(path: Path, sources: Sources, counts: Counter[str], events: EventTable) -> None:
+    """Add notes to the events on topics of the bag that no source has, and on sources whose topics it has not.
+
+    `counts`: messages of the bag by topic.
+    """
+    others = {topic: count for topic, count in counts.items() if not sources.of(topic)}
+    if others:
+        events.notes.append(f"{path}: not among the sources: {_join_counts(others)}")
     missing = [topic for topic in sources.topics if not set("+#") & set(topic) and topic not in counts]
     if missing:
         events.notes.append(f"{path}: not in the bag: {_join_names(missing)}")
@@ -145,26 +151,30 @@ def _open_reader(path: Path, readable: Path) -> "Iterator[AnyReader]":
 def read_raw_messages(path: Path, reader: "AnyReader", topics: list[str]) -> Iterator[RawMessage]:
     """Yield the messages of topics in the order in which they were logged.
 
+    Args:
+        path: the bag, for errors.
+        reader: its reader.
+        topics: names of the topics.
+
     Raises:
-        ValueError: damage, a topic that changes its type; one line with the place.
+        DamageError: damage, a topic that changes its type; one line with the place.
     """
     connections = [connection for connection in reader.connections if connection.topic in topics]
-    types, raw = dict[str, str](), read_messages_in_order(reader, connections) if connections else iter(())
+    messages = read_messages_in_order(reader, connections) if connections else iter(())
+    types = dict[str, str]()  # of each topic the type that it has first, and keeps
     count, last = 0, 0
     while True:
         try:
-            message = next(raw)
+            message = next(messages)
         except StopIteration:
             return
-        except Exception as error:
+        except Exception as error:  # whatever damage makes a reader do
             after = f"after message {count} of its topics, logged at {moment(last)}" if count else "before any message"
             raise DamageError(str(fail(f"{path}, {after}", "a bag without damage", _format_reason(error)))) from None
-        # A topic keeps the type that it has first.
-        connection, last = message.connection, message.logged
-        kind = connection.msgtype
-        if types.setdefault(connection.topic, kind) != kind:
-            where = f"{path}, {connection.topic}, logged at {moment(last)}"
-            raise DamageError(str(fail(where, f"messages of {types[connection.topic]}, as before", kind)))
+        topic, kind, last = message.connection.topic, message.connection.msgtype, message.logged
+        if types.setdefault(topic, kind) != kind:
+            where = f"{path}, {topic}, logged at {moment(last)}"
+            raise DamageError(str(fail(where, f"messages of {types[topic]}, as before", kind)))
         yield message
         count += 1
 

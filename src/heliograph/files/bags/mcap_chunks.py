@@ -69,19 +69,25 @@ def _read_chunk(
 ) -> Iterator[RawMessage]:
     """Yield the messages of one chunk, as they stand in it.
 
+    Args:
+        storage: the open file.
+        chunk: the chunk, as the file's index has it.
+        channels: connections by the numbers of their channels; messages of others are passed over.
+
     Raises:
         ValueError: a record that is longer than what is left of the chunk.
     """
     from rosbags.rosbag2.storage_mcap import decompress
 
-    # Its content, whose checksum `decompress` compares.
-    stream, at = storage.bio, chunk.chunk_start_offset + LENGTH
+    # A chunk's content: CRC bytes, a checksum, FIXED bytes in all and the name of the compression, then its messages,
+    # whose checksum `decompress` compares.
+    stream, first = storage.bio, chunk.chunk_start_offset + LENGTH
     assert stream is not None
-    stream.seek(at + CRC)
+    stream.seek(first + CRC)
     (checksum,) = CHECKSUM.unpack(stream.read(CHECKSUM.size))
-    stream.seek(at + FIXED + len(chunk.compression))
+    stream.seek(first + FIXED + len(chunk.compression))
     content = decompress(stream.read(chunk.compressed_size), chunk.compression, chunk.uncompressed_size, checksum)
-    # Record after record.
+    # Record after record: a byte for its kind, eight for its length, its content.
     begin, end = 0, len(content)
     while begin < end:
         (size,) = SIZE.unpack_from(content, begin + 1)

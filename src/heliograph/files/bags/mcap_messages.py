@@ -76,38 +76,61 @@ def read_mcap_messages(path: Path, sources: Sources | None = None) -> Iterator[F
     Raises:
         ValueError: a topic of the sources that is in another encoding; one line.
     """
-    channels, types, count = dict[int, Channel](), dict[int, Types](), 0
+    count = 0
     with path.open("rb") as file:
         file.seek(len(MAGIC))
         try:
-            for kind, content in _read_records(file):
-                if kind == SCHEMA:
-                    types |= _read_schema(content)
-                elif kind == CHANNEL:
-                    number, channel = _read_channel(content, types)
-                    channels[number] = channel
-                    if channel.encoding not in (JSON, PROTOBUF) and sources is not None and sources.of(channel.topic):
-                        expected = "messages in JSON or Protobuf with its schema, as others of this file are"
-                        raise fail(f"{path}, {channel.topic}", expected, channel.encoding or "no encoding")
-                elif kind == MESSAGE:
-                    count += 1
-                    number, _, logged, _ = HEADER.unpack_from(content)
-                    channel, where = channels[number], f"{path}, message {count}"
-                    wanted = sources is None or bool(sources.of(channel.topic))
-                    payload = _decode(where, channel, types, content[HEADER.size :]) if wanted else None
-                    if isinstance(payload, InputError):
-                        yield payload
-                    else:
-                        yield FileMessage(where, channel.topic, payload, np.datetime64(logged, "ns"))
+            for count, channel, logged, data, types in _yield_raw_messages(path, file, sources):
+                where = f"{path}, message {count}"
+                wanted = sources is None or bool(sources.of(channel.topic))
+                payload = _decode(where, channel, types, data) if wanted else None
+                if isinstance(payload, InputError):
+                    yield payload
+                else:
+                    yield FileMessage(where, channel.topic, payload, np.datetime64(logged, "ns"))
         except InputError as error:
             if not isinstance(error, DamageError):
                 raise
             yield CutOffError(f"{error}; what was read before it stays")
         except Exception as error:  # whatever damage makes a reader do
-            where = f"{path}, after message {count}"
-            yield CutOffError(
-                f"{fail(where, 'a file without damage', error_text(error))}; what was read before it stays"
-            )
+            why = fail(f"{path}, after message {count}", "a file without damage", error_text(error))
+            yield CutOffError(f"{why}; what was read before it stays")
+
+
+class _RawMessage(NamedTuple):
+    """A message as it stands in the file: its number from 1, its channel, when it was logged, its bytes, known types.
+
+    `types`: of messages in Protocol Buffers, by the number of their schema.
+    """
+
+    number: int
+    channel: Channel
+    logged: int
+    data: bytes
+    types: dict[int, Types]
+
+
+def _yield_raw_messages(path: Path, file: BinaryIO, sources: Sources | None) -> Iterator[_RawMessage]:
+    """Yield the messages of an open file in its order; schemas and channels stand before the messages that need them.
+
+    Raises:
+        ValueError: a topic of the sources in an encoding that is not read.
+        Exception: whatever damage leads to.
+    """
+    channels, types, count = dict[int, Channel](), dict[int, Types](), 0
+    for kind, content in _read_records(file):
+        if kind == SCHEMA:
+            types |= _read_schema(content)
+        elif kind == CHANNEL:
+            number, channel = _read_channel(content, types)
+            channels[number] = channel
+            if channel.encoding not in (JSON, PROTOBUF) and sources is not None and sources.of(channel.topic):
+                expected = "messages in JSON or Protobuf with its schema, as others of this file are"
+                raise fail(f"{path}, {channel.topic}", expected, channel.encoding or "no encoding")
+        elif kind == MESSAGE:
+            count += 1
+            number, _, logged, _ = HEADER.unpack_from(content)
+            yield _RawMessage(count, channels[number], logged, content[HEADER.size :], types)
 
 
 def _decode(where: str, channel: Channel, types: dict[int, Types], data: bytes) -> object:

@@ -80,8 +80,15 @@ class Layout:
         return begin
 
     def _place_field(self, begin: int, node: str, of: Any, path: str) -> int:
-        """Note where the wanted numbers of one field stand in a message's bytes; return where the next field begins."""
-        # Parts, texts and single numbers.
+        """Note where the wanted numbers of one field stand in a message's bytes; return where the next field begins.
+
+        Args:
+            begin: the byte behind the field before it.
+            node: what the field is: "NAME" of a message, "BASE" of a number or text, "ARRAY" or "SEQUENCE" of a list.
+            of: the message's type; the basic type; or what the list has, and how many of it ("SEQUENCE": at most).
+            path: dotted path of the field in the whole message.
+        """
+        # A part, a text, a number.
         if node == "NAME":
             return self._place_message(begin, of, f"{path}.")
         if node == "BASE" and of[0] == "string":
@@ -89,7 +96,7 @@ class Layout:
             return begin + 4 + self._read_length(begin)
         if node == "BASE":
             return self._place_numbers(begin, of[0], 1, [path])
-        # Lists, of numbers or of anything else.
+        # A list, of numbers or of anything else; before one of any length stands its length.
         (inner_node, inner), count = of
         if node == "SEQUENCE":
             begin = _align(begin, 4)
@@ -134,7 +141,7 @@ class Decoder:
         self._definitions, self._sources, self._little = reader.typestore.fielddefs, sources, reader.is2
         self._layouts = defaultdict[tuple[str, int], list[Layout]](list)
 
-    def add(self, batch: Sequence[RawMessage], table: EventTable) -> bool:
+    def append_events(self, batch: Sequence[RawMessage], table: EventTable) -> bool:
         """Append the events of messages to a table; False, and nothing is appended, where they need a look at each.
 
         What `Sources.read` says of a message at a time is what it gives: the same numbers, in the same order.
@@ -239,29 +246,38 @@ def _convert_columns(
     Raises:
         LayoutError: a stamp, a count or part of a value that is none, which reading message by message then names.
     """
-    uncounted = np.full(len(rows), -1, dtype=np.int64)
-    time = np.full(len(rows), NONE)
     values = np.full((len(rows), size), np.nan)
     for column, path, scale, offset in zip(places, source.paths, source.scale, source.offset, strict=True):
-        numbers = [columns[part].astype(np.float64) for part in _parts(path)]
-        parts = [np.where(np.isfinite(n), n, np.nan) for n in numbers]
-        try:
-            value = parts[0] if isinstance(path, str) else path.of(*parts)
-        except InputError:  # a number of one of them, such as a latitude beyond 90 degrees
-            raise LayoutError from None
+        value = _read_values(columns, path)
         values[:, column] = np.where(np.isfinite(value), scale * value + offset, np.nan)
     # Stamps and counts have to be what a message alone is asked for: set, and whole numbers.
+    time = np.full(len(rows), NONE)
     if source.time is not None:
-        seconds, rest = (columns[f"{source.time.path}.{field}"] for field in STAMP)
-        time = seconds.astype(np.int64) * SECOND + rest
+        seconds, nanoseconds = (columns[f"{source.time.path}.{field}"] for field in STAMP)
+        time = seconds.astype(np.int64) * SECOND + nanoseconds
         if seconds.dtype.itemsize > 4 or np.any(time == 0):
             raise LayoutError
         time += source.time.shift
-    sequence = uncounted if source.sequence is None else columns[source.sequence.path]
-    if sequence.dtype.kind not in "iu" or (source.sequence is not None and np.any(sequence.astype(np.int64) < 0)):
+    if source.sequence is None:
+        return Readings(rows, time, sequence=np.full(len(rows), -1, dtype=np.int64), values=values, period=0)
+    sequence = columns[source.sequence.path]
+    if sequence.dtype.kind not in "iu" or np.any(sequence.astype(np.int64) < 0):
         raise LayoutError
-    period = 0 if source.sequence is None else source.sequence.period
-    return Readings(rows, time, sequence.astype(np.int64), values, period)
+    return Readings(rows, time, sequence.astype(np.int64), values, source.sequence.period)
+
+
+def _read_values(columns: dict[str, np.ndarray], path: str | Computed) -> np.ndarray:
+    """Return a value of many messages, (messages,): the field at a path, or what is computed of several; NaN for none.
+
+    Raises:
+        LayoutError: a number of one of them that is none of its kind, such as a latitude beyond 90 degrees.
+    """
+    numbers = [columns[part].astype(np.float64) for part in _parts(path)]
+    parts = [np.where(np.isfinite(number), number, np.nan) for number in numbers]
+    try:
+        return parts[0] if isinstance(path, str) else np.asarray(path.of(*parts))
+    except InputError:
+        raise LayoutError from None
 
 
 def _column(table: np.ndarray, begin: int, kind: str) -> np.ndarray:

@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from typing_extensions import TypeAliasType
@@ -108,21 +108,20 @@ def write_bag(record: Record, path: str | Path, origin: np.datetime64 | None = N
 
     store = _load_types()
     times = _convert_times(record.time, origin)
+    # The type of each topic's messages.
+    types = {
+        topic: kind
+        for node, filters in record.estimates.items()
+        for name, estimate in filters.items()
+        for topic, kind in _name_topics(_make_prefix(node, name), record.states, estimate.claim, pose)
+    }
     # The writer makes a folder; the file in it is complete in itself.
     with whole_file(path) as partial, tempfile.TemporaryDirectory(dir=path.parent) as folder:
         bag = Path(folder) / "bag"
         with Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-            topics = {
-                topic: (writer.add_connection(topic, kind, typestore=store), kind)
-                for node, filters in record.estimates.items()
-                for name, estimate in filters.items()
-                for topic, kind in _name_topics(
-                    f"/{_make_topic_word(node)}/{_make_topic_word(name)}", record.states, estimate.claim, pose
-                )
-            }
+            connections = {topic: writer.add_connection(topic, kind, typestore=store) for topic, kind in types.items()}
             for stamp, topic, message in _yield_messages(record, times, pose, store.types):
-                connection, kind = topics[topic]
-                writer.write(connection, stamp, store.serialize_cdr(message, kind))
+                writer.write(connections[topic], stamp, store.serialize_cdr(message, types[topic]))
         shutil.move(bag / f"{bag.name}.mcap", partial)
 
 
@@ -134,7 +133,7 @@ def _load_types() -> Any:
 
 
 def _convert_times(time: np.ndarray, origin: np.datetime64 | None) -> list[int]:
-    """Convert times to nanoseconds since 1970: dates, or seconds or steps from an origin."""
+    """Return times in nanoseconds since 1970: of dates, or of seconds or steps from an origin (None: 1970)."""
     if time.dtype.kind == "M":
         return [int(at) for at in time.astype("datetime64[ns]").astype(np.int64)]
     begun = 0 if origin is None else int(origin.astype("datetime64[ns]").astype(np.int64))
@@ -144,6 +143,11 @@ def _convert_times(time: np.ndarray, origin: np.datetime64 | None) -> list[int]:
 def _make_topic_word(name: str) -> str:
     """Return a name as a word of a topic."""
     return re.sub(r"\W", "_", name)
+
+
+def _make_prefix(node: str, filter_name: str) -> str:
+    """Return the beginning of the topics of one filter at a node, /NODE/FILTER."""
+    return f"/{_make_topic_word(node)}/{_make_topic_word(filter_name)}"
 
 
 def _name_topics(prefix: str, states: tuple[str, ...], claim: Claim, pose: Pose) -> Iterator[tuple[str, str]]:
@@ -156,30 +160,60 @@ def _name_topics(prefix: str, states: tuple[str, ...], claim: Claim, pose: Pose)
             yield f"{prefix}/{_make_topic_word(state)}/sd", NUMBER
 
 
+class _Estimates(NamedTuple):
+    """Estimates of one filter at all times: beginning of its topics, and by row mean, covariance, claim, soundness.
+
+    Shapes: mean (rows, n), covariance (rows, n, n), claims and sound (rows,).
+    """
+
+    prefix: str
+    mean: np.ndarray
+    covariance: np.ndarray
+    claims: np.ndarray
+    sound: np.ndarray
+
+
 def _yield_messages(record: Record, times: list[int], pose: Pose, types: Any) -> Iterator[tuple[int, str, object]]:
-    """Yield time, topic and message of each estimate, in order of time."""
+    """Yield time, topic and message of each sound estimate, in order of time.
+
+    Args:
+        record: the estimates.
+        times: of its rows, in nanoseconds since 1970.
+        pose: states that are pose and twist.
+        types: classes of messages by the names of their types.
+    """
     # Estimates as arrays, once for all rows.
-    number, places = types[NUMBER], pose.places(record.states)
-    moves = any(state is not None for axes in places for state in axes)
-    parts = []
-    for node, filters in record.estimates.items():
-        for name, estimate in filters.items():
-            prefix = f"/{_make_topic_word(node)}/{_make_topic_word(name)}"
-            mean, covariance = np.asarray(estimate.mean), np.asarray(estimate.covariance)
-            parts.append((prefix, mean, covariance, np.asarray(estimate.claims), is_sound(estimate)))
-    # Row by row, in order of time.
+    all_estimates = [
+        _Estimates(
+            prefix=_make_prefix(node, name),
+            mean=np.asarray(estimate.mean),
+            covariance=np.asarray(estimate.covariance),
+            claims=np.asarray(estimate.claims),
+            sound=is_sound(estimate),
+        )
+        for node, filters in record.estimates.items()
+        for name, estimate in filters.items()
+    ]
+    places = pose.places(record.states)
     for k, stamp in enumerate(times):
-        for prefix, mean, covariance, claims, sound in parts:
-            if not sound[k]:
+        for estimates in all_estimates:
+            if not estimates.sound[k]:
                 continue
-            if moves:
-                bound = None if claims[k] == "none" else covariance[k]
-                yield stamp, f"{prefix}/odometry", _make_odometry(stamp, mean[k], bound, places, pose, types)
-            for i, state in enumerate(record.states):
-                topic = f"{prefix}/{_make_topic_word(state)}"
-                yield stamp, topic, number(float(mean[k, i]))
-                if claims[k] != "none":
-                    yield stamp, f"{topic}/sd", number(float(np.sqrt(max(covariance[k, i, i], 0.0))))
+            if any(state is not None for axes in places for state in axes):
+                bound = None if estimates.claims[k] == "none" else estimates.covariance[k]
+                odometry = _make_odometry(stamp, estimates.mean[k], bound, places, pose, types)
+                yield stamp, f"{estimates.prefix}/odometry", odometry
+            for topic, number in _yield_numbers(estimates, k, record.states):
+                yield stamp, topic, types[NUMBER](number)
+
+
+def _yield_numbers(estimates: _Estimates, k: int, states: tuple[str, ...]) -> Iterator[tuple[str, float]]:
+    """Yield topic and number of each state in row k: its mean, and its deviation if the filter claims one."""
+    for i, state in enumerate(states):
+        topic = f"{estimates.prefix}/{_make_topic_word(state)}"
+        yield topic, float(estimates.mean[k, i])
+        if estimates.claims[k] != "none":
+            yield f"{topic}/sd", float(np.sqrt(max(estimates.covariance[k, i, i], 0.0)))
 
 
 def _make_odometry(
@@ -201,16 +235,22 @@ def _make_odometry(
         types: classes of messages by the names of their types.
     """
     geometry = "geometry_msgs/msg/"
-    vector, header = types[f"{geometry}Vector3"], types["std_msgs/msg/Header"]
-    (position, bound), (velocity, twist_bound) = (_select_pose(mean, covariance, states) for states in places)
-    rotation = types[f"{geometry}Quaternion"](*_convert_angles_to_quaternion(*position[3:]))
-    there = types[f"{geometry}Pose"](types[f"{geometry}Point"](*position[:3]), rotation)
-    moving = types[f"{geometry}Twist"](vector(*velocity[:3]), vector(*velocity[3:]))
+    vector, point, quaternion = (types[f"{geometry}{name}"] for name in ("Vector3", "Point", "Quaternion"))
+    # Six numbers each, by axis, and their covariance (36,).
+    (position, position_covariance), (velocity, velocity_covariance) = (
+        _select_pose(mean, covariance, states) for states in places
+    )
+    rotation = quaternion(*_convert_angles_to_quaternion(*position[3:]))
+    pose_message = types[f"{geometry}Pose"](point(*position[:3]), rotation)
+    twist_message = types[f"{geometry}Twist"](vector(*velocity[:3]), vector(*velocity[3:]))
+    seconds, nanoseconds = divmod(stamp, 10**9)
+    time = types["builtin_interfaces/msg/Time"](seconds, nanoseconds)
+    # In the order of the fields of an odometry message.
     return types[ODOMETRY](
-        header(types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9)), pose.frame),
+        types["std_msgs/msg/Header"](time, pose.frame),
         pose.child,
-        types[f"{geometry}PoseWithCovariance"](there, bound),
-        types[f"{geometry}TwistWithCovariance"](moving, twist_bound),
+        types[f"{geometry}PoseWithCovariance"](pose_message, position_covariance),
+        types[f"{geometry}TwistWithCovariance"](twist_message, velocity_covariance),
     )
 
 

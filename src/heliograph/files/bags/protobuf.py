@@ -206,14 +206,20 @@ def _read_varint(data: bytes, at: int) -> tuple[int, int]:
 
 
 def _unpack(field: Field, wire: int, value: Wire) -> list[Wire]:
-    """Return the values of a field as they stand: of a packed list several."""
-    expected = SIZED if field.kind in (TEXT, BYTES, MESSAGE) else VARINT if field.kind == ENUM else None
-    if expected is None:
-        if field.kind not in SCALARS:
-            raise ValueError(f"field {field.name!r} is of a type that is not read")
-        expected = SCALARS[field.kind].wire
+    """Return the values of a field as they stand: of a packed list several.
+
+    Args:
+        field: the field, as the schema has it.
+        wire: how the message has its value: the wire type that stands before it.
+        value: the value as it stands there.
+
+    Raises:
+        ValueError: a field of a type that is not read, or of another one than the schema's.
+    """
+    expected = _find_wire_type(field)
     if wire == expected:
         return [value]
+    # A list may be packed: its values one after another, in one block of bytes.
     if not (field.repeated and wire == SIZED and isinstance(value, bytes)):
         raise ValueError(f"field {field.name!r} is of another type than the schema's")
     values, at = list[Wire](), 0
@@ -226,6 +232,17 @@ def _unpack(field: Field, wire: int, value: Wire) -> list[Wire]:
             values.append(value[at : at + size])
             at += size
     return values
+
+
+def _find_wire_type(field: Field) -> int:
+    """Return the wire type that stands before a field's value; raise ValueError at a type that is not read."""
+    if field.kind in (TEXT, BYTES, MESSAGE):
+        return SIZED
+    if field.kind == ENUM:
+        return VARINT
+    if field.kind not in SCALARS:
+        raise ValueError(f"field {field.name!r} is of a type that is not read")
+    return SCALARS[field.kind].wire
 
 
 def _of_number(data: bytes, wanted: int) -> list[bytes]:

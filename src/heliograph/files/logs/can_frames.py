@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from heliograph.files.logs.log import DIGITS, Log, Wanted
 from heliograph.files.logs.log_sources import STAMP, LogSources
@@ -79,7 +79,7 @@ class FrameReader:
         self._identifiers, self._left_out = Counter[str](), Counter[str]()
 
     def read(self) -> Iterator[FileMessage | InputError]:
-        """Yield the messages in the order of the file.
+        """Yield the messages in the order of the file, or why one cannot be read; then note what was left out.
 
         Raises:
             ValueError: no frame of a wanted message, frames all of which are too short for it, or of two buses.
@@ -92,10 +92,16 @@ class FrameReader:
             if frame.is_error_frame or frame.is_remote_frame:
                 self._left_out["error" if frame.is_error_frame else "remote"] += 1
             elif self._sources.channel in (None, frame.channel):
-                yield from self._decode(frame, moment, f"{self._path}, frame {number}")
+                message = self._decode_frame(frame, moment, f"{self._path}, frame {number}")
+                if message is not None:
+                    yield message
             else:
                 self._left_out[f"of channel {frame.channel}"] += 1
-        self._check_fit()
+        self._check_frames_fit_database()
+        self._note_left_out()
+
+    def _note_left_out(self) -> None:
+        """Append a line on the frames that were left out, and one on those longer than the database has them."""
         if self._left_out:
             counts = ", ".join(f"{kind} ({count})" for kind, count in self._left_out.items())
             self._notes.append(f"{self._path}: frames left out: {counts}")
@@ -103,33 +109,47 @@ class FrameReader:
             counts = ", ".join(f"{name} ({count})" for name, count in self._longer.items())
             self._notes.append(f"{self._path}: frames longer than {self._sources.dbc} has them: {counts}")
 
-    def _decode(self, frame: "Message", moment: float, where: str) -> Iterator[FileMessage | InputError]:
-        """Yield the message of a frame, if it is wanted, or why it cannot be read."""
-        described = self._database.get((frame.arbitration_id, frame.is_extended_id))
-        name = f"0x{frame.arbitration_id:x}" if described is None else described.name
+    def _decode_frame(self, frame: "Message", moment: float, where: str) -> FileMessage | InputError | None:
+        """Return the message of a frame, or why it cannot be read; None of one that is not wanted.
+
+        Args:
+            frame: the frame.
+            moment: its time in seconds since 1970.
+            where: place of the frame, for errors.
+        """
+        description = self._database.get((frame.arbitration_id, frame.is_extended_id))
+        name = f"0x{frame.arbitration_id:x}" if description is None else description.name
         self._identifiers[f"0x{frame.arbitration_id:x}"] += 1
         if not self._wanted(name):
-            return
-        content: dict[str, Any] = {}
-        if described is not None:
+            return None
+        signals: dict[str, Any] | InputError = {}
+        if description is not None:
             self._check_channel(name, frame.channel)
-            size, length = len(frame.data), described.length
             where = f"{where}, {name}"
-            if size < length:
-                self._short[name][size] += 1
-                yield fail(where, f"{length} bytes, as {self._sources.dbc} has it", f"{size}")
-                return
-            try:
-                signals: Any = described.decode(bytes(frame.data), decode_choices=False)
-            except Exception as error:  # a multiplexer that the database does not know
-                yield fail(where, f"what {self._sources.dbc} describes", error_text(error))
-                return
-            # Signals that a multiplexed message does not have this time did not arrive: None.
-            content = dict.fromkeys(signal.name for signal in described.signals) | signals
-            if size > length:
-                self._longer[name] += 1
+            signals = self._decode_signals(frame, description, where)
+        if isinstance(signals, InputError):
+            return signals
         self._decoded[name] += 1
-        yield FileMessage(where, name, {STAMP: moment, **content}, moment)
+        return FileMessage(where, name, {STAMP: moment, **signals}, moment)
+
+    def _decode_signals(self, frame: "Message", description: "Description", where: str) -> dict[str, Any] | InputError:
+        """Return the signals of a frame by name, None for one that it does not have; or why they cannot be read.
+
+        `description`: the frame's message as the database has it. Frames of other lengths are counted.
+        """
+        size, length = len(frame.data), description.length
+        if size < length:
+            self._short[description.name][size] += 1
+            return fail(where, f"{length} bytes, as {self._sources.dbc} has it", f"{size}")
+        try:
+            decoded: Any = description.decode(bytes(frame.data), decode_choices=False)
+        except Exception as error:  # a multiplexer that the database does not know
+            return fail(where, f"what {self._sources.dbc} describes", error_text(error))
+        if size > length:
+            self._longer[description.name] += 1
+        # Signals that a multiplexed message does not have this time did not arrive.
+        signals: dict[str, Any] = dict.fromkeys(signal.name for signal in description.signals) | decoded
+        return signals
 
     def _check_channel(self, name: str, channel: object) -> None:
         """Raise ValueError where a message comes from two buses."""
@@ -138,7 +158,7 @@ class FrameReader:
         if len(seen) > 1:
             raise fail(f"{self._path}, {name}", "one bus, which channel= of LogSources names", sorted(map(str, seen)))
 
-    def _check_fit(self) -> None:
+    def _check_frames_fit_database(self) -> None:
         """Raise ValueError if the frames of a wanted message are all too short, or no frame is of a wanted one."""
         remedy = "another database, or another bus (channel=)?"
         for name, sizes in self._short.items():
@@ -159,13 +179,14 @@ def _read_frames(path: Path, sources: LogSources) -> "Iterator[tuple[Message, fl
     number = 0
     with ExitStack() as stack:
         try:
-            reader, begin, shift = _open_frames(path, stack)
+            opened = _open_frames(path, stack)
         except (InputError, ModuleNotFoundError):
             raise
         except Exception as error:  # whatever a damaged file makes a reader do
             raise fail(str(path), "a log of a CAN bus", error_text(error)) from None
-        shift = shift if sources.start is None else sources.start - begin
-        frames = iter(reader)
+        # The sources may say when the log began.
+        shift = opened.shift if sources.start is None else sources.start - opened.begin
+        frames = iter(opened.reader)
         while True:
             try:
                 frame = next(frames, None)
@@ -178,31 +199,56 @@ def _read_frames(path: Path, sources: LogSources) -> "Iterator[tuple[Message, fl
             yield frame, round(frame.timestamp + shift, DIGITS)
 
 
-def _open_frames(path: Path, stack: ExitStack) -> "tuple[MessageReader, float, float]":
-    """Return a reader, the time in it of the log's begin, and what added to its times makes them seconds since 1970."""
-    from can import ASCReader, BLFReader
+class _OpenedFrames(NamedTuple):
+    """A reader of frames; the time of the log's begin by it, and what added to its times makes seconds since 1970."""
 
+    reader: "MessageReader"
+    begin: float
+    shift: float
+
+
+def _open_frames(path: Path, stack: ExitStack) -> _OpenedFrames:
+    """Open a log of frames by the kind of its name: BLF, ASC, or else MDF4; the stack closes it.
+
+    Raises:
+        ValueError: an ASC log whose times are from each event to the next.
+    """
     kind = path.suffix.lower()
     if kind == ".blf":
+        from can import BLFReader
+
         blf = BLFReader(path)
         stack.callback(blf.stop)
-        return blf, blf.start_timestamp, 0.0
+        return _OpenedFrames(blf, blf.start_timestamp, 0.0)
     if kind == ".asc":
-        # Frames have seconds from the begin, whose date has no zone: it is read as UTC, on every machine.
-        dated = ASCReader(path, relative_timestamp=False)
-        stack.callback(dated.stop)
-        next(iter(dated), None)
-        begin = datetime.fromtimestamp(dated.start_time).replace(tzinfo=UTC).timestamp() if dated.start_time else 0.0
-        if dated.timestamps_format == "relative":
-            expected = "times from the log's begin ('timestamps absolute' in its header)"
-            raise fail(str(path), expected, "times from each event to the next")
-        return stack.enter_context(ASCReader(path)), 0.0, begin
+        return _open_asc(path, stack)
     import asammdf
     from can.io.mf4 import MF4Reader
 
     with asammdf.MDF(path) as file:
         begin = file.start_time.timestamp()
-    return stack.enter_context(MF4Reader(path)), begin, 0.0
+    return _OpenedFrames(stack.enter_context(MF4Reader(path)), begin, 0.0)
+
+
+def _open_asc(path: Path, stack: ExitStack) -> _OpenedFrames:
+    """Open an ASC log, whose frames have seconds from the begin; the stack closes it.
+
+    The date of the begin has no zone: it is read as UTC, on every machine.
+
+    Raises:
+        ValueError: times from each event to the next.
+    """
+    from can import ASCReader
+
+    # A first reader, for the header alone.
+    header = ASCReader(path, relative_timestamp=False)
+    stack.callback(header.stop)
+    next(iter(header), None)
+    if header.timestamps_format == "relative":
+        expected = "times from the log's begin ('timestamps absolute' in its header)"
+        raise fail(str(path), expected, "times from each event to the next")
+    begin = datetime.fromtimestamp(header.start_time).replace(tzinfo=UTC).timestamp() if header.start_time else 0.0
+    return _OpenedFrames(stack.enter_context(ASCReader(path)), 0.0, begin)
 
 
 def _join(names: list[str]) -> str:

@@ -17,7 +17,12 @@ LISTED = 8  # names in one line
 
 
 def open_logs(path: Path, sources: LogSources, wanted: Wanted) -> Log:
-    """Open a vehicle's log, or those in a folder as one, file by file; only messages that are wanted are decoded.
+    """Return a vehicle's log, or those in a folder as one, file by file; only messages that are wanted are decoded.
+
+    Args:
+        path: the log, or the folder.
+        sources: which database and which channel of a bus, and when the log began.
+        wanted: whether a message of a name is decoded.
 
     Raises:
         ValueError: what `open_log` refuses.
@@ -26,6 +31,7 @@ def open_logs(path: Path, sources: LogSources, wanted: Wanted) -> Log:
     logs = [open_log(part, sources, wanted) for part in list_logs(path) or [path]]
     if len(logs) == 1:
         return logs[0]
+    # Notes come with the messages: once all of a log have been read.
     notes = list[str]()
 
     def read_one_after_another() -> Iterator[FileMessage | InputError]:
@@ -34,6 +40,7 @@ def open_logs(path: Path, sources: LogSources, wanted: Wanted) -> Log:
             yield from log.messages
             notes.extend(log.notes)
 
+    # By topic the units and bits of the signals that any of the logs has.
     units, bits = dict[str, dict[str, str]](), dict[str, dict[str, int]]()
     for log in logs:
         for topic, signals in log.units.items():

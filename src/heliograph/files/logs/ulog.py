@@ -18,9 +18,14 @@ DATE = "time_utc_usec"
 
 
 def open_ulog(path: Path, sources: LogSources, wanted: Wanted) -> Log:
-    """Open a ULog file; a further instance of a topic is named with its number, "sensor_baro.1".
+    """Return a ULog file as a log; a further instance of a topic is named with its number, "sensor_baro.1".
 
     Times are since the device began to run; their date is that of the first fix of its satellite receiver.
+
+    Args:
+        path: the file.
+        sources: which say the date of the begin, where it is known otherwise.
+        wanted: whether a topic of a name is read.
 
     Raises:
         ValueError: no ULog file.
@@ -33,6 +38,7 @@ def open_ulog(path: Path, sources: LogSources, wanted: Wanted) -> Log:
             file = ULog(opened)
     except Exception as error:  # whatever a damaged file makes a reader do
         raise fail(str(path), "a ULog file", error_text(error)) from None
+    # Of each topic the fields, which have no units, and of the wanted ones their values over time.
     topics = {data.name if data.multi_id == 0 else f"{data.name}.{data.multi_id}": data for data in file.data_list}
     units = {name: dict.fromkeys((field for field in data.data if field != STAMP), "") for name, data in topics.items()}
     series = {
@@ -40,6 +46,7 @@ def open_ulog(path: Path, sources: LogSources, wanted: Wanted) -> Log:
         for name, data in topics.items()
         if wanted(name)
     }
+    # When the device began to run; if the sources say when the log began, from that.
     begin = _find_date(file)
     if sources.start is not None:
         begin = sources.start - file.start_timestamp * MICROSECOND

@@ -142,7 +142,13 @@ class OwnReader:
         self._columns: Set[str] = frozenset()
 
     def read(self, where: str, row: Mapping[str, Any]) -> list[tuple[Reading | Unread, Any]]:
-        """Return the events of a message, each with its arrival, in the unit of times.
+        """Return the events of a message, its inputs first, each with its arrival, in the unit of times.
+
+        Where its values cannot be read, one `Unread` with node, count and time stands for the events.
+
+        Args:
+            where: place of the message, for errors.
+            row: its fields.
 
         Raises:
             HeaderError: columns that lack, or that nobody knows.
@@ -153,6 +159,7 @@ class OwnReader:
         if node not in self.components:
             raise fail(f"{where}, column {NODE!r}", f"one of {', '.join(self.components)}", show_value(node))
         sequence = _parse_whole(row[SEQUENCE], f"{where}, column {SEQUENCE!r}")
+        # Without an arrival it arrived when it was measured; an empty cell of a table is an error.
         time, dated = self._read_moment(row[TIME], where, TIME)
         arrival = time
         if ARRIVAL in row and (row[ARRIVAL] is not None or self._table):
@@ -163,11 +170,11 @@ class OwnReader:
             values = _read_values(row, self.components[node], where, node in self._numbered)
         except InputError as error:
             return [(Unread(error, Reading(plant, node, sequence, time, NOTHING)), arrival)]
-        found: list[tuple[Reading | Unread, Any]] = []
+        events: list[tuple[Reading | Unread, Any]] = []
         if isinstance(row.get(INPUTS), list) and node != INPUTS:
-            given = _read_values({VALUES: row[INPUTS]}, self.components[INPUTS], where)
-            found.append((Reading(plant, INPUTS, sequence, time, given), arrival))
-        return [*found, (Reading(plant, node, sequence, time, values), arrival)]
+            inputs = _read_values({VALUES: row[INPUTS]}, self.components[INPUTS], where)
+            events.append((Reading(plant, INPUTS, sequence, time, inputs), arrival))
+        return [*events, (Reading(plant, node, sequence, time, values), arrival)]
 
     def _check_columns(self, where: str, row: Mapping[str, Any]) -> None:
         """Raise ValueError at an unknown column, which is most likely misspelt, or at one that lacks.

@@ -20,7 +20,7 @@ from heliograph.files.messages.in_files import (
 )
 from heliograph.files.messages.own_form import NODE, SEQUENCE, OwnMessages, holds_events, is_own, is_table
 from heliograph.files.sources.fields import parse_arrival
-from heliograph.files.sources.reading import Unread
+from heliograph.files.sources.reading import Reading, Unread
 from heliograph.files.sources.sources import Sources
 from heliograph.files.stores.address import is_store, parse_store
 from heliograph.files.stores.tables import StoreTable, ask_store
@@ -83,11 +83,15 @@ def read_events(
     strict: bool,
     ignore_unknown: bool,
 ) -> EventTable:
-    """Read the events of a bag, a file or a store's table, as `read_messages` says."""
+    """Return the events of a bag, a log, a file or a folder, or of a store's table.
+
+    The arguments are those of `read_messages`, but for `source`: the recording's path, or the table of a store.
+    """
     instance("network", network, Network, "a Network")
     check_progress(progress, "(read, total)")
     strict, ignore_unknown = flag("strict", strict), flag("ignore_unknown", ignore_unknown)
     checked = None if sources is None else Sources(sources, network)
+    # By what the recording is: bags and logs, then messages in our own form, or of the sources' topics.
     if isinstance(source, Path) and is_bag(source):
         if checked is None:
             raise fail("sources", f"a source for the topics of {source}", "none")
@@ -154,7 +158,17 @@ def _read_own_table(path: Path | StoreTable, network: Network, strict: bool, ign
 
 
 def _read_by_topic(path: Path | StoreTable, network: Network, sources: Sources | None, strict: bool) -> EventTable:
-    """Return the events of messages, which are either all of topics of the sources, or all in our own form."""
+    """Return the events of messages, which are either all of topics of the sources, or all in our own form.
+
+    Args:
+        path: the file, the folder or the store's table.
+        network: the network.
+        sources: its sources; None of messages in our own form.
+        strict: whether the first message that cannot be read is an error.
+
+    Raises:
+        ValueError: messages of both kinds, or of topics without sources.
+    """
     events = None if sources is None else EventTable(network, sources.step)
     is_rows = isinstance(path, StoreTable) or is_table(path)
     own = OwnMessages(network, path, table=is_rows, ignore_unknown=False)
@@ -162,15 +176,16 @@ def _read_by_topic(path: Path | StoreTable, network: Network, sources: Sources |
     for message in _list_messages(path, sources):
         if isinstance(message, CutOffError) and not strict:
             broken = str(message)
-            continue
-        if isinstance(message, InputError) or (message.topic is None and is_own(message.content)):
+        elif isinstance(message, InputError) or (message.topic is None and is_own(message.content)):
             own.add(message, strict)
-            continue
-        if events is None or sources is None:
+        elif events is None or sources is None:
             raise fail(message.where, "a message in our own form, or sources for its topic", message.topic or "none")
-        _append_message(path, message, sources, events, strict)
-    if events is None or own.used:
-        if events is not None and len(events):
+        else:
+            _append_message(path, message, sources, events, strict)
+    if events is None:
+        events = own.events()
+    elif own.used:
+        if len(events):
             raise fail(str(path), "messages in our own form, or of topics", "both")
         events = own.events()
     else:  # those that could not be read count against the topics' messages
@@ -206,7 +221,15 @@ def _append_messages_by_topic(
 def _append_message(
     path: Path | StoreTable, message: FileMessage, sources: Sources, events: EventTable, strict: bool
 ) -> None:
-    """Append the events of a message; what cannot be read is refused alone."""
+    """Append the events of a message; what cannot be read is refused alone.
+
+    Args:
+        path: the file, the folder or the store's table.
+        message: the message.
+        sources: the sources, which note words of devices and what was left out.
+        events: where the events go.
+        strict: whether a message that cannot be read is an error.
+    """
     topic = message.topic
     if topic is None:
         topic = path.topic if isinstance(path, StoreTable) else name_topic(path, sources)
@@ -215,25 +238,52 @@ def _append_message(
             return
         # The payload of a topic that nobody asks for may be anything.
         content = decode_payload(message) if sources.of(topic) else None
-        came = None if message.arrival is None else parse_arrival(message.arrival, f"{message.where}, arrival")
+        arrival = None if message.arrival is None else parse_arrival(message.arrival, f"{message.where}, arrival")
         for reading in sources.read(topic, content, message.where):
             if isinstance(reading, Unread):
                 events.refuse(reading.error, strict)
-                events.note_unread(reading, came)
-                continue
-            arrival = reading.time if came is None else came
-            if arrival is None:
-                what = "a time field (time=...), or a field or column 'arrival'"
-                raise fail(f"{message.where}, {topic}", what, "neither")
-            if message.stored and reading.time is None:
-                sources.stored += 1
-                continue
-            if came is None and reading.time is not None and events.dated:
-                sources.clocks.note_time(topic, content, reading.time, (single.source for single in sources.of(topic)))
-            events.add(sources.date_as_original(reading, came), arrival)
-            sources.senders.note_fields(topic, reading.plant, reading.node, content, sources.list_fields(topic))
+                events.note_unread(reading, arrival)
+            else:
+                _append_reading(topic, message, content, reading, arrival, sources, events)
     except InputError as error:
         events.refuse(error, strict)
+
+
+def _append_reading(
+    topic: str,
+    message: FileMessage,
+    content: object,
+    reading: Reading,
+    arrival: int | None,
+    sources: Sources,
+    events: EventTable,
+) -> None:
+    """Append the event of one reading of a message, unless only the arrival of a stored message would date it.
+
+    Args:
+        topic: of the message.
+        message: the message, whose `content` is its payload, decoded.
+        content: this.
+        reading: what one source read in it.
+        arrival: when the message arrived, in nanoseconds since 1970; None where it does not say it: when measured.
+        sources: the sources.
+        events: where the event goes.
+
+    Raises:
+        ValueError: neither a time nor an arrival.
+    """
+    arrived = reading.time if arrival is None else arrival
+    if arrived is None:
+        what = "a time field (time=...), or a field or column 'arrival'"
+        raise fail(f"{message.where}, {topic}", what, "neither")
+    if message.stored and reading.time is None:
+        sources.stored += 1
+        return
+    # Clocks of topics whose messages say nothing of their arrival are compared with each other.
+    if arrival is None and reading.time is not None and events.dated:
+        sources.clocks.note_time(topic, content, reading.time, (single.source for single in sources.of(topic)))
+    events.add(sources.date_as_original(reading, arrival), arrived)
+    sources.senders.note_fields(topic, reading.plant, reading.node, content, sources.list_fields(topic))
 
 
 def _note_left_out(path: Path | StoreTable, sources: Sources, events: EventTable) -> None:
@@ -244,7 +294,7 @@ def _note_left_out(path: Path | StoreTable, sources: Sources, events: EventTable
     """
     if said := sources.describe_absent_field():
         raise InputError(said)
-    from_zero = sources.clocks.check(str(path))
+    from_zero = sources.clocks.check_dates(str(path))
     if isinstance(path, Path) and is_folder(path) and not is_log(path):
         events.notes += list_left_files(path, sources)
         if len(from_zero) > 1:
@@ -253,7 +303,7 @@ def _note_left_out(path: Path | StoreTable, sources: Sources, events: EventTable
     if sources.unknown.total():
         counts = ", ".join(f"{topic} ({count})" for topic, count in sources.unknown.items() if count)
         events.notes.append(f"{path}: not among the sources: {counts}")
-    events.notes += [f"{path}: {note}" for note in (*sources.notes, *sources.senders.lines())]
+    events.notes += [f"{path}: {note}" for note in (*sources.notes, *sources.senders.describe_several_senders())]
     if sources.stored:
         events.notes.append(f"{path}: {sources.stored} stored messages were left out: without time= they have no date")
     if sources.steps is False and not len(events) and not events.reasons and not events.broken:

@@ -53,7 +53,7 @@ class TopicClocks:
         clock.count += 1
         clock.far_from_1970 += abs(time) >= YEAR
 
-    def check(self, place: str) -> list[str]:
+    def check_dates(self, place: str) -> list[str]:
         """Return the topics whose clocks count from their own starts; raise ValueError if others have dates.
 
         Raises:

@@ -64,10 +64,14 @@ def fail_of_doubled(name: str, field: str) -> InputError:
 
 
 def _decode_json(text: str | bytes, name: str) -> tuple[Any, list[tuple[dict[str, Any], str]]]:
-    """Return the content of JSON, and each object in it that has a field twice, with the field's name."""
+    """Return the content of JSON, and each object in it that has a field twice, with the field's name.
+
+    `name`: of the text, for errors. A bare nan or inf is null.
+    """
     doubled: list[tuple[dict[str, Any], str]] = []
 
     def collect(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        """Return the fields of an object, and note the object if it has one twice."""
         fields = dict(pairs)
         if len(fields) < len(pairs):
             names = [name for name, _ in pairs]
@@ -119,6 +123,11 @@ def match_topic(topic: str, pattern: str) -> bool:
 def field_at(message: object, path: str, where: str) -> Any:
     """Return the field at a dotted path of a message: of dictionaries, lists, arrays and objects with attributes.
 
+    Args:
+        message: the message, decoded.
+        path: names between dots, positions in lists as numbers; "" for the message itself.
+        where: place of the message, for errors.
+
     Raises:
         ValueError: no such field; one line with the path and the fields that are there.
     """
@@ -133,6 +142,7 @@ def field_at(message: object, path: str, where: str) -> Any:
         if isinstance(value, Mapping) and rest in value:
             return value[rest]
         name, _, rest = rest.partition(".")
+        # A key of a dictionary, a position in a list, an attribute of any other object.
         if isinstance(value, Mapping) and name in value:
             value = value[name]
         elif name.isdigit() and isinstance(value, list | tuple | np.ndarray) and int(name) < len(value):
@@ -184,20 +194,20 @@ def is_stamp(value: object) -> bool:
 
 
 def convert_time(value: Any, unit: TimeUnit, name: str, quoted: bool = False) -> int:
-    """Convert a time to nanoseconds since 1970, or to a step if that is its unit.
+    """Return a time in nanoseconds since 1970, or as a step if that is its unit.
+
+    Args:
+        value: a stamp of two whole numbers, a date with its zone, or a number.
+        unit: of a number.
+        name: of the value, for errors.
+        quoted: whether a number in quotes is one.
 
     Raises:
         ValueError: no time; a date without a zone; a stamp of zero, which nobody has set.
     """
-    # Stamps of two whole numbers.
-    for pair in STAMPS if not isinstance(value, int | float | str) else ():
-        is_map = isinstance(value, Mapping)
-        if set(pair) <= value.keys() if is_map else hasattr(value, pair[0]) and hasattr(value, pair[1]):
-            seconds, rest = (int(value[part] if is_map else getattr(value, part)) for part in pair)
-            if seconds == rest == 0:
-                raise fail(name, "a time that was set (without time= it is the moment of arrival)", "a stamp of 0")
-            value, unit = seconds * 10**9 + rest, "ns"
-            break
+    stamp = None if isinstance(value, int | float | str) else _read_stamp(value, name)
+    if stamp is not None:
+        return _count_nanoseconds(stamp, "ns", name)
     # Dates, then numbers in their unit.
     if isinstance(value, str):
         value = parse_number(value) if quoted else value
@@ -211,9 +221,30 @@ def convert_time(value: Any, unit: TimeUnit, name: str, quoted: bool = False) ->
         raise fail(name, "a time: a date with its zone, a stamp, or a number", show_value(value))
     if unit == "step":
         return convert_count(value, name)
+    return _count_nanoseconds(value, unit, name)
+
+
+def _read_stamp(value: Any, name: str) -> int | None:
+    """Return the nanoseconds since 1970 of a stamp of two whole numbers, a dictionary or an object; None of others.
+
+    Raises:
+        ValueError: a stamp of zero, which nobody has set; one line that begins with `name`.
+    """
+    is_map = isinstance(value, Mapping)
+    for pair in STAMPS:
+        if set(pair) <= value.keys() if is_map else hasattr(value, pair[0]) and hasattr(value, pair[1]):
+            seconds, nanoseconds = (int(value[part] if is_map else getattr(value, part)) for part in pair)
+            if seconds == nanoseconds == 0:
+                raise fail(name, "a time that was set (without time= it is the moment of arrival)", "a stamp of 0")
+            return seconds * 10**9 + nanoseconds
+    return None
+
+
+def _count_nanoseconds(value: Any, unit: Literal["s", "ms", "us", "ns"], name: str) -> int:
+    """Return the nanoseconds since 1970 of a finite number in a unit; raise ValueError where 64 bits do not hold it."""
     # The decimal that was meant: a double of seconds times 10^9 is off by up to 128 ns.
-    whole_units = float(value).is_integer()
-    stamp = int(value) * UNITS[unit] if whole_units else round(Decimal(repr(float(value))) * UNITS[unit])
+    is_whole = float(value).is_integer()
+    stamp = int(value) * UNITS[unit] if is_whole else round(Decimal(repr(float(value))) * UNITS[unit])
     if not -(2**63) < stamp < 2**63:
         fits = next((other for other, size in UNITS.items() if 0 <= float(value) * size < 2**63), None)
         hint = "" if fits is None else f": in {fits} it is one (time_unit={fits!r})"

@@ -263,22 +263,19 @@ def json_field(
         ValueError: no path, as many outputs as paths expected and others given, numbers that are not finite, another
             unit of time, a step that is not positive.
     """
+    # Paths and the outputs that they are.
     paths = read_paths(path)
     outputs = () if output is None else read_texts("output", output)
     if not paths or (outputs and len(outputs) != len(paths)):
         raise fail("json_field, output", f"{max(len(paths), 1)} names, one for each path", show_value(output))
-    if not isinstance(time_unit, str) or time_unit not in get_args(TimeUnit):
-        raise fail("json_field, time_unit", f"one of {', '.join(get_args(TimeUnit))}", show_value(time_unit))
-    stamp = Stamp(time) if isinstance(time, str) else time
-    if not isinstance(stamp, Stamp | None):
-        raise fail("json_field, time", "a text or hg.files.Stamp", show_value(time))
+    # Time and count.
+    stamp, seconds = _read_time_options(time, time_unit, step)
     count = Count(sequence) if isinstance(sequence, str) else sequence
     if not isinstance(count, Count | None):
         raise fail("json_field, sequence", "a text or hg.files.Count", show_value(sequence))
+    # A text as the plant's name is the path of a field, one as the node's is the name itself.
     plant_name = Field(plant) if isinstance(plant, str) else plant
-    seconds = None if step is None else float(scalar("json_field, step", step, TINY))
-    if time_unit == "step" and (seconds is not None or (stamp is not None and stamp.shift)):
-        raise fail("json_field, step", "none where the time is in steps already, and no offset", step)
+    # Factor and offset of each value; what messages have to say of themselves.
     factors, shifts = (
         _broadcast_to_paths(name, value, paths, neutral)
         for name, value, neutral in (("scale", scale, 1.0), ("offset", offset, 0.0))
@@ -300,6 +297,19 @@ def json_field(
         valid=_read_valid(valid),
         quoted=flag("json_field, quoted", quoted),
     )
+
+
+def _read_time_options(time: "Time", time_unit: "Unit", step: "Step") -> "tuple[Stamp | None, float | None]":
+    """Return the stamp of a source and the seconds of its steps, None where it has none; raise ValueError at others."""
+    if not isinstance(time_unit, str) or time_unit not in get_args(TimeUnit):
+        raise fail("json_field, time_unit", f"one of {', '.join(get_args(TimeUnit))}", show_value(time_unit))
+    stamp = Stamp(time) if isinstance(time, str) else time
+    if not isinstance(stamp, Stamp | None):
+        raise fail("json_field, time", "a text or hg.files.Stamp", show_value(time))
+    seconds = None if step is None else float(scalar("json_field, step", step, TINY))
+    if time_unit == "step" and (seconds is not None or (stamp is not None and stamp.shift)):
+        raise fail("json_field, step", "none where the time is in steps already, and no offset", step)
+    return stamp, seconds
 
 
 def read_paths(value: object) -> tuple[str | Computed, ...]:

@@ -32,11 +32,24 @@ class _UplinkLayout(NamedTuple):
     def make_sources(
         self, path: "Paths", node: "Name", output: "Texts", scale: float, offset: float, radio: "Texts"
     ) -> "dict[str, Source]":
-        """Return the source of the server's topic, as `the_things_stack` takes its arguments."""
+        """Return {the server's topic: the source of its uplinks}.
+
+        Args:
+            path: dotted path within the decoded payload, or several.
+            node: name of a node of the network; or the `Field` that names it.
+            output: name of the output, one for each path; None for all of the node's.
+            scale: factor of the values.
+            offset: added after scaling.
+            radio: "rssi", "snr" or both, of the first gateway in the message; None for neither.
+
+        Raises:
+            ValueError: what `json_field` refuses.
+        """
         radio_names = () if radio is None else read_texts("radio", radio)
         unknown = [name for name in radio_names if name not in RADIO]
         if unknown:
             raise fail("radio of an uplink", f"some of {', '.join(RADIO)}", show_value(unknown[0]))
+        # Values, then how they were received; a number of the reception that is absent is 0.
         values = _prefix_paths(self.values, path)
         reception = [ZeroIfAbsent(f"{self.reception}.{name}") for name in radio_names]
         outputs = None if output is None else [*read_texts("output", output), *radio_names]

@@ -34,10 +34,10 @@ class SenderCounter:
                     counts[value] += 1
 
     def lines_now_and_then(self) -> list[str]:
-        """Return `lines` after 1, 2, 4, 8, ... messages, and [] in between, to save time."""
-        return self.lines() if self._noted & (self._noted - 1) == 0 else []
+        """Return what `describe_several_senders` does after 1, 2, 4, 8, ... messages, and [] in between, to save time."""
+        return self.describe_several_senders() if self._noted & (self._noted - 1) == 0 else []
 
-    def lines(self) -> list[str]:
+    def describe_several_senders(self) -> list[str]:
         """Return a line for each field of a topic that has several values which come again; each is returned once."""
         found: dict[tuple[str, str], list[object]] = {}
         for (topic, _, _, name), counts in self._counts.items():

@@ -57,6 +57,7 @@ class Sources:
 
     def __init__(self, table: object, network: Network, others: Collection[str] = ()):
         self.network, self.others = network, others
+        # What is counted and noted of the messages that come.
         self.senders, self.clocks = SenderCounter(), TopicClocks()
         self.unknown = Counter[str]()  # messages of topics that are not in the table
         self.stored = 0  # messages that only their arrival would date, which is that of a new subscriber
@@ -66,14 +67,17 @@ class Sources:
         self.absent, self.found = dict[tuple[str, str], str](), set[tuple[str, str]]()
         # By plant and node the newest reading, its moment, and whether the count has moved.
         self._last = dict[tuple[str, str], tuple[Reading, int, bool]]()
+        # Whether time counts steps; names of the numbers of each node, and of the inputs.
         self.steps = TIME_STEP not in network.inputs
         self.names = {name: tuple(network.nodes[name].received_names) for name in network.names}
         self.names[INPUTS] = tuple(name for name in network.inputs if name != TIME_STEP)
+        # The sources of each topic of the table, checked; then of each topic that came, and the fields that they use.
         if not isinstance(table, Mapping):
             raise fail("sources", "a dictionary of topics, each with json_field or a list of them", show_value(table))
         self._table = {topic: self._check_sources(topic, items) for topic, items in table.items()}
         self._known: dict[str, list[MappedSource]] = {}
         self._asked: dict[str, set[str]] = {}
+        # Words of devices that say whether they are online; seconds of a step, where times are dates.
         mapped = [single for several in self._table.values() for single in several]
         self.words = DeviceStatuses(condition for single in mapped for condition in single.source.available)
         steps = {single.source.step for single in mapped}
@@ -155,7 +159,7 @@ class Sources:
         Raises:
             ValueError: a word that is neither online nor offline; one line.
         """
-        return self.words.take_word(topic, payload, where)
+        return self.words.take_last_word(topic, payload, where)
 
     def read(self, topic: str, message: object, where: str) -> list[Reading | Unread]:
         """Return a reading of a message for each source of its topic; [] of an unknown topic, which is counted.
@@ -171,9 +175,9 @@ class Sources:
         self.unknown[topic] += not sources
         for mapped in sources:
             try:
-                reading = self._read(mapped, topic, message, where)
+                reading = self._read_by_source(mapped, topic, message, where)
             except InputError as error:
-                results.append(Unread(error, self._read_count(mapped, topic, message, where, error)))
+                results.append(Unread(error, self._read_without_values(mapped, topic, message, where, error)))
             else:
                 results += [] if reading is None else [reading]
         return results
@@ -203,64 +207,75 @@ class Sources:
         """Return the error of the first field that no message of its topic had; "" if there is none."""
         return next((said for key, said in self.absent.items() if key not in self.found), "")
 
-    def _read(self, mapped: MappedSource, topic: str, message: object, where: str) -> Reading | None:
+    def _read_by_source(self, mapped: MappedSource, topic: str, message: object, where: str) -> Reading | None:
         """Return a message's reading by one source; None if a condition leaves it out or another process reads it.
 
         Raises:
             ValueError: a field that is not there, or is no number, time or count; one line that names it.
         """
-        source, pattern, places = mapped
-        # A condition leaves a message out.
-        for field, allowed in source.where.items():
-            if field_at(message, field, where) not in allowed:
-                self.excluded[topic] += 1
-                return None
-        if any(self.words.offline(condition, topic) for condition in source.available):
-            self.offline[topic] += 1
+        source, pattern = mapped.source, mapped.pattern
+        if self._is_left_out(source, topic, message, where):
             return None
         plant, node = _read_names(mapped, topic, message, where)
         if node in self.others:
             return None
-        if node not in places:
-            raise fail(f"{where}, node", f"one of {', '.join(places)}", _suggest_name(node, places))
+        if node not in mapped.places:
+            raise fail(f"{where}, node", f"one of {', '.join(mapped.places)}", _suggest_name(node, mapped.places))
         source.check_valid(message, where)
-        sequence, missing = self._read_message_count(source, pattern, message, where)
-        # Values; of a message that has its count they may be absent.
+        sequence, is_count_absent = self._read_message_count(source, pattern, message, where)
+        # Of a message that has its count values may be absent: it measured nothing.
+        has_count = sequence is not None and not is_count_absent
         values = np.full(len(self.names[node]), np.nan)
-        for column, path, scale, offset in zip(places[node], source.paths, source.scale, source.offset, strict=True):
+        columns = zip(mapped.places[node], source.paths, source.scale, source.offset, strict=True)
+        for column, path, scale, offset in columns:
             try:
                 values[column] = scale * _read_value(message, path, where, source.quoted) + offset
                 if sequence is not None:
                     self.found.add((pattern, str(path)))
             except MissingFieldError as error:
-                if sequence is None or missing:
+                if not has_count:
                     raise
                 self.absent.setdefault((pattern, str(path)), str(error))
         period = 0 if source.sequence is None else source.sequence.period
         return Reading(plant, node, sequence, _read_time(source, message, where), values, period)
 
-    def _read_count(
+    def _is_left_out(self, source: Source, topic: str, message: object, where: str) -> bool:
+        """Return whether a condition leaves a message out, or its device said that it is offline; count such ones."""
+        for field, allowed in source.where.items():
+            if field_at(message, field, where) not in allowed:
+                self.excluded[topic] += 1
+                return True
+        if any(self.words.offline(condition, topic) for condition in source.available):
+            self.offline[topic] += 1
+            return True
+        return False
+
+    def _read_without_values(
         self, mapped: MappedSource, topic: str, message: object, where: str, error: InputError
     ) -> Reading | None:
-        """Return plant, node, count and time of a message with this error; None if these cannot be read either."""
-        sequence, missing = None, False
+        """Return plant, node, count and time of a message that could not be read, as a reading whose values are NaN.
+
+        None if these cannot be read either, or if it has no count, unless it is refused for a reason of its own.
+        `error`: why it could not be read.
+        """
+        sequence, is_count_absent = None, False
         try:
             plant, node = _read_names(mapped, topic, message, where)
-            sequence, missing = self._read_message_count(mapped.source, mapped.pattern, message, where)
+            sequence, is_count_absent = self._read_message_count(mapped.source, mapped.pattern, message, where)
         except RefusedError:  # by its count: its names are read
             pass
         except InputError:
             return None
-        sequence = None if missing else sequence
+        if is_count_absent:
+            sequence = None
         if node not in mapped.places or (sequence is None and not isinstance(error, RefusedError)):
             return None
         try:
             time = _read_time(mapped.source, message, where)
         except InputError:
             time = None
-        no_values = np.full(len(self.names[node]), np.nan)
         period = 0 if mapped.source.sequence is None else mapped.source.sequence.period
-        return Reading(plant, node, sequence, time, no_values, period)
+        return Reading(plant, node, sequence, time, np.full(len(self.names[node]), np.nan), period)
 
     def _read_message_count(self, source: Source, pattern: str, message: object, where: str) -> tuple[int | None, bool]:
         """Return a message's count, None if the source has none, and whether it is absent, which means 0."""
@@ -287,39 +302,52 @@ class Sources:
         return [MappedSource(source, topic, self._place_outputs(topic, source)) for source in sources]
 
     def _place_outputs(self, topic: str, source: Source) -> dict[str, np.ndarray]:
-        """Return by node which output each value of a source is; raise ValueError if it does not fit the network."""
+        """Return {node: which of its numbers each value of a source is, (values,)}.
+
+        Raises:
+            ValueError: a source that does not fit the network; one line that names the topic.
+        """
         name, node = f"sources, {topic!r}", source.node
-        wild = [i for i, word in enumerate(topic.split("/")) if word in ("+", "#")]
-        if wild and source.plant is None and isinstance(node, str):
-            remedy = f"plant=hg.files.Level({wild[0]}), node=hg.files.Level({wild[0]}) or a field that names either"
+        wildcards = [i for i, word in enumerate(topic.split("/")) if word in ("+", "#")]
+        if wildcards and source.plant is None and isinstance(node, str):
+            level = f"hg.files.Level({wildcards[0]})"
+            remedy = f"plant={level}, node={level} or a field that names either"
             raise fail(f"{name}, plant", f"{remedy}, since a wildcard stands for several sensors", "neither")
         if isinstance(node, str):
             if node not in self.names:
                 raise fail(f"{name}, node", f"one of {', '.join(self.names)}", _suggest_name(node, self.names))
-            found = {node: self._index_outputs(name, source, node)}
-        else:  # of the nodes that have these outputs
-            wanted = set(source.outputs)
-            found = {}
-            for candidate, known in self.names.items():
-                fits = wanted <= set(known) if wanted else len(known) == len(source.paths)
-                if fits and candidate != INPUTS:
-                    found[candidate] = self._index_outputs(name, source, candidate)
-            if not found:
+            places = {node: self._index_outputs(name, source, node)}
+        else:  # messages name it: one of those that have these outputs
+            fitting = [each for each in self.names if each != INPUTS and self._has_outputs(each, source)]
+            places = {each: self._index_outputs(name, source, each) for each in fitting}
+            if not places:
                 raise fail(f"{name}, output", "outputs of a node", show_value(source.outputs or len(source.paths)))
         for condition in source.available if "#" not in topic else ():
             condition.of(topic)
-        # Either all times are moments, or all are steps.
-        if self.steps != (source.step is not None or (source.time is not None and source.time_unit == "step")):
-            expected = (
-                "the seconds of a step (step=0.1), or a time field in steps (time=..., time_unit='step'), "
-                "since the network counts steps: no input 'dt'"
-                if self.steps
-                else "a time that is no step, since the network's time is continuous"
-            )
-            raise fail(
-                f"{name}, time", expected, f"{show_value(source.time and source.time.path)} in {source.time_unit}"
-            )
-        return found
+        self._check_kind_of_time(name, source)
+        return places
+
+    def _has_outputs(self, node: str, source: Source) -> bool:
+        """Return whether a node has the outputs of a source: those that it names, or as many as it has values."""
+        names = self.names[node]
+        return set(source.outputs) <= set(names) if source.outputs else len(names) == len(source.paths)
+
+    def _check_kind_of_time(self, name: str, source: Source) -> None:
+        """Raise ValueError, which begins with `name`, unless a source's times are steps where the network counts steps.
+
+        They are that if they are in steps, or moments of which each is of the nearest step.
+        """
+        are_steps = source.step is not None or (source.time is not None and source.time_unit == "step")
+        if self.steps == are_steps:
+            return
+        expected = (
+            "the seconds of a step (step=0.1), or a time field in steps (time=..., time_unit='step'), "
+            "since the network counts steps: no input 'dt'"
+            if self.steps
+            else "a time that is no step, since the network's time is continuous"
+        )
+        got = f"{show_value(source.time and source.time.path)} in {source.time_unit}"
+        raise fail(f"{name}, time", expected, got)
 
     def _index_outputs(self, name: str, source: Source, node: str) -> np.ndarray:
         """Return the numbers of a source's outputs among those of a node, in the order of its values."""

@@ -79,38 +79,60 @@ def parse_store(url: str) -> StoreAddress:
 
     text("store", url)
     # "scheme://.../database?options", then "query", "flux" or "sql" and the statement, where there is one.
-    place, language, statement = [*ASKS.split(url, maxsplit=1), "", ""][:3]
+    location, language, statement = [*ASKS.split(url, maxsplit=1), "", ""][:3]
     try:
-        parts = urlsplit(place)
-        host, _ = parts.hostname, parts.port
+        parts = urlsplit(location)
+        host, _ = parts.hostname, parts.port  # the port is only checked
     except ValueError:
         raise fail("store", SHAPE, "an address that cannot be read") from None
     database = unquote(parts.path).strip("/")
-    influx = parts.scheme in INFLUX
-    if parts.scheme not in (*INFLUX, *POSTGRES) or not database or (influx and not host):
+    is_influx = parts.scheme in INFLUX
+    if parts.scheme not in (*INFLUX, *POSTGRES) or not database or (is_influx and not host):
         raise fail("store", SHAPE, f"{parts.scheme}://{host or ''}{parts.path}")
     store = f"store {parts.scheme}://{host or ''}/{database}"
-    options = [unquote(option) for option in parts.query.split("&") if option]
-    tables = [option.removeprefix("table=") for option in options if option.startswith("table=")]
-    others = [option for option in options if not option.startswith("table=")]
-    organisation = ""
-    if influx and len(others) == 1 and others[0].startswith("org="):
-        organisation = others.pop().removeprefix("org=")
-    # What is asked for: one table, or one statement, and of InfluxDB nothing else.
-    if influx and others:
-        raise fail(store, ASKED, others[0].split("=")[0])
-    if (language and (tables or not statement.strip())) or len(tables) > 1:
-        raise fail(store, ASKED, "both, or one without a value" if language else "several")
-    if not influx and language not in ("", "query"):
+    table, organisation = _read_options(store, parts.query, is_influx, asks=bool(language))
+    # One table or one statement, in a language that the server has.
+    if language and not statement.strip():
+        raise fail(store, ASKED, "both, or one without a value")
+    if not is_influx and language not in ("", "query"):
         raise fail(store, "query=SELECT..., as InfluxDB alone has others", language)
     # The server's own options stay in the URL.
-    kept = "" if influx else "&".join(option for option in parts.query.split("&") if not option.startswith("table="))
+    kept = [option for option in parts.query.split("&") if not is_influx and not option.startswith("table=")]
     return StoreAddress(
         kind=parts.scheme,
-        url=urlunsplit((parts.scheme, parts.netloc, parts.path, kept, "")),
+        url=urlunsplit((parts.scheme, parts.netloc, parts.path, "&".join(kept), "")),
         database=database,
-        table=tables[0] if tables else "",
+        table=table,
         query=unquote(statement),
         language=cast(Language, language or "query"),
         organisation=organisation,
     )
+
+
+def _read_options(store: str, options: str, is_influx: bool, asks: bool) -> tuple[str, str]:
+    """Return the table and the organisation that options of a URL name, "" where they name none.
+
+    Args:
+        store: the store, for errors.
+        options: the options, "table=NAME&org=NAME"; of PostgreSQL others are the server's.
+        is_influx: whether the store is InfluxDB, which has no others.
+        asks: whether the URL has a statement, beside which no table may stand.
+
+    Raises:
+        ValueError: an option that InfluxDB has not, several tables, a table beside a statement.
+    """
+    from heliograph.numerics.check import fail
+
+    named = [unquote(option) for option in options.split("&") if option]
+    tables = [option.removeprefix("table=") for option in named if option.startswith("table=")]
+    others = [option for option in named if not option.startswith("table=")]
+    organisation = ""
+    if is_influx and len(others) == 1 and others[0].startswith("org="):
+        organisation = others.pop().removeprefix("org=")
+    if is_influx and others:
+        raise fail(store, ASKED, others[0].split("=")[0])
+    if asks and tables:
+        raise fail(store, ASKED, "both, or one without a value")
+    if len(tables) > 1:
+        raise fail(store, ASKED, "several")
+    return (tables[0] if tables else ""), organisation

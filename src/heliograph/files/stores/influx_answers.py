@@ -22,13 +22,14 @@ def read_influxql(address: StoreAddress, answer: bytes) -> Answer:
         ValueError: no answer of InfluxDB, a refusal, a part of the rows, none; one line.
     """
     try:
-        results = json.loads(answer)["results"]
+        results = json.loads(answer)["results"]  # one for each statement
     except (ValueError, KeyError, TypeError):
         raise fail(str(address), "an answer of InfluxDB in JSON", repr(answer[:40])) from None
-    refused = next((each["error"] for each in results if "error" in each), None)
-    if refused is not None:
-        raise fail(str(address), "a query that it answers", shorten(str(refused)))
-    series = [part for each in results for part in each.get("series", ())]
+    refusal = next((result["error"] for result in results if "error" in result), None)
+    if refusal is not None:
+        raise fail(str(address), "a query that it answers", shorten(str(refusal)))
+    # A series has a name, tags that all its rows share, names of columns, and rows of values.
+    series = [part for result in results for part in result.get("series", ())]
     if any(part.get("partial") for part in (*results, *series)):
         raise fail(str(address), "all rows of the query", "a part of them, as the server limits their number")
     rows = [
@@ -37,8 +38,8 @@ def read_influxql(address: StoreAddress, answer: bytes) -> Answer:
         for values in part["values"]
     ]
     names = [name for part in series for name in (*part["columns"], *part.get("tags", {}))]
-    name = str(series[0].get("name", address.table)) if series else ""
-    return name, _make_columns(address, names, rows, lambda time: int(time), len(series) > 1)
+    measurement = str(series[0].get("name", address.table)) if series else ""
+    return measurement, _make_columns(address, names, rows, read_time=lambda time: int(time), sorts=len(series) > 1)
 
 
 def read_sql_rows(address: StoreAddress, answer: bytes) -> Answer:
@@ -54,7 +55,7 @@ def read_sql_rows(address: StoreAddress, answer: bytes) -> Answer:
     if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
         raise fail(str(address), "rows of InfluxDB 3 in JSON", repr(answer[:40]))
     names = [name for row in rows for name in row]
-    return address.database, _make_columns(address, names, rows, _read_moment, False)
+    return address.database, _make_columns(address, names, rows, read_time=_read_moment, sorts=False)
 
 
 def read_flux(address: StoreAddress, answer: bytes) -> Answer:
@@ -67,32 +68,45 @@ def read_flux(address: StoreAddress, answer: bytes) -> Answer:
     Raises:
         ValueError: no such answer, an error in it, no rows; one line.
     """
-    joined: dict[tuple[object, ...], dict[str, Any]] = {}
-    measurement = ""
     try:
-        for number, row in enumerate(_yield_flux_rows(answer.decode())):
-            if "error" in row:
-                raise fail(str(address), "a query that it answers", shorten(str(row["error"])))
-            measurement_of_row = str(row.pop("_measurement", ""))
-            measurement = measurement or measurement_of_row
-            for name in ("result", "table", "_start", "_stop"):
-                row.pop(name, None)
-            if "_time" in row:
-                row["time"] = row.pop("_time")
-            if "_field" not in row or "_value" not in row:  # pivoted, or fields of a query's own
-                joined[(number,)] = row
-                continue
-            name, value = str(row.pop("_field")), row.pop("_value")
-            # What is left are the time and the tags, which all fields of one row share.
-            fields = joined.setdefault((measurement_of_row, *sorted(row.items())), row.copy())
-            fields |= _join_tags(address, row, {name: value})
+        measurement, rows = _join_flux_rows(address, _yield_flux_rows(answer.decode()))
     except InputError:
         raise
     except (ValueError, KeyError, csv.Error):
         raise fail(str(address), "tables of InfluxDB in annotated CSV", repr(answer[:40])) from None
-    rows = list(joined.values())
     names = [name for row in rows for name in row]
-    return measurement or address.database, _make_columns(address, names, rows, _read_moment, True)
+    return measurement or address.database, _make_columns(address, names, rows, read_time=_read_moment, sorts=True)
+
+
+def _join_flux_rows(address: StoreAddress, rows: Iterable[dict[str, Any]]) -> tuple[str, list[dict[str, Any]]]:
+    """Return the name of the first measurement among rows of Flux, and the rows, values of one time and tags joined.
+
+    Args:
+        address: where they came from, for errors.
+        rows: by name of the column; they are changed.
+
+    Raises:
+        ValueError: an error in the place of a row; a tag of a field's name.
+    """
+    joined: dict[tuple[object, ...], dict[str, Any]] = {}
+    first_measurement = ""
+    for number, row in enumerate(rows):
+        if "error" in row:
+            raise fail(str(address), "a query that it answers", shorten(str(row["error"])))
+        measurement = str(row.pop("_measurement", ""))
+        first_measurement = first_measurement or measurement
+        for name in ("result", "table", "_start", "_stop"):
+            row.pop(name, None)
+        if "_time" in row:
+            row["time"] = row.pop("_time")
+        if "_field" not in row or "_value" not in row:  # pivoted, or fields of a query's own
+            joined[(number,)] = row
+            continue
+        name, value = str(row.pop("_field")), row.pop("_value")
+        # What is left are the time and the tags, which all fields of one row share.
+        fields = joined.setdefault((measurement, *sorted(row.items())), row.copy())
+        fields |= _join_tags(address, row, {name: value})
+    return first_measurement, list(joined.values())
 
 
 def _join_tags(address: StoreAddress, tags: Row, columns: Row) -> dict[str, Any]:
@@ -116,7 +130,7 @@ def _yield_flux_rows(text: str) -> Iterable[dict[str, Any]]:
     A table has a line of types, one of names, its rows, and then an empty line.
     """
     types: list[str] = []
-    names: list[str] = []
+    names: list[str] = []  # [] between two tables
     for cells in csv.reader(text.splitlines()):
         if not any(cells):
             names = []
@@ -127,6 +141,7 @@ def _yield_flux_rows(text: str) -> Iterable[dict[str, Any]]:
         elif not names:
             names = cells
         else:
+            # Without types, as of an error, cells are texts.
             types_of_row = types if len(types) == len(names) else [""] * len(names)
             yield {
                 name: None if cell == "" else READ.get(type_, str)(cell)

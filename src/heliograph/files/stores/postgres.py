@@ -21,6 +21,7 @@ def ask_postgres(address: StoreAddress) -> tuple[str, dict[str, Any]]:
     Raises:
         ValueError: the server is away or refuses; no rows; a name twice. One line.
     """
+    # The URL's statement, or else all of its table.
     table = sql.SQL("SELECT * FROM {} ORDER BY time").format(sql.Identifier(*address.table.split(".")))
     query: Any = address.query.encode() or table
     try:
@@ -47,12 +48,18 @@ def write_postgres(address: StoreAddress, columns: Mapping[str, np.ndarray], pla
 
     It has the columns `plant` (text) and `time` (timestamptz, or numbers), and those given: all or nothing is written.
 
+    Args:
+        address: the store, and the table.
+        columns: the rows by column, (rows,) each; one of them is `time`.
+        plant: name of the plant, "" of a single one.
+
     Raises:
         ValueError: the server is away or refuses, a table of other columns, a name that is too long; one line.
     """
-    long = next((name for name in columns if len(name.encode()) > LONGEST), None)
-    if long is not None:
-        raise fail(str(address), f"columns whose names have at most {LONGEST} bytes", repr(long))
+    too_long = next((name for name in columns if len(name.encode()) > LONGEST), None)
+    if too_long is not None:
+        raise fail(str(address), f"columns whose names have at most {LONGEST} bytes", repr(too_long))
+    # The parts of the statements: table, columns with their types, their names, cells column by column.
     table = sql.Identifier(*address.written_table.split("."))
     types = [sql.SQL("{} {}").format(sql.Identifier(n), sql.SQL(TYPES[c.dtype.kind])) for n, c in columns.items()]
     names = sql.SQL(", ").join(map(sql.Identifier, (PLANT, *columns)))
@@ -60,10 +67,10 @@ def write_postgres(address: StoreAddress, columns: Mapping[str, np.ndarray], pla
     times = _convert_cells(np.sort(columns[TIME]))
     try:
         with psycopg.connect(address.url) as connection:
-            made = sql.SQL("CREATE TABLE IF NOT EXISTS {} (plant text NOT NULL, {})")
-            connection.execute(made.format(table, sql.SQL(", ").join(types)))
-            kept = sql.SQL("DELETE FROM {} WHERE plant = %s AND time BETWEEN %s AND %s").format(table)
-            connection.execute(kept, (plant, times[0], times[-1]))
+            make = sql.SQL("CREATE TABLE IF NOT EXISTS {} (plant text NOT NULL, {})")
+            connection.execute(make.format(table, sql.SQL(", ").join(types)))
+            remove = sql.SQL("DELETE FROM {} WHERE plant = %s AND time BETWEEN %s AND %s").format(table)
+            connection.execute(remove, (plant, times[0], times[-1]))
             with connection.cursor().copy(sql.SQL("COPY {} ({}) FROM STDIN").format(table, names)) as copy:
                 for row in zip(*cells, strict=True):
                     copy.write_row((plant, *row))

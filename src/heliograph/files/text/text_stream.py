@@ -51,9 +51,9 @@ class TextStream:
             self._start += data
             if len(self._start) < LONGEST_START and not ended and self._may_be_no_text(self._start):
                 return b""
-            data, self._start = self._begin(self._start), None
+            data, self._start = self._choose_decoder(self._start), None
         if self._inside is not None:
-            return self._inside.feed(self._unpacked(data, ended), ended and not self.more)
+            return self._inside.feed(self._unpack_bytes(data, ended), ended and not self.more)
         if self._decode is not None:
             return self._decode.decode(data, ended).encode("utf-8", "replace")
         return data
@@ -64,7 +64,7 @@ class TextStream:
         marks = (*NO_TEXT, GZIP, *WIDE, codecs.BOM_UTF8)
         return len(start) < len(WIDE[0]) or any(mark.startswith(start) for mark in marks if len(start) < len(mark))
 
-    def _begin(self, start: bytes) -> bytes:
+    def _choose_decoder(self, start: bytes) -> bytes:
         """Choose how the bytes are read, by the first of them; return them without the mark of UTF-8."""
         for mark, kind in NO_TEXT.items():
             if start.startswith(mark):
@@ -76,7 +76,7 @@ class TextStream:
             self._decode = codecs.getincrementaldecoder(encoding)("replace")
         return start.removeprefix(codecs.BOM_UTF8)
 
-    def _unpacked(self, data: bytes, ended: bool) -> bytes:
+    def _unpack_bytes(self, data: bytes, ended: bool) -> bytes:
         """Return what is packed in these bytes, a part of it at a time; nothing after damage."""
         packed, results = (self._packed or b"") + data, b""
         try:

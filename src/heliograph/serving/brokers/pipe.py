@@ -76,7 +76,7 @@ class Pipe:
         loop = asyncio.get_running_loop()
         await _wait_until_ready(self.source, loop.add_reader, loop.remove_reader)
         with name_path_in_errors("standard input"):
-            return self._read()
+            return self._read_available()
 
     def _warn_if_broken(self) -> None:
         """Warn, once, that what came could not be unpacked to its end."""
@@ -84,7 +84,7 @@ class Pipe:
             self._said = True
             LOG.warning("%s", self._text.broken)
 
-    def _read(self) -> bytes:
+    def _read_available(self) -> bytes:
         """Read what is there; of a sender that is ahead also what it sends next."""
         data = more = os.read(self.source, READ)
         waiting = select.poll()

@@ -114,7 +114,7 @@ class Translator:
             named = ", ".join(f"{topic} ({count})" for topic, count in unknown.most_common(LISTED))
             more = "" if len(unknown) <= LISTED else f" and {len(unknown) - LISTED} more"
             lines.append(f"topics that are not among the sources: {named}{more}")
-        lines += [*self.sources.notes, *self.sources.senders.lines()]
+        lines += [*self.sources.notes, *self.sources.senders.describe_several_senders()]
         if said := self.sources.describe_absent_field():
             lines.append(f"a field that no message had: {said}")
         if self._stored:
