@@ -34,7 +34,7 @@ class SenderCounter:
                     counts[value] += 1
 
     def lines_now_and_then(self) -> list[str]:
-        """Return what `describe_several_senders` does after 1, 2, 4, 8, ... messages, and [] in between, to save time."""
+        """Return what `describe_several_senders` does after 1, 2, 4, 8, ... messages; [] in between, to save time."""
         return self.describe_several_senders() if self._noted & (self._noted - 1) == 0 else []
 
     def describe_several_senders(self) -> list[str]:
