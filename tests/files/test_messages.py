@@ -291,7 +291,7 @@ def test_a_stamp_with_an_offset_is_the_same_one_by_one(world, monkeypatch):
     field = hg.files.json_field("pose.pose.position.x", "gps", time=hg.files.Stamp("header.stamp", -0.05))
     yaw = hg.files.json_field(hg.files.Yaw("pose.pose.orientation"), "inputs", time="header.stamp")
     table = hg.files.read_messages(path, network, {"/odometry": [field, yaw]})
-    monkeypatch.setattr(Decoder, "add", lambda decoder, batch, table: False)
+    monkeypatch.setattr(Decoder, "append_events", lambda decoder, batch, table: False)
     one = hg.files.read_messages(path, network, {"/odometry": [field, yaw]})
     order = np.argsort(drive.logged, kind="stable")
     assert list(table.columns["gps"].time) == (drive.measured[order] - 5 * 10**7).tolist()
