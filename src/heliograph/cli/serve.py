@@ -76,12 +76,12 @@ class ServeOptions:
         from heliograph.live.fleet import Options
         from heliograph.numerics.times.dates import horizons_in
         from heliograph.serving.brokers.url import parse_address
-        from heliograph.serving.settings import ServiceSettings, name_of, settings_of_node, store_of
+        from heliograph.serving.settings import ServiceSettings, choose_store, name_of_network, settings_of_node
         from heliograph.serving.thresholds import parse_threshold
 
         broker = None if self.broker is None else parse_address(self.broker)
         options = Options(self.window, self.ahead, self.leap)
-        store = store_of(reference, self.store, self.parts, self.node)
+        store = choose_store(reference, self.store, self.parts, self.node)
         network, module = load_module(reference)
         settings = ServiceSettings(
             network,
@@ -96,7 +96,7 @@ class ServeOptions:
             anew=tuple(self.anew or ()),
             sources=module.get("sources"),
             ignore_unknown=self.ignore_unknown,
-            name=name_of(reference),
+            name=name_of_network(reference),
             accept_changes=self.accept_changes,
             every=self.every,
             forecast=horizons_in(self.forecast) if self.forecast else None,

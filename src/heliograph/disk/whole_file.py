@@ -29,7 +29,7 @@ def try_lock(path: Path) -> Iterator[bool]:
         yield False
         return
     try:
-        yield _try_lock(handle)
+        yield _lock_handle(handle)
     finally:
         os.close(handle)
 
@@ -64,7 +64,7 @@ def _open_locked(path: Path) -> int | None:
     """Return the handle of the lock file at `path`, made if needed and locked; None if somebody else holds the lock."""
     while True:
         handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
-        if not _try_lock(handle):
+        if not _lock_handle(handle):
             os.close(handle)
             return None
         # The path must still name the locked file: a holder before us may have removed the one that we opened.
@@ -83,7 +83,7 @@ def _is_path_of_handle(path: Path, handle: int) -> bool:
     return False
 
 
-def _try_lock(handle: int) -> bool:
+def _lock_handle(handle: int) -> bool:
     """Take the lock of an open file without waiting; return whether it was free (always, where locks do not exist)."""
     if fcntl is None:
         return True
@@ -103,7 +103,7 @@ def sync(path: Path) -> None:
         os.close(handle)
 
 
-def sync_tree(folder: Path) -> None:
+def flush_tree_to_disk(folder: Path) -> None:
     """Flush a folder with all its contents to the disk."""
     for path in (*folder.rglob("*"), folder):
         sync(path)
@@ -248,7 +248,7 @@ def whole_folder(target: Path) -> Iterator[Path]:
             lock.enter_context(try_lock(temporary))
         with lock, name_path_in_errors(target):
             yield temporary / "new"
-            sync_tree(temporary / "new")
+            flush_tree_to_disk(temporary / "new")
         with hold_signals():
             _replace_folder(temporary, target)
     except BaseException:

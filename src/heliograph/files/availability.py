@@ -82,6 +82,7 @@ class DeviceStatuses:
     """
 
     def __init__(self, conditions: Iterable[Available]):
+        """Begin with no word of any device; `conditions`: of sources, on the topics where devices say them."""
         self._by_pattern: dict[str, list[Available]] = {}
         for condition in dict.fromkeys(conditions):
             self._by_pattern.setdefault(condition.topic, []).append(condition)

@@ -76,7 +76,7 @@ class NodeEvents:
             self.period = reading.period
 
     def count_lost(self) -> int | None:
-        """Count the gaps in the node's count, in the order of its times; None without a count.
+        """Return how many messages are missing by the node's count, in the order of its times; None without a count.
 
         A message that came and could not be read, or whose stamp was not set, is none that was lost.
         """
@@ -278,7 +278,7 @@ def count_verdicts(
 
 
 def count_gaps(time: np.ndarray, sequence: Int[np.ndarray, " events"], period: int) -> int:
-    """Count the gaps in a node's count, in the order of its times.
+    """Return how many counts are missing between a node's messages, in the order of their times.
 
     After `period` messages the count begins at 0 again (0: it does not). A smaller count is a node that was restarted,
     unless it follows after at most `GAP` messages.

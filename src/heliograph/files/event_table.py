@@ -58,6 +58,7 @@ class EventTable:
     """
 
     def __init__(self, network: Network, step: float | None = None, start: int | None = None, numbers: bool = False):
+        """Begin with no event; `step`: seconds of a step, `start`: of step 0; `numbers`: whether times are numbers."""
         instance("network", network, Network, "a Network")
         self.network, self.steps, self.numbers = network, TIME_STEP not in network.inputs, numbers
         self.step = None if step is None else round(scalar("step", step, 1 / SECOND) * SECOND)  # in nanoseconds

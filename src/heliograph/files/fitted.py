@@ -52,11 +52,11 @@ def as_json(fitted: Fit, **more: Any) -> dict[str, Any]:
     return {
         **more,
         "values": {name: np.asarray(value).tolist() for name, value in fitted.values.items()},
-        "table": [{key: _plain(value) for key, value in row._asdict().items()} for row in fitted.table],
+        "table": [{key: _replace_non_finite(value) for key, value in row._asdict().items()} for row in fitted.table],
         "delays": {node: _tabulate_delays(delays) for node, delays in fitted.delays.items()},
         "sentences": list(fitted.sentences),
         "log_likelihood": dict(fitted.log_likelihoods),
-        "ends": [_plain(float(end)) for end in fitted.ends],
+        "ends": [_replace_non_finite(float(end)) for end in fitted.ends],
         "converged": fitted.converged,
         "stopped": fitted.stopped,
     }
@@ -104,7 +104,7 @@ def _tabulate_delays(delays: Delays) -> dict[str, Any]:
     return {"step": delays.step, "counted": delays.counted, "early": delays.early, "shares": shares}
 
 
-def _plain(value: object) -> object:
+def _replace_non_finite(value: object) -> object:
     """Return a value for JSON: None in place of a float that is not finite."""
     return None if isinstance(value, float) and not np.isfinite(value) else value
 

@@ -190,11 +190,11 @@ def _inspect_mcap(path: Path, topics: dict[str, Topic]) -> str:
         if isinstance(message.content, dict):
             _note_message(topics, str(message.topic), message.content, "Protobuf", arrival)
         else:
-            note(topics, str(message.topic), str(message.content or ""), arrival)
+            note_payload(topics, str(message.topic), str(message.content or ""), arrival)
     return ""
 
 
-def note(topics: dict[str, Topic], name: str, payload: str | bytes, arrival: int) -> None:
+def note_payload(topics: dict[str, Topic], name: str, payload: str | bytes, arrival: int) -> None:
     """Add a message of a broker to its topic; `arrival` is in nanoseconds since 1970."""
     try:
         _note_message(topics, name, decode_json(payload, name), "JSON", arrival)
@@ -283,7 +283,7 @@ def inspect_file(path: Path) -> tuple[dict[str, Topic], str]:
         with suppress(InputError):
             arrival = None if message.arrival is None else parse_arrival(message.arrival, message.where)
         if message.topic is not None and isinstance(message.content, str) and arrival is not None:
-            note(topics, name, message.content, arrival)
+            note_payload(topics, name, message.content, arrival)
             continue
         try:
             _note_message(topics, name, decode_payload(message), "JSON" if is_message_file(path) else "row", arrival)

@@ -52,14 +52,14 @@ class CheckedEvent(NamedTuple):
 
 
 def check_63_bits(name: str, value: object) -> int:
-    """Check a count: an integer from 0 of 63 bits."""
+    """Return a count as an int; raise ValueError, which calls it `name`, unless it is whole, from 0, of 63 bits."""
     if not is_whole(value) or not 0 <= int(value) < 2**63:
         raise fail(name, WHOLE, show_value(value))
     return int(value)
 
 
 def check_moment(name: str, value: object) -> float:
-    """Check a time: a finite number, since times are counted from an origin."""
+    """Return a time as a float; raise ValueError, which calls it `name`, unless it is a finite number."""
     if not is_whole(value) and not isinstance(value, float | np.floating):
         raise fail(name, "a finite number", show_value(value))
     if not np.isfinite(value):

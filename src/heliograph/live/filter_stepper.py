@@ -72,7 +72,7 @@ class NativeFilterStepper:
             leaf_of_state[...] = leaf
 
     def step(self, z: np.ndarray, u: np.ndarray, k: int) -> bool:
-        """Compute a step; False, with the state unchanged, if data are not finite or something is implausible."""
+        """Compute step k from z and u; return False, with the state unchanged, if these are implausible or infinite."""
         self._z[...], self._u[...], self._k[...] = z, u, k
         self._code()
         return not self._flagged
@@ -117,7 +117,7 @@ class XlaFilterStepper:
             self._state = [jnp.array(leaf) for leaf in leaves]
 
     def step(self, z: np.ndarray, u: np.ndarray, k: int) -> bool:
-        """Compute a step; False, with the state unchanged, if data are not finite or something is implausible."""
+        """Compute step k from z and u; return False, with the state unchanged, if these are implausible or infinite."""
         with jax.enable_x64(True):
             state = self._tree.unflatten(self._state)
             judged, flagged, self._after, self._estimate = self._run(self._numbers, state, z, u, np.asarray(k))
@@ -165,7 +165,7 @@ def _judge_step(
 
 @lru_cache
 def compile_xla_step(static: Static) -> Any:
-    """Compile (numbers, state, z, u, k) to (judgement, whether to refuse, leaves of the state, of the estimate)."""
+    """Return a filter's step, compiled by XLA: `_judge_step` as a function of (numbers, state, z, u, k)."""
 
     def step(*data: PyTree) -> PyTree:
         return _judge_step(static, *data)
@@ -220,6 +220,7 @@ def _compile_step(
         return judged, flagged, after, estimate, next_state
 
     def compile_code() -> Any:
+        """Return the code of the step; its last results are written over the arguments of the state."""
         # The last results are written over the arguments of the state: {number of the result: of the argument}.
         in_place = {i - state_count: number_count + i for i in range(state_count)}
         return compile_one(step, *(np.zeros(shape, kind) for shape, kind in shapes), in_place=in_place)
@@ -258,6 +259,7 @@ class CompiledFilter:
     """
 
     def __init__(self, filter: AbstractFilter):
+        """Take a filter apart into arrays and structure; note what its step takes and returns; nothing is compiled."""
         self.filter, self.horizon = filter, filter.horizon
         self.received, self.given = filter.received, len(filter.inputs)
         self.values = 0

@@ -58,6 +58,10 @@ class Fleet:
     """
 
     def __init__(self, program: NetworkProgram, options: Options, alone: bool = False):
+        """Take the compiled step of a network and the limits of events, and note what each node's events need.
+
+        `alone`: single rows are stepped, not those of many plants at once. There is no plant yet.
+        """
         instance("program", program, NetworkProgram, "NetworkProgram")
         instance("options", options, Options, "Options")
         network = self.network = program.network
@@ -75,7 +79,7 @@ class Fleet:
         self._joint = self.program.dt is None or network.common is not None  # see `rows_are_joint`
         # What a node refuses of its readings; what it watches for where it refuses none that repeat.
         self._limits = {name: node.limits for name, node in network.nodes.items() if node.limits is not None}
-        self.held_watches = {n: watch for n, node in network.nodes.items() if (watch := RepeatWatch.of_node(node))}
+        self.held_watches = {n: watch for n, node in network.nodes.items() if (watch := RepeatWatch.for_node(node))}
         self.periods = dict[str, int]()  # after how many messages a node's count begins at 0 again, where it does
         # Nodes whose silence says something; of these the ones whose sender decides when to send, by its trigger.
         self.watched = find_silence_rules(network)

@@ -39,15 +39,16 @@ class JudgementReader:
     """
 
     def __init__(self, fleet: Fleet):
+        """Find among the outputs of the fleet's filters the columns of their judgements on each node's events."""
         self.fleet, places = fleet, fleet.program.places
         # Columns of the judgements among a row's outputs, (filter, part): of all filters, and of the central ones.
-        self._all_columns = _judgement_columns(places)
-        central = _judgement_columns([place for place in places if place.node == Network.FUSED])
+        self._all_columns = _find_judgement_columns(places)
+        central = _find_judgement_columns([place for place in places if place.node == Network.FUSED])
         # By index of a node those on it; the nodes without a filter of their own, whose events central filters judge.
         self._judgement_columns, self._judged_centrally = dict[int, np.ndarray](), set[int]()
         for index, name in enumerate(fleet.network.names):
             of_node = [place for place in places if place.node == name and _takes_measurements(fleet, place)]
-            own = _judgement_columns(of_node)
+            own = _find_judgement_columns(of_node)
             self._judgement_columns[index] = own if len(own) else central
             if not len(own):
                 self._judged_centrally.add(index)
@@ -66,7 +67,7 @@ class JudgementReader:
         return [self.why_inputs(row) for row in self.fleet.predict_outputs(plants, given)]
 
     def why_inputs(self, outputs: Float[np.ndarray, " outputs"]) -> str | None:
-        """Explain why the inputs that led to these outputs are implausible; None if they are not."""
+        """Return why the inputs that led to these outputs of a row are implausible; None if they are not."""
         return Judgement.why_inputs(outputs[self._all_columns])
 
     def find_implausible(self, taken: Sequence[Candidate]) -> dict[int, str]:
@@ -196,7 +197,7 @@ def _largest_number(event: CheckedEvent) -> float:
     return float(np.max(np.abs(event.values), initial=-1.0, where=~np.isnan(event.values)))
 
 
-def _judgement_columns(outputs: Sequence[FilterColumns]) -> np.ndarray:
+def _find_judgement_columns(outputs: Sequence[FilterColumns]) -> np.ndarray:
     """Return the columns of the judgements of these filters, of shape (filter, part)."""
     results = [list(output.judgement) for output in outputs if output.judgement is not None]
     return np.array(results, dtype=int).reshape(-1, len(Judgement._fields))
@@ -220,6 +221,7 @@ class FleetAngles:
     """Watch a fleet for angles that a filter knows less well than it can use, and for degrees; each is said once."""
 
     def __init__(self, fleet: Fleet):
+        """List the angles that the fleet's filters estimate and its nodes receive; nothing was said of them yet."""
         self._pool = fleet.pool
         self._states = _watch_states(fleet)
         self._received = _watch_received(fleet)

@@ -29,7 +29,7 @@ class FactorPlaces(NamedTuple):
     variances: np.ndarray
 
 
-def factors_in(places: PyTree) -> list[FactorPlaces]:
+def find_factor_places(places: PyTree) -> list[FactorPlaces]:
     """Return the places of all factors in a row, from the tree of a state whose leaves are their own places."""
     parts = {path: part.astype(int) for path, part in split_by_path(places).items()}
     stems = [path.removesuffix(VARIANCES) for path in parts if path.endswith(VARIANCES)]

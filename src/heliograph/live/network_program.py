@@ -14,7 +14,7 @@ from heliograph.simulation.rows.row_smoother import RowSmoother
 from heliograph.simulation.rows.row_step import RowStep
 
 
-def time_input(network: Network) -> int | None:
+def find_time_input(network: Network) -> int | None:
     """Return the index of the plant's input dt, the time since the previous row; None if time counts steps.
 
     Raises:
@@ -52,8 +52,9 @@ class NetworkProgram:
     """
 
     def __init__(self, network: Network):
+        """Compile the step of a network on rows; raise ValueError if it has no filter."""
         instance("network", network, Network, "a Network")
-        self.network, self.claims, self.dt = network, network.claims(), time_input(network)
+        self.network, self.claims, self.dt = network, network.claims(), find_time_input(network)
         if not any(self.claims.values()):
             raise fail("network", "at least one filter to run", "none")
         self.uneven = "" if self.dt is None else explain_unevenness(first(network.plant), self.dt)

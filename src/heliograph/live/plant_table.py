@@ -7,7 +7,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from heliograph.live.long_gap import LONG, TAIL, factors_in, pass_long_gap
+from heliograph.live.long_gap import LONG, TAIL, find_factor_places, pass_long_gap
 from heliograph.live.network_program import NetworkProgram
 from heliograph.live.sorted_rows import HeldRow
 from heliograph.numerics.types import Float, PyTree
@@ -25,6 +25,7 @@ class SlotTable:
     """
 
     def __init__(self, program: NetworkProgram, alone: bool = False):
+        """Make a table with FEWEST free slots for rows of a network's program; `alone`: single rows are stepped."""
         self.program, self.step_rows, self._alone = program, program.step_rows, alone
         sizes = self.step_rows.state.size, self.step_rows.outputs.size
         ends = np.cumsum([*sizes, program.given, 1, program.received + program.given + 1])
@@ -128,7 +129,7 @@ class SlotTable:
             return self._step_parts(states, rest)[:, : self.step_rows.state.size].copy()
 
         flat = self.step_rows.state
-        places = factors_in(flat.tree(np.arange(float(flat.size))))
+        places = find_factor_places(flat.tree(np.arange(float(flat.size))))
         after = pass_long_gap(step, self.step_rows.start, row[self.state].copy(), at, to - at, places)
         self.table[slot, self.state], self.table[slot, self.at.start] = after, to
 

@@ -36,7 +36,7 @@ class RepeatWatch:
         self._bounds = dict[tuple[int, float], float]()  # by output and resolution
 
     @staticmethod
-    def of(sensor: AnySensor | None, channel: Channel | None, received: int) -> "RepeatWatch | None":
+    def for_sensor(sensor: AnySensor | None, channel: Channel | None, received: int) -> "RepeatWatch | None":
         """Return the watch for what arrives of a sensor; None if its law is not known, or readings arrive changed."""
         steps = [] if sensor is None else unstack(sensor)
         if channel is None or not steps or not all(isinstance(step, AbstractSensor) for step in steps):
@@ -55,12 +55,12 @@ class RepeatWatch:
         return RepeatWatch(noises)
 
     @staticmethod
-    def of_node(node: object) -> "RepeatWatch | None":
+    def for_node(node: object) -> "RepeatWatch | None":
         """Return the watch for what a node receives; None if it refuses what is stuck, or its sender decides."""
         if not isinstance(node, Node) or node.trigger is not None or node.encoder is not None:
             return None
         refuses = node.limits is not None and node.limits.stuck is not None
-        return None if refuses else RepeatWatch.of(node.sensor, node.channel, node.received)
+        return None if refuses else RepeatWatch.for_sensor(node.sensor, node.channel, node.received)
 
     def follow(self, values: Sequence[float], before: Repeats | None = None) -> Repeats:
         """Return the runs that end with these readings, NaN where none arrived, after those `before`, if any.
@@ -96,7 +96,10 @@ class RepeatWatch:
         )
 
     def describe(self, output: int, name: str, repeats: Repeats) -> str:
-        """Say that an output repeats its newest reading for longer than its noise allows, and what refuses that."""
+        """Return a sentence: an output repeats its newest reading for longer than its noise allows; what refuses that.
+
+        `output`: its index; `name`: what it is called; `repeats`: the runs so far.
+        """
         length, value = repeats.lengths[output], repeats.newest[output]
         before = repeats.steps[output], repeats.readings[output], repeats.equal[output]
         count = self._count_too_many(output, length, *before)

@@ -63,6 +63,14 @@ class Stream:
         invalid: ArrayLike = (),
         stuck: StuckLike = None,
     ):
+        """Start from the filter's initial law: no step is done, and nothing is counted.
+
+        Args:
+            filter: the filter to run.
+            limits: greatest and smallest plausible values of received numbers; what is beyond counts as not arrived.
+            invalid: codes for a missing value.
+            stuck: after how many equal readings in a row one counts as not arrived.
+        """
         if not isinstance(filter, AbstractFilter):
             raise fail("stream", "a filter", type(filter).__name__)
         # The sensor and the channel that the filter believes in, where it says so.
@@ -75,7 +83,9 @@ class Stream:
         self._repeats = Repeats()
         has_rule = self.limits is not None and self.limits.stuck is not None
         self._watch = (
-            None if has_rule or find_deciding_sender(filter) else RepeatWatch.of(sensor, channel, filter.received)
+            None
+            if has_rule or find_deciding_sender(filter)
+            else RepeatWatch.for_sensor(sensor, channel, filter.received)
         )
         self.steps = 0  # done so far
         self._last = -1  # the step of a sender's newest value
@@ -241,7 +251,7 @@ class Stream:
         stepper.accept()
 
     def _name_faulty_function(self, u: np.ndarray) -> str:
-        """Name the function of the filter's model that returned no number, after a semicolon; "" where none did."""
+        """Return, after "; ", the function of the filter's model that gives no number for inputs u; "" if none does."""
         before = self.filter.estimate(self._compiled.state.unflatten(self._stepper.state))
         fault = find_function_fault(self.filter, before, u, self.steps)
         return f"; {fault}" if fault else ""
@@ -325,6 +335,7 @@ class Stream:
         return data | {"state": self._stepper.state}
 
     def __setstate__(self, data: dict[str, Any]) -> None:
+        """Restore what `__getstate__` returned, and compile the step anew."""
         state = data["state"]
         vars(self).update({name: value for name, value in data.items() if name != "state"})
         self._compiled = compile_once(self.filter)

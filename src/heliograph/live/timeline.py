@@ -73,6 +73,11 @@ class Timeline:
     """
 
     def __init__(self, network: Network, window: float, start: float = 0.0, ahead: float = 0.0, capacity: int = 1000):
+        """Begin with the initial laws of a network's filters, and no event.
+
+        `window`: how late an event may be; `start`: of continuous time; `ahead`: how much later than its arrival an
+        event may be dated; `capacity`: greatest number of rows held. Times are in steps or in the unit of dt.
+        """
         # The arguments, checked.
         self.network = instance("network", network, Network, "a Network")
         self.window, self.ahead = float(scalar("window", window, 0)), float(scalar("ahead", ahead, 0))

@@ -30,6 +30,7 @@ class EstimateWriter:
     """
 
     def __init__(self, program: NetworkProgram):
+        """Make the template of a line with the estimates of all filters of a network's program."""
         n = self._n = len(program.network.states)
         self._nodes: dict[str, list[FilterColumns]] = {}
         for columns in program.places:

@@ -72,6 +72,7 @@ class BatchIntake:
     """Gives the messages of a batch to their plants; `plants` are those in memory, by name."""
 
     def __init__(self, fleet: Fleet, plants: OrderedDict[str, PlantState]):
+        """Prepare to give messages to plants; `plants`, by name, are those in memory, which are changed."""
         self.fleet, self.plants, self._judges = fleet, plants, JudgementReader(fleet)
         # Why something is refused, by the number of its message and whether it is the message's inputs.
         self._refused: dict[tuple[int, bool], str] = {}

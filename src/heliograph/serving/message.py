@@ -197,7 +197,7 @@ def _describe_payload(payload: bytes) -> str:
 
 
 def convert_time_to_seconds(moment: float | datetime, origin: datetime | None, plant: str) -> float:
-    """Convert a time to a number: for dates the seconds since `origin`, exact to the microsecond before rounding."""
+    """Return a time as a number: of a date the seconds since `origin`, exact to the microsecond before rounding."""
     mend = f"if its first message was wrong, serve --anew {quote(plant)} begins it anew"
     if isinstance(moment, datetime):
         if origin is None:

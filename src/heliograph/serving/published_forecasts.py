@@ -43,6 +43,7 @@ class ForecastPublisher:
     """
 
     def __init__(self, fleet: Fleet, horizons: Spans, thresholds: Thresholds = ()):
+        """Check thresholds and horizons against the network; raise ValueError where they do not fit it."""
         check_threshold_names(fleet.network, thresholds)
         self._thresholds = thresholds
         self._fleet, self._continuous = fleet, fleet.program.dt is not None

@@ -76,6 +76,7 @@ class Service:
         forecast: Spans | None = None,
         thresholds: Thresholds = (),
     ):
+        """Begin with no plant in memory, whose state `store` keeps; `say` gets warnings; the class says all else."""
         instance("fleet", fleet, Fleet, "a Fleet")
         self.fleet, self.store = fleet, store
         self.plants = OrderedDict[str, PlantState]()  # those in memory, in order of their newest message

@@ -102,14 +102,14 @@ class ServiceSettings:
             raise fail("--parts", "messages in our own form, which name their part", "sources in the network's file")
 
 
-def store_of(network: str, given: str | None, parts: int | None, node: str | None = None) -> str | None:
+def choose_store(network: str, given: str | None, parts: int | None, node: str | None = None) -> str | None:
     """Return the path or URL of the store: `given`, else a file in this folder named after the network and its node.
 
     None keeps no state. Processes that share `parts` have no such default, and must all name the store.
     """
     if given is not None or parts is not None:
         return None if given == NOTHING else given
-    return f"{name_of(network)}{'' if node is None else f'-{encode_name(node)}'}.db"
+    return f"{name_of_network(network)}{'' if node is None else f'-{encode_name(node)}'}.db"
 
 
 def settings_of_node(settings: ServiceSettings, node: str) -> ServiceSettings:
@@ -127,13 +127,13 @@ def settings_of_node(settings: ServiceSettings, node: str) -> ServiceSettings:
                    "none" if settings.broker is None else "--parts")  # fmt: skip
     states = settings.states
     if states is not None:
-        states = states._replace(address=_below(states.address, node))
+        states = states._replace(address=_address_below(states.address, node))
     sources, step = _select_sources(settings, node)
     return replace(
         settings,
         network=node_network(settings.network, node),
         options=settings.options._replace(step=step),
-        broker=_below(settings.broker, node),
+        broker=_address_below(settings.broker, node),
         states=states,
         sources=sources,
         others=tuple(name for name in settings.network.names if name != node),
@@ -153,11 +153,11 @@ def _select_sources(settings: ServiceSettings, node: str) -> tuple[object, float
     by_topic = {topic: list(rows) if isinstance(rows, Sequence) else [rows] for topic, rows in sources.items()}
     step = next((row.step for rows in by_topic.values() for row in rows if isinstance(row, Source)), step)
     measures = node in settings.network.nodes and settings.network.nodes[node].received > 0
-    of_node = {topic: [row for row in rows if _concerns(row, node, measures)] for topic, rows in by_topic.items()}
+    of_node = {topic: [row for row in rows if _is_for_node(row, node, measures)] for topic, rows in by_topic.items()}
     return {topic: rows for topic, rows in of_node.items() if rows} or None, step
 
 
-def _concerns(row: object, node: str, measures: bool) -> bool:
+def _is_for_node(row: object, node: str, measures: bool) -> bool:
     """Return whether a source is for a node: its own, of the inputs, or of a node that the message names.
 
     The last is so if the node measures something. What is no Source is refused later.
@@ -167,12 +167,12 @@ def _concerns(row: object, node: str, measures: bool) -> bool:
     return measures and not isinstance(row.node, str)
 
 
-def _below(address: Address, node: str) -> Address:
+def _address_below(address: Address, node: str) -> Address:
     """Return the address of a node's service, at the topic of its name below that of all."""
     return replace(address, topic=f"{address.topic}/{encode_name(node)}")
 
 
-def name_of(network: str) -> str:
+def name_of_network(network: str) -> str:
     """Return the name of a network: of `my_network.py` or of a module, and of the one among several there."""
     prefix, _, name = network.rpartition(":")
     file, name = (prefix, f"-{name}") if name.isidentifier() and prefix else (network, "")

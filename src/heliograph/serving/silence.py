@@ -43,6 +43,7 @@ class SilenceWatch:
     """
 
     def __init__(self, fleet: Fleet, every: float | None):
+        """Begin with nothing published; `every`: seconds after which an estimate is published again; None for never."""
         self.fleet, self.every = fleet, every
         self._begun, self._looked = monotonic(), -inf  # when this started, and when timeouts were looked for last
         self._published: dict[str, PublishedEstimate] = {}  # by plant, the newest

@@ -169,11 +169,15 @@ def read_raw_messages(path: Path, reader: "AnyReader", topics: list[str]) -> Ite
         except StopIteration:
             return
         except Exception as error:  # whatever damage makes a reader do
-            after = f"after message {count} of its topics, logged at {moment(last)}" if count else "before any message"
+            after = (
+                f"after message {count} of its topics, logged at {format_moment(last)}"
+                if count
+                else "before any message"
+            )
             raise DamageError(str(fail(f"{path}, {after}", "a bag without damage", _format_reason(error)))) from None
         topic, kind, last = message.connection.topic, message.connection.msgtype, message.logged
         if types.setdefault(topic, kind) != kind:
-            where = f"{path}, {topic}, logged at {moment(last)}"
+            where = f"{path}, {topic}, logged at {format_moment(last)}"
             raise DamageError(str(fail(where, f"messages of {types[topic]}, as before", kind)))
         yield message
         count += 1
@@ -225,12 +229,12 @@ def _append_messages(
         try:
             content = reader.deserialize(data, kind)
         except Exception as error:
-            where = f"{path}, {topic}, logged at {moment(logged)}"
+            where = f"{path}, {topic}, logged at {format_moment(logged)}"
             table.refuse(fail(where, f"a message of {kind}", _format_reason(error)), strict)
             continue
         for reading in sources.read(topic, content, topic):
             if isinstance(reading, Unread):
-                where = f"{path}, message {number}, logged at {moment(logged)}"
+                where = f"{path}, message {number}, logged at {format_moment(logged)}"
                 table.refuse(InputError(f"{where}, {reading.error}"), strict)
                 table.note_unread(reading, logged)
             else:
@@ -254,7 +258,7 @@ def list_fields(reader: "AnyReader", kind: str, prefix: str = "", depth: int = 6
             yield prefix + name, "list"
 
 
-def moment(nanoseconds: int) -> str:
+def format_moment(nanoseconds: int) -> str:
     """Return nanoseconds since 1970 as a date of ISO 8601."""
     return f"{np.datetime64(nanoseconds, 'ns')}Z"
 

@@ -52,6 +52,10 @@ class Layout:
     """
 
     def __init__(self, definitions: Any, kind: str, data: bytes, paths: set[str]):
+        """Find where the fields at `paths` stand in messages laid out as `data`; raise LayoutError if one cannot be.
+
+        `definitions`: fields of each type of messages; `kind`: type of this one.
+        """
         self._definitions, self._data, self._paths = definitions, data, paths
         self.lengths, self.fields = dict[int, int](), dict[str, tuple[int, str]]()
         self._read_length(0)
@@ -63,12 +67,12 @@ class Layout:
         """Return whether each message of a table of bytes, (messages, size), has these lengths, (messages,)."""
         fits = np.ones(len(table), dtype=bool)
         for begin, length in self.lengths.items():
-            fits &= _column(table, begin, "uint32") == length
+            fits &= _read_column(table, begin, "uint32") == length
         return fits
 
     def columns(self, table: np.ndarray) -> dict[str, np.ndarray]:
         """Return each wanted field of messages of this layout, (messages,)."""
-        return {path: _column(table, begin, kind) for path, (begin, kind) in self.fields.items()}
+        return {path: _read_column(table, begin, kind) for path, (begin, kind) in self.fields.items()}
 
     def _place_message(self, begin: int, kind: str, prefix: str) -> int:
         """Note where the wanted numbers of a message stand that begins at byte `begin`; return where it ends.
@@ -92,14 +96,14 @@ class Layout:
         if node == "NAME":
             return self._place_message(begin, of, f"{path}.")
         if node == "BASE" and of[0] == "string":
-            begin = _align(begin, 4)
+            begin = _align_to_size(begin, 4)
             return begin + 4 + self._read_length(begin)
         if node == "BASE":
             return self._place_numbers(begin, of[0], 1, [path])
         # A list, of numbers or of anything else; before one of any length stands its length.
         (inner_node, inner), count = of
         if node == "SEQUENCE":
-            begin = _align(begin, 4)
+            begin = _align_to_size(begin, 4)
             count, begin = self._read_length(begin), begin + 4
         if inner_node.name == "BASE" and inner[0] in NUMBERS:
             is_wanted = any(name.startswith(f"{path}.") for name in self._paths)
@@ -114,7 +118,7 @@ class Layout:
         size = NUMBERS.get(kind)
         if size is None:
             raise LayoutError
-        begin = _align(begin, size) if count else begin
+        begin = _align_to_size(begin, size) if count else begin
         for i, name in enumerate(names):
             if name in self._paths:
                 self.fields[name] = begin + i * size, kind
@@ -222,11 +226,11 @@ def _list_paths(source: Source) -> list[str]:
     if source.plant is not None or not isinstance(source.node, str) or source.where or source.time_unit == "step":
         raise LayoutError
     stamp = [] if source.time is None else [f"{source.time.path}.{field}" for field in STAMP]
-    values = [part for path in source.paths for part in _parts(path)]
+    values = [part for path in source.paths for part in _list_parts(path)]
     return [*values, *stamp, *([] if source.sequence is None else [source.sequence.path])]
 
 
-def _parts(path: str | Computed) -> tuple[str, ...]:
+def _list_parts(path: str | Computed) -> tuple[str, ...]:
     """Return the paths of the numbers of which a value is computed; that of the value itself if it is not."""
     return (path,) if isinstance(path, str) else path.parts
 
@@ -272,7 +276,7 @@ def _read_values(columns: dict[str, np.ndarray], path: str | Computed) -> np.nda
     Raises:
         LayoutError: a number of one of them that is none of its kind, such as a latitude beyond 90 degrees.
     """
-    numbers = [columns[part].astype(np.float64) for part in _parts(path)]
+    numbers = [columns[part].astype(np.float64) for part in _list_parts(path)]
     parts = [np.where(np.isfinite(number), number, np.nan) for number in numbers]
     try:
         return parts[0] if isinstance(path, str) else np.asarray(path.of(*parts))
@@ -280,12 +284,12 @@ def _read_values(columns: dict[str, np.ndarray], path: str | Computed) -> np.nda
         raise LayoutError from None
 
 
-def _column(table: np.ndarray, begin: int, kind: str) -> np.ndarray:
+def _read_column(table: np.ndarray, begin: int, kind: str) -> np.ndarray:
     """Return the number of a kind at byte `begin` of each message of a table of bytes, (messages,)."""
     column = np.ascontiguousarray(table[:, begin : begin + NUMBERS[kind]])
     return column.view(np.dtype(kind).newbyteorder("<"))[:, 0]
 
 
-def _align(begin: int, size: int) -> int:
+def _align_to_size(begin: int, size: int) -> int:
     """Return the next byte from this one on that a number of a size may have."""
     return 4 + -(-(begin - 4) // size) * size

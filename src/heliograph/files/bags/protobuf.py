@@ -15,12 +15,12 @@ DEEPEST = 64  # messages within messages
 Wire = bytes | int
 
 
-def _zigzag(number: int) -> int:
+def _decode_zigzag(number: int) -> int:
     """Return the signed number that a varint stands for, of types sint32 and sint64."""
     return (number >> 1) ^ -(number & 1)
 
 
-def _signed(number: int) -> int:
+def _decode_signed(number: int) -> int:
     """Return the signed number of 64 bits in two's complement."""
     return number - (1 << 64) if number >> 63 else number
 
@@ -32,25 +32,25 @@ class Scalar(NamedTuple):
     read: Callable[[Any], Any]
 
 
-def _fixed(layout: str) -> Callable[[bytes], Any]:
+def _make_fixed_reader(layout: str) -> Callable[[bytes], Any]:
     """Return what reads a number of fixed length."""
     return lambda data: struct.unpack(layout, data)[0]
 
 
 SCALARS = {  # by type of FieldDescriptorProto
-    1: Scalar(FIXED64, _fixed("<d")),
-    2: Scalar(FIXED32, _fixed("<f")),
-    3: Scalar(VARINT, _signed),
+    1: Scalar(FIXED64, _make_fixed_reader("<d")),
+    2: Scalar(FIXED32, _make_fixed_reader("<f")),
+    3: Scalar(VARINT, _decode_signed),
     4: Scalar(VARINT, int),
-    5: Scalar(VARINT, _signed),
-    6: Scalar(FIXED64, _fixed("<Q")),
-    7: Scalar(FIXED32, _fixed("<I")),
+    5: Scalar(VARINT, _decode_signed),
+    6: Scalar(FIXED64, _make_fixed_reader("<Q")),
+    7: Scalar(FIXED32, _make_fixed_reader("<I")),
     8: Scalar(VARINT, bool),
     13: Scalar(VARINT, int),
-    15: Scalar(FIXED32, _fixed("<i")),
-    16: Scalar(FIXED64, _fixed("<q")),
-    17: Scalar(VARINT, _zigzag),
-    18: Scalar(VARINT, _zigzag),
+    15: Scalar(FIXED32, _make_fixed_reader("<i")),
+    16: Scalar(FIXED64, _make_fixed_reader("<q")),
+    17: Scalar(VARINT, _decode_zigzag),
+    18: Scalar(VARINT, _decode_zigzag),
 }
 LENGTHS = {FIXED64: 8, FIXED32: 4}
 
@@ -89,38 +89,38 @@ class Schema:
     def of(data: bytes) -> "Schema":
         """Read a FileDescriptorSet; raise ValueError at what is none."""
         schema = Schema({}, {})
-        for file in _of_number(data, 1):
-            syntax = _text(file, 12)
-            package = _text(file, 2)
+        for file in _select_fields(data, 1):
+            syntax = _read_text_field(file, 12)
+            package = _read_text_field(file, 2)
             for number, add in ((4, schema._add_message), (5, schema._add_enum)):
-                for content in _of_number(file, number):
+                for content in _select_fields(file, number):
                     add(content, f"{package}." if package else "", syntax == "proto3")
         return schema
 
     def _add_message(self, data: bytes, prefix: str, implicit: bool) -> None:
         """Add a type of messages, and those within it."""
-        name, fields = prefix + _text(data, 1), dict[int, Field]()
-        for content in _of_number(data, 2):
+        name, fields = prefix + _read_text_field(data, 1), dict[int, Field]()
+        for content in _select_fields(data, 2):
             found = {number: value for number, _, value in read_fields(content)}
             # Of a oneof, or declared optional, nothing is said by an absent field; nor of a message.
             has_presence = 9 in found or found.get(17) == 1 or found[5] == MESSAGE
             fields[int(found[3])] = Field(
-                _as_text(found[1]),
+                _decode_text(found[1]),
                 int(found[5]),
-                _as_text(found.get(6, b"")).removeprefix("."),
+                _decode_text(found.get(6, b"")).removeprefix("."),
                 repeated=found.get(4) == REPEATED,
                 implicit=implicit and not has_presence,
             )
         self.messages[name] = fields
         for number, add in ((3, self._add_message), (4, self._add_enum)):
-            for content in _of_number(data, number):
+            for content in _select_fields(data, number):
                 add(content, f"{name}.", implicit)
 
     def _add_enum(self, data: bytes, prefix: str, implicit: bool) -> None:
         """Add an enumeration."""
-        values = [{number: value for number, _, value in read_fields(content)} for content in _of_number(data, 2)]
-        names = {_signed(int(found.get(2, 0))): _as_text(found[1]) for found in values}
-        self.enums[prefix + _text(data, 1)] = names
+        values = [{number: value for number, _, value in read_fields(content)} for content in _select_fields(data, 2)]
+        names = {_decode_signed(int(found.get(2, 0))): _decode_text(found[1]) for found in values}
+        self.enums[prefix + _read_text_field(data, 1)] = names
 
     def decode(self, data: bytes, name: str, depth: int = 0) -> dict[str, Any]:
         """Return a message as a dictionary by the names of its fields.
@@ -157,9 +157,9 @@ class Schema:
         if field.kind == MESSAGE:
             return self.decode(value, field.of, depth + 1)
         if field.kind == ENUM:
-            return self.enums.get(field.of, {}).get(_signed(value), _signed(value))
+            return self.enums.get(field.of, {}).get(_decode_signed(value), _decode_signed(value))
         if field.kind == TEXT:
-            return _as_text(value)
+            return _decode_text(value)
         return None if field.kind == BYTES else SCALARS[field.kind].read(value)
 
     def _default(self, field: Field) -> Any:
@@ -245,17 +245,17 @@ def _find_wire_type(field: Field) -> int:
     return SCALARS[field.kind].wire
 
 
-def _of_number(data: bytes, wanted: int) -> list[bytes]:
+def _select_fields(data: bytes, wanted: int) -> list[bytes]:
     """Return the messages or texts in the fields of a number."""
     return [value for number, _, value in read_fields(data) if number == wanted and isinstance(value, bytes)]
 
 
-def _text(data: bytes, number: int) -> str:
+def _read_text_field(data: bytes, number: int) -> str:
     """Return the text in the last field of a number; "" where there is none."""
-    return _as_text((_of_number(data, number) or [b""])[-1])
+    return _decode_text((_select_fields(data, number) or [b""])[-1])
 
 
-def _as_text(value: Any) -> str:
+def _decode_text(value: Any) -> str:
     """Return a text; raise ValueError at what is none."""
     if not isinstance(value, bytes):
         raise ValueError("a number where a text is expected")

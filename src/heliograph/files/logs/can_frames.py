@@ -70,6 +70,7 @@ class FrameReader:
     """
 
     def __init__(self, path: Path, sources: LogSources, database: Database, wanted: Wanted, notes: list[str]):
+        """Prepare to read a log of frames by a database of its messages; `notes` gets lines on what was left out."""
         self._path, self._sources, self._database, self._wanted, self._notes = path, sources, database, wanted, notes
         # By name of the message: frames decoded, frames longer than described, sizes of those too short, channels.
         self._decoded, self._longer = Counter[str](), Counter[str]()
@@ -168,10 +169,10 @@ class FrameReader:
                 raise fail(f"{self._path}, {name}", f"frames of {length} bytes, as {self._sources.dbc} has it", got)
         wanted = [f"{m.name} (0x{m.frame_id:x})" for m in self._database.values() if self._wanted(m.name)]
         if wanted and not self._decoded:
-            among = f"only {_join(list(self._identifiers))}; {remedy}" if self._identifiers else "no frame at all"
+            among = f"only {_join_names(list(self._identifiers))}; {remedy}" if self._identifiers else "no frame at all"
             if self._sources.channel is not None and not self._identifiers:
                 among = ", ".join(f"frames {kind}" for kind in self._left_out) or among
-            raise fail(str(self._path), f"a frame of {_join(wanted)}", among)
+            raise fail(str(self._path), f"a frame of {_join_names(wanted)}", among)
 
 
 def _read_frames(path: Path, sources: LogSources) -> "Iterator[tuple[Message, float] | InputError]":
@@ -251,6 +252,6 @@ def _open_asc(path: Path, stack: ExitStack) -> _OpenedFrames:
     return _OpenedFrames(stack.enter_context(ASCReader(path)), 0.0, begin)
 
 
-def _join(names: list[str]) -> str:
+def _join_names(names: list[str]) -> str:
     """Return the first LISTED names, and how many more there are."""
     return ", ".join(names[:LISTED]) + (f" and {len(names) - LISTED} more" if len(names) > LISTED else "")

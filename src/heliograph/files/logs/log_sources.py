@@ -45,6 +45,14 @@ class LogSources(Mapping[str, "Source | Sequence[Source]"]):
         channel: int | None = None,
         start: str | None = None,
     ):
+        """Check the options of a log, and keep its sources by message, as in a network's file.
+
+        Args:
+            sources: by name of a message its source, or several.
+            dbc: database that describes the frames of a bus; None for none.
+            channel: the bus's channel, of a log of several; None for any.
+            start: date of the log's begin, with its zone; None for that in the log.
+        """
         if not isinstance(sources, Mapping):
             expected = "a dictionary of messages, each with json_field or a list of them"
             raise fail("LogSources, sources", expected, show_value(sources))

@@ -52,7 +52,7 @@ def open_logs(path: Path, sources: LogSources, wanted: Wanted) -> Log:
 
 
 def open_log(path: Path, sources: LogSources, wanted: Wanted) -> Log:
-    """Open a vehicle's log; only messages that are wanted are decoded.
+    """Return a vehicle's log, opened by the kind of its name; only messages that are wanted are decoded.
 
     Raises:
         ValueError: no such file, one that cannot be opened, frames without a database; one line.

@@ -130,6 +130,7 @@ class OwnReader:
     """
 
     def __init__(self, network: Network, source: str, ignore_unknown: bool, table: bool):
+        """Prepare to read messages in our own form, of a network; nothing is known yet of their times and columns."""
         self.network, self.source, self._ignore, self._table = network, source, ignore_unknown, table
         self.components = {name: tuple(node.received_names) for name, node in network.nodes.items()}
         self.components[INPUTS] = tuple(name for name in network.inputs if name != TIME_STEP)

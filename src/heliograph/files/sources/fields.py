@@ -34,7 +34,7 @@ class MissingFieldError(InputError):
 
 
 def decode_json(text: str | bytes, name: str) -> Any:
-    """Decode JSON, in which a bare nan or inf, as printf writes them, is null.
+    """Return the content of JSON, in which a bare nan or inf, as printf writes them, is null; `name`: for errors.
 
     Raises:
         ValueError: no JSON, or a field that is there twice; one line.
@@ -46,7 +46,7 @@ def decode_json(text: str | bytes, name: str) -> Any:
 
 
 def decode_items(text: str | bytes, name: str) -> list[tuple[Any, str | None]]:
-    """Decode JSON as `decode_json` does; return each item of a list, or of lists in it, else the one content.
+    """Return each item of a list of JSON, or of lists in it, else the one content, read as `decode_json` does.
 
     Returns:
         Each item, and a field that is there twice within it, None if none is.
@@ -253,7 +253,7 @@ def _count_nanoseconds(value: Any, unit: Literal["s", "ms", "us", "ns"], name: s
 
 
 def parse_arrival(value: Any, name: str) -> int:
-    """Convert what a log says of an arrival, a date or seconds, also as a text, to nanoseconds since 1970."""
+    """Return what a log says of an arrival, a date or seconds, also as a text, in nanoseconds since 1970."""
     if isinstance(value, np.datetime64):
         return int(value.astype("datetime64[ns]").astype(np.int64))
     return convert_time(value, "s", name, quoted=True)

@@ -56,6 +56,7 @@ class Sources:
     """
 
     def __init__(self, table: object, network: Network, others: Collection[str] = ()):
+        """Check a table of sources, by topic, against a network; `others`: nodes whose messages are left out."""
         self.network, self.others = network, others
         # What is counted and noted of the messages that come.
         self.senders, self.clocks = SenderCounter(), TopicClocks()

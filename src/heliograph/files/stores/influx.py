@@ -16,7 +16,7 @@ from urllib.parse import urlencode, urlsplit
 import numpy as np
 
 from heliograph.files.stores.address import StoreAddress
-from heliograph.files.stores.influx_answers import read_flux, read_influxql, read_sql_rows, shorten
+from heliograph.files.stores.influx_answers import read_flux, read_influxql, read_sql_rows, shorten_line
 from heliograph.numerics.check import InputError, fail
 
 PORT = 8086
@@ -123,7 +123,7 @@ def _send_request(address: StoreAddress, method: str, target: str, body: bytes |
         content, status = answer.read(), answer.status
     except (OSError, HTTPException) as error:
         why = getattr(error, "strerror", None) or str(error) or type(error).__name__
-        raise fail(str(address), "a server that answers", shorten(why)) from None
+        raise fail(str(address), "a server that answers", shorten_line(why)) from None
     finally:
         connection.close()
     if status >= 300:
@@ -152,5 +152,5 @@ def _explain_refusal(content: bytes) -> str:
     except ValueError:
         found = None
     if isinstance(found, dict):
-        return shorten(str(found.get("error") or found.get("message") or answer))
-    return shorten(answer)
+        return shorten_line(str(found.get("error") or found.get("message") or answer))
+    return shorten_line(answer)

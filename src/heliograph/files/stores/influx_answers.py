@@ -27,7 +27,7 @@ def read_influxql(address: StoreAddress, answer: bytes) -> Answer:
         raise fail(str(address), "an answer of InfluxDB in JSON", repr(answer[:40])) from None
     refusal = next((result["error"] for result in results if "error" in result), None)
     if refusal is not None:
-        raise fail(str(address), "a query that it answers", shorten(str(refusal)))
+        raise fail(str(address), "a query that it answers", shorten_line(str(refusal)))
     # A series has a name, tags that all its rows share, names of columns, and rows of values.
     series = [part for result in results for part in result.get("series", ())]
     if any(part.get("partial") for part in (*results, *series)):
@@ -92,7 +92,7 @@ def _join_flux_rows(address: StoreAddress, rows: Iterable[dict[str, Any]]) -> tu
     first_measurement = ""
     for number, row in enumerate(rows):
         if "error" in row:
-            raise fail(str(address), "a query that it answers", shorten(str(row["error"])))
+            raise fail(str(address), "a query that it answers", shorten_line(str(row["error"])))
         measurement = str(row.pop("_measurement", ""))
         first_measurement = first_measurement or measurement
         for name in ("result", "table", "_start", "_stop"):
@@ -191,7 +191,7 @@ def _make_columns(
     return columns
 
 
-def shorten(said: str) -> str:
+def shorten_line(said: str) -> str:
     """Return what a server says as one line of at most 200 characters."""
     line = " ".join(said.split())
     return line if len(line) <= SAID else f"{line[:SAID]}..."

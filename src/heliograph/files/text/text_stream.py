@@ -28,6 +28,7 @@ class TextStream:
     """
 
     def __init__(self, source: str):
+        """Begin with no byte; `source`: where they come from, for errors."""
         self.source, self.broken = source, ""
         self._start: bytes | None = b""  # bytes of which it is not known yet what they are
         self._packed: bytes | None = None  # packed bytes that are not unpacked yet; None of what is not packed

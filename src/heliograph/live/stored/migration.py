@@ -216,7 +216,7 @@ class PlantMigration:
         ]
         index_here = {i: network.names.index(name) for i, name in enumerate(sizes_before) if name in kept}
         index_here[-1] = -1  # the inputs
-        parts = PlantParts.of(stored, self._count_columns_before())
+        parts = PlantParts.from_bytes(stored, self._count_columns_before())
         rows = self._select_rows(parts, index_here)
         table = self._translate_table(parts.table[[row.number_before for row in rows]], index_here)
         assert table.shape[1] == self.fleet.pool.table.shape[1]

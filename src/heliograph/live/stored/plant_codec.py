@@ -45,7 +45,7 @@ class PlantParts(NamedTuple):
         return _pack_parts(self.head, *(array.ravel() for array in self[1:]))
 
     @staticmethod
-    def of(data: bytes, width: int) -> "PlantParts":
+    def from_bytes(data: bytes, width: int) -> "PlantParts":
         """Read the parts from bytes, of rows with `width` numbers; raise ValueError if these have another width."""
         length, rows, events, numbers = HEAD.unpack_from(data)
         head, at, arrays = json.loads(data[HEAD.size : HEAD.size + length]), HEAD.size + length, list[np.ndarray]()
@@ -112,7 +112,7 @@ def _unpack_table(data: bytes, at: int, size: int, kept: int) -> tuple[np.ndarra
 
 def unpack_plant(name: str, data: bytes, fleet: Fleet) -> PlantState:
     """Return the plant `name` from what `pack_plant` returned, with its rows in new slots of the fleet's table."""
-    parts = PlantParts.of(data, fleet.pool.table.shape[1])
+    parts = PlantParts.from_bytes(data, fleet.pool.table.shape[1])
     head, rows = parts.head, _make_rows_with_events(parts, fleet)
     # Where the head says when the last moment before a leap was, the first row is the one kept from before it.
     moment_before = head.get(BEFORE_LEAP)

@@ -131,6 +131,7 @@ class _Examination:
         received = list[bytes]()
 
         async def listen() -> None:
+            """Receive batches until all of the bodies have arrived, and add what came to `received`."""
             while set(bodies) - set(received):
                 received.extend(await self._unpack(await transport.receive(), acknowledge))
                 await asyncio.sleep(0)  # a transport that never waits would let no time pass

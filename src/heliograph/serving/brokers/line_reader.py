@@ -45,6 +45,14 @@ class LineReader:
         path: Path | None = None,
         ignore_unknown: bool = False,
     ):
+        """Prepare readers of all kinds of lines; the first lines tell which kind they are.
+
+        Args:
+            network: the network.
+            translator: the sources of the network's file; None if it has none.
+            path: the file that is redirected, whose name may be a topic; None of any other pipe.
+            ignore_unknown: whether columns that the network does not know are left out.
+        """
         instance("network", network, Network, "a Network")
         if translator is not None:
             instance("translator", translator, Translator, "a Translator, or None")

@@ -4,7 +4,7 @@ import asyncio
 import threading
 import time
 
-from heliograph.files.inspection import Topic, note
+from heliograph.files.inspection import Topic, note_payload
 from heliograph.numerics.check import fail
 from heliograph.serving.brokers.url import Address
 
@@ -65,7 +65,7 @@ def _listen_mqtt(address: Address, seconds: float, topics: dict[str, Topic]) -> 
     def note_message(client: Client, data: object, message: MQTTMessage) -> None:
         """Note a message under its topic, with the time of its arrival."""
         if not message.retain:  # a stored message says nothing of rate and lateness
-            note(topics, message.topic, bytes(message.payload), time.time_ns())
+            note_payload(topics, message.topic, bytes(message.payload), time.time_ns())
 
     # Callbacks run in the client's thread while this one sleeps.
     client = Client(CallbackAPIVersion.VERSION2)
@@ -105,7 +105,7 @@ async def _listen_nats(address: Address, seconds: float, topics: dict[str, Topic
     async def note_message(received: Msg) -> None:
         """Note a message under its topic, words between slashes, but for the server's own."""
         if not received.subject.startswith(INTERNAL):
-            note(topics, received.subject.replace(".", "/"), received.data, time.time_ns())
+            note_payload(topics, received.subject.replace(".", "/"), received.data, time.time_ns())
 
     async def ignore(error: Exception) -> None:
         """Do nothing at an error, which the client would log with a traceback; what it raises is one line."""

@@ -53,6 +53,11 @@ class Connection:
     """A connection that is opened anew whenever it ends, after a wait that doubles; callbacks run in its thread."""
 
     def __init__(self, address: Address, identity: str):
+        """Prepare a client of the broker at an address; `start` connects it.
+
+        `identity`: name of the session that the broker keeps while nobody reads, whose messages are acknowledged one by
+        one; "" for no session.
+        """
         self.address, self.open = address, True
         self.changed = threading.Condition()
         session = bool(identity)
@@ -113,6 +118,7 @@ class _Reader(Connection):
     """Connection that receives messages and holds them until `receive` takes them."""
 
     def __init__(self, address: Address, part: Part, translator: Translator | None):
+        """Connect, to read the messages of one part of the plants, and topics of the translator's sources, if any."""
         super().__init__(address, f"{address.topic.replace('/', '-')}-part-{part.number}-of-{part.of}")
         self._topics_below = f"{part.number}/#" if part.of > 1 else "#"
         self._loop, self._some_held = asyncio.get_running_loop(), asyncio.Event()

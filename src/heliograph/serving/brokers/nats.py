@@ -59,6 +59,7 @@ class Nats:
     """
 
     def __init__(self, address: Address, part: Part = WHOLE, translator: Translator | None = None):
+        """Prepare to serve one part of the plants through the server at an address; the first call connects."""
         self.address, self.part, self._translator = address, part, translator
         self.topic = address.topic.replace("/", ".")
         self.stream = self.topic.replace(".", "-")

@@ -14,12 +14,12 @@ from asyncua import Client, Node, ua
 from asyncua.common.subscription import DataChangeNotif
 from asyncua.ua.uaerrors import UaError
 
-from heliograph.files.inspection import Topic, note
+from heliograph.files.inspection import Topic, note_payload
 from heliograph.model.trigger import SendOnDelta
 from heliograph.numerics.check import fail, items, show_value, text
 from heliograph.serving.brokers.pipe import Pipe
 from heliograph.serving.brokers.translator import Translator
-from heliograph.serving.brokers.transport import Batch, Retry, nothing
+from heliograph.serving.brokers.transport import Batch, Retry, acknowledge_nothing
 from heliograph.serving.brokers.url import Address, parse_address
 from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
@@ -125,6 +125,7 @@ class OpcUa:
     """
 
     def __init__(self, parse_address: Address, translator: Translator, target: int = 1):
+        """Prepare to read a server's variables by a translator's sources; outputs go to file descriptor `target`."""
         self.address, self._translator = parse_address, translator
         self._output, self._retry = Pipe(target=target), Retry(str(parse_address))
         self._changes: asyncio.Queue[Sequence[Payload]] = asyncio.Queue()
@@ -143,7 +144,7 @@ class OpcUa:
             while len(payloads) < MOST and not self._changes.empty():
                 payloads += self._changes.get_nowait()
             if payloads:
-                return Batch(payloads, nothing)
+                return Batch(payloads, acknowledge_nothing)
 
     async def publish(self, outputs: Sequence[Output]) -> None:
         await self._output.publish(outputs)
@@ -220,7 +221,7 @@ class Listener:
         """Note a change; of a variable's first value only that it is there."""
         name, body = _translate_change(node, val, data)
         stored = name not in self.topics
-        note(self.topics, name, body, time.time_ns())
+        note_payload(self.topics, name, body, time.time_ns())
         if stored:
             del self.topics[name].logged[:], self.topics[name].late[:]
 

@@ -11,7 +11,7 @@ from typing import Protocol
 
 from heliograph.disk.whole_file import name_path_in_errors
 from heliograph.files.text.text_stream import TextStream
-from heliograph.serving.brokers.transport import LOG, Batch, nothing
+from heliograph.serving.brokers.transport import LOG, Batch, acknowledge_nothing
 from heliograph.serving.message import LONGEST, Payload
 from heliograph.serving.output import Output
 
@@ -46,6 +46,7 @@ class Pipe:
     """
 
     def __init__(self, source: int = 0, target: int = 1, reader: MessageReader | None = None):
+        """Prepare to read lines of the file `source` by a reader, and to write to `target`; nothing is read yet."""
         self.source, self.target, self._reader = source, target, reader
         self._rest = b""  # the begin of a line that has not ended
         self._skipping = False  # whether the rest of a line is left out that was too long
@@ -67,7 +68,7 @@ class Pipe:
                 payloads += [] if self._reader is None else self._reader.end()
                 self._warn_if_broken()
             if payloads:
-                return Batch(payloads, nothing)
+                return Batch(payloads, acknowledge_nothing)
             if ended:
                 return None
 

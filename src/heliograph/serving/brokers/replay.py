@@ -205,7 +205,7 @@ def delay_as_traced(events: Sequence[Event], trace: Path) -> list[Event]:
 
 
 def encode_messages(events: Sequence[Event], plant: str, origin: np.datetime64 | None) -> Iterator[tuple[float, str]]:
-    """Encode each event as a message, with the time of its arrival.
+    """Yield each event as a message, a line of JSON, behind the time of its arrival.
 
     Args:
         events: the events, in order of arrival.

@@ -105,6 +105,7 @@ class TimeRowReader:
     """
 
     def __init__(self, network: Network, header: list[str], text: CsvReader, ignore_unknown: bool):
+        """Prepare to read rows of a table with these columns; `text`: where they come from, a file or another pipe."""
         self._network, self._steps = network, TIME_STEP not in network.inputs  # the latter: time counts steps
         self._rows = RowReader(network, text.source, strict=False, ignore_unknown=ignore_unknown)
         self._columns = CsvColumnReader(text.source, text.path, self._rows.only, strict=False)

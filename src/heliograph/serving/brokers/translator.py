@@ -42,6 +42,7 @@ class Translator:
     """
 
     def __init__(self, table: object, network: Network, others: Collection[str] = ()):
+        """Check a table of sources by topic against the network; `others`: nodes whose messages are left out."""
         instance("network", network, Network, "a Network")
         if isinstance(others, str) or not isinstance(others, Collection):
             raise fail("nodes of other processes", "a list of names", show_value(others))

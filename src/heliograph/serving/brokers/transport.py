@@ -62,7 +62,7 @@ class TakenOverError(InputError):
     """Loss of the messages to another process, which reads them now."""
 
 
-async def nothing() -> None:
+async def acknowledge_nothing() -> None:
     """Acknowledge to a sender that expects no answer."""
 
 

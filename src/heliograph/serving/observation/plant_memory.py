@@ -44,6 +44,7 @@ class PlantMemory:
     """
 
     def __init__(self, names: Mapping[tuple[str, str], Sequence[str]]):
+        """Begin with no plant; `names`: those of the received numbers by node and filter."""
         self.count, self._names = 0, names  # names of the received numbers by node and filter
         self.points: OrderedDict[str, deque[EstimatePoint]] = OrderedDict()
         self.outputs: OrderedDict[str, RecentOutputs] = OrderedDict()
@@ -107,6 +108,7 @@ class BatchHistograms:
     """Histograms of batches, in a registry of metrics: how long each took, and how old its messages were."""
 
     def __init__(self) -> None:
+        """Register the histograms, all empty."""
         registry = self.registry = CollectorRegistry()
         self._took = Histogram("heliograph_batch_seconds", "From messages to what is published.", registry=registry)
         what = "From when the oldest message of a batch was measured, where it has a date, to what is published."

@@ -52,7 +52,7 @@ class RunningNis:
         return float(low), float(high)
 
     def explain_doubt(self) -> str | None:
-        """Explain why the claim is doubtful, or return None."""
+        """Return why the claim is doubtful, in words; None if it is not, or too few rows were tested."""
         low, high = self.band()
         if self.numbers < FEWEST:
             return None

@@ -71,6 +71,16 @@ class Watch:
         names: Mapping[tuple[str, str], Sequence[str]] | None = None,
         uncounted: Collection[str] = (),
     ):
+        """Begin without a service.
+
+        Args:
+            states: names of the states.
+            title: name of the network.
+            time_unit: unit of times that are numbers.
+            fused: by the name of a fusion its claim, and the (node, filter) pairs that it fuses.
+            names: names of the received numbers by node and filter.
+            uncounted: nodes whose messages carry no count.
+        """
         self.states, self.title, self.time_unit = list(states), title, time_unit
         self.fused, self.uncounted = dict(fused or {}), uncounted
         # Held while a batch is taken, and while its outputs are recorded; when the batch began that is being taken.

@@ -70,6 +70,7 @@ class Store:
         opened: "Store | None" = None,
         carrier: PlantMigration | None = None,
     ):
+        """Open the database at `location`, or make it, and check that it is of `mine`; the class says all else."""
         self.process, self.journal = process, journal
         self.identity: Identity = {}
         mine = None if mine is None else table("identity of a store", mine, "texts") | {LAYOUT_KEY: LAYOUT}
@@ -197,7 +198,7 @@ class Store:
         return url.database or "" if url.get_backend_name() == "sqlite" else url.render_as_string(hide_password=True)
 
     def load(self, names: Iterable[str]) -> dict[str, StoredPlant]:
-        """Load the stored plants of these names; of some only damage may be left."""
+        """Return {name: its stored plant}, of these names; of one that is damaged only what is wrong with it."""
         names = list(names)
         with self._name_store_in_errors("a database that can be read"), self._engine.connect() as connection:
             rows = select_plants(connection, list(PLANTS.c), names)

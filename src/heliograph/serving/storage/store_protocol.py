@@ -151,7 +151,7 @@ class InMemoryStore:
 
 
 def report_damage(plants: Mapping[str, Damage]) -> str:
-    """Describe damaged plants to a user: their names, and whether a name itself was lost."""
+    """Return a sentence for users on damaged plants: their names, and whether a name itself was lost."""
     options = " ".join(f"--anew {quote(name)}" for name in list(plants)[:LISTED])
     more = "" if len(plants) <= LISTED else f" and {len(plants) - LISTED} more"
     lost_name = ""
