@@ -63,7 +63,15 @@ def as_json(fitted: Fit, **more: Any) -> dict[str, Any]:
 
 
 def write_fitted(content: Mapping[str, object], reference: str, measurements: str, folder: Path, target: Path) -> None:
-    """Write `fitted.json` and `fitted_network.py` into a folder that will be renamed to `target`."""
+    """Write `fitted.json` and `fitted_network.py`, which loads the network with the numbers in the former.
+
+    Args:
+        content: what `fitted.json` gets.
+        reference: the network, FILE:NAME or MODULE:NAME.
+        measurements: name of the file that was learned from.
+        folder: where both are written.
+        target: what this folder will be renamed to, by which the network's file is found.
+    """
     (folder / FITTED).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
     path, colon, name = _split_reference(reference)
     if path is None:
@@ -110,7 +118,7 @@ def _replace_non_finite(value: object) -> object:
 
 
 def _split_reference(reference: str) -> tuple[Path | None, str, str]:
-    """Split a reference into path, colon and name; modules have no path."""
+    """Return path (None of a module), colon and name of a reference, FILE:NAME or MODULE:NAME; "" where it has none."""
     module, colon, name = reference.rpartition(":")
     if not module or not name.isidentifier():
         module, colon, name = reference, "", ""

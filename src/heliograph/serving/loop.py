@@ -27,8 +27,8 @@ class StoppableWork:
         self.stop = stop
         self._thread, self._stopped_at = ThreadPoolExecutor(1), 0.0
 
-    async def finished(self, work: "asyncio.Future[T]") -> bool:
-        """Wait for work, after a stop for as long as is left; return whether it is done."""
+    async def wait_in_time(self, work: "asyncio.Future[T]") -> bool:
+        """Wait for work to end, after a stop only for the time that is left; return whether it has ended."""
         stopped = asyncio.ensure_future(self.stop.wait())
         both: set[asyncio.Future[Any]] = {work, stopped}
         await asyncio.wait(both, return_when=asyncio.FIRST_COMPLETED)
@@ -39,13 +39,13 @@ class StoppableWork:
         return work.done()
 
     async def call(self, function: Callable[..., T], *arguments: object) -> T:
-        """Call the service in its thread.
+        """Return what a function of the service returns, called in the service's thread.
 
         Raises:
             AbandonedError: it takes longer than is left after a stop, as where programs are compiled.
         """
         work = asyncio.get_running_loop().run_in_executor(self._thread, function, *arguments)
-        if not await self.finished(work):
+        if not await self.wait_in_time(work):
             raise AbandonedError
         return work.result()
 
@@ -130,7 +130,7 @@ async def _publish(
 ) -> None:
     """Publish outputs; what a reader does not take in the time after a stop is published after a restart."""
     publishing = asyncio.ensure_future(transport.publish(outputs))
-    if not await ending.finished(publishing):
+    if not await ending.wait_in_time(publishing):
         publishing.cancel()
         return
     publishing.result()  # raises what it raised

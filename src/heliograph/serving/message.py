@@ -102,12 +102,13 @@ _READER, _FAST = TypeAdapter(Message), msgspec.json.Decoder(NumberedMessage)
 
 
 def read_messages(payloads: Sequence[Payload]) -> list[Read]:
-    """Parse a batch; of what cannot be read, return the reason, with its node, count and time if it has these.
+    """Return the messages of payloads; of what cannot be read the reason, with node, count and time if it has these.
 
     Args:
         payloads: the messages; if the time of the first is a date, msgspec is not tried.
     """
     results = list[Read]()
+    # The fast decoder reads times that are numbers.
     quick = not payloads or not isinstance(payloads[0], bytes) or re.search(rb'"time":\s*"', payloads[0]) is None
     for payload in payloads:
         if not isinstance(payload, bytes):
@@ -142,7 +143,7 @@ def _read_or_explain(payload: bytes) -> Message | UnreadMessage | str:
 
 
 def read_message(payload: bytes) -> Message:
-    """Parse a message from a line of JSON.
+    """Return the message in a line of JSON.
 
     Args:
         payload: the line, of at most LONGEST bytes.

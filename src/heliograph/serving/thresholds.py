@@ -39,7 +39,7 @@ Thresholds = TypeAliasType("Thresholds", tuple[Threshold, ...])
 
 
 def parse_threshold(text: str) -> Threshold:
-    """Read a level as it is typed.
+    """Return the threshold that is typed as a name, a sign and a number.
 
     Args:
         text: a name, a sign and a number, as level>30 or flow<600.

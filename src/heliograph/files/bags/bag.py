@@ -317,6 +317,7 @@ def is_cut_off(path: Path) -> bool:
 def measure_whole_records(path: Path) -> int:
     """Return the number of bytes of an MCAP file up to the end of its last whole record of data."""
     size, end = path.stat().st_size, len(MAGIC)
+    # A record: a byte for its kind, eight for the length of its content, and this.
     with path.open("rb") as file:
         while end + 9 <= size:
             file.seek(end)

@@ -57,7 +57,13 @@ def list_logs(path: Path) -> list[Path]:
 
 
 def merge_series(path: Path, begin: float, series: Mapping[str, Series]) -> Iterator[FileMessage]:
-    """Yield the messages of several series in order of time; `begin` is in seconds since 1970."""
+    """Yield the messages of several series in order of time.
+
+    Args:
+        path: the log, for the messages' places.
+        begin: when it begins, in seconds since 1970.
+        series: by name of their messages.
+    """
     # All messages one series after another: time, number of the series, and row in it.
     names = list(series)
     times = np.concatenate([np.zeros(0), *(each.time for each in series.values())])

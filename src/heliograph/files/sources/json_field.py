@@ -32,7 +32,7 @@ class Level:
     names: Mapping[str, str] | None = None
 
     def of(self, topic: str, message: object, where: str) -> str:
-        """Return the name for a message of a topic."""
+        """Return the name that a level of the message's topic gives; `where`: place of the message, for errors."""
         words = topic.split("/")
         if not -len(words) <= self.index < len(words):
             raise fail(where, f"a topic with a level {self.index}", repr(topic))
@@ -54,7 +54,7 @@ class Field:
     names: Mapping[str, str] | None = None
 
     def of(self, topic: str, message: object, where: str) -> str:
-        """Return the name for a message of a topic."""
+        """Return the name that a field of the message gives; `where`: place of the message, for errors."""
         name = convert_name(field_at(message, self.path, where), f"{where}, field {self.path!r}")
         return (self.names or {}).get(name, name)
 
@@ -92,7 +92,10 @@ class Stamp:
         return start + round(self.offset * 10**9)
 
     def of(self, message: object, unit: TimeUnit, where: str, quoted: bool = False) -> int:
-        """Return the time in a message, in nanoseconds since 1970, or its step."""
+        """Return the time in a message, in nanoseconds since 1970, or its step.
+
+        `unit`: of a time that is a number; `where`: place of the message, for errors; `quoted`: whether it may be text.
+        """
         value, name = field_at(message, self.path, where), f"{where}, field {self.path!r}"
         if self.start is not None and isinstance(value, str) and looks_like_date(value):
             raise fail(name, f"a number, which counts from start={self.start!r}", show_value(value))
@@ -119,7 +122,7 @@ class Count:
         return 0 if self.bits is None else 1 << self.bits
 
     def check(self, number: int, name: str) -> int:
-        """Return a count of a message; refuse one of another modulus."""
+        """Return the count `number` of a message; raise ValueError, which calls it `name`, if it is too large."""
         if self.period and number >= self.period:
             got = f"{number}: of another modulus than bits={self.bits}"
             raise RefusedError("counter", fail(name, f"a count below {self.period}", got))
@@ -191,7 +194,7 @@ class Source:
         return [*values, *named, *self.where, *self.valid]
 
     def check_valid(self, message: object, where: str) -> None:
-        """Refuse a message whose flag does not say that it can be trusted.
+        """Raise ValueError unless all flags of a message say that it can be trusted.
 
         Raises:
             ValueError: a flag that does not, that is a text where a number is expected, or is not there.
@@ -322,14 +325,17 @@ def read_paths(value: object) -> tuple[str | Computed, ...]:
 
 
 def _check_name(name: str, value: object) -> Any:
-    """Return what names a node or a plant; raise ValueError unless it is a text, a Level or a Field."""
+    """Return what names a node or a plant (`name` says which); raise ValueError unless text, a Level or a Field."""
     if not isinstance(value, str | Level | Field):
         raise fail(f"json_field, {name}", "a text, hg.files.Level or hg.files.Field", show_value(value))
     return value
 
 
 def _split_conditions(where: object) -> tuple[Allowed, tuple[Available, ...]]:
-    """Return the allowed values by path of a field, and the conditions on what devices say of themselves."""
+    """Return the allowed values by path of a field, and the conditions on what devices say of themselves.
+
+    `where`: as `json_field` takes it: one condition, or several in a list, or None.
+    """
     several = list(where) if isinstance(where, list | tuple) else [] if where is None else [where]
     available = tuple(single for single in several if isinstance(single, Available))
     pairs = list[tuple[str, object]]()

@@ -109,7 +109,13 @@ def _escape(name: str, signs: str) -> str:
 
 
 def _send_request(address: StoreAddress, method: str, target: str, body: bytes | None = None) -> bytes:
-    """Send one request; return the body of the answer.
+    """Return the body of a server's answer to one request.
+
+    Args:
+        address: the server.
+        method: "GET" or "POST".
+        target: path and query of the request.
+        body: what is sent, None for nothing.
 
     Raises:
         ValueError: no answer, or one that refuses; one line.

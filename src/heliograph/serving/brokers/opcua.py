@@ -124,10 +124,10 @@ class OpcUa:
     subscribed is lost, except for its last value.
     """
 
-    def __init__(self, parse_address: Address, translator: Translator, target: int = 1):
+    def __init__(self, address: Address, translator: Translator, target: int = 1):
         """Prepare to read a server's variables by a translator's sources; outputs go to file descriptor `target`."""
-        self.address, self._translator = parse_address, translator
-        self._output, self._retry = Pipe(target=target), Retry(str(parse_address))
+        self.address, self._translator = address, translator
+        self._output, self._retry = Pipe(target=target), Retry(str(address))
         self._changes: asyncio.Queue[Sequence[Payload]] = asyncio.Queue()
         self._client: Client | None = None
         self._first: set[str] = set()  # variables of which the first value is still to come
@@ -155,7 +155,10 @@ class OpcUa:
                 await asyncio.wait_for(self._client.disconnect(), WAIT)
 
     def datachange_notification(self, node: Node, val: object, data: DataChangeNotif) -> None:
-        """Translate a change; the first value of a subscription was there before, as a stored message."""
+        """Put a change of a variable into the queue, as messages; its first value was there before, as stored ones.
+
+        `val`: the new value; `data`: its dates and its quality.
+        """
         name, body = _translate_change(node, val, data)
         stored = name in self._first
         self._first.discard(name)
@@ -281,7 +284,7 @@ def _translate_change(node: Node, value: object, data: DataChangeNotif) -> tuple
 
 
 def _find_node(client: Client, name: str) -> Node:
-    """Return the server's node with this identifier, or refuse an identifier that is none."""
+    """Return the server's node with the identifier `name`; raise ValueError at what is no identifier."""
     try:
         return client.get_node(name)
     except (UaError, ValueError):

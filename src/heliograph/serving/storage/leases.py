@@ -42,7 +42,9 @@ class Leases:
         TABLES.create_all(engine)
 
     def renew(self) -> set[int]:
-        """Report that this process is alive, and lease its parts anew: those that it has and those that are free.
+        """Report that this process is alive, lease its parts anew, and return the numbers of those that it has now.
+
+        These are the parts that it had, then free ones, up to its fair share.
 
         Raises:
             AwayError: the database does not answer now.
