@@ -98,7 +98,7 @@ def test_an_implausible_value_in_a_fused_filter_is_its_nodes_and_costs_that_valu
     plant = service.plants[""]
     outputs = service.fleet.outputs([plant.rows.held[-1].slot])[0]
     expected = clean.estimates()["fused"]["all"]
-    place = service.fleet.program.places[-1]
+    place = service.fleet.program.filter_columns[-1]
     assert outputs[place.mean] == pytest.approx(expected.mean[0], rel=1e-12)
     assert outputs[place.covariance] == pytest.approx(expected.covariance[0, 0], rel=1e-12)
     # Two bad ones in a row are each found.

@@ -37,9 +37,9 @@ def test_a_line_from_the_template_is_that_of_its_row(program):
     outputs = np.abs(generator.normal(size=(300, size))) * 10.0 ** generator.integers(-30, 30, (300, size))
     for row in outputs[100:]:
         row[generator.integers(size)] = generator.choice([np.nan, np.inf, -1.0])
-    counts = [i for columns in program.places for i in (columns.judgement or columns.tested or ())[1:2]]
+    counts = [i for columns in program.filter_columns for i in (columns.judgement or columns.tested or ())[1:2]]
     outputs[:, counts] = generator.integers(0, 3, (300, len(counts)))
-    reasons = [columns.judgement.reason for columns in program.places if columns.judgement is not None]
+    reasons = [columns.judgement.reason for columns in program.filter_columns if columns.judgement is not None]
     outputs[:, reasons] = 2 * generator.integers(0, 2, (300, len(reasons))) * (np.arange(300)[:, None] >= 200)
     rows = [(f'p{i}, "%b"', float(i) if i % 3 else "2026-11-26T00:00:00+00:00") for i in range(300)]
     written = writer.write_lines(b"final", rows, outputs)

@@ -34,8 +34,8 @@ class FinalRows:
 class GateCounts:
     """Counts of the values that filters left out of rows, by node and filter that weighs what arrives."""
 
-    def __init__(self, places: Iterable[FilterColumns]):
-        self._columns = {(p.node, p.filter): list(p.weighed.weight) for p in places if p.weighed is not None}
+    def __init__(self, filters: Iterable[FilterColumns]):
+        self._columns = {(f.node, f.filter): list(f.weighed.weight) for f in filters if f.weighed is not None}
         self.counts = dict.fromkeys(self._columns, 0)
 
     def add(self, rows: Float[np.ndarray, "row output"]) -> None:

@@ -40,14 +40,14 @@ class JudgementReader:
 
     def __init__(self, fleet: Fleet):
         """Find among the outputs of the fleet's filters the columns of their judgements on each node's events."""
-        self.fleet, places = fleet, fleet.program.places
+        self.fleet, all_columns = fleet, fleet.program.filter_columns
         # Columns of the judgements among a row's outputs, (filter, part): of all filters, and of the central ones.
-        self._all_columns = _find_judgement_columns(places)
-        central = _find_judgement_columns([place for place in places if place.node == Network.FUSED])
+        self._all_columns = _find_judgement_columns(all_columns)
+        central = _find_judgement_columns([each for each in all_columns if each.node == Network.FUSED])
         # By index of a node those on it; the nodes without a filter of their own, whose events central filters judge.
         self._judgement_columns, self._judged_centrally = dict[int, np.ndarray](), set[int]()
         for index, name in enumerate(fleet.network.names):
-            of_node = [place for place in places if place.node == name and _takes_measurements(fleet, place)]
+            of_node = [each for each in all_columns if each.node == name and _takes_measurements(fleet, each)]
             own = _find_judgement_columns(of_node)
             self._judgement_columns[index] = own if len(own) else central
             if not len(own):
@@ -126,20 +126,20 @@ class JudgementReader:
         row_before, outputs = self._find_row_before(candidate), self.fleet.pool.table[row.slot, self.fleet.pool.outputs]
         # Filters that take the event: of its node, or of all nodes. Inputs concern every filter.
         concerned = None if event.node_index < 0 else (Network.FUSED, self.fleet.network.names[event.node_index])
-        for place in self.fleet.program.places:
-            filter = filter_of(self.fleet, place)
-            if filter is None or (concerned is not None and place.node not in concerned):
+        for columns in self.fleet.program.filter_columns:
+            filter = filter_of(self.fleet, columns)
+            if filter is None or (concerned is not None and columns.node not in concerned):
                 continue
             # Only those that judged the row to be no number.
-            if place.judgement is None or not Judgement.is_spoilt(outputs[place.judgement.reason]):
+            if columns.judgement is None or not Judgement.is_spoilt(outputs[columns.judgement.reason]):
                 continue
             # Call the filter's functions from its estimate before the row: which of them returns no number?
-            tries, sentence = self._faults.get((place.node, place.filter), (0, ""))
+            tries, sentence = self._faults.get((columns.node, columns.filter), (0, ""))
             if not sentence and tries < TRIES:
                 inputs, step = self.fleet.pool.inputs_between(row_before.slot, row.slot)
-                estimate = self._estimate_after(row_before, filter, place)
+                estimate = self._estimate_after(row_before, filter, columns)
                 sentence = find_function_fault(filter, estimate, inputs, step)
-                self._faults[place.node, place.filter] = tries + 1, sentence
+                self._faults[columns.node, columns.filter] = tries + 1, sentence
             if sentence:
                 return f"; {sentence}"
         return ""
@@ -149,13 +149,13 @@ class JudgementReader:
         rows = candidate.plant.rows
         return rows.held[rows.index(candidate.row.key) - 1]
 
-    def _estimate_after(self, row: HeldRow, filter: AbstractFilter, place: FilterColumns) -> Estimate:
+    def _estimate_after(self, row: HeldRow, filter: AbstractFilter, columns: FilterColumns) -> Estimate:
         """Return what a filter estimated after a row, from its columns; before all events its initial estimate."""
         if row.key[1] == BEFORE:  # no estimate was computed there
             return filter.estimate(filter.init())
         n, outputs = len(filter.states), self.fleet.pool.table[row.slot, self.fleet.pool.outputs]
-        covariance = outputs[place.covariance : place.covariance + n * n].reshape(n, n)
-        return Estimate(outputs[place.mean : place.mean + n], covariance, place.claim)
+        covariance = outputs[columns.covariance : columns.covariance + n * n].reshape(n, n)
+        return Estimate(outputs[columns.mean : columns.mean + n], covariance, columns.claim)
 
     def _drop_blameless(self, taken: Sequence[Candidate], reasons: dict[int, str]) -> None:
         """Leave in `reasons`, of several nodes' events that a central filter judged together, only the one to blame.
@@ -183,7 +183,7 @@ class JudgementReader:
         pool, rows = self.fleet.pool, candidate.plant.rows
         trial = HeldRow(row.key, pool.take(), self.fleet.width)
         trial.numbers = row.numbers.copy()
-        columns = rows.places[event.node_index]
+        columns = rows.columns_by_node[event.node_index]
         trial.numbers[columns] = [nan] * (columns.stop - columns.start)
         # Stepped from the row before, judged, and let go.
         self.fleet.step_row(self._find_row_before(candidate), trial)
@@ -249,13 +249,13 @@ class FleetAngles:
 def _watch_states(fleet: Fleet) -> list[WatchedAngles]:
     """Return for each filter with angles among its states what to watch: the variances of its states."""
     watched = list[WatchedAngles]()
-    for place in fleet.program.places:
-        filter = filter_of(fleet, place)
+    for columns in fleet.program.filter_columns:
+        filter = filter_of(fleet, columns)
         if filter is not None and (angles := WideAngles(filter)).states:
             # The diagonal of its covariance, (n, n) row by row.
             n = len(filter.states)
-            variances = fleet.pool.outputs.start + place.covariance + np.arange(n) * (n + 1)
-            watched.append(WatchedAngles(f"{place.node}/{place.filter}", variances, angles))
+            variances = fleet.pool.outputs.start + columns.covariance + np.arange(n) * (n + 1)
+            watched.append(WatchedAngles(f"{columns.node}/{columns.filter}", variances, angles))
     return watched
 
 
@@ -265,17 +265,17 @@ def _watch_received(fleet: Fleet) -> list[WatchedAngles]:
     Each column is watched only once.
     """
     watched, seen = list[WatchedAngles](), set[int]()
-    for place in fleet.program.places:
-        filter = filter_of(fleet, place)
+    for columns in fleet.program.filter_columns:
+        filter = filter_of(fleet, columns)
         if filter is None or not filter.received:
             continue
-        names = _list_received(fleet.network, place.node)
+        names = _list_received(fleet.network, columns.node)
         angles = WideAngles(filter, list(names.values()))
         for i, column in enumerate(names):
             if column in seen:
                 angles.received.pop(i, None)
         seen |= set(names)
-        watched.append(WatchedAngles(place.node, fleet.pool.numbers.start + np.array(list(names)), angles))
+        watched.append(WatchedAngles(columns.node, fleet.pool.numbers.start + np.array(list(names)), angles))
     return watched
 
 

@@ -39,7 +39,7 @@ def find_time_input(network: Network) -> int | None:
 class NetworkProgram:
     """A network's step on rows, `step_rows`, one for each plant; plants come and go without compilation.
 
-    `places` gives the columns of each filter's estimate and judgement among its outputs.
+    `filter_columns` gives the columns of each filter's estimate and judgement among its outputs.
 
     `uneven` explains why the plant's intervals cannot be divided, "" if they can. Rows have `received` measurements and
     `given` inputs without the time step, whose number among the inputs is `dt`; None where time counts steps.
@@ -62,7 +62,7 @@ class NetworkProgram:
         self.received = sum(node.received for node in network.nodes.values())
         self.given = len(network.inputs) - (self.dt is not None)
         self.step_rows = RowStep(network)
-        self.places = self.step_rows.columns
+        self.filter_columns = self.step_rows.columns
 
     @cached_property
     def smoother(self) -> RowSmoother:

@@ -34,12 +34,12 @@ def estimates_by_name(program: NetworkProgram, outputs: np.ndarray) -> dict[str,
     """Return the estimates of a row, or of rows, by node and filter, from its outputs (..., outputs)."""
     n, attitude = len(program.network.states), first(program.network.plant).manifold.rotations
     estimates: dict[str, dict[str, Estimate]] = {node: {} for node in program.claims}
-    for place in program.places:
-        mean = outputs[..., place.mean : place.mean + n]
-        covariance = outputs[..., place.covariance : place.covariance + n * n].reshape(*outputs.shape[:-1], n, n)
-        modes = place.probabilities(outputs)
-        estimate = Estimate(mean, covariance, place.claim, modes, attitude=attitude)
-        estimates[place.node][place.filter] = lower_unsound_claim(estimate)
+    for columns in program.filter_columns:
+        mean = outputs[..., columns.mean : columns.mean + n]
+        covariance = outputs[..., columns.covariance : columns.covariance + n * n].reshape(*outputs.shape[:-1], n, n)
+        modes = columns.probabilities(outputs)
+        estimate = Estimate(mean, covariance, columns.claim, modes, attitude=attitude)
+        estimates[columns.node][columns.filter] = lower_unsound_claim(estimate)
     return estimates
 
 
@@ -49,13 +49,13 @@ def judged_estimates_by_name(program: NetworkProgram, outputs: np.ndarray) -> di
     `outputs`: those of the row, (outputs,). A fusion that tests nothing itself has an estimate alone.
     """
     estimates = estimates_by_name(program, outputs)
-    for place in program.places:
-        tested = place.judgement or place.tested  # columns of its squared distance and count
+    for columns in program.filter_columns:
+        tested = columns.judgement or columns.tested  # columns of its squared distance and count
         if tested is None:
             continue
-        estimate, nis = estimates[place.node][place.filter], float(outputs[tested.distance])
-        reason = 0.0 if place.judgement is None else float(outputs[place.judgement.reason])
-        estimates[place.node][place.filter] = JudgedEstimate(
+        estimate, nis = estimates[columns.node][columns.filter], float(outputs[tested.distance])
+        reason = 0.0 if columns.judgement is None else float(outputs[columns.judgement.reason])
+        estimates[columns.node][columns.filter] = JudgedEstimate(
             mean=estimate.mean,
             covariance=estimate.covariance,
             claim=estimate.claim,
@@ -64,6 +64,6 @@ def judged_estimates_by_name(program: NetworkProgram, outputs: np.ndarray) -> di
             nis=nis,
             received=int(outputs[tested.arrived]),
             refused=Judgement.describe(reason, nis) if reason > 0 else "",
-            weight=None if place.weighed is None else outputs[list(place.weighed.weight)],
+            weight=None if columns.weighed is None else outputs[list(columns.weighed.weight)],
         )
     return estimates

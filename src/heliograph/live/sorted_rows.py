@@ -43,13 +43,13 @@ class SortedRows:
     Args:
         base: the base, which at first is the only row.
         joint: whether all events of one time form one row.
-        places: columns of each node's numbers in a row, by its index, those of the inputs last.
+        columns: columns of each node's numbers in a row, by its index, those of the inputs last.
         capacity: greatest number of rows held behind the base.
     """
 
-    def __init__(self, base: HeldRow, joint: bool, places: list[slice], capacity: int):
+    def __init__(self, base: HeldRow, joint: bool, columns: list[slice], capacity: int):
         self.held, self.keys = [base], [base.key]
-        self.joint, self.places, self.capacity = joint, places, capacity
+        self.joint, self.columns_by_node, self.capacity = joint, columns, capacity
 
     def hold(self, rows: list[HeldRow]) -> None:
         """Replace all rows by these, in their order."""
@@ -91,7 +91,7 @@ class SortedRows:
             return "duplicate" if np.array_equal(values_held, event.values, equal_nan=True) else "conflict"
         # Two events of a node in one row are fine where they fill different components: NaN, which is not equal to
         # itself, is nothing yet.
-        there = row.numbers[self.places[event.node_index]]
+        there = row.numbers[self.columns_by_node[event.node_index]]
         both = any(old == old and new == new for old, new in zip(there, event.values, strict=True))
         return "conflict" if both else "used"
 
@@ -113,7 +113,7 @@ class SortedRows:
 
     def fill(self, row: HeldRow, event: CheckedEvent) -> None:
         """Write an event's values into its row; NaN is left out."""
-        columns, values = self.places[event.node_index], event.values
+        columns, values = self.columns_by_node[event.node_index], event.values
         if row.events:  # else nothing is there yet
             values = [there if new != new else new for there, new in zip(row.numbers[columns], values, strict=True)]
         row.numbers[columns] = values

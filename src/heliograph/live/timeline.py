@@ -99,7 +99,7 @@ class Timeline:
         self._angles, self._remarks = FleetAngles(self._fleet), FleetRemarks(self._fleet)
         self._held = FleetRepeatWatch(self._fleet)
         # Of final rows: what filters left out, and the outputs that `final` has not returned yet.
-        self._gates = GateCounts(self._program.places)
+        self._gates = GateCounts(self._program.filter_columns)
         self._finals = FinalRows(2 * self.capacity, self._program.step_rows.outputs.size)
 
     def __getstate__(self) -> dict[str, object]:

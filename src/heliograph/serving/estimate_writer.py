@@ -33,16 +33,20 @@ class EstimateWriter:
         """Make the template of a line with the estimates of all filters of a network's program."""
         n = self._n = len(program.network.states)
         self._nodes: dict[str, list[FilterColumns]] = {}
-        for columns in program.places:
+        for columns in program.filter_columns:
             self._nodes.setdefault(columns.node, []).append(columns)
         # Columns of the outputs that decide whether the template fits: variances, reasons not to use what arrived, and
         # all that has to be finite.
-        claimed = [columns.covariance for columns in program.places if columns.claim != "none"]
+        claimed = [columns.covariance for columns in program.filter_columns if columns.claim != "none"]
         self._variances = [begin + i * (n + 1) for begin in claimed for i in range(n)]  # of a covariance row by row
-        self._reasons = [columns.judgement.reason for columns in program.places if columns.judgement is not None]
-        self._finite = [i for columns in program.places for i in range(columns.mean, columns.mean + n)]
-        self._finite += [i for columns in program.places for i in range(columns.covariance, columns.covariance + n * n)]
-        self._finite += [columns.tested.distance for columns in program.places if columns.tested is not None]
+        self._reasons = [
+            columns.judgement.reason for columns in program.filter_columns if columns.judgement is not None
+        ]
+        self._finite = [i for columns in program.filter_columns for i in range(columns.mean, columns.mean + n)]
+        self._finite += [
+            i for columns in program.filter_columns for i in range(columns.covariance, columns.covariance + n * n)
+        ]
+        self._finite += [columns.tested.distance for columns in program.filter_columns if columns.tested is not None]
         self._template, self._order, self._whole = self._make_template(program.step_rows.outputs.size)
 
     def _make_template(self, size: int) -> tuple[bytes, list[int], list[int]]:

@@ -49,9 +49,11 @@ class SilenceWatch:
         self._published: dict[str, PublishedEstimate] = {}  # by plant, the newest
         self._resumed = set[str]()  # plants of before this start, of which messages may wait somewhere
         # Columns (filter, state) of each filter's mean, and of the diagonal of its covariance, which is row by row.
-        n, places = len(fleet.network.states), fleet.program.places
-        self._means = np.array([[place.mean + i for i in range(n)] for place in places], dtype=int)
-        self._variances = np.array([[place.covariance + i * (n + 1) for i in range(n)] for place in places], dtype=int)
+        n, all_columns = len(fleet.network.states), fleet.program.filter_columns
+        self._means = np.array([[each.mean + i for i in range(n)] for each in all_columns], dtype=int)
+        self._variances = np.array(
+            [[each.covariance + i * (n + 1) for i in range(n)] for each in all_columns], dtype=int
+        )
 
     def resume(self, names: Iterable[str]) -> None:
         """Note plants that a service goes on with, of which messages may wait somewhere."""

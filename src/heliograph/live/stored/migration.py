@@ -57,8 +57,8 @@ def describe_network(fleet: Fleet, covariances: bool = False) -> str:
 def _find_mode_columns(fleet: Fleet) -> Bool[np.ndarray, " outputs"]:
     """Return the mask of a network's outputs that is true where an output is the probability of a mode."""
     results = np.zeros(fleet.pool.step_rows.outputs.size, bool)
-    for place in fleet.program.places:
-        results[slice(*(place.modes or (0, 0)))] = True
+    for columns in fleet.program.filter_columns:
+        results[slice(*(columns.modes or (0, 0)))] = True
     return results
 
 
