@@ -164,6 +164,13 @@ def test_what_only_all_rows_say_is_no_block(folder, case):
     assert contents(folder) == before
 
 
+def test_filters_that_weigh_are_judged_by_all_rows(folder):
+    (folder / "data.csv").write_text(table(ROWS))
+    with pytest.raises(cli.AllRowsNeededError, match="what a/kf weighs is judged by all of them"):
+        run_in_blocks(STEPS.replace("kalman_filter(plant, sensor)", "robust_filter(plant, sensor, hg.perfect(1))"))
+    assert not (folder / "out.csv").exists()
+
+
 def test_a_stamp_that_only_a_block_calls_unset(folder):
     """A year back of its block, but among the stamps of the first."""
     far = {f"row{k}": f"{1e6 * k},1,1" for k in range(1, 44)}
@@ -241,8 +248,31 @@ def test_long_tables_are_run_in_blocks_by_the_command(folder, capsys, long_table
     assert cli.main(arguments) == 0
     said = capsys.readouterr()
     assert said.out == "out.parquet: 67000 rows of a/kf (exact)\n" and said.err == ""
-    assert cli.main([*arguments[:-2], "out2.parquet", "--ignore-unknown", "--forecast", "2", "--predicted"]) == 0
+    more = ["out2.parquet", "--ignore-unknown", "--forecast", "2", "--predicted"]
+    assert cli.main([*arguments[:-2], *more]) == 0
     expected = f"heliograph: {long_table}: all rows are held in memory at once: --forecast and --predicted need them\n"
     assert capsys.readouterr().err == expected
     blocks, whole = read_table("out.parquet"), read_table("out2.parquet")
     np.testing.assert_allclose(blocks["p"], whole["p"][: len(blocks["p"])], rtol=1e-12, atol=1e-12)
+
+
+FUSED = """
+node = hg.Node(sensor, hg.perfect(1), {"kf": hg.kalman_filter(plant, sensor)})
+reported = hg.Fusion("kf", hg.fusion.AllReports(), uplink=hg.fusion.ReportLink())
+network = hg.Network(plant, {"a": node, "b": node}, fused={"all": reported})
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("more", "out", "network", "why"), [
+    (["--smooth", "1"], "out.csv", STEPS, "--smooth needs them"),
+    ([], "out.mcap", STEPS, "blocks go to .csv or .parquet alone, not to out.mcap"),
+    ([], "out.csv", STEPS + FUSED, "messages of the fusion all may come rows later"),
+])  # fmt: skip
+def test_what_needs_all_rows_is_said_before_they_are_read(folder, capsys, long_table, more, out, network, why):
+    """Which then ends at the column that no network knows."""
+    (folder / "net.py").write_text(network)
+    assert cli.main([*run_arguments(measurements=str(long_table), out=out), *more]) == 2
+    first, second = capsys.readouterr().err.splitlines()
+    assert first == f"heliograph: {long_table}: all rows are held in memory at once: {why}"
+    assert f"{long_table}, header: expected only the columns" in second

@@ -57,3 +57,14 @@ def test_arrays_without_a_common_axis_are_refused():
     for arrays in ((), (np.zeros((3, 2)), np.zeros((4, 2))), (np.zeros((0, 2)),), (1.0,)):
         with pytest.raises(ValueError, match=r"arrays over runs: expected one leading axis of runs, at least one"):
             hg.simulation.over_runs(follow, *arrays)
+
+
+def test_results_have_the_precision_that_their_numbers_have():
+    """Rows of float32 by themselves stay so; a filter's numbers are doubles, and what it makes of the rows is, too."""
+    random = np.random.default_rng(4)
+    gains, z = (random.uniform(0.5, 1.5, shape).astype(np.float32) for shape in ((3, STEPS), (3, STEPS, 1)))
+    assert hg.simulation.over_runs(lambda row: 2 * row, z).dtype == np.float32
+    single, double = (hg.simulation.over_runs(follow, gains.astype(kind), z.astype(kind)) for kind in ("f4", "f8"))
+    for one, other in zip(single, double, strict=True):
+        assert one.dtype == np.float64
+        np.testing.assert_array_equal(one, other)

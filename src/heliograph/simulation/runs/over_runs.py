@@ -23,6 +23,11 @@ def over_runs(function: Callable[..., PyTree], *arrays: PyTree, width: int = WID
     computes them, or XLA, `width` runs in parallel, for functions that native code does not support
     (`heliograph.engine.engine_of` says which).
 
+    Numbers keep the precision that they have in jax.numpy where doubles are enabled: of rows of float32 alone results
+    are float32, and with the numbers of a filter, which are doubles, they are doubles, bit for bit those of the same
+    rows as doubles. A filter computes in doubles, since in single precision a covariance is lost where variances differ
+    by ten million; `monte_carlo(precision="float32")` has filters that are written for it.
+
     Args:
         function: of one run's arrays.
         arrays: arrays (run, ...) of numbers, with one number of runs.
