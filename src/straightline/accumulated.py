@@ -8,7 +8,8 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from straightline.compiled import addresses, aligned, memory_of, threads
+from straightline.call_arrays import addresses, aligned, memory_of
+from straightline.compiled import threads
 from straightline.folding import DTYPES
 from straightline.llvm.module import write_module
 from straightline.lowering import like
@@ -58,36 +59,52 @@ class AccumulatedProgram:
         return BegunProgram(self, arguments, runs)
 
     def __call__(self, *arguments: PyTree, runs: int, first: int = 0) -> PyTree:
-        """Compute runs on all cores; return sums, (..., batch), and what is collected, (run, ...).
+        """Compute runs on all cores; return a tree of sums, (..., batch), and of what is collected, (run, ...).
 
-        Runs are dealt to sums of their own in an order that depends on their count alone, and so do the bits.
+        The runs are split into at most PARTS parts, each with sums of its own, which are added in order: the parts
+        depend on the count of runs alone, so that the bits do not depend on the number of cores.
 
         Args:
             arguments: trees like the examples.
             runs: how many.
             first: number of the first one; 0 by default.
         """
-        # Parts of whole blocks of runs, each with sums of its own.
+        # A part is some whole vectors of runs.
         begun = self.begin(jax.tree.leaves(arguments), runs)
-        share = -(-runs // (PARTS * self.width)) * self.width
-        starts = range(first, first + runs, share)
+        part_length = -(-runs // (PARTS * self.width)) * self.width
+        starts = range(first, first + runs, part_length)
         sums = [begun.zeros() for _ in starts]
 
-        def compute(part: int) -> list[np.ndarray | None]:
-            return begun.add(np.arange(starts[part], min(starts[part] + share, first + runs)), sums[part])
+        def compute_part(part: int) -> list[np.ndarray | None]:
+            """Add the runs of a part to its sums; return its results that are collected, None for all others."""
+            return begun.add(np.arange(starts[part], min(starts[part] + part_length, first + runs)), sums[part])
 
-        collected = list(threads().map(compute, range(len(starts))))
-        # Each result: a sum over all parts, the parts one behind another, or what all runs share.
-        totals, counts = iter(begun.total(sums)), _count_by_batch(first, runs, self.summed.batches)
+        collected = list(threads().map(compute_part, range(len(starts))))
+        return jax.tree.unflatten(self.tree, self._join_parts(begun, sums, collected, first, runs))
+
+    def _join_parts(
+        self,
+        begun: "BegunProgram",
+        sums: Sequence[Sequence[np.ndarray]],
+        collected: Sequence[Sequence[np.ndarray | None]],
+        first: int,
+        runs: int,
+    ) -> list[Any]:
+        """Return each result, leaf by leaf, of the parts' sums and of what each part collected.
+
+        A summed result is the sum over all parts; one that is collected has the parts one behind another; one that all
+        runs share is repeated for each run, or counts once for each run of a batch.
+        """
+        totals, runs_by_batch = iter(begun.total(sums)), _count_by_batch(first, runs, self.summed.batches)
         leaves: list[Any] = []
         for shared, is_summed, *parts in zip(begun.shared, self.summed.outputs, *collected, strict=True):
             if shared is None:
                 leaves.append(next(totals) if is_summed else np.concatenate(parts))
             elif is_summed:
-                leaves.append(shared[..., None] * counts)
+                leaves.append(shared[..., None] * runs_by_batch)
             else:
                 leaves.append(np.broadcast_to(shared, (runs, *shared.shape)))
-        return jax.tree.unflatten(self.tree, leaves)
+        return leaves
 
 
 class BegunProgram:
@@ -102,14 +119,14 @@ class BegunProgram:
         if program.once is not None:
             number, results = np.zeros(1, np.uint32), [np.empty(0)] * len(program.common)
             pointers = self._pointers(number, results)
-            once = program.once.machine(1)
+            once = program.once.choose_machine(1)
             once.run(pointers.ctypes.data, 0, 0, 1, 1)
         for n, (buffer, offset) in enumerate(zip(program.code.outputs, program.code.places, strict=True)):
             if program.common[n]:
                 kind = np.dtype(DTYPES[buffer.type])
                 computed = self.memory[offset : offset + buffer.size * kind.itemsize]
                 self.shared[n] = computed.view(kind).reshape(buffer.shape).copy()
-        self._machine = None if all(program.common) else program.blocks.machine(-(-runs // program.width))
+        self._machine = None if all(program.common) else program.blocks.choose_machine(-(-runs // program.width))
 
     def zeros(self, memory: list[list[np.ndarray]] | None = None) -> list[np.ndarray]:
         """Return sums over no runs, of each summed result that runs do not share, as `add` and `total` take them.
@@ -129,29 +146,36 @@ class BegunProgram:
         return taken
 
     def add(self, runs: np.ndarray, sums: Sequence[np.ndarray]) -> list[np.ndarray | None]:
-        """Add runs to the sums; return the other results, (run, ...), None for those that are shared or summed.
+        """Add the runs of these numbers (run,) to `sums` in place; return what is collected of them.
 
-        Runs are computed in blocks of consecutive ones, each several times as many as a vector has.
+        That is for each result, leaf by leaf, an array (run, ...), or None where it is summed or all runs share it.
         """
         numbers = np.ascontiguousarray(runs, dtype=np.uint32)
-        # Outputs of the code: the sums themselves, or an array with a row for each run; the latter are returned.
-        totals = iter(sums)
-        results: list[np.ndarray] = []
+        outputs, collected = self._make_outputs(len(numbers), sums)
+        # There is no code for runs where they share all results.
+        if len(numbers) and self._machine is not None:
+            scratch = aligned(self.program.code.scratch)
+            pointers = self._pointers(numbers, outputs)
+            blocks = -(-len(numbers) // self._machine.width)  # a block: the runs of one vector
+            self._machine.run(pointers.ctypes.data, scratch.ctypes.data, 0, blocks, len(numbers))
+        return collected
+
+    def _make_outputs(self, runs: int, sums: Sequence[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray | None]]:
+        """Return an array for each output of the code, and the same with None for all that is not collected.
+
+        An output is one of `sums`, a new array (run, ...), or, where all runs share the result, an empty one.
+        """
+        remaining_sums = iter(sums)
+        outputs: list[np.ndarray] = []
         collected: list[np.ndarray | None] = []
         for (buffer, summed), common in zip(self._outputs(), self.program.common, strict=True):
             if summed:
-                results.append(next(totals))
+                outputs.append(next(remaining_sums))
             else:
-                shape = (0,) if common else (len(numbers), *buffer.shape)
-                results.append(np.empty(shape, DTYPES[buffer.type]))
-            collected.append(None if summed or common else results[-1])
-        # Compute all blocks of runs.
-        if len(numbers) and self._machine is not None:
-            scratch = aligned(self.program.code.scratch)
-            pointers = self._pointers(numbers, results)
-            blocks = -(-len(numbers) // self._machine.width)
-            self._machine.run(pointers.ctypes.data, scratch.ctypes.data, 0, blocks, len(numbers))
-        return collected
+                shape = (0,) if common else (runs, *buffer.shape)
+                outputs.append(np.empty(shape, DTYPES[buffer.type]))
+            collected.append(None if summed or common else outputs[-1])
+        return outputs, collected
 
     def total(self, parts: Sequence[Sequence[np.ndarray]]) -> list[np.ndarray]:
         """Return the sums (..., batch) of several sums, of each summed result that runs do not share.
@@ -180,10 +204,10 @@ def accumulate(
     known: Mapping[int, np.ndarray] = MappingProxyType({}),
     single: bool = False,
 ) -> AccumulatedProgram:
-    """Compile a JAX function of the number of a run, whose results are summed over runs or collected.
+    """Compile a JAX function of a run's number; return a program that sums its results over runs, or collects them.
 
     Such is a Monte Carlo simulation: the run's number makes its key. What is summed takes no more memory for more runs.
-    The result is called with the arguments and with `runs`; `begin` and `add` compute runs a few at a time.
+    The program is called with the arguments and with `runs`; `begin` and `add` compute runs a few at a time.
 
     Args:
         function: of the arguments, which all runs share, and of the number of the run (uint32); it returns a pair, what
@@ -201,16 +225,26 @@ def accumulate(
     """
     features()  # refuses a processor that LLVM does not know
     leaves = jax.tree.leaves(examples)
-    numbers = {n: (np.asarray(mask), np.asarray(leaves[n])) for n, mask in known.items()}
-    program = lower_function(function, *examples, like((), np.uint32), known=numbers, single=single)
-    # The results are a pair: leaves of its first part are summed.
-    pair, data = program.tree.children(), program.tree.node_data()
-    if data is None or data[0] is not tuple or len(pair) != 2:
-        expected = "a pair of what is summed and what is collected"
-        raise ValueError(f"function of a run: expected {expected}, got {program.tree}")
-    count = pair[0].num_leaves
-    summed = tuple(n < count for n in range(len(program.outputs)))
+    known_numbers = {n: (np.asarray(mask), np.asarray(leaves[n])) for n, mask in known.items()}
+    # The last argument is the number of the run.
+    program = lower_function(function, *examples, like((), np.uint32), known=known_numbers, single=single)
+    summed_leaves = _count_summed_leaves(program.tree)
+    summed = tuple(n < summed_leaves for n in range(len(program.outputs)))
     return AccumulatedProgram(program, SummedOutputs(outputs=summed, batches=batches, number=len(leaves)))
+
+
+def _count_summed_leaves(tree: Any) -> int:
+    """Return how many leaves are summed: those of the first of the pair that a function of a run returns.
+
+    Raises:
+        ValueError: a tree of results that is no pair.
+    """
+    parts, kind = tree.children(), tree.node_data()
+    if kind is None or kind[0] is not tuple or len(parts) != 2:
+        expected = "a pair of what is summed and what is collected"
+        raise ValueError(f"function of a run: expected {expected}, got {tree}")
+    count: int = parts[0].num_leaves
+    return count
 
 
 def _add_in_order(sums: Sequence[np.ndarray]) -> np.ndarray:

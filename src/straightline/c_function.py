@@ -12,7 +12,7 @@ from jaxtyping import PyTree
 from straightline.c_lowering import lower_for_c
 from straightline.c_source import CSource, Place, Real, c_type
 from straightline.lowering import code_line, scalars, trace_function, type_of
-from straightline.nodes import Node, Type, Unsupported
+from straightline.nodes import Buffer, Node, Type, Unsupported
 
 RANDOM = ("random_", "threefry")
 RESERVED = frozenset((
@@ -74,7 +74,7 @@ def to_c(
     symmetric: Collection[int] = (),
     short: bool = False,
 ) -> CFunction:
-    """Write a JAX function of small arrays as C99, for a device.
+    """Return a JAX function of small arrays as a function of C99, for a device.
 
     The arrays of the arguments come first, then those of the results, each row by row; a result may be written over an
     argument, since all are written at the end. The same numbers as native code's but for libm's rounding, and for fused
@@ -98,22 +98,17 @@ def to_c(
     _check_name(name)
     program, tree = trace_function(function, *examples)
     equations = list(_yield_equations(program.jaxpr))
-    for equation in equations:
-        if equation.primitive.name.startswith(RANDOM):
-            raise Unsupported(equation.primitive.name, code_line(equation))
+    _refuse_random_numbers(equations)
     graph, buffers, outputs = lower_for_c(program, finite, symmetric, short)
     real: Real = "float" if single else "double"
     argument_names, result_names = _name_arrays(function, examples, tree, names)
-    # The body: statements in the order of the graph. Arguments without axes are passed by value.
+    arguments = _describe_arguments(argument_names, buffers, real)
+    # The body: statements in the order of the graph.
     result_nodes = [scalars(x) for x in outputs]
-    arguments = [
-        CArray(name=array_name, type=_name_stored_type(b.type, real), size=b.size, is_array=bool(b.shape))
-        for array_name, b in zip(argument_names, buffers, strict=True)
-    ]
     places = {b: _locate(x) for b, x in zip(buffers, arguments, strict=True)}
     source = CSource([node for nodes in result_nodes for node in nodes], places, real, name)
     try:
-        body = source.statements(graph.top)
+        body = source.write_statements(graph.top)
     except Unsupported as error:
         raise Unsupported(error.operation, error.where or _line_of(error.operation, equations)) from None
     # The end: every result is written, after all arguments are read.
@@ -134,6 +129,21 @@ def to_c(
         results=results,
         operations=source.operations,
     )
+
+
+def _refuse_random_numbers(equations: Sequence[Any]) -> None:
+    """Raise Unsupported for the first operation that draws random numbers, with its line."""
+    for equation in equations:
+        if equation.primitive.name.startswith(RANDOM):
+            raise Unsupported(equation.primitive.name, code_line(equation))
+
+
+def _describe_arguments(names: Sequence[str], buffers: Sequence[Buffer], real: Real) -> list[CArray]:
+    """Describe the arrays that a C function reads, one for each input; numbers without axes are passed by value."""
+    return [
+        CArray(name=name, type=_name_stored_type(b.type, real), size=b.size, is_array=bool(b.shape))
+        for name, b in zip(names, buffers, strict=True)
+    ]
 
 
 def _check_name(name: str) -> None:

@@ -26,7 +26,7 @@ VIEWS = frozenset(
 
 
 class ZeroFoldingGraph(Graph):
-    """A graph that also simplifies products of zero with numbers that depend on finite `buffers` only.
+    """A graph that also simplifies products of zero with numbers that depend on `finite_buffers` only.
 
     Another buffer may have NaN for what is missing: a number that depends on it counts as finite only after a
     selection that replaces NaN.
@@ -34,8 +34,8 @@ class ZeroFoldingGraph(Graph):
 
     def __init__(self) -> None:
         super().__init__()
-        self.buffers: set[Buffer] = set()
-        self.finite: set[Node] = set()
+        self.finite_buffers: set[Buffer] = set()  # inputs that hold no NaN
+        self.finite: set[Node] = set()  # numbers that follow from these alone
 
     def node(self, op: str, type: Type, *args: Node, value: Any = None) -> Node:
         """Make a node, with products of zero and a finite number simplified."""
@@ -52,7 +52,7 @@ class ZeroFoldingGraph(Graph):
     def load(self, buffer: Buffer, offset: int, strides: Sequence[int] = (), indices: Sequence[Node] = ()) -> Node:
         """Load a number; note that it is finite if all of its buffer are."""
         made = super().load(buffer, offset, strides, indices)
-        if buffer in self.buffers:
+        if buffer in self.finite_buffers:
             self.finite.add(made)
         return made
 
@@ -68,16 +68,16 @@ class CLowering(Lowering):
         super().__init__()
         self.graph: ZeroFoldingGraph = ZeroFoldingGraph()
 
-    def equation(self, equation: JaxprEqn, inputs: list[Value]) -> Sequence[Value]:
+    def lower_equation(self, equation: JaxprEqn, inputs: list[Value]) -> Sequence[Value]:
         """Lower one operation; arithmetic is written out unless its arrays are too long."""
         if equation.primitive.name in RULES and equation.primitive.name not in VIEWS:
             inputs = [self.nodes(x) if isinstance(x, InMemory) and x.size <= LOADED else x for x in inputs]
-        return super().equation(equation, inputs)
+        return super().lower_equation(equation, inputs)
 
-    def known(self, number: Any) -> Value:
+    def make_known_array(self, number: Any) -> Value:
         """Place an array of known numbers in memory; an entry at a known place is a constant."""
         if not isinstance(number, np.ndarray | np.generic | jax.Array) or not np.shape(number) or not np.size(number):
-            return super().known(number)
+            return super().make_known_array(number)
         if isinstance(number, np.ndarray) and number.dtype == object:
             return number
         array = np.asarray(number)
@@ -89,22 +89,27 @@ def lower_for_c(
 ) -> tuple[ZeroFoldingGraph, list[Buffer], list[np.ndarray]]:
     """Return a traced program's graph, a buffer for each argument and the nodes of each result.
 
-    `finite` arguments have no NaN; of `symmetric` ones the upper triangle alone is read. `short`: each loop stays one.
+    Args:
+        program: the traced function.
+        finite: numbers of the arguments that hold no NaN.
+        symmetric: numbers of the arguments that are symmetric matrices, of which the upper triangle alone is read.
+        short: whether each loop stays a loop; else short ones are written out.
     """
     lowering, buffers, values = CLowering(), list[Buffer](), list[Any]()
     graph = lowering.graph
-    lowering.written_out = 0 if short else lowering.written_out
+    if short:
+        lowering.written_out = 0  # loops of at most so many operations are written out
     for number, variable in enumerate(program.jaxpr.invars):
         aval: Any = variable.aval
         buffer = Buffer("input", type_of(aval), tuple(aval.shape), graph.top)
         buffers.append(buffer)
         if number in finite:
-            graph.buffers.add(buffer)
+            graph.finite_buffers.add(buffer)
         value: Any = InMemory.whole(buffer)
-        if number in symmetric:
+        if number in symmetric:  # entries (i, j) and (j, i) are one node, that of the upper triangle
             nodes, n = value.nodes(graph), aval.shape[0]
             value = array_of([nodes[min(i, j), max(i, j)] for i in range(n) for j in range(n)], aval.shape)
         values.append(value)
     with jax.enable_x64(True):
-        outputs = [lowering.nodes(x) for x in lowering.inline(program, values)]
+        outputs = [lowering.nodes(x) for x in lowering.inline_program(program, values)]
     return graph, buffers, outputs

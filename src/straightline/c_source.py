@@ -61,7 +61,12 @@ def c_type(type: Type, real: Real) -> str:
 
 
 def write_literal(value: float | int | bool, type: Type, real: Real) -> str:
-    """Return a known number as a literal with every digit that its type has.
+    """Return a known number as a literal of C with every digit that its type has.
+
+    Args:
+        value: the number.
+        type: its type in the graph.
+        real: the type of C for numbers that are f64 in the graph.
 
     Raises:
         ValueError: a number beyond the range of single precision.
@@ -69,10 +74,12 @@ def write_literal(value: float | int | bool, type: Type, real: Real) -> str:
     if type == "bool":
         return "1" if value else "0"
     if type not in REAL:
-        ending = f"{'U' if type[0] == 'u' else ''}{'LL' if type[1:] == '64' else ''}"
+        is_unsigned, is_long = type.startswith("u"), type.endswith("64")
+        suffix = f"{'U' if is_unsigned else ''}{'LL' if is_long else ''}"
         if value >= 0:
-            return f"{int(value)}{ending}"
-        return f"({int(value) + 1}{ending} - 1)"  # of the least number C has no literal
+            return f"{int(value)}{suffix}"
+        # -n as -(n - 1) - 1: in C, -2147483648 is the negative of a literal that is too large for its type.
+        return f"({int(value) + 1}{suffix} - 1)"
     # Floating-point numbers: the shortest text that reads back as the same number.
     if math.isnan(value):
         return "NAN"
@@ -92,6 +99,8 @@ def write_literal(value: float | int | bool, type: Type, real: Real) -> str:
 def write_expression(node: Node, arguments: Sequence[str], real: Real) -> str:
     """Return the C expression of a node's operation on arguments, which are names and literals.
 
+    `real` is the type of C for numbers that are f64 in the graph.
+
     Raises:
         Unsupported: an operation that C does not have.
     """
@@ -104,7 +113,7 @@ def write_expression(node: Node, arguments: Sequence[str], real: Real) -> str:
         return _write_bitcast(source, node.type, arguments[0], real)
     if op == "not":
         return f"!{arguments[0]}" if source == "bool" else f"({c_type(source, real)})~{arguments[0]}"
-    # Comparisons.
+    # Comparisons: of real numbers by the macros that raise no floating-point flag for NaN.
     if source in REAL and op in QUIET:
         return f"{QUIET[op]}({', '.join(arguments)})"
     if op in ORDER:
@@ -120,8 +129,8 @@ def write_expression(node: Node, arguments: Sequence[str], real: Real) -> str:
     if op in INFIX:
         return f"{arguments[0]} {INFIX[op]} {arguments[1]}"
     if op in FUNCTIONS and source in REAL:
-        ending = "f" if c_type(source, real) == "float" else ""
-        return f"{FUNCTIONS[op]}{ending}({', '.join(arguments)})"
+        suffix = "f" if c_type(source, real) == "float" else ""  # sinf is the sin of float
+        return f"{FUNCTIONS[op]}{suffix}({', '.join(arguments)})"
     raise Unsupported(op)
 
 
@@ -200,11 +209,11 @@ class CSource:
             min(max(node.value, -largest), largest) if node.type == "f64" else node.value, node.type, self.real
         )
 
-    def statements(self, block: Block, indent: str = "    ") -> list[str]:
-        """Return a block's statements, in order."""
+    def write_statements(self, block: Block, indent: str = "    ") -> list[str]:
+        """Return the lines of C for a block's operations and statements, in order, each after `indent`."""
         lines: list[str] = []
         for statement in block.items:
-            # Only what is needed; the end of a loop always is.
+            # Only what the results need; the exit of a loop is in no list of needs.
             if statement not in self.needed and not isinstance(statement, LoopExit):
                 continue
             if isinstance(statement, Node):
@@ -278,26 +287,21 @@ class CSource:
         return self.tables[key][0]
 
     def _write_loop(self, loop: Loop, indent: str) -> list[str]:
-        """Write a loop: a variable for each number that is carried and read, the body, and the next turn's values.
+        """Return the lines of a loop: a variable for each carried number that is read, the body, and new values.
 
-        Without a length the body has the break that ends it.
+        A loop without a length has in its body the `break` that ends it.
         """
         deeper, lines = f"{indent}    ", []
-        # Variables, with the numbers before the loop: they are parameters within it and results behind it.
+        # Carried numbers, by their place in the loop's carry: one variable each, which has the initial number first.
+        # It is the parameter within the loop and the result behind it.
         carried = [k for k, node in enumerate(loop.parameters) if {node, loop.results[k]} & self.needed.keys()]
         for k in carried:
             name, start = self._new_name(), loop.initial[k]
             lines.append(f"{indent}{c_type(start.type, self.real)} {name} = {self.name(start)};")
             self.names[loop.parameters[k]] = self.names[loop.results[k]] = name
-        head = "for (;;) {"
-        if loop.length is not None:
-            counter = self._new_name()
-            if loop.counter is not None:
-                self.names[loop.counter] = counter
-            head = f"for (int64_t {counter} = 0; {counter} < {loop.length}; ++{counter}) {{"
-        lines += [f"{indent}{head}", *self.statements(loop.body, deeper)]
-        # The next turn's values are assigned at the end, all at once: one that is another parameter is copied before
-        # that parameter changes.
+        lines += [f"{indent}{self._write_loop_head(loop)}", *self.write_statements(loop.body, deeper)]
+        # The next turn's values are assigned at the end, all at once: a value that is itself a carried variable is
+        # copied first, since the assignments change that variable.
         next_values: list[str] = []
         for k in carried:
             node = loop.following[k]
@@ -310,6 +314,15 @@ class CSource:
             lines.append(f"{deeper}{self.names[loop.parameters[k]]} = {value};")
         return [*lines, f"{indent}}}"]
 
+    def _write_loop_head(self, loop: Loop) -> str:
+        """Return the `for` of a loop, with a counter if its length is known; note the counter's name."""
+        if loop.length is None:
+            return "for (;;) {"
+        counter = self._new_name()
+        if loop.counter is not None:
+            self.names[loop.counter] = counter
+        return f"for (int64_t {counter} = 0; {counter} < {loop.length}; ++{counter}) {{"
+
     def _write_guard(self, guard: Guard, indent: str) -> list[str]:
         """Write a guarded block; its results are zero if the condition does not hold."""
         results = [(r, v) for r, v in zip(guard.results, guard.values, strict=True) if r in self.needed]
@@ -318,7 +331,7 @@ class CSource:
             self.names[outcome] = self._new_name()
             lines.append(f"{indent}{c_type(outcome.type, self.real)} {self.names[outcome]} = 0;")
         deeper = f"{indent}    "
-        lines += [f"{indent}if ({self.name(guard.condition)}) {{", *self.statements(guard.body, deeper)]
+        lines += [f"{indent}if ({self.name(guard.condition)}) {{", *self.write_statements(guard.body, deeper)]
         return [*lines, *(f"{deeper}{self.names[r]} = {self.name(v)};" for r, v in results), f"{indent}}}"]
 
 

@@ -12,14 +12,14 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
+from straightline.call_arrays import addresses, aligned, memory_of
 from straightline.folding import DTYPES
 from straightline.limits import ALONE, LITTLE, LONGEST
-from straightline.llvm.layout import LINE
 from straightline.llvm.module import ModuleText, write_module
 from straightline.machine import Machine, TieredCode, features, generate, narrow
 from straightline.nodes import Unsupported
 from straightline.program import Program, lower_function
-from straightline.result_memory import from_line, in_lines
+from straightline.result_memory import in_lines
 
 SHARES = 4  # parts of the work for each core, so that one that is held up holds up little
 
@@ -122,31 +122,40 @@ class Compiled:
         """Return the results of the runs of several calls, one after another, in the same arrays.
 
         Args:
-            calls: the arguments of each, which differ by those of which each run has its own.
+            calls: the arguments of each call; those that all runs share are the same in all calls.
             cores: threads that compute; those of the machine by default.
         """
         arrays = [self._convert_arguments(arguments) for arguments in calls]
-        counts, code = [self._count_runs(some) for some in arrays], self.code
-        runs = sum(counts)
-        outputs = [in_lines((runs, *b.shape), DTYPES[b.type]) for b in code.outputs]
-        shared = aligned(code.shared) if self._shared is None else self._shared
-        # What all runs share: held for later calls unless it follows from arguments that these change.
-        if self.once is not None:
-            if self._shared is None:
-                pointers = self._point_to(arrays[0], outputs, shared)
-                self.once.machine(1).run(pointers.ctypes.data, 0, 0, 1, 1)
-                self._shared = shared if all(self.differs[len(self._first) :]) else None
-            self._copy_common(outputs, shared)
-        # What differs, block by block.
-        if not all(code.common):
-            tiers, width = self._choose_tiers(runs)
-            machine, begin = tiers.machine(-(-runs // width)), 0
-            for some, count in zip(arrays, counts, strict=True):
-                own = [x[begin : begin + count] for x in outputs]
-                pointers, memory = self._point_to(some, own, shared), (some, code.tables, own, shared)
-                self._compute_blocks(CallMemory(machine=machine, pointers=pointers, memory=memory, runs=count), cores)
-                begin += count
+        counts, code = [self._count_runs(x) for x in arrays], self.code
+        outputs = [in_lines((sum(counts), *b.shape), DTYPES[b.type]) for b in code.outputs]
+        shared = self._compute_shared(arrays[0], outputs)
+        if all(code.common):
+            return jax.tree.unflatten(self.tree, outputs)
+        # What differs between runs, block by block: each call computes its own rows of the outputs.
+        tiers, width = self._choose_tiers(sum(counts))
+        machine, begin = tiers.choose_machine(-(-sum(counts) // width)), 0
+        for call_arrays, count in zip(arrays, counts, strict=True):
+            rows = [x[begin : begin + count] for x in outputs]
+            pointers, memory = self._point_to(call_arrays, rows, shared), (call_arrays, code.tables, rows, shared)
+            self._compute_blocks(CallMemory(machine=machine, pointers=pointers, memory=memory, runs=count), cores)
+            begin += count
         return jax.tree.unflatten(self.tree, outputs)
+
+    def _compute_shared(self, arrays: list[np.ndarray], outputs: list[np.ndarray]) -> np.ndarray:
+        """Return the memory of what all runs share, computed from a call's arguments; copy shared results to `outputs`.
+
+        It is kept for later calls where it follows from the first arguments alone, which calls leave out.
+        """
+        if self.once is None:
+            return aligned(self.code.shared)
+        shared = self._shared
+        if shared is None:
+            shared = aligned(self.code.shared)
+            pointers = self._point_to(arrays, outputs, shared)
+            self.once.choose_machine(1).run(pointers.ctypes.data, 0, 0, 1, 1)
+            self._shared = shared if all(self.differs[len(self._first) :]) else None
+        self._copy_common(outputs, shared)
+        return shared
 
     def _point_to(self, arrays: list[np.ndarray], outputs: list[np.ndarray], shared: np.ndarray) -> np.ndarray:
         """Return addresses in the order that the code expects: inputs, tables, outputs, what runs share."""
@@ -197,44 +206,58 @@ class InPlaceCode:
     """
 
     def __init__(self, compiled: Compiled, runs: int, inputs: Mapping[int, np.ndarray]):
-        code, given, self.runs = compiled.code, len(compiled._first), runs
-        self._compiled, differs = compiled, compiled.differs[given:]
-        shapes = [(runs, *s) if d else s for s, d in zip(compiled.shapes[given:], differs, strict=True)]
-        fresh = [np.zeros(s, t) for s, t in zip(shapes, compiled.types[given:], strict=True)]
-        self.inputs = [inputs.get(n, x) for n, x in enumerate(fresh)]
-        compiled._check_shapes(self.inputs, given, runs)
-        if runs != 1 and compiled._by_run is None:
-            raise ValueError(f"runs: expected one, since they share all arguments, got {runs}")
-        for n, (x, new) in enumerate(zip(self.inputs, fresh, strict=True)):
-            if x.dtype != new.dtype or not x.flags.c_contiguous:
-                raise ValueError(f"array {n} read in place: expected contiguous numbers of type {new.dtype}")
+        """Make the arrays of calls; `inputs` has those that are read in place, by the number of the argument."""
+        code, left_out, self.runs = compiled.code, len(compiled._first), runs
+        self._compiled, differs = compiled, compiled.differs[left_out:]
+        self.inputs = self._make_inputs(inputs)
         self.outputs = [in_lines((runs, *b.shape), DTYPES[b.type]) for b in code.outputs]
+        # Addresses in the order that the code expects; `_memory` keeps the arrays alive, what runs share is its last.
         self._memory = *compiled._first, *self.inputs, *code.tables, *self.outputs, aligned(code.shared)
         self._pointers = np.array(addresses(self._memory), dtype=np.uint64)
         self._scratch, self._is_common = aligned(code.scratch), all(code.common)
-        self._at = self._pointers.ctypes.data, self._scratch.ctypes.data
+        self._addresses = self._pointers.ctypes.data, self._scratch.ctypes.data
+        # The code for so many runs, and whether a call is so little work that threads would cost more.
         self._tiers, width = compiled._choose_tiers(runs)
         self._blocks = -(-runs // width)
         self._is_little = runs == 1 or self._blocks * code.blocks.work < LITTLE
-        self._varies = compiled.once is not None and not all(differs)
-        if compiled.once is not None and not self._varies:
+        # What all runs share is computed now, unless it follows from an argument of the calls.
+        self._shared_varies = compiled.once is not None and not all(differs)
+        if compiled.once is not None and not self._shared_varies:
             self._compute_shared(compiled.once)
+
+    def _make_inputs(self, in_place: Mapping[int, np.ndarray]) -> list[np.ndarray]:
+        """Return an array for each argument of a call: the one that is read in place, else a new one.
+
+        Raises:
+            ValueError: an array of another shape or type, or not contiguous; several runs that share all arguments.
+        """
+        compiled, left_out, runs = self._compiled, len(self._compiled._first), self.runs
+        kinds = zip(compiled.shapes, compiled.types, compiled.differs, strict=True)
+        new = [np.zeros((runs, *s) if d else s, t) for s, t, d in list(kinds)[left_out:]]
+        inputs = [in_place.get(n, x) for n, x in enumerate(new)]
+        compiled._check_shapes(inputs, left_out, runs)
+        if runs != 1 and compiled._by_run is None:
+            raise ValueError(f"runs: expected one, since they share all arguments, got {runs}")
+        for n, (x, expected) in enumerate(zip(inputs, new, strict=True)):
+            if x.dtype != expected.dtype or not x.flags.c_contiguous:
+                raise ValueError(f"array {n} read in place: expected contiguous numbers of type {expected.dtype}")
+        return inputs
 
     def __call__(self) -> None:
         """Compute `outputs` from `inputs`."""
-        if self._varies and self._compiled.once is not None:
+        if self._shared_varies and self._compiled.once is not None:
             self._compute_shared(self._compiled.once)
         if self._is_common:
             return
-        machine = self._tiers.machine(self._blocks)
+        machine = self._tiers.choose_machine(self._blocks)
         if self._is_little:
-            machine.run(*self._at, 0, -(-self.runs // machine.width), self.runs)
+            machine.run(*self._addresses, 0, -(-self.runs // machine.width), self.runs)
         else:
             self._compiled._compute_blocks(CallMemory(machine, self._pointers, self._memory, self.runs), None)
 
     def _compute_shared(self, once: TieredCode) -> None:
-        """Compute what all runs share."""
-        once.machine(1).run(self._at[0], 0, 0, 1, 1)
+        """Compute what all runs share, and copy the shared results to every run's."""
+        once.choose_machine(1).run(self._addresses[0], 0, 0, 1, 1)
         self._compiled._copy_common(self.outputs, self._memory[-1])
 
 
@@ -356,28 +379,6 @@ def explain(
 def counted(code: Compiled) -> str:
     """Return in words how many operations a run takes."""
     return f"{code.operations} operations{f', {code.divisions} of them divisions and roots' if code.divisions else ''}"
-
-
-def memory_of(x: Any, dtype: Any) -> np.ndarray:
-    """Return numbers as contiguous memory; a key of random numbers as its words."""
-    if type(x) is np.ndarray and x.dtype == dtype and x.flags.c_contiguous:
-        return x
-    if isinstance(x, jax.Array) and jax.numpy.issubdtype(x.dtype, jax.dtypes.prng_key):
-        x = jax.random.key_data(x)
-    array = np.asarray(x)
-    if array.dtype.kind not in ("biuf" if np.dtype(dtype).kind == "f" else "biu"):
-        raise ValueError(f"arguments: expected numbers of type {np.dtype(dtype)}, got {array.dtype}")
-    return np.ascontiguousarray(array, dtype=dtype).reshape(array.shape)
-
-
-def addresses(arrays: Sequence[np.ndarray]) -> list[int]:
-    """Return the addresses of arrays."""
-    return [x.__array_interface__["data"][0] for x in arrays]
-
-
-def aligned(size: int) -> np.ndarray:
-    """Allocate bytes of zero at an address that is a multiple of a cache line."""
-    return from_line(np.zeros(size + LINE, np.uint8))
 
 
 def cpu_count() -> int:

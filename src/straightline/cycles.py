@@ -43,9 +43,9 @@ class Recurring(NamedTuple):
 
 
 def keep_cycles(graph: Graph, outputs: Sequence[Buffer]) -> dict[Any, None]:
-    """Keep what comes back in each counted loop that these outputs of one run need, where it is much.
+    """Rewrite each counted loop of one run where much comes back; return what the outputs need then.
 
-    Returns what the outputs need then, as `list_needed` does.
+    Much: S has more than DEAR operations beside the numbers that others need of it.
     """
     items = list_needed(outputs)
     for loop in [x for x in items if isinstance(x, Loop) and x.length is not None]:
@@ -54,41 +54,43 @@ def keep_cycles(graph: Graph, outputs: Sequence[Buffer]) -> dict[Any, None]:
             continue
         kept = _list_needed_elsewhere(items, found)
         if len(found.nodes) > DEAR + len(kept):
-            _keep(graph, items, loop, found, kept)
+            _rewrite_loop(graph, items, loop, found, kept)
             items = list_needed(outputs)
     return items
 
 
 def _find_recurring(loop: Loop, needed: Collection[Any]) -> Recurring | None:
-    """Find what of a loop's body follows from carried numbers that follow from themselves, and from tests of rows.
+    """Return S and C of a loop's body, and the tests of rows that S needs; None where S is no more than DEAR nodes.
 
-    None where that is not much: of a program with hundreds of small loops, `needed` is gone through for no such loop.
+    `needed`: items that the outputs need; of a program with hundreds of small loops it is gone through for none of them.
     """
     body = loop.body
     nodes = [x for x in body.items if isinstance(x, Node) and x in needed]
     rows = _find_of_rows(loop, nodes)
     tests = {n for n in rows if n.type == "bool" and all(a.type != "bool" for a in n.args)}
+    # The largest set C: begin with all carried numbers, and drop those whose next value does not follow from C.
     carried = [k for k, parameter in enumerate(loop.parameters) if parameter in needed]
     operations = [(n, _list_inner(n.args, body)) for n in nodes if n.op not in REFERRING and n not in tests]
     while True:
-        known, found = tests | {loop.parameters[k] for k in carried}, dict[Node, None]()
+        known, following = tests | {loop.parameters[k] for k in carried}, dict[Node, None]()
         for n, arguments in operations:
             if known.issuperset(arguments):
                 known.add(n)
-                found[n] = None
-        # A carried number whose next value is none of these is none itself: once more without it.
+                following[n] = None
         closed = [k for k in carried if known.issuperset(_list_inner([loop.following[k]], body))]
         if closed == carried:
             break
         carried = closed
-    if not carried or len(found) <= DEAR:
+    if not carried or len(following) <= DEAR:
         return None
-    _leave_fused_products(needed, found)
-    used = {a for n in found for a in n.args} | {loop.following[k] for k in carried}
-    own = [n for n in rows if n in tests and n in used]
-    # What a test is computed of is computed in each turn, also where it follows from other tests.
-    sources = _list_sources(rows, own)
-    return Recurring({n: None for n in found if n not in sources}, carried, own, sources)
+    _leave_fused_products(needed, following)
+    # Only the tests that S or C's next values use; what these are computed of is no part of S, even where it follows
+    # from other tests, since the tests are computed in each turn.
+    used = {a for n in following for a in n.args} | {loop.following[k] for k in carried}
+    used_tests = [n for n in rows if n in tests and n in used]
+    sources = _list_sources(rows, used_tests)
+    recurring = {n: None for n in following if n not in sources}
+    return Recurring(nodes=recurring, carried=carried, tests=used_tests, rows=sources)
 
 
 def _list_inner(nodes: Sequence[Node], body: Block) -> list[Node]:
@@ -119,7 +121,7 @@ def _list_sources(rows: Iterable[Node], tests: Iterable[Node]) -> dict[Node, Non
 
 
 def _leave_fused_products(needed: Iterable[Any], found: dict[Node, None]) -> None:
-    """Leave out the products that are fused with a sum elsewhere: apart from it they would be rounded."""
+    """Remove from `found` the products that are fused with a sum outside of it: apart from the sum they are rounded."""
     users: defaultdict[Node, list[Any]] = defaultdict(list)
     for x in needed:
         for used in list_used_nodes(x):
@@ -162,49 +164,75 @@ class Turn(NamedTuple):
     begins: Node
 
 
-def _keep(graph: Graph, items: Iterable[Any], loop: Loop, found: Recurring, kept: Sequence[Node]) -> None:
-    """Put S in a guarded block of the loop's body, and what of it other numbers need in a ring.
+def _rewrite_loop(graph: Graph, items: Iterable[Any], loop: Loop, found: Recurring, kept: Sequence[Node]) -> None:
+    """Rewrite a loop so that S is computed only in turns that seek a cycle; all other turns read it from a ring.
 
-    The loop carries the last turn's row of the ring, and the period, 0 where no cycle is known.
+    The body becomes: the tests of rows; the choice of the turn's row; a guarded block with S, which stores its row; the
+    rest, which loads from the row. The loop carries in addition the last turn's row of the ring, and the period of the
+    cycle, 0 where none is known.
+
+    Args:
+        graph: the program.
+        items: all that its outputs need.
+        loop: the loop.
+        found: S, C and the tests.
+        kept: the numbers of S that something outside of S needs.
     """
-    body, before = loop.body, graph.current
-    graph.max_nodes += 8 * (len(found.nodes) + len(found.tests))  # what is made here was not asked for
+    body, enclosing = loop.body, graph.current
+    graph.max_nodes += 8 * (len(found.nodes) + len(found.tests))  # nodes made here are not the program's own
     rest = [x for x in body.items if x not in found.nodes and x not in found.rows]
     body.items, body.seen, graph.current = [*found.rows], {}, body
-    tests, ring = (Ring(graph, [n.type for n in nodes], loop) for nodes in (found.tests, kept))
-    row, period = _carry(graph, loop, RING - 1), _carry(graph, loop, 0)
-    turn = _choose_row(graph, found.tests, tests, row, period)
-    # S in its block, and whether it closes a cycle.
-    guard = Guard(Block(body, pinned=True), turn.seeks)
+    test_ring, value_ring = (Ring(graph, [n.type for n in nodes], loop) for nodes in (found.tests, kept))
+    last_row, period = _carry(graph, loop, RING - 1), _carry(graph, loop, 0)
+    turn = _choose_row(graph, found.tests, test_ring, last_row, period)
+    # S, the stores of its row, and whether it closes a cycle.
+    closes = _guard_nodes(graph, loop, found, kept, turn, (test_ring, value_ring))
+    # A cycle that closes with row p - 1 has the period p.
+    zero, one = graph.constant(0, "i64"), graph.constant(1, "i64")
+    found_period = select(graph, closes, graph.node("add", "i64", turn.now, one), zero)
+    # The rest of the program has the numbers of S from the turn's row.
+    from_ring = dict(zip(kept, value_ring.load(turn.now), strict=True))
+    for x in items:
+        if x not in found.nodes:
+            _replace_uses(x, from_ring)
+    loop.following += [turn.now, select(graph, turn.seeks, found_period, period)]
+    body.items += rest
+    graph.current = enclosing
+
+
+def _guard_nodes(
+    graph: Graph, loop: Loop, found: Recurring, kept: Sequence[Node], turn: Turn, rings: tuple[Ring, Ring]
+) -> Node:
+    """Move S to a guarded block, for turns that seek a cycle; return whether C has the bits with which it began.
+
+    The block also stores the turn's row of the two rings, of tests and of the numbers that others need. The result is
+    False in turns that do not seek.
+    """
+    guard = Guard(Block(loop.body, pinned=True), turn.seeks)
     graph.current, guard.body.items = guard.body, [*found.nodes]
     for n in found.nodes:
         n.block = guard.body
-    tests.store(found.tests, turn.now)
-    ring.store(kept, turn.now)
-    guard.values = [_close(graph, loop, found.carried, turn.begins)]
-    graph.current = body
-    guard.results = [graph.fresh("guarded", "bool", (), body, (guard, 0))]
-    body.items.append(guard)
-    # What else needs a number of S has it from the turn's row.
-    zero, one = graph.constant(0, "i64"), graph.constant(1, "i64")
-    closed = select(graph, guard.results[0], graph.node("add", "i64", turn.now, one), zero)
-    replaced = dict(zip(kept, ring.load(turn.now), strict=True))
-    for x in items:
-        if x not in found.nodes:
-            _replace_uses(x, replaced)
-    loop.following += [turn.now, select(graph, turn.seeks, closed, period)]
-    body.items += rest
-    graph.current = before
+    for ring, nodes in zip(rings, (found.tests, kept), strict=True):
+        ring.store(nodes, turn.now)
+    guard.values = [_compare_with_start(graph, loop, found.carried, turn.begins)]
+    graph.current = loop.body
+    guard.results = [graph.fresh("guarded", "bool", (), loop.body, (guard, 0))]
+    loop.body.items.append(guard)
+    return guard.results[0]
 
 
 def _choose_row(graph: Graph, now: Sequence[Node], tests: Ring, row: Node, period: Node) -> Turn:
-    """Choose a turn's row: the next of a cycle if that has the tests of now, else one for which S is computed."""
+    """Choose a turn's row: the next of a cycle if that has the tests of now, else one for which S is computed.
+
+    now: the outcomes of the turn's tests; tests: the ring with those of each row; row: the last turn's row; period: of
+    the cycle, 0 where none is known.
+    """
     node, zero, one = graph.node, graph.constant(0, "i64"), graph.constant(1, "i64")
     following = node("add", "i64", row, one)
     of_cycle = select(graph, node("eq", "bool", following, period), zero, following)
     unknown = node("eq", "bool", period, zero)
-    others = [node("xor", "bool", *pair) for pair in zip(now, tests.load(of_cycle), strict=True)]
-    seeks = reduce(partial(node, "or", "bool"), others, unknown)
+    differing_tests = [node("xor", "bool", *pair) for pair in zip(now, tests.load(of_cycle), strict=True)]
+    seeks = reduce(partial(node, "or", "bool"), differing_tests, unknown)
     # A cycle that was left, and a full ring, are begun anew.
     full = node("eq", "bool", row, graph.constant(RING - 1, "i64"))
     begins = node("or", "bool", node("not", "bool", unknown), full)
@@ -212,29 +240,31 @@ def _choose_row(graph: Graph, now: Sequence[Node], tests: Ring, row: Node, perio
     return Turn(now=select(graph, seeks, sought, of_cycle), seeks=seeks, begins=begins)
 
 
-def _close(graph: Graph, loop: Loop, carried: Sequence[int], begins: Node) -> Node:
+def _compare_with_start(graph: Graph, loop: Loop, carried: Sequence[int], begins: Node) -> Node:
     """Return whether the next values of carried numbers have the bits that these had when the cycle began."""
     block, zero = graph.current, graph.constant(0, "i64")
+    # Their bits before row 0, stored in the turns in which a cycle begins.
     reference = Ring(graph, [INTEGERS.get(loop.parameters[k].type, loop.parameters[k].type) for k in carried], loop, 1)
     guard = Guard(Block(block, pinned=True), begins)
     block.items.append(guard)
     graph.current = guard.body
     reference.store([_read_bits(graph, loop.parameters[k]) for k in carried], zero)
     graph.current = block
+    # The bits in which any number differs, of each type together.
     differing = dict[Type, Node]()
-    for k, was in zip(carried, reference.load(zero), strict=True):
-        other = graph.node("xor", was.type, was, _read_bits(graph, loop.following[k]))
-        differing[was.type] = graph.node("or", was.type, differing[was.type], other) if was.type in differing else other
+    for k, old in zip(carried, reference.load(zero), strict=True):
+        bits = graph.node("xor", old.type, old, _read_bits(graph, loop.following[k]))
+        differing[old.type] = graph.node("or", old.type, differing[old.type], bits) if old.type in differing else bits
     equal = [graph.node("eq", "bool", n, graph.constant(0, type)) for type, n in differing.items()]
     return reduce(partial(graph.node, "and", "bool"), equal)
 
 
 def _carry(graph: Graph, loop: Loop, start: int) -> Node:
-    """Make a number that the loop carries; return its parameter."""
-    at = loop, len(loop.parameters)
+    """Make an integer that the loop carries, `start` before the first turn; return its parameter."""
+    place = loop, len(loop.parameters)
     loop.initial.append(graph.constant(start, "i64"))
-    loop.parameters.append(graph.fresh("parameter", "i64", (), loop.body, at))
-    loop.results.append(graph.fresh("result", "i64", (), loop.block, at))
+    loop.parameters.append(graph.fresh("parameter", "i64", (), loop.body, place))
+    loop.results.append(graph.fresh("result", "i64", (), loop.block, place))
     return loop.parameters[-1]
 
 
@@ -244,9 +274,10 @@ def _read_bits(graph: Graph, node: Node) -> Node:
 
 
 def _replace_uses(x: Any, replaced: Mapping[Node, Node]) -> None:
-    """Let a node or a statement use other numbers in the place of some."""
+    """Let a node or a statement use the values of `replaced` in the place of its keys."""
 
     def of(nodes: Sequence[Node]) -> list[Node]:
+        """Return the nodes with those replaced that have a replacement."""
         return [replaced.get(n, n) for n in nodes]
 
     if isinstance(x, Node):

@@ -31,7 +31,7 @@ Memory = dict[Buffer, jax.Array]  # numbers of one run
 
 def function_of(program: Program) -> Callable[..., PyTree]:
     """Return the function of one run's arrays that a program computes, for JAX to trace, map and differentiate."""
-    return lambda *arrays: jax.tree.unflatten(program.tree, _JaxEvaluation(program).results(arrays))
+    return lambda *arrays: jax.tree.unflatten(program.tree, _JaxEvaluation(program).evaluate(arrays))
 
 
 class _JaxEvaluation:
@@ -46,14 +46,14 @@ class _JaxEvaluation:
         self.values: dict[Node, jax.Array] = {}
         self.memory: Memory = {}
 
-    def results(self, arrays: tuple[Any, ...]) -> list[jax.Array]:
+    def evaluate(self, arrays: tuple[Any, ...]) -> list[jax.Array]:
         """Return the results for these arguments, leaf by leaf."""
         for buffer, array in zip(self.program.inputs, arrays, strict=True):
             self.memory[buffer] = jnp.asarray(array, DTYPES[buffer.type]).reshape(-1)
         for buffer in {x.owner[0] for x in self.needed if isinstance(x, Buffer)} - set(self.memory):
             start = np.zeros(buffer.size) if buffer.table is None else buffer.table.ravel()
             self.memory[buffer] = jnp.asarray(start, DTYPES[buffer.type])
-        self.block(self.program.graph.top.items)
+        self.evaluate_block(self.program.graph.top.items)
         return [self._gather_result(x) for x in self.program.outputs]
 
     def _gather_result(self, value: Any) -> jax.Array:
@@ -71,7 +71,7 @@ class _JaxEvaluation:
         """Return the value of a node."""
         return jnp.asarray(node.value, DTYPES[node.type]) if node.op == "constant" else self.values[node]
 
-    def block(self, items: list[Any]) -> None:
+    def evaluate_block(self, items: list[Any]) -> None:
         """Evaluate operations and statements in order."""
         for statement in items:
             if statement not in self.needed:  # a check of a loop among them
@@ -110,57 +110,62 @@ class _JaxEvaluation:
 
     def _find_filled(self, block: Block) -> list[Buffer]:
         """Return the buffers that a block, or a block inside it, stores into."""
-        stores = [x for x in self.needed if isinstance(x, Store) and block in x.block.inwards()]
+        stores = [x for x in self.needed if isinstance(x, Store) and block in x.block.list_enclosing_blocks()]
         return list(dict.fromkeys(x.buffer.owner[0] for x in sorted(stores, key=lambda x: x.node.serial)))
 
     def _evaluate_loop(self, loop: Loop) -> None:
-        """Evaluate a loop: the carry is that of the graph, and the memory that the body fills."""
+        """Evaluate a loop by JAX, and note its results: a carry has the carried numbers, and the memory it fills.
+
+        A carry is (one number for each carried place that is needed, one array for each buffer that the body fills).
+        """
         pairs = zip(loop.parameters, loop.results, strict=True)
         carried = [k for k, pair in enumerate(pairs) if {*pair} & self.needed.keys()]
-        filled, outer, memory = self._find_filled(loop.body), self.values, self.memory
+        filled, outer_values, outer_memory = self._find_filled(loop.body), self.values, self.memory
 
         def begin_turn(carry: PyTree, counter: Any) -> None:
             """Make the parameters and the memory those of the carry (numbers, memory)."""
-            self.values, self.memory = dict(outer), memory | dict(zip(filled, carry[1], strict=True))
-            self.values |= zip((loop.parameters[k] for k in carried), carry[0], strict=True)
+            numbers, arrays = carry
+            self.values, self.memory = dict(outer_values), outer_memory | dict(zip(filled, arrays, strict=True))
+            self.values |= zip((loop.parameters[k] for k in carried), numbers, strict=True)
             if loop.counter is not None:
                 self.values[loop.counter] = jnp.asarray(counter, np.int64)
 
-        def turn(counter: Any, carry: PyTree) -> PyTree:
+        def run_turn(counter: Any, carry: PyTree) -> PyTree:
             """Return the carry after the body."""
             begin_turn(carry, counter)
-            self.block(loop.body.items)
+            self.evaluate_block(loop.body.items)
             return [self.value(loop.following[k]) for k in carried], [self.memory[b] for b in filled]
 
         def goes_on(carry: PyTree) -> jax.Array:
             """Return the loop's condition, after the part of the body before its check."""
             begin_turn(carry, 0)
             check = next(i for i, x in enumerate(loop.body.items) if isinstance(x, LoopExit))
-            self.block(loop.body.items[:check])
+            self.evaluate_block(loop.body.items[:check])
             assert loop.condition is not None
             return self.value(loop.condition)
 
         # From the first carry to the last, whose values are the loop's results.
-        start = [self.value(loop.initial[k]) for k in carried], [memory[b] for b in filled]
+        start = [self.value(loop.initial[k]) for k in carried], [outer_memory[b] for b in filled]
         if loop.length is None:
-            end = lax.while_loop(goes_on, lambda carry: turn(0, carry), start)
+            numbers, arrays = lax.while_loop(goes_on, lambda carry: run_turn(0, carry), start)
         else:
-            end = lax.fori_loop(0, loop.length, turn, start)
-        self.values, self.memory = outer, memory | dict(zip(filled, end[1], strict=True))
-        self.values |= zip((loop.results[k] for k in carried), end[0], strict=True)
+            numbers, arrays = lax.fori_loop(0, loop.length, run_turn, start)
+        self.values, self.memory = outer_values, outer_memory | dict(zip(filled, arrays, strict=True))
+        self.values |= zip((loop.results[k] for k in carried), numbers, strict=True)
 
     def _evaluate_guard(self, guard: Guard) -> None:
-        """Evaluate a guarded block where its condition holds; its results are zeros elsewhere."""
+        """Evaluate a guarded block where its condition holds, and note its results, which are zeros elsewhere."""
         used = [k for k, r in enumerate(guard.results) if r in self.needed]
-        filled, outer, memory = self._find_filled(guard.body), self.values, self.memory
+        filled, outer_values, outer_memory = self._find_filled(guard.body), self.values, self.memory
 
         def evaluate_body() -> PyTree:
             """Return the block's values, and the memory that it fills."""
-            self.values, self.memory = dict(outer), dict(memory)
-            self.block(guard.body.items)
+            self.values, self.memory = dict(outer_values), dict(outer_memory)
+            self.evaluate_block(guard.body.items)
             return [self.value(guard.values[k]) for k in used], [self.memory[b] for b in filled]
 
         zeros = [jnp.zeros((), DTYPES[guard.results[k].type]) for k in used]
-        end = lax.cond(self.value(guard.condition), evaluate_body, lambda: (zeros, [memory[b] for b in filled]))
-        self.values, self.memory = outer, memory | dict(zip(filled, end[1], strict=True))
-        self.values |= zip((guard.results[k] for k in used), end[0], strict=True)
+        unchanged = [outer_memory[b] for b in filled]
+        numbers, arrays = lax.cond(self.value(guard.condition), evaluate_body, lambda: (zeros, unchanged))
+        self.values, self.memory = outer_values, outer_memory | dict(zip(filled, arrays, strict=True))
+        self.values |= zip((guard.results[k] for k in used), numbers, strict=True)

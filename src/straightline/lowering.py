@@ -42,29 +42,31 @@ class Lowering:
         self.written_out = WRITTEN_OUT  # executions of a loop's operations up to which its turns are written out
         self.products: dict[Any, tuple[np.ndarray, np.ndarray]] = {}  # entries of A B' -> A and B, of each product
 
-    def inline(self, program: ClosedJaxpr | Jaxpr, inputs: Sequence[Value], consts: Sequence[Any] = ()) -> list[Value]:
+    def inline_program(
+        self, program: ClosedJaxpr | Jaxpr, inputs: Sequence[Value], consts: Sequence[Any] = ()
+    ) -> list[Value]:
         """Return the results of a traced program for these arguments."""
         jaxpr: Any = program
         if isinstance(program, ClosedJaxpr):
             jaxpr, consts = program.jaxpr, program.consts
-        values: dict[Var, Value] = dict(zip(jaxpr.constvars, map(self.known, consts), strict=True))
+        values: dict[Var, Value] = dict(zip(jaxpr.constvars, map(self.make_known_array, consts), strict=True))
         values |= zip(jaxpr.invars, inputs, strict=True)
         for equation in _find_used(jaxpr):
             arguments = [self._read(values, v) for v in equation.invars]
-            values |= zip(equation.outvars, self.equation(equation, arguments), strict=True)
+            values |= zip(equation.outvars, self.lower_equation(equation, arguments), strict=True)
         return [self._read(values, v) for v in jaxpr.outvars]
 
-    def results(self, program: ClosedJaxpr, inputs: Sequence[Value]) -> list[Value]:
+    def lower_whole_program(self, program: ClosedJaxpr, inputs: Sequence[Value]) -> list[Value]:
         """Return the results of a whole program; an array without entries, which has no node, is a typed view."""
         avals: list[Any] = [v.aval for v in program.jaxpr.outvars]
-        values = self.inline(program, inputs)
+        values = self.inline_program(program, inputs)
         return [x if x.size else self._empty(a) for x, a in zip(values, avals, strict=True)]
 
     def _empty(self, aval: Any) -> InMemory:
         """Return an array without entries, in memory of its type and shape."""
         return InMemory.whole(Buffer("scratch", type_of(aval), tuple(aval.shape), self.graph.top))
 
-    def equation(self, equation: JaxprEqn, inputs: list[Value]) -> Sequence[Value]:
+    def lower_equation(self, equation: JaxprEqn, inputs: list[Value]) -> Sequence[Value]:
         """Return the results of one operation.
 
         Raises:
@@ -95,7 +97,7 @@ class Lowering:
         """Return a value as a NumPy array of nodes."""
         return value.nodes(self.graph) if isinstance(value, InMemory) else value
 
-    def scalar(self, value: Value) -> Node:
+    def get_only_node(self, value: Value) -> Node:
         """Return the node of a value without axes."""
         nodes = self.nodes(value)
         if nodes.size != 1:
@@ -103,12 +105,12 @@ class Lowering:
         node: Node = nodes.item()
         return node
 
-    def known(self, number: Any) -> Value:
+    def make_known_array(self, number: Any) -> Value:
         """Return an array of known numbers: as constants, or as a table in memory if it is long."""
         if isinstance(number, np.ndarray) and number.dtype == object:
             return number
         if isinstance(number, jax.Array) and jax.numpy.issubdtype(number.dtype, jax.dtypes.prng_key):
-            return keys_of(self.known(np.asarray(jax.random.key_data(number))))
+            return keys_of(self.make_known_array(np.asarray(jax.random.key_data(number))))
         array = np.asarray(number)
         type = type_of(array)
         if array.size > TABLE:
@@ -117,7 +119,7 @@ class Lowering:
 
     def _read(self, values: dict[Var, Value], v: Any) -> Value:
         """Return the value of an operation's argument: a literal's constant, else what was computed."""
-        return self.known(_as_traced(v.val, v)) if isinstance(v, Literal) else values[v]
+        return self.make_known_array(_as_traced(v.val, v)) if isinstance(v, Literal) else values[v]
 
 
 def _as_traced(number: Any, variable: Any) -> Any:

@@ -127,7 +127,7 @@ class TieredCode:
         with self._lock:
             self._first(self._executions + self._of(blocks))
 
-    def machine(self, blocks: float) -> Machine:
+    def choose_machine(self, blocks: float) -> Machine:
         """Return code that is about to be executed for so many blocks of the most runs; hold it while it runs."""
         made = self._machine
         if made is not None and made.level:  # nothing better is to come

@@ -68,13 +68,13 @@ class InMemory:
 
     def nodes(self, graph: Graph) -> np.ndarray:
         """Return a node for each entry, which loads it: once in a block, for the blocks inside it too."""
-        if self.loaded is None or self.loaded[0] not in graph.current.inwards():
+        if self.loaded is None or self.loaded[0] not in graph.current.list_enclosing_blocks():
             if self.size > LOADED:
                 raise Unsupported(f"an array of {self.size} numbers at once")
-            self.loaded = graph.current, self._load(graph)
+            self.loaded = graph.current, self._load_entries(graph)
         return self.loaded[1]
 
-    def _load(self, graph: Graph) -> np.ndarray:
+    def _load_entries(self, graph: Graph) -> np.ndarray:
         """Return a node for each entry, which loads it."""
         strides, indices = [s for s, _ in self.moves], [i for _, i in self.moves]
         nodes = np.empty(self.shape, dtype=object)
@@ -84,40 +84,51 @@ class InMemory:
         return nodes
 
     def reshaped(self, shape: tuple[int, ...]) -> "InMemory | None":
-        """Return the same numbers in another shape, None if no strides describe it."""
+        """Return a view of the same numbers in another shape, None if no strides describe it."""
         if not self.size:
             return self.view(shape, (0,) * len(shape))
         axes = [(n, s) for n, s in zip(self.shape, self.strides, strict=True) if n != 1]
-        strides: list[int] = []
-        # New axes are split off old ones, from the last on; old axes that lie contiguously are merged. `axis`: the next
-        # old axis to split; `left`, `base`: entries of the present one that are not used yet, and their stride.
-        axis, left = len(axes) - 1, 1
-        base = 1
-        for n in reversed(shape):
-            if n == 1:
-                strides.append(0)
-                continue
-            # The next old axis, with those that go on from it.
-            if left == 1:
-                if axis < 0:
-                    return None
-                left, base = axes[axis]
-                axis -= 1
-                while left % n and axis >= 0 and axes[axis][1] == axes[axis + 1][0] * axes[axis + 1][1]:
-                    left *= axes[axis][0]
-                    axis -= 1
-            while left < n and axis >= 0 and axes[axis][1] == base * left:
-                left *= axes[axis][0]
-                axis -= 1
-            # The new axis does not divide what is left.
-            if left % n:
-                return None
-            strides.append(base)
-            left, base = left // n, base * n
-        return self.view(shape, strides[::-1]) if left == 1 and axis < 0 else None
+        strides = _split_axes(_merge_axes(axes), shape)
+        return None if strides is None else self.view(shape, strides)
+
+
+def _merge_axes(axes: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return axes, pairs of length and stride, with each that continues the next one merged with it.
+
+    Axis a continues axis b behind it if its stride is b's length times b's stride: both are one of length n_a n_b.
+    """
+    merged: list[tuple[int, int]] = []
+    for length, stride in reversed(axes):
+        if merged and stride == merged[-1][0] * merged[-1][1]:
+            merged[-1] = length * merged[-1][0], merged[-1][1]
+        else:
+            merged.append((length, stride))
+    return merged[::-1]
+
+
+def _split_axes(axes: Sequence[tuple[int, int]], shape: Sequence[int]) -> list[int] | None:
+    """Return the strides of an array of this shape whose axes are parts of these ones, in order; None if none are.
+
+    axes: pairs of length and stride, merged, with as many entries as the shape. From the last axis on, each new axis
+    is split off what is left of an old one.
+    """
+    remaining_axes = list(axes)
+    left, stride = 1, 0  # entries of the present old axis that are not split off yet, and the stride between them
+    strides: list[int] = []
+    for length in reversed(shape):
+        if length == 1:
+            strides.append(0)
+            continue
+        if left == 1:
+            left, stride = remaining_axes.pop()
+        if left % length:
+            return None
+        strides.append(stride)
+        left, stride = left // length, stride * length
+    return strides[::-1]
 
 
 def contiguous(shape: Sequence[int]) -> tuple[int, ...]:
-    """Return the strides of an array whose last axis is innermost."""
+    """Return the strides of an array of this shape in row-major order: the last axis is innermost."""
     strides = np.cumprod([1, *shape[:0:-1]])[::-1]
     return tuple(int(s) for s in strides[: len(shape)])

@@ -71,7 +71,7 @@ class Block:
         self.items: list[Node | Loop | Guard | Store | LoopExit] = []
         self.seen: dict[Any, Node] = {}
 
-    def let_go(self) -> None:
+    def free_contents(self) -> None:
         """Empty this block and those inside, so that no number refers to itself and all are freed without a search."""
         for statement in self.items:
             if isinstance(statement, Node):
@@ -79,14 +79,14 @@ class Block:
             elif isinstance(statement, Store):
                 statement.buffer.stores, statement.buffer.parts = [], []
             elif isinstance(statement, Loop | Guard):
-                statement.body.let_go()
+                statement.body.free_contents()
                 statement.results = []
                 if isinstance(statement, Loop):
                     statement.parameters, statement.following = [], []
                     statement.condition = statement.counter = None
         self.items, self.seen, self.owner = [], {}, None
 
-    def inwards(self) -> Iterator["Block"]:
+    def list_enclosing_blocks(self) -> Iterator["Block"]:
         """Yield this block and the enclosing ones, outermost last."""
         block: Block | None = self
         while block is not None:

@@ -77,29 +77,38 @@ def lower_traced(
     known: Known = MappingProxyType({}),
     single: bool = False,
 ) -> Program:
-    """Lower a program that is traced already, in single precision or in double; the rest as of `lower_function`."""
+    """Lower a program that JAX traced already; return its graph with a buffer for each argument.
+
+    Args:
+        traced: the program, in single precision or in double.
+        tree: the structure of its results.
+        most: operations above which it is refused.
+        known: by the number of the argument, which of its entries are the same in every call, and these numbers.
+        single: whether numbers are float32.
+    """
     lowering = Lowering(most)
     avals: list[Any] = [v.aval for v in traced.jaxpr.invars]
     inputs, values = [], []
     for number, aval in enumerate(avals):
         is_key = jax.numpy.issubdtype(aval.dtype, jax.dtypes.prng_key)
-        shape = (*aval.shape, 2) if is_key else aval.shape
+        shape = (*aval.shape, 2) if is_key else aval.shape  # a key is two words
         buffer = Buffer("input", "u32" if is_key else type_of(aval), shape, lowering.graph.top)
         view = InMemory.whole(buffer)
         inputs.append(buffer)
         if number in known:
-            values.append(_find_known_entries(lowering, view, *known[number]))
+            mask, numbers = known[number]
+            values.append(_insert_known_entries(lowering, view, mask, numbers))
         else:
             values.append(keys_of(view.nodes(lowering.graph)) if is_key else view)
     with jax.enable_x64(not single):
-        outputs = lowering.results(traced, values)
+        outputs = lowering.lower_whole_program(traced, values)
     return Program(lowering.graph, inputs, outputs, tree)
 
 
-def _find_known_entries(lowering: Lowering, view: InMemory, mask: np.ndarray, numbers: np.ndarray) -> Value:
-    """Return an array of which some entries are known: all, or a few of a short one, as constants."""
+def _insert_known_entries(lowering: Lowering, view: InMemory, mask: np.ndarray, numbers: np.ndarray) -> Value:
+    """Return an argument with constants where `mask` says that its numbers are known; a long one stays in memory."""
     if mask.all():
-        return lowering.known(numbers.astype(DTYPES[view.type]))
+        return lowering.make_known_array(numbers.astype(DTYPES[view.type]))
     if view.size > TABLE:
         return view
     graph, kind = lowering.graph, view.type
@@ -160,7 +169,7 @@ def _list_dependencies(node: Any) -> list[Any]:
 
 
 def fusable(node: Node, products: set[Node]) -> Node | None:
-    """Return the product that is computed with a sum or difference as one operation."""
+    """Return the argument of a sum or difference that is a product fused with it (`find_fusable_products`), or None."""
     for a in node.args:
         if a.value is node and a in products:
             return a
@@ -217,29 +226,36 @@ def sort_items(items: Iterable[Any]) -> list[Any]:
 
 
 def find_varying(items: Iterable[Any], inputs: Iterable[Buffer]) -> set[Any]:
-    """Return which nodes, buffers, loops and guards of these differ if these input buffers do."""
+    """Return which nodes, buffers, loops and guards among `items` differ between runs if these input buffers do.
+
+    The input buffers are among them.
+    """
 
     @cache
-    def around(block: Block) -> list[Any]:
-        """Return the statements around a block by which what is in it may differ: not loops of a known length."""
-        return [b.owner for b in block.inwards() if b.owner is not None and getattr(b.owner, "length", None) is None]
+    def list_owners(block: Block) -> list[Any]:
+        """Return the loops and guards around a block that may make it differ: not loops of a known length."""
+        return [
+            b.owner
+            for b in block.list_enclosing_blocks()
+            if b.owner is not None and getattr(b.owner, "length", None) is None
+        ]
 
-    # What each makes differ directly.
+    # For each item, those that differ if it does.
     followers: defaultdict[Any, list[Any]] = defaultdict(list)
     for x in items:
-        for source in x.args if is_plain(x) else _list_sources(x, around):
+        for source in x.args if is_plain(x) else _list_sources(x, list_owners):
             followers[source].append(x)
         if isinstance(x, Store):  # a store makes its buffer differ
             followers[x].append(x.buffer.owner[0])
-    # From the inputs on.
-    results: set[Any] = set(inputs)
-    left = list(results)
-    while left:
-        for x in followers.pop(left.pop(), ()):
-            if x not in results:
-                results.add(x)
-                left.append(x)
-    return results
+    # From the inputs on, all that follows; each item is visited once.
+    differing: set[Any] = set(inputs)
+    to_visit = list(differing)
+    while to_visit:
+        for x in followers.pop(to_visit.pop(), ()):
+            if x not in differing:
+                differing.add(x)
+                to_visit.append(x)
+    return differing
 
 
 def find_differing(items: list[Any], inputs: Iterable[Buffer]) -> set[Any]:
@@ -275,29 +291,36 @@ def find_crossing_items(items: Iterable[Any], spread: set[Any]) -> set[Any]:
     return results - {None}
 
 
-def _list_sources(node: Any, around: Callable[[Block], list[Any]]) -> list[Any]:
-    """Return all of which any makes a number or a statement differ: arguments, memory, what is around it."""
-    if isinstance(node, Buffer):
-        return [node.owner[0]]
-    # Statements: a loop differs by its condition.
-    if isinstance(node, Loop):
-        return [node.condition, *node.parameters] if node.length is None else []
-    if isinstance(node, Guard):
-        return [node.condition]
-    if isinstance(node, Store):
-        return [node.node, *around(node.block)]
-    # Nodes: by their block, by memory, by the carry, else by their arguments.
-    if node.op in ("constant", "counter"):
-        return list(node.args)
-    if node.op == "load":
-        return [*node.args, *around(node.block), node.value[0].owner[0]]
-    if node.op in ("parameter", "result"):
-        loop, index = node.value
-        return [*node.args, *around(node.block), loop, loop.initial[index], loop.following[index]]
-    if node.op == "guarded":
-        guard, index = node.value
-        return [*node.args, *around(node.block), guard, guard.values[index]]
-    return [*node.args, *around(node.block)]
+def _list_sources(item: Any, list_owners: Callable[[Block], list[Any]]) -> list[Any]:
+    """Return the items each of which makes this node, buffer or statement differ between runs if it does itself.
+
+    `list_owners` returns the loops and guards around a block that may make what is in it differ.
+    """
+    # Memory inside other memory differs with it.
+    if isinstance(item, Buffer):
+        whole, _ = item.owner
+        return [whole]
+    # Runs differ in the turns of a loop only if it ends by a condition, which carried numbers decide.
+    if isinstance(item, Loop):
+        return [item.condition, *item.parameters] if item.length is None else []
+    if isinstance(item, Guard):
+        return [item.condition]
+    if isinstance(item, Store):
+        return [item.node, *list_owners(item.block)]
+    # All others are nodes. A constant and a counter are the same in all runs.
+    if item.op in ("constant", "counter"):
+        return []
+    sources = [*item.args, *list_owners(item.block)]
+    if item.op == "load":
+        buffer, _offset, _strides = item.value
+        sources.append(buffer.owner[0])
+    elif item.op in ("parameter", "result"):
+        loop, index = item.value
+        sources += [loop, loop.initial[index], loop.following[index]]
+    elif item.op == "guarded":
+        guard, index = item.value
+        sources += [guard, guard.values[index]]
+    return sources
 
 
 class SummedOutputs(NamedTuple):

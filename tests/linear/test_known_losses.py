@@ -93,7 +93,7 @@ def test_independent_losses_are_a_chain_with_equal_rows():
     """The sum over modes has the radius of the operator by mode; a chain a hair off has the same to that hair."""
     chain = np.array([[0.6, 0.4], [0.6 + 1e-13, 0.4 - 1e-13]])
     by_mode, together = lossy(COUPLED, chain), independent(COUPLED, 0.6)
-    sizes = [len(item.closed(find_gains(item)).operator()) for item in (by_mode, together)]
+    sizes = [len(item.close_loop(find_gains(item)).operator()) for item in (by_mode, together)]
     assert sizes == [2 * 3, 3]
     np.testing.assert_allclose(bound(by_mode), bound(together), rtol=1e-9)
 
@@ -118,7 +118,7 @@ def test_a_certificate_does_not_trust_the_gains():
 
 def test_the_radius_is_the_growth_of_the_mean_square_under_the_gains():
     system = lossy(COUPLED, [[0.5, 0.5], [0.8, 0.2]])
-    jumps = system.closed(find_gains(system), noise=0.0)
+    jumps = system.close_loop(find_gains(system), noise=0.0)
     parts = np.array([np.eye(2), np.eye(2)])
     for _ in range(400):
         before, (parts,) = parts, jumps.after(parts)

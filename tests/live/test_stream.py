@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from straightline.compiled import aligned
+from straightline.call_arrays import aligned
 
 PLANT = hg.LinearPlant([[0.9, 0.2], [0.0, 0.8]], 0.1, [1.0, -1.0], 1.0, [[1.0], [0.0]], inputs=["push"])
 SENSOR = hg.LinearSensor(np.eye(2), 0.5)

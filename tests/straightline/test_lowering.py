@@ -17,7 +17,9 @@ def folded(function, *arguments):
     program, tree = trace_function(function, *arguments)
     lowering = Lowering()
     with jax.enable_x64(True):
-        results = lowering.inline(program, [lowering.known(np.asarray(x)) for x in jax.tree.leaves(arguments)])
+        results = lowering.inline_program(
+            program, [lowering.make_known_array(np.asarray(x)) for x in jax.tree.leaves(arguments)]
+        )
     nodes = [lowering.nodes(r) for r in results]
     numbers = [np.array([n.value for n in r.ravel()]).reshape(r.shape) for r in nodes]
     return jax.tree.unflatten(tree, numbers)

@@ -49,7 +49,7 @@ def code(optimized):
 
 def level(code):
     """The level at which the blocks' code is generated, without another execution."""
-    return code.blocks.machine(0).level
+    return code.blocks.choose_machine(0).level
 
 
 def test_code_is_generated_with_care_when_its_executions_have_cost_as_much(code):
@@ -71,8 +71,8 @@ def test_calls_go_on_in_haste_while_care_is_taken(code):
     background().submit(released.wait, 60)
     code(STARTS)
     enough = OFTEN * source.operations / source.work  # blocks
-    hasty = code.blocks.machine(enough / 2)
-    assert code.blocks.machine(enough / 2) is hasty and hasty.level == 0
+    hasty = code.blocks.choose_machine(enough / 2)
+    assert code.blocks.choose_machine(enough / 2) is hasty and hasty.level == 0
     released.set()
     background().submit(int).result()
     assert level(code) == 1
@@ -80,10 +80,10 @@ def test_calls_go_on_in_haste_while_care_is_taken(code):
 
 def test_code_in_haste_goes_on_where_care_fails_and_it_is_said_once(code, monkeypatch):
     before = code(STARTS)
-    hasty = code.blocks.machine(0)
+    hasty = code.blocks.choose_machine(0)
     monkeypatch.setattr("straightline.machine.Machine", lambda *arguments: [].pop())
     with pytest.warns(RuntimeWarning, match="native code: generated with care it failed .*pop from empty list.*haste"):
-        assert code.blocks.machine(OFTEN) is hasty
+        assert code.blocks.choose_machine(OFTEN) is hasty
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         again = code(STARTS)
@@ -98,14 +98,14 @@ def test_a_call_that_executes_its_code_often_waits_for_care(code):
 
 def test_prepared_code_is_not_generated_by_the_first_call(code):
     code.prepare()
-    prepared = code.blocks.machine(0)
+    prepared = code.blocks.choose_machine(0)
     code(STARTS)
-    assert code.blocks.machine(0) is prepared
+    assert code.blocks.choose_machine(0) is prepared
 
 
 def test_no_code_is_generated_with_care_without_optimizations(code):
     jax.config.update("jax_disable_most_optimizations", True)
-    assert code.blocks.machine(2 * OFTEN).level == 0
+    assert code.blocks.choose_machine(2 * OFTEN).level == 0
 
 
 def test_a_long_step_in_live_use_is_generated_in_haste(monkeypatch):

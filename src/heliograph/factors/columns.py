@@ -160,31 +160,38 @@ def _triangularise_row_by_row(columns: WeightedColumns) -> WeightedColumns:
 
 
 def absorb_columns(factors: WeightedColumns, columns: WeightedColumns) -> WeightedColumns:
-    """Find L and d of L diag(d) L' + W diag(w) W', W's columns one after another in a loop: short rather than fast.
+    """Return the factors (unit lower triangular M, e) with M diag(e) M' = L diag(d) L' + W diag(w) W'.
+
+    Args:
+        factors: L (n, n), unit lower triangular, and d (n,).
+        columns: W (n, count), of which one column after another is absorbed in a loop, and w (count,).
 
     A column c of weight w goes from row to row j: with d_j' = d_j + w c_j^2, s = d_j / d_j' and g = w c_j / d_j',
     column j of L becomes s L_j + g c, c loses c_j L_j, and w becomes s w. These rotations without roots keep each row
-    to eps of itself, as `triangularise` does, by 3/2 of its products, and a reciprocal for each d and column.
+    to eps of itself, as `triangularise` does. They take half as many products again, and a reciprocal for each d and
+    column, but the loop is a shorter program.
 
     Source: Gentleman, Least squares computations by Givens transformations without square roots (1973).
     """
     n, dtype = len(factors.matrix), jnp.asarray(columns.matrix).dtype
     rows, places = np.tril_indices(n, -1)
-    entry = {(i, j): e for e, (i, j) in enumerate(zip(rows.tolist(), places.tolist(), strict=True))}
+    # Place of entry (i, j) of L in the flat array of what is below its diagonal.
+    flat_place = {(i, j): e for e, (i, j) in enumerate(zip(rows.tolist(), places.tolist(), strict=True))}
 
     def absorb(carry: tuple[jax.Array, jax.Array], column: tuple[jax.Array, jax.Array]) -> tuple[Any, None]:
-        """Rotate one column into the factors, from the first row down."""
-        lower, variances = list(carry[0]), list(carry[1])
-        c, weight = list(column[0]), column[1]
+        """Rotate one column (c, w) into the factors (entries below the diagonal, d), from the first row down."""
+        lower, variances = map(list, carry)
+        entries_of_column, weight = column
+        c = list(entries_of_column)
         for j in range(n):
             d = variances[j] + weight * c[j] ** 2
-            over = reciprocal_or_one(d)
-            kept, gain = jnp.where(is_positive(d), variances[j] * over, 1.0), weight * c[j] * over
+            reciprocal = reciprocal_or_one(d)
+            s, g = jnp.where(is_positive(d), variances[j] * reciprocal, 1.0), weight * c[j] * reciprocal
             variances[j] = d
             for i in range(j + 1, n):
-                e = entry[i, j]
-                lower[e], c[i] = kept * lower[e] + gain * c[i], c[i] - c[j] * lower[e]
-            weight = weight * kept
+                e = flat_place[i, j]
+                lower[e], c[i] = s * lower[e] + g * c[i], c[i] - c[j] * lower[e]
+            weight = weight * s
         return (jnp.asarray(lower, dtype), jnp.asarray(variances, dtype)), None
 
     start = below_diagonal(jnp.asarray(factors.matrix)).astype(dtype), jnp.asarray(factors.weights).astype(dtype)

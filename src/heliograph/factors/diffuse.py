@@ -164,40 +164,47 @@ def observe_diffuse(
 
 
 def _observe_scalar(x: Diffuse, h: jax.Array, noise: jax.Array) -> tuple[Diffuse, jax.Array, jax.Array, jax.Array]:
-    """Condition x on one number h'x + v, column by column of L from the last.
+    """Condition x on one number z = h'x + v, Var v = `noise`, where some directions of x are unknown.
+
+    The covariance of x is L diag(d + kappa d_inf) L', kappa -> infinity: column j of L is an unknown direction where
+    d_inf,j > 0, and then d_j = 0. Bierman's steps go over the columns of L from the last to the first; f_j = h'L_j is
+    what z shows of column j. What has a factor kappa is the infinite part, and outweighs the finite one.
 
     Returns:
-        x given the number, its mean as it was; the gain (n,) by which the innovation moves the mean; the variance of
-        the number, s, or s_inf of one that hears an unknown direction; and whether it hears one.
+        x given z, its mean as it was; the gain (n,) by which the innovation moves the mean; the variance of z, or its
+        infinite part where z shows an unknown direction; and whether it shows one.
 
-    Source: Bierman, Factorization methods for discrete sequential estimation (1977), at two levels.
+    Source: Bierman, Factorization methods for discrete sequential estimation (1977), for finite and infinite parts.
     """
     n, root = len(x.mean), x.root
-    # Sums over the columns k > j that are done: s = r + sum f_k^2 d_k, far = sum f_k^2 d_inf,k, and k = Cov(x, number).
-    s, far, k = noise, jnp.zeros_like(noise), jnp.zeros(n)
+    # Sums over the columns k > j that are done: s = noise + sum f_k^2 d_k, s_inf = sum f_k^2 d_inf,k, and the
+    # covariance of x with z, of its infinite part alone once that is not zero.
+    s, s_inf, cross = noise, jnp.zeros_like(noise), jnp.zeros(n)
     columns, d, d_inf = [root[:, j] for j in range(n)], list(x.variances), list(x.infinite)
     for j in reversed(range(n)):
         column = columns[j]
-        f, reach = h @ column, jnp.abs(h) @ jnp.abs(column)
-        is_far, heard = d_inf[j] > 0, jnp.abs(f) > DEAF * reach
-        new = is_far & heard  # an unknown direction that the number tells of
-        first_heard = new & (far == 0)
-        # Level of the step: the finite sum before anything unknown is heard, the infinite one after.
-        level = jnp.where(far > 0, far, s)
-        # Bierman's step, L_j - (f_j / s_{j+1}) w_{j+1}; slopes of an unknown direction that is not heard are rounding.
-        columns[j] = jnp.where(is_far & ~heard, column, column - f * reciprocal_or_zero(level) * k)
-        s_after, far_after = s + jnp.where(is_far, 0.0, f**2 * d[j]), far + jnp.where(new, f**2 * d_inf[j], 0.0)
-        # Beside an unknown direction that is heard, all finite ones are nothing.
-        finite_gain = jnp.where(is_far | (far > 0), 0.0, d[j] * f)
-        k = jnp.where(first_heard, 0.0, k) + column * jnp.where(new, d_inf[j] * f, finite_gain)
-        # d_j s_{j+1} / s_j; the first unknown direction that is heard is known then with the variance s / f^2.
-        shrunk = jnp.where(far > 0, d[j], d[j] * s * reciprocal_or_zero(s_after))
-        d[j] = jnp.where(is_far, jnp.where(first_heard, s * reciprocal_or_zero(f**2), 0.0), shrunk)
-        d_inf[j] = jnp.where(first_heard, 0.0, jnp.where(new, d_inf[j] * far * reciprocal_or_zero(far_after), d_inf[j]))
-        s, far = jnp.where(far > 0, s, s_after), far_after
-    total = jnp.where(far > 0, far, s)
-    lower = below_diagonal(jnp.stack(columns, axis=1))
-    return Diffuse(x.mean, lower, jnp.stack(d), jnp.stack(d_inf)), k * reciprocal_or_zero(total), total, far > 0
+        f, size_of_terms = h @ column, jnp.abs(h) @ jnp.abs(column)
+        is_unknown, is_shown = d_inf[j] > 0, jnp.abs(f) > DEAF * size_of_terms
+        shows_unknown = is_unknown & is_shown
+        is_first_unknown = shows_unknown & (s_inf == 0)
+        # The sum that counts: the infinite part once z shows an unknown direction, before it the finite one.
+        leading_s = jnp.where(s_inf > 0, s_inf, s)
+        # L_j - (f_j / s_{j+1}) cross_{j+1}; the slope f of an unknown direction that z does not show is rounding.
+        columns[j] = jnp.where(is_unknown & ~is_shown, column, column - f * reciprocal_or_zero(leading_s) * cross)
+        next_s = s + jnp.where(is_unknown, 0.0, f**2 * d[j])
+        next_s_inf = s_inf + jnp.where(shows_unknown, f**2 * d_inf[j], 0.0)
+        # Beside an unknown direction that z shows, finite variances are nothing.
+        finite_part = jnp.where(is_unknown | (s_inf > 0), 0.0, d[j] * f)
+        cross = jnp.where(is_first_unknown, 0.0, cross) + column * jnp.where(shows_unknown, d_inf[j] * f, finite_part)
+        # d_j s_{j+1} / s_j, of either part; the first unknown direction that z shows has the variance s / f^2 after it.
+        shrunk = jnp.where(s_inf > 0, d[j], d[j] * s * reciprocal_or_zero(next_s))
+        d[j] = jnp.where(is_unknown, jnp.where(is_first_unknown, s * reciprocal_or_zero(f**2), 0.0), shrunk)
+        shrunk_inf = jnp.where(shows_unknown, d_inf[j] * s_inf * reciprocal_or_zero(next_s_inf), d_inf[j])
+        d_inf[j] = jnp.where(is_first_unknown, 0.0, shrunk_inf)
+        s, s_inf = jnp.where(s_inf > 0, s, next_s), next_s_inf
+    variance = jnp.where(s_inf > 0, s_inf, s)
+    observed = Diffuse(x.mean, below_diagonal(jnp.stack(columns, axis=1)), jnp.stack(d), jnp.stack(d_inf))
+    return observed, cross * reciprocal_or_zero(variance), variance, s_inf > 0
 
 
 def condition_on_next_diffuse(x: Diffuse, matrix: jax.Array, ahead: jax.Array, noise: WeightedColumns) -> BackwardGain:

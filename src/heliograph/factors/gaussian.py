@@ -326,36 +326,46 @@ class BackwardGain(NamedTuple):
 
 
 def condition_on_next_state(x: Gaussian, slopes: jax.Array, ahead: jax.Array, noise: WeightedColumns) -> BackwardGain:
-    """Return the regression of x = m + L_x xi on x+ = ahead + slopes xi + N omega, measuring x+ part by part.
+    """Return the regression of a state x on the next one, x+, by measuring x+ part by part.
 
-    (x, x+) has the factors [[L_x, 0], [slopes, N]] and (d, r). Each part of x+, without a noise but omega, is measured:
-    its innovation, given those before it, is a part of e, its gain a column of K and, of the parts to come, of L. Where
-    those before it determine a part, its slopes are rounding, that of all that was taken from them, and count as zero.
+    x = m + L_x xi and x+ = ahead + slopes xi + N omega have together the factors [[L_x, 0], [slopes, N]], with the
+    variances d of xi and r of omega. Each part of x+ is measured without a noise but omega: its innovation, given those
+    before it, is a part of e, its gain a column of K for x and of L for the parts of x+ to come.
 
-    Shapes: slopes (n, n); noise N (n, n), unit lower, as `triangularise` makes it, and r (n,).
+    Args:
+        x: the state's Gaussian, with L_x (n, n) and d (n,).
+        slopes: of x+ in xi, (n, n).
+        ahead: the mean of x+, (n,).
+        noise: N (n, n), unit lower triangular, as `triangularise` makes it, and r (n,).
+
+    Returns:
+        What is left of x given x+, K, the mean of x+, and L.
     """
     n, root = len(x.mean), jnp.concatenate([x.root, slopes])
-    whole = slopes**2 @ x.variances + noise.matrix**2 @ noise.weights
-    least = rounding_of_products(n, whole)
-    beside, weights = jnp.concatenate([jnp.zeros((n, n), slopes.dtype), noise.matrix]), jnp.asarray(noise.weights)
+    variances_of_next = slopes**2 @ x.variances + noise.matrix**2 @ noise.weights
+    rounding_of_next = rounding_of_products(n, variances_of_next)
+    omega_rows, weights = jnp.concatenate([jnp.zeros((n, n), slopes.dtype), noise.matrix]), jnp.asarray(noise.weights)
 
     def measure_part(
         i: int | jax.Array, root: jax.Array, d: jax.Array, rounding: jax.Array
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Measure part i of x+: return the rows and variances after it, and its gain."""
-        # Of omega, part i has its own component left, and determines it: those before it are determined.
-        f, own, r = root[n + i], beside[:, i], weights[i]
+        # N is lower triangular: the parts before i determined omega_0 ... omega_i-1, and part i is the first with
+        # omega_i, which it determines given xi. So omega_i is one more column, with the slope 1 in part i.
+        f, column, r = root[n + i], omega_rows[:, i], weights[i]
         product = d * f
         power = f * product
-        says = jnp.sum(power) > rounding
-        products = jnp.append(jnp.where(says, product, 0.0), r), jnp.append(jnp.where(says, power, 0.0), r)
-        rows = jnp.concatenate([root, own[:, None]], axis=1)
+        # Where the parts before it determine a part, its slopes in xi are their rounding, and count as zero.
+        depends_on_xi = jnp.sum(power) > rounding
+        products = jnp.append(jnp.where(depends_on_xi, product, 0.0), r)
+        powers = jnp.append(jnp.where(depends_on_xi, power, 0.0), r)
+        rows = jnp.concatenate([root, column[:, None]], axis=1)
         rows, d, gain, _ = measure_scalar_given_products(
-            rows, jnp.append(d, r), jnp.append(f, 1.0), products, jnp.zeros_like(r)
+            rows, jnp.append(d, r), jnp.append(f, 1.0), (products, powers), jnp.zeros_like(r)
         )
         return rows[:, :n], d[:n], gain
 
-    root, d, gains = measure_parts(measure_part, root, x.variances, least)
+    root, d, gains = measure_parts(measure_part, root, x.variances, rounding_of_next)
     left = Gaussian(x.mean, below_diagonal(root[:n]), d)
     return BackwardGain(left, gains[:n], ahead, below_diagonal(gains[n:]))
 

@@ -44,40 +44,54 @@ def observe_root(
     output: Float[np.ndarray, "*items m n"],
     noise: Float[np.ndarray, "*items m d"],
 ) -> ObservedRoot:
-    """Condition x of covariance W W' on z = C x + v, Cov v = N N'.
+    """Condition x of covariance W W' on z = C x + v, Cov v = N N'; return the gain K (n, m) and a root of what is left.
 
-    [[N, C W], [0, W]] = [[V, 0], [K V, W+]] U with an orthogonal U and V V' = C P C' + N N': sums of squares alone,
-    each row known to eps of its length. A component of which those before it leave less than RANK of its variance has
-    the gain zero, since a covariance that is given is not known to more. It comes last, so that the direction which
-    rounding left of it takes nothing from the others, and its column stays in W+.
+    [[N, C W], [0, W]] = [[V, 0], [K V, W+]] U with an orthogonal U and V V' = C W W' C' + N N': sums of squares alone,
+    each row known to eps of its length. A component of z of whose variance the components before it leave less than the
+    share RANK is dependent: it has the gain zero, since a given covariance is not known to more digits.
+
+    Args:
+        root: W, for each item.
+        output: C.
+        noise: N.
 
     Source: Morf and Kailath, Square-root algorithms for least-squares estimation (1975).
     """
-    (m, n), through = output.shape[-2:], output @ root
+    (m, n), output_root = output.shape[-2:], output @ root
     columns = noise.shape[-1] + root.shape[-1]
     # At least as many columns as rows, so that the triangle is whole.
-    rows = np.zeros((*through.shape[:-2], m + n, max(columns, m + n)))
+    rows = np.zeros((*output_root.shape[:-2], m + n, max(columns, m + n)))
     rows[..., :m, : noise.shape[-1]] = noise
-    rows[..., :m, noise.shape[-1] : columns] = through
+    rows[..., :m, noise.shape[-1] : columns] = output_root
     rows[..., m:, noise.shape[-1] : columns] = root
-    # Those that add something first, of most models all of them as they are.
-    says = _find_independent_rows(rows[..., :m, :columns])
-    order = None if says.all() else np.argsort(~says, axis=-1, kind="stable")
+    # Dependent components come last, so that the direction which rounding left of them takes nothing from the others.
+    independent = _find_independent_rows(rows[..., :m, :columns])
+    order = None if independent.all() else np.argsort(~independent, axis=-1, kind="stable")
     if order is not None:
-        says = np.take_along_axis(says, order, axis=-1)
+        independent = np.take_along_axis(independent, order, axis=-1)
         rows[..., :m, :] = np.take_along_axis(rows[..., :m, :], order[..., None], axis=-2)
     lower = np.asarray(np.linalg.qr(rows.swapaxes(-1, -2), mode="r")).swapaxes(-1, -2)
-    # K from K V, the last column first.
-    total, moved = lower[..., :m, :m], lower[..., m:, :m]
-    inverse = np.where(says, 1 / np.where(says, np.diagonal(total, axis1=-2, axis2=-1), 1.0), 0.0)
-    gain = np.zeros_like(moved)
-    for j in reversed(range(m)):
-        rest = moved[..., j] - (gain[..., j + 1 :] @ total[..., j + 1 :, j, None])[..., 0]
-        gain[..., j] = rest * inverse[..., j, None]
-    unused = np.where(says[..., None, :], 0.0, moved)
-    if order is not None:
+    v, k_v = lower[..., :m, :m], lower[..., m:, :m]
+    gain = _solve_for_gain(v, k_v, independent)
+    # The columns of K V that no gain uses stay in the root of what is left.
+    unused = np.where(independent[..., None, :], 0.0, k_v)
+    if order is not None:  # the gain's columns in the order of z again
         gain = np.take_along_axis(gain, np.argsort(order, axis=-1)[..., None, :], axis=-1)
     return ObservedRoot(np.ascontiguousarray(gain), np.concatenate([lower[..., m:, m:], unused], axis=-1))
+
+
+def _solve_for_gain(v: np.ndarray, k_v: np.ndarray, independent: np.ndarray) -> np.ndarray:
+    """Return K (..., n, m) from the lower triangular V (..., m, m) and K V, with zeros for dependent components.
+
+    By substitution from the last column on: K_j = (K V_j - sum_i>j K_i V_ij) / V_jj.
+    """
+    pivots = np.diagonal(v, axis1=-2, axis2=-1)
+    inverse = np.where(independent, 1 / np.where(independent, pivots, 1.0), 0.0)
+    gain = np.zeros_like(k_v)
+    for j in reversed(range(v.shape[-1])):
+        remainder = k_v[..., j] - (gain[..., j + 1 :] @ v[..., j + 1 :, j, None])[..., 0]
+        gain[..., j] = remainder * inverse[..., j, None]
+    return gain
 
 
 def observe_information(

@@ -64,30 +64,37 @@ def measure_parts(
     d: jax.Array,
     least: jax.Array,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Measure n parts one by one, many of them in a loop: rows, variances d and gains (rows, n) after them.
+    """Measure n parts of a vector one after another; return the rows, the variances d and the gains after them.
+
+    Up to WRITTEN parts are written out, more are measured in a loop, so that the program stays short.
 
     Args:
-        measure_part: from the part's number, rows, variances and its entry of `least` to rows, variances and its gain.
-        root: rows of x, and below them those of the n parts.
-        d: variances of the columns.
+        measure_part: from the part's number, the rows, the variances and its entry of `least` to the rows and the
+            variances given the part, and its gain (rows,).
+        root: rows (rows, columns) of x, and below them those of the n parts.
+        d: variances (columns,).
         least: variance (n,) up to which a part's slopes are rounding (`carry_rounding`).
+
+    Returns:
+        Rows, variances, and gains (rows, n), a column for each part.
     """
     n, gains = len(least), list[jax.Array]()
-    first = len(root) - n
+    first_part = len(root) - n  # number of the row of part 0
     if n > WRITTEN:
 
-        def body(i: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-            """Measure part i, and put its gain beside those of the parts before it."""
+        def measure_next(i: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+            """Measure part i, and put its gain into column i of the gains."""
             root, d, least, gains = carry
             root, d, gain = measure_part(i, root, d, least[i])
             gains = jnp.where(np.arange(n) == i, gain[:, None], gains)
-            return root, d, carry_rounding(least, gain[first:], least[i]), gains
+            return root, d, carry_rounding(least, gain[first_part:], least[i]), gains
 
-        root, d, _, looped = lax.fori_loop(0, n, body, (root, d, least, jnp.zeros((len(root), n), root.dtype)))
-        return root, d, looped
+        no_gains = jnp.zeros((len(root), n), root.dtype)
+        root, d, _, all_gains = lax.fori_loop(0, n, measure_next, (root, d, least, no_gains))
+        return root, d, all_gains
     for i in range(n):
         root, d, gain = measure_part(i, root, d, least[i])
-        least = carry_rounding(least, gain[first:], least[i])
+        least = carry_rounding(least, gain[first_part:], least[i])
         gains.append(lax.expand_dims(gain, (1,)))
     return root, d, lax.concatenate(gains, 1)
 

@@ -192,7 +192,7 @@ class HorizonProblem:
         if initial is None:
             before, fixed = largest, np.zeros_like(weight)
         else:
-            self._require(largest, -initial)
+            self._require_semidefinite(largest, -initial)
             before, fixed = dict[int, np.ndarray](), initial
         start: np.ndarray | None = weight if initial is None else initial
         forms: LinearForms | None = None
@@ -230,13 +230,15 @@ class HorizonProblem:
                 padded = np.zeros((q, q, form.shape[1]))
                 padded[:width, :width] = form.reshape(width, width, -1)
                 blocks[index] = blocks.get(index, 0.0) + padded.reshape(q * q, -1)[entries]
-            self._require(blocks, constant[np.ix_(coupled, coupled)])
+            self._require_semidefinite(blocks, constant[np.ix_(coupled, coupled)])
         # Positive matrices of the unknowns.
         for form in forms.positive:
             size = int(np.sqrt(len(form)))
-            self._require({0: -MARGIN * np.eye(size).ravel()[:, None], k + 1: form}, np.zeros((size, size)))
+            self._require_semidefinite(
+                {0: -MARGIN * np.eye(size).ravel()[:, None], k + 1: form}, np.zeros((size, size))
+            )
 
-    def _require(self, blocks: dict[int, np.ndarray], constant: np.ndarray) -> None:
+    def _require_semidefinite(self, blocks: dict[int, np.ndarray], constant: np.ndarray) -> None:
         """Require sum_i blocks_i (unknowns in place i) + constant, a matrix row by row, to be positive semidefinite."""
         # One sparse matrix of all unknowns.
         values, rows, columns = [], [], []

@@ -43,7 +43,7 @@ class KnownLossSystem(NamedTuple):
     outputs: tuple[Float[np.ndarray, "_ n"], ...]
     noises: tuple[Float[np.ndarray, "_ _"], ...]
 
-    def closed(self, gains: KindGains, noise: float = 1.0) -> JumpSystem:
+    def close_loop(self, gains: KindGains, noise: float = 1.0) -> JumpSystem:
         """Return the recursion of V: V_j+ = F_j U_j F_j' + law_j (K R_j K' + Q), F_j = A - K C, true of any gains.
 
         Raises:
@@ -59,7 +59,7 @@ class KnownLossSystem(NamedTuple):
 
     def bound(self, gains: KindGains) -> Parts:
         """Return the steady U under gains of a radius below 1."""
-        bound: Parts = mix_modes(self.chain, self.closed(gains).steady()[0])
+        bound: Parts = mix_modes(self.chain, self.close_loop(gains).steady()[0])
         return bound
 
 
@@ -71,7 +71,7 @@ def certify_radius(system: KnownLossSystem, gains: KindGains) -> float:
 
     Source: Sinopoli et al., Kalman filtering with intermittent observations (2004), Theorem 5, with any gain.
     """
-    jumps = system.closed(gains)
+    jumps = system.close_loop(gains)
     radius = jumps.radius()
     if radius >= BELOW_ONE:
         return radius
@@ -82,36 +82,46 @@ def certify_radius(system: KnownLossSystem, gains: KindGains) -> float:
 
 
 def find_gains(system: KnownLossSystem) -> KindGains:
-    """Find gains of a small steady bound on E P: K_s = A V C' (C V C' + R)^-1, V and R summed over modes of a kind.
+    """Return a gain for each kind of mode s, that keep the mean error covariance E P bounded and small.
 
-    The covariance recursion of the best filter, with mean covariances in place of its own, runs until its gains
-    converge or are found to keep E P bounded; policy iteration, which then converges faster, improves them. Where the
-    outcome is not certified, gains A C+ are tried, with which an output that shows all of x leaves no old error.
+    K_s = A U C_s' (C_s U C_s' + R)^-1, with U and R summed over the modes of the kind. The covariance recursion of the
+    best filter, with mean covariances in place of its own, runs until its gains converge or are found to keep E P
+    bounded; policy iteration, which then converges faster, improves them. Where neither keeps E P bounded, the gains
+    A C+ are tried, with which an output that shows all of x leaves no old error.
 
     Source: Sinopoli et al. (2004), Theorem 3 (the modified algebraic Riccati equation); by mode for chains.
     """
-    system = system._replace(law=np.where(system.law > WEIGHT, system.law, SEEN))  # a mode of no weight has a gain too
-    size = float(np.trace(system.process)) or 1.0  # what starts at rest is searched as if it did not
+    # A mode that the chain leaves for good sooner or later needs a gain, too: it counts with a small share.
+    system = system._replace(law=np.where(system.law > WEIGHT, system.law, SEEN))
+    gains = _iterate_covariances(system)
+    gains = _iterate_policy(system, gains)
+    if system.close_loop(gains).radius() < BELOW_ONE:
+        return gains
+    forgetting_gains = tuple(system.transition @ np.linalg.pinv(c) for c in system.outputs)
+    return min(gains, forgetting_gains, key=lambda candidate: system.close_loop(candidate).radius())
+
+
+def _iterate_covariances(system: KnownLossSystem) -> KindGains:
+    """Return the gains that the covariance recursion ends with: converged, certified, or of ITERATIONS steps.
+
+    Where the covariances V grow beyond all bounds, they are divided by their size, and the noises with them.
+    """
+    size = float(np.trace(system.process)) or 1.0  # without process noise any size serves
     parts: Parts = system.law[:, None, None] * (system.process + size * np.eye(len(system.transition)))
-    # Value iteration, renormalised where covariances grow.
     noise, gains = 1.0, _improve_gains(system, parts, 1.0)
     for step in range(1, ITERATIONS + 1):
-        (parts,) = system.closed(gains, noise).after(parts)
-        grown = np.trace(parts.sum(axis=0)) / size
-        if grown > NEGLIGIBLE:
-            parts, noise = parts / grown, noise / grown
-        before, gains = gains, _improve_gains(system, parts, noise)
-        if _relative_change(before, gains) < CONVERGED:
+        (parts,) = system.close_loop(gains, noise).after(parts)
+        growth = np.trace(parts.sum(axis=0)) / size
+        if growth > NEGLIGIBLE:
+            parts, noise = parts / growth, noise / growth
+        last_gains, gains = gains, _improve_gains(system, parts, noise)
+        if _relative_change(last_gains, gains) < CONVERGED:
             break
-        # After 1, 2, 4, ... steps: gains that are certified already are improved by policies instead.
-        if step.bit_count() == 1 and system.closed(gains).radius() < BELOW_ONE:
+        # Tested after 1, 2, 4, ... steps, since it costs more than a step: do the gains keep E P bounded already?
+        is_power_of_two = step.bit_count() == 1
+        if is_power_of_two and system.close_loop(gains).radius() < BELOW_ONE:
             break
-    # Policy iteration, and the certificate rho(operator) < 1.
-    gains = _iterate_policy(system, gains)
-    if system.closed(gains).radius() < BELOW_ONE:
-        return gains
-    fresh = tuple(system.transition @ np.linalg.pinv(c) for c in system.outputs)
-    return min(gains, fresh, key=lambda candidate: system.closed(candidate).radius())
+    return gains
 
 
 def _iterate_policy(system: KnownLossSystem, gains: KindGains) -> KindGains:
@@ -119,19 +129,20 @@ def _iterate_policy(system: KnownLossSystem, gains: KindGains) -> KindGains:
 
     What gains leave is their steady bound, or, where they have none, the covariances that grow fastest.
     """
-    jumps = system.closed(gains)
+    jumps = system.close_loop(gains)
     values, vectors = np.linalg.eig(jumps.operator())
     radius = float(np.max(np.abs(values)))
     for _ in range(POLISHING):
-        below = radius < BELOW_ONE
-        parts = jumps.steady()[0] if below else _fastest_growing_covariances(jumps.shape, values, vectors)
-        better = _improve_gains(system, parts, 1.0 if below else 1 / NEGLIGIBLE)
-        jumps = system.closed(better)
+        is_bounded = radius < BELOW_ONE
+        parts = jumps.steady()[0] if is_bounded else _fastest_growing_covariances(jumps.shape, values, vectors)
+        next_gains = _improve_gains(system, parts, 1.0 if is_bounded else 1 / NEGLIGIBLE)
+        jumps = system.close_loop(next_gains)
         values, vectors = np.linalg.eig(jumps.operator())
-        reached = float(np.max(np.abs(values)))
-        if reached >= max(radius, BELOW_ONE) or _relative_change(gains, better) < CONVERGED:
+        next_radius = float(np.max(np.abs(values)))
+        # Worse gains are dropped, and the last ones kept; so are gains that changed by rounding alone.
+        if next_radius >= max(radius, BELOW_ONE) or _relative_change(gains, next_gains) < CONVERGED:
             break
-        gains, radius = better, reached
+        gains, radius = next_gains, next_radius
     return gains
 
 
@@ -142,7 +153,7 @@ def _fastest_growing_covariances(shape: tuple[int, ...], values: np.ndarray, vec
 
 
 def _improve_gains(system: KnownLossSystem, parts: Parts, noise: float) -> KindGains:
-    """Return the gains that are best for U of the V given, of all modes together if V is."""
+    """Return the best gain of each kind for these covariances V by mode, with R and law scaled by `noise`."""
     results: list[np.ndarray] = []
     before: Parts = mix_modes(system.chain, parts)
     for s, c in enumerate(system.outputs):
@@ -154,7 +165,7 @@ def _improve_gains(system: KnownLossSystem, parts: Parts, noise: float) -> KindG
 
 
 def _relative_change(before: KindGains, after: KindGains) -> float:
-    """Return the change of the bounds, relative to the larger one."""
+    """Return the largest change of an entry of the gains, relative to the largest entry after it."""
     size = max((np.max(np.abs(k), initial=0.0) for k in after), default=0.0)
     gap = max((np.max(np.abs(a - b), initial=0.0) for a, b in zip(before, after, strict=True)), default=0.0)
     return float(gap / size) if size > 0 else 0.0

@@ -71,7 +71,7 @@ def quadratic_system_with_linear_estimate(
     steps, rounding = list[Steps](), list[np.ndarray]()
     for k, route in enumerate(make_step_maps(plant, sensor, channel, 4, horizon)):
         # (x, q, z) -> (x+, q) -> (x+, q, z+) -> (x+, q+, z+).
-        move = stored.move(route.plant, m)
+        move = stored.make_move_map(route.plant, m)
         measure_squares, measure_fourth = stored.append_measurement(route.measurement, n)
         update = _make_filter_map(Gains(*(field[k] for field in linear.gains)))
         # E[(x, q, z)+^2 | (x, q, z)^2] = Sym^2(filter) E Sym^2(channel) E Sym^2(plant).
@@ -112,7 +112,7 @@ class _MomentCache:
         self.route: AbstractRandomAffine | None = None
         self.wide: tuple[np.ndarray, np.ndarray] = np.zeros((0, 0)), np.zeros((0, 0))
 
-    def move(self, plant: GainAndNoise, m: int) -> GainAndNoise:
+    def make_move_map(self, plant: GainAndNoise, m: int) -> GainAndNoise:
         """Return the map (x, q, z) -> (x+, q) of a plant's step, q being n numbers and z m."""
         n = plant.inputs
         if self.joint is None or plant.noise is not self.noise:

@@ -54,7 +54,7 @@ def compensate(function: Callable[[jax.Array], jax.Array], unit: float) -> Calla
     def evaluate(x: Compensated) -> Compensated:
         """Return f(high + low) as high + low, 0 where the low part is no number."""
         program = jax.make_jaxpr(function)(x.high)
-        result = _Evaluation(unit).inline(program, [x])[0]
+        result = _Evaluation(unit).evaluate_program(program, [x])[0]
         low = jnp.zeros_like(result.high) if result.low is None else result.low
         return Compensated(jnp.asarray(result.high), jnp.where(jnp.isfinite(low), low, 0.0))
 
@@ -71,10 +71,10 @@ class _Evaluation:
         self.rules: dict[str, Callable[..., Compensated]] = {
             "add": self._add, "add_any": self._add, "sub": self._subtract, "mul": self._multiply, "div": self._divide,
             "sqrt": self._take_root, "square": self._square, "integer_pow": self._raise_to_integer,
-            "reduce_sum": self._sum, "cumsum": self._accumulate, "dot_general": self._contract,
+            "reduce_sum": self._sum, "cumsum": self._sum_running, "dot_general": self._multiply_matrices,
         }  # fmt: skip
 
-    def inline(self, program: ClosedJaxpr, inputs: Sequence[Compensated]) -> list[Compensated]:
+    def evaluate_program(self, program: ClosedJaxpr, inputs: Sequence[Compensated]) -> list[Compensated]:
         """Return the results of a traced program."""
         jaxpr, known = program.jaxpr, map(self._split_known, program.consts)
         values: dict[Var, Compensated] = dict(zip(jaxpr.constvars, known, strict=True))
@@ -85,7 +85,9 @@ class _Evaluation:
             return self._split_known(v.val) if isinstance(v, Literal) else values[v]
 
         for equation in jaxpr.eqns:
-            values |= zip(equation.outvars, self._apply(equation, list(map(read, equation.invars))), strict=True)
+            values |= zip(
+                equation.outvars, self._apply_operation(equation, list(map(read, equation.invars))), strict=True
+            )
         return list(map(read, jaxpr.outvars))
 
     def _split_known(self, number: Any) -> Compensated:
@@ -97,23 +99,23 @@ class _Evaluation:
         rest = np.subtract(whole, high, out=np.zeros_like(whole), where=np.isfinite(high))
         return Compensated(high, rest if np.any(rest) else None)
 
-    def _apply(self, equation: JaxprEqn, inputs: list[Compensated]) -> list[Compensated]:
+    def _apply_operation(self, equation: JaxprEqn, inputs: list[Compensated]) -> list[Compensated]:
         """Return the results of one operation; of one without a rule f(high) + f'(high) rest."""
         name, params = equation.primitive.name, equation.params
         if (program := called_program(equation)) is not None:
-            return self.inline(program, inputs)
+            return self.evaluate_program(program, inputs)
         if name == "cond":
-            return self._branch(inputs, params["branches"])
+            return self._apply_branches(inputs, params["branches"])
         if name in self.rules and all(jnp.issubdtype(jnp.result_type(x.high), jnp.floating) for x in inputs):
             return [self.rules[name](*inputs, **params)]
         return _differentiate(partial(_bind, equation), inputs, equation.primitive.multiple_results)
 
-    def _branch(self, inputs: list[Compensated], branches: Sequence[ClosedJaxpr]) -> list[Compensated]:
+    def _apply_branches(self, inputs: list[Compensated], branches: Sequence[ClosedJaxpr]) -> list[Compensated]:
         """Take one of several programs, each evaluated so."""
 
         def evaluate_branch(branch: ClosedJaxpr, given: list[Compensated]) -> list[Compensated]:
             """Return its results, each with a low part if it is a real number, as those of the others."""
-            results = self.inline(branch, given)
+            results = self.evaluate_program(branch, given)
             real = [jnp.issubdtype(jnp.result_type(x.high), jnp.floating) for x in results]
             return [
                 Compensated(jnp.asarray(x.high), _or_zero(x.low) + jnp.zeros_like(x.high)) if is_real else x
@@ -171,7 +173,7 @@ class _Evaluation:
             a = reduce(self._add, parts) if parts else Compensated(jnp.sum(a.high, axis=axis))
         return a
 
-    def _accumulate(self, a: Compensated, axis: int, reverse: bool) -> Compensated:
+    def _sum_running(self, a: Compensated, axis: int, reverse: bool) -> Compensated:
         """Return the running sums along an axis, from its first entry on or from its last."""
         parts = _take_apart(a, axis)
         for i in range(1, len(parts)):
@@ -181,7 +183,7 @@ class _Evaluation:
         highs, lows = [p.high for p in parts], [_or_zero(p.low) + jnp.zeros_like(p.high) for p in parts]
         return Compensated(jnp.stack(highs, axis), jnp.stack(lows, axis))
 
-    def _contract(self, a: Compensated, b: Compensated, dimension_numbers: Any, **_: Any) -> Compensated:
+    def _multiply_matrices(self, a: Compensated, b: Compensated, dimension_numbers: Any, **_: Any) -> Compensated:
         """Multiply matrices by the products of entries, added one after another."""
         # Axes that are summed over, and axes of a batch; the result has the axes batch, rest of a, rest of b.
         (over_a, over_b), (same_a, same_b) = dimension_numbers
@@ -200,10 +202,10 @@ class _Evaluation:
         """Return a b - fl(a b) of numbers whose halves have exact products; None where one is 0 or a power of two."""
         if _is_scaling(a) or _is_scaling(b):
             return None
-        (a1, a2), (b1, b2) = self._halve(a), self._halve(b)
+        (a1, a2), (b1, b2) = self._split_digits(a), self._split_digits(b)
         return ((a1 * b1 - a * b) + a1 * b2 + a2 * b1) + a2 * b2
 
-    def _halve(self, a: Any) -> tuple[Any, Any]:
+    def _split_digits(self, a: Any) -> tuple[Any, Any]:
         """Return a as a sum of two numbers of half as many digits."""
         if not isinstance(a, jax.Array):
             whole: Any = np.asarray(a, self.stored)

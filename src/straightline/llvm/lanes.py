@@ -50,10 +50,12 @@ X86 = ("x86_64", "amd64", "i386", "i686")
 
 
 def write_flush(width: int) -> str:
-    """Write `i32 @hg_flush()`, from which on subnormal numbers are zeros, and `void @hg_restore(i32)` of what it gave.
+    """Return the LLVM text of two functions, `i32 @hg_flush()` and `void @hg_restore(i32)`.
 
-    An operation on them takes x86 a hundred times as long, and single precision has them at 1e-38, as XLA knows, whose
-    code does the same. Other processors take no longer for them, and compute with them.
+    After the first, the processor takes subnormal numbers for zeros; it returns the processor's former state, which the
+    second restores. An operation on subnormal numbers takes x86 a hundred times as long, and in single precision they
+    are not rare, from 1e-38 down; XLA's code takes them for zeros too. Other processors take no longer for them: there
+    both functions do nothing. The width is not used.
     """
     if platform.machine().lower() not in X86:
         flush, restore = "  ret i32 0\n", "  ret void\n"

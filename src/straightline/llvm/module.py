@@ -156,26 +156,35 @@ def write_module(
         Unsupported: an operation that LLVM's text does not have here, or a program that is too long.
     """
     outputs = choose_output_buffers(program, last)
-    lanes = [b for b, d in zip(program.inputs, differing, strict=True) if d or alone]
+    lanes = [b for b, differs in zip(program.inputs, differing, strict=True) if differs or alone]
     items = sort_items(keep_cycles(program.graph, outputs) if alone else list_needed(outputs))
     counts = _count_operations(items)
-    # What differs between runs, what the function of blocks needs for it, and where all of it lies.
-    differs = {*items, *program.inputs} if alone else find_differing(items, lanes)
-    differs = {x for x in differs if not (isinstance(x, Buffer) and x.kind == "table")}
+    # What differs between runs: all items if there is one run, but never the tables.
+    spread = {*items, *program.inputs} if alone else find_differing(items, lanes)
+    spread = {x for x in spread if not (isinstance(x, Buffer) and x.kind == "table")}
     parts = ProgramParts(
-        program, items, outputs, lanes, spread=differs, alone=alone, width=width or widest(differs), summed=summed
+        program=program,
+        items=items,
+        outputs=outputs,
+        lanes=lanes,
+        spread=spread,
+        alone=alone,
+        width=width or widest(spread),
+        summed=summed,
     )
-    of_blocks = find_crossing_items(items, differs)
+    # The items of the function of blocks, and where the numbers lie.
+    of_blocks = find_crossing_items(items, spread)
     layout = lay_out(parts, of_blocks)
     # The function of blocks computes what differs, and reads the rest from slots.
     slots = SharedSlots(layout.shared)
-    blocks = FunctionWriter(alone, of_blocks, find_fusable_products(items) if fuse else set(), differs, slots)
+    products = find_fusable_products(items) if fuse else set()
+    blocks = FunctionWriter(single=alone, mine=of_blocks, products=products, spread=spread, slots=slots)
     blocks.turning, blocks.flushes = layout.turning, _is_single(items)
     source = _write_blocks(blocks, parts, layout)
     # The other function fills these slots, once for all runs.
     once = _write_once(blocks, parts, layout)
     arrays = [np.ascontiguousarray(b.table, dtype=DTYPES[b.type]) for b in parts.tables if b.table is not None]
-    program.graph.top.let_go()
+    program.graph.top.free_contents()
     return ModuleText(
         blocks=source,
         once=once,
@@ -240,33 +249,37 @@ HEAD = "(ptr %pointers, ptr %scratch, i64 %begin, i64 %end, i64 %runs)"
 
 
 def _write_blocks(writer: FunctionWriter, parts: ProgramParts, layout: MemoryLayout) -> FunctionSource:
-    """Return the function for blocks `begin` to `end` of W runs: transpose inputs, compute, transpose outputs back."""
+    """Return the function for blocks `begin` to `end` of W runs: transpose inputs, compute, transpose outputs back.
+
+    W, the runs of a vector, is a type's size in the text: it is chosen when code is generated. Where there is one run
+    (`parts.alone`), nothing is transposed.
+    """
     names = _write_pointers(writer, parts.pointers, layout.in_shared)
     for buffer, offset in layout.in_scratch.items():
         writer.bases[buffer] = writer.add(f"getelementptr i8, ptr %scratch, i64 {offset}")
     # Loop over blocks; the block `number` has runs from `first` on.
     writer.line("%last = sub i64 %runs, 1")
     writer.line("br label %block")
-    writer.start("block")
+    writer.start_basic_block("block")
     writer.line("%number = phi i64 [%begin, %entry], [%next, %done]")
     writer.line(f"%first = mul i64 %number, {WIDTH}")
-    # Inputs to lanes, the operations, lanes to outputs.
+    # Inputs to lanes, the operations, lanes to outputs. A mover is the function that transposes arrays of one kind.
     moved = set() if parts.alone else {b for b in layout.in_scratch if b.size}
-    taken, given = [b for b in parts.lanes if b in moved], [b for b in parts.outputs if b in moved]
-    movers = {_write_move(writer, names, buffer, "take") for buffer in taken}
-    _ask_for_rows(writer, parts, names, taken, given)
+    moved_inputs, moved_outputs = [b for b in parts.lanes if b in moved], [b for b in parts.outputs if b in moved]
+    movers = {_write_move(writer, names, buffer, "take") for buffer in moved_inputs}
+    _ask_for_rows(writer, parts, names, moved_inputs, moved_outputs)
     if parts.summed is not None:
         number = parts.program.inputs[parts.summed.number]
         _add_to_sums(writer, parts.summed, names, number, parts.added, parts.width)
-    writer.block(parts.program.graph.top)
-    movers |= {_write_move(writer, names, buffer, "give") for buffer in given if buffer not in writer.sums}
+    writer.write_block(parts.program.graph.top)
+    movers |= {_write_move(writer, names, buffer, "give") for buffer in moved_outputs if buffer not in writer.sums}
     # Next block.
     writer.line("br label %done")
-    writer.start("done")
+    writer.start_basic_block("done")
     writer.line("%next = add i64 %number, 1")
     writer.line("%more = icmp slt i64 %next, %end")
     writer.line("br i1 %more, label %block, label %exit")
-    writer.start("exit")
+    writer.start_basic_block("exit")
     helpers: list[Callable[[int], str]] = [] if parts.summed is None else [lane_numbers]
     helpers += [partial(write_mover, move) for move in sorted(movers)]
     return _finish_source(_write_run("\n".join(writer.lines), writer), writer, helpers)
@@ -313,21 +326,33 @@ def _add_to_sums(
     outputs: list[Buffer],
     width: int,
 ) -> None:
-    """Make the writer's stores to these outputs add to sums over runs; `number`: the input with a run's number.
+    """Make the writer's stores to these outputs add to sums over runs.
 
-    A run's place in a row is that of a block of the most runs, which begins with the batch of its first run: so sums
-    have the same bits whatever the number of runs in a vector.
+    A row of sums has a place for each batch and some more (`row_length`). Of each `width` consecutive runs, the most
+    that a vector has, the first adds to the place of its batch, run number mod batches, and the others to the places
+    behind it: so sums have the same bits however many runs a vector has.
+
+    Args:
+        writer: of the function of blocks, at the beginning of a block.
+        summed: how many batches there are.
+        names: of the buffers' addresses.
+        number: the input with each run's number.
+        outputs: the buffers with rows of sums.
+        width: the most runs of a vector, a power of two.
     """
-    # Place of the vector's first lane: the batch of the first run of its block, plus the vector's place in the block.
-    begin = writer.add(f"and i64 %first, {-width}")
-    address = writer.add(f"getelementptr i32, ptr {names[number]}, i64 {begin}")
+    # The first of the `width` runs: the block's first run rounded down to a multiple of width, and its batch.
+    first_of_width = writer.add(f"and i64 %first, {-width}")
+    address = writer.add(f"getelementptr i32, ptr {names[number]}, i64 {first_of_width}")
     run = writer.add(f"load i32, ptr {address}, align 4")
     batch = writer.add(f"zext i32 {writer.add(f'urem i32 {run}, {summed.batches}')} to i64")
-    batch = writer.add(f"add i64 {batch}, {writer.add(f'sub i64 %first, {begin}')}")
-    count = writer.everywhere(writer.add("sub i64 %runs, %first"), "i64")
-    writer.counted = writer.add(f"icmp ult %i64 {writer.add('call %i64 @hg_lanes()')}, {count}")
+    # The place of this vector's first lane.
+    behind = writer.add(f"sub i64 %first, {first_of_width}")
+    place = writer.add(f"add i64 {batch}, {behind}")
+    # Lanes beyond the last run repeat it, and do not count.
+    runs_left = writer.write_broadcast(writer.add("sub i64 %runs, %first"), "i64")
+    writer.counted = writer.add(f"icmp ult %i64 {writer.add('call %i64 @hg_lanes()')}, {runs_left}")
     for buffer in outputs:
-        writer.bases[buffer] = writer.add(f"getelementptr double, ptr {names[buffer]}, i64 {batch}")
+        writer.bases[buffer] = writer.add(f"getelementptr double, ptr {names[buffer]}, i64 {place}")
         writer.sums[buffer] = row_length(width, summed.batches)
 
 
@@ -340,7 +365,7 @@ def _write_once(blocks: FunctionWriter, parts: ProgramParts, layout: MemoryLayou
     writer = FunctionWriter(True, list_needed(roots), blocks.products, set(), blocks.slots)
     writer.turning, writer.flushes = blocks.turning, blocks.flushes
     _write_pointers(writer, parts.pointers, layout.in_shared)
-    writer.block(parts.program.graph.top)
+    writer.write_block(parts.program.graph.top)
     return _finish_source(_write_run("\n".join(writer.lines), writer), writer, [])
 
 

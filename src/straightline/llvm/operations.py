@@ -49,7 +49,16 @@ def splat(value: float | int | bool, type: Type) -> str:
 
 
 def write_operation(node: Node, names: list[str], emit: Emit) -> str:
-    """Write the operation of a node on its arguments' names; return the name of the result."""
+    """Write a node's operation in LLVM IR for all lanes; return the name of the result.
+
+    Args:
+        node: the operation.
+        names: of its arguments, in the text.
+        emit: appends an instruction and returns the name of its result.
+
+    Raises:
+        Unsupported: an operation that has no text here.
+    """
     source: Type = node.args[0].type if node.args else node.type
     operand_type = vector(source)
     op, result_type = node.op, vector(node.type)
@@ -88,7 +97,10 @@ def _write_comparison(op: str, type: Type) -> str:
 
 
 def _write_float_operation(node: Node, names: list[str], text: str, emit: Emit) -> str:
-    """Write an operation on vectors of real numbers; return the name of its result."""
+    """Write an operation on vectors of real numbers; return the name of its result.
+
+    `names` are those of the arguments, `text` their vector type in LLVM IR; `emit` appends an instruction.
+    """
     op, type, first = node.op, node.args[0].type, f"{text} {names[0]}"
     if op == "neg":
         return emit(f"fneg {first}")
@@ -100,33 +112,39 @@ def _write_float_operation(node: Node, names: list[str], text: str, emit: Emit) 
     if op == "is_finite":
         size = emit(f"call {text} @llvm.fabs({first})")
         return emit(f"fcmp olt {text} {size}, {splat(float('inf'), type)}")
-    # sign x = x for zeros and NaN.
+    # sign x = 1 or -1, but x itself for zeros and NaN ("one": ordered and not equal, so that NaN is not).
     if op == "sign":
         signed = emit(f"call {text} @llvm.copysign({text} {splat(1.0, type)}, {first})")
-        other = emit(f"fcmp one {first}, {splat(0.0, type)}")
-        return emit(f"select {vector('bool')} {other}, {text} {signed}, {first}")
+        is_nonzero = emit(f"fcmp one {first}, {splat(0.0, type)}")
+        return emit(f"select {vector('bool')} {is_nonzero}, {text} {signed}, {first}")
     if op == "rem":
         return emit(f"frem {first}, {names[1]}")
     raise Unsupported(op)
 
 
 def _write_integer_operation(node: Node, names: list[str], text: str, emit: Emit) -> str:
-    """Write an operation on vectors of integers or flags; return the name of its result."""
+    """Write an operation on vectors of integers or flags; return the name of its result.
+
+    `names` are those of the arguments, `text` their vector type in LLVM IR; `emit` appends an instruction.
+    """
     op, type, first = node.op, node.args[0].type, f"{text} {names[0]}"
+    is_signed = type.startswith("i")
+    prefix = "s" if is_signed else "u"  # of LLVM's functions of signed and of unsigned numbers
     if op in INTEGER:
         return emit(f"{INTEGER[op]} {first}, {names[1]}")
     if op == "neg":
         return emit(f"sub {text} zeroinitializer, {names[0]}")
-    signed = type[0] == "i"
-    if type == "bool" and op in ("max", "min"):  # LLVM's own, in haste for masks of AVX-512, end the process
+    # Of flags by or and and: LLVM's max and min of them end the process where it generates code in haste for AVX-512.
+    if type == "bool" and op in ("max", "min"):
         return emit(f"{'or' if op == 'max' else 'and'} {first}, {names[1]}")
     if op in ("max", "min"):
-        return emit(f"call {text} @llvm.{'s' if signed else 'u'}{op}({first}, {text} {names[1]})")
-    if op == "abs" and signed:
+        return emit(f"call {text} @llvm.{prefix}{op}({first}, {text} {names[1]})")
+    if op == "abs" and is_signed:
         return emit(f"call {text} @llvm.abs({first}, i1 false)")
+    # sign x = x limited to [-1, 1], of unsigned numbers to [0, 1].
     if op == "sign":
-        limited = emit(f"call {text} @llvm.{'s' if signed else 'u'}min({first}, {text} {splat(1, type)})")
-        return emit(f"call {text} @llvm.smax({text} {limited}, {text} {splat(-1, type)})") if signed else limited
+        limited = emit(f"call {text} @llvm.{prefix}min({first}, {text} {splat(1, type)})")
+        return emit(f"call {text} @llvm.smax({text} {limited}, {text} {splat(-1, type)})") if is_signed else limited
     if op in ("div", "rem"):
         return _write_division(node, names, text, emit)
     if op in ("shift_left", "shift_right", "shift_right_signed"):

@@ -51,12 +51,12 @@ class SharedSlots:
 
     def _address(self, writer: "FunctionWriter", node: Node) -> str:
         start = writer.add(f"getelementptr i8, ptr {self.base}, i64 {self.offset_of(node)}")
-        return writer.of_turn(start, node.block, 8)
+        return writer.write_address_of_turn(start, node.block, 8)
 
 
 def loops_of(block: Block) -> list[Loop]:
     """Return the loops around a block's nodes, innermost first."""
-    return [b.owner for b in block.inwards() if isinstance(b.owner, Loop)]
+    return [b.owner for b in block.list_enclosing_blocks() if isinstance(b.owner, Loop)]
 
 
 def turns_of(block: Block) -> int:
@@ -102,12 +102,12 @@ class FunctionWriter:
         """Append a line without a result."""
         self.lines.append(f"  {text}")
 
-    def start(self, label: str) -> None:
+    def start_basic_block(self, label: str) -> None:
         """Begin a basic block."""
         self.lines.append(f"{label}:")
         self.label = label
 
-    def block(self, block: Block) -> None:
+    def write_block(self, block: Block) -> None:
         """Write operations and statements in order."""
         for statement in block.items:
             if statement not in self.mine:
@@ -135,13 +135,13 @@ class FunctionWriter:
         product = fusable(node, self.products)
         if product is not None:
             rest = node.args[0] if node.args[1] is product else node.args[1]
-            names = [self.operand(n) for n in (*product.args, rest)]
+            names = [self.write_operand(n) for n in (*product.args, rest)]
             return write_fused(node, product, names, self.add)
         if node.op in CALLED:
             self.called.add(called(node))
-        return write_operation(node, [self.operand(a) for a in node.args], self.add)
+        return write_operation(node, [self.write_operand(a) for a in node.args], self.add)
 
-    def operand(self, node: Node) -> str:
+    def write_operand(self, node: Node) -> str:
         """Return the name of a number in all lanes."""
         for scope in reversed(self.scopes):
             if node in scope:
@@ -151,10 +151,10 @@ class FunctionWriter:
             return name
         if node in self.mine and node.op != "counter":
             raise RuntimeError(f"{node} is used before it is computed")
-        name = self.scopes[-1][node] = self.everywhere(self.scalar(node), node.type)
+        name = self.scopes[-1][node] = self.write_broadcast(self.write_scalar(node), node.type)
         return name
 
-    def scalar(self, node: Node) -> str:
+    def write_scalar(self, node: Node) -> str:
         """Return the name of a number that all lanes share."""
         if node.op == "constant":
             return str(int(node.value))
@@ -163,7 +163,7 @@ class FunctionWriter:
             if key in scope:
                 return scope[key]
         if node in self.mine or any(node in scope for scope in self.scopes):
-            name = self.add(f"extractelement {vector(node.type)} {self.operand(node)}, i64 0")
+            name = self.add(f"extractelement {vector(node.type)} {self.write_operand(node)}, i64 0")
         elif node.op == "load" and all(self._is_scalar(i) for i in node.args):
             name = self._write_scalar_load(node)
         else:
@@ -175,7 +175,7 @@ class FunctionWriter:
         """Return whether a number is the same in all lanes."""
         return node.op in ("constant", "counter") or node not in self.mine or self.single
 
-    def everywhere(self, name: str, type: Type) -> str:
+    def write_broadcast(self, name: str, type: Type) -> str:
         """Return the name of a vector of a scalar."""
         kind = vector(type)
         first = self.add(f"insertelement {kind} poison, {LLVM[type]} {name}, i64 0")
@@ -194,7 +194,7 @@ class FunctionWriter:
             if row is None:
                 moved = ""
                 for stride, index in zip(strides, indices, strict=True):
-                    step = self.add(f"mul i64 {self.scalar(index)}, {stride}")
+                    step = self.add(f"mul i64 {self.write_scalar(index)}, {stride}")
                     moved = self.add(f"add i64 {moved}, {step}") if moved else step
                 row = self.scopes[-1][key] = self.add(f"getelementptr {entry}, ptr {base}, i64 {moved}")
             base = row
@@ -208,15 +208,15 @@ class FunctionWriter:
         base = next((scope[key] for scope in reversed(self.scopes) if key in scope), None)
         if base is None:
             bytes_ = owner.size * BITS[owner.type] // 8
-            base = self.scopes[-1][key] = self.of_turn(self.bases[owner], owner.block, bytes_)
+            base = self.scopes[-1][key] = self.write_address_of_turn(self.bases[owner], owner.block, bytes_)
         return base
 
-    def of_turn(self, start: str, block: Block, bytes_: int) -> str:
+    def write_address_of_turn(self, start: str, block: Block, bytes_: int) -> str:
         """Return the address that belongs to this turn of the loops around a block; each turn has so many bytes."""
         index = ""
         for loop in loops_of(block):
             assert loop.counter is not None
-            step = self.add(f"mul i64 {self.scalar(loop.counter)}, {bytes_}")
+            step = self.add(f"mul i64 {self.write_scalar(loop.counter)}, {bytes_}")
             index = self.add(f"add i64 {index}, {step}") if index else step
             bytes_ *= loop.length or 1
         return self.add(f"getelementptr i8, ptr {start}, i64 {index}") if index else start
@@ -227,7 +227,7 @@ class FunctionWriter:
         if not all(self._is_scalar(i) for i in node.args):
             return self._write_gather(node)
         if buffer.owner[0] not in self.spread:
-            return self.everywhere(self._write_scalar_load(node), node.type)
+            return self.write_broadcast(self._write_scalar_load(node), node.type)
         address = self._address(buffer, offset, strides, node.args, f"%i{BITS[node.type]}")
         if node.type == "bool":
             return self.add(f"icmp ne %i8 {self.add(f'load %i8, ptr {address}, align 1')}, zeroinitializer")
@@ -252,7 +252,7 @@ class FunctionWriter:
         # Place of each lane: offset + sum strides * indices.
         positions = f"splat (i64 {offset + start})"
         for stride, index in zip(strides, node.args, strict=True):
-            step = self.add(f"mul %i64 {self.operand(index)}, splat (i64 {stride})")
+            step = self.add(f"mul %i64 {self.write_operand(index)}, splat (i64 {stride})")
             positions = self.add(f"add %i64 {step}, {positions}")
         # One load for each lane; booleans are stored as bytes.
         self.gathered.add((bits, spread))
@@ -265,7 +265,7 @@ class FunctionWriter:
 
     def _write_store(self, store: Store) -> None:
         """Write the store of a number; where sums over runs are kept, add it to what is there, in lanes that count."""
-        name, kind, bits = self.operand(store.node), vector(store.node.type), BITS[store.node.type]
+        name, kind, bits = self.write_operand(store.node), vector(store.node.type), BITS[store.node.type]
         entry = f"[{self.sums[store.buffer]} x i64]" if store.buffer in self.sums else f"%i{bits}"
         address = self._address(store.buffer, store.offset, store.strides, store.indices, entry)
         if store.buffer in self.sums:  # of doubles
@@ -279,101 +279,113 @@ class FunctionWriter:
         self.line(f"store {kind} {name}, ptr {address}, align {bits // 8}")
 
     def _write_loop(self, loop: Loop) -> None:
-        """Write a loop, whose parameters are phi nodes of the carry; a counted loop has at least one turn."""
+        """Write a loop as basic blocks: phi nodes for the numbers that it carries, the body, and the jump back.
+
+        A phi node stands at the beginning of a turn: it has the initial number if control comes from before the loop,
+        and the next turn's number if it comes from the end of the body. A counted loop has at least one turn.
+        """
         self.count += 1
-        name, before = f"loop{self.count}", self.label
-        # Only the carried numbers that this function computes or reads.
+        name, label_before = f"loop{self.count}", self.label
+        # Only the carried numbers that this function computes or reads, by their place in the carry.
         pairs = zip(loop.parameters, loop.results, strict=True)
-        moving = [k for k, pair in enumerate(pairs) if any(n in self.mine for n in pair)]
-        starts = [self.operand(loop.initial[k]) for k in moving]
+        carried = [k for k, pair in enumerate(pairs) if any(n in self.mine for n in pair)]
+        starts = [self.write_operand(loop.initial[k]) for k in carried]
         self.line(f"br label %{name}")
-        self.start(name)
-        begin = len(self.lines)
-        # Names within a turn.
-        self.scopes.append({})
+        self.start_basic_block(name)
+        place_of_phis = len(self.lines)
+        self.scopes.append({})  # names that hold within a turn
         counter = f"%{name}.counter"
-        if loop.counter is not None:
-            self.scopes[-1]["scalar", loop.counter] = counter
-        for k in moving:
-            self._name(loop.parameters[k], f"%{name}.p{k}")
-        if loop.counter is not None and loop.counter in self.mine:
-            self._name(loop.counter, self.operand(loop.counter))
-        for rows in self.asked if loop is self.asking else ():
-            self.lines += [f"  {line}" for line in write_requests(rows, loop.length or 1, counter, WIDTH, self.add)]
+        self._name_parameters(loop, name, counter, carried)
+        if loop is self.asking:  # it asks for memory before that is used
+            for rows in self.asked:
+                requests = write_requests(rows, loop.length or 1, counter, WIDTH, self.add)
+                self.lines += [f"  {line}" for line in requests]
         # Counted: body, then the latch. Conditional: the check is inside the body.
         if loop.condition is None:
-            following = finals = self._write_counted_loop(loop, name, counter, moving)
+            following = finals = self._write_counted_loop(loop, name, counter, carried)
         else:
-            following, finals = self._write_conditional_loop(loop, name, moving)
+            following, finals = self._write_conditional_loop(loop, name, carried)
         # The phi nodes come first, but their arguments are known only now.
-        phis = [f"  {counter} = phi i64 [0, %{before}], [{counter}.next, %{self.label}]"] if loop.length else []
-        for k, start, after in zip(moving, starts, following, strict=True):
+        phis = []
+        if loop.length:
+            phis.append(f"  {counter} = phi i64 [0, %{label_before}], [{counter}.next, %{self.label}]")
+        for k, start, after in zip(carried, starts, following, strict=True):
             kind = vector(loop.parameters[k].type)
-            phis.append(f"  %{name}.p{k} = phi {kind} [{start}, %{before}], [{after}, %{self.label}]")
-        self.lines[begin:begin] = phis
-        self.start(f"{name}.end")
+            phis.append(f"  %{name}.p{k} = phi {kind} [{start}, %{label_before}], [{after}, %{self.label}]")
+        self.lines[place_of_phis:place_of_phis] = phis
+        self.start_basic_block(f"{name}.end")
         self.scopes.pop()
-        for k, final in zip(moving, finals, strict=True):
+        for k, final in zip(carried, finals, strict=True):
             self._name(loop.results[k], final)
 
-    def _write_counted_loop(self, loop: Loop, name: str, counter: str, moving: list[int]) -> list[str]:
-        """Write the body and the latch of a loop of known length; return the names of what it carries on."""
-        self.block(loop.body)
-        following = [self.operand(loop.following[k]) for k in moving]
+    def _name_parameters(self, loop: Loop, name: str, counter: str, carried: list[int]) -> None:
+        """Note the names of a loop's counter and of its carried numbers within a turn."""
+        if loop.counter is not None:
+            self.scopes[-1]["scalar", loop.counter] = counter
+        for k in carried:
+            self._name(loop.parameters[k], f"%{name}.p{k}")
+        if loop.counter is not None and loop.counter in self.mine:
+            self._name(loop.counter, self.write_operand(loop.counter))
+
+    def _write_counted_loop(self, loop: Loop, name: str, counter: str, carried: list[int]) -> list[str]:
+        """Write the body and the latch of a loop of known length; return the names of the next turn's numbers."""
+        self.write_block(loop.body)
+        following = [self.write_operand(loop.following[k]) for k in carried]
         self.line(f"br label %{name}.latch")
-        self.start(f"{name}.latch")
+        self.start_basic_block(f"{name}.latch")
         self.line(f"{counter}.next = add i64 {counter}, 1")
         self.line(f"%{name}.more = icmp slt i64 {counter}.next, {loop.length}")
         self.line(f"br i1 %{name}.more, label %{name}, label %{name}.end")
         return following
 
-    def _write_conditional_loop(self, loop: Loop, name: str, moving: list[int]) -> tuple[list[str], list[str]]:
+    def _write_conditional_loop(self, loop: Loop, name: str, carried: list[int]) -> tuple[list[str], list[str]]:
         """Write the body of a loop that ends when no lane's condition holds.
 
-        Returns the names of what it carries on, and of what is left at its end.
+        Returns the names of the carried numbers in the next turn, and of those that are left at the loop's end.
         """
         # The body up to the loop's check, and what follows it in a turn.
         check = next(i for i, s in enumerate(loop.body.items) if isinstance(s, LoopExit) and s.loop is loop)
         head, tail = Block(loop.body.parent), Block(loop.body.parent)
         head.items, tail.items = loop.body.items[:check], loop.body.items[check + 1 :]
-        self.block(head)
+        self.write_block(head)
         assert loop.condition is not None
         # Another turn if some lane needs it.
         any_lane = self._any(loop.condition)
         self.line(f"br i1 {any_lane}, label %{name}.turn, label %{name}.end")
-        self.start(f"{name}.turn")
-        self.block(tail)
-        following = [self.operand(loop.following[k]) for k in moving]
+        self.start_basic_block(f"{name}.turn")
+        self.write_block(tail)
+        following = [self.write_operand(loop.following[k]) for k in carried]
         self.line(f"br label %{name}.latch")
-        self.start(f"{name}.latch")
+        self.start_basic_block(f"{name}.latch")
         self.line(f"br label %{name}")
-        return following, [f"%{name}.p{k}" for k in moving]
+        return following, [f"%{name}.p{k}" for k in carried]
 
     def _any(self, condition: Node) -> str:
-        """Return the name of whether a condition holds in some lane."""
-        return self.add(f"icmp ne %lanes {self.add(f'bitcast %i1 {self.operand(condition)} to %lanes')}, 0")
+        """Write whether a condition holds in some lane; return its name."""
+        return self.add(f"icmp ne %lanes {self.add(f'bitcast %i1 {self.write_operand(condition)} to %lanes')}, 0")
 
     def _write_guard(self, guard: Guard) -> None:
-        """Write a block that is skipped where no lane needs it; its results are zero then."""
+        """Write a guarded block, which is skipped where its condition holds in no lane; its results are zero then."""
         self.count += 1
         name = f"guard{self.count}"
         # Jump past the body if no lane needs it.
         any_lane = self._any(guard.condition)
-        before = self.label
+        label_before = self.label
         self.line(f"br i1 {any_lane}, label %{name}, label %{name}.end")
-        self.start(name)
+        self.start_basic_block(name)
         self.scopes.append({})
-        self.block(guard.body)
+        self.write_block(guard.body)
         used = [k for k, r in enumerate(guard.results) if r in self.mine]
-        values = [self.operand(guard.values[k]) for k in used]
-        after = self.label
+        values = [self.write_operand(guard.values[k]) for k in used]
+        label_after = self.label
         self.line(f"br label %{name}.end")
-        self.start(f"{name}.end")
+        self.start_basic_block(f"{name}.end")
         self.scopes.pop()
-        # Results are zero where the body was skipped. All phi nodes come before what keeps one of them.
+        # A phi node each: the value behind the body, zero where that was skipped. All phi nodes come first, before
+        # what `_name` may write of one.
         merged = []
         for k, value in zip(used, values, strict=True):
             kind = vector(guard.results[k].type)
-            merged.append(self.add(f"phi {kind} [{value}, %{after}], [zeroinitializer, %{before}]"))
+            merged.append(self.add(f"phi {kind} [{value}, %{label_after}], [zeroinitializer, %{label_before}]"))
         for k, result in zip(used, merged, strict=True):
             self._name(guard.results[k], result)

@@ -27,7 +27,7 @@ class TextLines:
         self.lines.append(f"  %x{self.count} = {text}")
         return f"%x{self.count}"
 
-    def loop(self, name: str, begin: str, end: str, step: int, body: Callable[[str], None]) -> None:
+    def write_loop(self, name: str, begin: str, end: str, step: int, body: Callable[[str], None]) -> None:
         """Write a loop: for (i = begin; i + step <= end; i += step) body."""
         before, head, inside, after = f"{name}.before", f"{name}.head", f"{name}.inside", f"{name}.after"
         self.lines += [f"  br label %{before}", f"{before}:", f"  br label %{head}", f"{head}:"]
@@ -58,37 +58,47 @@ class Move(NamedTuple):
 
 
 def write_mover(move: Move, width: int) -> str:
-    """Write `void @take64(ptr runs, ptr lanes, i64 size, i64 first, i64 last)`, or `give64`, which moves back.
+    """Return the LLVM text of `void @take64(ptr runs, ptr lanes, i64 size, i64 first, i64 last)`, or of `give64`.
 
-    Lane l is run first + l, or the last run if there are fewer: it then repeats the computation of that run.
+    `take` moves arrays [run][entry], of `size` entries a run, to [entry][lane]; `give` moves them back. Lane l is run
+    first + l, or the last run if there are fewer: it then repeats the computation of that run.
     """
     text, bits = TextLines(), move.bits
-    side = min(REGISTER // bits if move.squared or move.few else FEW, width)
+    side = min(REGISTER // bits if move.squared or move.few else FEW, width)  # runs that are moved together: a group
     if move.few and width > 1:
         _write_whole(text, move, side, width)
     for group in range(0, width, side):
-        # Address of each lane's run.
-        rows = []
-        for lane in range(group, group + side):
-            run = text.add(f"add i64 %first, {lane}")
-            run = text.add(f"call i64 @llvm.smin.i64(i64 {run}, i64 %last)")
-            start = text.add(f"mul i64 {run}, %size")
-            rows.append(text.add(f"getelementptr i{bits}, ptr %runs, i64 {start}"))
-        # Squares, then the remaining entries.
-        start = "0"
+        rows = _write_row_addresses(text, bits, range(group, group + side))
+        first_entry = "0"
+        # Squares of `side` runs and as many entries, then the remaining entries one by one.
         if move.squared and not move.few:
-            text.loop(
-                f"g{group}", "0", "%size", side, _make_square_transposer(text, rows, width, group, bits, move.inwards)
-            )
-            start = text.add(f"and i64 %size, {-side}")
-        text.loop(f"h{group}", start, "%size", 1, _make_entry_mover(text, rows, width, group, bits, move.inwards))
+            write_square = _make_square_transposer(text, rows, width, group, bits, move.inwards)
+            text.write_loop(f"g{group}", "0", "%size", side, write_square)
+            first_entry = text.add(f"and i64 %size, {-side}")  # size rounded down to a multiple of side
+        write_entry = _make_entry_mover(text, rows, width, group, bits, move.inwards)
+        text.write_loop(f"h{group}", first_entry, "%size", 1, write_entry)
     body = "\n".join(text.lines)
     arguments = "ptr noalias %runs, ptr noalias %lanes, i64 %size, i64 %first, i64 %last"
     return f"define internal void @{move.name}({arguments}) noinline nounwind {{\n{body}\n  ret void\n}}\n"
 
 
+def _write_row_addresses(text: TextLines, bits: int, lanes: range) -> list[str]:
+    """Write the address of the first entry of each lane's run, the last run for lanes beyond it; return their names."""
+    rows = []
+    for lane in lanes:
+        run = text.add(f"add i64 %first, {lane}")
+        run = text.add(f"call i64 @llvm.smin.i64(i64 {run}, i64 %last)")
+        start = text.add(f"mul i64 {run}, %size")
+        rows.append(text.add(f"getelementptr i{bits}, ptr %runs, i64 {start}"))
+    return rows
+
+
 def _write_whole(text: TextLines, move: Move, side: int, width: int) -> None:
-    """Move a block in which each lane has a run, and return: few entries of runs are registers one after another."""
+    """Write the move of few entries of a block in which each lane has a run of its own, and the return after it.
+
+    The entries of the runs of a group follow one another in memory: they are loaded as whole registers, whose numbers
+    are exchanged.
+    """
     text.lines.append(f"  %end = add i64 %first, {width - 1}")
     text.lines.append("  %whole = icmp sle i64 %end, %last")
     text.lines += ["  br i1 %whole, label %registers, label %singles", "registers:"]
@@ -115,7 +125,10 @@ def _place(bits: int, start: str, number: int) -> str:
 
 
 def _choose(text: TextLines, registers: list[str], places: list[tuple[int, int]], vector: str) -> str:
-    """Return a register of these numbers, of each the register that has it and its place there."""
+    """Write the choice of numbers out of registers; return the name of the register that has them, lane by lane.
+
+    places: for each lane the number of the register that has its number, and the place there.
+    """
     chosen, side = "poison", len(places)
     for number in sorted({register for register, _ in places}):
         order = [side + place if register == number else lane for lane, (register, place) in enumerate(places)]
@@ -128,11 +141,24 @@ def _choose(text: TextLines, registers: list[str], places: list[tuple[int, int]]
 def _make_square_transposer(
     text: TextLines, rows: list[str], width: int, group: int, bits: int, inwards: bool
 ) -> Callable[[str], None]:
-    """Return what writes the move of entries i, i + 1, ... of as many runs: a square, from rows to lanes or back."""
+    """Return a function that writes the move of one square: entries i to i + n - 1 of n runs, to lanes or back.
 
-    def write_one_turn(i: str) -> None:
+    Args:
+        text: where it is written.
+        rows: names of the addresses of the n runs' first entries, n a power of two.
+        width: lanes of a vector.
+        group: the lane of the first of these runs.
+        bits: of a number.
+        inwards: whether from runs to lanes.
+
+    Returns:
+        The function of the name of i.
+    """
+
+    def write_square(i: str) -> None:
         """Write the transposition of one square: load its rows, exchange halves until each is a column, store."""
         vector = f"<{len(rows)} x i{bits}>"
+        # Entry i of each run; and in lanes, lane `group` of each entry: number (i + k) width + group for entry i + k.
         in_rows = [text.add(f"getelementptr i{bits}, ptr {row}, i64 {i}") for row in rows]
         base = text.add(f"mul i64 {i}, {width}")
         base = text.add(f"getelementptr i{bits}, ptr %lanes, i64 {base}")
@@ -145,7 +171,7 @@ def _make_square_transposer(
         for p, x in zip(targets, moved, strict=True):
             text.lines.append(f"  store {vector} {x}, ptr {p}, align {bits // 8}")
 
-    return write_one_turn
+    return write_square
 
 
 def _exchange_squares(text: TextLines, rows: list[str], half: int, bits: int) -> list[str]:
@@ -168,9 +194,9 @@ def _exchange_squares(text: TextLines, rows: list[str], half: int, bits: int) ->
 def _make_entry_mover(
     text: TextLines, rows: list[str], width: int, group: int, bits: int, inwards: bool
 ) -> Callable[[str], None]:
-    """Return what writes the move of entry i of each run, from its row to its lane or back."""
+    """Return a function that writes the move of entry i of each run, to its lane or back; arguments as above."""
 
-    def write_one_turn(i: str) -> None:
+    def write_entry(i: str) -> None:
         """Write the move of each lane, one after another."""
         base = text.add(f"mul i64 {i}, {width}")
         base = text.add(f"add i64 {base}, {group}")
@@ -182,4 +208,4 @@ def _make_entry_mover(
             x = text.add(f"load i{bits}, ptr {source}, align {bits // 8}")
             text.lines.append(f"  store i{bits} {x}, ptr {target}, align {bits // 8}")
 
-    return write_one_turn
+    return write_entry

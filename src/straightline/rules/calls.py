@@ -26,12 +26,12 @@ def _call(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[V
     """Inline the function of a call (jit, custom_jvp, ...)."""
     params = equation.params
     inner = next(params[name] for name in ("jaxpr", "call_jaxpr", "fun_jaxpr") if name in params)
-    return lowering.inline(inner, inputs)
+    return lowering.inline_program(inner, inputs)
 
 
 def _custom_vmap_call(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     """Inline a function that has a rule of its own for `vmap`."""
-    return lowering.inline(equation.params["call"], inputs)
+    return lowering.inline_program(equation.params["call"], inputs)
 
 
 def _expand_call(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
@@ -44,14 +44,14 @@ def _expand_call(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
     avals: list[Any] = [v.aval for v in equation.invars]
     struct: Any = jax.ShapeDtypeStruct
     program = jax.make_jaxpr(function)(*(struct(a.shape, a.dtype) for a in avals))
-    return lowering.inline(program, inputs)
+    return lowering.inline_program(program, inputs)
 
 
 def _platform_index(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     """Select the branch of a program for CPUs."""
     platforms = equation.params["platforms"]
     number = next((i for i, names in enumerate(platforms) if names is not None and "cpu" in names), len(platforms) - 1)
-    return [lowering.known(np.int32(number))]
+    return [lowering.make_known_array(np.int32(number))]
 
 
 IN_MEMORY |= dict.fromkeys(CALLS, _call)
@@ -62,12 +62,12 @@ RULES |= {"platform_index": _platform_index}
 def _lower_cond(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     """Lower `cond`: a branch by a constant, else all branches, large ones skipped where no lane takes them."""
     branches = equation.params["branches"]
-    which = lowering.scalar(inputs[0])
+    which = lowering.get_only_node(inputs[0])
     if which.op == "constant":
         taken = min(max(int(which.value), 0), len(branches) - 1)
-        return lowering.inline(branches[taken], inputs[1:])
+        return lowering.inline_program(branches[taken], inputs[1:])
     if len(branches) == 1:
-        return lowering.inline(branches[0], inputs[1:])
+        return lowering.inline_program(branches[0], inputs[1:])
     # Small branches are computed in any case, large ones in guarded blocks.
     conditions = _find_taken(lowering, which, len(branches))
     sizes = [estimate_size(lowering, branch.jaxpr) for branch in branches]
@@ -98,7 +98,7 @@ def _lower_branch(lowering: Lowering, condition: Node, branch: Any, inputs: list
     graph, outer = lowering.graph, lowering.graph.current
     graph.current = block = Block(outer, pinned=True)
     try:
-        results = [lowering.nodes(x) for x in lowering.inline(branch, inputs)]
+        results = [lowering.nodes(x) for x in lowering.inline_program(branch, inputs)]
     finally:
         graph.current = outer
     if _size(block) <= DEAR:

@@ -22,16 +22,17 @@ Numbers = dict[tuple[int, int], jax.Array]  # entries by row and column
 def eigh(a: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Compute eigenvectors (n, n), in columns, and eigenvalues (n,), ascending; all NaN if an entry is not finite.
 
-    Each rotation makes one off-diagonal entry zero; sweeps over all pairs end when the rest is below rounding. Pairs in
-    the order of a tournament: all turns of a sweep rotate the same places, and the rows move on, so that one turn is
-    the whole program, 6 n^2 operations.
+    Jacobi's method: each rotation makes one off-diagonal entry zero; a sweep rotates each pair of rows once, and sweeps
+    end when the off-diagonal entries are below rounding. Pairs are in the order of a tournament: all turns of a sweep
+    rotate the same places, and the rows move on between turns, so that the program has one turn, of 6 n^2 operations.
 
     Source: Jacobi, Ueber ein leichtes Verfahren (1846); Golub and Van Loan, Matrix computations, section 8.5; Luk and
     Park, On parallel Jacobi orderings (1989), by which it converges as the order by rows does.
     """
     n, eps = len(a), float(np.finfo(a.dtype).eps)
     finite = jnp.all(jnp.isfinite(a))
-    # The upper triangle of the symmetric part, in units in which its squares are numbers, and eigenvectors I so far.
+    # The upper triangle of (A + A') / 2, in a unit in which squares of entries neither overflow nor vanish; the
+    # eigenvectors are those of no rotation, I.
     unit = _choose_unit(a)
     entries = {(i, j): (a[i, j] / unit + a[j, i] / unit) / 2 for i in range(n) for j in range(i, n)}
     vectors = {(i, j): jnp.asarray(float(i == j), a.dtype) for i in range(n) for j in range(n)}
@@ -40,7 +41,7 @@ def eigh(a: jax.Array) -> tuple[jax.Array, jax.Array]:
 
     def goes_on(state: tuple[Numbers, Numbers, jax.Array]) -> jax.Array:
         """Return whether an off-diagonal entry is above rounding, and sweeps are left."""
-        entries, _, sweeps = state
+        entries, _vectors, sweeps = state
         large = [jnp.abs(entries[pair]) > rounding for pair in combinations(range(n), 2)]
         return jnp.any(jnp.stack(large)) & (sweeps < SWEEPS)
 
@@ -49,8 +50,8 @@ def eigh(a: jax.Array) -> tuple[jax.Array, jax.Array]:
     def sweep(state: tuple[Numbers, Numbers, jax.Array]) -> tuple[Numbers, Numbers, jax.Array]:
         """Rotate each pair once; after all turns each row is in its place again."""
         entries, vectors, sweeps = state
-        rotated, _ = jax.lax.scan(turn, (entries, vectors), length=turns)
-        return *rotated, sweeps + 1
+        (entries, vectors), _ = jax.lax.scan(turn, (entries, vectors), length=turns)
+        return entries, vectors, sweeps + 1
 
     if n > 1:
         entries, vectors, _ = jax.lax.while_loop(goes_on, sweep, (entries, vectors, jnp.asarray(0)))
@@ -144,7 +145,7 @@ def _decompose_each(lowering: Lowering, program: ClosedJaxpr, equation: JaxprEqn
     (single,) = program.in_avals
     leading = matrices.shape[: len(matrices.shape) - len(single.shape)]
     flat = lowering.nodes(matrices).reshape(math.prod(leading), *single.shape)
-    items = [[lowering.nodes(x) for x in lowering.inline(program, [matrix])] for matrix in flat]
+    items = [[lowering.nodes(x) for x in lowering.inline_program(program, [matrix])] for matrix in flat]
     shapes = [result_shape(equation, k) for k in range(len(equation.outvars))]
     return [array_of((x for item in items for x in item[k].ravel()), shape) for k, shape in enumerate(shapes)]
 
@@ -238,7 +239,7 @@ def _linear_solve(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -
     before = lengths.matvec + lengths.vecmat
     constants = inputs[before : before + lengths.solve]
     right = inputs[before + lengths.solve + lengths.transpose_solve :]
-    return lowering.inline(programs.solve, [*constants, *right])
+    return lowering.inline_program(programs.solve, [*constants, *right])
 
 
 IN_MEMORY |= {"lu": _lu, "lu_pivots_to_permutation": _permutation, "custom_linear_solve": _linear_solve}

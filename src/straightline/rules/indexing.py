@@ -95,23 +95,36 @@ def _gather_by_cases(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indi
 def _gather_from_memory(
     lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices: np.ndarray, column: int
 ) -> np.ndarray:
-    """Gather from memory if there are many places: each entry is loaded at an offset by its row's index."""
+    """Gather from an array put in memory, where one index of each window depends on data and has many places.
+
+    Args:
+        lowering: the program.
+        equation: the gather.
+        x: nodes of the array.
+        indices: nodes of the windows' first places, (..., column).
+        column: the last axis of `indices` at which they depend on data; all other columns are known.
+
+    Returns:
+        The gathered nodes.
+    """
     numbers, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
     axis = numbers.start_index_map[column]
     last = x.shape[axis] - sizes[axis]
-    begin = _replace_indices(lowering, indices, column, 0)
-    if known_integers(begin) is None:
+    # Where each gathered number lies in the flat array if the index that depends on data were 0.
+    with_zero = _replace_indices(lowering, indices, column, 0)
+    if known_integers(with_zero) is None:
         raise Unsupported("gather at two places that data decide")
-    starts = _gather_clipped(equation, lowering, np.arange(x.size, dtype=object).reshape(x.shape), begin)
+    offsets = _gather_clipped(equation, lowering, np.arange(x.size, dtype=object).reshape(x.shape), with_zero)
+    # Each is loaded that index times the axis' stride behind it.
     buffer, stride = put_in_memory(lowering, x).buffer, contiguous(x.shape)[axis]
-    loaded = np.empty(starts.shape, dtype=object)
+    loaded = np.empty(offsets.shape, dtype=object)
     for entry in np.ndindex(*loaded.shape):
-        start = indices[(*_row(entry, numbers), column)]
-        if start.op == "constant":
-            loaded[entry] = x.ravel()[starts[entry]]
+        index = indices[(*_row(entry, numbers), column)]
+        if index.op == "constant":
+            loaded[entry] = x.ravel()[offsets[entry]]
         else:
-            first: Any = clamp_place(lowering, start, last)
-            loaded[entry] = lowering.graph.load(buffer, int(starts[entry]), (stride,), (first,))
+            clamped: Any = clamp_place(lowering, index, last)
+            loaded[entry] = lowering.graph.load(buffer, int(offsets[entry]), (stride,), (clamped,))
     return loaded
 
 

@@ -40,36 +40,43 @@ def repeat_turns(
 def _lower_loop(
     lowering: Lowering, length: int | None, carry: Sequence[np.ndarray], body: Callable[[Loop, list[np.ndarray]], Any]
 ) -> tuple[list[np.ndarray], Any]:
-    """Lower a loop; return the carry after it, and what body(loop, carry) returns beside the following carry.
+    """Lower a loop; return the carry after it, and what the body returns beside its carry.
 
-    A matrix that is symmetric before the loop is taken for one within it, of which the loop carries a triangle; where
-    the body does not keep it so, the body is lowered once more for all entries.
+    A matrix that is symmetric before the loop is taken for symmetric within it: the loop carries its upper triangle.
+    Where the body does not keep a matrix symmetric, the body is lowered once more, with all its entries carried.
+
+    Args:
+        lowering: the program.
+        length: how many turns; None of a loop that ends by its condition.
+        carry: the arrays of nodes that the first turn begins with.
+        body: lowers one turn into the open block: of the loop and of the carry before a turn it returns the carry after
+            it and, beside that, anything.
     """
     graph, outer = lowering.graph, lowering.graph.current
-    halves = [is_symmetric(x) for x in carry]
+    by_triangle = [is_symmetric(x) for x in carry]
     while True:
-        serial = graph.serial
-        loop = Loop(Block(outer), length, _entries(carry, halves))
+        nodes_before = graph.serial
+        loop = Loop(Block(outer), length, _entries(carry, by_triangle))
         # In the body the carry is a parameter; the turn is traced once.
-        loop.parameters = _stand_ins(graph, "parameter", loop, loop.body)
+        loop.parameters = _make_stand_ins(graph, "parameter", loop, loop.body)
         graph.current = loop.body
-        following, rest = body(loop, _restore_arrays(carry, loop.parameters, halves))
+        following, beside = body(loop, _restore_arrays(carry, loop.parameters, by_triangle))
         graph.current = outer
-        still_symmetric = [half and is_symmetric(x) for half, x in zip(halves, following, strict=True)]
-        if still_symmetric == halves:
+        still_symmetric = [was and is_symmetric(x) for was, x in zip(by_triangle, following, strict=True)]
+        if still_symmetric == by_triangle:
             break
         # Once more; the nodes of this try do not count.
-        halves = still_symmetric
-        graph.max_nodes += graph.serial - serial
-    loop.following = _entries(following, halves)
+        by_triangle = still_symmetric
+        graph.max_nodes += graph.serial - nodes_before
+    loop.following = _entries(following, by_triangle)
     outer.items.append(loop)
     # After the loop the carry is a result.
-    loop.results = _stand_ins(graph, "result", loop, outer)
-    return _restore_arrays(carry, loop.results, halves), rest
+    loop.results = _make_stand_ins(graph, "result", loop, outer)
+    return _restore_arrays(carry, loop.results, by_triangle), beside
 
 
-def _stand_ins(graph: Graph, op: str, loop: Loop, block: Block) -> list[Node]:
-    """Make nodes that stand for the carry in the body or after the loop."""
+def _make_stand_ins(graph: Graph, op: str, loop: Loop, block: Block) -> list[Node]:
+    """Make a node for each carried number, which stands for it in the body ("parameter") or after it ("result")."""
     return [graph.fresh(op, n.type, (), block, (loop, index)) for index, n in enumerate(loop.initial)]
 
 
@@ -133,36 +140,49 @@ def _mirror(upper: np.ndarray, n: int) -> np.ndarray:
 
 
 def _lower_scan(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Lower `scan`: written out if it is short, else as a loop, whose long arrays stay in memory."""
+    """Lower `scan`: written out if it is short, else as a loop; return its carry, then what it stacks.
+
+    The arguments of a scan are constants, the carry, and arrays of which each turn gets a row.
+    """
     params = equation.params
     (consts, carried), length = _count_arguments(params), params["length"]
     fixed, carry, rows = inputs[:consts], inputs[consts : consts + carried], inputs[consts + carried :]
-    # Short loops are written out.
-    if length * estimate_size(lowering, params["jaxpr"].jaxpr) <= lowering.written_out or length <= 1:
+    size = length * estimate_size(lowering, params["jaxpr"].jaxpr)
+    if size <= lowering.written_out or length <= 1:
         return _write_out_scan(lowering, equation, fixed, [lowering.nodes(x) for x in carry], rows)
-    jaxpr = params["jaxpr"].jaxpr
-    # Of the carried arrays, by number: what the body returns unchanged is a constant of the loop, a long array is
-    # carried in memory (`held`), all others as numbers (`moving`).
-    unchanged = [jaxpr.outvars[k] is jaxpr.invars[consts + k] for k in range(carried)]
-    held = {
-        k: CarriedMemory(lowering, carry[k]) for k in range(carried) if not unchanged[k] and carry[k].size > WRITTEN_OUT
-    }
-    moving = [k for k in range(carried) if not unchanged[k] and k not in held]
+    return _lower_long_scan(lowering, equation, fixed, carry, rows)
+
+
+def _lower_long_scan(
+    lowering: Lowering, equation: JaxprEqn, fixed: list[Value], carry: list[Value], rows: list[Value]
+) -> list[Value]:
+    """Lower a scan as a loop, whose long arrays stay in memory; return its carry, then what it stacks.
+
+    Of the carried arrays, by number: one that the body returns unchanged is a constant of the loop; a long one is
+    carried in memory (`in_memory`); all others are carried as numbers (`as_numbers`).
+    """
+    program, count = equation.params["jaxpr"], len(carry)
+    carried_in, carried_out = program.jaxpr.invars[len(fixed) :], program.jaxpr.outvars
+    changed = [k for k in range(count) if carried_out[k] is not carried_in[k]]
+    in_memory = {k: CarriedMemory(lowering, carry[k]) for k in changed if carry[k].size > WRITTEN_OUT}
+    as_numbers = [k for k in changed if k not in in_memory]
     rows = [put_in_memory(lowering, x) for x in rows]
 
     def lower_turn(row: Node, numbers: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Lower the body for one row of the stacked arguments; return the moving carry, and what is stacked."""
-        arrays: dict[int, Value] = dict(zip(moving, numbers, strict=True)) | {k: x.in_turn() for k, x in held.items()}
-        whole_carry = [arrays.get(k, carry[k]) for k in range(carried)]
-        results = lowering.inline(params["jaxpr"], [*fixed, *whole_carry, *(x.row(row) for x in rows)])
-        nodes = [x if k in held else lowering.nodes(x) for k, x in enumerate(results)]
-        hold(lowering, [(x, nodes[k]) for k, x in held.items()])
-        return [nodes[k] for k in moving], nodes[carried:]
+        """Lower the body for one row of the stacked arguments; return the carried numbers, and what is stacked."""
+        arrays: dict[int, Value] = dict(zip(as_numbers, numbers, strict=True))
+        arrays |= {k: x.in_turn() for k, x in in_memory.items()}
+        whole_carry = [arrays.get(k, carry[k]) for k in range(count)]
+        results = lowering.inline_program(program, [*fixed, *whole_carry, *(x.row(row) for x in rows)])
+        nodes = [x if k in in_memory else lowering.nodes(x) for k, x in enumerate(results)]
+        fill_carried_memory(lowering, [(x, nodes[k]) for k, x in in_memory.items()])
+        return [nodes[k] for k in as_numbers], nodes[count:]
 
-    start = [lowering.nodes(carry[k]) for k in moving]
-    finals, stacked = repeat_turns(lowering, length, start, lower_turn, params["reverse"])
-    after: dict[int, Value] = dict(zip(moving, finals, strict=True)) | {k: x.after() for k, x in held.items()}
-    return [*(after.get(k, carry[k]) for k in range(carried)), *stacked]
+    start = [lowering.nodes(carry[k]) for k in as_numbers]
+    finals, stacked = repeat_turns(lowering, equation.params["length"], start, lower_turn, equation.params["reverse"])
+    after: dict[int, Value] = dict(zip(as_numbers, finals, strict=True))
+    after |= {k: x.after() for k, x in in_memory.items()}
+    return [*(after.get(k, carry[k]) for k in range(count)), *stacked]
 
 
 class CarriedMemory:
@@ -190,17 +210,21 @@ class CarriedMemory:
         self._part(copied(lowering, x).buffer)
 
     def _part(self, buffer: Buffer) -> InMemory:
+        """Place a buffer in this memory; return the view of it."""
         self.memory.take_in(buffer, 0)
         return InMemory.whole(buffer)
 
 
-def hold(lowering: Lowering, filled: Sequence[tuple[CarriedMemory, Value]]) -> None:
-    """Fill the memory of carried arrays at the end of a turn: all that is read of it is read before."""
-    memory = {held.memory for held, _ in filled}
-    arrays = [(held, put_in_memory(lowering, x)) for held, x in filled]
-    arrays = [(held, copied(lowering, x) if x.buffer.owner[0] in memory else x) for held, x in arrays]
-    for held, x in arrays:
-        held.fill(lowering, x)
+def fill_carried_memory(lowering: Lowering, filled: Sequence[tuple[CarriedMemory, Value]]) -> None:
+    """Fill the memory of carried arrays, at the end of a turn, each with the array paired with it.
+
+    An array that lies in carried memory itself, as where two are exchanged, is copied first.
+    """
+    memory = {carried.memory for carried, _ in filled}
+    arrays = [(carried, put_in_memory(lowering, x)) for carried, x in filled]
+    arrays = [(carried, copied(lowering, x) if x.buffer.owner[0] in memory else x) for carried, x in arrays]
+    for carried, x in arrays:
+        carried.fill(lowering, x)
 
 
 def _count_arguments(params: dict[str, Any]) -> tuple[int, int]:
@@ -220,7 +244,7 @@ def _write_out_scan(
     turns = range(params["length"])
     for turn in reversed(turns) if params["reverse"] else turns:
         items = [x.row(turn) if isinstance(x, InMemory) else _entry(x, turn) for x in rows]
-        results = lowering.inline(params["jaxpr"], [*fixed, *carry, *items])
+        results = lowering.inline_program(params["jaxpr"], [*fixed, *carry, *items])
         carry = results[: len(carry)]
         stacked.append([lowering.nodes(x) for x in results[len(carry) :]])
     if not stacked:
@@ -253,7 +277,7 @@ def put_in_memory(lowering: Lowering, value: Value) -> InMemory:
 
 
 def copied(lowering: Lowering, x: InMemory) -> InMemory:
-    """Copy a long array to new memory."""
+    """Copy a long array to new memory, row by row in a loop; return the copy."""
     return repeat_turns(lowering, x.shape[0], [], lambda row, _: ([], [lowering.nodes(x.row(row))]))[1][0]
 
 
@@ -268,10 +292,10 @@ def _lower_while(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
 
     def body(loop: Loop, carry: list[np.ndarray]) -> tuple[list[np.ndarray], None]:
         """Write the check, then the body; return the next carry, selected by each run's condition."""
-        active = lowering.nodes(lowering.inline(params["cond_jaxpr"], [*of_condition, *carry])[0])
+        active = lowering.nodes(lowering.inline_program(params["cond_jaxpr"], [*of_condition, *carry])[0])
         loop.condition = reduce(lambda a, b: graph.node("or", "bool", a, b), scalars(active))
         loop.body.items.append(LoopExit(loop))
-        moved = [lowering.nodes(x) for x in lowering.inline(params["body_jaxpr"], [*of_body, *carry])]
+        moved = [lowering.nodes(x) for x in lowering.inline_program(params["body_jaxpr"], [*of_body, *carry])]
         return [_where_active(graph, active, new, old) for new, old in zip(moved, carry, strict=True)], None
 
     return _lower_loop(lowering, None, [lowering.nodes(x) for x in inputs[conditional + fixed :]], body)[0]

@@ -72,26 +72,32 @@ def _accumulate_by(op: str) -> Rule:
 
 
 def _find_extreme(op: str) -> Rule:
-    """Return the rule of the first index of the greatest ("gt") or least ("lt") entry; of the first NaN, as in JAX."""
+    """Return the rule of `argmax` (op "gt") or `argmin` ("lt"): along one axis, with the result's other axes."""
 
-    def lower_operation(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-        graph, type, axis = lowering.graph, result_type(equation), equation.params["axes"][0]
+    def lower_argument_of_extreme(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+        axis = equation.params["axes"][0]
         x = np.moveaxis(inputs[0], axis, -1).reshape(-1, inputs[0].shape[axis])
-        results = []
-        for row in x.tolist():
-            best, index = row[0], graph.constant(0, type)
-            for number, entry in enumerate(row[1:], 1):
-                # A later entry replaces the best one if it is beyond it or NaN, unless the best is NaN.
-                best_is_number = graph.node("eq", "bool", best, best)
-                beyond = graph.node(op, "bool", entry, best)
-                is_nan = graph.node("ne", "bool", entry, entry)
-                better = graph.node("and", "bool", best_is_number, graph.node("or", "bool", beyond, is_nan))
-                best = graph.node("select", entry.type, better, entry, best)
-                index = graph.node("select", type, better, graph.constant(number, type), index)
-            results.append(index)
-        return [array_of(results, result_shape(equation))]
+        indices = [_find_first_extreme(lowering.graph, op, result_type(equation), row) for row in x.tolist()]
+        return [array_of(indices, result_shape(equation))]
 
-    return lower_operation
+    return lower_argument_of_extreme
+
+
+def _find_first_extreme(graph: Graph, op: str, type: Type, row: list[Node]) -> Node:
+    """Return the first index of the greatest (op "gt") or least ("lt") number, or of the first NaN, as in JAX.
+
+    `type`: of the index.
+    """
+    best, index = row[0], graph.constant(0, type)
+    for number, entry in enumerate(row[1:], 1):
+        # A later entry replaces the best one if it is beyond it or NaN, unless the best is NaN.
+        best_is_number = graph.node("eq", "bool", best, best)
+        beyond = graph.node(op, "bool", entry, best)
+        is_nan = graph.node("ne", "bool", entry, entry)
+        better = graph.node("and", "bool", best_is_number, graph.node("or", "bool", beyond, is_nan))
+        best = graph.node("select", entry.type, better, entry, best)
+        index = graph.node("select", type, better, graph.constant(number, type), index)
+    return index
 
 
 def write_product(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
@@ -208,52 +214,62 @@ def _type_of(matrix: np.ndarray) -> Type:
 
 
 def _cholesky(graph: Graph, params: Any, a: np.ndarray) -> np.ndarray:
-    """Return L of A = L L', column by column, one reciprocal each; all NaN if A is not positive definite."""
+    """Return the lower triangular L of A = L L', column by column; all NaN if A is not positive definite.
+
+    a: nodes (n, n), of which the lower triangle is read; params: of JAX's operation, not used. Each column takes one
+    reciprocal instead of a division for each entry.
+    """
     n, real = len(a), _type_of(a)
     zero, nan = graph.constant(0.0, real), graph.constant(float("nan"), real)
     definite = graph.constant(True, "bool")
     lower = np.full((n, n), zero, dtype=object)
     for j in range(n):
-        # a_ij - sum_k l_ik l_jk for the rows i >= j.
-        rests = []
+        # r_i = a_ij - sum_k<j l_ik l_jk for the rows i >= j.
+        remainders = []
         for i in range(j, n):
-            rest = a[i, j]
+            remainder = a[i, j]
             for k in range(j):
-                rest = graph.node("sub", real, rest, graph.node("mul", real, lower[i, k], lower[j, k]))
-            rests.append(rest)
-        # l_jj = sqrt(rest), l_ij = rest / l_jj.
-        root = graph.node("sqrt", real, rests[0])
-        negative = graph.node("le", "bool", rests[0], zero)  # NaN is not, and stays where it leads to
-        definite = graph.node("and", "bool", definite, graph.node("not", "bool", negative))
+                remainder = graph.node("sub", real, remainder, graph.node("mul", real, lower[i, k], lower[j, k]))
+            remainders.append(remainder)
+        # l_jj = sqrt(r_j), l_ij = r_i / l_jj. A pivot r_j <= 0 makes all NaN; one that is NaN (not <= 0) makes NaN
+        # only what is computed of it.
+        root = graph.node("sqrt", real, remainders[0])
+        is_bad = graph.node("le", "bool", remainders[0], zero)
+        definite = graph.node("and", "bool", definite, graph.node("not", "bool", is_bad))
         scale = graph.node("div", real, graph.constant(1.0, real), root)
         lower[j, j] = root
         for i in range(j + 1, n):
-            lower[i, j] = graph.node("mul", real, rests[i - j], scale)
+            lower[i, j] = graph.node("mul", real, remainders[i - j], scale)
     numbers = [graph.node("select", real, definite, x, nan) for x in lower.ravel().tolist()]
     return array_of(numbers, lower.shape)
 
 
 def _triangular_solve(graph: Graph, params: Any, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return X of A X = B (or X A = B, or with A') by substitution, one reciprocal for each diagonal entry."""
+    """Return the solution X of A X = B with a triangular A (n, n), or of X A = B, or with A', by substitution.
+
+    params, of JAX's operation: "left_side" (A X, else X A), "lower" (else upper), "transpose_a", and "unit_diagonal",
+    where A's diagonal is taken for ones. A diagonal entry takes one reciprocal instead of a division for each column.
+    """
     if params["conjugate_a"]:
         raise Unsupported("complex numbers")
     lower, transposed = params["lower"], params["transpose_a"]
-    if not params["left_side"]:  # A' X' = B'
+    if not params["left_side"]:  # X A = B is A' X' = B'
         transposed, b = not transposed, b.T
     if transposed:
         a, lower = a.T, not lower
-    # x_i = (b_i - sum_j a_ij x_j) / a_ii, in the order of substitution.
+    # x_i = (b_i - sum_j a_ij x_j) / a_ii over the rows j solved before, from the first row on if A is lower triangular,
+    # else from the last.
     n, real = len(a), _type_of(a)
-    unit = graph.constant(1.0, real)
-    scales = [unit if params["unit_diagonal"] else graph.node("div", real, unit, a[i, i]) for i in range(n)]
+    one = graph.constant(1.0, real)
+    reciprocals = [one if params["unit_diagonal"] else graph.node("div", real, one, a[i, i]) for i in range(n)]
     x = np.empty(b.shape, dtype=object)
     order = list(range(n)) if lower else list(range(n))[::-1]
     for step, i in enumerate(order):
         for column in range(b.shape[1]):
-            rest = b[i, column]
+            remainder = b[i, column]
             for j in order[:step]:
-                rest = graph.node("sub", real, rest, graph.node("mul", real, a[i, j], x[j, column]))
-            x[i, column] = graph.node("mul", real, rest, scales[i])
+                remainder = graph.node("sub", real, remainder, graph.node("mul", real, a[i, j], x[j, column]))
+            x[i, column] = graph.node("mul", real, remainder, reciprocals[i])
     return x if params["left_side"] else x.T
 
 

@@ -42,11 +42,11 @@ class _OperationProgram(NamedTuple):
 
 
 def operation(native: Callable[P, R]) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorate a plain function for which native code, and C, have one of their own.
+    """Decorate a function, called plain, in whose place native code and C have another one, `native`.
 
-    What is compiled by XLA, mapped by `vmap` or differentiated is the plain function. Native code takes the other one
-    in its place, of one item after another where `vmap` maps them: where a form that suits XLA, all entries side by
-    side, is not the one that suits a straight line. The plain function again where the other one is too long.
+    XLA compiles, `vmap` maps and JAX differentiates the plain function. Native code calls `native` instead, on one item
+    after another where `vmap` maps them; it calls the plain function where `native` is too long. So each has the form
+    that suits it: all entries side by side for XLA, a straight line for native code.
 
     Args:
         native: a function of the same arguments with the same results.
@@ -143,9 +143,9 @@ def _apply_native(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -
     program: _OperationProgram = equation.params["program"]
     try:
         with lowering.graph.at_most(MANY_TERMS):
-            return lowering.inline(_trace_in_loops(lowering, equation, program.native), inputs)
+            return lowering.inline_program(_trace_in_loops(lowering, equation, program.native), inputs)
     except Unsupported:
-        return lowering.inline(_trace_in_loops(lowering, equation, jaxpr_as_fun(program.plain)), inputs)
+        return lowering.inline_program(_trace_in_loops(lowering, equation, jaxpr_as_fun(program.plain)), inputs)
 
 
 def _trace_in_loops(lowering: Lowering, equation: JaxprEqn, function: Callable[..., list[Any]]) -> ClosedJaxpr:

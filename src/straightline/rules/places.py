@@ -15,13 +15,13 @@ from straightline.nodes import Node, Unsupported
 
 
 def clamp_place(lowering: Lowering, start: Node, last: int) -> Node | int:
-    """Clamp a place between 0 and the last one."""
+    """Return a place clamped between 0 and `last`: a number if it is known, else a node of type i64."""
     if last == 0:
         return 0
     if start.op == "constant":
         return min(max(int(start.value), 0), last)
     graph = lowering.graph
-    if start.type[0] == "u":  # above all that is signed there may be more
+    if start.type[0] == "u":  # an unsigned number may be too large for i64
         start = graph.node("min", start.type, start, graph.constant(last, start.type))
     wide = graph.node("convert", "i64", start)
     return graph.node(
@@ -30,7 +30,7 @@ def clamp_place(lowering: Lowering, start: Node, last: int) -> Node | int:
 
 
 def inside(graph: Graph, start: Node, last: int) -> Node:
-    """Return whether a place is one of 0 ... last."""
+    """Return the node of whether a place is one of 0 ... last."""
     below = graph.node("le", "bool", start, graph.constant(last, start.type))
     if start.type[0] == "u":
         return below
@@ -43,17 +43,17 @@ def fills(equation: JaxprEqn) -> bool:
 
 
 def narrowed(lowering: Lowering, indices: np.ndarray) -> np.ndarray:
-    """Convert indices that may be outside to 32 bits with a sign, as JAX does."""
+    """Return indices that may be outside converted to 32 bits with a sign, as JAX does."""
     nodes = [lowering.graph.node("convert", "i32", n) for n in indices.ravel().tolist()]
     return array_of(nodes, indices.shape)
 
 
 def fill_of(lowering: Lowering, equation: JaxprEqn) -> Node:
-    """Return the value in place of what is outside."""
+    """Return the node of the value that a gather has in place of what is outside of the array."""
     aval: Any = equation.outvars[0].aval
     if jax.numpy.issubdtype(aval.dtype, jax.dtypes.prng_key):
         raise Unsupported("a key of random numbers in place of one that is not there")
-    return lowering.scalar(lowering.known(np.full((), equation.params["fill_value"], aval.dtype)))
+    return lowering.get_only_node(lowering.make_known_array(np.full((), equation.params["fill_value"], aval.dtype)))
 
 
 def find_window_places(
@@ -65,29 +65,39 @@ def find_window_places(
     removed: Sequence[int],
     clips: bool,
 ) -> np.ndarray:
-    """Return for each index (...) and entry of its window (...) the place in an array of this shape; -1 outside.
+    """Return the place of each entry of each window in a flat array, -1 outside.
 
-    `index_map`: the array's axis for each number of an index; `batching`: pairs of an axis of the array and one of the
-    indices that correspond; `removed`: axes that a window does not have.
+    Args:
+        shape: of the array, whose entries are in row-major order.
+        sizes: of a window, along each axis of the array.
+        indices: first entry of each window, (..., k): `index_map[k]` is the axis of the array that its number k is for.
+        index_map: as said.
+        batching: pairs of an axis of the array and an axis of `indices` along which windows and array correspond.
+        removed: axes of size 1 that the result does not have.
+        clips: whether a window that is not inside is moved inside; else all its places are -1.
+
+    Returns:
+        Places, with the axes of the indices but the last, then those of a window.
     """
-    # First corner of each window, axis by axis.
+    # First entry of each window, axis by axis of the array.
     starts = np.zeros((*indices.shape[:-1], len(shape)), dtype=np.int64)
     for k, axis in enumerate(index_map):
         starts[..., axis] = indices[..., k]
     for axis, along in batching:
         count = np.arange(indices.shape[along])
         starts[..., axis] = count.reshape([-1 if a == along else 1 for a in range(indices.ndim - 1)])
-    # Place of the corner in row-major order; corners are clipped or marked as outside.
+    # Its place in row-major order.
     last = np.array(shape) - np.array(sizes)
     inside = np.all((starts >= 0) & (starts <= last), axis=-1)
     strides = np.array(contiguous(shape), dtype=np.int64)
     base = np.sum(np.clip(starts, 0, last) * strides, axis=-1)
-    if not clips:  # so far below 0 that all of the window is
+    if not clips:  # so far below 0 that adding an offset, at most the array's size - 1, leaves it below 0
         base = np.where(inside, base, -1 - int(np.prod(shape, dtype=np.int64)))
-    # Offsets of the entries of a window from its corner.
-    axes = [a for a in range(len(shape)) if a not in removed]
-    offsets = np.zeros([sizes[a] for a in axes], dtype=np.int64)
-    for position, a in enumerate(axes):
-        offsets += strides[a] * np.arange(sizes[a]).reshape([-1 if p == position else 1 for p in range(len(axes))])
+    # Offsets of a window's entries from its first one: the sum over its axes of stride times number along the axis.
+    window_axes = [a for a in range(len(shape)) if a not in removed]
+    offsets = np.zeros([sizes[a] for a in window_axes], dtype=np.int64)
+    for position, a in enumerate(window_axes):
+        along_axis = [-1 if p == position else 1 for p in range(len(window_axes))]
+        offsets += strides[a] * np.arange(sizes[a]).reshape(along_axis)
     places = np.reshape(base, (*base.shape, *[1] * offsets.ndim)) + offsets
     return np.maximum(places, -1)

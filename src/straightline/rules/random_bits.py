@@ -114,7 +114,7 @@ def _gamma(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> 
     gamma: Any = equation.primitive.impl
     avals: list[Any] = [v.aval for v in equation.invars]
     program = jax.make_jaxpr(lambda *args: gamma(*args, **equation.params))(*avals)
-    return [lowering.nodes(x) for x in lowering.inline(program, inputs)]
+    return [lowering.nodes(x) for x in lowering.inline_program(program, inputs)]
 
 
 def _same(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
@@ -160,11 +160,16 @@ def hash_words(first: Word, second: Word, high: Word, low: Word) -> Word:
 
 @cache
 def write_hash_function() -> str:
-    """Write `define internal %i64 @hg_threefry(%i32 ...)` of a key's and a counter's two words."""
+    """Return the LLVM text of `%i64 @hg_threefry(%i32 a, b, x, y)`: the hash Threefry-2x32 of a counter under a key.
+
+    (a, b) are the key's two words, (x, y) the counter's, in each lane of a vector; the result has the hash's first word
+    in its upper 32 bits and the second in its lower ones.
+    """
     vector, wide = "%i32", "%i64"
     lines: list[str] = []
 
     def op(text: str) -> str:
+        """Append an operation; return the new name of its result."""
         lines.append(f"  %t{len(lines)} = {text}")
         return f"%t{len(lines) - 1}"
 
@@ -172,15 +177,16 @@ def write_hash_function() -> str:
     both = op(f"xor {vector} %a, %b")
     keys = ("%a", "%b", op(f"xor {vector} {both}, splat (i32 {PARITY})"))
     x, y = op(f"add {vector} %x, %a"), op(f"add {vector} %y, %b")
-    # Five times four rounds, each with the next two key words.
-    for four in range(5):
-        for bits in ROTATIONS[four % 2]:
+    # Five groups of four rounds. A round: x += y, y = rotate(y, bits) ^ x (fshl of y and y rotates to the left). After
+    # each group the next two words of the key are added, and the group's number.
+    for group in range(5):
+        for bits in ROTATIONS[group % 2]:
             x = op(f"add {vector} {x}, {y}")
             y = op(f"call {vector} @llvm.fshl({vector} {y}, {vector} {y}, {vector} splat (i32 {bits}))")
             y = op(f"xor {vector} {y}, {x}")
-        x = op(f"add {vector} {x}, {keys[(four + 1) % 3]}")
-        y = op(f"add {vector} {y}, {keys[(four + 2) % 3]}")
-        y = op(f"add {vector} {y}, splat (i32 {four + 1})")
+        x = op(f"add {vector} {x}, {keys[(group + 1) % 3]}")
+        y = op(f"add {vector} {y}, {keys[(group + 2) % 3]}")
+        y = op(f"add {vector} {y}, splat (i32 {group + 1})")
     # Both words as one of 64 bits.
     high, low = op(f"zext {vector} {x} to {wide}"), op(f"zext {vector} {y} to {wide}")
     word = op(f"or {wide} {op(f'shl {wide} {high}, splat (i64 32)')}, {low}")

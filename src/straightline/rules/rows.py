@@ -60,9 +60,10 @@ def _are_written_out(inputs: list[Value], count: int) -> bool:
 
 
 def _apply_by_row(name: str) -> Rule:
-    """Return the rule of an elementwise operation that computes long arrays row by row, in a loop."""
+    """Return the rule of an elementwise operation: of short arrays at once, of long ones row by row in a loop."""
 
     def lower_row_by_row(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+        """Lower the operation on arrays of the result's shape, or of fewer axes, or of one row."""
         shape, ndim = result_shape(equation), max(len(x.shape) for x in inputs)
         if not is_long(inputs):
             return list(RULES[name](lowering, equation, [lowering.nodes(x) for x in inputs]))
@@ -73,7 +74,7 @@ def _apply_by_row(name: str) -> Rule:
         def turn(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
             """Return no carry, and the operation's result for one row."""
             rows = [row_of(lowering, x, row, ndim) for x in items]
-            return [], list(lowering.equation(row_equation, rows))
+            return [], list(lowering.lower_equation(row_equation, rows))
 
         return list(repeat_turns(lowering, shape[0], [], lambda p, c: as_nodes(lowering, turn(p, c)))[1])
 
@@ -106,42 +107,53 @@ def make_row_equation(equation: JaxprEqn, **params: Any) -> Any:
 
 
 def _dot_general(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Return a product of long arrays, computed row by row in a loop.
+    """Lower a product of arrays (JAX's `dot_general`): of short ones written out, of long ones row by row in a loop.
 
-    The loop is over the first batch axis, else the first free axis of the left argument, else that of the right one. A
-    sum over all axes is accumulated over the first of them.
+    Written out are results of one number from arrays of which nodes may be loaded, short arrays, and products by a
+    known matrix whose zeros leave few terms.
     """
-    (left, right), (left_batch, right_batch) = equation.params["dimension_numbers"]
     to_number = not result_shape(equation) and all(x.size <= LOADED for x in inputs)
     if to_number or not is_long(inputs):
         return list(RULES["dot_general"](lowering, equation, [lowering.nodes(x) for x in inputs]))
-    # A known matrix whose zeros leave few terms is written out.
-    short = [x if _is_table(x) or x.size > LOADED else lowering.nodes(x) for x in inputs]
-    if (factors := _find_few_terms(equation, short)) is not None:
+    arrays = [x if _is_table(x) or x.size > LOADED else lowering.nodes(x) for x in inputs]
+    if (factors := _find_few_terms(equation, arrays)) is not None:
         return list(_write_out_product(lowering, equation, factors))
-    # The axis of each argument that is looped over, None where an argument is used whole in every turn.
     a, b = (put_in_memory(lowering, x) for x in inputs)
-    in_left, in_right = (left_batch[0], right_batch[0]) if left_batch else (_find_free_axis(a, left), None)
-    if in_left is None:
-        in_right = _find_free_axis(b, right)
-    summed = in_left is None and in_right is None
-    if summed:
-        (in_left, *left), (in_right, *right) = left, right
-    # The operation on one row: dimension numbers without that axis, which comes first.
-    contracted = _without(left, in_left), _without(right, in_right)
-    batch = _without(left_batch[1:], in_left), _without(right_batch[1:], in_right)
+    return _multiply_by_row(lowering, equation, a, b)
+
+
+def _multiply_by_row(lowering: Lowering, equation: JaxprEqn, a: InMemory, b: InMemory) -> list[Value]:
+    """Lower a product of arrays in memory as a loop.
+
+    The loop is over the first batch axis, else over the first free axis of a, else over that of b: each turn computes a
+    row of the result. Where there is no such axis, the loop is over the first contracted one, and turns are summed.
+    """
+    (a_contracted, b_contracted), (a_batch, b_batch) = equation.params["dimension_numbers"]
+    # The axis of each argument that is looped over, None where an argument is used whole in every turn.
+    if a_batch:
+        a_axis, b_axis = a_batch[0], b_batch[0]
+    else:
+        a_axis = _find_free_axis(a, a_contracted)
+        b_axis = _find_free_axis(b, b_contracted) if a_axis is None else None
+    is_summed = a_axis is None and b_axis is None
+    if is_summed:
+        (a_axis, *a_contracted), (b_axis, *b_contracted) = a_contracted, b_contracted
+    # The operation on one row: dimension numbers without the axis of the loop.
+    contracted = _without(a_contracted, a_axis), _without(b_contracted, b_axis)
+    batch = _without(a_batch[1:], a_axis), _without(b_batch[1:], b_axis)
     row_equation = make_row_equation(equation, dimension_numbers=(contracted, batch))
-    a, b = (x if axis is None else _move_to_front(x, axis) for x, axis in ((a, in_left), (b, in_right)))
+    by_row = [(x if axis is None else _move_to_front(x, axis), axis) for x, axis in ((a, a_axis), (b, b_axis))]
 
-    def turn(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    def multiply_row(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """Return no carry, and the product for one row."""
-        rows: list[Value] = [x if axis is None else x.row(row) for x, axis in ((a, in_left), (b, in_right))]
-        return as_nodes(lowering, ([], list(lowering.equation(row_equation, rows))))
+        rows: list[Value] = [x if axis is None else x.row(row) for x, axis in by_row]
+        return as_nodes(lowering, ([], list(lowering.lower_equation(row_equation, rows))))
 
-    count = (b if in_left is None else a).shape[0]
-    if summed:
-        return _accumulate_turns(lowering, equation, count, turn)
-    return list(repeat_turns(lowering, count, [], turn)[1])
+    count = next(x.shape[0] for x, axis in by_row if axis is not None)
+    if is_summed:
+        return _accumulate_turns(lowering, equation, count, multiply_row)
+    _carry, stacked = repeat_turns(lowering, count, [], multiply_row)
+    return list(stacked)
 
 
 def _find_free_axis(x: InMemory, contracted: Sequence[int]) -> int | None:
@@ -240,36 +252,50 @@ def _without(axes: Sequence[int], removed: int | None) -> tuple[int, ...]:
 
 
 def _reduce_by_row(name: str) -> Rule:
-    """Return the rule of a reduction: of short arrays at once, of long ones row by row in a loop."""
+    """Return the rule of a reduction, such as `reduce_sum`: of short arrays at once, of long ones row by row."""
 
-    def lower_row_by_row(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-        x, axes = inputs[0], equation.params["axes"]
+    def lower_reduction(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+        """Lower the reduction of one array along the axes of the operation."""
         if not is_long(inputs):
-            return list(RULES[name](lowering, equation, [lowering.nodes(x)]))
-        # The reduction within a row, and that of two rows to one.
-        inner = tuple(a - 1 for a in axes if a)
-        shape = tuple(n for a, n in enumerate(x.shape[1:]) if a not in inner)
-        dtype = equation.outvars[0].aval.dtype  # type: ignore[attr-defined]
-        row = SimpleNamespace(aval=like(shape, dtype))
-        within: Any = SimpleNamespace(params=equation.params | {"axes": inner}, outvars=[row])
-        of_two: Any = SimpleNamespace(params=equation.params | {"axes": (0,)}, outvars=[row])
+            return list(RULES[name](lowering, equation, [lowering.nodes(inputs[0])]))
+        return _reduce_long(lowering, equation, name, inputs[0])
 
-        def reduce_row(index: Node) -> np.ndarray:
-            """Return a row reduced along its own axes."""
-            return np.asarray(RULES[name](lowering, within, [lowering.nodes(x.row(index))])[0])
+    return lower_reduction
 
-        if 0 not in axes:  # rows stay apart
-            return list(repeat_turns(lowering, x.shape[0], [], lambda index, _: ([], [reduce_row(index)]))[1])
-        # Rows are accumulated from the neutral element, the reduction of no row.
-        start = RULES[name](lowering, of_two, [np.empty((0, *shape), dtype=object)])[0]
 
-        def accumulate(index: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-            """Return the rows reduced so far with this one, and nothing to stack."""
-            return [np.asarray(RULES[name](lowering, of_two, [np.stack([carry[0], reduce_row(index)])])[0])], []
+def _reduce_long(lowering: Lowering, equation: JaxprEqn, name: str, x: Value) -> list[Value]:
+    """Lower the reduction of a long array in a loop: each turn reduces one row along its own axes.
 
-        return list(repeat_turns(lowering, x.shape[0], [start], accumulate)[0])
+    The reduced rows are stacked, or reduced further one after another where the operation's axes include the first.
+    """
+    axes = equation.params["axes"]
+    # The same operation within a row, and on two rows to one; both have a result of the shape of a reduced row.
+    row_axes = tuple(a - 1 for a in axes if a)
+    shape = tuple(n for a, n in enumerate(x.shape[1:]) if a not in row_axes)
+    result = SimpleNamespace(aval=like(shape, equation.outvars[0].aval.dtype))  # type: ignore[attr-defined]
+    within_row: Any = SimpleNamespace(params=equation.params | {"axes": row_axes}, outvars=[result])
+    of_two_rows: Any = SimpleNamespace(params=equation.params | {"axes": (0,)}, outvars=[result])
 
-    return lower_row_by_row
+    def reduce_row(index: Node) -> np.ndarray:
+        """Return a row reduced along its own axes."""
+        return np.asarray(RULES[name](lowering, within_row, [lowering.nodes(x.row(index))])[0])
+
+    def stack_row(index: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Return no carry, and the reduced row to stack."""
+        return [], [reduce_row(index)]
+
+    def accumulate_row(index: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Return the rows reduced so far with this one, and nothing to stack."""
+        pair = np.stack([carry[0], reduce_row(index)])
+        return [np.asarray(RULES[name](lowering, of_two_rows, [pair])[0])], []
+
+    if 0 not in axes:
+        _carry, stacked = repeat_turns(lowering, x.shape[0], [], stack_row)
+        return list(stacked)
+    # From the neutral element on: the reduction of no row.
+    start = RULES[name](lowering, of_two_rows, [np.empty((0, *shape), dtype=object)])[0]
+    total_of_rows, _stacked = repeat_turns(lowering, x.shape[0], [start], accumulate_row)
+    return list(total_of_rows)
 
 
 REDUCTIONS = ("reduce_sum", "reduce_prod", "reduce_or", "reduce_and", "reduce_max", "reduce_min")

@@ -18,10 +18,13 @@ from straightline.rules.places import fills, find_window_places, narrowed
 
 
 def _make_scatter_rule(op: str | None) -> Rule:
-    """Make a rule that applies updates one after another; those outside the array are dropped."""
+    """Return the rule of a scatter: updates are combined with an array's entries by `op`, or replace them if None."""
 
     def scatter_updates(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-        """Combine each update with the entry at its place, in order; places beyond the array are dropped or clipped."""
+        """Return the array after all updates, in order; places beyond it are dropped or clipped.
+
+        The inputs are the array, the indices (..., k) of the windows' first places, and the updates, one window each.
+        """
         x, indices, updates = inputs
         numbers = equation.params["dimension_numbers"]
         indices = narrowed(lowering, indices) if fills(equation) else indices
@@ -66,15 +69,24 @@ def _scatter_by_cases(
 ) -> np.ndarray:
     """Scatter at indices that data decide: at every place where an update may land, select(it lands here, new, old).
 
-    `sizes`: of a window along each axis of the array.
+    Args:
+        lowering: the program.
+        equation: the scatter.
+        op: combines an old and a new number; None where the new one replaces the old.
+        inputs: the array, the indices as JAX has them (not used), and the updates.
+        indices: nodes (..., k) of the windows' first places.
+        sizes: of a window, along each axis of the array.
+
+    Returns:
+        The array after all updates.
     """
-    (x, _, updates), numbers, graph = inputs, equation.params["dimension_numbers"], lowering.graph
+    (x, _indices, updates), numbers, graph = inputs, equation.params["dimension_numbers"], lowering.graph
     removed = (*numbers.inserted_window_dims, *numbers.operand_batching_dims)
     window_axes = [a for a in range(x.ndim) if a not in removed]
-    # Updates with axes (index, window).
+    # The updates with the axes of the indices first, then those of a window.
     along = numbers.update_window_dims
     windows = np.moveaxis(updates, along, range(updates.ndim - len(along), updates.ndim))
-    updated, count = x.copy(), 0
+    updated, count = x.copy(), 0  # of selections
     for row in np.ndindex(*indices.shape[:-1]):
         for start, is_here in _yield_starts(graph, equation, x.shape, sizes, row, indices[row]):
             count += math.prod(sizes)
@@ -95,7 +107,13 @@ def _yield_starts(
 ) -> Iterator[tuple[tuple[int, ...], Node]]:
     """Yield each place where the window of an index may start, and the node of whether it starts there.
 
-    `row` is the number of the index among all, `index` its numbers, one for each axis that an index selects.
+    Args:
+        graph: the program.
+        equation: the scatter.
+        shape: of the array.
+        sizes: of a window, along each axis of the array.
+        row: where the index stands among all, along the leading axes of the indices.
+        index: its nodes, one for each axis of the array that an index selects.
     """
     numbers, clips = equation.params["dimension_numbers"], _clips(equation)
     nodes = dict(zip(numbers.scatter_dims_to_operand_dims, index.tolist(), strict=True))
@@ -111,13 +129,15 @@ def _yield_starts(
         is_here = graph.constant(True, "bool")
         for axis, node in nodes.items():
             last = shape[axis] - sizes[axis]
-            if clips and not last:  # the one place there is
+            if clips and last == 0:  # clipped to the one place there is: always here
                 continue
             # Clipped, the first place stands for all below it, and the last one for all above.
-            op = "eq"
-            if clips and start[axis] in (0, last):
-                op = "ge" if start[axis] else "le"
-            along_axis = graph.node(op, "bool", node, graph.constant(start[axis], node.type))
+            comparison = "eq"
+            if clips and start[axis] == 0:
+                comparison = "le"
+            elif clips and start[axis] == last:
+                comparison = "ge"
+            along_axis = graph.node(comparison, "bool", node, graph.constant(start[axis], node.type))
             is_here = graph.node("and", "bool", is_here, along_axis)
         if is_here.op != "constant" or is_here.value:
             yield start, is_here

@@ -76,12 +76,16 @@ def _iota(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> l
     """Return 0, 1, 2, ... along one axis, the same along the others."""
     shape, axis = result_shape(equation), equation.params["dimension"]
     along = np.arange(shape[axis]).astype(equation.params["dtype"])
-    return [lowering.known(np.broadcast_to(along.reshape([-1 if d == axis else 1 for d in range(len(shape))]), shape))]
+    return [
+        lowering.make_known_array(
+            np.broadcast_to(along.reshape([-1 if d == axis else 1 for d in range(len(shape))]), shape)
+        )
+    ]
 
 
 def _empty(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[Any]:
     """Return the memory that a loop fills, as the transpose of a scan begins with: zeros."""
-    return [lowering.known(np.zeros(result_shape(equation), equation.params["dtype"]))]
+    return [lowering.make_known_array(np.zeros(result_shape(equation), equation.params["dtype"]))]
 
 
 def select_array(graph: Graph, which: Node, cases: list[np.ndarray]) -> np.ndarray:
@@ -98,7 +102,7 @@ def select_array(graph: Graph, which: Node, cases: list[np.ndarray]) -> np.ndarr
 
 def _lower_dynamic_update_slice(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
     """Lower `dynamic_update_slice`: at known starts a copy, at one that data decide a choice among its few places."""
-    x, update, starts = inputs[0], inputs[1], [lowering.scalar(s) for s in inputs[2:]]
+    x, update, starts = inputs[0], inputs[1], [lowering.get_only_node(s) for s in inputs[2:]]
     for axis, start in enumerate(starts):
         last = x.shape[axis] - update.shape[axis]
         if last and start.op != "constant":

@@ -40,82 +40,109 @@ class ContinuedFraction(NamedTuple):
 
 
 def gamma_masses(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Compute the mass below and above x of the gamma law of shape a: P(a, x) and Q(a, x) = 1 - P.
+    """Compute the mass below and above x of the gamma law of shape a: P(a, x) and Q(a, x) = 1 - P, each to its digits.
 
-    P = x^a e^-x / Gamma(a) sum_n x^n / (a (a + 1) ... (a + n)) converges fast below a + 1; above it Q's fraction does,
-    x^a e^-x / Gamma(a) / (x + 1 - a - 1 (1 - a) / (x + 3 - a - 2 (2 - a) / (x + 5 - a - ...))). NaN where a or x is
+    With the density p = x^a e^-x / Gamma(a): up to x = a + 1 P is a series, above it Q is a continued fraction
+    (`_sum_lower_series`, `_evaluate_upper_fraction`); for a > LARGE both are expanded in 1 / a. NaN where a or x is
     below zero.
 
-    Source: Abramowitz and Stegun, Handbook of mathematical functions, 6.5.29 and 6.5.31; Lentz, Generating Bessel
-    functions in Mie scattering calculations using continued fractions (1976).
+    Source: Abramowitz and Stegun, Handbook of mathematical functions, 6.5.29 and 6.5.31.
     """
-    valid = (a > 0) & (x >= 0)
-    large, by_expansion, given_x, at_zero = a > LARGE, gamma_masses_of_large_shape(a, x), x, (a == 0) & (x > 0)
-    a, x = jnp.where(large | ~valid, 1.0, a), jnp.where(large | ~valid, 1.0, x)
-    above = x > a + 1
-    density = jnp.exp(a * jnp.log(x) - x - jax.lax.lgamma(a))
+    is_valid, is_large = (a > 0) & (x >= 0), a > LARGE
+    # Where neither series nor fraction serves, 1 stands for a and x, so that no NaN comes into the loops.
+    shape, place = jnp.where(is_large | ~is_valid, 1.0, a), jnp.where(is_large | ~is_valid, 1.0, x)
+    above = place > shape + 1
+    density = jnp.exp(shape * jnp.log(place) - place - jax.lax.lgamma(shape))
+    lower = density * _sum_lower_series(shape, place, skipped=above)
+    upper = density * _evaluate_upper_fraction(shape, place, serves=above)
+    # The smaller mass as computed, to all its digits; the other one is 1 minus it.
+    p = jnp.where(place == jnp.inf, 1.0, jnp.where(above, 1 - upper, lower))
+    q = jnp.where(above & (place < jnp.inf), upper, 1 - p)
+    expanded_p, expanded_q = gamma_masses_of_large_shape(a, x)
+    use_expansion = is_large & (x < jnp.inf)
+    p, q = jnp.where(use_expansion, expanded_p, p), jnp.where(use_expansion, expanded_q, q)
+    p, q = jnp.where(x == jnp.inf, 1.0, p), jnp.where(x == jnp.inf, 0.0, q)
+    at_zero = (a == 0) & (x > 0)  # a law of shape 0 is all at 0
+    p, q = jnp.where(at_zero, 1.0, p), jnp.where(at_zero, 0.0, q)
+    return jnp.where(is_valid | at_zero, p, jnp.nan), jnp.where(is_valid | at_zero, q, jnp.nan)
 
-    # Below the mean the series; each loop ends at once where the other serves.
+
+def _sum_lower_series(a: jax.Array, x: jax.Array, skipped: jax.Array) -> jax.Array:
+    """Return P(a, x) / (x^a e^-x / Gamma(a)) = sum_n x^n / (a (a + 1) ... (a + n)); 0 where it is skipped.
+
+    It converges fast for x < a + 1.
+    """
+
     def add_term(state: SeriesState) -> SeriesState:
-        shape, term, total = state
-        term = term * x / (shape + 1)
-        return SeriesState(shape + 1, term, total + term)
+        """Add the next term, the last one times x / (a + n); `state.step` is a + n."""
+        denominator, term, total = state
+        term = term * x / (denominator + 1)
+        return SeriesState(denominator + 1, term, total + term)
 
     def has_more_terms(state: SeriesState) -> jax.Array:
+        """Return whether the last term counts: a series that is skipped ends at once."""
         return (state.term > EPSILON * state.total) & (state.step < a + TURNS)
 
-    first = jnp.where(above, 0.0, 1 / a)
-    lower = density * jax.lax.while_loop(has_more_terms, add_term, SeriesState(a, first, first)).total
+    first = jnp.where(skipped, 0.0, 1 / a)
+    return jax.lax.while_loop(has_more_terms, add_term, SeriesState(a, first, first)).total
 
-    # Above it the continued fraction by Lentz's two quotients C and D, from the front.
+
+def _evaluate_upper_fraction(a: jax.Array, x: jax.Array, serves: jax.Array) -> jax.Array:
+    """Return Q(a, x) / (x^a e^-x / Gamma(a)) where x > a + 1, by a continued fraction; elsewhere any number.
+
+    It is 1 / (x + 1 - a - 1 (1 - a) / (x + 3 - a - 2 (2 - a) / (x + 5 - a - ...))), by Lentz's method: the value is a
+    product of C_n D_n, quotients of consecutive numerators and of consecutive denominators.
+
+    Source: Lentz, Generating Bessel functions in Mie scattering calculations using continued fractions (1976).
+    """
+
     def continue_fraction(state: ContinuedFraction) -> ContinuedFraction:
+        """Add the next level: partial numerator n (a - n) over x + 2 n + 1 - a."""
         n, c, d, fraction, _ = state
         numerator, b = n * (a - n), x + 2 * n + 1 - a
         c, d = b + numerator / c, 1 / _keep_from_zero(b + numerator * d)
         return ContinuedFraction(n + 1, _keep_from_zero(c), d, fraction * c * d, jnp.abs(c * d - 1))
 
     def still_changes(state: ContinuedFraction) -> jax.Array:
+        """Return whether the last level changed the value; a fraction that does not serve ends at once."""
         return (state.change > EPSILON) & (state.turn < TURNS)
 
-    start = 1 / jnp.where(above, x + 1 - a, 1.0)
-    state = ContinuedFraction(jnp.ones_like(x), jnp.full_like(x, 1 / TINY), start, start, jnp.where(above, 1.0, 0.0))
-    upper = density * jax.lax.while_loop(still_changes, continue_fraction, state).value
-
-    # Both masses, the smaller one to all its digits.
-    below = jnp.where(x == jnp.inf, 1.0, jnp.where(above, 1 - upper, lower))
-    beyond = jnp.where(above & (x < jnp.inf), upper, 1 - below)
-    p, q = (jnp.where(large & (given_x < jnp.inf), e, y) for e, y in zip(by_expansion, (below, beyond), strict=True))
-    p, q = jnp.where(given_x == jnp.inf, 1.0, p), jnp.where(given_x == jnp.inf, 0.0, q)
-    p, q = jnp.where(at_zero, 1.0, p), jnp.where(at_zero, 0.0, q)  # a law of shape 0 is all at 0
-    return jnp.where(valid | at_zero, p, jnp.nan), jnp.where(valid | at_zero, q, jnp.nan)
+    first = 1 / jnp.where(serves, x + 1 - a, 1.0)
+    start = ContinuedFraction(
+        turn=jnp.ones_like(x), c=jnp.full_like(x, 1 / TINY), d=first, value=first, change=jnp.where(serves, 1.0, 0.0)
+    )
+    return jax.lax.while_loop(still_changes, continue_fraction, start).value
 
 
 def gamma_masses_of_large_shape(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Compute P(a, x) and Q(a, x) of a large shape a, in which the series above would take many terms.
+    """Compute P(a, x) and Q(a, x), the masses of the gamma law of a large shape a below and above x, by expansion.
+
+    A series in powers of x would take many terms.
 
     With y^2 / 2 = m - log(1 + m), m = x / a - 1, y of the sign of m,
     Q = erfc(y root(a / 2)) / 2 + e^(-a y^2 / 2) / root(2 pi a) (c_0(y) + c_1(y) / a + c_2(y) / a^2), P = 1 - Q.
 
     Source: Temme, The asymptotic expansion of the incomplete gamma functions (1979); DLMF 8.12.3, 8.12.4.
     """
-    m = jnp.clip((x - a) / a, -0.9, 3.0)  # beyond, the smaller mass is below all numbers
-    # m - log(1 + m) = m s - 2 (s^3 / 3 + s^5 / 5 + ...), s = m / (2 + m).
+    m = jnp.clip((x - a) / a, -0.9, 3.0)  # beyond these, the smaller mass is below the least number
+    # y^2 / 2 = m - log(1 + m) = m s - 2 s (s^2 / 3 + s^4 / 5 + ...), s = m / (2 + m): near 0, where the difference
+    # would cancel, by the series up to s^26 / 27, whose next term is below rounding for |m| < 0.4.
     s = m / (2 + m)
     tail = jnp.zeros_like(m)
     for n in range(27, 1, -2):
         tail = (tail + 1 / n) * s * s
-    half = jnp.where(jnp.abs(m) < 0.4, m * s - 2 * s * tail, m - jnp.log1p(m))  # y^2 / 2
-    y = jnp.where(m < 0, -1.0, 1.0) * jnp.sqrt(2 * half)
-    # The three coefficients as power series of y.
-    rest = jnp.zeros_like(y)
-    for series in expand_coefficients()[::-1]:
-        value = jnp.zeros_like(y)
-        for c in series[::-1]:
-            value = value * y + c
-        rest = rest / a + value
-    rest = rest * jnp.exp(-a * half) / jnp.sqrt(2 * np.pi * a)
+    half_square = jnp.where(jnp.abs(m) < 0.4, m * s - 2 * s * tail, m - jnp.log1p(m))
+    y = jnp.where(m < 0, -1.0, 1.0) * jnp.sqrt(2 * half_square)
+    # c_0(y) + c_1(y) / a + c_2(y) / a^2 from the last on; each c_k is a power series of y, by Horner's rule.
+    correction = jnp.zeros_like(y)
+    for coefficients in expand_coefficients()[::-1]:
+        c_k = jnp.zeros_like(y)
+        for c in coefficients[::-1]:
+            c_k = c_k * y + c
+        correction = correction / a + c_k
+    correction = correction * jnp.exp(-a * half_square) / jnp.sqrt(2 * np.pi * a)
     z = y * jnp.sqrt(a / 2)
-    return jax.lax.erfc(-z) / 2 - rest, jax.lax.erfc(z) / 2 + rest
+    return jax.lax.erfc(-z) / 2 - correction, jax.lax.erfc(z) / 2 + correction
 
 
 @cache
@@ -147,32 +174,36 @@ def _keep_from_zero(x: jax.Array) -> jax.Array:
 
 
 def scaled_bessel(order: int, x: jax.Array) -> jax.Array:
-    """Compute e^-|x| I_0(x) or e^-|x| I_1(x): a power series up to |x| = 30, beyond it the asymptotic one.
+    """Compute e^-|x| I_v(x), the scaled modified Bessel function of order v = 0 or 1.
 
-    I_v = (x / 2)^v sum_k (x^2 / 4)^k / (k! (k + v)!); of v = 0 and 1 it is e^x / root(2 pi x) (1 + sum_k a_k) with
-    a_k = a_k-1 ((2 k - 1)^2 - 4 v^2) / (8 k x), terms that fall to 1e-26 at 30.
+    Up to |x| = FAR by the power series I_v = (x / 2)^v sum_k (x^2 / 4)^k / (k! (k + v)!); beyond by the asymptotic one,
+    I_v = e^x / root(2 pi x) (1 + sum_k a_k), a_k = a_k-1 ((2 k - 1)^2 - 4 v^2) / (8 k x), whose terms fall to 1e-26.
 
     Source: Abramowitz and Stegun, Handbook of mathematical functions, 9.6.10 and 9.7.1.
     """
     size = jnp.abs(x)
-    large = size > FAR
+    is_far = size > FAR
 
-    # Both series, each term the last one times a ratio, until terms are rounding.
     def add_term(state: SeriesState) -> SeriesState:
+        """Add term k of the series that serves: the last term times a ratio."""
         k, term, total = state
         power_ratio = size * size / (4 * k * (k + order))
-        asymptotic_ratio = ((2 * k - 1) ** 2 - 4 * order**2) / (8 * k * jnp.where(large, size, 1.0))
-        ratio = jnp.where(large, asymptotic_ratio, power_ratio)
+        asymptotic_ratio = ((2 * k - 1) ** 2 - 4 * order**2) / (8 * k * jnp.where(is_far, size, 1.0))
+        ratio = jnp.where(is_far, asymptotic_ratio, power_ratio)
         return SeriesState(k + 1, term * ratio, total + term * ratio)
 
     def has_more_terms(state: SeriesState) -> jax.Array:
+        """Return whether the last term is above rounding."""
         return jnp.abs(state.term) > EPSILON / 8 * state.total
 
-    first = jnp.where(large | (order == 0), 1.0, size / 2)
+    # The term of k = 0 is 1, or (x / 2) of I_1's power series.
+    first = jnp.where(is_far | (order == 0), 1.0, size / 2)
     total = jax.lax.while_loop(has_more_terms, add_term, SeriesState(jnp.ones_like(x), first, first)).total
-    scale = jnp.where(large, 1 / (np.sqrt(2 * np.pi) * jnp.sqrt(jnp.where(large, size, 1.0))), jnp.exp(-size))
+    scale = jnp.where(is_far, 1 / (np.sqrt(2 * np.pi) * jnp.sqrt(jnp.where(is_far, size, 1.0))), jnp.exp(-size))
     value = jnp.where(jnp.isnan(x), jnp.nan, total * scale)
-    return jnp.where(x < 0, -value, jnp.where(x == 0, x, value)) if order else value
+    if order == 0:
+        return value
+    return jnp.where(x < 0, -value, jnp.where(x == 0, x, value))  # I_1 is odd; zeros keep their sign
 
 
 def digamma(x: jax.Array) -> jax.Array:
@@ -213,7 +244,7 @@ def _inline_in_double(
     if avals[0].dtype not in (np.float64, np.float32):
         raise Unsupported(f"{equation.primitive.name} of numbers of type {avals[0].dtype}")
     program = _trace_over(function, len(avals), avals[0].shape)
-    results = lowering.inline(program, [_convert(lowering, "f64", x) for x in inputs])
+    results = lowering.inline_program(program, [_convert(lowering, "f64", x) for x in inputs])
     return [_convert(lowering, type_of(avals[0]), x) for x in results]
 
 

@@ -79,7 +79,7 @@ def _lower_dynamic_slice(lowering: Lowering, equation: JaxprEqn, inputs: list[Va
         return list(RULES["dynamic_slice"](lowering, equation, [lowering.nodes(i) for i in inputs]))
     offset, moves = 0, []
     for axis, start in enumerate(inputs[1:]):
-        first = clamp_place(lowering, lowering.scalar(start), x.shape[axis] - sizes[axis])
+        first = clamp_place(lowering, lowering.get_only_node(start), x.shape[axis] - sizes[axis])
         if isinstance(first, int):
             offset += x.strides[axis] * first
         else:
@@ -89,7 +89,7 @@ def _lower_dynamic_slice(lowering: Lowering, equation: JaxprEqn, inputs: list[Va
 
 def _dynamic_slice_of_nodes(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[Value]:
     """Slice one axis after another, each start clamped so that the slice lies inside; in memory if places are many."""
-    x, sizes, starts = inputs[0], equation.params["slice_sizes"], [lowering.scalar(x) for x in inputs[1:]]
+    x, sizes, starts = inputs[0], equation.params["slice_sizes"], [lowering.get_only_node(x) for x in inputs[1:]]
     for axis, (start, size) in enumerate(zip(starts, sizes, strict=True)):
         last = x.shape[axis] - size
         if start.op != "constant" and last >= FEW:
@@ -124,34 +124,44 @@ def make_indexable(lowering: Lowering, x: Value, places: list[Value]) -> Value:
 
 
 def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Gather one window x[i, j, ...] of an array in memory as a view; other gathers use nodes.
+    """Lower a gather of one window x[i, j, ...] of an array in memory as a view; other gathers use nodes.
 
-    Where the mode fills what is outside, a window that is not inside is replaced by the value.
+    The inputs are the array and the indices (..., k) of the windows' first places.
     """
-    numbers, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
-    axes, indices = numbers.start_index_map, lowering.nodes(inputs[1])
+    numbers, indices = equation.params["dimension_numbers"], lowering.nodes(inputs[1])
     indices = narrowed(lowering, indices) if fills(equation) else indices
     x = make_indexable(lowering, inputs[0], [indices])
-    if not isinstance(x, InMemory) or indices.size != len(axes) or numbers.operand_batching_dims:
+    is_one_window = indices.size == len(numbers.start_index_map) and not numbers.operand_batching_dims
+    if not isinstance(x, InMemory) or not is_one_window:
         return list(RULES["gather"](lowering, equation, [lowering.nodes(i) for i in inputs]))
-    # Where the window starts, clamped to the array: a known offset, and moves by places that data decide.
-    offset, moves, is_inside = 0, [], lowering.graph.constant(True, "bool")
-    for axis, start in zip(axes, indices.ravel().tolist(), strict=True):
+    window, is_inside = _view_window(lowering, equation, x, indices.ravel().tolist())
+    is_known_inside = is_inside.op == "constant" and is_inside.value
+    if not fills(equation) or is_known_inside:
+        return [window]
+    # A window that is not inside is filled with a value.
+    filling, nodes = fill_of(lowering, equation), lowering.nodes(window)
+    return [array_of([select(lowering.graph, is_inside, n, filling) for n in nodes.ravel().tolist()], nodes.shape)]
+
+
+def _view_window(lowering: Lowering, equation: JaxprEqn, x: InMemory, starts: list[Node]) -> tuple[InMemory, Node]:
+    """Return the window of a gather as a view in the result's shape, and the node of whether it is inside the array.
+
+    starts: its first place along each axis of the operation's `start_index_map`; it is clamped to the array.
+    """
+    graph, numbers, sizes = lowering.graph, equation.params["dimension_numbers"], equation.params["slice_sizes"]
+    # Known places add to the offset; those that data decide move the view.
+    offset, moves, is_inside = 0, [], graph.constant(True, "bool")
+    for axis, start in zip(numbers.start_index_map, starts, strict=True):
         last = x.shape[axis] - sizes[axis]
         first = clamp_place(lowering, start, last)
-        is_inside = lowering.graph.node("and", "bool", is_inside, inside(lowering.graph, start, last))
+        is_inside = graph.node("and", "bool", is_inside, inside(graph, start, last))
         if isinstance(first, int):
             offset += x.strides[axis] * first
         else:
             moves.append((x.strides[axis], first))
-    # The window as a view, in the result's shape.
     window_axes = [a for a in range(x.ndim) if a not in numbers.collapsed_slice_dims]
     view = x.view([sizes[a] for a in window_axes], [x.strides[a] for a in window_axes], offset, *moves)
-    window = view.view(result_shape(equation), _match_strides(view, result_shape(equation)))
-    if not fills(equation) or (is_inside.op == "constant" and is_inside.value):
-        return [window]
-    filling, nodes = fill_of(lowering, equation), lowering.nodes(window)
-    return [array_of([select(lowering.graph, is_inside, n, filling) for n in nodes.ravel().tolist()], nodes.shape)]
+    return view.view(result_shape(equation), _match_strides(view, result_shape(equation))), is_inside
 
 
 def _match_strides(view: InMemory, shape: tuple[int, ...]) -> list[int]:

@@ -124,7 +124,7 @@ def erf_inv(x: Vector) -> Vector:
         end = polynomial(root - 3.25, INVERSE[1][::-1])
         return select(middle, end, tail)
 
-    factor = x.body.where_any(w >= 6.25, outer, polynomial(w - 3.125, INVERSE[0][::-1]))
+    factor = x.body.compute_where_needed(w >= 6.25, outer, polynomial(w - 3.125, INVERSE[0][::-1]))
     return x * select(abs(x).equals(1.0), math.inf, factor)
 
 

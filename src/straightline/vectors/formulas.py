@@ -31,7 +31,7 @@ class FormulaBody:
         self.lines.append(f"{name} = {operation}")
         return Vector(self, scalar, name)
 
-    def where_any(self, needed: "Vector", costly: Callable[[], "Vector"], value: "Vector") -> "Vector":
+    def compute_where_needed(self, needed: "Vector", costly: Callable[[], "Vector"], value: "Vector") -> "Vector":
         """Return `costly` where needed, else the value, with a jump past its operations if no lane needs it."""
         start, mark = self.block, len(self.lines)
         truth = self.type("i1")

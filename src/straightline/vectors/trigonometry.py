@@ -104,7 +104,7 @@ def _terms(x: Vector, coefficients: list[float]) -> list[float]:
 
 def _of_any_size(x: Vector, value: Vector, name: str) -> Vector:
     """Return the value where |x| is small enough for it, else that of the scalar library, if a lane needs it."""
-    return x.body.where_any(abs(x) >= LARGEST[x.scalar], lambda: x.body.call(name, x), value)
+    return x.body.compute_where_needed(abs(x) >= LARGEST[x.scalar], lambda: x.body.call(name, x), value)
 
 
 def atan(x: Vector) -> Vector:

@@ -25,7 +25,7 @@ def written(function, x, real="double"):
     arrays = [x.nodes(program.graph) if isinstance(x, InMemory) else x for x in program.outputs]
     results = [node for array in arrays for node in scalars(array)]
     source = CSource(results, {program.inputs[0]: "x[{}]".format}, real, "made")
-    body = source.statements(program.graph.top)
+    body = source.write_statements(program.graph.top)
     stores = [f"    out[{i}] = {source.name(node)};" for i, node in enumerate(results)]
     return [*source.declarations(), *body, *stores], source.table_definitions(), len(results)
 

@@ -53,7 +53,7 @@ def _function(case: Case, name: str) -> tuple[str, str, list[tuple[str, tuple[in
     places = {b: f"x{n}[{{}}]".format for n, b in enumerate(program.inputs)}
     nodes = [scalars(x) if x.size else [] for x in program.outputs]
     source = CSource([n for x in nodes for n in x], places, "double", name)
-    body, arrays, ends, types = source.statements(program.graph.top), [], [], []
+    body, arrays, ends, types = source.write_statements(program.graph.top), [], [], []
     for number, buffer in enumerate(program.inputs):
         array = f"x{number}[{max(buffer.size, 1)}]"
         arrays.append(f"    static {c_type(buffer.type, 'double')} {array};")

@@ -48,9 +48,9 @@ def program_of(cases: Sequence[Case], known: Sequence[bool] = (False,) * 4) -> P
         rows: list[list[Any]] = []
         with jax.enable_x64(True):
             for run in range(case.runs):
-                row = [c.row(run) if isinstance(c, InMemory) else lowering.known(c[run]) for c in columns]
+                row = [c.row(run) if isinstance(c, InMemory) else lowering.make_known_array(c[run]) for c in columns]
                 row = [lowering.nodes(x) if x.size <= TABLE else x for x in row]
-                rows.append(lowering.results(made, row))
+                rows.append(lowering.lower_whole_program(made, row))
         outputs += [_stacked(lowering, leaves) for leaves in zip(*rows, strict=True)]
     return Program(lowering.graph, inputs, outputs, jax.tree.structure([0] * len(outputs)))
 

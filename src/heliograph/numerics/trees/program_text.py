@@ -32,7 +32,7 @@ def text_of(program: ClosedJaxpr) -> str:
 
     A lowered program says the same, and takes as long to write as half of the trace.
     """
-    return _ProgramWriter().lines(program.jaxpr, program.consts)
+    return _ProgramWriter().write_program(program.jaxpr, program.consts)
 
 
 class _ProgramWriter:
@@ -41,7 +41,7 @@ class _ProgramWriter:
     def __init__(self) -> None:
         self._hashes: dict[int, tuple[object, str]] = {}  # by the identity of programs, which are held
 
-    def lines(self, jaxpr: Jaxpr, consts: Sequence[Any]) -> str:
+    def write_program(self, jaxpr: Jaxpr, consts: Sequence[Any]) -> str:
         """Return the lines of a program, its variables numbered in their order."""
         numbers: dict[Var, int] = {}
         head = [
@@ -87,5 +87,5 @@ class _ProgramWriter:
     def _hash(self, program: object, jaxpr: Jaxpr, consts: Sequence[Any]) -> str:
         """Return the hash of an inner program's text, written once."""
         if id(program) not in self._hashes:
-            self._hashes[id(program)] = program, hash_numbers(self.lines(jaxpr, consts))
+            self._hashes[id(program)] = program, hash_numbers(self.write_program(jaxpr, consts))
         return self._hashes[id(program)][1]

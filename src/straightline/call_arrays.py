@@ -1,0 +1,32 @@
+"""Arrays of a call of native code: contiguous numbers of the code's types, and their addresses."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from straightline.llvm.layout import LINE
+from straightline.result_memory import from_line
+
+
+def memory_of(x: Any, dtype: Any) -> np.ndarray:
+    """Return an argument of a call as contiguous numbers of a type; a key of random numbers as its words."""
+    if type(x) is np.ndarray and x.dtype == dtype and x.flags.c_contiguous:
+        return x
+    if isinstance(x, jax.Array) and jax.numpy.issubdtype(x.dtype, jax.dtypes.prng_key):
+        x = jax.random.key_data(x)
+    array = np.asarray(x)
+    if array.dtype.kind not in ("biuf" if np.dtype(dtype).kind == "f" else "biu"):
+        raise ValueError(f"arguments: expected numbers of type {np.dtype(dtype)}, got {array.dtype}")
+    return np.ascontiguousarray(array, dtype=dtype).reshape(array.shape)
+
+
+def addresses(arrays: Sequence[np.ndarray]) -> list[int]:
+    """Return the address of each array's first number."""
+    return [x.__array_interface__["data"][0] for x in arrays]
+
+
+def aligned(size: int) -> np.ndarray:
+    """Return so many bytes of zero, at an address that is a multiple of a cache line."""
+    return from_line(np.zeros(size + LINE, np.uint8))
