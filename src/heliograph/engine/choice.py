@@ -197,25 +197,32 @@ def try_native(make: Callable[[], Code]) -> Code | None:
 def _find_code(
     function: Callable[..., PyTree], arguments: Sequence[PyTree], differs: Sequence[bool], most: int | None = None
 ) -> Choice:
-    """Return code for the structure of a function and its arguments, both of which may be trees with arrays."""
-    # Whether each leaf has an axis of runs; those of the function have none.
+    """Return the native code of a function for arguments of this structure, compiled once, or why there is none.
+
+    Args:
+        function: the function, which may be a tree with arrays itself, as a bound method of a filter is.
+        arguments: trees with arrays.
+        differs: for each argument whether its arrays have a leading axis of runs.
+        most: operations above which there is no code; the compiler's own limit if None.
+    """
     leaves, structure = jax.tree.flatten((function, *arguments))
+    # The same of each leaf; those of the function have no axis of runs.
     leaf_differs = [False] * len(jax.tree.leaves(function))
     for argument, argument_differs in zip(arguments, differs, strict=True):
         leaf_differs += [argument_differs] * len(jax.tree.leaves(argument))
-    # Arrays become arguments of the code; by shape and type, like all other leaves, they are part of the cache's key.
+    # The key of the cache of code: the structure and its leaves, of arrays their shape in one run and their type.
+    # Arrays become arguments of the code; all other leaves are part of it.
     arrays, key_leaves = list[Any](), list[Any]()
-    for leaf, leading_runs in zip(leaves, leaf_differs, strict=True):
+    for leaf, has_runs in zip(leaves, leaf_differs, strict=True):
         if isinstance(leaf, np.ndarray | jax.Array):
             arrays.append(leaf)
-            shape = leaf.shape[1:] if leading_runs else leaf.shape
-            key_leaves.append(_ArrayOfRun(shape, leaf.dtype, leading_runs))
+            shape_of_run = leaf.shape[1:] if has_runs else leaf.shape
+            key_leaves.append(_ArrayOfRun(shape_of_run, leaf.dtype, has_runs))
         else:
             key_leaves.append(leaf)
-    # A leaf without a hash has no key: XLA computes.
     try:
         code, why = _compile_structure(structure, tuple(key_leaves), most)
-    except TypeError as error:
+    except TypeError as error:  # a leaf without a hash has no key: XLA computes
         if "unhashable" not in str(error):
             raise
         return Choice(None, f"the function holds an object that cannot be compared with another: {error}")

@@ -149,18 +149,32 @@ def make_text(
     size: bool = False,
     late: int | None = None,
 ) -> CText:
-    """Return the text of both files of a filter; for `size` the shorter of two forms, in loops and written out."""
-    kind = f"a {type(filter).__name__} in {'double' if real == 'double' else 'single'} precision"
+    """Return the text of both files of a filter in C, its header and its source.
+
+    Args:
+        filter: the filter.
+        received: names of z's components.
+        prefix: of all names in C.
+        real: type of numbers.
+        apart: whether prediction and correction are functions of their own, too.
+        size: whether the source is to be short: the shorter one of two forms, with loops and with loops written out.
+        late: how many steps late a measurement may be; None where there is no window for these.
+
+    Raises:
+        ValueError: single precision for a filter that cannot keep its covariance in it; a number that is beyond it.
+    """
     if real == "float" and not (isinstance(filter, ScheduledFilter) or carries_factors(filter)):
         expected = "a filter that carries its covariance as factors L D L', or a schedule of gains"
         raise fail("single precision", expected, type(filter).__name__)
     exported = filter if real == "double" else filter.for_single_precision()
-    form = TextOptions(prefix, real, received, kind, late)
+    precision, dtype = ("double", np.float64) if real == "double" else ("single", np.float32)
+    kind = f"a {type(filter).__name__} in {precision} precision"
+    form = TextOptions(prefix=prefix, real=real, received=received, kind=kind, late=late)
     texts = list[CText]()
     try:
-        for short in (True, False) if size else (False,):
-            with use_precision(np.float64 if real == "double" else np.float32), write_short_programs(short):
-                program = write_step_program(exported, real, prefix, apart, short)
+        for in_loops in (True, False) if size else (False,):
+            with use_precision(dtype), write_short_programs(in_loops):
+                program = write_step_program(exported, real, prefix, apart, in_loops)
             texts.append(write_c_text(program, form))
     except ValueError as error:
         raise InputError(str(error)) from None  # a number of the filter beyond single precision
@@ -214,6 +228,12 @@ def _write_timer(name: str, received: int, inputs: int, real: Real) -> str:
     """Return a C program that prints the nanoseconds of a step, by the fastest of REPEATS rounds of STEPS steps.
 
     Where a step is refused, as past the end of a schedule, it starts again.
+
+    Args:
+        name: of the filter's header, and the prefix of its functions.
+        received: count of z's components, which get numbers from 0.
+        inputs: count of u's components, which are 0.1.
+        real: type of numbers.
     """
     return f"""#include <stdio.h>
 #include <time.h>

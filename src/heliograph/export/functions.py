@@ -13,7 +13,7 @@ def list_signatures(program: StepProgram, prefix: str, real: Real) -> list[str]:
     start = f"int {prefix}_start_at({state}, const {real} mean[], const {real} covariance[])"
     predict = f"int {prefix}_predict({state}, const {real} u[])"
     correct = f"int {prefix}_correct({state}, const {real} z[], {prefix}_innovation *innovation)"
-    return [*([] if program.at is None else [start]), predict, correct, step]
+    return [*([] if program.start_at is None else [start]), predict, correct, step]
 
 
 def declare_innovation(program: StepProgram, prefix: str, real: Real) -> str:
@@ -41,7 +41,7 @@ def explain_separate_functions(program: StepProgram, prefix: str) -> list[str]:
     ]
     if "weight" in program.parts[1].beside:
         lines.append("weight is how much of each component was used: 1 all, 0 left out.")
-    if program.at is not None:
+    if program.start_at is not None:
         lines += [
             f"{prefix}_start_at starts from another mean and covariance, row by row, in place of {prefix}_start; it",
             "returns 0, or refuses by 7 what is no finite mean or no covariance.",
@@ -50,9 +50,11 @@ def explain_separate_functions(program: StepProgram, prefix: str) -> list[str]:
 
 
 def write_functions(program: StepProgram, prefix: str, real: Real) -> list[str]:
-    """Return the text of the functions that move the state, in the order of `list_signatures`.
+    """Return the text of the functions of C that move the state, in the order of `list_signatures`.
 
-    Each writes the state only where nothing is refused.
+    That is `step` alone, or, of a program in two parts, `start_at` (if the state can be set), `predict`, `correct` and
+    `step`, which calls both. Each returns 0, or the number of a reason to refuse, and writes the state only where
+    nothing is refused.
     """
     heads = list_signatures(program, prefix, real)
     if len(program.parts) == 1:
@@ -74,7 +76,7 @@ def write_functions(program: StepProgram, prefix: str, real: Real) -> list[str]:
         "    *state = after;",
         "    return 0;",
     ]
-    start = [] if program.at is None else [_write_start_statements(program, prefix)]
+    start = [] if program.start_at is None else [_write_start_statements(program, prefix)]
     return [_join_function(head, body) for head, body in zip(heads, [*start, predict, correct, step], strict=True)]
 
 
@@ -97,26 +99,38 @@ def _check_inputs(program: StepProgram) -> list[str]:
 
 
 def _write_part_statements(program: StepProgram, number: int, prefix: str) -> list[str]:
-    """Return the statements that compute a part, refuse an implausible one, and then write all that changed."""
+    """Return the statements of C that compute a part, refuse what is wrong, and then write all that changed.
+
+    `number` is that of the part: of the whole step or the prediction 0, of the correction 1. The codes of refusal, 4 to
+    6, are explained in the header.
+    """
     part, code = program.parts[number], program.computes[number]
+    is_correction = part.name == "correct"
+    flags = [name for name in part.beside if name in ("implausible", "spoilt")]
+    declarations = [
+        f"    {prefix}_state after;",
+        *([f"    {prefix}_innovation news;"] if is_correction else []),
+        *(f"    unsigned char {name}[1];" for name in flags),
+    ]
+    # The call: a number without axes is passed by value, all else as an array.
     read = [f"state->{m.name}" + ("" if m.start.ndim else "[0]") for m in program.read]
     written = [*(f"after.{m.name}" for m in program.members), *(_place_beside(name) for name in part.beside)]
     arguments = [*read, *part.data, _write_step_number(program, part), *written]
-    flags = [name for name in part.beside if name in ("implausible", "spoilt")]
-    corrects = part.name == "correct"
-    # A correction is of the step that was predicted; the others count it.
-    step = "state->step" if corrects else "state->step + 1"
-    return [
-        f"    {prefix}_state after;",
-        *([f"    {prefix}_innovation news;"] if corrects else []),
-        *(f"    unsigned char {name}[1];" for name in flags),
-        f"    {code.name}(\n        " + ",\n        ".join(arguments) + ");",
-        *(["    if (innovation != NULL) { *innovation = news; }"] if corrects else []),
+    call = f"    {code.name}(\n        " + ",\n        ".join(arguments) + ");"
+    checks = [
         *(["    if (spoilt[0] != 0U) { return 6; }"] if "spoilt" in flags else []),
         f"    for (int i = 0; i < {len(program.filter.states)}; ++i) {{",
         f"        if (!isfinite(after.{program.mean}[i])) {{ return 4; }}",
         "    }",
         "    if (implausible[0] != 0U) { return 5; }",
+    ]
+    # A correction is of the step that was predicted; the others count it.
+    step = "state->step" if is_correction else "state->step + 1"
+    return [
+        *declarations,
+        call,
+        *(["    if (innovation != NULL) { *innovation = news; }"] if is_correction else []),
+        *checks,
         *([f"    after.step = {step};"] if program.counts else []),
         "    *state = after;",
     ]
@@ -145,7 +159,7 @@ def _write_start_statements(program: StepProgram, prefix: str) -> list[str]:
     return [
         f"    {prefix}_state after;",
         "    unsigned char none[1];",
-        f"    {program.at.name}(mean, covariance, {members}, none);",
+        f"    {program.start_at.name}(mean, covariance, {members}, none);",
         "    if (none[0] != 0U) { return 7; }",
         *(["    after.step = 0;"] if program.counts else []),
         "    *state = after;",

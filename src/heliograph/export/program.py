@@ -43,7 +43,7 @@ class StepProgram(NamedTuple):
         parts: the whole step, or prediction and correction.
         computes: their functions in C, from `read`, the data and the step's number to `members` and what is beside.
         initial: the function in C that makes the first state.
-        at: the one that makes the state of a mean and a covariance; None of a state that is more than these.
+        start_at: the one that makes the state of a mean and a covariance; None of a state that is more than these.
         mean: name of the member that holds the estimate's mean.
         covariance: name of the member that holds its covariance.
         counts: whether the step's number is part of the state.
@@ -55,7 +55,7 @@ class StepProgram(NamedTuple):
     parts: list[PartOfStep]
     computes: list[Any]
     initial: Any
-    at: Any
+    start_at: Any
     mean: str
     covariance: str
     counts: bool
@@ -70,36 +70,57 @@ class StepProgram(NamedTuple):
 def write_step_program(
     filter: AbstractFilter, real: Real, prefix: str, apart: bool = False, size: bool = False
 ) -> StepProgram:
-    """Write `step` of a filter as a function of C, for numbers of this type; `apart`: as two, predict and correct.
+    """Return one step of a filter as functions of C.
 
-    `size`: in loops, where it is traced within `write_short_programs`.
+    Args:
+        filter: the filter.
+        real: type of numbers in C.
+        prefix: of the functions' names.
+        apart: whether prediction and correction are two functions; else they are one.
+        size: whether loops stay loops; then it is traced within `write_short_programs`.
 
     Raises:
         ValueError: random numbers, or operations that are not supported; with the operation and its place.
     """
     state = filter.init()
-    leaves = jax.tree.leaves(state)
-    named = [StateMember(name, np.asarray(leaf)) for name, leaf in zip(name_state_arrays(state), leaves, strict=True)]
-    read, estimate, parts = list(named), filter.estimate(state), make_parts_of_step(filter, real, apart)
-    named += [StateMember("estimate_mean", np.asarray(estimate.mean))]
-    named += [StateMember("estimate_covariance", np.asarray(estimate.covariance))]
+    leaves, estimate = jax.tree.leaves(state), filter.estimate(state)
+    read = [StateMember(name, np.asarray(leaf)) for name, leaf in zip(name_state_arrays(state), leaves, strict=True)]
+    of_estimate = [
+        StateMember("estimate_mean", np.asarray(estimate.mean)),
+        StateMember("estimate_covariance", np.asarray(estimate.covariance)),
+    ]
+    candidates, parts = [*read, *of_estimate], make_parts_of_step(filter, real, apart)
     try:
         symmetric = _find_symmetric_arrays(parts)
-        wholes = [_write_part(part, symmetric, prefix, real, size) for part in parts]
-        # Mean and covariance of the estimate are members of their own only if they are no arrays of the state.
-        places = [max(_find_same_result(n, whole, named) for whole in wholes) for n in (len(leaves), len(leaves) + 1)]
-        kept = [*range(len(leaves)), *(n for n in places if n >= len(leaves))]
-        members = [named[n] for n in kept]
+        # Mean and covariance of the estimate are members of their own only if they are no arrays of the state: of each,
+        # the number of the first candidate that equals it after every part, the last of these numbers over the parts.
+        with_all = [_write_part(part, symmetric, prefix, real, size) for part in parts]
+        numbers = range(len(read), len(candidates))
+        places = [max(_find_same_result(n, code, candidates) for code in with_all) for n in numbers]
+        kept = [*range(len(read)), *(n for n in places if n >= len(read))]
+        members = [candidates[n] for n in kept]
         computes = [_write_part(part, symmetric, prefix, real, size, kept, (read, members)) for part in parts]
         names, starts = [m.name for m in members], [m.start for m in members]
         initial = to_c(lambda: starts, name=f"{prefix}_initial", single=real == "float", names=((), names))
-        set_anew = isinstance(state, Gaussian | SplitMeanGaussian) and apart
-        at = _write_start_function(filter, kept, names, prefix, real) if set_anew else None
+        # A state that is nothing but a mean and a covariance can be set to others.
+        can_be_set = isinstance(state, Gaussian | SplitMeanGaussian) and apart
+        start_at = _write_start_function(filter, kept, names, prefix, real) if can_be_set else None
     except Unsupported as error:
         raise no_c(error.operation, error.where) from None
-    mean, covariance = (named[n].name for n in places)
-    counts = any(code.arguments[-1].used for code in computes) or filter.horizon is not None
-    return StepProgram(filter, members, read, parts, computes, initial, at, mean, covariance, counts)
+    mean, covariance = (candidates[n].name for n in places)
+    uses_step_number = any(code.arguments[-1].used for code in computes)
+    return StepProgram(
+        filter=filter,
+        members=members,
+        read=read,
+        parts=parts,
+        computes=computes,
+        initial=initial,
+        start_at=start_at,
+        mean=mean,
+        covariance=covariance,
+        counts=uses_step_number or filter.horizon is not None,
+    )
 
 
 def _find_same_result(number: int, code: Any, named: Sequence[StateMember]) -> int:
@@ -121,32 +142,35 @@ def _write_part(
     """Return a part of a step as a function of C; all its arguments but the measurement are finite.
 
     Args:
-        part: the part.
+        part: the part, a function of the state's arrays, the data and the step's number; its results are the state's
+            arrays, the estimate's mean and covariance, and what it has beside these.
         symmetric: which arrays of the state are symmetric.
         prefix: of its name.
         real: type of its numbers.
         size: whether it is to be small, in loops.
         kept: which arrays of state and estimate are results; all by default.
-        names: the members that are read, and those that are results.
+        names: the members that are read, and those that are results; used where `kept` is given.
     """
-    count = len(part.examples[0])
+    count = len(part.examples[0])  # of the state's arrays
+    beside = count + 2
 
     def choose_results(*arguments: Any) -> list[jax.Array]:
         """Return the results that are kept, then those beside state and estimate."""
         results = part.function(*arguments)
-        return results if kept is None else [*(results[n] for n in kept), *results[count + 2 :]]
+        return results if kept is None else [*(results[n] for n in kept), *results[beside:]]
 
-    read, members = ([m.name for m in some] for some in names)
-    # Numbers of the arguments: the arrays of the state, then the data, then the number of the step.
+    array_names: tuple[list[str], list[str]] = ([], [])
+    if kept is not None:
+        read, members = ([m.name for m in some] for some in names)
+        array_names = [*read, *part.data, "step"], [*(f"next_{name}" for name in members), *part.beside]
+    # Numbers of the arguments that are finite: the arrays of the state, all data but z, and the number of the step.
     finite_data = [count + n for n, name in enumerate(part.data) if name != "z"]
     return to_c(
         choose_results,
         *part.examples,
         name=f"{prefix}_compute" if part.name == "step" else f"{prefix}_compute_{part.name}",
         single=real == "float",
-        names=([*read, *part.data, "step"], [*(f"next_{name}" for name in members), *part.beside])
-        if kept is not None
-        else ((), ()),
+        names=array_names,
         finite={*range(count), *finite_data, count + len(part.data)},
         symmetric=symmetric,
         short=size,
@@ -154,9 +178,10 @@ def _write_part(
 
 
 def _write_start_function(filter: AbstractFilter, kept: list[int], names: list[str], prefix: str, real: Real) -> Any:
-    """Return the function of C from mean and covariance to the members, and a flag `none`: these are no such law.
+    """Return the function of C that makes the members of a state from a mean and a covariance.
 
-    A covariance whose factors do not give it back is none: elimination keeps each pivot at zero or above.
+    Its last result, `none`, is a flag: the arguments are no finite mean and no covariance. A matrix that differs from
+    the product of its factors is no covariance, since its elimination keeps each pivot at zero or above.
 
     Args:
         filter: the filter.
@@ -165,19 +190,19 @@ def _write_start_function(filter: AbstractFilter, kept: list[int], names: list[s
         prefix: of the function's name.
         real: type of its numbers.
     """
-    make = centred_from_covariance if isinstance(filter.init(), SplitMeanGaussian) else from_covariance
+    make_state = centred_from_covariance if isinstance(filter.init(), SplitMeanGaussian) else from_covariance
 
     @jax.jit
     def start_from_moments(mean: jax.Array, covariance: jax.Array) -> list[jax.Array]:
         """Return the members of the state of a mean and covariance, and whether these are none."""
-        state = make(mean, covariance)
+        state = make_state(mean, covariance)
         estimate = filter.estimate(state)
         results = [*jax.tree.leaves(state), estimate.mean, estimate.covariance]
         deviations = jnp.sqrt(jnp.abs(jnp.diagonal(covariance)))
         difference = jnp.abs(jnp.asarray(estimate.covariance) - covariance)
-        given_back = jnp.all(difference <= SAME * jnp.outer(deviations, deviations))
-        valid = given_back & jnp.all(jnp.isfinite(mean)) & jnp.all(jnp.isfinite(covariance))
-        return [*(results[n] for n in kept), ~valid]
+        is_covariance = jnp.all(difference <= SAME * jnp.outer(deviations, deviations))
+        is_valid = is_covariance & jnp.all(jnp.isfinite(mean)) & jnp.all(jnp.isfinite(covariance))
+        return [*(results[n] for n in kept), ~is_valid]
 
     n = len(filter.states)
     return to_c(

@@ -50,16 +50,23 @@ class CText(NamedTuple):
 
 
 def write_c_text(program: StepProgram, form: TextOptions) -> CText:
-    """Return header and source of a step."""
+    """Return header and source of a step in C, with its counts of operations and bytes.
+
+    Args:
+        program: the step, as functions of C.
+        form: names and options of the text.
+    """
     prefix, real = form.prefix, form.real
-    # The C type of each member: that of the result "next_<member>".
+    # The struct of the state: (C type, name, count of numbers) of each member, then the step's number. The type of a
+    # member is that of the result "next_<member>".
     types = {x.name.removeprefix("next_"): x.type for x in program.computes[0].results}
     fields = [(types[m.name], m.name, max(m.start.size, 1)) for m in program.members]
     counter = [lay_out_array("int64_t", 1)] if program.counts else []
     state = lay_out_struct([*(lay_out_array(kind, count) for kind, _, count in fields), *counter])
     window = None if form.late is None else write_window(program, form.late, state, prefix, real)
-    starts = [program.initial] if program.at is None else [program.initial, program.at]
-    text = _SOURCE.format(
+    # The source has the computing functions, then those that a device calls.
+    starts = [program.initial] if program.start_at is None else [program.initial, program.start_at]
+    source = _SOURCE.format(
         prefix=prefix,
         comment=f"{prefix}.c: one step of {form.kind}; {prefix}.h says how to use it.",
         functions="\n\n".join(_write_static(code) for code in (*starts, *program.computes)),
@@ -81,7 +88,12 @@ def write_c_text(program: StepProgram, form: TextOptions) -> CText:
         functions="".join(f"{head};\n" for head in heads),
         real=real,
     )
-    return CText(header, text, program.operations, state.size if window is None else window.size)
+    return CText(
+        header=header,
+        source=source,
+        operations=program.operations,
+        state_bytes=state.size if window is None else window.size,
+    )
 
 
 def _write_static(code: Any) -> str:
@@ -107,13 +119,15 @@ def claim_of(filter: AbstractFilter, real: Real) -> Claim:
 
 
 def _write_comment(program: StepProgram, form: TextOptions, window: WindowText | None) -> str:
-    """Return the comment at the head of the header: how to call the functions, and what the arrays hold."""
+    """Return the comment at the head of the header: how to call the functions, and what the arrays hold.
+
+    Args:
+        program: the step, as functions of C.
+        form: names and options of the text.
+        window: the functions for measurements that come late; None where there are none.
+    """
     filter, prefix, claim = program.filter, form.prefix, claim_of(program.filter, form.real)
-    # States that are angles or attitudes say so.
-    circular = first(filter.plant).circular if hasattr(filter, "plant") else ()
-    notes = {filter.states.index(name): " (radians, from -pi to pi)" for name in circular}
-    notes |= dict.fromkeys(filter.attitude, " (of a rotation vector, radians; its errors are turns in the body's axes)")
-    units = [notes.get(i, "") for i in range(len(filter.states))]
+    # Beside each measurement, the range of single precision; "" in double.
     ranges = explain_ranges(filter) if form.real == "float" else [""] * filter.received
     rounding = explain_rounding(filter, any(ranges)) if form.real == "float" else []
     lines = [
@@ -133,7 +147,7 @@ def _write_comment(program: StepProgram, form: TextOptions, window: WindowText |
         "",
         *_explain_entries("z", form.received, ranges),
         *_explain_entries("u", filter.inputs, [""] * len(filter.inputs)),
-        *_explain_entries("mean", filter.states, units),
+        *_explain_entries("mean", filter.states, _explain_angles(filter)),
         f"covariance[{len(filter.states)} * i + j] is that of the errors of mean[i] and mean[j].",
         "All numbers are in the units in which the plant and the sensor were described.",
         *rounding,
@@ -141,7 +155,16 @@ def _write_comment(program: StepProgram, form: TextOptions, window: WindowText |
     ]
     if filter.horizon is not None:
         lines.append(f"Steps: {filter.horizon}, from 0 on.")
+    # A name of the user's may hold the marks of a comment, which would end this one.
     return "\n".join(f" * {visible(line).replace('*/', '* /').replace('/*', '/ *')}".rstrip() for line in lines)
+
+
+def _explain_angles(filter: AbstractFilter) -> list[str]:
+    """Return a note for each state: the unit and range of an angle, what an attitude is; "" for all others."""
+    circular = first(filter.plant).circular if hasattr(filter, "plant") else ()
+    notes = {filter.states.index(name): " (radians, from -pi to pi)" for name in circular}
+    notes |= dict.fromkeys(filter.attitude, " (of a rotation vector, radians; its errors are turns in the body's axes)")
+    return [notes.get(i, "") for i in range(len(filter.states))]
 
 
 def _explain_entries(array: str, names: Sequence[str], notes: Sequence[str]) -> list[str]:

@@ -139,21 +139,28 @@ typedef struct {{
 
 
 def _explain_window(window: Window, prefix: str, bytes_held: int) -> list[str]:
-    """Return lines for the header on the window: what a late measurement is, what it costs, what is refused."""
+    """Return lines for the header on the window: what a late measurement is, what it costs, what is refused.
+
+    Args:
+        window: how many steps it holds, of steps or of times.
+        prefix: of all names.
+        bytes_held: of the window in C.
+    """
     late = f"{prefix}_window_late"
+    # How late: in steps, or as a time where the steps have one.
     if window.time is None:
         when = [
             f"{late} takes a measurement of an earlier step: of the newest one where `steps`",
             f"is 0, of the one before where it is 1, up to {window.steps}. What z has is filled into that step, and",
         ]
-        wrong = ""
+        refused_ages = ""
     else:
         when = [
             f"{late} takes a measurement of a time `age` before the newest step, in the unit of",
             f"{TIME_STEP}. A step of that time, to rounding, is filled; else one is made, with the inputs that led to",
             f"the one after it, whose {TIME_STEP} is divided. At most {window.rows} are held, also of those made, and",
         ]
-        wrong = "by 6 an age that is negative or not finite; "
+        refused_ages = "by 6 an age that is negative or not finite; "
     return [
         "",
         f"Measurements that come late: call {prefix}_window_start and {prefix}_window_step in place of {prefix}_start",
@@ -161,7 +168,7 @@ def _explain_window(window: Window, prefix: str, bytes_held: int) -> list[str]:
         *when,
         "all from it on are run again: the estimate is that of measurements in order, to rounding. Refused is, and",
         "leaves the estimate as it was, by 8 what is before all that is held, counted in `late`; by 9 a component that",
-        f"is there already, counted in `held`; {wrong}and, by the code of {prefix}_step, one",
+        f"is there already, counted in `held`; {refused_ages}and, by the code of {prefix}_step, one",
         "that would have its own step refused, or one after it.",
         f"sizeof({prefix}_window) is {bytes_held:,}. {prefix}_window_step takes the time of one step,",
         f"{late} that of at most {window.places}, or {2 * window.places} where a step is refused.",

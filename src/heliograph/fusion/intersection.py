@@ -33,35 +33,44 @@ def intersect_covariances(
     return means[0] + covariance @ differences, covariance
 
 
-_Progress = tuple[jax.Array, jax.Array, jax.Array, jax.Array]  # weights, multipliers, whether to go on, iteration
+class _Progress(NamedTuple):
+    """State of the interior point method: weights w, multipliers s of w >= 0, whether to go on, count of steps."""
+
+    weights: jax.Array
+    slack: jax.Array
+    goes_on: jax.Array
+    iteration: jax.Array
 
 
 def trace_optimal_weights(information: Float[jax.Array, "count n n"]) -> Float[jax.Array, " count"]:
-    """Return the weights on the simplex that minimise tr (sum w_k J_k)^-1, by a primal-dual interior point method.
+    """Return the weights w >= 0, sum w = 1, that minimise tr P, P = (sum w_k J_k)^-1, for information matrices J_k.
 
-    The gradient is g_k = -tr(P J_k P), and max_k tr(P J_k P) - tr P bounds the excess over the minimum (convexity); the
-    iteration stops when this certificate is below GAP tr P.
+    By a primal-dual interior point method. The gradient is g_k = -tr(P J_k P); since tr P is convex in w, it exceeds
+    its minimum by at most max_k tr(P J_k P) - tr P. The iteration stops when this certificate is below GAP tr P.
     """
     count = information.shape[0]
-    # Unit trace on average, so that the start of the multipliers fits.
+    # In a unit in which traces are 1 on average: the first multipliers below are of that size.
     scaled = information / (jnp.sum(jax.vmap(jnp.trace)(information)) / count)
 
-    def step(carry: _Progress) -> _Progress:
-        w, slack, _, iteration = carry
+    def improve_weights(progress: _Progress) -> _Progress:
+        """Take one Newton step, unless the certificate says that the weights are good enough."""
+        w, slack = progress.weights, progress.slack
         trace, gradient, hessian = _trace_derivatives(scaled, w)
-        # The first multipliers are positive, and nearly those of the gradient.
-        slack = jnp.where(iteration == 0, gradient - jnp.min(gradient) + 0.1 * trace, slack)
-        moved = _take_newton_step(_InteriorPoint(w, slack, gradient, hessian))
-        # Certificate of the excess: weights below it stay where they are.
-        going = jnp.max(-gradient) > (1 + rounding(GAP, trace, LOOP)) * trace
-        w, slack = (jnp.where(going, new, old) for new, old in zip(moved, (w, slack), strict=True))
-        return w, slack, going, iteration + 1
+        # At the optimum s = g - min g: with a tenth of the trace added, the first multipliers are positive.
+        slack = jnp.where(progress.iteration == 0, gradient - jnp.min(gradient) + 0.1 * trace, slack)
+        new_w, new_slack = _take_newton_step(_InteriorPoint(w, slack, gradient, hessian))
+        goes_on = jnp.max(-gradient) > (1 + rounding(GAP, trace, LOOP)) * trace
+        w, slack = jnp.where(goes_on, new_w, w), jnp.where(goes_on, new_slack, slack)
+        return _Progress(weights=w, slack=slack, goes_on=goes_on, iteration=progress.iteration + 1)
+
+    def goes_on(progress: _Progress) -> jax.Array:
+        """Return whether another step is to be taken."""
+        return progress.goes_on & (progress.iteration < ITERATIONS)
 
     # From equal weights, which are inside the simplex.
     w = jnp.full(count, 1 / count)
-    start = w, jnp.zeros_like(w), jnp.asarray(True), jnp.asarray(0)
-    w, *_ = jax.lax.while_loop(lambda c: c[2] & (c[3] < ITERATIONS), step, start)
-    return jnp.asarray(w)
+    start = _Progress(weights=w, slack=jnp.zeros_like(w), goes_on=jnp.asarray(True), iteration=jnp.asarray(0))
+    return jnp.asarray(jax.lax.while_loop(goes_on, improve_weights, start).weights)
 
 
 class _InteriorPoint(NamedTuple):
@@ -90,31 +99,32 @@ def _sum_weighted(w: Float[jax.Array, " count"], information: Float[jax.Array, "
 
 
 def _take_newton_step(point: _InteriorPoint) -> tuple[jax.Array, jax.Array]:
-    """Take one Newton step for g - s + m 1 = 0, sum w = 1, w s = target: eliminate s, then the multiplier m.
+    """Return weights w and multipliers s after one Newton step for g - s + m 1 = 0, sum w = 1, w s = target.
 
-    g is the gradient and s the multipliers of w >= 0. The target follows from where the step with target 0 would end
-    (Mehrotra's predictor and corrector). Returns the new weights and multipliers.
+    g is the gradient, s the multipliers of w >= 0, m that of the sum. The target follows from where the step with
+    target 0 would end (Mehrotra's predictor and corrector).
     """
     w, slack, gradient = point.weights, point.slack, point.gradient
-    root = jnp.sqrt(w)  # scaled by it, the matrix stays well conditioned as weights vanish
-    # Hessian + diag(s / w), scaled to root(w) (.) root(w).
+    # With H the Hessian, s = (target - s dw) / w is eliminated: (H + diag(s / w)) dw + m 1 = target / w - g. In the
+    # unit root(w) of each weight the matrix stays well conditioned as weights vanish.
+    root = jnp.sqrt(w)
     matrix = root[:, None] * point.hessian * root[None] + jnp.diag(slack)
     solve = solver(matrix)
-    ones = root * solve(root[:, None])[:, 0]
+    for_ones = root * solve(root[:, None])[:, 0]  # the solution for a right side of ones
 
-    def direction(target: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return the moves of w and s towards w s = target."""
+    def find_moves(target: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return the moves of w and of s towards w s = target; m is such that the moves of w sum to 0."""
         solved = root * solve((target / root - root * gradient)[:, None])[:, 0]
-        move = solved - jnp.sum(solved) / jnp.sum(ones) * ones
+        move = solved - jnp.sum(solved) / jnp.sum(for_ones) * for_ones
         return move, (target - slack * move) / w - slack
 
     # Predictor: the step with target 0, and the mean of w s before it and where it would end.
     before = jnp.mean(w * slack)
-    move, slack_move = direction(jnp.zeros_like(w))
+    move, slack_move = find_moves(jnp.zeros_like(w))
     after = jnp.mean((w + _longest_step(w, move) * move) * (slack + _longest_step(slack, slack_move) * slack_move))
-    # Corrector: centred, less the predictor's second-order term.
+    # Corrector: towards equal w s, smaller by Mehrotra's (after / before)^3, less the predictor's second-order term.
     target = before * jnp.clip(after / before, 0.0, 1.0) ** 3 - move * slack_move
-    move, slack_move = direction(target)
+    move, slack_move = find_moves(target)
     length = jnp.minimum(_longest_step(w, move), _longest_step(slack, slack_move))
     w = w + length * move
     return w / jnp.sum(w), slack + length * slack_move
@@ -134,29 +144,41 @@ def intersect_inverse_covariances(
     With C = (w P + (1 - w) Q)^-1 and V = (P^-1 + Q^-1 - C)^-1, tr V is convex in w, and its slope is
     -tr(V C (P - Q) C V). The weight is where the slope changes its sign, which is known to rounding; the least trace
     itself is too flat to tell weights apart that differ by 1e-8. Estimates of one covariance have equal weights.
+
+    Args:
+        a: the first mean.
+        p: its covariance P.
+        b: the second mean.
+        q: its covariance Q.
+
+    Returns:
+        The fused mean and its covariance V.
     """
     both = jnp.stack([p, q])
     p_information, q_information = invert_covariances(both)
 
-    def fused(w: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def fuse_covariances(w: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return V and C at the weight w."""
         common = invert_covariances((w * p + (1 - w) * q)[None])[0]
         return invert(p_information + q_information - common), common
 
-    def halve(_: jax.Array, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+    def halve_interval(_: jax.Array, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         """Return the half in which the slope changes its sign; its midpoint alone where the slope is flat there."""
+        low, high = ends
         w = jnp.mean(jnp.stack(ends))
-        covariance, common = fused(w)
+        covariance, common = fuse_covariances(w)
         factor = covariance @ common
+        # The slope, and the size of the terms whose difference it is.
         slope, size = (-jnp.sum((factor @ change) * factor) for change in (p - q, p + q))
-        flat = jnp.abs(slope) <= FLAT * jnp.abs(size)
-        return jnp.where(flat | (slope < 0), w, ends[0]), jnp.where(flat | (slope > 0), w, ends[1])
+        is_flat = jnp.abs(slope) <= FLAT * jnp.abs(size)
+        return jnp.where(is_flat | (slope < 0), w, low), jnp.where(is_flat | (slope > 0), w, high)
 
-    low, high = jax.lax.fori_loop(0, HALVINGS, halve, (jnp.asarray(0.0), jnp.asarray(1.0)))
+    low, high = jax.lax.fori_loop(0, HALVINGS, halve_interval, (jnp.asarray(0.0), jnp.asarray(1.0)))
     # Covariance and mean at the best weight.
     w = (low + high) / 2
-    covariance, common = fused(w)
-    # The weights of the two means sum to I: a and a multiple of the difference, as in `intersect_covariances`.
+    covariance, common = fuse_covariances(w)
+    # V (Q^-1 - (1 - w) C) is the weight of b, and I minus it that of a: the mean is a and a multiple of the difference,
+    # so that large equal means cost no digits.
     mean = a + covariance @ ((q_information - (1 - w) * common) @ (b - a))
     return restore_exact_components(mean, symmetric(covariance), jnp.stack([a, b]), both)
 

@@ -68,29 +68,34 @@ def matrix_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n 
 def solve_factored_weights(
     shared: Float[Array, "node n sources"], independent: Float[Array, "node n n"]
 ) -> Float[jax.Array, "n node n"]:
-    """Compute matrix weights of P = L L' + blockdiag(B_i) with every B_i positive definite, at a cost linear in nodes.
+    """Return the best weights W = (E' P^-1 E)^-1 E' P^-1 of nodes' estimates whose errors have the joint covariance P.
 
-    P^-1 E = B^-1 E - B^-1 L (I + L' B^-1 L)^-1 L' B^-1 E, with E = [I; ...; I].
+    P = L L' + blockdiag(B_i) with every B_i positive definite, and E = [I; ...; I]. By the matrix inversion lemma
+    P^-1 E = B^-1 E - B^-1 L (I + L' B^-1 L)^-1 L' B^-1 E, at a cost linear in the number of nodes.
 
     Args:
-        shared: blocks of L, one for each node.
-        independent: B_i of each node.
+        shared: blocks of L, one for each node: how each of the sources moves the node's error.
+        independent: B_i, the covariance of what else is in each node's error.
+
+    Returns:
+        W, of which W[:, i] multiplies the estimate of node i; these sum to I.
     """
     nodes, n, sources = shared.shape
-    # Whitened by B: L and E.
+    # With B = F F': F^-1 L and F^-1 E.
     factors = jnp.linalg.cholesky(jnp.asarray(independent))
     both = jnp.concatenate([jnp.asarray(shared), jnp.broadcast_to(jnp.eye(n), (nodes, n, n))], axis=-1)
     white = jax.lax.linalg.triangular_solve(factors, both, left_side=True, lower=True).reshape(nodes * n, -1)
     white_l, white_e = white[:, :sources], white[:, sources:]
-    # Matrix inversion lemma, in the number of sources.
+    # F' P^-1 E by the lemma.
     inner = jnp.linalg.cholesky(jnp.eye(sources) + white_l.T @ white_l)
     reduced = white_e - white_l @ jax.scipy.linalg.cho_solve((inner, True), white_l.T @ white_e)
-    # W = (E' P^-1 E)^-1 E' P^-1.
+    # E' P^-1 E, and P^-1 E (nodes, n, n), whose transpose E' P^-1 is (n, nodes n).
     information = white_e.T @ reduced
-    back = jax.lax.linalg.triangular_solve(factors, reduced.reshape(nodes, n, n), left_side=True, lower=True,
-                                           transpose_a=True)  # fmt: skip
-    weights = jnp.linalg.solve(information, jnp.moveaxis(back, 2, 0).reshape(n, -1)).reshape(n, nodes, n)
-    unbiased = jnp.linalg.solve(weights.sum(axis=1), weights.reshape(n, -1))  # what rounding took off the sum
+    solved = jax.lax.linalg.triangular_solve(factors, reduced.reshape(nodes, n, n), left_side=True, lower=True,
+                                             transpose_a=True)  # fmt: skip
+    weights = jnp.linalg.solve(information, jnp.moveaxis(solved, 2, 0).reshape(n, -1)).reshape(n, nodes, n)
+    # Rounding takes the sum of the weights off I: divide by it.
+    unbiased = jnp.linalg.solve(weights.sum(axis=1), weights.reshape(n, -1))
     return jnp.asarray(unbiased.reshape(n, nodes, n))
 
 

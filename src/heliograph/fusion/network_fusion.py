@@ -71,6 +71,12 @@ class Fusion(Module):
         rounds: int = 1,
         alpha: Float[ArrayLike, ""] | None = None,
     ):
+        """Check the arguments, which the class describes, and that they go together.
+
+        `filter` is the name of a filter, `alpha` the threshold of a node that sends only where its estimate changed.
+        Without `neighbours` the fusion is at a centre, to which the uplink belongs; links between nodes, several rounds
+        and the threshold belong to a fusion between neighbours.
+        """
         self.filter = instance("filter of a fusion", filter, str, "its name")
         self.rule = instance("fusion rule", rule, AbstractFusion, "one such as CovarianceIntersection()")
         self.quantizer, self.uplink = quantizer, uplink

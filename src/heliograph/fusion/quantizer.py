@@ -286,6 +286,7 @@ class EscapeQuantizer(AbstractQuantizer):
         smallest: Float[ArrayLike, "*n"],
         interval: int | None = None,
     ):
+        """Check the arguments, which the class describes; even the smallest amplitude must hold all levels apart."""
         self.levels = levels_of(levels)
         if levels % 2 == 0:
             raise fail("levels", "an odd number, so that zero is a level", levels)
@@ -330,26 +331,37 @@ class EscapeQuantizer(AbstractQuantizer):
 
     @in_float64
     def decode(self, state: UplinkState, symbols: UplinkSymbols) -> tuple[UplinkState, Quantized]:
-        """Decode at the receiver: next state and value, from the present state and the symbols alone."""
+        """Return the receiver's next state and the decoded value, from its present state and the symbols alone.
+
+        Args:
+            state: the receiver's, of its amplitude d and the number that it expects next.
+            symbols: m escapes, each of which doubles d; the segment of the value, or that it is above or below all of
+                them, or that nothing is sent; the number of the message; and whether the amplitude restarts.
+        """
         escapes, segment, number, restart = (jnp.asarray(symbol) for symbol in symbols)
-        restart, is_sent, beyond = restart != 0, segment != NOTHING, segment <= BELOW
+        restarts, is_sent, is_beyond = restart != 0, segment != NOTHING, segment <= BELOW
         # A missed number means a wrong amplitude, until a restart.
-        synchronised = restart | (state.number == number)
-        # Midpoint of the segment at the doubled amplitude d 2^m.
-        used = jnp.ldexp(self._present_amplitude(state, restart), escapes)
-        inside = midpoint(segment, used, self.levels)
-        sent = jnp.where(beyond, jnp.where(segment == ABOVE, used, -used), inside)
-        largest = np.finfo(used.dtype).max
-        # Next amplitude max(smallest, decay d 2^m + growth |sent|).
-        following = jnp.clip(self.decay * used + self.growth * jnp.abs(sent), self.smallest, largest)
-        is_decoded = is_sent & synchronised
-        value = jnp.where(is_decoded, sent, jnp.nan)
-        error = jnp.where(is_decoded & ~beyond, used / self.levels, jnp.nan)
-        after = UplinkState(
-            jnp.where(is_decoded, following, state.amplitude),
-            jnp.where(is_sent, jnp.where(synchronised, number + 1, LOST), state.number),
+        is_synchronised = restarts | (state.number == number)
+        # Midpoint of the segment at the doubled amplitude d 2^m; a value beyond all segments counts as +-d 2^m.
+        amplitude = jnp.ldexp(self._present_amplitude(state, restarts), escapes)
+        inside = midpoint(segment, amplitude, self.levels)
+        value = jnp.where(is_beyond, jnp.where(segment == ABOVE, amplitude, -amplitude), inside)
+        # Next amplitude max(smallest, decay d 2^m + growth |value|).
+        largest = np.finfo(amplitude.dtype).max
+        next_amplitude = jnp.clip(self.decay * amplitude + self.growth * jnp.abs(value), self.smallest, largest)
+        is_decoded = is_sent & is_synchronised
+        next_state = UplinkState(
+            amplitude=jnp.where(is_decoded, next_amplitude, state.amplitude),
+            number=jnp.where(is_sent, jnp.where(is_synchronised, number + 1, LOST), state.number),
         )
-        return after, Quantized(value, error, is_decoded & beyond, escapes + 1)
+        # The value, and how far off it may be: half a segment, unknown beyond all of them.
+        decoded = Quantized(
+            value=jnp.where(is_decoded, value, jnp.nan),
+            error=jnp.where(is_decoded & ~is_beyond, amplitude / self.levels, jnp.nan),
+            saturated=is_decoded & is_beyond,
+            symbols=escapes + 1,
+        )
+        return next_state, decoded
 
     def _is_restart(self, number: Int[Array, "*n"]) -> Bool[Array, "*n"]:
         """Return whether the value of this number is sent from the first amplitude again."""

@@ -62,25 +62,31 @@ class SplitIntersection(AbstractIntersection):
             raise fail("known part", f"that of {count} estimates", f"that of {len(self.known)}")
 
     def combine(self, means: Means, covariances: Covariances) -> Fused:
-        """Fuse with the best weights W for P(w) = P^a + blockdiag(P^b_i / w_i), and the best shares w for W.
+        """Return the fused mean and covariance of estimates whose errors are correlated in a known part only.
 
-        P^a is `known`, P^b_i what estimate i has beyond P^a_ii. Both are found in turn: W for P(w), then w_i in
-        proportion to root(tr W_i P^b_i W_i'). The trace of W P(w) W' falls with each.
+        The known parts have the joint covariance P^a (`known`); what covariance estimate i has beyond P^a_ii, P^b_i, is
+        of a part whose correlation with others is unknown. P(w) = P^a + blockdiag(P^b_i / w_i) bounds the joint
+        covariance for all shares w, sum w = 1. Weights W and shares are found in turn: W by least squares for P(w),
+        then w_i in proportion to root(tr W_i P^b_i W_i'). The trace of W P(w) W' falls with each.
+
+        Args:
+            means: of the estimates, (estimate, n).
+            covariances: of their errors, (estimate, n, n).
         """
         known = jnp.asarray(self.known)
         count = len(means)
         items = jnp.arange(count)
-        unknown = _add_rounding(covariances - known[items, :, items, :], covariances)
+        unknown = _add_rounding(covariances - known[items, :, items, :], covariances)  # P^b_i
 
         def bound_joint(shares: jax.Array) -> jax.Array:
             """Return P(w), which bounds the joint covariance for all shares that sum to 1."""
             return known.at[items, :, items, :].add(unknown / shares[:, None, None])
 
         def improve_shares(_: int, shares: jax.Array) -> jax.Array:
-            """Return the best shares for the weights that are the best for these shares."""
+            """Return the best shares for the weights that are the best for these shares; none is below LEAST."""
             weights = matrix_weights(bound_joint(shares))
             root = jnp.sqrt(jnp.maximum(jnp.einsum("aib,ibc,aic->i", weights, unknown, weights), 0.0))
-            total = root.sum()
+            total = root.sum()  # 0 where nothing is unknown: then the shares do not matter
             return jnp.maximum(jnp.where(total > 0, root / jnp.where(total > 0, total, 1.0), shares), LEAST)
 
         # Alternating minimisation from equal shares.
@@ -88,9 +94,9 @@ class SplitIntersection(AbstractIntersection):
         joint = bound_joint(shares / shares.sum())
         weights = matrix_weights(joint)
         # W x and W P(w) W'; NaN if some P^b_i is no covariance.
-        sound = jnp.all(jnp.isfinite(jax.vmap(cholesky)(unknown)))
+        are_covariances = jnp.all(jnp.isfinite(jax.vmap(cholesky)(unknown)))
         mean, covariance = jnp.einsum("aib,ib->a", weights, means), weigh_covariance(weights, joint)
-        return mean, jnp.where(sound, covariance, jnp.nan)
+        return mean, jnp.where(are_covariances, covariance, jnp.nan)
 
 
 def _add_rounding(unknown: jax.Array, covariances: jax.Array) -> jax.Array:

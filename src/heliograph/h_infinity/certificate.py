@@ -61,9 +61,10 @@ def certify_level(
     growth: "Sequence[GrowthFinding]" = (),
     output_growth: "Sequence[GrowthFinding]" = (),
 ) -> "HInfinityCertificate":
-    """Check that gains K guarantee an H-infinity level, given weights P and multipliers that are meant to prove it.
+    """Return whether gains K guarantee an H-infinity level, given weights P and multipliers that are meant to prove it.
 
-    Phi_k < 0 at every step, P_k > 0, level^2 W - P_0 > 0 and multipliers >= 0 together prove
+    With Phi_k the matrix of step k (`theorem_matrix`) and e the error, v and rho the disturbances of plant and channel,
+    W the initial weight: Phi_k < 0 at every step, P_k > 0, level^2 W - P_0 > 0 and multipliers >= 0 together prove
     sum |M e|^2 < level^2 (sum |v|^2 + |rho|^2 + xi_0' W xi_0). A level that rests on a refuted growth constant, or on a
     finding about a constant above the system's, is not certified.
 
@@ -90,22 +91,20 @@ def certify_level(
         raise fail("gains", f"entries of at most {LARGEST:g}", f"{np.max(np.abs(K)):g}")
     P = symmetric_weight("weights", array("weights", weights, (T + 1, 2 * n, 2 * n)))
     lam = _complete_multipliers(array("multipliers", multipliers, (T, None)))
-    # Phi_k of every step, and its largest eigenvalue.
+    # Phi_k < 0 of every step.
     matrices = [theorem_matrix(system, k, K[k], P[k], P[k + 1], lam[k], level) for k in range(T)]
     largest = np.array([_largest_eigenvalue(phi) for phi in matrices])
     negative = np.array([is_negative(phi) for phi in matrices])
-    # Initial condition: level^2 W - P_0 > 0.
+    # Initial condition level^2 W - P_0 > 0, and how far all these are from failing, free of units.
     allowed = level**2 * system.initial_weight
     initial = float(np.linalg.eigvalsh(allowed - P[0])[0])
     initial_margin = smallest_eigenvalue(allowed - P[0], np.sqrt(np.diagonal(allowed)))
-    margin = min(initial_margin, *(-_find_scaled_largest(phi) for phi in matrices))  # from failing, free of units
+    margin = min(initial_margin, *(-_find_scaled_largest(phi) for phi in matrices))
     # Every condition that fails, in words.
-    definite = np.array([smallest_eigenvalue(p) for p in P])
     reasons = [f"step {k}: the largest eigenvalue is {largest[k]:.3g}, not negative" for k in np.flatnonzero(~negative)]
     if not initial_margin > ROUNDING:
         reasons.append(f"initial condition: the smallest eigenvalue of level^2 W - P_0 is {initial:.3g}, not positive")
-    reasons += [f"P_{k} is not positive definite ({definite[k]:.3g})" for k in np.flatnonzero(~(definite > ROUNDING))]
-    reasons += [f"step {k}: a multiplier is negative" for k in np.flatnonzero((lam < 0).any(axis=1))]
+    reasons += _list_wrong_signs(P, lam)
     reasons += _list_objections(system.growth, findings["f"]) + _list_objections(system.output_growth, findings["h"])
     assumed = _list_assumed_constants("f", system.growth, findings["f"])
     assumed += _list_assumed_constants("h", system.output_growth, findings["h"])
@@ -168,6 +167,16 @@ def _list_assumed_constants(letter: str, growth: Growth, findings: Sequence[Grow
     return assumed
 
 
+def _list_wrong_signs(
+    weights: Float[np.ndarray, "times w w"], multipliers: Float[np.ndarray, "steps count"]
+) -> list[str]:
+    """Return in words which weights P_k are not positive definite, and which steps have a negative multiplier."""
+    smallest = np.array([smallest_eigenvalue(p) for p in weights])
+    not_definite = np.flatnonzero(~(smallest > ROUNDING))
+    reasons = [f"P_{k} is not positive definite ({smallest[k]:.3g})" for k in not_definite]
+    return reasons + [f"step {k}: a multiplier is negative" for k in np.flatnonzero((multipliers < 0).any(axis=1))]
+
+
 def theorem_matrix(
     system: GrowthSystem,
     k: int,
@@ -179,39 +188,48 @@ def theorem_matrix(
 ) -> Float[np.ndarray, "q q"]:
     """Return Phi of step k over eta = (x, e, f, f~, h, h~, v, rho): where negative definite, the step keeps the level.
 
-    f~ = f(x) - f(xhat), h~ = h(x) - h(xhat). `weight`: P_k, `following`: P_k+1, `multipliers`: of f, f~, h, h~.
+    x+ = A x + f(x) + B v and z = G (C x + h(x) + D v) + N rho, with H = [G, N] random; e = x - xhat,
+    f~ = f(x) - f(xhat), h~ = h(x) - h(xhat). The next (x, e) is R eta - [0; K] H V eta, V eta = (C x + h + D v, rho),
+    where R eta holds what the filter expects, G-bar (C xhat + h(xhat)), so that Phi needs E[H] and E[H_ab H_ij] and
+    nothing else of the channel. Functions that are zero throughout are left out of eta.
 
-    The next (x, e) is R eta - [0; K] H V eta with H = [G, N] random, V eta = (C x + h + D v, rho) and R eta holding the
-    filter's expectation G-bar (C xhat + h(xhat)), so Phi needs E[H] and E[H_ab H_ij] and nothing else of the channel.
-    Functions that are zero throughout are left out of eta.
+    Args:
+        system: the system.
+        k: the step.
+        gain: K.
+        weight: P_k.
+        following: P_k+1.
+        multipliers: of f, f~, h, h~.
+        level: gamma.
 
     Source: H-infinity fusion over amplify-and-forward relays, equations (8) and (18).
     """
-    A, B, C, D, M = (getattr(system, name)[k] for name in GrowthSystem._fields[:5])
+    A, B, M = system.transition[k], system.disturbance[k], system.target[k]
+    C, D = system.output[k], system.feedthrough[k]
     link, n, y, v = system.channel[k], system.states, system.output.shape[1], system.disturbance.shape[2]
     r, eye = link.disturbances, np.eye
-    # eta = (x, e, f, f~, h, h~, v, rho): where each part begins
-    at = dict(zip("xefghdvr", np.cumsum([0, n, n, n, n, y, y, v]), strict=True))  # g: f~, d: h~, r: rho
+    # Where each part of eta begins, by a letter: g for f~, d for h~, r for rho.
+    at = dict(zip("xefghdvr", np.cumsum([0, n, n, n, n, y, y, v]), strict=True))
     q = 4 * n + 2 * y + v + r
 
-    def row(height: int, **blocks: np.ndarray) -> Float[np.ndarray, "{height} q"]:
+    def rows(height: int, **blocks: np.ndarray) -> Float[np.ndarray, "{height} q"]:
         """Return rows over eta that multiply its parts by these blocks, by the letter of the part."""
         wide = np.zeros((height, q))
         for name, block in blocks.items():
             wide[:, at[name] : at[name] + block.shape[1]] = block
         return wide
 
-    # V eta, E[G] (C xhat + h(xhat)) and R eta
-    signal = np.concatenate([row(y, x=C, h=eye(y), v=D), row(r, r=eye(r))])
-    expected = link.mean[:, :y] @ row(y, x=C, e=-C, h=eye(y), d=-eye(y))  # G-bar (C xhat + h(xhat))
-    values = np.concatenate([row(n, x=A, f=eye(n), v=B), row(n, e=A, g=eye(n), v=B) + gain @ expected])
-    # E |R eta - [0; K] H V eta|^2 in the norm of P_k+1
+    # V eta, E[G] (C xhat + h(xhat)) and R eta.
+    v_eta = np.concatenate([rows(y, x=C, h=eye(y), v=D), rows(r, r=eye(r))])
+    expected = link.mean[:, :y] @ rows(y, x=C, e=-C, h=eye(y), d=-eye(y))
+    r_eta = np.concatenate([rows(n, x=A, f=eye(n), v=B), rows(n, e=A, g=eye(n), v=B) + gain @ expected])
+    # E |R eta - [0; K] H V eta|^2 in the norm of P_k+1.
     correction = np.concatenate([np.zeros_like(gain), gain])
     inner = correction.T @ following @ correction
-    cross = values.T @ following @ correction @ link.mean @ signal
-    square = signal.T @ np.einsum("ai,abij->bj", inner, link.second) @ signal
-    phi = values.T @ following @ values - cross - cross.T + square
-    # - P_k + M'M - level^2 |(v, rho)|^2
+    cross = r_eta.T @ following @ correction @ link.mean @ v_eta
+    square = v_eta.T @ np.einsum("ai,abij->bj", inner, link.second) @ v_eta
+    phi = r_eta.T @ following @ r_eta - cross - cross.T + square
+    # - P_k + M'M - level^2 |(v, rho)|^2, and the growth conditions.
     phi[: 2 * n, : 2 * n] -= weight
     phi[n : 2 * n, n : 2 * n] += M.T @ M
     disturbances = slice(4 * n + 2 * y, q)
@@ -230,18 +248,28 @@ def _add_growth(
 ) -> None:
     """Add to Phi the growth conditions of step k: sum_i lambda_i (a_i^2 |argument_i|^2 - |value_i|^2).
 
-    Of f(x), f~(e), h(x), h~(e) in turn; at: where each part of eta begins; y: number of outputs.
+    They are those of f(x), f~(e), h(x) and h~(e), with the constants a_i of the system.
+
+    Args:
+        phi: Phi, which is changed.
+        at: where each part of eta begins, by its letter (g for f~, d for h~).
+        y: number of outputs.
+        system: the system.
+        k: the step.
+        multipliers: lambda of f, f~, h, h~.
     """
     n, f, h = system.states, system.growth, system.output_growth
+    # Letter of the value, its size, letter of the argument (of n numbers), and the constant.
     conditions = [
         ("f", n, "x", f.state[k]),
-        ("g", n, "e", f.error[k]),  # f~
+        ("g", n, "e", f.error[k]),
         ("h", y, "x", h.state[k]),
-        ("d", y, "e", h.error[k]),  # h~
+        ("d", y, "e", h.error[k]),
     ]
-    for (name, width, of, constant), multiplier in zip(conditions, multipliers, strict=True):
-        value, argument = slice(at[name], at[name] + width), slice(at[of], at[of] + n)
-        phi[value, value] -= multiplier * np.eye(width)
+    for (value_name, size, argument_name, constant), multiplier in zip(conditions, multipliers, strict=True):
+        value = slice(at[value_name], at[value_name] + size)
+        argument = slice(at[argument_name], at[argument_name] + n)
+        phi[value, value] -= multiplier * np.eye(size)
         phi[argument, argument] += multiplier * constant**2 * np.eye(n)
 
 

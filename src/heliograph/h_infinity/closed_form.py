@@ -44,15 +44,23 @@ def known_channel_design(
 
 
 def _run_riccati(system: GrowthSystem, level: float, multipliers: Float[np.ndarray, "steps 2"]) -> HInfinityDesign:
-    """Run the Riccati recursion over the horizon at one level; return a design that ends at a step without a gain."""
+    """Return a design by the Riccati recursion at one level; it ends, infeasible, at a step for which no gain exists.
+
+    The weight before step k is P_k = diag(p I, P2), with a number p for x and a matrix P2 for e.
+
+    Args:
+        system: the system.
+        level: gamma.
+        multipliers: of f~ and h~, in the user's units.
+    """
     n, m, steps = system.states, system.received, system.steps
     # A little below the level, so that the certificate has a margin.
-    inner = level * (1 - SLACK)
-    # P_0 = diag(state I, error I), as large as level^2 W allows for e, small for x: so small that the state's weight
-    # costs next to nothing of the level, whatever B v adds to x.
+    inner_level = level * (1 - SLACK)
+    # P_0: P2 as large as level^2 W allows, and p so small that the weight of x costs next to nothing of the level,
+    # whatever B v adds to x.
     error_weight = level**2 * float(np.linalg.eigvalsh(system.initial_weight)[0]) * (1 - SLACK)
     input_size = float(np.max(np.linalg.norm(system.disturbance, 2, axis=(1, 2))))
-    state = SLACK * min(error_weight, level**2 / (1 + (1 + 1 / SPARE) * input_size**2))
+    state_weight = SLACK * min(error_weight, level**2 / (1 + (1 + 1 / SPARE) * input_size**2))
     design = HInfinityDesign(
         level=level,
         gains=np.full((steps, n, m), np.nan),
@@ -61,16 +69,17 @@ def _run_riccati(system: GrowthSystem, level: float, multipliers: Float[np.ndarr
         feasible=False,
         status="",
     )
-    design.weights[0] = np.diag(np.repeat([state, error_weight], n))
-    # Step by step: K and P2 in closed form, P1 small enough that it does no harm.
+    design.weights[0] = np.diag(np.repeat([state_weight, error_weight], n))
+    # Step by step: K and P2 in closed form, p small enough that it does no harm.
     for k, step in enumerate(step_matrices(system, separate=True)):
-        gain_and_error = _compute_best_gain(system, step, design.weights[k, n:, n:], inner, multipliers[k])
-        if gain_and_error is None:
+        found = _compute_best_gain(system, step, design.weights[k, n:, n:], inner_level, multipliers[k])
+        if found is None:
             text = f"no gain exists at step {k} of {steps} with these multipliers"
             return design._replace(status=text, failed_step=k)
-        design.gains[k], error = gain_and_error
-        state, (multiplier_f, multiplier_h) = _compute_state_weight(system, k, state)
-        design.weights[k + 1] = np.block([[state * np.eye(n), np.zeros((n, n))], [np.zeros((n, n)), error]])
+        design.gains[k], next_error_weight = found
+        state_weight, (multiplier_f, multiplier_h) = _compute_state_weight(system, k, state_weight)
+        no_coupling = np.zeros((n, n))
+        design.weights[k + 1] = np.block([[state_weight * np.eye(n), no_coupling], [no_coupling, next_error_weight]])
         design.multipliers[k] = [multiplier_f, multipliers[k, 0], multiplier_h, multipliers[k, 1]]
     return design._replace(feasible=True, status="optimal")
 
@@ -82,21 +91,33 @@ def _compute_best_gain(
     level: float,
     multipliers: Float[np.ndarray, "2"],
 ) -> tuple[Float[np.ndarray, "n m"], Float[np.ndarray, "n n"]] | None:
-    """Return K* and P2+ = (E S E' - K* U S E')^-1, or None where Q is not positive."""
+    """Return the best gain K* of a step and the largest weight P2+ of e after it, or None where there is no gain.
+
+    Over the part (e, f~, h~, v, rho) of eta: e+ = E eta before the correction, U eta is received less its prediction,
+    and S^-1 is the quadratic form of what a level allows. K* = E S U' (U S U')^-1 and P2+ = (E S E' - K* U S E')^-1.
+
+    Args:
+        system: the system.
+        step: its matrices at this step, of which E is `error` and U `received`.
+        weight: P2 before the step.
+        level: gamma.
+        multipliers: lambda of f~ and h~.
+    """
     errors = slice(system.states, 2 * system.states)
     grows = [not growth.absent for growth in (system.growth, system.output_growth)]
-    # S^-1 over (e, f~, h~, v, rho): Q = P2 - M'M - (lambda_f~ a^2 + lambda_h~ b^2) I of e, then the multipliers
-    form = level**2 * step.energy - step.target - np.diag(multipliers[grows] @ step.growth[1::2])
-    form[errors, errors] += weight
-    if np.linalg.eigvalsh(form[errors, errors])[0] <= 0:
+    # S^-1: P2 - M'M - (lambda_f~ a^2 + lambda_h~ b^2) I of e, the multipliers of f~ and h~, level^2 of v and rho. The
+    # growth forms of differences, f~ and h~, are every second one.
+    inverse_s = level**2 * step.energy - step.target - np.diag(multipliers[grows] @ step.growth[1::2])
+    inverse_s[errors, errors] += weight
+    if np.linalg.eigvalsh(inverse_s[errors, errors])[0] <= 0:
         return None
-    used = np.flatnonzero(np.diag(form))
-    inverse, forward, received = np.linalg.inv(form[np.ix_(used, used)]), step.error[:, used], step.received[:, used]
-    # K* = E S U' (U S U')^-1, P2+^-1 = E S E' - K* U S E'
-    cross, spread = received @ inverse @ forward.T, received @ inverse @ received.T
-    best = np.linalg.lstsq(spread, cross, rcond=None)[0].T
-    next_weight = np.linalg.inv(forward @ inverse @ forward.T - best @ cross)
-    return best, (1 - SLACK) * (next_weight + next_weight.T) / 2
+    used = np.flatnonzero(np.diag(inverse_s))
+    S, E, U = np.linalg.inv(inverse_s[np.ix_(used, used)]), step.error[:, used], step.received[:, used]
+    cross, spread = U @ S @ E.T, U @ S @ U.T
+    solution, *_ = np.linalg.lstsq(spread, cross, rcond=None)
+    gain = solution.T
+    next_weight = np.linalg.inv(E @ S @ E.T - gain @ cross)
+    return gain, (1 - SLACK) * (next_weight + next_weight.T) / 2
 
 
 def _compute_state_weight(system: GrowthSystem, k: int, state: float) -> tuple[float, tuple[float, float]]:

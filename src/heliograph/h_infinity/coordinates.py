@@ -66,42 +66,43 @@ def _symmetrise(a: Float[np.ndarray, "w w"]) -> Float[np.ndarray, "w w"]:
 def scale_steps(
     system: GrowthSystem, steps: list[StepMatrices], gains: Float[np.ndarray, "steps n m"] | None = None
 ) -> tuple[list[StepMatrices], Coordinates]:
-    """Transform the steps to coordinates of order one, near the best predictor's gains or the given `gains`.
+    """Return the steps in coordinates in which all numbers are of order one, and the way back to the user's units.
 
-    Sizes are deviations that disturbances of unit variance, as independent noises, would cause.
+    Scales are deviations of x, e and what is received that disturbances of unit variance, as independent noises, would
+    cause, with the `gains` (or, of None, nearly the best predictor's) in the loop. Errors are about these gains, so
+    that the unknown of a scaled step is a correction of its nominal gain.
     """
     n, nothing_grows = system.states, system.growth.absent and system.output_growth.absent
     # Covariances of x_0 and e_0 from the initial weight.
     initial = np.diag(1 / np.diagonal(system.initial_weight))
     x, e = initial[:n, :n], initial[n:, n:]
-    states, received, forms, scaled, target = [_choose_state_scales(x, e, nothing_grows)], [], [], [], 0.0
-    nominal = steps[0].nominal
-    # Covariances of (x, e) propagated with the nominal gain, and sizes from these.
+    state_scales, received_scales, form_scales = [_choose_state_scales(x, e, nothing_grows)], [], []
+    scaled, largest_target, nominal = list[StepMatrices](), 0.0, steps[0].nominal
     for k, step in enumerate(steps):
+        # Covariances of (x, e) after the step with the nominal gain, and scales from these.
         eta = _compute_eta_covariance(system, k, step, x, e)
-        target = max(target, float(np.trace(step.target @ eta)))
-        x, e, measured, best = _propagate_covariances(step, eta, None if gains is None else gains[k])
-        nominal = best if gains is not None or k == 0 else _keep_gain(nominal, best, measured, e)
-        states.append(_choose_state_scales(x, e, nothing_grows))
-        received.append(_powers_of_four_near(np.sqrt(np.diagonal(measured))))
-        unit = _choose_eta_scales(system, k, step, states[k])
+        largest_target = max(largest_target, float(np.trace(step.target @ eta)))
+        x, e, received, gain = _propagate_covariances(step, eta, None if gains is None else gains[k])
+        nominal = gain if gains is not None or k == 0 else _keep_gain(nominal, gain, received, e)
+        state_scales.append(_choose_state_scales(x, e, nothing_grows))
+        received_scales.append(_powers_of_four_near(np.sqrt(np.diagonal(received))))
+        eta_scales = _choose_eta_scales(system, k, step, state_scales[k])
         # Growth forms to the order of one; they are diagonal, and with growth so are the scales of eta.
-        form = np.max(np.abs(step.growth) * np.diagonal(unit) ** 2, axis=1, initial=0.0)
-        forms.append(np.where(form > 0, form, 1.0))
-        scaled.append(_rescale_step(step, unit, states[k + 1], received[k], forms[k], nominal))
-    if target == 0:
+        size = np.max(np.abs(step.growth) * np.diagonal(eta_scales) ** 2, axis=1, initial=0.0)
+        form_scales.append(np.where(size > 0, size, 1.0))
+        scaled.append(_rescale_step(step, eta_scales, state_scales[k + 1], received_scales[k], form_scales[k], nominal))
+    if largest_target == 0:
         raise fail("wanted matrix", "one that is not zero", "zero at every step")
-    # Levels in units of the largest E |M e|^2.
-    level = float(_nearest_power_of_four(np.sqrt(target)))
-    scaled = [s._replace(target=s.target / level**2) for s in scaled]
+    # Levels in units of the largest root of E |M e|^2.
+    unit = float(_nearest_power_of_four(np.sqrt(largest_target)))
     coordinates = Coordinates(
-        states=np.array(states),
-        received=np.array(received),
-        forms=np.array(forms),
-        unit=level,
+        states=np.array(state_scales),
+        received=np.array(received_scales),
+        forms=np.array(form_scales),
+        unit=unit,
         nothing_grows=nothing_grows,
     )
-    return scaled, coordinates
+    return [s._replace(target=s.target / unit**2) for s in scaled], coordinates
 
 
 def _nearest_power_of_four(size: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
@@ -137,17 +138,24 @@ def _powers_of_four_near(size: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]
 def _compute_eta_covariance(
     system: GrowthSystem, k: int, step: StepMatrices, x: np.ndarray, e: np.ndarray
 ) -> np.ndarray:
-    """Return the covariance of eta = (x, e, f, f~, h, h~, v, rho) with f and h as large as their growth allows."""
+    """Return the covariance of eta = (x, e, f, f~, h, h~, v, rho) with f and h as large as their growth allows.
+
+    x and e are the covariances of x and e before step k; disturbances v and rho have the variance 1, and functions that
+    are absent no part in eta.
+    """
     n, y, q = system.states, system.output.shape[1], len(step.energy)
-    total, at = np.zeros((q, q)), 2 * n
-    total[:n, :n], total[n:at, n:at] = x, e
+    covariance, begin = np.zeros((q, q)), 2 * n
+    covariance[:n, :n], covariance[n:begin, n:begin] = x, e
     for growth, width in ((system.growth, n), (system.output_growth, y)):
-        if not growth.absent:
-            for constant, p in ((growth.state[k], x), (growth.error[k], e)):
-                total[at : at + width, at : at + width] = constant**2 * np.linalg.eigvalsh(p)[-1] * np.eye(width)
-                at += width
-    total[at:, at:] = np.eye(q - at)
-    return total
+        if growth.absent:
+            continue
+        # |f(x)|^2 <= a^2 |x|^2, at most a^2 times the largest variance in any direction.
+        for constant, p in ((growth.state[k], x), (growth.error[k], e)):
+            part = slice(begin, begin + width)
+            covariance[part, part] = constant**2 * np.linalg.eigvalsh(p)[-1] * np.eye(width)
+            begin += width
+    covariance[begin:, begin:] = np.eye(q - begin)
+    return covariance
 
 
 def _propagate_covariances(
@@ -193,24 +201,31 @@ def _choose_eta_scales(system: GrowthSystem, k: int, step: StepMatrices, sizes: 
 
 def _rescale_step(
     step: StepMatrices,
-    unit: np.ndarray,
-    after: np.ndarray,
-    received: np.ndarray,
-    forms: np.ndarray,
+    eta_scales: np.ndarray,
+    state_scales: np.ndarray,
+    received_scales: np.ndarray,
+    form_scales: np.ndarray,
     nominal: np.ndarray,
 ) -> StepMatrices:
     """Return the step in scaled coordinates, with errors about the nominal gain.
 
-    unit: scales of eta; after: of (x, e) after the step; received, forms: of what is received and of growth forms.
+    Args:
+        step: in the user's units.
+        eta_scales: T of eta = T times scaled eta.
+        state_scales: diag(S1, S2), that of (x, e) after the step.
+        received_scales: one number for each that is received.
+        form_scales: one number for each growth form.
+        nominal: the gain about which errors are.
     """
     n = step.state.shape[0]
+    s1, s2, per_received = state_scales[:n, :n], state_scales[n:, n:], received_scales[:, None]
     return StepMatrices(
-        state=np.linalg.solve(after[:n, :n], step.state @ unit),
-        error=np.linalg.solve(after[n:, n:], (step.error - nominal @ step.received) @ unit),
-        received=step.received @ unit / received[:, None],
-        spreads=step.spreads @ unit / received[:, None],
-        target=_symmetrise(unit.T @ step.target @ unit),
-        energy=_symmetrise(unit.T @ step.energy @ unit),
-        growth=step.growth * np.diagonal(unit) ** 2 / forms[:, None],
-        nominal=np.linalg.solve(after[n:, n:], nominal * received),
+        state=np.linalg.solve(s1, step.state @ eta_scales),
+        error=np.linalg.solve(s2, (step.error - nominal @ step.received) @ eta_scales),
+        received=step.received @ eta_scales / per_received,
+        spreads=step.spreads @ eta_scales / per_received,
+        target=_symmetrise(eta_scales.T @ step.target @ eta_scales),
+        energy=_symmetrise(eta_scales.T @ step.energy @ eta_scales),
+        growth=step.growth * np.diagonal(eta_scales) ** 2 / form_scales[:, None],
+        nominal=np.linalg.solve(s2, nominal * received_scales),
     )

@@ -106,19 +106,19 @@ def recursive_design(
     start = None if initial is None else _check_initial_weight(initial, system.states)
     recursion = _Recursion(system, objective, solver, flag("separate", separate))
     search = flag("search", search)
-    # At the given level, or by bisection.
+    # At the given level, if there is one and it works; else the smallest level, by bisection.
     design = None if target is None else recursion.run(target, start)
     if design is not None and (design.feasible or not search):
         return design
-    guess = recursion.coordinates.unit if target is None else target
     tried: dict[float, HInfinityDesign] = {}
 
-    def works(trial: float) -> bool:
+    def is_feasible(trial: float) -> bool:
+        """Return whether the recursion succeeds at a level; keep its design."""
         tried[trial] = recursion.run(trial, start)
         return tried[trial].feasible
 
-    smallest = _bisect_level(works, guess)
-    if design is not None:
+    smallest = _bisect_level(is_feasible, recursion.coordinates.unit if target is None else target)
+    if design is not None:  # the given level fails: it is said which one would not
         return design._replace(smallest_level=smallest)
     if smallest is None:
         raise fail("smallest level", f"one below {SEARCH_LIMIT:g} times the norm of M", "none that works")
@@ -152,9 +152,10 @@ def horizon_design(
     check_choice("solver", solver, Solver)
     n, m = system.states, system.received
     given_gains = None if gains is None else np.asarray(array("gains", gains, (system.steps, n, m)))
-    # Coordinates of order one, and the unknowns of every step.
+    # Coordinates of order one, and the unknowns of every step: a correction of its nominal gain among them, which is
+    # zero where gains are given.
     steps, coordinates = scale_steps(system, step_matrices(system, flag("separate", separate)), given_gains)
-    given_correction = None if given_gains is None else np.zeros((n, m))  # as a correction of the given ones
+    given_correction = None if given_gains is None else np.zeros((n, m))
     layouts = [UnknownsLayout(n, m, len(s.growth), given_correction) for s in steps]
     start = None if initial is None else coordinates.initial_weight(_check_initial_weight(initial, n))
     allowed = coordinates.unit**2 * coordinates.initial_weight(system.initial_weight)
@@ -168,20 +169,19 @@ def horizon_design(
     # The solver's answer must satisfy every step's inequality itself.
     level_part, *step_parts = [np.asarray(values[entries]) for entries in problem.places]
     solved = [layout.unpack(part) for layout, part in zip(layouts, step_parts, strict=True)]
-    square = float(level_part[0])
-    weights = [(1 - MARGIN) * square * allowed if start is None else start, *map(_weigh_state_and_error, solved)]
-    failed = _find_first_failing(steps, solved, weights, square)
+    level_squared = level_part.item()
+    first_weight = (1 - MARGIN) * level_squared * allowed if start is None else start
+    weights = [first_weight, *map(_weigh_state_and_error, solved)]
+    failed = _find_first_failing(steps, solved, weights, level_squared)
     if failed is not None:
         text = f"the solver's answer fails at step {failed} ({status})"
         return _make_unsolved_design(system, separate, float("nan"), text)._replace(failed_step=failed)
     # Back to the user's units.
-    chosen = given_gains
-    if chosen is None:
-        chosen = np.array([coordinates.gain(steps[k].nominal + _gain_correction(u), k) for k, u in enumerate(solved)])
+    found = [coordinates.gain(steps[k].nominal + _gain_correction(u), k) for k, u in enumerate(solved)]
     multipliers = np.array([coordinates.multipliers(u, k) for k, u in enumerate(solved)])
     return HInfinityDesign(
-        level=float(np.sqrt(square)) * coordinates.unit,
-        gains=chosen,
+        level=float(np.sqrt(level_squared)) * coordinates.unit,
+        gains=np.array(found) if given_gains is None else given_gains,
         weights=np.array([coordinates.weight(weight, k) for k, weight in enumerate(weights)]),
         multipliers=all_multipliers(system, multipliers, separate),
         feasible=True,
@@ -214,22 +214,29 @@ class _Recursion:
         self.compiled: list[tuple[StepMatrices, tuple[float, float], np.ndarray | None, StepProblem]] = []
 
     def run(self, level: float, initial: Float[np.ndarray, "w w"] | None) -> HInfinityDesign:
-        """Return the design at one level, feasible or not; every weight on the way is in units of the level squared."""
+        """Return the design at one level, feasible or not.
+
+        Args:
+            level: gamma.
+            initial: P_0 in the user's units; nearly level^2 W, the largest allowed, if None.
+        """
         system, n, coordinates = self.system, self.system.states, self.coordinates
         design = _make_unsolved_design(system, self.separate, level, "")
-        # P_0 in scaled coordinates, and the initial condition. A level squared too small would make it no number.
-        square = (level / coordinates.unit) ** 2
+        # P_0 in scaled coordinates and, as all weights here, in units of the level squared. The square of too small a
+        # level would be no number.
+        level_squared = (level / coordinates.unit) ** 2
         too_low = design._replace(status="the initial condition 0 < P_0 < level^2 W fails", failed_step=0)
-        if square < LARGEST**-2:
+        if level_squared < LARGEST**-2:
             return too_low
         largest = coordinates.unit**2 * coordinates.initial_weight(system.initial_weight)
-        weight = (1 - MARGIN) * largest if initial is None else coordinates.initial_weight(initial) / square
+        weight = (1 - MARGIN) * largest if initial is None else coordinates.initial_weight(initial) / level_squared
         if np.linalg.eigvalsh(largest - weight)[0] <= 0 or np.linalg.eigvalsh(weight)[0] <= 0:
             return too_low
-        design.weights[0] = square * coordinates.weight(weight, 0)
+        design.weights[0] = level_squared * coordinates.weight(weight, 0)
         # Step by step: the inequality, then gain, weight and multipliers in the user's units.
         for k, step in enumerate(self.steps):
-            fixed = step.target / square - step.energy
+            # The part of Phi that is known: M'M / level^2 - |(v, rho)|^2 - P_k.
+            fixed = step.target / level_squared - step.energy
             fixed[: 2 * n, : 2 * n] -= weight
             status, unknowns = self._find_problem(k, weight if k == 0 else None).solve(fixed)
             if unknowns is None or not _inequality_holds(step, unknowns, fixed, SCREEN):
@@ -237,8 +244,8 @@ class _Recursion:
                 return design._replace(status=text, failed_step=k)
             weight = _weigh_state_and_error(unknowns)
             design.gains[k] = coordinates.gain(step.nominal + _gain_correction(unknowns), k)
-            design.weights[k + 1] = square * coordinates.weight(weight, k + 1)
-            multipliers = square * coordinates.multipliers(unknowns, k)
+            design.weights[k + 1] = level_squared * coordinates.weight(weight, k + 1)
+            multipliers = level_squared * coordinates.multipliers(unknowns, k)
             design.multipliers[k] = all_multipliers(system, multipliers, self.separate)
         return design._replace(feasible=True, status="optimal")
 

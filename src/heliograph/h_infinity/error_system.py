@@ -93,7 +93,7 @@ def growth_system(
     output: Varying | None = None,
     initial_weight: "Float[ArrayLike, '...']" = 1.0,
 ) -> "GrowthSystem":
-    """Describe x+ = A x + f(x) + B v, y = C x + h(x) + D v, z = M x behind a channel, for `steps` steps.
+    """Return the description of x+ = A x + f(x) + B v, y = C x + h(x) + D v, z = M x behind a channel.
 
     Each matrix may be an `OverTime` of one for every step. A linear h is given by `output` and growth 0.
 

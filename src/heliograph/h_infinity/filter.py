@@ -109,25 +109,31 @@ def h_infinity_filter(
     if not design.feasible:
         smallest = "" if design.smallest_level is None else f"; the smallest level found is {design.smallest_level:.6g}"
         raise fail("design", "one that is feasible", f"{design.status} at level {design.level:g}{smallest}")
-    # Sizes of plant, sensor and design agree.
-    if instance("plant", first(plant), AbstractPlant, "a plant").attitude:
-        raise fail("plant of an H-infinity filter", WITHOUT_ATTITUDE, list(first(plant).attitude))
-    start, inputs = first(plant), system.output.shape[1]
-    n = len(start.states)
-    if n != system.states or design.gains.shape != (system.steps, n, system.received):
-        raise fail("system", f"{n} states and gains {design.gains.shape}", f"{system.states} states")
-    check_sensor(first(sensor), n)
-    refuse_angles("H-infinity filter", plant, sensor)
-    if len(first(sensor).outputs) != inputs:
-        raise fail("sensor", f"the system's {inputs} outputs", len(first(sensor).outputs))
-    mean = start.initial_mean if initial_mean is None else array("filter's initial mean", initial_mean, (n,))
-    # E[G], by which the filter predicts z.
-    expected = np.array([link.mean[:, :inputs] for link in system.channel])
+    _check_sizes(plant, sensor, system, design)
+    start, outputs = first(plant), system.output.shape[1]
+    shape = (system.states,)
+    mean = start.initial_mean if initial_mean is None else array("filter's initial mean", initial_mean, shape)
+    # E[G], by which the filter predicts z; the other columns of the channel's mean belong to its own disturbances.
+    expected_gain = np.array([link.mean[:, :outputs] for link in system.channel])
     return HInfinityFilter(
         plant=plant,
         sensor=sensor,
         gains=OverTime(design.gains),
-        expected_gain=OverTime(expected),
+        expected_gain=OverTime(expected_gain),
         initial_mean=mean,
         **make_sizes("none", start, system.received),
     )
+
+
+def _check_sizes(plant: AnyPlant, sensor: AnySensor, system: GrowthSystem, design: HInfinityDesign) -> None:
+    """Raise ValueError unless plant, sensor, system and design fit each other, without attitudes and angles."""
+    start = instance("plant", first(plant), AbstractPlant, "a plant")
+    if start.attitude:
+        raise fail("plant of an H-infinity filter", WITHOUT_ATTITUDE, list(start.attitude))
+    n, outputs = len(start.states), system.output.shape[1]
+    if n != system.states or design.gains.shape != (system.steps, n, system.received):
+        raise fail("system", f"{n} states and gains {design.gains.shape}", f"{system.states} states")
+    check_sensor(first(sensor), n)
+    refuse_angles("H-infinity filter", plant, sensor)
+    if len(first(sensor).outputs) != outputs:
+        raise fail("sensor", f"the system's {outputs} outputs", len(first(sensor).outputs))

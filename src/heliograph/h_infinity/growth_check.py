@@ -151,23 +151,35 @@ def check_growth(
         raise fail("region", "a box around 0", f"{bottom.tolist()} and {top.tolist()}")
     tools, random = _SlopesAndRatios(function, float(np.linalg.norm(top - bottom))), np.random.default_rng(seed)
     starts = bottom + (top - bottom) * scipy.stats.qmc.Sobol(len(bottom), seed=seed).random(POINTS)
-
-    # |f(x)| <= a |x| alone: pairs with 0.
-    def pair_with_zero(points: np.ndarray) -> np.ndarray:
-        return np.concatenate([points, np.zeros_like(points)], axis=1)
-
-    if not differences:
-        points = _climb_at_random(lambda x: tools.ratio(pair_with_zero(x)), starts, bottom, top, random)
-        return _make_finding(name, constant, bottom, top, tools, points, pair_with_zero(points), differences)
-    # Largest slope: Sobol points, then random moves from the steepest.
-    points = _climb_at_random(tools.slope, starts, bottom, top, random)
-    # Largest ratio: close pairs along the steepest directions, and pairs far apart.
-    move = tools.steepest(points) * NEARBY * tools.width / 2
-    close = np.concatenate([np.clip(points - move, bottom, top), np.clip(points + move, bottom, top)], axis=1)
-    far = bottom + (top - bottom) * random.random((POINTS, 2, len(bottom)))
-    starts = np.concatenate([close, far.reshape(POINTS, -1)])
-    pairs = _climb_at_random(tools.ratio, starts, np.tile(bottom, 2), np.tile(top, 2), random)
+    if differences:
+        points, pairs = _search_slopes_and_pairs(tools, starts, bottom, top, random)
+    else:  # |f(x)| <= a |x| alone: pairs of a point and 0
+        points = _climb_at_random(lambda x: tools.ratio(_pair_with_zero(x)), starts, bottom, top, random)
+        pairs = _pair_with_zero(points)
     return _make_finding(name, constant, bottom, top, tools, points, pairs, differences)
+
+
+def _pair_with_zero(points: Float[np.ndarray, "points n"]) -> Float[np.ndarray, "points n+n"]:
+    """Return each point with 0 behind it, as a pair."""
+    return np.concatenate([points, np.zeros_like(points)], axis=1)
+
+
+def _search_slopes_and_pairs(
+    tools: _SlopesAndRatios,
+    starts: Float[np.ndarray, "points n"],
+    low: Float[np.ndarray, "n"],
+    high: Float[np.ndarray, "n"],
+    random: np.random.Generator,
+) -> tuple[Float[np.ndarray, "points n"], Float[np.ndarray, "pairs n+n"]]:
+    """Return points of large slopes in the box, and pairs (x, y) of large ratios |f(x) - f(y)| / |x - y|."""
+    # Largest slope: the starts, then random moves from the steepest.
+    points = _climb_at_random(tools.slope, starts, low, high, random)
+    # Largest ratio: close pairs along the steepest directions, and as many pairs of any two points of the box.
+    move = tools.steepest(points) * NEARBY * tools.width / 2
+    close = np.concatenate([np.clip(points - move, low, high), np.clip(points + move, low, high)], axis=1)
+    far = low + (high - low) * random.random((POINTS, 2, len(low)))
+    pairs = np.concatenate([close, far.reshape(POINTS, -1)])
+    return points, _climb_at_random(tools.ratio, pairs, np.tile(low, 2), np.tile(high, 2), random)
 
 
 def _check_function(function: Function, point: Float[np.ndarray, "n"]) -> None:
@@ -248,10 +260,21 @@ def _make_finding(
     pairs: np.ndarray,
     differences: bool,
 ) -> GrowthFinding:
-    """Return the finding from the points and pairs that a search ended at, with a bound unless it is refuted."""
+    """Return the finding from the points and pairs that a search ended at, with a bound unless it is refuted.
+
+    Args:
+        name: of the function.
+        constant: a, the growth constant in question.
+        low: lower corner of the box (n,).
+        high: upper corner of the box (n,).
+        tools: slopes and ratios of the function.
+        points: (points, n), of which the steepest is reported.
+        pairs: (pairs, 2n), x and y of each, of which that of the largest ratio is reported.
+        differences: whether the constant bounds |f(x) - f(y)| / |x - y|; else |f(x)| / |x|.
+    """
     slopes, ratios = tools.slope(points), tools.ratio(pairs)
-    steepest, widest = int(np.argmax(slopes)), int(np.argmax(ratios))
-    x, y = np.split(pairs[widest], 2)
+    steepest, largest_ratio = int(np.argmax(slopes)), int(np.argmax(ratios))
+    x, y = np.split(pairs[largest_ratio], 2)
     finding = GrowthFinding(
         name=name,
         constant=float(constant),
@@ -260,7 +283,7 @@ def _make_finding(
         slope=float(slopes[steepest]),
         point=points[steepest],
         pair=(x, y),
-        ratio=float(ratios[widest]),
+        ratio=float(ratios[largest_ratio]),
         at_zero=tools.at_zero(len(low)),
         bound=None,
         reason="",

@@ -35,16 +35,21 @@ class Interval(NamedTuple):
 
 
 def evaluate(jaxpr: core.ClosedJaxpr, arguments: Sequence[Interval], continuous: bool) -> list[Interval]:
-    """Return the intervals of a traced function's results on intervals of its arguments.
+    """Return intervals that hold a traced function's results wherever its arguments lie in these intervals.
 
-    `continuous`: refuse an open decision, where the function may jump, and a stopped slope, which its derivative lacks.
+    Args:
+        jaxpr: the function, traced by JAX.
+        arguments: an interval for each argument, arrays of lower and upper ends.
+        continuous: refuse a comparison whose outcome the intervals leave open, where the function may jump, and a
+            stopped gradient, which its derivative lacks.
 
     Raises:
-        UnknownError: an operation that is not known here, a decision that is refused.
+        UnknownError: an operation that is not known here, or that is refused.
     """
     values: dict[core.Var, Interval] = {}
 
     def read(atom: core.Var | core.Literal) -> Interval:
+        """Return the interval of a variable, or the point of a literal number."""
         return point_interval(atom.val) if isinstance(atom, core.Literal) else values[atom]
 
     # Intervals of the arguments and constants, then of each operation's results in order.
@@ -55,11 +60,12 @@ def evaluate(jaxpr: core.ClosedJaxpr, arguments: Sequence[Interval], continuous:
         name = equation.primitive.name
         if (called := called_program(equation)) is not None:
             results = evaluate(called, inputs, continuous)
-        elif name == "mul" and equation.invars[0] is equation.invars[1]:
+        elif name == "mul" and equation.invars[0] is equation.invars[1]:  # x x is never below 0, as x y may be
             results = [_square(inputs[0])]
-        elif name == "stop_gradient" and continuous and not np.array_equal(*inputs[0]):
+        elif name == "stop_gradient" and continuous and not np.array_equal(*inputs[0]):  # no point
             raise UnknownError("a slope that is stopped")
-        elif name in MOVES or all(a.low.dtype.kind in "iu" for a in inputs):  # whole numbers are not rounded
+        # What moves entries about, and whole numbers, are not rounded: the ends' results are the ends.
+        elif name in MOVES or all(a.low.dtype.kind in "iu" for a in inputs):
             results = _apply_to_ends(equation, inputs)
         else:
             results = [_apply_operation(equation, inputs, continuous)]
@@ -83,7 +89,13 @@ def round_outward(low: object, high: object, ulps: int = 1) -> Interval:
 
 
 def _apply_operation(equation: Any, x: list[Interval], continuous: bool) -> Interval:
-    """Return the interval of an operation's result on arguments x; UnknownError where it is not known here."""
+    """Return the interval that holds an operation's result on intervals x of its arguments.
+
+    `continuous`: refuse a comparison or sign whose outcome the intervals leave open.
+
+    Raises:
+        UnknownError: an operation that is not known here, or that is refused.
+    """
     name, params = equation.primitive.name, equation.params
     # Arithmetic, and functions of a single number.
     if name in ARITHMETIC:
@@ -94,10 +106,10 @@ def _apply_operation(equation: Any, x: list[Interval], continuous: bool) -> Inte
         case "integer_pow":
             return _raise_interval_to_power(x[0], params["y"])
         case "convert_element_type":
-            kind = np.dtype(params["new_dtype"])
-            if kind.kind not in "fb" and not np.array_equal(x[0].low, x[0].high):
+            dtype, is_point = np.dtype(params["new_dtype"]), np.array_equal(x[0].low, x[0].high)
+            if dtype.kind not in "fb" and not is_point:  # to whole numbers: a jump
                 raise UnknownError("a number made whole")
-            return Interval(x[0].low.astype(kind), x[0].high.astype(kind))
+            return Interval(x[0].low.astype(dtype), x[0].high.astype(dtype))
         case "reduce_sum":
             return _sum_intervals(x[0], tuple(params["axes"]))
         case "dot_general":

@@ -1,5 +1,6 @@
 """Semidefinite programmes of H-infinity design, written for cvxpy, which no other file imports."""
 
+import math
 import warnings
 from collections.abc import Callable
 from types import ModuleType
@@ -93,24 +94,44 @@ class StepProblem:
         sizes: tuple[float, float] = (1.0, 1.0),
         start: Float[np.ndarray, "w w"] | None = None,
     ):
+        """Compile the problem of one step: Phi < 0 with the known part of Phi as a parameter.
+
+        Args:
+            step: the step's matrices in scaled coordinates.
+            layout: where each unknown stands in the vector of unknowns.
+            objective: which of the possible weights after the step is taken.
+            solver: "clarabel" or "scs".
+            sizes: of x and e, in whose units the objective measures.
+            start: the weight before the first step, which may couple x and e; None at all others.
+        """
         cp = import_solvers()
         self.layout, self.solver = layout, solver
         self.unknowns = cp.Variable(layout.size)
         self.fixed = cp.Parameter(step.energy.shape, symmetric=True)
-        # Phi < 0 for each part of eta that is coupled, multipliers >= 0 and [[Z, Y'], [Y, P2]] > 0.
-        forms, q, n = linear_forms(step, layout), len(step.energy), layout.states
-        phi = cp.reshape(forms.next @ self.unknowns, (q, q), order="C") + self.fixed
-        constraints = [self.unknowns[layout.size - layout.multipliers :] >= 0]
-        for coupled in independent_parts(step, forms, start):
-            constraints.append(phi[coupled][:, coupled] << -MARGIN * np.eye(len(coupled)))
-        for form in forms.positive:
-            size = int(np.sqrt(len(form)))
-            constraints.append(cp.reshape(form @ self.unknowns, (size, size), order="C") >> MARGIN * np.eye(size))
+        forms, n = linear_forms(step, layout), layout.states
+        constraints = self._list_constraints(cp, step, forms, start)
         # Objectives on L, one problem after another; `reached`: the best value of the first, which the next keeps.
         weight = cp.reshape(forms.weight @ self.unknowns, (2 * n, 2 * n), order="C")
         self.reached = cp.Parameter()
         goals = _list_goals(cp, objective, [weight[:n, :n], weight[n:, n:]], sizes, self.reached)
         self.problems = [cp.Problem(goal, constraints + more) for goal, more in goals]
+
+    def _list_constraints(
+        self, cp: ModuleType, step: StepMatrices, forms: LinearForms, start: Float[np.ndarray, "w w"] | None
+    ) -> "list[Constraint]":
+        """Return the constraints Phi < 0 of each part of eta that is coupled, multipliers >= 0, and positive matrices.
+
+        Matrices that must be positive definite are linear in the unknowns, such as [[Z, Y'], [Y, P2]].
+        """
+        q, layout = len(step.energy), self.layout
+        phi = cp.reshape(forms.next @ self.unknowns, (q, q), order="C") + self.fixed
+        constraints = [self.unknowns[layout.size - layout.multipliers :] >= 0]
+        for coupled in independent_parts(step, forms, start):
+            constraints.append(phi[coupled][:, coupled] << -MARGIN * np.eye(len(coupled)))
+        for form in forms.positive:
+            size = math.isqrt(len(form))
+            constraints.append(cp.reshape(form @ self.unknowns, (size, size), order="C") >> MARGIN * np.eye(size))
+        return constraints
 
     def solve(self, fixed: Float[np.ndarray, "q q"]) -> tuple[str, Unknowns | None]:
         """Solve with fixed = S - diag(P, 0) at level 1; return the solver's status, and a solution if there is one."""
@@ -140,23 +161,31 @@ def _list_goals(
 ) -> list[tuple["Minimize | Maximize", list["Constraint"]]]:
     """Return the objectives on L = P+^-1, one after another, each with the constraints that express it.
 
-    weights: P1 and P2, of which P+ is made. sizes: of x and e, in whose units L is measured. reached: the value of the
-    objective before, which the next must not give up.
+    Args:
+        cp: the module cvxpy.
+        objective: its name.
+        weights: P1 of x and P2 of e, P+ = diag(P1, P2).
+        sizes: of x and e, in whose units L is measured.
+        reached: the value of the objective before, which the next must not give up.
     """
     if objective == "none":
         return [(cp.Minimize(0), [])]
     if objective == "log_determinant":
         return [(cp.Maximize(sum(cp.log_det(w) for w in weights)), [])]
-    # L >= P+^-1 by a Schur complement
+    # The least tr L, with L >= P+^-1 by a Schur complement: [[L, I], [I, P+]] >= 0.
     eye = np.eye(weights[0].shape[0])
     inverses = [cp.Variable(w.shape, symmetric=True) for w in weights]
-    above = [cp.bmat([[inverse, eye], [eye, w]]) >> 0 for inverse, w in zip(inverses, weights, strict=True)]
-    trace = cp.Minimize(sum(s**2 * cp.trace(inverse) for inverse, s in zip(inverses, sizes, strict=True)))
+    above_inverse = [cp.bmat([[inverse, eye], [eye, w]]) >> 0 for inverse, w in zip(inverses, weights, strict=True)]
+    least_trace = cp.Minimize(sum(s**2 * cp.trace(inverse) for inverse, s in zip(inverses, sizes, strict=True)))
     if objective == "trace":
-        return [(trace, above)]
+        return [(least_trace, above_inverse)]
+    # The least largest eigenvalue of L, that is the largest smallest one of P+; then the least trace that keeps it.
     smallest = cp.Variable()
-    within = [w >> smallest * s**2 * eye for w, s in zip(weights, sizes, strict=True)]
-    return [(cp.Maximize(smallest), within), (trace, [*above, *within, smallest >= reached])]
+    above_smallest = [w >> smallest * s**2 * eye for w, s in zip(weights, sizes, strict=True)]
+    return [
+        (cp.Maximize(smallest), above_smallest),
+        (least_trace, [*above_inverse, *above_smallest, smallest >= reached]),
+    ]
 
 
 class HorizonProblem:
@@ -179,6 +208,14 @@ class HorizonProblem:
         weight: Float[np.ndarray, "w w"],
         initial: Float[np.ndarray, "w w"] | None = None,
     ):
+        """Compile the problem of all steps, whose unknowns are theirs and the level squared, which is minimised.
+
+        Args:
+            steps: each step's matrices in scaled coordinates.
+            layouts: where each unknown of a step stands in the part of the vector that belongs to the step.
+            weight: W, where P_0 <= level^2 W.
+            initial: P_0; if None the largest allowed, nearly level^2 W.
+        """
         cp = import_solvers()
         self.layouts = layouts
         # One vector: the level squared (place 0), then each step's unknowns (places 1, 2, ...).
@@ -186,8 +223,8 @@ class HorizonProblem:
         self.places = [slice(end - size, end) for size, end in zip(sizes, np.cumsum(sizes), strict=True)]
         self.unknowns = cp.Variable(sum(sizes))
         self.constraints: list[Constraint] = []
-        # P_0 is level^2 W, which is linear in an unknown, or fixed and required to be below that. `before` and `fixed`:
-        # the two parts of the weight before a step, the first by place of its unknowns.
+        # The weight before a step is `fixed` plus linear maps of unknowns, `before` by their place. At the start it is
+        # level^2 W, which is linear in an unknown, or P_0, which is fixed and must be below that.
         largest = {0: (1 - MARGIN) * weight.ravel()[:, None]}
         if initial is None:
             before, fixed = largest, np.zeros_like(weight)
@@ -198,12 +235,16 @@ class HorizonProblem:
         forms: LinearForms | None = None
         # Every step's inequality, from the weight before it to its own.
         for k, (step, layout) in enumerate(zip(steps, layouts, strict=True)):
-            if forms is None or layout.gain is not None or not all(map(np.array_equal, step, steps[k - 1])):
+            # The forms of the step before serve an equal step with free gains.
+            is_like_last = forms is not None and layout.gain is None and all(map(np.array_equal, step, steps[k - 1]))
+            if forms is None or not is_like_last:
                 forms = linear_forms(step, layout)
             self._add_step(k, step, forms, before, fixed, start)
-            self.constraints.append(self.unknowns[self.places[k + 1]][layout.size - layout.multipliers :] >= 0)
+            multipliers = self.unknowns[self.places[k + 1]][layout.size - layout.multipliers :]
+            self.constraints.append(multipliers >= 0)
             before, fixed, start = {k + 1: forms.weight}, np.zeros_like(weight), None
-        self.problem = cp.Problem(cp.Minimize(self.unknowns[0]), self.constraints)
+        level_squared = self.unknowns[0]
+        self.problem = cp.Problem(cp.Minimize(level_squared), self.constraints)
 
     def _add_step(
         self,
@@ -214,13 +255,19 @@ class HorizonProblem:
         fixed: Float[np.ndarray, "w w"],
         start: Float[np.ndarray, "w w"] | None,
     ) -> None:
-        """Add -Phi >= MARGIN level^2 of step k for each part of eta that is coupled.
+        """Add the inequality -Phi >= MARGIN level^2 of step k, and that its positive matrices are positive.
 
-        The weight before is `fixed` plus the linear maps `before` of the unknowns, by place; `start`: an initial weight
-        that may couple x and e, at the first step.
+        Args:
+            k: the step; its unknowns are at place k + 1, the level squared at place 0.
+            step: its matrices in scaled coordinates.
+            forms: matrices of the step as linear maps of its unknowns.
+            before: the weight before the step as linear maps of unknowns, by their place.
+            fixed: what of that weight is known.
+            start: an initial weight that may couple x and e, at the first step; else None.
         """
         q, width = len(step.energy), len(fixed)
-        # -Phi = level^2 energy - target + weight before - next energy, part by part
+        # -Phi = level^2 energy - target + weight before - next energy, for each part of eta that is coupled. `entries`:
+        # the places of the part's matrix in the flat q x q one.
         constant = -step.target
         constant[:width, :width] += fixed
         for coupled in independent_parts(step, forms, start):
@@ -233,7 +280,7 @@ class HorizonProblem:
             self._require_semidefinite(blocks, constant[np.ix_(coupled, coupled)])
         # Positive matrices of the unknowns.
         for form in forms.positive:
-            size = int(np.sqrt(len(form)))
+            size = math.isqrt(len(form))
             self._require_semidefinite(
                 {0: -MARGIN * np.eye(size).ravel()[:, None], k + 1: form}, np.zeros((size, size))
             )

@@ -80,35 +80,35 @@ def all_multipliers(
 def _make_step_matrices(
     system: GrowthSystem, k: int, spreads: Float[np.ndarray, "spreads m _"], separate: bool
 ) -> StepMatrices:
-    """Return the matrices of step k; `spreads`: the random part of (G, N) as a sum of independent matrices."""
-    A, B, C, D, M = (getattr(system, name)[k] for name in GrowthSystem._fields[:5])
-    link, n, y, m = system.channel[k], system.states, system.output.shape[1], system.received
-    f_width, h_width = 0 if system.growth.absent else n, 0 if system.output_growth.absent else y
-    # eta = (x, e, f, f~, h, h~, v, rho) without absent functions.
-    widths = [n, n, f_width, f_width, h_width, h_width, B.shape[1], link.disturbances]
-    places = (slice(end - width, end) for width, end in zip(widths, np.cumsum(widths), strict=True))
-    x, e, f, f_error, h, h_error, v, rho = places
-    q, eye = sum(widths), np.eye(n)[:, :f_width]
+    """Return the matrices of step k over eta = (x, e, f, f~, h, h~, v, rho), without functions that are absent.
+
+    Args:
+        system: x+ = A x + f(x) + B v, what is received G (C x + h(x) + D v) + N rho, and the target M e.
+        k: the step.
+        spreads: the random part of (G, N) as a sum of independent matrices, (matrix, m, y + size of rho).
+        separate: whether each of f, f~, h, h~ has a multiplier of its own; else f and f~ share one, and h and h~.
+    """
+    A, B, M = system.transition[k], system.disturbance[k], system.target[k]
+    C, D = system.output[k], system.feedthrough[k]
+    n, y, m, link = system.states, system.output.shape[1], system.received, system.channel[k]
+    eta = _locate_parts_of_eta(system, k)
+    q, of_f, of_h = eta.rho.stop, slice(0, eta.f.stop - eta.f.start), slice(0, eta.h.stop - eta.h.start)
     # x+ = A x + f + B v, and e+ = A e + f~ + B v before the correction.
     state, error = np.zeros((n, q)), np.zeros((n, q))
-    state[:, x], state[:, f], state[:, v] = A, eye, B
-    error[:, e], error[:, f_error], error[:, v] = A, eye, B
+    state[:, eta.x], state[:, eta.f], state[:, eta.v] = A, np.eye(n)[:, of_f], B
+    error[:, eta.e], error[:, eta.f_error], error[:, eta.v] = A, np.eye(n)[:, of_f], B
     # Received less its prediction: E[G] (C e + h~ + D v) + E[N] rho, and the random part of G (C x + h + D v) + N rho.
-    gain, noise = link.mean[:, :y], link.mean[:, y:]
+    G, N = link.mean[:, :y], link.mean[:, y:]
     mean = np.zeros((m, q))
-    mean[:, e], mean[:, h_error], mean[:, v], mean[:, rho] = gain @ C, gain[:, :h_width], gain @ D, noise
+    mean[:, eta.e], mean[:, eta.h_error], mean[:, eta.v], mean[:, eta.rho] = G @ C, G[:, of_h], G @ D, N
+    G, N = spreads[..., :y], spreads[..., y:]
     random = np.zeros((len(spreads), m, q))
-    gain, noise = spreads[..., :y], spreads[..., y:]
-    random[..., x], random[..., h], random[..., v], random[..., rho] = gain @ C, gain[..., :h_width], gain @ D, noise
+    random[..., eta.x], random[..., eta.h], random[..., eta.v] = G @ C, G[..., of_h], G @ D
+    random[..., eta.rho] = N
     # M'M and the disturbances' energy as quadratic forms.
     target, energy = np.zeros((q, q)), np.zeros((q, q))
-    target[e, e] = M.T @ M
-    energy[v, v], energy[rho, rho] = np.eye(v.stop - v.start), np.eye(rho.stop - rho.start)
-    # Growth conditions (value, argument, constant), those with one multiplier in a list.
-    of_f = [(f, x, system.growth.state[k]), (f_error, e, system.growth.error[k])]
-    of_h = [(h, x, system.output_growth.state[k]), (h_error, e, system.output_growth.error[k])]
-    pairs = ([of_f] if f_width else []) + ([of_h] if h_width else [])
-    groups = [[condition] for pair in pairs for condition in pair] if separate else pairs
+    target[eta.e, eta.e] = M.T @ M
+    energy[eta.v, eta.v], energy[eta.rho, eta.rho] = np.eye(B.shape[1]), np.eye(link.disturbances)
     return StepMatrices(
         state=state,
         error=error,
@@ -116,9 +116,49 @@ def _make_step_matrices(
         spreads=random,
         target=target,
         energy=energy,
-        growth=np.array([_make_growth_form(q, group) for group in groups]).reshape(-1, q),
+        growth=_list_growth_forms(system, k, eta, separate),
         nominal=np.zeros((n, m)),
     )
+
+
+class _PartsOfEta(NamedTuple):
+    """The place of each part of eta = (x, e, f, f~, h, h~, v, rho); that of an absent function is empty."""
+
+    x: slice
+    e: slice
+    f: slice
+    f_error: slice
+    h: slice
+    h_error: slice
+    v: slice
+    rho: slice
+
+
+def _locate_parts_of_eta(system: GrowthSystem, k: int) -> _PartsOfEta:
+    """Return the place of each part of eta at step k."""
+    n, y = system.states, system.output.shape[1]
+    f, h = 0 if system.growth.absent else n, 0 if system.output_growth.absent else y
+    sizes = [n, n, f, f, h, h, system.disturbance.shape[2], system.channel[k].disturbances]
+    ends = np.cumsum(sizes).tolist()
+    return _PartsOfEta(*(slice(end - size, end) for size, end in zip(sizes, ends, strict=True)))
+
+
+def _list_growth_forms(
+    system: GrowthSystem, k: int, eta: _PartsOfEta, separate: bool
+) -> Float[np.ndarray, "multipliers q"]:
+    """Return the diagonals of the growth forms of step k, one for each multiplier.
+
+    Conditions |value| <= constant |argument| on f and f~, on h and h~; `separate`: each has a multiplier of its own.
+    """
+    growth, output_growth = system.growth, system.output_growth
+    pairs = []
+    if not growth.absent:
+        pairs.append([(eta.f, eta.x, growth.state[k]), (eta.f_error, eta.e, growth.error[k])])
+    if not output_growth.absent:
+        pairs.append([(eta.h, eta.x, output_growth.state[k]), (eta.h_error, eta.e, output_growth.error[k])])
+    groups = [[condition] for pair in pairs for condition in pair] if separate else pairs
+    q = eta.rho.stop
+    return np.array([_make_growth_form(q, group) for group in groups]).reshape(-1, q)
 
 
 def _make_growth_form(q: int, parts: list[tuple[slice, slice, float]]) -> Float[np.ndarray, "{q}"]:

@@ -81,47 +81,66 @@ def lift_modes(
         projection: matrix that reads x off Y.
 
     E[Y+ 1{j}] = sum_i Pi_ij M Y 1{i} and E[Z | Y, modes] = sum_j K_j Y 1{j}, with M and K_j the moments of the plant
-    and of the route in mode j. Noises, with B = E[Y Y']:
+    and of the route in mode j. Noises, with B = E[Y Y'] and x the Kronecker product:
     Cov(w) = sum_i p_i (diag(Pi_i) - Pi_i' Pi_i) x M B M' + diag(p+) x (B+ - M B M'),
     Cov(v) = sum_j p_j (E[Z Z' | j] - K_j B+ K_j').
     """
     n, modes = plants[0].inputs, len(measurements[0].initial)
-    law, rows = np.asarray(measurements[0].initial), np.eye(modes)
-    before = products_of_monomials(moments, n + 1, degree)
-    mean = np.kron(law, before[:, -1])
-    start = np.kron(np.diag(law), before) - np.outer(mean, mean)
+    # p and Pi of the next step. The modes of the first step have the initial law, and their chain has not moved yet.
+    law, chain = np.asarray(measurements[0].initial), np.eye(modes)
+    second = products_of_monomials(moments, n + 1, degree)  # B
+    mean = np.kron(law, second[:, -1])
+    start = np.kron(np.diag(law), second) - np.outer(mean, mean)
     # Matrices of each distinct measurement and plant once.
-    steps, roundings, earlier = list[Steps](), list[tuple[np.ndarray, np.ndarray]](), law
     distinct = {id(measurement): measurement for measurement in measurements}
     varies = len(distinct) > 1
-    of_modes = {i: [LiftedMap(m, degree, varies) for m in measurement.maps] for i, measurement in distinct.items()}
-    of_plant = {identity: np.asarray(p.moments(degree).matrix) for identity, p in {id(p): p for p in plants}.items()}
+    lifts_by_id = {i: [LiftedMap(m, degree, varies) for m in measurement.maps] for i, measurement in distinct.items()}
+    matrix_by_id = {i: np.asarray(p.moments(degree).matrix) for i, p in {id(p): p for p in plants}.items()}
     # Where nothing varies, and the moments and the law have come to stay, all later steps are as the last, to rounding.
-    steady = SteadyMoments(np.asarray(plants[0].matrix), 2 * degree, varies or len(of_plant) > 1)
+    steady = SteadyMoments(np.asarray(plants[0].matrix), 2 * degree, varies or len(matrix_by_id) > 1)
+    steps, roundings, last_law = list[Steps](), list[tuple[np.ndarray, np.ndarray]](), law
     for k, (plant, measurement) in enumerate(zip(plants, measurements, strict=True)):
-        if steady.is_steady(moments) and np.array_equal(law, earlier) and k > 1:
+        if steady.is_steady(moments) and np.array_equal(law, last_law) and k > 1:
             break
-        earlier = law
-        moved, lifts = of_plant[id(plant)], of_modes[id(measurement)]
+        last_law = law
         with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused
             moments = np.asarray(push_moments(plant, 2 * degree, moments))
         check_finite_moments(moments, k, 2 * degree)
-        # Process noise: what the mode's draw adds, and the plant's.
-        after, carried = products_of_monomials(moments, n + 1, degree), moved @ before @ moved.T
-        unchosen = np.eye(modes)[None] - rows[:, None, :]
-        chosen = np.einsum("i,ij,ijl->jl", law, rows, unchosen)
-        law = _keep_if_unchanged(law, law @ rows)
-        process = np.kron(chosen, carried) + np.kron(np.diag(law), after - carried)
+        next_second = products_of_monomials(moments, n + 1, degree)
+        matrix, lifts = matrix_by_id[id(plant)], lifts_by_id[id(measurement)]
+        process, law = _spread_modes(law, chain, matrix @ second @ matrix.T, next_second)
         noise, rounding_of_noise = _average_noise(law, lifts, moments)
         output = np.concatenate([lift.matrix for lift in lifts], axis=1)[:-1]
         no_drift, no_offset = np.zeros(len(mean)), np.zeros(len(output))
-        steps.append(Steps(np.kron(rows.T, moved), no_drift, process, output, no_offset, noise))
-        roundings.append((EPS * np.kron(law, np.diag(after)), rounding_of_noise))
-        before, rows = after, np.asarray(measurement.transition)
+        steps.append(Steps(np.kron(chain.T, matrix), no_drift, process, output, no_offset, noise))
+        roundings.append((EPS * np.kron(law, np.diag(next_second)), rounding_of_noise))
+        second, chain = next_second, np.asarray(measurement.transition)
     over_time = Steps(*(repeat_last(values, len(plants)) for values in zip(*steps, strict=True)))
     process_rounding, received_rounding = (repeat_last(values, len(plants)) for values in zip(*roundings, strict=True))
     whole = np.tile(projection, (1, modes))
     return LinearSystem(over_time, mean, start, whole, rounding=process_rounding, received_rounding=received_rounding)
+
+
+def _spread_modes(
+    law: Float[np.ndarray, " modes"],
+    chain: Float[np.ndarray, "modes modes"],
+    moved: Float[np.ndarray, "L L"],
+    second: Float[np.ndarray, "L L"],
+) -> tuple[Float[np.ndarray, "N N"], Float[np.ndarray, " modes"]]:
+    """Return Cov(w) of a step of Y 1{mode}, N = modes L, and the law of the modes after it.
+
+    Args:
+        law: of the modes before the step, p.
+        chain: Pi[i, j] = P(next mode j | mode i).
+        moved: M B M', the second moments of Y that the plant's mean map makes of those before the step.
+        second: B+, those after the step.
+    """
+    # What the draw of the next mode adds, sum_i p_i (diag(Pi_i) - Pi_i' Pi_i) x M B M'; then the plant's own noise.
+    not_drawn = np.eye(len(law))[None] - chain[:, None, :]
+    drawn = np.einsum("i,ij,ijl->jl", law, chain, not_drawn)
+    next_law = law @ chain
+    kept_law = _keep_if_unchanged(law, next_law)
+    return np.kron(drawn, moved) + np.kron(np.diag(kept_law), second - moved), kept_law
 
 
 def _average_noise(
@@ -172,23 +191,14 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
     start = first(plant)
     n, m = len(start.states), int(first(channel).outputs)
     refuse_lift(degree, n, m, horizon)
-    routes, moments = (
-        make_step_maps(plant, sensor, channel, 2 * degree, horizon),
-        initial_monomial_moments(start, 2 * degree),
-    )
-    # Memory: monomials times the indicator of each joint mode.
+    routes = make_step_maps(plant, sensor, channel, 2 * degree, horizon)
+    moments = initial_monomial_moments(start, 2 * degree)
+    premise = Premise(plant, sensor, channel, order=2 * degree)
     if first(channel).remembers:
-        projection = np.pad(linear_rows(n, degree), ((0, 0), (0, 1)))
-        distinct = {id(r.measurement): r.measurement for r in routes}
-        modes = {identity: joint_modes(measurement, order=degree) for identity, measurement in distinct.items()}
-        chains = [modes[id(r.measurement)] for r in routes]
-        refuse_lift(degree, n, m, horizon, max(len(mode.initial) for mode in modes.values()))
-        of_modes = lift_modes([r.plant for r in routes], chains, degree, moments, projection)
-        return on_premise(of_modes, Premise(plant, sensor, channel, order=2 * degree))
+        return on_premise(_lift_chain(routes, degree, moments, (n, m)), premise)
     # Start of the lifted state: E Y_0 and Cov Y_0.
-    before = products_of_monomials(moments, n + 1, degree)
-    mean, spread = mean_and_spread(before)
-    start_lost = EPS * np.diag(before)[:-1]
+    second = products_of_monomials(moments, n + 1, degree)
+    mean, spread = mean_and_spread(second)
     varies = isinstance(plant, OverTime), isinstance(sensor, OverTime) or isinstance(channel, OverTime)
     steps, process_rounding, received_rounding = _lift_steps(routes, degree, moments, varies)
     system = LinearSystem(
@@ -198,30 +208,54 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
         projection=linear_rows(n, degree),
         rounding=process_rounding,
         received_rounding=received_rounding,
-        start_rounding=start_lost,
+        start_rounding=EPS * np.diag(second)[:-1],
     )
-    return on_premise(system, Premise(plant, sensor, channel, order=2 * degree))
+    return on_premise(system, premise)
+
+
+def _lift_chain(
+    routes: Sequence[StepMaps], degree: int, moments: Float[np.ndarray, "M"], sizes: tuple[int, int]
+) -> LinearSystem:
+    """Lift the steps of a channel with memory: to monomials times the indicator of each joint mode (`lift_modes`).
+
+    `moments` are those of x_0 up to twice the degree, `sizes` the numbers of states and of outputs.
+    """
+    n, m = sizes
+    distinct = {id(r.measurement): r.measurement for r in routes}
+    modes_by_id = {i: joint_modes(measurement, order=degree) for i, measurement in distinct.items()}
+    refuse_lift(degree, n, m, len(routes), max(len(modes.initial) for modes in modes_by_id.values()))
+    projection = np.pad(linear_rows(n, degree), ((0, 0), (0, 1)))  # Y ends with the constant 1, which x has no part of
+    chains = [modes_by_id[id(r.measurement)] for r in routes]
+    return lift_modes([r.plant for r in routes], chains, degree, moments, projection)
 
 
 def _lift_steps(
     routes: Sequence[StepMaps], degree: int, moments: Float[np.ndarray, "M"], varies: tuple[bool, bool]
 ) -> tuple[Steps, np.ndarray, np.ndarray]:
-    """Lift each step to monomials; return the system's steps, and the roundings of process and received noise.
+    """Lift each step to monomials; return the steps, and the rounding errors of both noises' variances over time.
 
-    `moments` are those of x_0 up to twice the degree; `varies` says of the plant and of the measurement whether it
-    differs between steps. Where nothing varies and the moments of the state are steady, all later steps equal the
-    last, to rounding.
+    Args:
+        routes: the maps of each step, x -> x+ and x+ -> z.
+        degree: of the monomials.
+        moments: of x_0, up to twice the degree.
+        varies: of the plant, and of the measurement, whether it differs between steps.
+
+    Returns:
+        Steps, and (time, monomials of x) and (time, monomials of z) for process and received noise. Where nothing
+        varies and the moments of the state are steady, all later steps equal the last, to rounding.
     """
+    plant_varies, measurement_varies = varies
     steps, roundings = list[Steps](), list[tuple[np.ndarray, np.ndarray]]()
-    steady = SteadyMoments(np.asarray(routes[0].plant.matrix), 2 * degree, any(varies))
+    steady = SteadyMoments(np.asarray(routes[0].plant.matrix), 2 * degree, plant_varies or measurement_varies)
     last: StepMaps | None = None
     for k, route in enumerate(routes):
         if steady.is_steady(moments):
             break
+        # A map that equals the last step's is lifted once.
         if last is None or not _are_identical(route.plant, last.plant):
-            plant_lift = LiftedMap(route.plant, degree, varies[0])
+            plant_lift = LiftedMap(route.plant, degree, plant_varies)
         if last is None or not _are_identical(route.measurement, last.measurement):
-            measurement_lift = LiftedMap(route.measurement, degree, varies[1])
+            measurement_lift = LiftedMap(route.measurement, degree, measurement_varies)
         last = route
         # Cov(w) from the moments before the step; then the moments after it, and Cov(v) from those.
         process, rounding_of_process = plant_lift.conditional_spread(moments)

@@ -28,10 +28,14 @@ def modal_system(
 ) -> LinearSystem:
     """Return the system of y 1{mode} for a state y+ = `move`(y) and z = `measure`(y+), both random affine maps.
 
+    Its state stacks y~ = (y, 1) times the indicator 1{j} of each joint mode j of the two maps' memories; the modes are
+    a chain, Pi[i, j] = P(next mode j | mode i).
+
     A plant that depends on a mode is a `move` with modes; a relay that filters behind a shared fading is a `move` of
     (x, its estimate), and the receiver behind the same fading a `measure` with the same chain. With H_j the move in
     mode j, F[j, i] = Pi[i, j] E H_j and Cov(w)[j, l] = sum_i Pi_ij (delta_jl - Pi_il) E H_j E_i E H_l' + delta_jl
-    sum_i Pi_ij Spread_j(E_i), E_i = E[y~ y~' 1{i}]. The two maps of a step are independent given its modes.
+    sum_i Pi_ij Spread_j(E_i), E_i = E[y~ y~' 1{i}], where Spread_j(E[y~ y~']) is what the randomness of H_j itself adds
+    to Cov(H_j y~). The two maps of a step are independent given its modes.
     `LinearSystemFilter` filters the result, exactly.
 
     Args:
@@ -46,42 +50,52 @@ def modal_system(
         ValueError: maps whose sizes do not fit, gains in `move` that drift (no finitely many functions of them are
             closed), fewer steps than the horizon.
     """
+    n = _check_square_maps(move, measure)
+    # Homogeneous coordinates y~ = (y, 1).
+    mean = np.append(array("initial mean", initial_mean, (n,)), 1.0)
+    spread = np.pad(covariance("initial covariance", initial_covariance, n), ((0, 1), (0, 1)))
+    wanted = np.eye(n) if projection is None else array("what is to be known", projection, (None, n))
+    pairs = zip(each_step(move, horizon), each_step(measure, horizon), strict=True)
+    modes_by_step = [joint_modes(Stack(pair)) for pair in pairs]
+    # E_i = E[y~ y~' 1{i}] and Cov(y~ 1{i}) at the start, where the chain of the modes has not moved yet.
+    law, chain = np.asarray(modes_by_step[0].initial), np.eye(len(modes_by_step[0].initial))
+    moments = law[:, None, None] * (np.outer(mean, mean) + spread)
+    start = np.kron(np.diag(law), spread) + np.kron(np.diag(law) - np.outer(law, law), np.outer(mean, mean))
+    steps = list[Steps]()
+    for modes in modes_by_step:
+        # Of the pair (move, measure) in each mode: moments of either.
+        moves, measures = zip(*(m.maps for m in modes.maps if isinstance(m, Stack)), strict=True)
+        transition, process, moments = _propagate_modes(_take_moments_by_mode(list(moves)), chain, moments)
+        measure_mean, measure_spread = _take_moments_by_mode(list(measures))
+        noise = np.einsum("jabcd,jcd->ab", measure_spread, moments)  # Cov(v) = sum_j Spread_j(E_j)
+        output = np.concatenate(list(measure_mean), axis=1)
+        no_drift, no_offset = np.zeros(len(transition)), np.zeros(len(output))
+        steps.append(Steps(transition, no_drift, process, output, no_offset, noise))
+        chain = np.asarray(modes.transition)
+    return LinearSystem(
+        Steps(*map(np.array, zip(*steps, strict=True))),
+        mean=np.kron(law, mean),
+        covariance=start,
+        projection=np.tile(np.pad(wanted, ((0, 0), (0, 1))), (1, len(law))),
+    )
+
+
+def _check_square_maps(move: Channel, measure: Channel) -> int:
+    """Return n of a move from n to n numbers and a measurement of n numbers.
+
+    Raises:
+        ValueError: maps of other sizes, or gains in `move` that drift.
+    """
     for what, affine in (("move", move), ("measure", measure)):
         check_maps(what, [first(affine)])
-    n = first(move).inputs
+    n = int(first(move).inputs)
     sizes = {"outputs of the move": first(move).outputs, "inputs of the measurement": first(measure).inputs}
     for name, size in sizes.items():
         if size != n:
             raise fail(name, f"{n}, the move's inputs", size)
     if any(memory.drifts for memory in memories(move).values()):
         raise fail("move", "chains as its memories", "a gain that drifts")
-    # Homogeneous coordinates y~ = (y, 1).
-    mean = np.append(array("initial mean", initial_mean, (n,)), 1.0)
-    spread = np.pad(covariance("initial covariance", initial_covariance, n), ((0, 1), (0, 1)))
-    read = np.eye(n) if projection is None else array("what is to be known", projection, (None, n))
-    pairs = zip(each_step(move, horizon), each_step(measure, horizon), strict=True)
-    steps = [joint_modes(Stack(pair)) for pair in pairs]
-    # E_i = E[y~ y~' 1{i}] and Cov(y~ 1{i}) at the start.
-    law, rows = np.asarray(steps[0].initial), np.eye(len(steps[0].initial))
-    moments = law[:, None, None] * (np.outer(mean, mean) + spread)
-    start = np.kron(np.diag(law), spread) + np.kron(np.diag(law) - np.outer(law, law), np.outer(mean, mean))
-    parts = list[Steps]()
-    for step in steps:
-        maps = [m.maps for m in step.maps if isinstance(m, Stack)]
-        move_moments, received = (_take_moments_by_mode([m[i] for m in maps]) for i in range(2))
-        # F, Cov(w) and E_i of one step; Cov(v) = sum_j Spread_j(E_j).
-        transition, process, moments = _propagate_modes(move_moments, rows, moments)
-        noise = np.einsum("jabcd,jcd->ab", received[1], moments)
-        output = np.concatenate(list(received[0]), axis=1)
-        no_drift, no_offset = np.zeros(len(transition)), np.zeros(len(output))
-        parts.append(Steps(transition, no_drift, process, output, no_offset, noise))
-        rows = np.asarray(step.transition)
-    return LinearSystem(
-        Steps(*map(np.array, zip(*parts, strict=True))),
-        mean=np.kron(law, mean),
-        covariance=start,
-        projection=np.tile(np.pad(read, ((0, 0), (0, 1))), (1, len(law))),
-    )
+    return n
 
 
 def _take_moments_by_mode(maps: list[AbstractRandomAffine]) -> Moments:

@@ -62,29 +62,30 @@ def quadratic_system_with_linear_estimate(
         raise fail("linear schedule", f"gains of shape {(n, m)}", f"shape {linear.gains.gain.shape[1:]}")
     total = 2 * n + m
     refuse_lift(2, total, m + n, horizon)
-    # (x_0, q_0, 0) is an affine function of x_0.
-    beginning = _affine_matrix(np.eye(total, n), np.concatenate([np.zeros(n), linear.start, np.zeros(m)]))
-    moments = push_through_known_map(beginning, 4, initial_monomial_moments(start, 4))
-    before = products_of_monomials(moments, total + 1, 2)
-    mean, spread = mean_and_spread(before)
-    received, stored = _make_received_products(n, m), _MomentCache()
+    # At the start (x_0, q_0, 0), q_0 a known number: an affine function of x_0. Moments up to order 4, of which
+    # `second` = E[Y Y'] of the products Y up to degree 2.
+    start_map = _affine_matrix(np.eye(total, n), np.concatenate([np.zeros(n), linear.start, np.zeros(m)]))
+    moments = push_through_known_map(start_map, 4, initial_monomial_moments(start, 4))
+    second = products_of_monomials(moments, total + 1, 2)
+    mean, spread = mean_and_spread(second)
+    received, cache = _make_received_products(n, m), _MomentCache()
     steps, rounding = list[Steps](), list[np.ndarray]()
     for k, route in enumerate(make_step_maps(plant, sensor, channel, 4, horizon)):
         # (x, q, z) -> (x+, q) -> (x+, q, z+) -> (x+, q+, z+).
-        move = stored.make_move_map(route.plant, m)
-        measure_squares, measure_fourth = stored.append_measurement(route.measurement, n)
+        move = cache.make_move_map(route.plant, m)
+        measure_squares, measure_fourth = cache.append_measurement(route.measurement, n)
         update = _make_filter_map(Gains(*(field[k] for field in linear.gains)))
-        # E[(x, q, z)+^2 | (x, q, z)^2] = Sym^2(filter) E Sym^2(channel) E Sym^2(plant).
+        # E[Y+ | Y] = M Y with M = Sym^2(filter) E Sym^2(channel) E Sym^2(plant).
         transition = symmetric_power(update, 2) @ measure_squares @ move.moments(2).matrix
         moments = push_through_known_map(update, 4, measure_fourth @ push_moments(move, 4, moments))
-        after = products_of_monomials(moments, total + 1, 2)
+        next_second = products_of_monomials(moments, total + 1, 2)
         # Cov(w) = E[Y+ Y+'] - M E[Y Y'] M'.
-        process = after - transition @ before @ transition.T
+        process = next_second - transition @ second @ transition.T
         matrix, drift = affine(transition)
         no_offset, no_noise = np.zeros(len(received)), np.zeros((len(received), len(received)))
         steps.append(Steps(matrix, drift, process[:-1, :-1], received, no_offset, no_noise))
-        rounding.append(np.finfo(float).eps * np.diag(after)[:-1])
-        before = after
+        rounding.append(np.finfo(float).eps * np.diag(next_second)[:-1])
+        second = next_second
     over_time = Steps(*map(np.array, zip(*steps, strict=True)))
     system = LinearSystem(over_time, mean, spread, projection=linear_rows(total, 2, n), rounding=rounding)
     return on_premise(system, Premise(plant, sensor, channel, order=4))
@@ -187,7 +188,9 @@ def gain_over_linear(
     degrees: Sequence[int] = (2, 3),
     after: int | None = None,
 ) -> GainOverLinear:
-    """Compute how much filters of these degrees gain over the best linear one, from the model alone.
+    """Return the error covariances of the best filters of several degrees, to compare with the linear one's.
+
+    They follow from the model alone: no data are simulated.
 
     Args:
         plant: linear plant without inputs.
@@ -201,44 +204,65 @@ def gain_over_linear(
         ValueError: what `lifted_system` refuses, no degree above 1, `after` outside the horizon.
     """
     check_count("horizon", horizon)
-    expected = sorted({1, 2, *degrees})
     if not degrees or min(degrees) < 2:
         raise fail("degrees", "at least one, all of 2 or more", list(degrees))
-    begin = horizon // 3 if after is None else after
-    if not 0 <= begin < horizon:
-        raise fail("first step that counts", f"one from 0 to {horizon - 1}", begin)
-    systems = {d: lifted_system(plant, sensor, channel, d, horizon) for d in expected}
+    first_step = horizon // 3 if after is None else after
+    if not 0 <= first_step < horizon:
+        raise fail("first step that counts", f"one from 0 to {horizon - 1}", first_step)
+    # Degree 1 to compare with, and degree 2 for the skewness.
+    systems = {d: lifted_system(plant, sensor, channel, d, horizon) for d in sorted({1, 2, *degrees})}
     n, m = len(first(plant).states), int(first(channel).outputs)
     covariances = {d: lmmse(system).gains.covariance for d, system in systems.items()}
-    return GainOverLinear(first(plant).states, covariances, skewness(systems[2], n, m), begin)
+    return GainOverLinear(
+        states=first(plant).states, covariance=covariances, skewness=skewness(systems[2], n, m), after=first_step
+    )
 
 
 def skewness(square: LinearSystem, states: int, outputs: int) -> float:
-    """Return the largest |E (a - Ea)(b - Eb)(c - Ec)| / (sd a sd b sd c) over a, b, c among x_k and z_k.
+    """Return the largest |E (a - Ea)(b - Eb)(c - Ec)| / (sd a sd b sd c) over all steps k.
 
-    All comes from the system of degree 2: k3(a, b, c) = Cov(a b, c) - E a Cov(b, c) - E b Cov(a, c), with a b one of
-    its monomials.
+    a and b are two components of x_k, or two of z_k, and c is any component of either.
+
+    Args:
+        square: the system of degree 2, whose state and measurement are the products of x_k and of z_k up to degree 2.
+        states: number of components of x.
+        outputs: number of components of z.
     """
-    x, z = _place_products(states), _place_products(outputs)
-    before = state_moments(square)
-    worst = 0.0
+    x_places, z_places = _place_products(states), _place_products(outputs)
+    state = state_moments(square)
+    largest = 0.0
     for k in range(square.horizon):
-        s, spread = square.step(k), before.covariance[k + 1]
+        s, spread = square.step(k), state.covariance[k + 1]
         cross = s.output @ spread
-        # Joint covariance and mean of the lifted (x, z).
+        # Joint covariance and mean of (products of x, products of z), and the places of x and z themselves in it.
         joint = np.block([[spread, cross.T], [cross, cross @ s.output.T + s.noise]])
-        mean = np.concatenate([before.mean[k + 1], s.output @ before.mean[k + 1] + s.offset])
-        linear = [x[(i,)] for i in range(states)] + [len(spread) + z[(i,)] for i in range(outputs)]
-        deviation = np.sqrt(np.diag(joint))
-        for places, start in ((x, 0), (z, len(spread))):
-            for (a, b), row in ((key, p) for key, p in places.items() if len(key) == 2):
-                i, j = start + places[(a,)], start + places[(b,)]
-                # k3 of a, b and each c.
-                third = joint[start + row, linear] - mean[i] * joint[j, linear] - mean[j] * joint[i, linear]
-                size = deviation[i] * deviation[j] * deviation[linear]
-                ratio = np.divide(np.abs(third), size, out=np.zeros_like(third), where=size > 0)
-                worst = max(worst, float(np.max(ratio)))
-    return worst
+        mean = np.concatenate([state.mean[k + 1], s.output @ state.mean[k + 1] + s.offset])
+        first_z = len(spread)
+        linear = [x_places[(i,)] for i in range(states)] + [first_z + z_places[(i,)] for i in range(outputs)]
+        for places, start in ((x_places, 0), (z_places, first_z)):
+            pairs = [
+                (start + product, start + places[(key[0],)], start + places[(key[1],)])
+                for key, product in places.items()
+                if len(key) == 2
+            ]
+            largest = max([largest, *(_largest_third_moment(joint, mean, pair, linear) for pair in pairs)])
+    return largest
+
+
+def _largest_third_moment(
+    joint: Float[np.ndarray, "N N"], mean: Float[np.ndarray, "N"], pair: tuple[int, int, int], linear: list[int]
+) -> float:
+    """Return the largest |k3(a, b, c)| / (sd a sd b sd c) over c, of numbers with this joint covariance and mean.
+
+    k3(a, b, c) = Cov(a b, c) - E a Cov(b, c) - E b Cov(a, c). `pair` are the places of a b, a and b, `linear` those of
+    each c.
+    """
+    product, a, b = pair
+    deviation = np.sqrt(np.diag(joint))
+    third = joint[product, linear] - mean[a] * joint[b, linear] - mean[b] * joint[a, linear]
+    size = deviation[a] * deviation[b] * deviation[linear]
+    ratio = np.divide(np.abs(third), size, out=np.zeros_like(third), where=size > 0)
+    return float(np.max(ratio))
 
 
 def _place_products(variables: int) -> dict[tuple[int, ...], int]:

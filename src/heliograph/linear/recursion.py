@@ -90,7 +90,7 @@ def covariance_step(root: Float[np.ndarray, "N _"], s: Steps, noises: NoiseRoots
 
 
 def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
-    """Return the best linear filter of x = W y from z_1 ... z_k: an ordinary Kalman recursion, since w and v are white.
+    """Return gains of the best linear filter of x = W y from z_1 ... z_k: a Kalman recursion, since w and v are white.
 
     `claim` is what the covariance is worth: "exact" if the system's moments are the world's. It is lowered to
     "nominal", with a warning, where rounding in the system's own covariances reaches a visible part of the error's.
@@ -104,27 +104,29 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
     Source: Kalman (1960), with the second moments of random coefficients in the noises.
     """
     instance("system", system, LinearSystem, "a LinearSystem")
-    root, steps = roots_of(system.covariance), list[Gains]()
-    size = system.mean**2 + np.diag(system.covariance)
-    noises = take_noise_roots(system.step(0), size)
-    rounding = CarriedRounding(np.diag(system.start_rounding), 0.0, 0)
-    steady, last = system.steady_from, None
+    root, gains_by_step = roots_of(system.covariance), list[Gains]()
+    second_moments = system.mean**2 + np.diag(system.covariance)
+    noises = take_noise_roots(system.step(0), second_moments)
+    rounding = CarriedRounding(covariance=np.diag(system.start_rounding), worst=0.0, when=0)
+    steady_from, last = system.steady_from, None
     for k in range(system.horizon):
-        # From `steady` on the system is the same: stop where the recursion has come to rest.
-        if k > steady and (k - steady) % SPAN == 0:
+        # From `steady_from` on all steps of the system are the same. There, every SPAN steps, see whether the error
+        # covariance has come to rest: then all later gains are the last ones, to rounding.
+        if k > steady_from and (k - steady_from) % SPAN == 0:
             now = covariance_of_root(root), rounding.covariance
-            if last is not None and _has_converged(now, last, steps[-1].transition):
-                break  # what follows is the same, to rounding
+            if last is not None and _has_converged(now, last, gains_by_step[-1].transition):
+                break
             last = now
         s = system.step(k)
-        noises = take_noise_roots(s, size) if 0 < k <= steady else noises
+        if 0 < k <= steady_from:  # later steps have the noises of step `steady_from`
+            noises = take_noise_roots(s, second_moments)
         step = covariance_step(root, s, noises)
         gains, root = _make_gains(system, s, step), step.root
         rounding = rounding.after_step(system, k, s, gains)
-        steps.append(gains)
-    gains = Gains(*(repeat_last(values, system.horizon) for values in zip(*steps, strict=True)))
+        gains_by_step.append(gains)
+    over_time = Gains(*(repeat_last(values, system.horizon) for values in zip(*gains_by_step, strict=True)))
     claim = _support_claim(claim, rounding.worst, rounding.when)
-    return on_premise(Schedule(gains, system.mean, claim), system.kept.premise)
+    return on_premise(Schedule(over_time, system.mean, claim), system.kept.premise)
 
 
 def _make_gains(system: LinearSystem, s: Steps, step: RecursionStep) -> Gains:
@@ -180,37 +182,56 @@ def _support_claim(claim: Claim, lost: float, step: int) -> Claim:
 
 
 def true_covariance(system: LinearSystem, schedule: Schedule) -> Float[np.ndarray, "time q q"]:
-    """Return E[(x - xhat)(x - xhat)'] of a schedule run on a system that it need not have been designed for.
+    """Return E[(x - xhat)(x - xhat)'] over time of a schedule run on a system that it need not have been designed for.
 
-    Joint moments of (y, s) are propagated; nothing is assumed of the gains.
+    Mean and covariance of (y, s), the system's state and the schedule's, are propagated; nothing is assumed of the
+    gains.
 
     Args:
-        system: the world.
-        schedule: gains for as many steps and measurements.
+        system: the world, y+ = A y + a + w and z = C y+ + c + v, of which x = W y is to be known.
+        schedule: gains for as many steps and measurements, s+ = F s + K z + f and xhat = L s + J z + d.
 
     Raises:
         ValueError: a system and a schedule of different lengths or measurements.
     """
     instance("system", system, LinearSystem, "a LinearSystem")
     instance("schedule", schedule, Schedule, "a Schedule")
-    g, m = schedule.gains, system.steps.offset.shape[-1]
-    if schedule.horizon != system.horizon or g.gain.shape[-1] != m:
-        got = f"{schedule.horizon} steps of {g.gain.shape[-1]} measurements"
+    m, received_by_schedule = system.steps.offset.shape[-1], schedule.gains.gain.shape[-1]
+    if schedule.horizon != system.horizon or received_by_schedule != m:
+        got = f"{schedule.horizon} steps of {received_by_schedule} measurements"
         raise fail("schedule", f"{system.horizon} steps of {m} measurements", got)
+    # Of (y, s), s a known number at the start.
     mean, spread = np.append(system.mean, schedule.start), np.pad(system.covariance, (0, len(schedule.start)))
-    q, nothing = len(system.projection), np.zeros((len(system.mean), len(schedule.start)))
+    q = len(system.projection)
     covariances = []
-    # Maps from (y, s) and (w, v) to (y+, s+ = F s + K z + c, x - xhat = W y+ - L s - J z - d).
     for k in range(system.horizon):
-        s, now = system.step(k), Gains(*(field[k] for field in g))
-        into = np.concatenate([np.eye(len(nothing)), now.gain @ s.output, system.projection - now.direct @ s.output])
-        received = np.concatenate([np.zeros((len(nothing), m)), now.gain, -now.direct])
-        maps = np.concatenate([into @ s.transition, np.concatenate([nothing, now.transition, -now.output])], axis=1)
-        shift = np.concatenate([np.zeros(len(nothing)), now.offset, -now.output_offset])
-        mean = maps @ mean + into @ s.drift + received @ s.offset + shift
-        spread = propagate_by_mode(
-            maps, spread, propagate_by_mode(into, s.process, propagate_by_mode(received, s.noise, 0.0))
-        )
+        gains = Gains(*(field[k] for field in schedule.gains))
+        mean, spread = _propagate_errors(system.step(k), gains, system.projection, mean, spread)
+        # The last q numbers are x - xhat; the first ones go on.
         covariances.append(spread[-q:, -q:] + np.outer(mean[-q:], mean[-q:]))
         mean, spread = mean[:-q], spread[:-q, :-q]
     return np.array(covariances)
+
+
+def _propagate_errors(
+    step: Steps,
+    gains: Gains,
+    projection: Float[np.ndarray, "q N"],
+    mean: Float[np.ndarray, " joint"],
+    spread: Float[np.ndarray, "joint joint"],
+) -> tuple[Float[np.ndarray, " next"], Float[np.ndarray, "next next"]]:
+    """Return mean and covariance of (y+, s+, x - xhat) after a step from those of (y, s) before it.
+
+    With z = C y+ + c + v: s+ = F s + K z + f and x - xhat = W y+ - L s - J z - d, so that three matrices lead to
+    (y+, s+, x - xhat): `of_next` from y+, `of_noise` from c + v, and `of_schedule` from s.
+    """
+    size, m = len(step.transition), len(step.noise)
+    states = len(mean) - size
+    of_next = np.concatenate([np.eye(size), gains.gain @ step.output, projection - gains.direct @ step.output])
+    of_noise = np.concatenate([np.zeros((size, m)), gains.gain, -gains.direct])
+    of_schedule = np.concatenate([np.zeros((size, states)), gains.transition, -gains.output])
+    offset = np.concatenate([np.zeros(size), gains.offset, -gains.output_offset])
+    maps = np.concatenate([of_next @ step.transition, of_schedule], axis=1)  # from (y, s)
+    mean = maps @ mean + of_next @ step.drift + of_noise @ step.offset + offset
+    noise = propagate_by_mode(of_next, step.process, propagate_by_mode(of_noise, step.noise, 0.0))
+    return mean, propagate_by_mode(maps, spread, noise)

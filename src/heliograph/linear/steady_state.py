@@ -60,27 +60,36 @@ def critical_arrival(
     a, q = plant_matrices(plant)
     c, r = sensor_matrices(sensor, len(a))
     fixed = None if gain is None else np.asarray(array("gain", gain, (len(a), len(c))))
-    lost = np.zeros((0, len(a)))
+    no_outputs = np.zeros((0, len(a)))  # C of a lost packet
 
-    def gain_at(arrival: float) -> Float[np.ndarray, "n m"] | None:
-        """Return a certified gain, or None."""
-        # Independent losses as a chain of two modes with equal rows: arrived, lost.
+    def certified_gain(arrival: float) -> Float[np.ndarray, "n m"] | None:
+        """Return a gain that is certified to keep the error bounded at this probability of arrival, or None."""
+        # Independent losses as a chain of two modes with equal rows: mode 0 arrived, mode 1 lost, of no outputs.
         chain = np.array([[arrival, 1 - arrival]] * 2)
-        system = KnownLossSystem(a, q, chain, chain[0], np.array([0, 1]), (c, lost), (r, np.zeros((0, 0))))
-        gains = find_gains(system) if fixed is None else (fixed, lost.T)
+        system = KnownLossSystem(
+            transition=a,
+            process=q,
+            chain=chain,
+            law=chain[0],
+            known=np.array([0, 1]),
+            outputs=(c, no_outputs),
+            noises=(r, np.zeros((0, 0))),
+        )
+        gains = find_gains(system) if fixed is None else (fixed, no_outputs.T)
         return gains[0] if certify_radius(system, gains) < BELOW_ONE else None
 
+    # A stable plant's error is bounded without data.
     radius = spectral_radius(a)
     if radius < BELOW_ONE and fixed is None:
         return CriticalArrival(0.0, 0.0, np.zeros((len(a), len(c))))
     # Lower bound 1 - rho(A)^-2.
     lower = max(1 - radius**-2, 0.0)
-    if gain_at(1.0) is None:
+    if certified_gain(1.0) is None:
         what = "sensor" if fixed is None else "gain"
         raise fail(what, "one that keeps the error bounded where everything arrives", "an unstable mode that stays")
     # Upper bound: bisection over certified gains.
-    upper, certified = _bisect_critical_arrival(gain_at, lower)
-    return CriticalArrival(lower if fixed is None else upper, upper, certified)
+    upper, gain_at_upper = _bisect_critical_arrival(certified_gain, lower)
+    return CriticalArrival(lower if fixed is None else upper, upper, gain_at_upper)
 
 
 def _bisect_critical_arrival(gain_at: Callable[[float], np.ndarray | None], lower: float) -> tuple[float, np.ndarray]:

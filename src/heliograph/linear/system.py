@@ -77,14 +77,14 @@ class LinearSystem(Module):
         received_rounding: Rounding | None = None,
         start_rounding: Rounding | None = None,
     ):
+        """Check all arrays against the numbers of steps, states N and outputs m that `steps` has."""
         instance("steps of a system", steps, Steps, "Steps")
         time, n = np.shape(steps.drift)
         m = np.shape(steps.offset)[-1]
-        # A, a, Cov w of the state and C, c, Cov v of what is received, as `Steps` has them.
-        one_step: tuple[tuple[int, ...], ...] = ((n, n), (n,), (n, n), (m, n), (m,), (m, m))
-        named = zip(Steps._fields, steps, one_step, strict=True)
-        checked = [array(f"system {name}", value, (time, *shape)) for name, value, shape in named]
-        self.steps = Steps(*checked)
+        # Shapes of one step: A, a, Cov w of the state and C, c, Cov v of what is received, as `Steps` has them.
+        shapes: tuple[tuple[int, ...], ...] = ((n, n), (n,), (n, n), (m, n), (m,), (m, m))
+        named = zip(Steps._fields, steps, shapes, strict=True)
+        self.steps = Steps(*(array(f"system {name}", value, (time, *shape)) for name, value, shape in named))
         self.mean = array("mean of the start", mean, (n,))
         self.covariance = check.covariance("covariance of the start", covariance, n)
         self.projection = array("what is to be known", projection, (None, n))

@@ -17,36 +17,35 @@ T = TypeVar("T")
 
 
 def cache_by_object(function: Callable[Concatenate[S, P], T]) -> Callable[Concatenate[S, P], T]:
-    """Return the function with its results cached for each object that is its first argument.
+    """Decorate a function: its results are cached for each object that is its first argument, while the object lives.
 
-    An object is identified by `id`, so that nothing is compared, and its entries go with it. Cached arrays are made
-    read-only, since all callers share them; traced results are never cached.
+    An object is identified by `id`, so that nothing is compared. Cached arrays are made read-only, since all callers
+    share them; traced results are never cached.
     """
-    results: dict[int, tuple[ref[S], dict[Hashable, T]]] = {}
-
-    first = next(iter(signature(function).parameters))
+    # By identity of the object: a weak reference to it, and the results by the other arguments.
+    cache: dict[int, tuple[ref[S], dict[Hashable, T]]] = {}
+    first_parameter = next(iter(signature(function).parameters))
 
     @wraps(function)
-    def look_up(*given: Any, **named: Any) -> T:
-        """Return the answer for this object and these arguments, computed only once while the object lives."""
-        if not given and first not in named:
-            return function(*given, **named)  # which says what is missing
-        owner, rest = (given[0], given[1:]) if given else (named.pop(first), ())
-        # Key: identity of the object, and the other arguments.
-        identity, requested = id(owner), (rest, tuple(named.items()))
-        answers = results[identity][1] if identity in results else {}
-        if requested in answers:
-            return answers[requested]
-        answer = function(owner, *rest, **named)
+    def look_up(*positional: Any, **named: Any) -> T:
+        """Return the result for this object and these arguments, computed only once while the object lives."""
+        if not positional and first_parameter not in named:
+            return function(*positional, **named)  # which raises an error that says what is missing
+        owner, others = (positional[0], positional[1:]) if positional else (named.pop(first_parameter), ())
+        identity, key = id(owner), (others, tuple(named.items()))
+        _reference, results = cache.get(identity, (None, {}))
+        if key in results:
+            return results[key]
+        result = function(owner, *others, **named)
         # A traced result belongs to one trace only.
-        if is_traced(answer):
-            return answer
-        for leaf in jax.tree.leaves(answer):
-            _close(leaf)
-        # The weak reference removes the entry when the object is collected.
-        answers[requested] = answer
-        results.setdefault(identity, (ref(owner, lambda _: results.pop(identity, None)), answers))
-        return answer
+        if is_traced(result):
+            return result
+        for leaf in jax.tree.leaves(result):
+            _make_read_only(leaf)
+        # The weak reference removes the object's entry when it is collected, before another has the same `id`.
+        results[key] = result
+        cache.setdefault(identity, (ref(owner, lambda _: cache.pop(identity, None)), results))
+        return result
 
     return cast(Callable[Concatenate[S, P], T], look_up)
 
@@ -85,7 +84,7 @@ def cache_arrays(function: Callable[P, T]) -> Callable[P, T]:
     return copied
 
 
-def _close(leaf: Any) -> None:
-    """Close an array to writing; leave all else as it is."""
+def _make_read_only(leaf: Any) -> None:
+    """Make an array read-only; leave all else as it is."""
     if isinstance(leaf, np.ndarray):
         leaf.setflags(write=False)

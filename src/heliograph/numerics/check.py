@@ -298,11 +298,13 @@ def check_horizon(value: object, covered: int | None = None) -> int:
 
 
 def covariance(name: str, value: ArrayLike, dimension: int | None = None) -> Any:
-    """Return a symmetric positive semidefinite matrix; a scalar is taken as that multiple of the identity."""
+    """Return a value checked to be a symmetric positive semidefinite matrix, made exactly symmetric.
+
+    A number c stands for c I where the `dimension` is known. Of a traced value only the shape is checked.
+    """
     report_covariance(name, value)
     matrix = _read_numbers(name, value)
-    # A scalar c stands for c I where the dimension is known.
-    if matrix.ndim != 2 and (dimension is None or matrix.ndim):
+    if matrix.ndim != 2 and (matrix.ndim or dimension is None):  # neither a matrix nor a multiple of I
         raise fail(
             name, "a square matrix, such as [[4, 0], [0, 1]], or [[4]] of one component", f"shape {matrix.shape}"
         )
@@ -314,16 +316,16 @@ def covariance(name: str, value: ArrayLike, dimension: int | None = None) -> Any
     if is_traced(matrix):
         return matrix / 2 + matrix.T / 2  # the sum of two large variances may overflow
     # Symmetry and definiteness are judged of correlations, so that neither depends on units.
-    unit = standard_deviations(matrix)
-    skew = np.abs(matrix - matrix.T)
-    if np.any(skew > SYMMETRY_TOLERANCE * np.outer(unit, unit)):
-        raise fail(name, "a symmetric matrix", f"entries that differ by {np.max(skew):.3g} across the diagonal")
-    scaled = matrix / np.outer(unit, unit)
-    eigenvalues = np.diagonal(scaled) if is_diagonal(scaled) else np.linalg.eigvalsh(scaled)
+    deviations = standard_deviations(matrix)
+    asymmetry = np.abs(matrix - matrix.T)
+    if np.any(asymmetry > SYMMETRY_TOLERANCE * np.outer(deviations, deviations)):
+        raise fail(name, "a symmetric matrix", f"entries that differ by {np.max(asymmetry):.3g} across the diagonal")
+    correlations = matrix / np.outer(deviations, deviations)
+    eigenvalues = np.diagonal(correlations) if is_diagonal(correlations) else np.linalg.eigvalsh(correlations)
     smallest = np.min(eigenvalues, initial=np.inf)
     if smallest < -DEFINITENESS_TOLERANCE:
         raise fail(name, "a positive semidefinite matrix", f"smallest eigenvalue {np.linalg.eigvalsh(matrix)[0]:.3g}")
-    return matrix / 2 + matrix.T / 2  # the sum of two large variances may overflow
+    return matrix / 2 + matrix.T / 2  # halves first: the sum of two large variances may overflow
 
 
 def is_diagonal(matrix: np.ndarray) -> bool:

@@ -224,27 +224,40 @@ def _bind(equation: JaxprEqn, *arguments: Any) -> Any:
 
 
 def _differentiate(function: Callable[..., Any], inputs: Sequence[Compensated], several: bool) -> list[Compensated]:
-    """Return f of the high parts, and as low parts its derivative by them times what was lost of each."""
-    lost = [i for i, x in enumerate(inputs) if x.low is not None]
+    """Return f(high parts) with low parts by f's derivative: the low part of f(x) is f'(high) low, to first order.
 
-    def of_lost(*some: Any) -> Any:
-        """Return f with these values in the places of the inputs of which something was lost."""
+    A number is high + low, its rounded value and what rounding lost of it; low is None where nothing was.
+
+    Args:
+        function: f, of the high parts.
+        inputs: its arguments.
+        several: whether f returns a list of results rather than one.
+    """
+    with_low = [i for i, x in enumerate(inputs) if x.low is not None]
+
+    def call_with(*replaced: Any) -> Any:
+        """Return f with these values in the places of the inputs that have a low part."""
         arguments = [x.high for x in inputs]
-        for i, value in zip(lost, some, strict=True):
+        for i, value in zip(with_low, replaced, strict=True):
             arguments[i] = value
         return function(*arguments)
 
-    if not lost:
-        results, lows = of_lost(), None
+    lows: Any = None
+    if not with_low:
+        results = call_with()
     else:
-        given = [jnp.asarray(inputs[i].high) for i in lost]
-        moves = [jnp.broadcast_to(inputs[i].low, x.shape) for i, x in zip(lost, given, strict=True)]
-        results, lows = jax.jvp(of_lost, given, moves)
+        highs = [jnp.asarray(inputs[i].high) for i in with_low]
+        moves = [jnp.broadcast_to(inputs[i].low, x.shape) for i, x in zip(with_low, highs, strict=True)]
+        results, lows = jax.jvp(call_with, highs, moves)
     if not several:
-        results, lows = [results], [lows]
-    real = [jnp.issubdtype(jnp.result_type(x), jnp.floating) for x in results]
-    return [Compensated(x, low if is_real else None)
-            for x, low, is_real in zip(results, lows or [None] * len(results), real, strict=True)]  # fmt: skip
+        results, lows = [results], None if lows is None else [lows]
+    if lows is None:
+        return [Compensated(x, None) for x in results]
+    # Whole numbers have no derivative.
+    return [
+        Compensated(x, low if jnp.issubdtype(jnp.result_type(x), jnp.floating) else None)
+        for x, low in zip(results, lows, strict=True)
+    ]
 
 
 def _is_scaling(a: Any) -> bool:

@@ -1,6 +1,6 @@
 """Density of a Gaussian vector of which components may be missing or determined by others, and its derivatives."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +20,18 @@ from heliograph.numerics.types import Bool, Float
 LOG_TURN = float(np.log(2 * np.pi))
 
 
+class _Conditioned(NamedTuple):
+    """What is left of a vector given its first components: its value and covariance, with the log density of these.
+
+    `growth`: the largest quotient of a component's variance and what was left of it, by which rounding was amplified.
+    """
+
+    value: Float[jax.Array, " m"]
+    covariance: Float[jax.Array, "m m"]
+    total: Float[jax.Array, ""]
+    growth: Float[jax.Array, ""]
+
+
 @jax.jit
 def log_density(
     value: "Float[jax.Array, ' m']",
@@ -27,48 +39,56 @@ def log_density(
     size: "Float[jax.Array, ' m']",
     present: "Bool[jax.Array, ' m'] | None" = None,
 ) -> "Float[jax.Array, '']":
-    """Return log N(value; 0, covariance) of the components that are present, not NaN unless it is said; 0 if none is.
+    """Return log N(value; 0, covariance) of the components that are present; 0 if none is.
 
-    Component after component given those before it: sum_j -(d_j^2 / s_j + log(2 pi s_j)) / 2, s_j the pivots of the
-    covariance. A component that those before it determine (s_j = 0) adds nothing where it agrees with them, and -inf
-    where it does not: the density is that of the free components. `size` (m,) is the size of the terms whose difference
-    is `value`, for its rounding. An indefinite covariance gives NaN.
+    Component after component given those before it: sum_j -(e_j^2 / s_j + log(2 pi s_j)) / 2, e_j what is left of the
+    value and s_j of the variance (the pivots of the covariance). A component that those before it determine (s_j = 0)
+    adds nothing where it agrees with them, and -inf where it does not: the density is that of the free components. An
+    indefinite covariance gives NaN.
+
+    Args:
+        value: deviations from the mean.
+        covariance: of the value.
+        size: the size of the terms whose difference is the value, for its rounding.
+        present: which components count; those that are not NaN if None.
     """
     # Absent components: value and covariance zero, so that they are determined and agree.
     present = ~jnp.isnan(value) if present is None else present
-    rest = jnp.where(present, value, 0.0)
-    left = jnp.where(present[:, None] & present, covariance, 0.0)
+    present_value = jnp.where(present, value, 0.0)
+    present_covariance = jnp.where(present[:, None] & present, covariance, 0.0)
     # Deviation within which a determined component agrees with those before it.
-    variance = jnp.diagonal(left)
-    reach = OFF_SUPPORT * jnp.sqrt(variance) + OFF_VALUE * jnp.where(present, size, 0.0)
+    variance = jnp.diagonal(present_covariance)
+    agreement = OFF_SUPPORT * jnp.sqrt(variance) + OFF_VALUE * jnp.where(present, size, 0.0)
 
-    def condition_on_component(j: Any, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+    def condition_on_component(j: Any, state: _Conditioned) -> _Conditioned:
         """Add log N of component j given those before it, and condition the components behind it on it."""
-        rest, left, total, growth = carry
+        e, left = state.value, state.covariance
         pivot = left[j, j]
-        # Determined: the pivot is zero, to rounding.
+        # Zero to rounding, which may leave it negative, the more the components before it were amplified.
         determined = (pivot <= rounding(PIVOT_TOLERANCE, value) * variance[j]) & (
-            pivot >= -negative_tolerance(value, growth) * variance[j]
+            pivot >= -negative_tolerance(value, state.growth) * variance[j]
         )
-        safe = jnp.where(determined, 1.0, pivot)
-        scale = 1 / safe
-        # Density of component j given those before it.
-        density = -(rest[j] ** 2 * scale + jnp.log(safe) + LOG_TURN) / 2
-        agrees = jnp.where(jnp.abs(rest[j]) <= reach[j], 0.0, -jnp.inf)
-        # Condition the remaining components on component j.
-        column = jnp.where(determined, 0.0, left[:, j] * scale)
-        after = rest - column * rest[j], left - jnp.outer(column, left[j])
-        growth = jnp.maximum(growth, jnp.where(determined, 0.0, variance[j] * scale))
-        return *after, total + jnp.where(determined, agrees, density), growth
+        safe_pivot = jnp.where(determined, 1.0, pivot)
+        reciprocal = 1 / safe_pivot
+        density = -(e[j] ** 2 * reciprocal + jnp.log(safe_pivot) + LOG_TURN) / 2
+        if_determined = jnp.where(jnp.abs(e[j]) <= agreement[j], 0.0, -jnp.inf)
+        # Regression of the other components on component j, which takes from them what it explains.
+        column = jnp.where(determined, 0.0, left[:, j] * reciprocal)
+        return _Conditioned(
+            value=e - column * e[j],
+            covariance=left - jnp.outer(column, left[j]),
+            total=state.total + jnp.where(determined, if_determined, density),
+            growth=jnp.maximum(state.growth, jnp.where(determined, 0.0, variance[j] * reciprocal)),
+        )
 
-    none = jnp.zeros((), value.dtype)
-    carry: tuple[jax.Array, ...] = (rest, left, none, none)
-    if len(value) > WRITTEN:
-        carry = jax.lax.fori_loop(0, len(value), condition_on_component, carry)
-        return carry[2]
-    for j in range(len(value)):
-        carry = condition_on_component(j, carry)
-    return carry[2]
+    zero = jnp.zeros((), value.dtype)
+    state = _Conditioned(value=present_value, covariance=present_covariance, total=zero, growth=zero)
+    if len(value) > WRITTEN:  # a loop, so that the program stays short
+        state = jax.lax.fori_loop(0, len(value), condition_on_component, state)
+    else:
+        for j in range(len(value)):
+            state = condition_on_component(j, state)
+    return state.total
 
 
 def differentiate_log_density(

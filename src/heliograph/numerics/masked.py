@@ -18,18 +18,22 @@ def fill_masked(value: Any) -> Any:
         elif all(is_absent(part) or isinstance(part, Real) for part in value):
             return [np.nan if is_absent(part) else part for part in value]
     if isinstance(value, np.ma.MaskedArray):
-        numbers, masked = np.asarray(value), np.ma.getmaskarray(value)
-    elif hasattr(value, "to_numpy"):  # a column of a table, or several
-        numbers, masked = np.asarray(value), np.asarray(False)
-    else:
-        return value
-    if numbers.dtype.kind == "M":
+        return _fill_array(np.asarray(value), np.ma.getmaskarray(value))
+    if hasattr(value, "to_numpy"):  # a column of a table, or several
+        return _fill_array(np.asarray(value), np.asarray(False))
+    return value
+
+
+def _fill_array(numbers: np.ndarray, masked: np.ndarray) -> np.ndarray:
+    """Return an array with NaN, or NaT among dates, where it is masked, or an object in it is absent."""
+    kind = numbers.dtype.kind
+    if kind == "M":  # dates
         return np.where(masked, np.datetime64("NaT"), numbers)
-    if numbers.dtype.kind == "O":
+    if kind == "O":  # any objects: numbers if all that is not absent are
         absent = np.array([is_absent(part) for part in numbers.flat], dtype=bool)
         filled = np.where(masked | absent.reshape(numbers.shape), np.nan, numbers)
         return filled.astype(np.float64) if all(isinstance(part, Real) for part in filled.flat) else filled
-    if numbers.dtype.kind not in "fiub" or not masked.any():
+    if kind not in "fiub" or not masked.any():  # no real numbers, or none masked
         return numbers
     return np.where(masked, np.nan, numbers.astype(np.float64))
 

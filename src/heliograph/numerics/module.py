@@ -18,7 +18,7 @@ from heliograph.numerics.names import refuse_attribute
 
 
 def are_same(x: Any, y: Any) -> bool:
-    """Return one bool for objects that hold arrays: of the same class, and the same in each part.
+    """Return whether two objects that may hold arrays are of the same class, and the same in each part.
 
     Arrays are the same if their shape, kind of number and numbers are; NaN is the same as NaN. A traced array is the
     same as itself alone.
@@ -40,11 +40,13 @@ def are_same(x: Any, y: Any) -> bool:
         return are_same((x.func, x.args, x.keywords), (y.func, y.args, y.keywords))
     if is_dataclass(x):
         return all(are_same(getattr(x, f.name, None), getattr(y, f.name, None)) for f in fields(x) if f.compare)
-    # Objects without an equality of their class are compared by their attributes.
+    # Objects whose class defines no equality are compared by their attributes, but for functions.
     kind: Any = type(x)
-    if kind.__eq__ is object.__eq__ and not callable(x) and getattr(x, "__dict__", None):
-        return are_same(vars(x), vars(y))  # nobody has said when two of these are equal
-    return bool(x == y) or (isinstance(x, float) and x != x and y != y)
+    has_no_equality = kind.__eq__ is object.__eq__
+    if has_no_equality and not callable(x) and getattr(x, "__dict__", None):
+        return are_same(vars(x), vars(y))
+    are_both_nan = isinstance(x, float) and x != x and y != y
+    return bool(x == y) or are_both_nan
 
 
 def _same_attributes(x: object, y: object) -> bool:
@@ -137,27 +139,32 @@ def format_on_one_line(value: object, depth: int) -> str:
     """Return any value on one line: arrays by their size, what lies deeper than `depth` by its class name."""
     if isinstance(value, np.ndarray | np.generic | jax.Array):
         return _format_array(value)
+
+    def format_part(part: object) -> str:
+        """Return what the value holds on one line, one level deeper."""
+        return format_on_one_line(part, depth - 1)
+
+    def format_pair(pair: tuple[object, object]) -> str:
+        """Return "key: part" of a mapping."""
+        key, part = pair
+        return f"{key!r}: {format_part(part)}"
+
+    def format_field(field: tuple[str, object]) -> str:
+        """Return "name=part" of an object."""
+        name, part = field
+        return f"{name}={format_part(part)}"
+
     # Containers, item by item.
     if isinstance(value, Mapping) and not _is_ours(value):
-        return _join_some(
-            "{",
-            value.items(),
-            len(value),
-            depth,
-            lambda pair: f"{pair[0]!r}: {format_on_one_line(pair[1], depth - 1)}",
-            "}",
-        )
-    if isinstance(value, tuple | list) and not _is_ours(value):
-        marks = "[]" if isinstance(value, list) else ("(", ",)" if len(value) == 1 else ")")
-        return _join_some(
-            marks[0], value, len(value), depth, lambda entry: format_on_one_line(entry, depth - 1), marks[1]
-        )
+        return _join_some("{", value.items(), len(value), depth, format_pair, "}")
+    if isinstance(value, list) and not _is_ours(value):
+        return _join_some("[", value, len(value), depth, format_part, "]")
+    if isinstance(value, tuple) and not _is_ours(value):
+        return _join_some("(", value, len(value), depth, format_part, ",)" if len(value) == 1 else ")")
     # Objects with fields.
     if _is_ours(value) or is_dataclass(value):
-        name, parts = type(value).__name__, list(islice(_list_parts(value), LARGE))
-        return _join_some(
-            f"{name}(", parts, len(parts), depth, lambda p: f"{p[0]}={format_on_one_line(p[1], depth - 1)}", ")"
-        )
+        parts = list(islice(_list_parts(value), LARGE))
+        return _join_some(f"{type(value).__name__}(", parts, len(parts), depth, format_field, ")")
     if isinstance(value, partial):
         return format_on_one_line(value.func, depth)
     if callable(value):

@@ -24,26 +24,34 @@ def bfgs(
     tolerance: float = 1e-12,
     memory: int | None = None,
 ) -> Float[np.ndarray, "n"]:
-    """Minimise by BFGS from `start`, where the value is finite; a step to an infinite value is shortened.
+    """Return a local minimum of a function, found by BFGS from `start`.
 
-    Stops after PATIENCE steps that gain less than `tolerance`, or where no step decreases the value any more. With
-    thousands of variables the last `memory` updates stand for the inverse Hessian (L-BFGS).
+    The search ends after PATIENCE steps in a row that gain less than `tolerance`, where no step decreases the value any
+    more, or after `iterations` steps. A step to an infinite value is shortened.
+
+    Args:
+        function: from x to its value and gradient.
+        start: where the search begins; its value is finite.
+        iterations: the most steps.
+        tolerance: decrease of the value below which a step gains nothing.
+        memory: how many of the last updates stand for the inverse Hessian, for thousands of variables (L-BFGS); None
+            holds it whole.
     """
     x = np.asarray(start, dtype=np.float64)
     value, gradient = function(x)
-    inverse = _DenseInverseHessian(gradient) if memory is None else _LimitedInverseHessian(memory)
-    idle = 0
+    inverse_hessian = _DenseInverseHessian(gradient) if memory is None else _LimitedInverseHessian(memory)
+    steps_without_gain = 0
     for _ in range(iterations):
         # Quasi-Newton direction, shortened until the value decreases; then the update.
-        direction = -inverse.times(gradient)
-        taken = _backtrack(function, x, value, direction, float(direction @ gradient))
-        if taken is None:
+        direction = -inverse_hessian.times(gradient)
+        trial = _backtrack(function, x, value, direction, float(direction @ gradient))
+        if trial is None:
             break
-        step, new_value, new_gradient = taken
-        inverse.update(step, new_gradient - gradient)
-        idle = idle + 1 if value - new_value < tolerance else 0
+        step, new_value, new_gradient = trial
+        inverse_hessian.update(step, new_gradient - gradient)
+        steps_without_gain = steps_without_gain + 1 if value - new_value < tolerance else 0
         x, value, gradient = x + step, new_value, new_gradient
-        if idle >= PATIENCE or not np.any(gradient):
+        if steps_without_gain >= PATIENCE or not np.any(gradient):
             break
     return x
 

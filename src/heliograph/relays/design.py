@@ -124,10 +124,11 @@ def make_design(network: RelayNetwork, propagated: Propagated) -> RelayDesign:
 
 
 def relay_schedules(network: RelayNetwork, design: RelayDesign) -> dict[str, Schedule]:
-    """Return every filter of a design as a schedule of gains, to save, to simulate or to run.
+    """Return every filter of a design as a schedule of gains, by name, to save, to simulate or to run.
 
-    s+ = A s + K (z - B s - b), where B s + b is the mean of z if the filter's own estimate were everybody's. Claim:
-    "exact" for complete data from the network it was designed for, "upper" where noise is known by bounds.
+    A filter's estimate moves by s+ = A s + a + K (z - B s - b), where z is what it receives and B s + b its mean if
+    the filter's own estimate were that of every relay. Claim: "exact" for complete data from the network it was
+    designed for, "upper" where noise is known by bounds.
 
     Args:
         network: relays that filter.
@@ -142,29 +143,63 @@ def relay_schedules(network: RelayNetwork, design: RelayDesign) -> dict[str, Sch
         raise fail("design", f"filters {list(network.filters)}", list(design.gains))
     _check_start(network, design)
     steps = network.steps(len(design.moments) - 1)
-    rows, constants = steps.predict_maps()
-    # Moments of (eta+ before correction, innovation): predicted and innovation covariances.
-    n, before = len(network.states), np.asarray(_predict_covariances(steps, design.moments[:-1]))
-    d = design.moments.shape[-1]
-    ends = dict(zip(network.filters, np.cumsum(network.received), strict=True))
+    # Moments over (x, e_1 ... e_F before the correction, innovations of all filters), of size d and then of the rest.
+    predicted, d = np.asarray(_predict_covariances(steps, design.moments[:-1])), design.moments.shape[-1]
+    n, ends = len(network.states), np.cumsum(network.received)
+    start_mean, _start_covariance = network.initial()
     schedules = {}
     for f, (name, size) in enumerate(zip(network.filters, network.received, strict=True)):
-        received = slice(ends[name] - size, ends[name])
-        error = slice((1 + f) * n, (2 + f) * n)
-        # Covariances of the error after and before the correction, and of the innovation.
-        covariances = design.covariance[name][1:], before[:, error, error], before[:, d:, d:][:, received, received]
-        # Gains on what nobody transmits are not used.
-        gain = design.gains[name] * np.asarray(steps.receives_in_slot)[:, None, received]
-        expected, constant = rows[:, received], constants[:, received]
-        # s+ = (A - K B) s + K z + a - K b.
-        transition = steps.transition - gain @ expected
-        offset = steps.drift - np.einsum("kir,kr->ki", gain, constant)
-        moves = transition, gain, offset  # of the state and of the estimate, which are one here
-        arrays = Gains(*moves, *moves, expected, constant, *covariances)
-        schedules[name] = Schedule(arrays, network.initial()[0], lower_by_noise("exact", network))
+        received, error = slice(ends[f] - size, ends[f]), slice((1 + f) * n, (2 + f) * n)
+        gains = _make_gains(
+            steps,
+            design.gains[name],
+            received,
+            covariance=design.covariance[name][1:],
+            predicted=predicted[:, error, error],
+            innovation=predicted[:, d:, d:][:, received, received],
+        )
+        schedules[name] = Schedule(gains, start_mean, lower_by_noise("exact", network))
     relayed = {name: schedules[name].gains.gain for name in network.relays}
     premise = Premise(network.plant, relays=network, gains=relayed)
     return {name: on_premise(schedule, premise) for name, schedule in schedules.items()}
+
+
+def _make_gains(
+    steps: RelaySteps,
+    gain: Float[Array, "steps n received"],
+    received: slice,
+    covariance: Float[Array, "steps n n"],
+    predicted: Float[Array, "steps n n"],
+    innovation: Float[Array, "steps received received"],
+) -> Gains:
+    """Return s+ = (A - K B) s + K z + a - K b of one filter as gains over time; its estimate is its state s.
+
+    Args:
+        steps: of the network, with A, a and, over what all filters receive, B and b.
+        gain: K.
+        received: which of the received numbers are the filter's z.
+        covariance: of its error after each step.
+        predicted: of its error before each correction.
+        innovation: of its innovation.
+    """
+    rows, constants = steps.predict_maps()
+    b_matrix, b = rows[:, received], constants[:, received]
+    used_gain = gain * np.asarray(steps.receives_in_slot)[:, None, received]  # zero on what nobody transmits
+    transition = steps.transition - used_gain @ b_matrix
+    offset = steps.drift - np.einsum("kir,kr->ki", used_gain, b)
+    return Gains(
+        transition=transition,
+        gain=used_gain,
+        offset=offset,
+        output=transition,
+        direct=used_gain,
+        output_offset=offset,
+        expected=b_matrix,
+        expected_offset=b,
+        covariance=covariance,
+        predicted=predicted,
+        innovation=innovation,
+    )
 
 
 def _check_start(network: RelayNetwork, design: RelayDesign) -> None:
@@ -229,8 +264,10 @@ def receiver_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> Sched
 def receiver_system(network: RelayNetwork, gains: GainsByFilter) -> LinearSystem:
     """Return a `network` with given relay `gains` as its receiver sees it: a linear system of (x, e_1, ..., z).
 
-    z reads the state before the step and shares the step's noise, so it is a component. A `LinearSystemFilter` of it is
-    `receiver_behind_relays` with its covariance propagated on line: for data with gaps, and for smoothing.
+    e_r = x - s_r is the error of relay r. What the receiver receives, z, depends on the state before the step and
+    shares the step's noise, so it is a component of the state, which is measured without noise. A `LinearSystemFilter`
+    of the system is `receiver_behind_relays` with its covariance propagated on line: for data with gaps, and for
+    smoothing.
 
     Args:
         network: relays that filter.
@@ -245,13 +282,14 @@ def receiver_system(network: RelayNetwork, gains: GainsByFilter) -> LinearSystem
     steps, n = network.steps(len(joined)), len(network.states)
     side = _list_relay_sides(steps, start_moments(network), joined)
     count, r, d = side.output.shape
-    # Means: x+ has drift a, z the constant b.
+    # Means: x+ has drift a, z the constant b, the last r of what is received in the network.
+    _rows, constants = steps.predict_maps()
     drift = np.zeros((count, d + r))
-    drift[:, :n], drift[:, d:] = steps.drift, steps.predict_maps()[1][:, -r:]
+    drift[:, :n], drift[:, d:] = steps.drift, constants[:, -r:]
     # (x, e, z)+ = [A; C] (x, e) + white noise, whatever z was, and z is measured without noise.
-    moves, no_z = np.concatenate([side.transition, side.output], axis=1), np.zeros((count, d + r, r))
+    of_states, of_z = np.concatenate([side.transition, side.output], axis=1), np.zeros((count, d + r, r))
     system = SystemSteps(
-        transition=np.concatenate([moves, no_z], axis=2),
+        transition=np.concatenate([of_states, of_z], axis=2),
         drift=drift,
         process=np.asarray(side.noise),
         output=np.tile(np.eye(r, d + r, d), (count, 1, 1)),
@@ -259,15 +297,17 @@ def receiver_system(network: RelayNetwork, gains: GainsByFilter) -> LinearSystem
         noise=np.zeros((count, r, r)),
     )
     mean, covariance = np.zeros(d + r), np.zeros((d + r, d + r))
-    mean[:n], covariance[:d, :d] = network.initial()[0], start_moments(network)[:d, :d]
-    # Gains on what nobody transmits are not used.
+    start_mean, _start_covariance = network.initial()
+    mean[:n], covariance[:d, :d] = start_mean, start_moments(network)[:d, :d]
+    # Gains on what nobody transmits are not used. The receiver comes last, behind all relays.
     ends, receives = np.cumsum(network.received), np.asarray(steps.receives_in_slot)
     relayed = {
         name: np.asarray(gains[name]) * receives[:, None, end - size : end]
         for name, size, end in zip(network.relays, network.received, ends, strict=False)
     }
+    x_of_state = np.eye(n, d + r)
     return on_premise(
-        LinearSystem(system, mean, covariance, np.eye(n, d + r)),
+        LinearSystem(system, mean, covariance, x_of_state),
         Premise(network.plant, relays=network, gains=relayed),
     )
 
@@ -297,29 +337,33 @@ class RelaySide(NamedTuple):
 
 
 def relay_side(step: RelaySteps, moments: Float[Array, "d d"], gain: Float[Array, "Fn R"]) -> RelaySide:
-    """Return the linear system of (x, e_relays) that the receiver estimates in one step.
+    """Return the linear system of zeta = (x, e_1 ... e_relays) that the receiver estimates, in one step.
 
-    moments: covariance of (x, e_1 .. e_F) before the step, which decides how much noise random gains add.
+    Args:
+        step: of the network, with x+ = A x + w, a sensor's noise v, and random gains of its links.
+        moments: covariance of (x, e_1 ... e_F) of all filters before the step, the receiver last, which decides how
+            much noise random gains add.
+        gain: K of all filters as one block matrix, over what all of them receive.
     """
     n, r = step.transition.shape[-1], step.received[-1]
     maps, d = linear_maps(step), moments.shape[0]
-    # (x, e_relays), and rows that the relays receive: without the receiver's error and what it receives.
+    # Sizes of zeta, and of what all relays receive: without the receiver's error and what it receives.
     zeta, relay_rows = d - n, step.gain.shape[0] - r
-    # (zeta+ before corrections, the relays' innovations, z), as rows over (x, e_1 .. e_F, w, v).
+    # (zeta+ before corrections, the relays' innovations, z), as rows over (x, e_1 ... e_F, w, v).
     received = (step.gain @ maps.sent)[relay_rows:]
-    before = jnp.concatenate([maps.moved[:zeta], maps.innovation[:relay_rows], received])
-    # (zeta+, z) from these: e_r+ = e_r+ before its correction - K_r i_r.
-    corrections = -(gain * step.receives_in_slot)[: zeta - n, :relay_rows]
-    corrections = jnp.concatenate([jnp.zeros((n, relay_rows)), corrections])
-    close = jnp.concatenate([jnp.eye(zeta), corrections, jnp.zeros((zeta, r))], axis=1)
-    close = jnp.concatenate([close, jnp.eye(r, zeta + relay_rows + r, zeta + relay_rows)])
-    after = close @ before
+    uncorrected = jnp.concatenate([maps.moved[:zeta], maps.innovation[:relay_rows], received])
+    # The matrix from these to (zeta+, z): e_r+ = e_r+ before its correction - K_r i_r.
+    relay_gain = -(gain * step.receives_in_slot)[: zeta - n, :relay_rows]
+    from_innovations = jnp.concatenate([jnp.zeros((n, relay_rows)), relay_gain])
+    correct_zeta = jnp.concatenate([jnp.eye(zeta), from_innovations, jnp.zeros((zeta, r))], axis=1)
+    correct = jnp.concatenate([correct_zeta, jnp.eye(r, zeta + relay_rows + r, zeta + relay_rows)])
+    corrected = correct @ uncorrected
     # White noise: of plant and sensor, and what random gains make of the signals sent.
     noise = jax.scipy.linalg.block_diag(step.process, step.sensor_noise)
     _, sent = step_moments(step, moments)
-    random = contract(step.spread, sent.second)
-    white = propagate_by_mode(after[:, d:], noise, propagate_by_mode(close[:, zeta:], random, 0.0))
-    return RelaySide(transition=after[:zeta, :zeta], output=after[zeta:, :zeta], noise=white)
+    of_random_gains = propagate_by_mode(correct[:, zeta:], contract(step.spread, sent.second), 0.0)
+    white = propagate_by_mode(corrected[:, d:], noise, of_random_gains)
+    return RelaySide(transition=corrected[:zeta, :zeta], output=corrected[zeta:, :zeta], noise=white)
 
 
 @compile_in_float64

@@ -1,6 +1,7 @@
 """Descent over the gains of a relay network's period, with the power of each slot kept below a limit."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -33,36 +34,42 @@ def minimise_over_gains(
 ) -> Float[np.ndarray, "slots Fn R"]:
     """Return the gains of least cost, by descent over the entries that multiply `free` received numbers.
 
-    `steps`: those of one period. Entries of each filter are in units of its largest. A limit of power is kept by an
-    augmented Lagrangian: with g_s = power_s / limit_s - 1 in slot s the cost is that of `_penalise_power`, and after
-    each descent lambda_s = max(0, lambda_s + STIFFNESS g_s).
+    A limit of power is kept by an augmented Lagrangian: with g_s = power_s / limit_s - 1 in slot s the cost is that of
+    `_penalise_power`, and after each descent lambda_s = max(0, lambda_s + STIFFNESS g_s).
+
+    Args:
+        network: the relay network.
+        steps: those of one period.
+        start: gains of all filters with which the descent begins, one block matrix for each slot of the period.
+        free: which of the received numbers have gains that may change.
+        cost: the penalised cost of gains (`make_penalised_cost`).
+        power_limit: of all relays together in each slot; None for no limit.
+
+    Raises:
+        ValueError: gains at the start under which moments diverge; a limit that no gains were found to meet.
     """
-    # Free entries: those that multiply a received number, and their units.
+    # The entries that may change; the variables x are their changes in units of their filter's largest entry.
     where = np.nonzero(gain_mask(steps) & (steps.receives_in_slot[:, None, :] > 0) & free)
     unit = _find_largest_entries(network, start)[where]
     # A limit for each slot, without effect where no relay transmits. The search aims a margin below it.
     slots = len(network.slots)
     limit = np.full(slots, np.inf) if power_limit is None else repeat_per_step("power limit", power_limit, slots)
     limit = np.where(steps.transmits_in_slot[:, 1:].any(axis=1), limit, np.inf)
-    aim = limit * (1 - MARGIN)
-    # Scaled changes x of the gains, and a multiplier for the power of each slot.
+    aimed_limit = limit * (1 - MARGIN)
+    # lambda, a multiplier for the power of each slot.
     multipliers, x = np.zeros(slots), np.zeros(len(unit))
-    if not np.isfinite(cost(x, steps, start, where, unit, np.full(slots, np.inf), multipliers)[0]):
+    start_cost, _gradient, _power = cost(x, steps, start, where, unit, np.full(slots, np.inf), multipliers)
+    if not np.isfinite(start_cost):
         raise fail("start of the search", "gains under which second moments converge", "some under which they diverge")
-    # Descend, then raise the multipliers of slots above their limit.
+    # Descend, then raise the multipliers of slots above their limit; once where there is no limit.
     for _ in range(ROUNDS if power_limit is not None else 1):
-
-        def function(x: np.ndarray, multipliers: np.ndarray = multipliers) -> tuple[float, np.ndarray]:
-            value, gradient, _ = cost(x, steps, start, where, unit, aim, multipliers)
-            return float(value), np.asarray(gradient)
-
-        x = bfgs(function, x)
-        power = np.asarray(cost(x, steps, start, where, unit, limit, multipliers)[2])
-        excess = power / aim - 1
-        if _within_limits(excess, multipliers):
+        x = _descend(cost, x, (steps, start, where, unit, aimed_limit, multipliers))
+        _cost, _gradient, powers = cost(x, steps, start, where, unit, limit, multipliers)
+        power = np.asarray(powers)
+        excess = power / aimed_limit - 1
+        if _are_within_limits(excess, multipliers):
             break
         multipliers = np.maximum(0.0, multipliers + STIFFNESS * excess)
-    # Gains in their units again.
     if np.any(power > limit * (1 + POWER_TOLERANCE)):
         raise fail("power limit", "one that some gains meet", f"an excess of {np.max(power / limit) - 1:.2g}")
     tuned: np.ndarray = start.copy()
@@ -70,8 +77,19 @@ def minimise_over_gains(
     return tuned
 
 
-def _within_limits(excess: Float[np.ndarray, "slots"], multipliers: Float[np.ndarray, "slots"]) -> bool:
-    """Decide whether no slot is above its limit, and those with a multiplier are at it; `excess`: power / limit - 1."""
+def _descend(cost: Cost, x: Float[np.ndarray, "n"], arguments: tuple[Any, ...]) -> Float[np.ndarray, "n"]:
+    """Return the x of least cost, found by descent from x; `arguments` are those of the cost behind x."""
+
+    def evaluate(x: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return the cost of x, and its gradient."""
+        value, gradient, _power = cost(x, *arguments)
+        return float(value), np.asarray(gradient)
+
+    return bfgs(evaluate, x)
+
+
+def _are_within_limits(excess: Float[np.ndarray, "slots"], multipliers: Float[np.ndarray, "slots"]) -> bool:
+    """Return whether no slot is above its limit, and those with a multiplier are at it; `excess`: power / limit - 1."""
     return bool(np.all(excess < MARGIN / 2) and np.all(excess[multipliers > 0] > -MARGIN))
 
 
@@ -110,7 +128,10 @@ def _penalise_power(
 
 
 def make_penalised_cost(traces: Callable[[RelaySteps, jax.Array], tuple[jax.Array, jax.Array, jax.Array]]) -> Cost:
-    """Return the penalised cost of `traces(steps, gains)`, which returns tr P by slot, soundness and powers."""
+    """Return the function that computes the penalised cost of a period's gains, its gradient and their powers.
+
+    `traces(steps, gains)` returns tr P of each slot, whether the moments converge, and the power of each slot.
+    """
 
     def evaluate(
         x: Array,
@@ -121,13 +142,17 @@ def make_penalised_cost(traces: Callable[[RelaySteps, jax.Array], tuple[jax.Arra
         limit: Array,
         multipliers: Array,
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Return the penalised cost of gains x, its gradient, and the powers that they send."""
+        """Return the penalised cost of the gains `base` + x `unit` at `where`, its gradient, and the slots' powers.
 
-        def cost_and_power(x: jax.Array) -> tuple[jax.Array, jax.Array]:
-            trace, sound, power = traces(steps, jnp.asarray(base).at[where].add(x * unit))
-            return _penalise_power(trace, sound, power, limit, multipliers), power
+        `limit` and `multipliers` are those of each slot's power in `_penalise_power`.
+        """
 
-        (cost, power), gradient = jax.value_and_grad(cost_and_power, has_aux=True)(x)
+        def compute_cost_and_power(x: jax.Array) -> tuple[jax.Array, jax.Array]:
+            """Return the penalised cost, and beside it the powers."""
+            trace, converges, power = traces(steps, jnp.asarray(base).at[where].add(x * unit))
+            return _penalise_power(trace, converges, power, limit, multipliers), power
+
+        (cost, power), gradient = jax.value_and_grad(compute_cost_and_power, has_aux=True)(x)
         return cost, gradient, power
 
     return compile_in_float64(evaluate)

@@ -142,8 +142,12 @@ def is_covariance(moments: Float[Array, "... d d"]) -> Bool[jax.Array, ""]:
 def steady_receiver_covariance(steps: RelaySteps, gains: Float[Array, "slots Fn R"]) -> Float[jax.Array, "slots d d"]:
     """Return the steady error covariances of the best linear estimate of (x, e_relays) from the receiver's data.
 
-    The receiver's gains are held while differentiating: they minimise the error, so their change has no first-order
-    effect, and the fixed point with given gains is affine. The covariances are those at the end of each slot.
+    They are those at the end of each slot of a period. The receiver's gains are held while differentiating: they
+    minimise the error, so their change has no first-order effect, and the fixed point with given gains is affine.
+
+    Args:
+        steps: of one period.
+        gains: of all filters as one block matrix for each slot; those of the receiver are not used.
     """
     moments = steady_moments(steps, gains).moments[:-1]
     sides = jax.vmap(relay_side)(steps, moments, gains)
@@ -156,31 +160,34 @@ def steady_receiver_covariance(steps: RelaySteps, gains: Float[Array, "slots Fn 
 
     def correct_best(covariance: jax.Array, side: RelaySide) -> tuple[jax.Array, jax.Array]:
         """Take one Riccati step: return the covariance after a slot, and the best gain."""
-        z = predict(covariance, side)
-        gain = regression_gain(z[:d, d:], z[d:, d:])  # zero in a slot in which nobody transmits to the receiver
-        return correct_moments(z, gain), gain
+        joint = predict(covariance, side)
+        gain = regression_gain(joint[:d, d:], joint[d:, d:])  # zero in a slot without data for the receiver
+        return correct_moments(joint, gain), gain
 
-    def correct_given(covariance: jax.Array, row: tuple[RelaySide, jax.Array]) -> tuple[jax.Array, jax.Array]:
+    def correct_with(covariance: jax.Array, row: tuple[RelaySide, jax.Array]) -> tuple[jax.Array, jax.Array]:
         """Take one step with a given gain: return the covariance after a slot, twice."""
         side, gain = row
-        after = correct_moments(predict(covariance, side), gain)
-        return after, after
+        corrected = correct_moments(predict(covariance, side), gain)
+        return corrected, corrected
 
-    # The receiver's steady gains, by its Riccati recursion, constant under differentiation.
-    held = jax.lax.stop_gradient(sides)
-    converged, _ = _repeat_until_steady(
-        lambda e: jax.lax.scan(correct_best, e, held)[0],
-        jax.lax.stop_gradient(moments[0][:d, :d]),
-        GAINS_CONVERGED,
-    )
-    best_gains = jax.lax.stop_gradient(jax.lax.scan(correct_best, converged, held)[1])
+    # The receiver's steady gains: its Riccati recursion over periods, without derivatives.
+    constant_sides = jax.lax.stop_gradient(sides)
+
+    def run_best_period(covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return the covariance at the end of a period, and the best gain of each of its slots."""
+        return jax.lax.scan(correct_best, covariance, constant_sides)
+
+    start = jax.lax.stop_gradient(moments[0][:d, :d])
+    steady_start, _ = _repeat_until_steady(lambda e: run_best_period(e)[0], start, GAINS_CONVERGED)
+    best_gains = jax.lax.stop_gradient(run_best_period(steady_start)[1])
 
     # With these gains the fixed point is one linear solve.
     def run_period(covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return the covariances at the end of a period, and of each of its slots."""
-        return jax.lax.scan(correct_given, covariance, (sides, best_gains))
+        return jax.lax.scan(correct_with, covariance, (sides, best_gains))
 
-    return jnp.asarray(run_period(affine_fixed_point(lambda e: run_period(e)[0], d))[1])
+    _, covariances = run_period(affine_fixed_point(lambda e: run_period(e)[0], d))
+    return jnp.asarray(covariances)
 
 
 _steady = compile_in_float64(steady_moments)

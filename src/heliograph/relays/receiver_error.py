@@ -1,5 +1,6 @@
 """Relays and receiver tuned together, over a horizon, so that the receiver's error is small; power may be bounded."""
 
+import math
 from functools import partial
 from typing import NamedTuple
 
@@ -99,26 +100,40 @@ def minimise_within_limit(
 ) -> Float[np.ndarray, "time Fn R"]:
     """Return the gains of small cost that meet the limit; never dearer than `local_gains`, if those meet it.
 
-    Descends f - t sum_k log(1 - p_k / limit_k), f the cost in units of that of `local_gains`, over the gains of all
-    steps at once, for ever smaller t. Every point on the way is strictly inside, so nothing hangs on a last sweep that
-    happens to meet all limits at once; and t falls little at a time, since long descents multiply what rounding leaves.
+    By an interior point method: f - t sum_k log(1 - p_k / limit_k) is descended over the gains of all steps at once,
+    for ever smaller t, where f is the cost in units of that of `local_gains` and p_k a step's power. Every point on the
+    way is strictly inside the limits. t falls little at a time, since long descents multiply what rounding leaves.
+
+    Args:
+        problem: the cost and the limits.
+        local_gains: with which the first descent begins, scaled into the limits.
+        iterations: steps of all descents together.
     """
-    local_cost = float(_compute_cost_and_slack(problem, local_gains)[0])
-    problem = problem._replace(cost=problem.cost / max(local_cost, np.finfo(float).tiny))
+    local_cost, _slack = _compute_cost_and_slack(problem, local_gains)
+    problem = problem._replace(cost=problem.cost / max(float(local_cost), np.finfo(float).tiny))
     # Designs to choose from: the local gains, these scaled into the limit, and the end of each descent.
-    results = [local_gains, _scale_into_limit(problem, local_gains)]
+    designs = [local_gains, _scale_into_limit(problem, local_gains)]
     for barrier in BARRIERS / len(local_gains):
-        gains = results[-1]
+        gains = designs[-1]
+        # The variables x (time, r): changes of the r free gains of each step, in units in which the cost curves alike.
         units = np.asarray(_choose_units(problem, gains, barrier))
-        function = partial(_evaluate_barrier, problem, gains, units, barrier)
-        x = bfgs(function, np.zeros(units[..., 0].size), -(-iterations // len(BARRIERS)), PRECISION, MEMORY)
-        results.append(np.asarray(_change_gains(gains, units, x.reshape(units.shape[:2]), problem.steps)))
-    judged = [_compute_cost_and_slack(problem, gains) for gains in results]
+        evaluate = partial(_evaluate_barrier, problem, gains, units, barrier)
+        shape = units.shape[:2]
+        x = bfgs(
+            evaluate,
+            start=np.zeros(math.prod(shape)),
+            iterations=-(-iterations // len(BARRIERS)),
+            tolerance=PRECISION,
+            memory=MEMORY,
+        )
+        designs.append(np.asarray(_change_gains(gains, units, x.reshape(shape), problem.steps)))
+    # The cheapest that meets all limits.
+    judged = [_compute_cost_and_slack(problem, gains) for gains in designs]
     costs = [float(cost) if np.all(slack >= 0) else np.inf for cost, slack in judged]
     best = int(np.argmin(costs))
     if not np.isfinite(costs[best]):
         raise fail("power limit", "one that some design meets", "one for which none was found")
-    return results[best]
+    return designs[best]
 
 
 def _scale_into_limit(
@@ -189,28 +204,35 @@ def _evaluate_barrier(
 def _choose_units(
     problem: LimitedProblem, gains: Float[Array, "time Fn R"], barrier: float
 ) -> Float[Array, "time r r"]:
-    """Return L'^-1 for each step, L L' the Hessian of its gains: in these units the cost curves alike all around.
+    """Return units (columns) of the r free gains of each step, in which the cost curves alike in all directions.
 
-    The gradient of cost and barrier by the moments is taken back step by step from the last.
+    They are L'^-1, with L L' the Hessian of cost and barrier by the step's gains while those of other steps stay. It
+    needs Lam, the gradient of cost and barrier by the moments after the step, which is found step by step from the
+    last.
     """
     steps, start, cost, (form, limit) = problem
     moments = jnp.asarray(propagate_slots(steps, start, gains).moments)
+    # Cost and barrier of step k alone, by the moments after it: d/dp of -t log(limit - p) is t / (limit - p).
     slack = limit - jnp.sum(form * moments[1:], axis=(1, 2))
-    slope = jnp.asarray(cost) + (barrier / slack)[:, None, None] * form
+    own_gradient = jnp.asarray(cost) + (barrier / slack)[:, None, None] * form
 
     def step_back(
-        ahead: jax.Array, row: tuple[RelaySteps, jax.Array, jax.Array, jax.Array]
+        later: jax.Array, row: tuple[RelaySteps, jax.Array, jax.Array, jax.Array]
     ) -> tuple[jax.Array, jax.Array]:
         """Return the gradient by the moments before a step, from that of later steps, and the units of its gains."""
-        step, gain, before, slope_k = row
-        ahead = ahead + slope_k
-        hessian, _ = gain_hessian(step_moments(step, before)[0], ahead, step, DAMPING)
-        free = jnp.asarray(step.receives_in_slot)[np.nonzero(gain_mask(step))[1]]
-        unit = jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(hessian).T, jnp.diag(free))
-        return moment_adjoint(step, gain, ahead), free[:, None] * unit
+        step, gain, moments_before, own = row
+        lam = later + own
+        uncorrected, _ = step_moments(step, moments_before)
+        hessian, _ = gain_hessian(uncorrected, lam, step, DAMPING)
+        # 1 for a gain on what is transmitted, else 0: such a gain stays.
+        _gain_rows, received = np.nonzero(gain_mask(step))
+        is_free = jnp.asarray(step.receives_in_slot)[received]
+        unit = jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(hessian).T, jnp.diag(is_free))
+        return moment_adjoint(step, gain, lam), is_free[:, None] * unit
 
-    items = (steps, jnp.asarray(gains), moments[:-1], slope)
-    return jax.lax.scan(step_back, jnp.zeros_like(jnp.asarray(start)), items, reverse=True)[1]
+    items = (steps, jnp.asarray(gains), moments[:-1], own_gradient)
+    _, units = jax.lax.scan(step_back, jnp.zeros_like(jnp.asarray(start)), items, reverse=True)
+    return units
 
 
 STEPS = 4  # of a descent within a power limit, for each sweep
@@ -254,40 +276,50 @@ def receiver_error_design(
         raise fail("weights and sweeps", "no negative weight and at least one sweep", f"{np.min(weights):g}, {sweeps}")
     steps, start = network.steps(horizon), start_moments(network)
     cost = receiver_weight(weights, len(network.filters), len(network.states))
-    first = join_gains(network, design.gains)
+    # From the gains with which each filter minimises its own error.
+    local_gains = join_gains(network, design.gains)
     if power_limit is None:
-        gains = _alternate_sweeps(steps, start, cost, first, np.arange(sweeps))
+        gains = _alternate_sweeps(steps, start, cost, local_gains, np.arange(sweeps))
     else:
         limit = power_limit_of(steps, power_limit, start.shape[0])
-        gains = minimise_within_limit(LimitedProblem(steps, start, cost, limit), first, STEPS * sweeps)
+        problem = LimitedProblem(steps=steps, start=start, cost=cost, power=limit)
+        gains = minimise_within_limit(problem, local_gains, STEPS * sweeps)
     return given_design(network, split_gains(network, np.asarray(gains)))
 
 
 def _sweep_backward(
     steps: RelaySteps, start: Array, cost: Float[Array, "time d d"], gains: jax.Array
 ) -> Float[jax.Array, "time d d"]:
-    """Return the gradient Lam_k of the cost by the moments after each step, from the last step to the first.
+    """Return the gradient Lam_k of the cost by the moments after each step, found from the last step to the first.
 
-    On the way each step's gains are the best for Lam and for the moments that the given gains lead to.
+    Later steps are taken with the gains that are best for their Lam and for the moments that the given gains lead to.
+
+    Args:
+        steps: of the network.
+        start: moments before the first step.
+        cost: C_k, with the cost sum_k <C_k, moments after step k>.
+        gains: of all filters as one block matrix for each step.
     """
 
     def predict(moments: jax.Array, row: tuple[RelaySteps, jax.Array]) -> tuple[jax.Array, jax.Array]:
         """Return the moments after a step with its given gain, and those before the correction."""
         step, gain = row
-        z, _ = step_moments(step, moments)
-        return correct_moments(z, gain), z
+        uncorrected, _ = step_moments(step, moments)
+        return correct_moments(uncorrected, gain), uncorrected
 
     def step_back(
-        ahead: jax.Array, row: tuple[RelaySteps, jax.Array, jax.Array, jax.Array]
+        later: jax.Array, row: tuple[RelaySteps, jax.Array, jax.Array, jax.Array]
     ) -> tuple[jax.Array, jax.Array]:
-        """Return the gradient by the moments before a step, and after it."""
-        step, gain, z_k, cost_k = row
-        ahead = ahead + cost_k
-        return moment_adjoint(step, minimise_cost_ahead(z_k, ahead, gain, step), ahead), ahead
+        """Return the gradient by the moments before a step, from that of later steps, and Lam."""
+        step, gain, uncorrected, own_cost = row
+        lam = later + own_cost
+        best_gain = minimise_cost_ahead(uncorrected, lam, gain, step)
+        return moment_adjoint(step, best_gain, lam), lam
 
-    _, z = jax.lax.scan(predict, jnp.asarray(start), (steps, gains))
-    items = (steps, gains, z, jnp.asarray(cost))
-    return jax.lax.scan(step_back, jnp.zeros_like(start), items, reverse=True)[1]
+    _, uncorrected = jax.lax.scan(predict, jnp.asarray(start), (steps, gains))
+    items = (steps, gains, uncorrected, jnp.asarray(cost))
+    _, lams = jax.lax.scan(step_back, jnp.zeros_like(start), items, reverse=True)
+    return lams
 
 
 def _sweep_forward(steps: RelaySteps, start: Array, gains: jax.Array, ahead: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -6,6 +6,7 @@ chunks, that by which one of them was entered backwards and the one with which t
 else the earlier one is smoothed again from the latter. What a step leaves for the way back stays in the lanes.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -64,43 +65,49 @@ def smooth_chunk(
     later: Gaussian,
     is_given: Array,
 ) -> SmoothedChunk:
-    """Smooth a chunk by its own rows and those behind it, up to row `end`.
+    """Smooth a chunk's own rows by all data up to row `end`: filter ahead, then pass back.
 
     Args:
         recursion: the filter over rows, and how many rows are the chunk's own.
         state: the filter's state at the chunk's beginning.
-        rows: measurements and inputs of its own rows and those behind.
+        rows: measurements and inputs of its own rows and of those behind them.
         first: number of its first row.
-        end: number of the row before which the pass back begins.
-        later: the law from which it begins, if it `is_given`; else it is the filter's.
+        end: number of the row before which the pass back begins; rows from it on are not used.
+        later: the smoothed law with which the pass back begins, if it `is_given`; else it is the filter's there.
         is_given: whether `later` is used.
     """
     own = recursion.own
-    after, steps = scan_chunk(recursion, state, take(rows, slice(own)), first, end)
-    last, steps_behind = scan_chunk(recursion, after, take(rows, slice(own, None)), first + own, end)
+    state_after, steps = scan_chunk(recursion, state, take(rows, slice(own)), first, end)
+    last_state, steps_behind = scan_chunk(recursion, state_after, take(rows, slice(own, None)), first + own, end)
 
     def pass_back(law: Gaussian, item: tuple[SmootherStep, Array]) -> tuple[Gaussian, None]:
         """Return the law before a row from that behind it; the same from row `end` on."""
         step, k = item
         return select_state(k < end, step.back(law), law), None
 
-    def smooth(law: Gaussian, item: tuple[SmootherStep, Array]) -> tuple[Gaussian, Estimate]:
-        """Pass back over a row, and keep its estimate."""
-        return pass_back(law, item)[0], item[0].estimate_from(law)
+    def pass_back_and_estimate(law: Gaussian, item: tuple[SmootherStep, Array]) -> tuple[Gaussian, Estimate]:
+        """Return the law before a row, and the row's smoothed estimate."""
+        step, _k = item
+        law_before, _ = pass_back(law, item)
+        return law_before, step.estimate_from(law)
 
     k = first + jnp.arange(len(rows[0]))
-    law = select_state(is_given, later, gaussian_of(last))
+    law = select_state(is_given, later, gaussian_of(last_state))
     entered, _ = jax.lax.scan(pass_back, law, (steps_behind, k[own:]), reverse=True)
-    left, estimate = jax.lax.scan(smooth, entered, (steps, k[:own]), reverse=True)
-    return SmoothedChunk(after, entered, left, estimate, steps.nis, steps.received)
+    left, estimate = jax.lax.scan(pass_back_and_estimate, entered, (steps, k[:own]), reverse=True)
+    return SmoothedChunk(
+        end=state_after, entered=entered, left=left, estimate=estimate, nis=steps.nis, received=steps.received
+    )
+
+
+SmoothChunks = Callable[..., SmoothedChunk | None]  # of states, which chunks, and the laws behind them, if given
 
 
 def _smooth_all(recursion: SmootherStepRecursion, begun: ChunkStarts, rows: PyTree) -> SmoothedRows | None:
-    """Smooth all chunks side by side, and again those that a neighbour contradicts.
+    """Smooth all chunks side by side, and again those that a neighbour contradicts; None without native code.
 
     A chunk has `own` rows. It filters `ahead` rows more and passes back over these, begun by the filter's own law at
-    their end, which they forget: so it enters its own rows by the law that all later data give. Where the next chunk's
-    first row has another law, it is smoothed once more, from that one; the last such chunk first.
+    their end, which they forget: so it enters its own rows by the law that all later data give.
     """
     total, (own, ahead) = len(rows[0]), begun.lengths
     windows = take_windows(rows, begun.first, own + ahead)
@@ -112,31 +119,43 @@ def _smooth_all(recursion: SmootherStepRecursion, begun: ChunkStarts, rows: PyTr
         end = ends[which] if later is None else first + own
         laws = gaussian_of(states) if later is None else later
         arguments = recursion, states, take(windows, which), first, end, laws, np.full(len(first), later is not None)
-        choice = choose_code(smooth_chunk, arguments, [False, *[True] * 6])
+        differs_by_chunk = [False, *[True] * 6]  # all arguments but the recursion
+        choice = choose_code(smooth_chunk, arguments, differs_by_chunk)
         return None if choice.code is None else choice.results()
 
     def smooth_means(settled: SettledState) -> SmoothedChunk | None:
         """Smooth all chunks as if they were settled."""
         return smooth_settled_chunks(recursion, settled, begun, windows)
 
-    # Settled chunks are those whose rows are complete, their own and those behind, of which none are beyond the end.
-    whole = begun.complete.cover(begun.first, own + ahead) & (begun.first + own + ahead <= total)
-    begun = begun._replace(covered=begun.covered & whole)
+    # Chunks whose covariances stand still, of which means alone are computed, have complete rows: their own and those
+    # behind, none of them beyond the end.
+    is_complete = begun.complete.cover(begun.first, own + ahead) & (begun.first + own + ahead <= total)
+    begun = begun._replace(covered=begun.covered & is_complete)
     results = scan_settled_by_means(begun, smooth_chunks_from, smooth_means)
     if results is None:
         return None
+    # In place: forwards, chunks that began with another state than that in which the one before them ends; then back.
     rescan_wrong_starts(smooth_chunks_from, begun.states, lambda results: results.end, results)
-    # The states with which chunks begin are those in which the ones before them end.
+    _resmooth_wrong_ends(smooth_chunks_from, begun.states, results)
+    parts = results.estimate, results.nis, results.received
+    estimate, nis, received = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:total], parts)
+    return SmoothedRows(estimate, np.asarray(sum_nis_over_blocks(nis, received)))
+
+
+def _resmooth_wrong_ends(smooth: SmoothChunks, states: PyTree, results: SmoothedChunk) -> None:
+    """Smooth again, in place, each chunk entered by another law than that with which the next one was left.
+
+    The last such chunk comes first: smoothed again from the next one's law, it is left by another law itself, with
+    which the chunk before it has to agree. A chunk begins in the state in which the one before it ends, the first one
+    in that of `states`.
+    """
     wrong = ~find_equal_states(take(results.entered, slice(None, -1)), take(results.left, slice(1, None)))
     for c in range(len(wrong) - 1, -1, -1):
-        if wrong[c]:
-            here, law = slice(c, c + 1), take(results.left, slice(c + 1, c + 2))
-            state = take(results.end, slice(c - 1, c)) if c else take(begun.states, here)
-            replace_chunk(results, here, smooth_chunks_from(state, here, law))
-            # This chunk is left by another law now, with which the one before it has to agree.
-            if c:
-                wrong[c - 1] = not find_equal_states(take(results.entered, slice(c - 1, c)), take(results.left, here))[
-                    0
-                ]
-    estimate, nis, received = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:total], results[3:])
-    return SmoothedRows(estimate, np.asarray(sum_nis_over_blocks(nis, received)))
+        if not wrong[c]:
+            continue
+        before, here, behind = slice(c - 1, c), slice(c, c + 1), slice(c + 1, c + 2)
+        state = take(results.end, before) if c else take(states, here)
+        replace_chunk(results, here, smooth(state, here, take(results.left, behind)))
+        if c:
+            (agrees,) = find_equal_states(take(results.entered, before), take(results.left, here))
+            wrong[c - 1] = not agrees

@@ -72,15 +72,15 @@ class BackwardRecursion(Recursion):
 def smooth_settled_chunks(
     recursion: SmootherStepRecursion, settled: SettledState, begun: ChunkStarts, windows: PyTree
 ) -> SmoothedChunk | None:
-    """Smooth chunks, as if all were settled, by their rows and those behind them (chunks, rows, ...).
+    """Smooth chunks as if the filter's covariance stood still in all of them; None where that is not possible.
 
-    None where the smoothed law does not settle, or without native code.
+    It is not where the smoothed law's covariance does not come to stand still, or without native code.
 
     Args:
         recursion: the filter over rows.
         settled: the state at which its covariance stands still, and its smoother step there.
         begun: the states with which the chunks begin.
-        windows: rows of each chunk.
+        windows: the rows of each chunk and those behind it, (chunks, rows, ...).
     """
     # The smoothed law that stands still, by repeating the settled smoother step.
     back = BackwardRecursion(settled)
@@ -90,7 +90,8 @@ def smooth_settled_chunks(
     if smoothed is None:
         return None
     arguments = recursion, back, smoothed, means_of(begun.states), windows, begun.first
-    choice = choose_code(_smooth_settled, arguments, [False, False, False, True, True, True])
+    differs_by_chunk = [False, False, False, True, True, True]  # means, rows and numbers of first rows
+    choice = choose_code(_smooth_settled, arguments, differs_by_chunk)
     if choice.code is None:
         return None
     end, entered, left, estimates, nis = choice.results()
@@ -112,15 +113,24 @@ def _smooth_settled(
     rows: PyTree,
     first: Array,
 ) -> tuple[PyTree, ...]:
-    """Smooth a settled chunk that begins with these means, by its own rows and those behind it.
+    """Smooth one chunk in which covariances stand still: filter its means ahead, then pass them back.
+
+    Args:
+        recursion: the filter over rows, and how many rows are the chunk's own.
+        back: the pass back over settled smoother steps.
+        smoothed: the smoothed law at which its covariance stands still.
+        means: the filter's means at the chunk's beginning, one array for each Gaussian of its state.
+        rows: of the chunk and of those behind it.
+        first: number of its first row.
 
     Returns:
-        The filter's means at its end, the means of the smoothed laws by which it is entered and left, the leaves of its
-        estimates that vary (own, ...), and the squared innovations (own,).
+        The filter's means at the end of its own rows, the means of the smoothed laws by which it is entered and left,
+        the leaves of its estimates that vary (own, ...), and the squared innovations (own,).
     """
     own, settled, end = recursion.own, back.settled, first + len(rows[0])
-    after, steps = scan_settled_rows(recursion, settled, means, take(rows, slice(own)), first, end)
-    last, steps_behind = scan_settled_rows(recursion, settled, after, take(rows, slice(own, None)), first + own, end)
+    means_after, steps = scan_settled_rows(recursion, settled, means, take(rows, slice(own)), first, end)
+    rows_behind = take(rows, slice(own, None))
+    last, steps_behind = scan_settled_rows(recursion, settled, means_after, rows_behind, first + own, end)
 
     def pass_back(means: list[jax.Array], varying: list[jax.Array]) -> tuple[list[jax.Array], list[jax.Array]]:
         """Return the smoothed means before a row from those behind it, and what varies of its estimate."""
@@ -131,4 +141,4 @@ def _smooth_settled(
     entered, _ = jax.lax.scan(pass_back, law, steps_behind, reverse=True)
     left, estimates = jax.lax.scan(pass_back, entered, steps, reverse=True)
     nis = settled.row_of(steps).nis
-    return after, entered, left, estimates, jnp.broadcast_to(nis, (own,))
+    return means_after, entered, left, estimates, jnp.broadcast_to(nis, (own,))

@@ -13,7 +13,7 @@ from straightline.cycles import keep_cycles
 from straightline.folding import DTYPES
 from straightline.limits import LONGEST, TABLE
 from straightline.llvm.lanes import WIDTH, lane_numbers, types, write_flush, write_gather
-from straightline.llvm.layout import FILLED, LINE, MemoryLayout, ProgramParts, lay_out
+from straightline.llvm.layout import FILLED, LINE, MemoryLayout, ProgramParts, divide_program, lay_out
 from straightline.llvm.operations import BITS
 from straightline.llvm.prefetch import PrefetchedRows, longest, share
 from straightline.llvm.text import FunctionWriter, SharedSlots, turns_of
@@ -25,7 +25,6 @@ from straightline.program import (
     Program,
     SummedOutputs,
     find_crossing_items,
-    find_differing,
     find_fusable_products,
     list_needed,
     row_length,
@@ -33,10 +32,8 @@ from straightline.program import (
 )
 from straightline.rules.loops import copied
 from straightline.rules.random_bits import write_hash_function
-from straightline.vectors.elementary import FUNCTIONS, write_functions
+from straightline.vectors.elementary import write_functions
 
-WIDEST = 8  # runs of a vector of doubles: one register of the widest processors, two of others; more only spill
-LONG = 60  # operations of an elementary function or of a hash: 30 to 150, and 80
 SQUARED = ("f64", "i64", "u64", "f32")  # types whose arrays are long enough, or wide, to be moved in squares
 
 
@@ -156,29 +153,16 @@ def write_module(
         Unsupported: an operation that LLVM's text does not have here, or a program that is too long.
     """
     outputs = choose_output_buffers(program, last)
-    lanes = [b for b, differs in zip(program.inputs, differing, strict=True) if differs or alone]
     items = sort_items(keep_cycles(program.graph, outputs) if alone else list_needed(outputs))
     counts = _count_operations(items)
-    # What differs between runs: all items if there is one run, but never the tables.
-    spread = {*items, *program.inputs} if alone else find_differing(items, lanes)
-    spread = {x for x in spread if not (isinstance(x, Buffer) and x.kind == "table")}
-    parts = ProgramParts(
-        program=program,
-        items=items,
-        outputs=outputs,
-        lanes=lanes,
-        spread=spread,
-        alone=alone,
-        width=width or widest(spread),
-        summed=summed,
-    )
+    parts = divide_program(program, items, outputs, differing, width, alone, summed)
     # The items of the function of blocks, and where the numbers lie.
-    of_blocks = find_crossing_items(items, spread)
+    of_blocks = find_crossing_items(items, parts.spread)
     layout = lay_out(parts, of_blocks)
     # The function of blocks computes what differs, and reads the rest from slots.
     slots = SharedSlots(layout.shared)
     products = find_fusable_products(items) if fuse else set()
-    blocks = FunctionWriter(single=alone, mine=of_blocks, products=products, spread=spread, slots=slots)
+    blocks = FunctionWriter(single=alone, mine=of_blocks, products=products, spread=parts.spread, slots=slots)
     blocks.turning, blocks.flushes = layout.turning, _is_single(items)
     source = _write_blocks(blocks, parts, layout)
     # The other function fills these slots, once for all runs.
@@ -207,20 +191,6 @@ def _count_operations(items: Iterable[Any]) -> Counter[str]:
     if counts.total() > LONGEST:
         raise Unsupported(f"a program of {counts.total()} operations, above {LONGEST}")
     return counts
-
-
-def widest(items: Iterable[Any]) -> int:
-    """Return the most runs of a vector: twice as many where most of what is computed has 32 bits, not 64.
-
-    A step of a particle filter that hashes two words and makes four normal numbers of floats of them, among 112
-    operations on doubles, takes 12 ns a particle with 16 runs and 19 with 8; among 281 it takes 15 and 31.
-    """
-    counts = Counter[int]()
-    for x in items:
-        if isinstance(x, Node):
-            bits = 32 if x.op == "threefry" else BITS[x.type]
-            counts[bits] += LONG if x.op == "threefry" or x.op in FUNCTIONS else 1
-    return 2 * WIDEST if counts[32] > counts[64] else WIDEST
 
 
 def _is_single(items: Iterable[Any]) -> bool:

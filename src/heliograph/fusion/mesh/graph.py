@@ -64,38 +64,49 @@ class Graph(NamedTuple):
 
 
 def neighbours_of(value: object) -> dict[str, tuple[str, ...]]:
-    """Return the names of those whom each node receives, from a table of these or from a graph of networkx.
+    """Return by node the names of the nodes whose messages it receives, checked.
+
+    Args:
+        value: a table of these, or a graph of networkx, whose edges lead from sender to receiver, or both ways.
 
     Raises:
         ValueError: neither of them, names that are no texts, a node as its own neighbour, or one twice.
     """
-    # Edges of a networkx graph, in both directions where it has none.
-    if isinstance(value, GraphLike):
-        pairs = [tuple(pair[:2]) for pair in value.edges()]
-        both = pairs if value.is_directed() else [*pairs, *(pair[::-1] for pair in pairs)]
-        listed: dict[Any, list[Any]] = {name: [] for name in value.nodes()}
-        for sender, receiver in both:
-            listed[receiver].append(sender)
-        value = listed
-    given = table("neighbours", value, "names of those whom a node receives (or a networkx graph of names)")
-    # Whom a node receives; a node that is named by others alone receives nobody.
-    results: dict[str, tuple[str, ...]] = {}
-    for name, senders in given.items():
-        results[name] = mine = tuple(items(f"neighbours of {name!r}", senders, "names"))
-        wrong = [sender for sender in mine if not isinstance(sender, str)]
-        if wrong:
-            raise fail(f"neighbours of {name!r}", "names", show_value(wrong[0]))
-        if name in mine:
-            raise fail(f"neighbours of {name!r}", "other nodes (a node has its own message anyway)", repr(name))
-        if len(set(mine)) < len(mine):
-            twice = sorted({sender for sender in mine if mine.count(sender) > 1})
-            raise fail(f"neighbours of {name!r}", "each once", f"{twice} more than once")
-    # Senders that no entry names.
-    for sender in {sender: None for mine in results.values() for sender in mine}:
+    listed = _list_senders(value) if isinstance(value, GraphLike) else value
+    given = table("neighbours", listed, "names of those whom a node receives (or a networkx graph of names)")
+    results = {name: _check_senders(name, senders) for name, senders in given.items()}
+    # A sender without an entry of its own receives nobody.
+    for sender in {sender: None for senders in results.values() for sender in senders}:
         results.setdefault(sender, ())
     if not results:
         raise fail("neighbours", "at least one node", "none")
     return results
+
+
+def _list_senders(graph: GraphLike) -> dict[Any, list[Any]]:
+    """Return by node of a graph the nodes from which an edge leads to it; both ends' of an edge without direction."""
+    pairs = [tuple(pair[:2]) for pair in graph.edges()]
+    if not graph.is_directed():
+        pairs += [pair[::-1] for pair in pairs]
+    listed: dict[Any, list[Any]] = {name: [] for name in graph.nodes()}
+    for sender, receiver in pairs:
+        listed[receiver].append(sender)
+    return listed
+
+
+def _check_senders(name: str, value: object) -> tuple[str, ...]:
+    """Return the names of those whom a node receives: texts, each once, and not its own."""
+    what = f"neighbours of {name!r}"
+    senders = tuple(items(what, value, "names"))
+    no_names = [sender for sender in senders if not isinstance(sender, str)]
+    if no_names:
+        raise fail(what, "names", show_value(no_names[0]))
+    if name in senders:
+        raise fail(what, "other nodes (a node has its own message anyway)", repr(name))
+    if len(set(senders)) < len(senders):
+        repeated = sorted({sender for sender in senders if senders.count(sender) > 1})
+        raise fail(what, "each once", f"{repeated} more than once")
+    return senders
 
 
 def neighbours_within(
@@ -123,15 +134,17 @@ def neighbours_within(
     names = list(given)
     from scipy.spatial import cKDTree  # imported here, since it takes 40 ms
 
-    # In a power of two as the unit, which changes no digit, and in which no square leaves the range of numbers: all
-    # numbers are less than 2, and so no distance is 4 (1 + axes); a longer reach is cut to that.
+    # The unit is a power of two, which changes no digit, and in which no square leaves the range of numbers: the
+    # largest coordinate is between 1 and 2. No two points are 4 (1 + axes) apart then: a longer reach is cut to that.
     points = np.array(rows)
     largest = np.abs(points).max(initial=0.0)
-    unit = 2.0 ** (int(np.frexp(largest)[1]) - 1) if largest else 1.0
-    near = cKDTree(points / unit).query_ball_point(points / unit, min(reach / unit, 4.0 * (1 + points.shape[1])))
+    _mantissa, exponent = np.frexp(largest)
+    unit = 2.0 ** (int(exponent) - 1) if largest else 1.0
+    reach_in_units = min(reach / unit, 4.0 * (1 + points.shape[1]))
+    near = cKDTree(points / unit).query_ball_point(points / unit, reach_in_units)  # numbers of nodes, by node
     return {
-        name: tuple(names[j] for j in sorted(mine) if j != i)
-        for i, (name, mine) in enumerate(zip(names, near, strict=True))
+        name: tuple(names[j] for j in sorted(numbers) if j != i)
+        for i, (name, numbers) in enumerate(zip(names, near, strict=True))
     }
 
 

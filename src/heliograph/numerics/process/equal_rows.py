@@ -38,9 +38,12 @@ def repeat_row(row: np.ndarray, count: int) -> np.ndarray:
 
 
 def _map_rows(row: np.ndarray, count: int) -> np.ndarray | None:
-    """Return the rows as pieces of memory that are mapped again and again; None where the system has no such."""
+    """Return `count` equal rows, of which only a piece is in memory, mapped again and again; None where that fails.
+
+    It fails where the system has no such mapping, and is not tried where little memory would be saved.
+    """
     map_memory, size = _system_call(), row.nbytes * count
-    # A piece: whole rows in whole pages, of PIECE bytes at least, and of so many that PIECES of them are enough.
+    # A piece: whole rows in whole pages, at least PIECE bytes, and so long that at most PIECES of them are mapped.
     unit = math.lcm(row.nbytes, mmap.PAGESIZE)
     piece = unit * max(-(-PIECE // unit), -(-size // (unit * PIECES)))
     if map_memory is None or size < 4 * piece or len(_held) >= MOST:  # of fewer than four pieces little is saved
@@ -50,25 +53,30 @@ def _map_rows(row: np.ndarray, count: int) -> np.ndarray | None:
     except OSError:  # no such files here
         return None
     try:
-        os.ftruncate(file, piece)
-        with mmap.mmap(file, piece) as filled:
-            values: np.ndarray = np.frombuffer(filled, row.dtype).reshape(-1, *row.shape)
-            values[...] = row
-            del values  # a view of what is closed
+        _fill_file(file, piece, row)
         # Addresses for all rows, which are given back when the last view of them is gone, and pieces in their place.
-        whole = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE)
-        rows: np.ndarray = np.frombuffer(whole, row.dtype).reshape(count, *row.shape)
-        at, both = rows.ctypes.data, mmap.PROT_READ | mmap.PROT_WRITE
-        for place in range(0, size, piece):
-            length = min(piece, size - place)
-            if map_memory(at + place, length, both, mmap.MAP_PRIVATE | MAP_FIXED, file, 0) != at + place:
+        addresses = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE)
+        rows: np.ndarray = np.frombuffer(addresses, row.dtype).reshape(count, *row.shape)
+        start, read_and_write = rows.ctypes.data, mmap.PROT_READ | mmap.PROT_WRITE
+        for offset in range(0, size, piece):
+            length, target = min(piece, size - offset), start + offset
+            if map_memory(target, length, read_and_write, mmap.MAP_PRIVATE | MAP_FIXED, file, 0) != target:
                 return None
     except OSError:  # no memory for it
         return None
     finally:
         os.close(file)
-    _held.add(whole)
+    _held.add(addresses)
     return rows
+
+
+def _fill_file(file: int, size: int, row: np.ndarray) -> None:
+    """Fill so many bytes of a file with copies of a row."""
+    os.ftruncate(file, size)
+    with mmap.mmap(file, size) as memory:
+        values: np.ndarray = np.frombuffer(memory, row.dtype).reshape(-1, *row.shape)
+        values[...] = row
+        del values  # the memory cannot be closed while a view of it is left
 
 
 MAP_FIXED = 0x10  # of Linux: at this address, in the place of what is mapped there

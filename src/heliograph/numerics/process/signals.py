@@ -15,30 +15,31 @@ IMPORTS = ExtensionFileLoader.exec_module.__code__.co_filename
 
 @contextmanager
 def handle_stop_signals(handler: Callable[[int, FrameType | None], object]) -> Iterator[None]:
-    """Handle the signals to stop so within a block of the main thread, but for those that the process ignores.
+    """Call `handler` for the signals that stop a process, within a `with` block of the main thread.
 
-    A process in the background ignores SIGINT: nobody's Ctrl-C is meant for it. While a module in C is imported the
-    handler waits: such a module prints what is raised in the Python that it calls, or dies of it.
+    Afterwards the signals have the handlers again that they had. A signal that the process ignores stays ignored: a
+    process in the background ignores SIGINT, since nobody's Ctrl-C is meant for it. While a module in C is imported
+    the handler waits: such a module prints what is raised in the Python that it calls, or dies of it.
     """
 
-    def handle(number: int, frame: FrameType | None) -> None:
+    def handle_or_wait(number: int, frame: FrameType | None) -> None:
         """Pass a signal to the handler, or raise it again soon while a module in C is imported."""
         if _imports_in_c(frame):
-            again = Timer(SOON, interrupt_main, (number,))
-            again.daemon = True
-            again.start()
+            timer = Timer(SOON, interrupt_main, (number,))
+            timer.daemon = True
+            timer.start()
         else:
             handler(number, frame)
 
-    before = {number: signal.getsignal(number) for number in STOPPING}
+    former_handlers = {number: signal.getsignal(number) for number in STOPPING}
     try:
-        for number, known in before.items():
-            if known is not signal.SIG_IGN:
-                signal.signal(number, handle)
+        for number, former in former_handlers.items():
+            if former is not signal.SIG_IGN:
+                signal.signal(number, handle_or_wait)
         yield
     finally:
-        for number, known in before.items():
-            signal.signal(number, known)
+        for number, former in former_handlers.items():
+            signal.signal(number, former)
 
 
 def _imports_in_c(frame: FrameType | None) -> bool:

@@ -14,26 +14,28 @@ CENTURY = 946_684_800 * SECOND  # 2000-01-01
 def find_out_of_order(time: np.ndarray) -> Bool[np.ndarray, " rows"]:
     """Return the mask of the fewest rows without which times do not go backwards; of equally few, the later ones.
 
-    The others are a longest subsequence that does not fall (patience sorting, from the end).
+    The others are a longest subsequence that does not fall, found by patience sorting.
     """
     if np.all(time[1:] >= time[:-1]):
         return np.zeros(len(time), dtype=bool)
-    # A subsequence of times that does not fall, read from its end, is one of negated times that does not fall.
-    falling = (-time.astype(np.int64) if time.dtype.kind in "Mi" else -time)[::-1].tolist()
-    # Of subsequences of each length the least end, and its row; and for each row the one before it in its subsequence.
-    tails, last = list[float](), list[int]()
-    before = list[int]()
-    for row, value in enumerate(falling):
-        length = bisect_right(tails, value)
-        before.append(last[length - 1] if length else -1)
-        tails[length : length + 1], last[length : length + 1] = [value], [row]
+    # From the end, so that of equally long subsequences the one with the earlier rows is kept: negated times, last row
+    # first, do not fall along a subsequence exactly where the times do not.
+    reversed_times = (-time.astype(np.int64) if time.dtype.kind in "Mi" else -time)[::-1].tolist()
+    # Of the subsequences of length k + 1 found so far, the least last value and its row; and for each row the one
+    # before it in the longest subsequence that ends with it, -1 for none.
+    least_ends, end_rows = list[float](), list[int]()
+    previous = list[int]()
+    for row, value in enumerate(reversed_times):
+        length = bisect_right(least_ends, value)
+        previous.append(end_rows[length - 1] if length else -1)
+        least_ends[length : length + 1], end_rows[length : length + 1] = [value], [row]
     # All rows are out of order but those of the longest subsequence, from its end back.
-    out = np.ones(len(time), dtype=bool)
-    row = last[-1]
+    out_of_order = np.ones(len(time), dtype=bool)
+    row = end_rows[-1]
     while row >= 0:
-        out[len(time) - 1 - row] = False
-        row = before[row]
-    return out
+        out_of_order[len(time) - 1 - row] = False
+        row = previous[row]
+    return out_of_order
 
 
 def find_unset_stamps(time: np.ndarray, year: float = YEAR) -> Bool[np.ndarray, " events"]:
