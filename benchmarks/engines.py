@@ -38,7 +38,7 @@ import heliograph as hg
 from heliograph.engine import choice
 from heliograph.simulation.runs import native as runs
 from straightline import accumulated, compiled
-from straightline.machine import features
+from straightline.machine import find_processor_features
 
 HERE = Path(__file__).resolve().parent
 DONE, RESULTS = HERE.parent / "out" / "engines.jsonl", HERE / "engines.json"
@@ -60,7 +60,7 @@ def rounded_more(item: hg.Network, index: int) -> Any:
     """The record by native code with products rounded before they are added."""
 
     def unfused() -> tuple[str, str, bool]:
-        return (*features()[:2], False)
+        return (*find_processor_features()[:2], False)
 
     def forget() -> None:
         for programs in (runs._find_program, choice._compile_structure):
@@ -68,7 +68,10 @@ def rounded_more(item: hg.Network, index: int) -> Any:
 
     forget()
     try:
-        with patch.object(compiled, "features", unfused), patch.object(accumulated, "features", unfused):
+        with (
+            patch.object(compiled, "find_processor_features", unfused),
+            patch.object(accumulated, "find_processor_features", unfused),
+        ):
             return simulated(item, index, "native")
     finally:
         forget()

@@ -8,12 +8,12 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from straightline.call_arrays import addresses, aligned, memory_of
-from straightline.compiled import threads
+from straightline.call_arrays import allocate_aligned, convert_to_memory, list_addresses
+from straightline.compiled import get_thread_pool
 from straightline.folding import DTYPES
 from straightline.llvm.module import write_module
-from straightline.lowering import like
-from straightline.machine import TieredCode, features, narrow
+from straightline.lowering import make_placeholder
+from straightline.machine import TieredCode, choose_hasty_width, find_processor_features
 from straightline.program import Program, SummedOutputs, fold_rows, lower_function, row_length
 
 PARTS = 64  # sums of their own, which computers of any number of cores share out
@@ -29,10 +29,10 @@ class AccumulatedProgram:
         differs = [n == summed.number for n in range(len(program.inputs))]
         self.summed, self.tree = summed, program.tree
         self.types = [DTYPES[b.type] for n, b in enumerate(program.inputs) if n != summed.number]
-        self.code = write_module(program, differs, None, features()[2], summed=summed)
+        self.code = write_module(program, differs, None, find_processor_features()[2], summed=summed)
         self.common, self.operations = self.code.common, self.code.operations
         self.width = self.code.width
-        self.blocks = TieredCode(self.code.blocks, (narrow(self.width), self.width))
+        self.blocks = TieredCode(self.code.blocks, (choose_hasty_width(self.width), self.width))
         self.once = None if self.code.once is None else TieredCode(self.code.once, (1, 1))
 
     def memory(self, runs: int, lanes: int, in_flight: int) -> tuple[float, float, float]:
@@ -79,7 +79,7 @@ class AccumulatedProgram:
             """Add the runs of a part to its sums; return its results that are collected, None for all others."""
             return begun.add(np.arange(starts[part], min(starts[part] + part_length, first + runs)), sums[part])
 
-        collected = list(threads().map(compute_part, range(len(starts))))
+        collected = list(get_thread_pool().map(compute_part, range(len(starts))))
         return jax.tree.unflatten(self.tree, self._join_parts(begun, sums, collected, first, runs))
 
     def _join_parts(
@@ -112,8 +112,8 @@ class BegunProgram:
 
     def __init__(self, program: AccumulatedProgram, arguments: Sequence[Any], runs: int):
         self.program, self.summed = program, program.summed.outputs
-        self.arguments = [memory_of(x, t) for x, t in zip(arguments, program.types, strict=True)]
-        self.memory = aligned(program.code.shared)
+        self.arguments = [convert_to_memory(x, t) for x, t in zip(arguments, program.types, strict=True)]
+        self.memory = allocate_aligned(program.code.shared)
         # Compute what all runs share; the number of the run and results of runs are not used.
         self.shared: list[np.ndarray | None] = [None] * len(program.common)
         if program.once is not None:
@@ -154,7 +154,7 @@ class BegunProgram:
         outputs, collected = self._make_outputs(len(numbers), sums)
         # There is no code for runs where they share all results.
         if len(numbers) and self._machine is not None:
-            scratch = aligned(self.program.code.scratch)
+            scratch = allocate_aligned(self.program.code.scratch)
             pointers = self._pointers(numbers, outputs)
             blocks = -(-len(numbers) // self._machine.width)  # a block: the runs of one vector
             self._machine.run(pointers.ctypes.data, scratch.ctypes.data, 0, blocks, len(numbers))
@@ -194,7 +194,7 @@ class BegunProgram:
         position = self.program.summed.number
         inputs = [*self.arguments[:position], numbers, *self.arguments[position:]]
         every = [*inputs, *self.program.code.tables, *results, self.memory]
-        return np.array(addresses(every), dtype=np.uint64)
+        return np.array(list_addresses(every), dtype=np.uint64)
 
 
 def accumulate(
@@ -223,11 +223,11 @@ def accumulate(
         Unsupported: an operation that native code does not take, with the line that it comes from.
         ValueError: a function that returns no pair.
     """
-    features()  # refuses a processor that LLVM does not know
+    find_processor_features()  # refuses a processor that LLVM does not know
     leaves = jax.tree.leaves(examples)
     known_numbers = {n: (np.asarray(mask), np.asarray(leaves[n])) for n, mask in known.items()}
     # The last argument is the number of the run.
-    program = lower_function(function, *examples, like((), np.uint32), known=known_numbers, single=single)
+    program = lower_function(function, *examples, make_placeholder((), np.uint32), known=known_numbers, single=single)
     summed_leaves = _count_summed_leaves(program.tree)
     summed = tuple(n < summed_leaves for n in range(len(program.outputs)))
     return AccumulatedProgram(program, SummedOutputs(outputs=summed, batches=batches, number=len(leaves)))

@@ -11,7 +11,7 @@ from jaxtyping import PyTree
 
 from straightline.c_lowering import lower_for_c
 from straightline.c_source import CSource, Place, Real, c_type
-from straightline.lowering import code_line, scalars, trace_function, type_of
+from straightline.lowering import code_line, list_nodes, trace_function, type_of
 from straightline.nodes import Buffer, Node, Type, Unsupported
 
 RANDOM = ("random_", "threefry")
@@ -104,13 +104,13 @@ def to_c(
     argument_names, result_names = _name_arrays(function, examples, tree, names)
     arguments = _describe_arguments(argument_names, buffers, real)
     # The body: statements in the order of the graph.
-    result_nodes = [scalars(x) for x in outputs]
-    places = {b: _locate(x) for b, x in zip(buffers, arguments, strict=True)}
+    result_nodes = [list_nodes(x) for x in outputs]
+    places = {b: _make_entry_expression(x) for b, x in zip(buffers, arguments, strict=True)}
     source = CSource([node for nodes in result_nodes for node in nodes], places, real, name)
     try:
         body = source.write_statements(graph.top)
     except Unsupported as error:
-        raise Unsupported(error.operation, error.where or _line_of(error.operation, equations)) from None
+        raise Unsupported(error.operation, error.where or _find_code_line(error.operation, equations)) from None
     # The end: every result is written, after all arguments are read.
     arguments = [x._replace(used=b in source.needed) for x, b in zip(arguments, buffers, strict=True)]
     results = _describe_results(result_names, program, outputs, result_nodes, real)
@@ -157,7 +157,7 @@ def _name_stored_type(type: Type, real: Real) -> str:
     return "unsigned char" if type == "bool" else c_type(type, real)
 
 
-def _locate(array: CArray) -> Place:
+def _make_entry_expression(array: CArray) -> Place:
     """Return the function from an index to the C expression of an argument's number there."""
     return (lambda index: f"{array.name}[{index}]") if array.is_array else (lambda index: array.name)
 
@@ -238,7 +238,7 @@ def _name_leaves(label: str, tree: PyTree) -> list[str]:
     return results
 
 
-def _line_of(operation: str, equations: Sequence[Any]) -> str:
+def _find_code_line(operation: str, equations: Sequence[Any]) -> str:
     """Return the line of an operation of the graph."""
     same = (e for e in equations if e.primitive.name.removesuffix("_convert_type") == operation)
     return next((code_line(e) for e in same), "an unknown line")

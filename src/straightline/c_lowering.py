@@ -10,7 +10,7 @@ from jax.extend.core import ClosedJaxpr, JaxprEqn
 from straightline.folding import is_finite
 from straightline.graph import Graph
 from straightline.limits import LOADED
-from straightline.lowering import RULES, Lowering, Value, array_of, type_of
+from straightline.lowering import RULES, Lowering, Value, arrange_nodes, type_of
 from straightline.memory import InMemory
 from straightline.nodes import REAL, Buffer, Node, Type
 
@@ -108,7 +108,7 @@ def lower_for_c(
         value: Any = InMemory.whole(buffer)
         if number in symmetric:  # entries (i, j) and (j, i) are one node, that of the upper triangle
             nodes, n = value.nodes(graph), aval.shape[0]
-            value = array_of([nodes[min(i, j), max(i, j)] for i in range(n) for j in range(n)], aval.shape)
+            value = arrange_nodes([nodes[min(i, j), max(i, j)] for i in range(n) for j in range(n)], aval.shape)
         values.append(value)
     with jax.enable_x64(True):
         outputs = [lowering.nodes(x) for x in lowering.inline_program(program, values)]

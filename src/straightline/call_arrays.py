@@ -7,10 +7,10 @@ import jax
 import numpy as np
 
 from straightline.llvm.layout import LINE
-from straightline.result_memory import from_line
+from straightline.result_memory import align_to_line
 
 
-def memory_of(x: Any, dtype: Any) -> np.ndarray:
+def convert_to_memory(x: Any, dtype: Any) -> np.ndarray:
     """Return an argument of a call as contiguous numbers of a type; a key of random numbers as its words."""
     if type(x) is np.ndarray and x.dtype == dtype and x.flags.c_contiguous:
         return x
@@ -22,11 +22,11 @@ def memory_of(x: Any, dtype: Any) -> np.ndarray:
     return np.ascontiguousarray(array, dtype=dtype).reshape(array.shape)
 
 
-def addresses(arrays: Sequence[np.ndarray]) -> list[int]:
+def list_addresses(arrays: Sequence[np.ndarray]) -> list[int]:
     """Return the address of each array's first number."""
     return [x.__array_interface__["data"][0] for x in arrays]
 
 
-def aligned(size: int) -> np.ndarray:
+def allocate_aligned(size: int) -> np.ndarray:
     """Return so many bytes of zero, at an address that is a multiple of a cache line."""
-    return from_line(np.zeros(size + LINE, np.uint8))
+    return align_to_line(np.zeros(size + LINE, np.uint8))

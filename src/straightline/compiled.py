@@ -12,14 +12,14 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from straightline.call_arrays import addresses, aligned, memory_of
+from straightline.call_arrays import allocate_aligned, convert_to_memory, list_addresses
 from straightline.folding import DTYPES
 from straightline.limits import ALONE, LITTLE, LONGEST
 from straightline.llvm.module import ModuleText, write_module
-from straightline.machine import Machine, TieredCode, features, generate, narrow
+from straightline.machine import Machine, TieredCode, choose_hasty_width, find_processor_features, generate
 from straightline.nodes import Unsupported
 from straightline.program import Program, lower_function
-from straightline.result_memory import in_lines
+from straightline.result_memory import make_aligned_array
 
 SHARES = 4  # parts of the work for each core, so that one that is held up holds up little
 
@@ -39,25 +39,27 @@ class Compiled:
         self.shapes = [b.shape for b in program.inputs]
         self.tree = program.tree
         # If runs share all arguments, they are one, whose results are computed in the arrays that are returned.
-        self.code: ModuleText = write_module(program, self.differs, width, features()[2], alone=not any(self.differs))
+        self.code: ModuleText = write_module(
+            program, self.differs, width, find_processor_features()[2], alone=not any(self.differs)
+        )
         self.width, self.common = self.code.width, self.code.common
         self.operations, self.divisions = self.code.operations, self.code.divisions
         # Code for blocks of runs, for what all runs share, and for one run alone.
-        self.blocks = TieredCode(self.code.blocks, (width or narrow(self.width), self.width))
+        self.blocks = TieredCode(self.code.blocks, (width or choose_hasty_width(self.width), self.width))
         self.once = None if self.code.once is None else TieredCode(self.code.once, (1, 1))
         self.single = TieredCode(self.code.blocks, (1, 1))
         self._refusal: str | None = None  # why LLVM makes no code, "" if it does, None until it was tried
         self._first: list[np.ndarray] = []  # the first arguments, which calls leave out, and their addresses
-        self._addresses, self._tables = list[int](), addresses(self.code.tables)
+        self._addresses, self._tables = list[int](), list_addresses(self.code.tables)
         self._by_run = self.differs.index(True) if True in self.differs else None  # an argument that each run has
         self._shared: np.ndarray | None = None  # what all runs of all calls share, once it is computed
 
     def with_first(self, *arguments: PyTree) -> "Compiled":
         """Return the same code whose first arguments are these, which calls leave out."""
         new = copy(self)
-        new._first = [memory_of(x, t) for x, t in zip(jax.tree.leaves(arguments), self.types, strict=False)]
+        new._first = [convert_to_memory(x, t) for x, t in zip(jax.tree.leaves(arguments), self.types, strict=False)]
         new._check_shapes(new._first, 0, new._count_runs(new._first))
-        new._addresses, new._shared = addresses(new._first), None
+        new._addresses, new._shared = list_addresses(new._first), None
         return new
 
     def for_runs(self, runs: int, inputs: Mapping[int, np.ndarray] = MappingProxyType({})) -> "InPlaceCode":
@@ -97,7 +99,7 @@ class Compiled:
         leaves, count = jax.tree.leaves(arguments), len(self._first)
         if len(leaves) != len(self.types) - count:
             raise ValueError(f"arguments: expected {len(self.types) - count} arrays, got {len(leaves)}")
-        arrays = [*self._first, *(memory_of(x, t) for x, t in zip(leaves, self.types[count:], strict=True))]
+        arrays = [*self._first, *(convert_to_memory(x, t) for x, t in zip(leaves, self.types[count:], strict=True))]
         self._check_shapes(arrays[count:], count, self._count_runs(arrays))
         return arrays
 
@@ -127,7 +129,7 @@ class Compiled:
         """
         arrays = [self._convert_arguments(arguments) for arguments in calls]
         counts, code = [self._count_runs(x) for x in arrays], self.code
-        outputs = [in_lines((sum(counts), *b.shape), DTYPES[b.type]) for b in code.outputs]
+        outputs = [make_aligned_array((sum(counts), *b.shape), DTYPES[b.type]) for b in code.outputs]
         shared = self._compute_shared(arrays[0], outputs)
         if all(code.common):
             return jax.tree.unflatten(self.tree, outputs)
@@ -147,10 +149,10 @@ class Compiled:
         It is kept for later calls where it follows from the first arguments alone, which calls leave out.
         """
         if self.once is None:
-            return aligned(self.code.shared)
+            return allocate_aligned(self.code.shared)
         shared = self._shared
         if shared is None:
-            shared = aligned(self.code.shared)
+            shared = allocate_aligned(self.code.shared)
             pointers = self._point_to(arrays, outputs, shared)
             self.once.choose_machine(1).run(pointers.ctypes.data, 0, 0, 1, 1)
             self._shared = shared if all(self.differs[len(self._first) :]) else None
@@ -159,8 +161,8 @@ class Compiled:
 
     def _point_to(self, arrays: list[np.ndarray], outputs: list[np.ndarray], shared: np.ndarray) -> np.ndarray:
         """Return addresses in the order that the code expects: inputs, tables, outputs, what runs share."""
-        own = addresses(arrays[len(self._first) :])
-        return np.array([*self._addresses, *own, *self._tables, *addresses([*outputs, shared])], dtype=np.uint64)
+        own = list_addresses(arrays[len(self._first) :])
+        return np.array([*self._addresses, *own, *self._tables, *list_addresses([*outputs, shared])], dtype=np.uint64)
 
     def _compute_blocks(self, call: "CallMemory", cores: int | None) -> None:
         """Compute all blocks of runs of a call: here if that is little work, else shared among threads."""
@@ -170,7 +172,7 @@ class Compiled:
             call.compute(0, blocks, scratch)
             return
         starts = range(0, blocks, share)
-        list(threads().map(lambda start: call.compute(start, min(start + share, blocks), scratch), starts))
+        list(get_thread_pool().map(lambda start: call.compute(start, min(start + share, blocks), scratch), starts))
 
     def _copy_common(self, outputs: list[np.ndarray], shared: np.ndarray) -> None:
         """Copy the outputs that all runs share from where they were computed, to every run."""
@@ -194,7 +196,7 @@ class CallMemory(NamedTuple):
 
     def compute(self, begin: int, end: int, scratch: int) -> None:
         """Compute blocks `begin` to `end` of runs in this thread, with `scratch` bytes of its own."""
-        memory = aligned(scratch)
+        memory = allocate_aligned(scratch)
         self.machine.run(self.pointers.ctypes.data, memory.ctypes.data, begin, end, self.runs)
 
 
@@ -210,11 +212,11 @@ class InPlaceCode:
         code, left_out, self.runs = compiled.code, len(compiled._first), runs
         self._compiled, differs = compiled, compiled.differs[left_out:]
         self.inputs = self._make_inputs(inputs)
-        self.outputs = [in_lines((runs, *b.shape), DTYPES[b.type]) for b in code.outputs]
+        self.outputs = [make_aligned_array((runs, *b.shape), DTYPES[b.type]) for b in code.outputs]
         # Addresses in the order that the code expects; `_memory` keeps the arrays alive, what runs share is its last.
-        self._memory = *compiled._first, *self.inputs, *code.tables, *self.outputs, aligned(code.shared)
-        self._pointers = np.array(addresses(self._memory), dtype=np.uint64)
-        self._scratch, self._is_common = aligned(code.scratch), all(code.common)
+        self._memory = *compiled._first, *self.inputs, *code.tables, *self.outputs, allocate_aligned(code.shared)
+        self._pointers = np.array(list_addresses(self._memory), dtype=np.uint64)
+        self._scratch, self._is_common = allocate_aligned(code.scratch), all(code.common)
         self._addresses = self._pointers.ctypes.data, self._scratch.ctypes.data
         # The code for so many runs, and whether a call is so little work that threads would cost more.
         self._tiers, width = compiled._choose_tiers(runs)
@@ -268,7 +270,7 @@ class SingleRunCode:
     """
 
     def __init__(self, program: Program, in_place: Mapping[int, int] = MappingProxyType({})):
-        self.code = write_module(program, [True] * len(program.inputs), 1, features()[2], True, in_place)
+        self.code = write_module(program, [True] * len(program.inputs), 1, find_processor_features()[2], True, in_place)
         level = int(self.code.operations <= ALONE)
         self.machine, self.tree, self._in_place = generate(self.code.blocks, level, 1), program.tree, in_place
         self._arguments = [(b.shape, DTYPES[b.type]) for b in program.inputs]
@@ -287,9 +289,9 @@ class SingleRunCode:
         self.inputs += [np.zeros(*kind) for kind in kinds[len(first) :]]
         fresh = [np.zeros(b.shape, DTYPES[b.type]) for b in self.code.outputs]
         self.outputs = [self.inputs[self._in_place[k]] if k in self._in_place else x for k, x in enumerate(fresh)]
-        self.scratch, self._shared = aligned(self.code.scratch), aligned(self.code.shared)
+        self.scratch, self._shared = allocate_aligned(self.code.scratch), allocate_aligned(self.code.shared)
         every = [*self.inputs, *self.code.tables, *self.outputs, self._shared]
-        self.pointers = np.array(addresses(every), dtype=np.uint64)
+        self.pointers = np.array(list_addresses(every), dtype=np.uint64)
         self._call = self.machine.run, self.pointers.ctypes.data, self.scratch.ctypes.data
 
     def __call__(self) -> None:
@@ -323,7 +325,7 @@ def compile(
     Raises:
         Unsupported: an operation that native code does not take, with the line that it comes from.
     """
-    features()  # refuses a processor that LLVM does not know
+    find_processor_features()  # refuses a processor that LLVM does not know
     differs = [n not in shared for n, example in enumerate(examples) for _ in jax.tree.leaves(example)]
     return Compiled(lower_function(function, *examples, most=most or 2 * LONGEST, single=single), differs)
 
@@ -350,7 +352,7 @@ def compile_one(
     Raises:
         Unsupported: an operation that native code does not take, with the line that it comes from.
     """
-    features()  # refuses a processor that LLVM does not know
+    find_processor_features()  # refuses a processor that LLVM does not know
     program = lower_function(function, *examples, single=single)
     return SingleRunCode(program, {n % len(program.outputs): argument for n, argument in in_place.items()})
 
@@ -373,10 +375,10 @@ def explain(
         code = compile(function, *examples, shared=shared, single=single)
     except Unsupported as error:
         return f"refused: {error}"
-    return counted(code)
+    return describe_counts(code)
 
 
-def counted(code: Compiled) -> str:
+def describe_counts(code: Compiled) -> str:
     """Return in words how many operations a run takes."""
     return f"{code.operations} operations{f', {code.divisions} of them divisions and roots' if code.divisions else ''}"
 
@@ -387,6 +389,6 @@ def cpu_count() -> int:
 
 
 @cache
-def threads() -> ThreadPoolExecutor:
+def get_thread_pool() -> ThreadPoolExecutor:
     """Return the thread pool of the process, one thread for each core."""
     return ThreadPoolExecutor(cpu_count())

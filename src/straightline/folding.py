@@ -37,7 +37,7 @@ class NodeMaker(Protocol):
         """Return the node of a constant."""
 
 
-def wrapped(number: int, like: Any) -> Any:
+def wrap_integer(number: int, like: Any) -> Any:
     """Return the integer of a type that has the lowest bits of a number."""
     kind = type(like)
     bits = 8 * like.itemsize
@@ -47,13 +47,13 @@ def wrapped(number: int, like: Any) -> Any:
 
 def _shift_left(a: Any, b: Any) -> Any:
     """Return a << b; 0 where b is no number of bits of the type."""
-    return wrapped(int(a) << int(b), a) if 0 <= b < 8 * a.itemsize else a * 0
+    return wrap_integer(int(a) << int(b), a) if 0 <= b < 8 * a.itemsize else a * 0
 
 
 def _shift_right(a: Any, b: Any) -> Any:
     """Return a >> b with zeros from the left; 0 where b is no number of bits of the type."""
     bits = 8 * a.itemsize
-    return wrapped(int(a) % (1 << bits) >> int(b), a) if 0 <= b < bits else a * 0
+    return wrap_integer(int(a) % (1 << bits) >> int(b), a) if 0 <= b < bits else a * 0
 
 
 def _shift_right_signed(a: Any, b: Any) -> Any:
@@ -61,21 +61,21 @@ def _shift_right_signed(a: Any, b: Any) -> Any:
     last = 8 * a.itemsize - 1
     is_negative = int(a) >> last == 1  # an unsigned number whose highest bit is set is read as one below zero
     signed = int(a) - (1 << last + 1) if is_negative else int(a)
-    return wrapped(signed >> (int(b) if 0 <= b <= last else last), a)
+    return wrap_integer(signed >> (int(b) if 0 <= b <= last else last), a)
 
 
 def _divide(a: Any, b: Any) -> Any:
     """Divide; integers toward zero, by 0 to all bits set, the least one by -1 to itself."""
     if isinstance(a, np.floating):
         return np.divide(a, b)
-    return wrapped(_quotient(int(a), int(b)) if b else -1, a)
+    return wrap_integer(_quotient(int(a), int(b)) if b else -1, a)
 
 
 def _remainder(a: Any, b: Any) -> Any:
     """Return what is left of a division, with the sign of a; of integers by 0 all."""
     if isinstance(a, np.floating):
         return np.fmod(a, b)
-    return wrapped(int(a) - _quotient(int(a), int(b)) * int(b) if b else int(a), a)
+    return wrap_integer(int(a) - _quotient(int(a), int(b)) * int(b) if b else int(a), a)
 
 
 def _quotient(a: int, b: int) -> int:
@@ -135,7 +135,7 @@ EVALUATED: dict[str, Callable[..., Any]] = {
 }  # fmt: skip
 
 
-def folded(graph: NodeMaker, op: str, type: Type, args: tuple[Node, ...]) -> Node | None:
+def fold_node(graph: NodeMaker, op: str, type: Type, args: tuple[Node, ...]) -> Node | None:
     """Return an existing or simpler node of the same value; None if there is none."""
     for a in args:
         if a.op != "constant":
@@ -169,7 +169,7 @@ def _evaluate(graph: NodeMaker, op: str, type: Type, args: tuple[Node, ...]) -> 
     return graph.constant(value.item(), type)
 
 
-def _is(node: Node, number: float) -> bool:
+def _is_constant(node: Node, number: float) -> bool:
     """Return whether a node is the constant of this number."""
     return bool(node.op == "constant" and node.value == number)
 
@@ -198,9 +198,9 @@ def _fold_add(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
 
 def _fold_sub(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
     """Simplify a - b: x - 0 = x, -0 - x = -x, a - (-x) = a + x; None where nothing is simpler."""
-    if _is(b, 0):
+    if _is_constant(b, 0):
         return a
-    if type in REAL and _is(a, 0) and math.copysign(1, a.value) < 0:  # 0 - 0 is 0, but -0 of -x
+    if type in REAL and _is_constant(a, 0) and math.copysign(1, a.value) < 0:  # 0 - 0 is 0, but -0 of -x
         return graph.node("neg", type, b)
     if type in REAL and b.op == "neg":
         return graph.node("add", type, a, b.args[0])
@@ -279,7 +279,7 @@ def _fold_not(graph: NodeMaker, type: Type, a: Node) -> Node | None:
 
 def _fold_shift(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
     """Simplify a shift by no bits."""
-    return a if _is(b, 0) else None
+    return a if _is_constant(b, 0) else None
 
 
 def _fold_extremum(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from straightline.folding import COMMUTATIVE, DTYPES, folded
+from straightline.folding import COMMUTATIVE, DTYPES, fold_node
 from straightline.limits import LONGEST
 from straightline.nodes import REAL, Block, Buffer, Node, Number, Store, Type, Unsupported
 
@@ -28,7 +28,7 @@ class Graph:
 
     def node(self, op: str, type: Type, *args: Node, value: Any = None) -> Node:
         """Return a node of an operation: a constant, an existing equal node, or a new one."""
-        simpler = folded(self, op, type, args)
+        simpler = fold_node(self, op, type, args)
         if simpler is not None:
             return simpler
         if op in COMMUTATIVE and args[0].serial > args[1].serial:

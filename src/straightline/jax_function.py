@@ -29,7 +29,7 @@ OPERATIONS: dict[str, Callable[..., jax.Array]] = {
 Memory = dict[Buffer, jax.Array]  # numbers of one run
 
 
-def function_of(program: Program) -> Callable[..., PyTree]:
+def make_jax_function(program: Program) -> Callable[..., PyTree]:
     """Return the function of one run's arrays that a program computes, for JAX to trace, map and differentiate."""
     return lambda *arrays: jax.tree.unflatten(program.tree, _JaxEvaluation(program).evaluate(arrays))
 

@@ -83,7 +83,7 @@ class Lowering:
         except Unsupported as error:
             raise (error if error.where else Unsupported(error.operation, code_line(equation))) from None
         except Exception as error:
-            raise failed(name, error, code_line(equation)) from error
+            raise make_refusal(name, error, code_line(equation)) from error
 
     def _apply_rule(self, equation: JaxprEqn, name: str, inputs: list[Value]) -> Sequence[Value]:
         """Apply the rule of an operation: in memory if an input is there, else on its entries."""
@@ -110,27 +110,27 @@ class Lowering:
         if isinstance(number, np.ndarray) and number.dtype == object:
             return number
         if isinstance(number, jax.Array) and jax.numpy.issubdtype(number.dtype, jax.dtypes.prng_key):
-            return keys_of(self.make_known_array(np.asarray(jax.random.key_data(number))))
+            return make_keys(self.make_known_array(np.asarray(jax.random.key_data(number))))
         array = np.asarray(number)
         type = type_of(array)
         if array.size > TABLE:
             return InMemory.whole(Buffer("table", type, array.shape, self.graph.top, array))
-        return array_of([self.graph.constant(x, type) for x in array.ravel().tolist()], array.shape)
+        return arrange_nodes([self.graph.constant(x, type) for x in array.ravel().tolist()], array.shape)
 
     def _read(self, values: dict[Var, Value], v: Any) -> Value:
         """Return the value of an operation's argument: a literal's constant, else what was computed."""
-        return self.make_known_array(_as_traced(v.val, v)) if isinstance(v, Literal) else values[v]
+        return self.make_known_array(_convert_literal(v.val, v)) if isinstance(v, Literal) else values[v]
 
 
-def _as_traced(number: Any, variable: Any) -> Any:
+def _convert_literal(number: Any, variable: Any) -> Any:
     """Return a literal in the type that the trace has for it: of single precision it may be a number of Python."""
     return np.asarray(number, np.float32) if variable.aval.dtype == np.float32 else number
 
 
-def failed(operation: str, error: Exception, where: str) -> Unsupported:
+def make_refusal(operation: str, error: Exception, where: str) -> Unsupported:
     """Return the refusal of a program whose native code cannot be made for a defect, and say so once for a line."""
     refused = Unsupported(f"{operation}, whose native code failed ({type(error).__name__}: {error})", where)
-    say(f"no native code: {refused}")
+    warn_once(f"no native code: {refused}")
     return refused
 
 
@@ -142,16 +142,16 @@ def refuse_failures(what: str) -> Iterator[None]:
     except Unsupported:
         raise
     except Exception as error:
-        raise failed(what, error, "") from error
+        raise make_refusal(what, error, "") from error
 
 
 @cache
-def say(text: str) -> None:
+def warn_once(text: str) -> None:
     """Warn once in a process."""
     warnings.warn(text, RuntimeWarning, stacklevel=2)
 
 
-def array_of(nodes: Iterable[Any], shape: tuple[int, ...]) -> np.ndarray:
+def arrange_nodes(nodes: Iterable[Any], shape: tuple[int, ...]) -> np.ndarray:
     """Arrange nodes in row-major order as an array."""
     flat = list(nodes)
     array = np.empty(len(flat), dtype=object)
@@ -159,13 +159,13 @@ def array_of(nodes: Iterable[Any], shape: tuple[int, ...]) -> np.ndarray:
     return array.reshape(shape)
 
 
-def keys_of(words: np.ndarray) -> np.ndarray:
+def make_keys(words: np.ndarray) -> np.ndarray:
     """Return keys (...) from their words (..., 2)."""
     flat = words.reshape(-1, 2)
-    return array_of((RandomKey(*pair) for pair in flat), words.shape[:-1])
+    return arrange_nodes((RandomKey(*pair) for pair in flat), words.shape[:-1])
 
 
-def scalars(value: np.ndarray) -> list[Node]:
+def list_nodes(value: np.ndarray) -> list[Node]:
     """Return the nodes of an array in row-major order, a key as its two words."""
     flat: list[Any] = value.ravel().tolist()
     return [n for x in flat for n in ((x.first, x.second) if isinstance(x, RandomKey) else (x,))]
@@ -193,7 +193,7 @@ def result_shape(equation: JaxprEqn, index: int = 0) -> tuple[int, ...]:
     return tuple(aval.shape)
 
 
-def like(shape: Sequence[int], dtype: Any) -> Any:
+def make_placeholder(shape: Sequence[int], dtype: Any) -> Any:
     """Return a placeholder from which JAX traces an array of this shape and type."""
     return jax.ShapeDtypeStruct(tuple(shape), dtype)  # type: ignore[no-untyped-call]
 
@@ -228,10 +228,10 @@ ARRAYS = (jax.Array, np.ndarray, np.generic, bool, int, float, complex)
 HALVED = {np.dtype(x): np.dtype(y) for x, y in (("f8", "f4"), ("i8", "i4"), ("u8", "u4"))}
 
 
-def _halved(example: Any) -> Any:
+def _halve_precision(example: Any) -> Any:
     """Return an example of the type that JAX has for it without enable_x64; a number of Python as it is."""
     kind = getattr(example, "dtype", None)
-    return like(example.shape, HALVED[kind]) if kind in HALVED else example
+    return make_placeholder(example.shape, HALVED[kind]) if kind in HALVED else example
 
 
 def trace_function(function: Callable[..., PyTree], *examples: PyTree, single: bool = False) -> tuple[ClosedJaxpr, Any]:
@@ -251,7 +251,7 @@ def trace_function(function: Callable[..., PyTree], *examples: PyTree, single: b
 
     with jax.enable_x64(not single):
         flat, tree = jax.tree.flatten(examples)
-        program = jax.make_jaxpr(call)(*(map(_halved, flat) if single else flat))
+        program = jax.make_jaxpr(call)(*(map(_halve_precision, flat) if single else flat))
     return program, structure[0]
 
 

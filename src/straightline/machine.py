@@ -11,7 +11,7 @@ import llvmlite.binding as llvm
 
 from straightline.limits import OFTEN
 from straightline.llvm.module import FunctionSource
-from straightline.lowering import refuse_failures, say
+from straightline.lowering import refuse_failures, warn_once
 from straightline.nodes import Unsupported
 
 Function = Callable[[int, int, int, int, int], None]
@@ -30,12 +30,12 @@ def find_llvm_target() -> llvm.Target:
     try:
         return llvm.Target.from_default_triple()
     except RuntimeError as error:
-        say(f"no native code: expected a processor that LLVM knows, got {error}")
+        warn_once(f"no native code: expected a processor that LLVM knows, got {error}")
         raise Unsupported("LLVM does not know this processor") from None
 
 
 @cache
-def features() -> tuple[str, str, bool]:
+def find_processor_features() -> tuple[str, str, bool]:
     """Return this processor's name and features for LLVM, and whether it has fused multiply-add."""
     flags = llvm.get_host_cpu_features()
     arm = "aarch64" in find_llvm_target().triple or "arm64" in find_llvm_target().triple
@@ -52,7 +52,7 @@ class Machine:
 
     def __init__(self, source: FunctionSource, level: int, width: int):
         self.level, self.width = level, width
-        cpu, flags, *_ = features()
+        cpu, flags, *_ = find_processor_features()
         machine = find_llvm_target().create_target_machine(cpu=cpu, features=flags, opt=level)
         module = llvm.parse_assembly(source.text(width))
         module.verify()
@@ -65,22 +65,22 @@ class Machine:
         self.run: Function = SIGNATURE(self.engine.get_function_address("run"))
 
 
-def narrow(width: int) -> int:
+def choose_hasty_width(width: int) -> int:
     """Return the runs of one register where `width` are those of one of the widest: for code in haste, sooner made so.
 
     LLVM splits what does not fit one register: selections and comparisons of event filters take it three times as long.
     """
-    return width if "+avx512f" in features()[1].split(",") else width // 2
+    return width if "+avx512f" in find_processor_features()[1].split(",") else width // 2
 
 
 @cache
-def background() -> ThreadPoolExecutor:
+def get_careful_thread() -> ThreadPoolExecutor:
     """Return the thread that generates code with care while that in haste is executed."""
     return ThreadPoolExecutor(1)
 
 
 @cache
-def _hasty() -> ThreadPoolExecutor:
+def _get_hasty_thread() -> ThreadPoolExecutor:
     """Return the thread that generates code for which the main thread waits."""
     return ThreadPoolExecutor(1)
 
@@ -97,15 +97,17 @@ def generate(source: FunctionSource, level: int, width: int) -> Machine:
     """
     if current_thread() is not main_thread():
         return Machine(source, level, width)
-    return _hasty().submit(Machine, source, level, width).result()
+    return _get_hasty_thread().submit(Machine, source, level, width).result()
 
 
-def _with_care(source: FunctionSource, width: int, hasty: Machine) -> Machine:
+def _generate_with_care(source: FunctionSource, width: int, hasty: Machine) -> Machine:
     """Generate code with care; if that fails, that in haste goes on, and it is said once."""
     try:
         return Machine(source, 1, width)
     except Exception as error:
-        say(f"native code: generated with care it failed ({type(error).__name__}: {error}); that in haste goes on")
+        warn_once(
+            f"native code: generated with care it failed ({type(error).__name__}: {error}); that in haste goes on"
+        )
         return hasty
 
 
@@ -137,7 +139,9 @@ class TieredCode:
             self._executions += executions
             machine = self._first(self._executions)
             if not machine.level and self._level(self._executions):  # JAX takes 30 us to say its setting
-                self._careful = self._careful or background().submit(_with_care, self._source, self._widths[1], machine)
+                self._careful = self._careful or get_careful_thread().submit(
+                    _generate_with_care, self._source, self._widths[1], machine
+                )
                 if executions >= OFTEN or self._careful.done():
                     self._machine = machine = self._careful.result()
             return machine

@@ -30,7 +30,7 @@ class InMemory:
     @classmethod
     def whole(cls, buffer: Buffer) -> "InMemory":
         """Return the view of a whole buffer."""
-        return cls(buffer, buffer.shape, contiguous(buffer.shape))
+        return cls(buffer, buffer.shape, contiguous_strides(buffer.shape))
 
     @property
     def ndim(self) -> int:
@@ -128,7 +128,7 @@ def _split_axes(axes: Sequence[tuple[int, int]], shape: Sequence[int]) -> list[i
     return strides[::-1]
 
 
-def contiguous(shape: Sequence[int]) -> tuple[int, ...]:
+def contiguous_strides(shape: Sequence[int]) -> tuple[int, ...]:
     """Return the strides of an array of this shape in row-major order: the last axis is innermost."""
     strides = np.cumprod([1, *shape[:0:-1]])[::-1]
     return tuple(int(s) for s in strides[: len(shape)])

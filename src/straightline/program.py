@@ -18,7 +18,7 @@ from jaxtyping import PyTree
 from straightline.folding import DTYPES
 from straightline.graph import Graph
 from straightline.limits import LONGEST, TABLE
-from straightline.lowering import Lowering, Value, array_of, keys_of, trace_function, type_of
+from straightline.lowering import Lowering, Value, arrange_nodes, make_keys, trace_function, type_of
 from straightline.memory import InMemory
 from straightline.nodes import REAL, Block, Buffer, Guard, Loop, Node, Store
 from straightline.rules import (  # noqa: F401  (they fill the rules)
@@ -99,7 +99,7 @@ def lower_traced(
             mask, numbers = known[number]
             values.append(_insert_known_entries(lowering, view, mask, numbers))
         else:
-            values.append(keys_of(view.nodes(lowering.graph)) if is_key else view)
+            values.append(make_keys(view.nodes(lowering.graph)) if is_key else view)
     with jax.enable_x64(not single):
         outputs = lowering.lower_whole_program(traced, values)
     return Program(lowering.graph, inputs, outputs, tree)
@@ -113,7 +113,9 @@ def _insert_known_entries(lowering: Lowering, view: InMemory, mask: np.ndarray, 
         return view
     graph, kind = lowering.graph, view.type
     entries = zip(mask.ravel().tolist(), numbers.ravel().tolist(), range(view.size), strict=True)
-    return array_of([graph.constant(x, kind) if m else graph.load(view.buffer, i) for m, x, i in entries], view.shape)
+    return arrange_nodes(
+        [graph.constant(x, kind) if m else graph.load(view.buffer, i) for m, x, i in entries], view.shape
+    )
 
 
 def list_needed(roots: Iterable[Node | Buffer]) -> dict[Any, None]:
@@ -168,7 +170,7 @@ def _list_dependencies(node: Any) -> list[Any]:
     return list(node.args)
 
 
-def fusable(node: Node, products: set[Node]) -> Node | None:
+def find_fused_product(node: Node, products: set[Node]) -> Node | None:
     """Return the argument of a sum or difference that is a product fused with it (`find_fusable_products`), or None."""
     for a in node.args:
         if a.value is node and a in products:
@@ -266,12 +268,12 @@ def find_differing(items: list[Any], inputs: Iterable[Buffer]) -> set[Any]:
     """
     spread = find_varying(items, inputs)
     carried = {x for x in items if isinstance(x, Buffer) and x.kind == "carried"}
-    while within := (carried and _read_within(find_crossing_items(items, spread)) & carried - spread):
+    while within := (carried and _find_memory_read_in_parts(find_crossing_items(items, spread)) & carried - spread):
         spread = find_varying(items, [*inputs, *within, *(carried & spread)])
     return spread
 
 
-def _read_within(items: Iterable[Any]) -> set[Buffer]:
+def _find_memory_read_in_parts(items: Iterable[Any]) -> set[Buffer]:
     """Return the memory of which items read a part that is filled in a block inside its own."""
     used = (n for x in items if not isinstance(x, Buffer) for n in (x, *_list_dependencies(x)) if isinstance(n, Node))
     parts = {n.value[0] for n in used if n.op == "load"}

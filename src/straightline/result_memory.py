@@ -31,24 +31,24 @@ class _Loan:
 
     def __del__(self, ends: Callable[[], bool] = sys.is_finalizing) -> None:
         if not ends():  # at the end of the process the names of this module are gone
-            _keep(self._memory)
+            _keep_memory(self._memory)
 
 
-def in_lines(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+def make_aligned_array(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
     """Return an array whose numbers are to be filled, at an address that is a multiple of a cache line."""
     size = math.prod(shape) * np.dtype(dtype).itemsize
-    memory = np.empty(size + LINE, np.uint8) if size < LEAST else np.asarray(_Loan(_take(size + LINE)))
-    numbers: np.ndarray = from_line(memory)[:size].view(dtype)
+    memory = np.empty(size + LINE, np.uint8) if size < LEAST else np.asarray(_Loan(_take_memory(size + LINE)))
+    numbers: np.ndarray = align_to_line(memory)[:size].view(dtype)
     return numbers.reshape(shape)
 
 
-def from_line(memory: np.ndarray) -> np.ndarray:
+def align_to_line(memory: np.ndarray) -> np.ndarray:
     """Return all but a line of some bytes, from the first one on that begins a line."""
     start = -memory.ctypes.data % LINE
     return memory[start : start + len(memory) - LINE]
 
 
-def _take(size: int) -> np.ndarray:
+def _take_memory(size: int) -> np.ndarray:
     """Return at least so many bytes: those kept last, of which at most half would be idle, else fresh ones."""
     for key in reversed(tuple(_kept)):
         memory = _kept.get(key)  # None where another thread took it
@@ -57,7 +57,7 @@ def _take(size: int) -> np.ndarray:
     return np.empty(size, np.uint8)
 
 
-def _keep(memory: np.ndarray) -> None:
+def _keep_memory(memory: np.ndarray) -> None:
     """Keep bytes for later results, and give back what was kept first beyond MOST and ARRAYS."""
     if len(memory) <= MOST:
         _kept[id(memory)] = memory

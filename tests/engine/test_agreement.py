@@ -9,7 +9,7 @@ import heliograph as hg
 from heliograph.engine.choice import engine_of
 from straightline import machine
 from straightline.compiled import Compiled, SingleRunCode, compile
-from straightline.jax_function import function_of
+from straightline.jax_function import make_jax_function
 from straightline.program import lower_function
 
 RANDOM = np.random.default_rng(4)
@@ -70,7 +70,7 @@ def test_every_filter_gives_what_xla_gives(name):
     program = lower_function(single, z[0])
     with jax.enable_x64(True):
         expected = [np.asarray(x) for x in jax.jit(jax.vmap(single))(z)]
-        by_jax = jax.jit(jax.vmap(function_of(program)))(z)
+        by_jax = jax.jit(jax.vmap(make_jax_function(program)))(z)
     deviation = np.sqrt(np.diagonal(expected[1], axis1=-2, axis2=-1))
     for mean, covariance in (Compiled(program, [True])(z), map(np.asarray, by_jax)):
         assert np.max(np.abs(mean - expected[0]) / deviation) < 1e-12
@@ -162,7 +162,7 @@ def test_loops_end_for_each_run_at_its_turn():
     y, turns = compile(root, x[0])(x)
     with jax.enable_x64(True):
         expected = jax.vmap(root)(x)
-        by_jax = jax.vmap(function_of(lower_function(root, x[0])))(x)
+        by_jax = jax.vmap(make_jax_function(lower_function(root, x[0])))(x)
     np.testing.assert_allclose(y, np.sqrt(x), rtol=1e-15)
     np.testing.assert_array_equal(turns, expected[1])
     np.testing.assert_array_equal(by_jax[1], expected[1])
@@ -240,7 +240,7 @@ def test_random_draws_are_those_of_jax():
     uniform, normal = compile(draw, numbers[0])(numbers)
     with jax.enable_x64(True):
         expected = jax.vmap(draw)(numbers)
-        by_jax = jax.vmap(function_of(lower_function(draw, numbers[0])))(numbers)
+        by_jax = jax.vmap(make_jax_function(lower_function(draw, numbers[0])))(numbers)
     np.testing.assert_array_equal(uniform, expected[0])
     np.testing.assert_allclose(normal, expected[1], rtol=1e-14)
     np.testing.assert_array_equal(by_jax[0], expected[0])
@@ -253,7 +253,7 @@ def test_derivatives_of_the_graph_are_those_of_the_function():
     with jax.enable_x64(True):
         by_graph, by_jax = (
             jax.jit(jax.grad(lambda z, f=f: jnp.sum(f(z)[0] ** 2)))(z)
-            for f in (function_of(lower_function(single, z)), single)
+            for f in (make_jax_function(lower_function(single, z)), single)
         )
     np.testing.assert_allclose(by_graph, by_jax, rtol=1e-11, atol=1e-12)
 
@@ -373,7 +373,7 @@ def test_a_machine_without_native_code_says_so_once_and_computes_by_xla(monkeypa
 
     x = RANDOM.normal(size=(3, 2, 2))
     monkeypatch.setattr(machine.llvm.Target, "from_default_triple", unknown)
-    for cached in (machine.find_llvm_target, machine.features):
+    for cached in (machine.find_llvm_target, machine.find_processor_features):
         cached.cache_clear()
     with pytest.warns(RuntimeWarning, match="no native code: expected a processor that LLVM knows, got no target"):
         assert engine_of(lambda x: x @ x, x) == "xla: LLVM does not know this processor"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from straightline.call_arrays import aligned
+from straightline.call_arrays import allocate_aligned
 
 PLANT = hg.LinearPlant([[0.9, 0.2], [0.0, 0.8]], 0.1, [1.0, -1.0], 1.0, [[1.0], [0.0]], inputs=["push"])
 SENSOR = hg.LinearSensor(np.eye(2), 0.5)
@@ -150,7 +150,7 @@ def test_a_sample_runs_little_python():
 def test_what_is_pushed_is_copied():
     """The caller may fill one array again and again."""
     stream, other = hg.Stream(Remembering()), hg.Stream(Remembering())
-    z = aligned(8 * 8).view(float)  # as JAX would take it without a copy
+    z = allocate_aligned(8 * 8).view(float)  # as JAX would take it without a copy
     for k in range(4):
         z[:] = k
         known = stream.push(z).mean, other.push(np.full(8, float(k))).mean

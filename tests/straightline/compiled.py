@@ -6,7 +6,7 @@ from collections.abc import Iterable
 import llvmlite.binding as llvm
 import numpy as np
 
-from straightline.llvm.lanes import types
+from straightline.llvm.lanes import write_types
 from straightline.vectors.elementary import write_functions
 
 WIDTH = 8
@@ -40,7 +40,7 @@ def engine_of(text: str) -> llvm.ExecutionEngine:
     target = llvm.Target.from_default_triple().create_target_machine(
         cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=1
     )
-    module = llvm.parse_assembly(types(WIDTH) + text)
+    module = llvm.parse_assembly(write_types(WIDTH) + text)
     module.verify()
     engine = llvm.create_mcjit_compiler(module, target)
     engine.finalize_object()

@@ -7,7 +7,7 @@ import pytest
 
 from straightline import present
 from straightline.accumulated import AccumulatedProgram
-from straightline.lowering import scalars
+from straightline.lowering import list_nodes
 from straightline.machine import Machine
 from straightline.program import SummedOutputs, fold_rows, lower_function, row_length
 
@@ -109,6 +109,6 @@ def test_what_has_arrived_is_never_requested():
         return jnp.where(jnp.isnan(x), 0.0, 2 * x), jnp.where(jnp.isnan(present(x)), 0.0, 3 * x)
 
     program = lower_function(filled, np.zeros(2))
-    asking, plain = ([node.op for node in scalars(output)] for output in program.outputs)
+    asking, plain = ([node.op for node in list_nodes(output)] for output in program.outputs)
     assert asking == ["select", "select"] and plain == ["mul", "mul"]
     np.testing.assert_array_equal(jax.jit(jax.vmap(present))(np.array([1.0, np.nan])), [1.0, np.nan])

@@ -15,7 +15,7 @@ import pytest
 from straightline import compiled
 from straightline.compiled import SingleRunCode, compile
 from straightline.limits import OFTEN
-from straightline.machine import background
+from straightline.machine import get_careful_thread
 from straightline.nodes import Node
 from straightline.program import lower_function
 
@@ -59,7 +59,7 @@ def test_code_is_generated_with_care_when_its_executions_have_cost_as_much(code)
     calls = [code(STARTS) for _ in range(int(count) - 1)]
     assert level(code) == 0
     calls.append(code(STARTS))
-    background().submit(int).result()  # after what was asked for before
+    get_careful_thread().submit(int).result()  # after what was asked for before
     assert level(code) == 1
     calls.append(code(STARTS))
     for a, b in zip(*map(jax.tree.leaves, (calls[0], calls[-1])), strict=True):
@@ -68,13 +68,13 @@ def test_code_is_generated_with_care_when_its_executions_have_cost_as_much(code)
 
 def test_calls_go_on_in_haste_while_care_is_taken(code):
     released, source = Event(), code.code.blocks
-    background().submit(released.wait, 60)
+    get_careful_thread().submit(released.wait, 60)
     code(STARTS)
     enough = OFTEN * source.operations / source.work  # blocks
     hasty = code.blocks.choose_machine(enough / 2)
     assert code.blocks.choose_machine(enough / 2) is hasty and hasty.level == 0
     released.set()
-    background().submit(int).result()
+    get_careful_thread().submit(int).result()
     assert level(code) == 1
 
 
@@ -152,8 +152,8 @@ def test_threads_hold_what_they_write_when_nobody_waits_any_more(code, monkeypat
         signal.raise_signal(signal.SIGINT)
 
     machine, arguments = Slow(), [STARTS.copy()]
-    monkeypatch.setattr(code.blocks, "machine", lambda blocks, held=[machine]: held.pop())
-    monkeypatch.setattr(compiled, "threads", lambda: Interrupted(interrupted))
+    monkeypatch.setattr(code.blocks, "choose_machine", lambda blocks, held=[machine]: held.pop())
+    monkeypatch.setattr(compiled, "get_thread_pool", lambda: Interrupted(interrupted))
     monkeypatch.setattr(compiled, "LITTLE", 0)
     before, stopped = signal.signal(signal.SIGINT, signal.default_int_handler), False
     try:
@@ -167,7 +167,7 @@ def test_threads_hold_what_they_write_when_nobody_waits_any_more(code, monkeypat
     assert stopped and len(made) == 2
     assert all(item() is not None for item in made)
     released.set()
-    background().submit(int).result()
+    get_careful_thread().submit(int).result()
 
 
 class Interrupted:

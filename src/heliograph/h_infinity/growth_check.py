@@ -159,29 +159,6 @@ def check_growth(
     return _make_finding(name, constant, bottom, top, tools, points, pairs, differences)
 
 
-def _pair_with_zero(points: Float[np.ndarray, "points n"]) -> Float[np.ndarray, "points n+n"]:
-    """Return each point with 0 behind it, as a pair."""
-    return np.concatenate([points, np.zeros_like(points)], axis=1)
-
-
-def _search_slopes_and_pairs(
-    tools: _SlopesAndRatios,
-    starts: Float[np.ndarray, "points n"],
-    low: Float[np.ndarray, "n"],
-    high: Float[np.ndarray, "n"],
-    random: np.random.Generator,
-) -> tuple[Float[np.ndarray, "points n"], Float[np.ndarray, "pairs n+n"]]:
-    """Return points of large slopes in the box, and pairs (x, y) of large ratios |f(x) - f(y)| / |x - y|."""
-    # Largest slope: the starts, then random moves from the steepest.
-    points = _climb_at_random(tools.slope, starts, low, high, random)
-    # Largest ratio: close pairs along the steepest directions, and as many pairs of any two points of the box.
-    move = tools.steepest(points) * NEARBY * tools.width / 2
-    close = np.concatenate([np.clip(points - move, low, high), np.clip(points + move, low, high)], axis=1)
-    far = low + (high - low) * random.random((POINTS, 2, len(low)))
-    pairs = np.concatenate([close, far.reshape(POINTS, -1)])
-    return points, _climb_at_random(tools.ratio, pairs, np.tile(low, 2), np.tile(high, 2), random)
-
-
 def _check_function(function: Function, point: Float[np.ndarray, "n"]) -> None:
     """Raise ValueError unless the function returns a number or a vector at a point."""
     expected = "one of the state in operations of jax.numpy that returns a number or a vector"
@@ -234,6 +211,29 @@ class _SlopesAndRatios:
         """Return the size |f(0)|, infinite where it is no number."""
         size = float(np.linalg.norm(self.values(np.zeros((1, n)))))
         return size if np.isfinite(size) else np.inf
+
+
+def _pair_with_zero(points: Float[np.ndarray, "points n"]) -> Float[np.ndarray, "points n+n"]:
+    """Return each point with 0 behind it, as a pair."""
+    return np.concatenate([points, np.zeros_like(points)], axis=1)
+
+
+def _search_slopes_and_pairs(
+    tools: _SlopesAndRatios,
+    starts: Float[np.ndarray, "points n"],
+    low: Float[np.ndarray, "n"],
+    high: Float[np.ndarray, "n"],
+    random: np.random.Generator,
+) -> tuple[Float[np.ndarray, "points n"], Float[np.ndarray, "pairs n+n"]]:
+    """Return points of large slopes in the box, and pairs (x, y) of large ratios |f(x) - f(y)| / |x - y|."""
+    # Largest slope: the starts, then random moves from the steepest.
+    points = _climb_at_random(tools.slope, starts, low, high, random)
+    # Largest ratio: close pairs along the steepest directions, and as many pairs of any two points of the box.
+    move = tools.steepest(points) * NEARBY * tools.width / 2
+    close = np.concatenate([np.clip(points - move, low, high), np.clip(points + move, low, high)], axis=1)
+    far = low + (high - low) * random.random((POINTS, 2, len(low)))
+    pairs = np.concatenate([close, far.reshape(POINTS, -1)])
+    return points, _climb_at_random(tools.ratio, pairs, np.tile(low, 2), np.tile(high, 2), random)
 
 
 def _compile_by_part(function: Callable[[Any], jax.Array]) -> Callable[[np.ndarray], np.ndarray]:

@@ -125,7 +125,7 @@ def _spread_modes(
     law: Float[np.ndarray, " modes"],
     chain: Float[np.ndarray, "modes modes"],
     moved: Float[np.ndarray, "L L"],
-    second: Float[np.ndarray, "L L"],
+    second: Float[Array, "L L"],
 ) -> tuple[Float[np.ndarray, "N N"], Float[np.ndarray, " modes"]]:
     """Return Cov(w) of a step of Y 1{mode}, N = modes L, and the law of the modes after it.
 

@@ -166,11 +166,11 @@ def relay_schedules(network: RelayNetwork, design: RelayDesign) -> dict[str, Sch
 
 def _make_gains(
     steps: RelaySteps,
-    gain: Float[Array, "steps n received"],
+    gain: Float[np.ndarray, "steps n received"],
     received: slice,
-    covariance: Float[Array, "steps n n"],
-    predicted: Float[Array, "steps n n"],
-    innovation: Float[Array, "steps received received"],
+    covariance: Float[np.ndarray, "steps n n"],
+    predicted: Float[np.ndarray, "steps n n"],
+    innovation: Float[np.ndarray, "steps received received"],
 ) -> Gains:
     """Return s+ = (A - K B) s + K z + a - K b of one filter as gains over time; its estimate is its state s.
 

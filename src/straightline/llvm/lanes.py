@@ -7,7 +7,7 @@ from straightline.llvm.transposed import TextLines
 
 
 @cache
-def types(width: int) -> str:
+def write_types(width: int) -> str:
     """Return the text that names each type <W x T> `%T`, and an integer of W bits `%lanes`."""
     vectors = [f"%{scalar} = type <{width} x {scalar}>\n" for scalar in ("double", "float", "i64", "i32", "i8", "i1")]
     return "".join([*vectors, f"%lanes = type i{width}\n"])
@@ -17,7 +17,7 @@ def types(width: int) -> str:
 WIDTH = "ptrtoint (ptr getelementptr (%i8, ptr null, i64 1) to i64)"
 
 
-def lane_numbers(width: int) -> str:
+def write_lane_numbers(width: int) -> str:
     """Write `%i64 @hg_lanes()`: 0, 1, ... W - 1."""
     numbers = ", ".join(f"i64 {lane}" for lane in range(width))
     return f"define internal %i64 @hg_lanes() noinline nounwind {{\n  ret %i64 <{numbers}>\n}}\n"

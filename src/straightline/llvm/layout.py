@@ -5,7 +5,7 @@ from collections.abc import Collection, Iterable
 from typing import Any, NamedTuple
 
 from straightline.llvm.operations import BITS
-from straightline.llvm.text import loops_of, turns_of
+from straightline.llvm.text import count_turns, list_loops_around
 from straightline.nodes import REAL, Buffer, Node, Unsupported
 from straightline.program import Program, SummedOutputs, find_differing, list_used_nodes
 from straightline.vectors.elementary import FUNCTIONS
@@ -87,12 +87,12 @@ def divide_program(
         lanes=lanes,
         spread=spread,
         alone=alone,
-        width=width or widest(spread),
+        width=width or choose_vector_width(spread),
         summed=summed,
     )
 
 
-def widest(items: Iterable[Any]) -> int:
+def choose_vector_width(items: Iterable[Any]) -> int:
     """Return the most runs of a vector: twice as many where most of what is computed has 32 bits, not 64.
 
     A step of a particle filter that hashes two words and makes four normal numbers of floats of them, among 112
@@ -119,7 +119,7 @@ class MemoryLayout(NamedTuple):
     turning: set[Buffer]
 
 
-def lay_out(parts: ProgramParts, mine: Collection[Any]) -> MemoryLayout:
+def lay_out_memory(parts: ProgramParts, mine: Collection[Any]) -> MemoryLayout:
     """Place what differs between runs in the memory of a thread, and what the program fills for all in shared memory.
 
     `mine` are the items of the function of blocks. What it reads of memory that is filled anew in each turn of a loop
@@ -131,19 +131,19 @@ def lay_out(parts: ProgramParts, mine: Collection[Any]) -> MemoryLayout:
     used_in_place = {*parts.outputs, *parts.lanes} if parts.alone else set()
     own = [b for b in owners if b in parts.spread and b not in added and b not in used_in_place]
     common = [b for b in owners if b not in parts.spread and b.kind in FILLED]
-    turning = {b for b in common if loops_of(b.block)}
-    turning &= _read(mine) if turning else turning
+    turning = {b for b in common if list_loops_around(b.block)}
+    turning &= _find_read_buffers(mine) if turning else turning
     return MemoryLayout(*_place_buffers(own, parts.width), *_place_buffers(common, 1, turning), turning)
 
 
 def _check_sums(items: Iterable[Any], outputs: Collection[Buffer]) -> None:
     """Raise unless sums are only stored to: a number that is read again needs memory of its own."""
-    read = _read(items) if outputs else set()
+    read = _find_read_buffers(items) if outputs else set()
     if any(b.inside is not None or b in read or b.type not in REAL for b in outputs):
         raise Unsupported("a sum over runs of numbers that are used again")
 
 
-def _read(items: Iterable[Any]) -> set[Buffer]:
+def _find_read_buffers(items: Iterable[Any]) -> set[Buffer]:
     """Return the buffers that these items, or what they use directly, load numbers of."""
     nodes = (node for x in items for node in (x, *list_used_nodes(x)) if isinstance(node, Node))
     return {node.value[0].owner[0] for node in nodes if node.op == "load"}
@@ -159,6 +159,6 @@ def _place_buffers(
     start, places = 0, dict[Buffer, int]()
     for buffer in buffers:
         places[buffer] = start
-        copies = turns_of(buffer.block) if buffer in turning else 1
+        copies = count_turns(buffer.block) if buffer in turning else 1
         start += -(-buffer.size * copies * width * BITS[buffer.type] // 8 // LINE) * LINE
     return start, places

@@ -12,14 +12,14 @@ import numpy as np
 from straightline.cycles import keep_cycles
 from straightline.folding import DTYPES
 from straightline.limits import LONGEST, TABLE
-from straightline.llvm.lanes import WIDTH, lane_numbers, types, write_flush, write_gather
-from straightline.llvm.layout import FILLED, LINE, MemoryLayout, ProgramParts, divide_program, lay_out
+from straightline.llvm.lanes import WIDTH, write_flush, write_gather, write_lane_numbers, write_types
+from straightline.llvm.layout import FILLED, LINE, MemoryLayout, ProgramParts, divide_program, lay_out_memory
 from straightline.llvm.operations import BITS
-from straightline.llvm.prefetch import PrefetchedRows, longest, share
-from straightline.llvm.text import FunctionWriter, SharedSlots, turns_of
+from straightline.llvm.prefetch import PrefetchedRows, count_lines_per_turn, find_longest_loop
+from straightline.llvm.text import FunctionWriter, SharedSlots, count_turns
 from straightline.llvm.transposed import FEW, Move, write_mover
 from straightline.lowering import Lowering, Value, refuse_failures
-from straightline.memory import InMemory, contiguous
+from straightline.memory import InMemory, contiguous_strides
 from straightline.nodes import Buffer, Loop, Node, Type, Unsupported
 from straightline.program import (
     Program,
@@ -30,7 +30,7 @@ from straightline.program import (
     row_length,
     sort_items,
 )
-from straightline.rules.loops import copied
+from straightline.rules.loops import copy_in_memory
 from straightline.rules.random_bits import write_hash_function
 from straightline.vectors.elementary import write_functions
 
@@ -53,7 +53,7 @@ class FunctionSource(NamedTuple):
     def text(self, width: int) -> str:
         """Return the text for vectors of so many runs."""
         body = zlib.decompress(self.compressed).decode()
-        return "\n".join([types(width), *(helper(width) for helper in self.helpers), body])
+        return "\n".join([write_types(width), *(helper(width) for helper in self.helpers), body])
 
 
 class OutputShape(NamedTuple):
@@ -108,12 +108,12 @@ def choose_output_buffers(program: Program, last: Collection[int] = ()) -> list[
 def _find_or_copy(lowering: Lowering, value: InMemory, taken: list[Buffer]) -> InMemory:
     """Return an array's buffer if it is all of one that the program filled; else copy the array."""
     buffer = value.buffer
-    whole = not value.moves and value.offset == 0 and value.strides == contiguous(value.shape)
+    whole = not value.moves and value.offset == 0 and value.strides == contiguous_strides(value.shape)
     alone = buffer.kind == "scratch" and buffer.inside is None and buffer not in taken
     if whole and alone and value.size == buffer.size:
         buffer.shape = value.shape
         return value
-    return _store_in_memory(lowering, value) if value.size <= TABLE else copied(lowering, value)
+    return _store_in_memory(lowering, value) if value.size <= TABLE else copy_in_memory(lowering, value)
 
 
 def _store_in_memory(lowering: Lowering, value: Value) -> InMemory:
@@ -158,7 +158,7 @@ def write_module(
     parts = divide_program(program, items, outputs, differing, width, alone, summed)
     # The items of the function of blocks, and where the numbers lie.
     of_blocks = find_crossing_items(items, parts.spread)
-    layout = lay_out(parts, of_blocks)
+    layout = lay_out_memory(parts, of_blocks)
     # The function of blocks computes what differs, and reads the rest from slots.
     slots = SharedSlots(layout.shared)
     products = find_fusable_products(items) if fuse else set()
@@ -202,7 +202,7 @@ def _is_single(items: Iterable[Any]) -> bool:
 def _finish_source(text: str, writer: FunctionWriter, movers: Sequence[Callable[[int], str]]) -> FunctionSource:
     """Return the source of a written text, with its helpers and counts; a loop of unknown length counts as one turn."""
     counts = Counter([x.block for x in writer.mine if isinstance(x, Node)])
-    turns = {block: turns_of(block) for block in counts}
+    turns = {block: count_turns(block) for block in counts}
     work = sum(count * turns[block] for block, count in counts.items())
     helpers: list[Callable[[int], str]] = [*movers, *(partial(write_gather, *kind) for kind in sorted(writer.gathered))]
     if writer.flushes:
@@ -237,7 +237,7 @@ def _write_blocks(writer: FunctionWriter, parts: ProgramParts, layout: MemoryLay
     moved = set() if parts.alone else {b for b in layout.in_scratch if b.size}
     moved_inputs, moved_outputs = [b for b in parts.lanes if b in moved], [b for b in parts.outputs if b in moved]
     movers = {_write_move(writer, names, buffer, "take") for buffer in moved_inputs}
-    _ask_for_rows(writer, parts, names, moved_inputs, moved_outputs)
+    _request_rows_ahead(writer, parts, names, moved_inputs, moved_outputs)
     if parts.summed is not None:
         number = parts.program.inputs[parts.summed.number]
         _add_to_sums(writer, parts.summed, names, number, parts.added, parts.width)
@@ -250,7 +250,7 @@ def _write_blocks(writer: FunctionWriter, parts: ProgramParts, layout: MemoryLay
     writer.line("%more = icmp slt i64 %next, %end")
     writer.line("br i1 %more, label %block, label %exit")
     writer.start_basic_block("exit")
-    helpers: list[Callable[[int], str]] = [] if parts.summed is None else [lane_numbers]
+    helpers: list[Callable[[int], str]] = [] if parts.summed is None else [write_lane_numbers]
     helpers += [partial(write_mover, move) for move in sorted(movers)]
     return _finish_source(_write_run("\n".join(writer.lines), writer), writer, helpers)
 
@@ -266,11 +266,11 @@ def _write_move(
     return called
 
 
-def _ask_for_rows(
+def _request_rows_ahead(
     writer: FunctionWriter, parts: ProgramParts, names: dict[Buffer, str], taken: list[Buffer], given: list[Buffer]
 ) -> None:
     """Let the longest loop, if there is one, ask for the memory of inputs and outputs before it is used."""
-    writer.asking = longest(x for x in parts.program.graph.top.items if x in writer.mine)
+    writer.asking = find_longest_loop(x for x in parts.program.graph.top.items if x in writer.mine)
     if writer.asking is not None:
         writer.asked = _locate_rows(writer, names, taken, given, parts.width, writer.asking)
 
@@ -284,7 +284,7 @@ def _locate_rows(
         bytes_, writes = buffer.size * BITS[buffer.type] // 8, buffer in given
         place = writer.add(f"mul i64 {'%first' if writes else following}, {bytes_}")
         start = writer.add(f"getelementptr i8, ptr {names[buffer]}, i64 {place}")
-        results.append(PrefetchedRows(start, bytes_, share(bytes_, width, loop), writes))
+        results.append(PrefetchedRows(start, bytes_, count_lines_per_turn(bytes_, width, loop), writes))
     return results
 
 

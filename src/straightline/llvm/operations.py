@@ -29,12 +29,12 @@ CALLED = {*FUNCTIONS, *SCALAR, "threefry"}  # functions of their own, `hg_` befo
 Emit = Callable[[str], str]  # the text of an operation -> the name of its result
 
 
-def vector(type: Type) -> str:
+def vector_type(type: Type) -> str:
     """Return the name of the type <W x T>."""
     return f"%{LLVM[type]}"
 
 
-def literal(value: float | int | bool, type: Type) -> str:
+def write_literal(value: float | int | bool, type: Type) -> str:
     """Return a constant; real ones by their bits as doubles."""
     if type in REAL:
         return "0x" + struct.pack(">d", float(value)).hex().upper()
@@ -43,9 +43,9 @@ def literal(value: float | int | bool, type: Type) -> str:
     return str(int(value))
 
 
-def splat(value: float | int | bool, type: Type) -> str:
+def write_splat(value: float | int | bool, type: Type) -> str:
     """Return a constant in all lanes."""
-    return f"splat ({LLVM[type]} {literal(value, type)})"
+    return f"splat ({LLVM[type]} {write_literal(value, type)})"
 
 
 def write_operation(node: Node, names: list[str], emit: Emit) -> str:
@@ -60,8 +60,8 @@ def write_operation(node: Node, names: list[str], emit: Emit) -> str:
         Unsupported: an operation that has no text here.
     """
     source: Type = node.args[0].type if node.args else node.type
-    operand_type = vector(source)
-    op, result_type = node.op, vector(node.type)
+    operand_type = vector_type(source)
+    op, result_type = node.op, vector_type(node.type)
     if source in REAL and op in FLOAT:
         return emit(f"{FLOAT[op]} {operand_type} {names[0]}, {names[1]}")
     if op == "select":
@@ -74,15 +74,16 @@ def write_operation(node: Node, names: list[str], emit: Emit) -> str:
     if op == "bitcast":
         return emit(f"bitcast {operand_type} {names[0]} to {result_type}")
     if op == "not":
-        return emit(f"xor {operand_type} {names[0]}, {splat(True, 'bool') if source == 'bool' else splat(-1, source)}")
+        all_bits = write_splat(True, "bool") if source == "bool" else write_splat(-1, source)
+        return emit(f"xor {operand_type} {names[0]}, {all_bits}")
     # Functions of their own, then arithmetic by type.
     if op in CALLED:
-        typed = ", ".join(f"{vector(a.type)} {n}" for a, n in zip(node.args, names, strict=True))
-        return emit(f"call {result_type} @hg_{called(node)}({typed})")
+        typed = ", ".join(f"{vector_type(a.type)} {n}" for a, n in zip(node.args, names, strict=True))
+        return emit(f"call {result_type} @hg_{name_called_function(node)}({typed})")
     return (_write_float_operation if source in REAL else _write_integer_operation)(node, names, operand_type, emit)
 
 
-def called(node: Node) -> str:
+def name_called_function(node: Node) -> str:
     """Return the name of the function that computes an operation: in single precision it ends in f, as in C."""
     return f"{node.op}f" if node.type == "f32" else node.op
 
@@ -111,12 +112,12 @@ def _write_float_operation(node: Node, names: list[str], text: str, emit: Emit) 
         return emit(f"call {text} @llvm.{op}imum({first}, {text} {names[1]})")
     if op == "is_finite":
         size = emit(f"call {text} @llvm.fabs({first})")
-        return emit(f"fcmp olt {text} {size}, {splat(float('inf'), type)}")
+        return emit(f"fcmp olt {text} {size}, {write_splat(float('inf'), type)}")
     # sign x = 1 or -1, but x itself for zeros and NaN ("one": ordered and not equal, so that NaN is not).
     if op == "sign":
-        signed = emit(f"call {text} @llvm.copysign({text} {splat(1.0, type)}, {first})")
-        is_nonzero = emit(f"fcmp one {first}, {splat(0.0, type)}")
-        return emit(f"select {vector('bool')} {is_nonzero}, {text} {signed}, {first}")
+        signed = emit(f"call {text} @llvm.copysign({text} {write_splat(1.0, type)}, {first})")
+        is_nonzero = emit(f"fcmp one {first}, {write_splat(0.0, type)}")
+        return emit(f"select {vector_type('bool')} {is_nonzero}, {text} {signed}, {first}")
     if op == "rem":
         return emit(f"frem {first}, {names[1]}")
     raise Unsupported(op)
@@ -143,8 +144,10 @@ def _write_integer_operation(node: Node, names: list[str], text: str, emit: Emit
         return emit(f"call {text} @llvm.abs({first}, i1 false)")
     # sign x = x limited to [-1, 1], of unsigned numbers to [0, 1].
     if op == "sign":
-        limited = emit(f"call {text} @llvm.{prefix}min({first}, {text} {splat(1, type)})")
-        return emit(f"call {text} @llvm.smax({text} {limited}, {text} {splat(-1, type)})") if is_signed else limited
+        limited = emit(f"call {text} @llvm.{prefix}min({first}, {text} {write_splat(1, type)})")
+        return (
+            emit(f"call {text} @llvm.smax({text} {limited}, {text} {write_splat(-1, type)})") if is_signed else limited
+        )
     if op in ("div", "rem"):
         return _write_division(node, names, text, emit)
     if op in ("shift_left", "shift_right", "shift_right_signed"):
@@ -162,15 +165,15 @@ def _write_division(node: Node, names: list[str], text: str, emit: Emit) -> str:
     if node.args[1].op == "constant" and node.args[1].value not in (0, -1):
         return emit(f"{instruction} {text} {a}, {b}")
     # What LLVM does not define is divided by 1, which has the right result of the least number by -1.
-    flags = vector("bool")
+    flags = vector_type("bool")
     is_zero = undefined = emit(f"icmp eq {text} {b}, zeroinitializer")
     if type[0] == "i":
-        undefined = emit(f"or {flags} {is_zero}, {emit(f'icmp eq {text} {b}, {splat(-1, type)}')}")
-        is_least = emit(f"icmp eq {text} {a}, {splat(-(2 ** (BITS[type] - 1)), type)}")
+        undefined = emit(f"or {flags} {is_zero}, {emit(f'icmp eq {text} {b}, {write_splat(-1, type)}')}")
+        is_least = emit(f"icmp eq {text} {a}, {write_splat(-(2 ** (BITS[type] - 1)), type)}")
         undefined = emit(f"and {flags} {undefined}, {emit(f'or {flags} {is_zero}, {is_least}')}")
-    divisor = emit(f"select {flags} {undefined}, {text} {splat(1, type)}, {text} {b}")
+    divisor = emit(f"select {flags} {undefined}, {text} {write_splat(1, type)}, {text} {b}")
     divided = emit(f"{instruction} {text} {a}, {divisor}")
-    by_zero = splat(-1, type) if op == "div" else a
+    by_zero = write_splat(-1, type) if op == "div" else a
     return emit(f"select {flags} {is_zero}, {text} {by_zero}, {text} {divided}")
 
 
@@ -181,17 +184,17 @@ def _write_shift(node: Node, names: list[str], text: str, emit: Emit) -> str:
     if by.op == "constant" and 0 <= by.value < BITS[type]:
         return emit(f"{instruction} {text} {a}, {b}")
     # By at most all bits but one, which leaves the sign; other shifts by more are zero.
-    at_most = emit(f"call {text} @llvm.umin({text} {b}, {text} {splat(BITS[type] - 1, type)})")
+    at_most = emit(f"call {text} @llvm.umin({text} {b}, {text} {write_splat(BITS[type] - 1, type)})")
     shifted = emit(f"{instruction} {text} {a}, {at_most}")
     if instruction == "ashr":
         return shifted
-    in_range = emit(f"icmp ult {text} {b}, {splat(BITS[type], type)}")
-    return emit(f"select {vector('bool')} {in_range}, {text} {shifted}, {text} zeroinitializer")
+    in_range = emit(f"icmp ult {text} {b}, {write_splat(BITS[type], type)}")
+    return emit(f"select {vector_type('bool')} {in_range}, {text} {shifted}, {text} zeroinitializer")
 
 
 def _write_conversion(source: Type, target: Type, name: str, emit: Emit) -> str:
     """Write a conversion between types, saturating from reals to integers; return the name of its result."""
-    operand_type, result_type = vector(source), vector(target)
+    operand_type, result_type = vector_type(source), vector_type(target)
     if source == target or LLVM[source] == LLVM[target]:
         return name
     if source in REAL and target in REAL:
@@ -211,7 +214,7 @@ def write_fused(node: Node, product: Node, names: list[str], emit: Emit) -> str:
 
     `product`: the argument a b of the node, whose place tells the sign.
     """
-    reals = vector(node.type)
+    reals = vector_type(node.type)
     a, b, c = names
     if node.op == "sub":
         if node.args[1] is product:

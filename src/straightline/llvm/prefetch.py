@@ -27,13 +27,13 @@ class PrefetchedRows(NamedTuple):
     writes: bool
 
 
-def longest(items: Iterable[Any]) -> Loop | None:
+def find_longest_loop(items: Iterable[Any]) -> Loop | None:
     """Return the loop of known length that has most turns, None if there is none."""
     loops = [x for x in items if isinstance(x, Loop) and x.length]
     return max(loops, key=lambda loop: loop.length or 0) if loops else None
 
 
-def share(bytes: int, width: int, loop: Loop) -> int:
+def count_lines_per_turn(bytes: int, width: int, loop: Loop) -> int:
     """Return the lines of rows of W runs that a loop asks for in each of its turns.
 
     0 where these take longer than its operations: a loop that does little but move numbers hides nothing beside them.

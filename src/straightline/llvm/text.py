@@ -8,10 +8,19 @@ from collections.abc import Collection, Sequence
 from typing import Any
 
 from straightline.llvm.lanes import WIDTH, gather_name
-from straightline.llvm.operations import BITS, CALLED, LLVM, called, splat, vector, write_fused, write_operation
+from straightline.llvm.operations import (
+    BITS,
+    CALLED,
+    LLVM,
+    name_called_function,
+    vector_type,
+    write_fused,
+    write_operation,
+    write_splat,
+)
 from straightline.llvm.prefetch import PrefetchedRows, write_requests
 from straightline.nodes import REAL, Block, Buffer, Guard, Loop, LoopExit, Node, Store, Type
-from straightline.program import fusable
+from straightline.program import find_fused_product
 
 Scope = dict[Any, str]
 
@@ -31,7 +40,7 @@ class SharedSlots:
         """Return the offset of a number, assigned at its first use."""
         if node not in self.places:
             self.places[node] = self.size
-            self.size += 8 * turns_of(node.block)
+            self.size += 8 * count_turns(node.block)
         return self.places[node]
 
     def load(self, writer: "FunctionWriter", node: Node) -> str:
@@ -43,7 +52,7 @@ class SharedSlots:
 
     def store(self, writer: "FunctionWriter", node: Node, name: str) -> None:
         """Store a number, which the other function uses."""
-        kind = vector(node.type)
+        kind = vector_type(node.type)
         address = self._address(writer, node)
         if node.type == "bool":
             name, kind = writer.add(f"zext {kind} {name} to %i8"), "%i8"
@@ -54,14 +63,14 @@ class SharedSlots:
         return writer.write_address_of_turn(start, node.block, 8)
 
 
-def loops_of(block: Block) -> list[Loop]:
+def list_loops_around(block: Block) -> list[Loop]:
     """Return the loops around a block's nodes, innermost first."""
     return [b.owner for b in block.list_enclosing_blocks() if isinstance(b.owner, Loop)]
 
 
-def turns_of(block: Block) -> int:
+def count_turns(block: Block) -> int:
     """Return how many turns the loops around a block's nodes make together; of unknown length one."""
-    return math.prod(loop.length or 1 for loop in loops_of(block))
+    return math.prod(loop.length or 1 for loop in list_loops_around(block))
 
 
 class FunctionWriter:
@@ -132,13 +141,13 @@ class FunctionWriter:
         """Write the operation of a node, a sum with a product as one fused operation; return the name of its result."""
         if node.op == "load":
             return self._write_load(node)
-        product = fusable(node, self.products)
+        product = find_fused_product(node, self.products)
         if product is not None:
             rest = node.args[0] if node.args[1] is product else node.args[1]
             names = [self.write_operand(n) for n in (*product.args, rest)]
             return write_fused(node, product, names, self.add)
         if node.op in CALLED:
-            self.called.add(called(node))
+            self.called.add(name_called_function(node))
         return write_operation(node, [self.write_operand(a) for a in node.args], self.add)
 
     def write_operand(self, node: Node) -> str:
@@ -147,7 +156,7 @@ class FunctionWriter:
             if node in scope:
                 return scope[node]
         if node.op == "constant":
-            name = self.scopes[0][node] = splat(node.value, node.type)
+            name = self.scopes[0][node] = write_splat(node.value, node.type)
             return name
         if node in self.mine and node.op != "counter":
             raise RuntimeError(f"{node} is used before it is computed")
@@ -163,7 +172,7 @@ class FunctionWriter:
             if key in scope:
                 return scope[key]
         if node in self.mine or any(node in scope for scope in self.scopes):
-            name = self.add(f"extractelement {vector(node.type)} {self.write_operand(node)}, i64 0")
+            name = self.add(f"extractelement {vector_type(node.type)} {self.write_operand(node)}, i64 0")
         elif node.op == "load" and all(self._is_scalar(i) for i in node.args):
             name = self._write_scalar_load(node)
         else:
@@ -177,7 +186,7 @@ class FunctionWriter:
 
     def write_broadcast(self, name: str, type: Type) -> str:
         """Return the name of a vector of a scalar."""
-        kind = vector(type)
+        kind = vector_type(type)
         first = self.add(f"insertelement {kind} poison, {LLVM[type]} {name}, i64 0")
         if self.single:
             return first
@@ -214,7 +223,7 @@ class FunctionWriter:
     def write_address_of_turn(self, start: str, block: Block, bytes_: int) -> str:
         """Return the address that belongs to this turn of the loops around a block; each turn has so many bytes."""
         index = ""
-        for loop in loops_of(block):
+        for loop in list_loops_around(block):
             assert loop.counter is not None
             step = self.add(f"mul i64 {self.write_scalar(loop.counter)}, {bytes_}")
             index = self.add(f"add i64 {index}, {step}") if index else step
@@ -231,7 +240,7 @@ class FunctionWriter:
         address = self._address(buffer, offset, strides, node.args, f"%i{BITS[node.type]}")
         if node.type == "bool":
             return self.add(f"icmp ne %i8 {self.add(f'load %i8, ptr {address}, align 1')}, zeroinitializer")
-        return self.add(f"load {vector(node.type)}, ptr {address}, align {BITS[node.type] // 8}")
+        return self.add(f"load {vector_type(node.type)}, ptr {address}, align {BITS[node.type] // 8}")
 
     def _write_scalar_load(self, node: Node) -> str:
         """Load a number that all lanes share."""
@@ -261,11 +270,11 @@ class FunctionWriter:
         )
         if node.type == "bool":
             return self.add(f"icmp ne %i8 {loaded}, zeroinitializer")
-        return self.add(f"bitcast %i{bits} {loaded} to {vector(node.type)}") if node.type in REAL else loaded
+        return self.add(f"bitcast %i{bits} {loaded} to {vector_type(node.type)}") if node.type in REAL else loaded
 
     def _write_store(self, store: Store) -> None:
         """Write the store of a number; where sums over runs are kept, add it to what is there, in lanes that count."""
-        name, kind, bits = self.write_operand(store.node), vector(store.node.type), BITS[store.node.type]
+        name, kind, bits = self.write_operand(store.node), vector_type(store.node.type), BITS[store.node.type]
         entry = f"[{self.sums[store.buffer]} x i64]" if store.buffer in self.sums else f"%i{bits}"
         address = self._address(store.buffer, store.offset, store.strides, store.indices, entry)
         if store.buffer in self.sums:  # of doubles
@@ -310,7 +319,7 @@ class FunctionWriter:
         if loop.length:
             phis.append(f"  {counter} = phi i64 [0, %{label_before}], [{counter}.next, %{self.label}]")
         for k, start, after in zip(carried, starts, following, strict=True):
-            kind = vector(loop.parameters[k].type)
+            kind = vector_type(loop.parameters[k].type)
             phis.append(f"  %{name}.p{k} = phi {kind} [{start}, %{label_before}], [{after}, %{self.label}]")
         self.lines[place_of_phis:place_of_phis] = phis
         self.start_basic_block(f"{name}.end")
@@ -385,7 +394,7 @@ class FunctionWriter:
         # what `_name` may write of one.
         merged = []
         for k, value in zip(used, values, strict=True):
-            kind = vector(guard.results[k].type)
+            kind = vector_type(guard.results[k].type)
             merged.append(self.add(f"phi {kind} [{value}, %{label_after}], [zeroinitializer, %{label_before}]"))
         for k, result in zip(used, merged, strict=True):
             self._name(guard.results[k], result)

@@ -66,7 +66,7 @@ def write_mover(move: Move, width: int) -> str:
     text, bits = TextLines(), move.bits
     side = min(REGISTER // bits if move.squared or move.few else FEW, width)  # runs that are moved together: a group
     if move.few and width > 1:
-        _write_whole(text, move, side, width)
+        _write_register_mover(text, move, side, width)
     for group in range(0, width, side):
         rows = _write_row_addresses(text, bits, range(group, group + side))
         first_entry = "0"
@@ -93,7 +93,7 @@ def _write_row_addresses(text: TextLines, bits: int, lanes: range) -> list[str]:
     return rows
 
 
-def _write_whole(text: TextLines, move: Move, side: int, width: int) -> None:
+def _write_register_mover(text: TextLines, move: Move, side: int, width: int) -> None:
     """Write the move of few entries of a block in which each lane has a run of its own, and the return after it.
 
     The entries of the runs of a group follow one another in memory: they are loaded as whole registers, whose numbers
@@ -105,8 +105,8 @@ def _write_whole(text: TextLines, move: Move, side: int, width: int) -> None:
     start = text.add(f"mul i64 %first, {move.few}")
     start = text.add(f"getelementptr i{move.bits}, ptr %runs, i64 {start}")
     for group in range(0, width, side):
-        runs = [text.add(_place(move.bits, start, group * move.few + i * side)) for i in range(move.few)]
-        lanes = [text.add(_place(move.bits, "%lanes", i * width + group)) for i in range(move.few)]
+        runs = [text.add(_write_address(move.bits, start, group * move.few + i * side)) for i in range(move.few)]
+        lanes = [text.add(_write_address(move.bits, "%lanes", i * width + group)) for i in range(move.few)]
         sources, targets = (runs, lanes) if move.inwards else (lanes, runs)
         # Where the numbers of each target are among those of the sources, which follow one another.
         numbers = np.arange(move.few * side)
@@ -114,17 +114,17 @@ def _write_whole(text: TextLines, move: Move, side: int, width: int) -> None:
         vector = f"<{side} x i{move.bits}>"
         loaded = [text.add(f"load {vector}, ptr {p}, align {move.bits // 8}") for p in sources]
         for target, places in zip(targets, in_sources.reshape(move.few, side).tolist(), strict=True):
-            chosen = _choose(text, loaded, [divmod(place, side) for place in places], vector)
+            chosen = _write_choice(text, loaded, [divmod(place, side) for place in places], vector)
             text.lines.append(f"  store {vector} {chosen}, ptr {target}, align {move.bits // 8}")
     text.lines += ["  ret void", "singles:"]
 
 
-def _place(bits: int, start: str, number: int) -> str:
+def _write_address(bits: int, start: str, number: int) -> str:
     """Return the operation that makes the address of a number behind a start."""
     return f"getelementptr i{bits}, ptr {start}, i64 {number}"
 
 
-def _choose(text: TextLines, registers: list[str], places: list[tuple[int, int]], vector: str) -> str:
+def _write_choice(text: TextLines, registers: list[str], places: list[tuple[int, int]], vector: str) -> str:
     """Write the choice of numbers out of registers; return the name of the register that has them, lane by lane.
 
     places: for each lane the number of the register that has its number, and the place there.

@@ -11,7 +11,7 @@ import numpy as np
 from jax.extend.core import JaxprEqn
 
 from straightline.limits import DEAR
-from straightline.lowering import IN_MEMORY, RULES, Lowering, Value, array_of
+from straightline.lowering import IN_MEMORY, RULES, Lowering, Value, arrange_nodes
 from straightline.nodes import Block, Guard, Node, RandomKey
 from straightline.rules.elementwise import select
 from straightline.rules.loops import estimate_size
@@ -22,14 +22,14 @@ CALLS = (
 )  # fmt: skip
 
 
-def _call(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+def _inline_call(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     """Inline the function of a call (jit, custom_jvp, ...)."""
     params = equation.params
     inner = next(params[name] for name in ("jaxpr", "call_jaxpr", "fun_jaxpr") if name in params)
     return lowering.inline_program(inner, inputs)
 
 
-def _custom_vmap_call(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+def _inline_custom_vmap_call(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     """Inline a function that has a rule of its own for `vmap`."""
     return lowering.inline_program(equation.params["call"], inputs)
 
@@ -47,16 +47,16 @@ def _expand_call(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
     return lowering.inline_program(program, inputs)
 
 
-def _platform_index(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+def _select_platform(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     """Select the branch of a program for CPUs."""
     platforms = equation.params["platforms"]
     number = next((i for i, names in enumerate(platforms) if names is not None and "cpu" in names), len(platforms) - 1)
     return [lowering.make_known_array(np.int32(number))]
 
 
-IN_MEMORY |= dict.fromkeys(CALLS, _call)
-IN_MEMORY |= {"custom_vmap_call": _custom_vmap_call, "call_hi_primitive": _expand_call}
-RULES |= {"platform_index": _platform_index}
+IN_MEMORY |= dict.fromkeys(CALLS, _inline_call)
+IN_MEMORY |= {"custom_vmap_call": _inline_custom_vmap_call, "call_hi_primitive": _expand_call}
+RULES |= {"platform_index": _select_platform}
 
 
 def _lower_cond(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
@@ -77,7 +77,7 @@ def _lower_cond(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> 
     # Select the results of the branch that is taken.
     chosen = results[len(branches) - 1]
     for k in reversed(range(len(branches) - 1)):
-        chosen = [_where(lowering, conditions[k], a, b) for a, b in zip(results[k], chosen, strict=True)]
+        chosen = [_select_arrays(lowering, conditions[k], a, b) for a, b in zip(results[k], chosen, strict=True)]
     return chosen
 
 
@@ -101,12 +101,12 @@ def _lower_branch(lowering: Lowering, condition: Node, branch: Any, inputs: list
         results = [lowering.nodes(x) for x in lowering.inline_program(branch, inputs)]
     finally:
         graph.current = outer
-    if _size(block) <= DEAR:
-        _dissolve(block, outer)
+    if _count_block_nodes(block) <= DEAR:
+        _move_statements_out(block, outer)
         return results
     guard = Guard(block, condition)
     outer.items.append(guard)
-    return [array_of([_guard_result(lowering, guard, x) for x in r.ravel().tolist()], r.shape) for r in results]
+    return [arrange_nodes([_guard_result(lowering, guard, x) for x in r.ravel().tolist()], r.shape) for r in results]
 
 
 def _guard_result(lowering: Lowering, guard: Guard, value: Any) -> Any:
@@ -123,12 +123,12 @@ def _guard_result(lowering: Lowering, guard: Guard, value: Any) -> Any:
     return guarded
 
 
-def _size(block: Block) -> int:
+def _count_block_nodes(block: Block) -> int:
     """Count the nodes of a block; a statement in it counts as many."""
     return sum(1 if isinstance(statement, Node) else DEAR + 1 for statement in block.items)
 
 
-def _dissolve(block: Block, outer: Block) -> None:
+def _move_statements_out(block: Block, outer: Block) -> None:
     """Move the statements of a block into the one around it."""
     for statement in block.items:
         statement.block = outer  # type: ignore[union-attr]
@@ -136,10 +136,10 @@ def _dissolve(block: Block, outer: Block) -> None:
     outer.seen |= block.seen
 
 
-def _where(lowering: Lowering, condition: Node, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _select_arrays(lowering: Lowering, condition: Node, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return array a where the condition, one for all entries, holds, else b."""
     pairs = zip(a.ravel().tolist(), b.ravel().tolist(), strict=True)
-    return array_of([select(lowering.graph, condition, x, y) for x, y in pairs], a.shape)
+    return arrange_nodes([select(lowering.graph, condition, x, y) for x, y in pairs], a.shape)
 
 
 IN_MEMORY |= {"cond": _lower_cond}

@@ -12,7 +12,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, JaxprEqn
 
 from straightline.limits import FEW
-from straightline.lowering import IN_MEMORY, Lowering, Value, array_of, like, result_shape
+from straightline.lowering import IN_MEMORY, Lowering, Value, arrange_nodes, make_placeholder, result_shape
 from straightline.nodes import Unsupported
 
 SWEEPS = 30  # at most; a handful is enough, more where sizes differ by many decades
@@ -45,7 +45,7 @@ def eigh(a: jax.Array) -> tuple[jax.Array, jax.Array]:
         large = [jnp.abs(entries[pair]) > rounding for pair in combinations(range(n), 2)]
         return jnp.any(jnp.stack(large)) & (sweeps < SWEEPS)
 
-    turns, turn = _tournament(n)
+    turns, turn = _make_tournament_turn(n)
 
     def sweep(state: tuple[Numbers, Numbers, jax.Array]) -> tuple[Numbers, Numbers, jax.Array]:
         """Rotate each pair once; after all turns each row is in its place again."""
@@ -69,7 +69,9 @@ def _choose_unit(a: jax.Array) -> jax.Array:
     return jnp.where(largest > 2.0**power, 4.0**power, jnp.where(largest < 2.0**-power, 4.0**-power, 1.0))
 
 
-def _tournament(n: int) -> tuple[int, Callable[[tuple[Numbers, Numbers], None], tuple[tuple[Numbers, Numbers], None]]]:
+def _make_tournament_turn(
+    n: int,
+) -> tuple[int, Callable[[tuple[Numbers, Numbers], None], tuple[tuple[Numbers, Numbers], None]]]:
     """Return the count of turns of a sweep, and one turn: A <- J' A J, V <- V J for pairs (p, q), then rows move on."""
     # As in a tournament of n players, all but the last move around; with n odd one pauses in each turn.
     turns = n - 1 + n % 2
@@ -147,14 +149,14 @@ def _decompose_each(lowering: Lowering, program: ClosedJaxpr, equation: JaxprEqn
     flat = lowering.nodes(matrices).reshape(math.prod(leading), *single.shape)
     items = [[lowering.nodes(x) for x in lowering.inline_program(program, [matrix])] for matrix in flat]
     shapes = [result_shape(equation, k) for k in range(len(equation.outvars))]
-    return [array_of((x for item in items for x in item[k].ravel()), shape) for k, shape in enumerate(shapes)]
+    return [arrange_nodes((x for item in items for x in item[k].ravel()), shape) for k, shape in enumerate(shapes)]
 
 
 @cache
 def _eigh_program(n: int, dtype: Any) -> ClosedJaxpr:
     """Return `eigh` of a matrix (n, n), traced."""
     with jax.enable_x64(True):
-        return jax.make_jaxpr(eigh)(like((n, n), dtype))
+        return jax.make_jaxpr(eigh)(make_placeholder((n, n), dtype))
 
 
 IN_MEMORY |= {"eigh": _eigh}
@@ -214,7 +216,7 @@ def _lu(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Val
 def _lu_program(n: int, dtype: Any) -> ClosedJaxpr:
     """Return `lu` of a matrix (n, n), traced."""
     with jax.enable_x64(True):
-        return jax.make_jaxpr(lu)(like((n, n), dtype))
+        return jax.make_jaxpr(lu)(make_placeholder((n, n), dtype))
 
 
 def _permutation(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
@@ -227,7 +229,7 @@ def _permutation(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
 def _permutation_program(count: int, size: int) -> ClosedJaxpr:
     """Return `permutation` of so many pivots, traced."""
     with jax.enable_x64(True):
-        return jax.make_jaxpr(lambda pivots: permutation(pivots, size))(like((count,), np.int32))
+        return jax.make_jaxpr(lambda pivots: permutation(pivots, size))(make_placeholder((count,), np.int32))
 
 
 def _linear_solve(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:

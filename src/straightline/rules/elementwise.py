@@ -10,7 +10,7 @@ from jax.extend.core import JaxprEqn
 
 from straightline.folding import DTYPES
 from straightline.graph import Graph
-from straightline.lowering import RULES, Lowering, Rule, array_of, result_shape, result_type
+from straightline.lowering import RULES, Lowering, Rule, arrange_nodes, result_shape, result_type
 from straightline.nodes import REAL, Node, RandomKey, Type, Unsupported
 
 # Operation of JAX -> the graph's.
@@ -25,7 +25,7 @@ ELEMENTWISE = {name: name for name in (
 WORDS: dict[Type, tuple[Type, Type]] = {"f64": ("u64", "i64"), "f32": ("u32", "i32")}  # integers of as many bits
 
 
-def broadcast(arrays: Sequence[np.ndarray], shape: tuple[int, ...]) -> list[list[Any]]:
+def broadcast_entries(arrays: Sequence[np.ndarray], shape: tuple[int, ...]) -> list[list[Any]]:
     """Return the entries of several arrays in row-major order, axes of length 1 repeated."""
     size = math.prod(shape)
     return [
@@ -34,23 +34,27 @@ def broadcast(arrays: Sequence[np.ndarray], shape: tuple[int, ...]) -> list[list
     ]
 
 
-def _elementwise(op: str) -> Rule:
+def _make_elementwise_rule(op: str) -> Rule:
     """Return the rule of an operation that is applied to each entry."""
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
         shape, type, node = result_shape(equation), result_type(equation), lowering.graph.node
-        return [array_of([node(op, type, *nodes) for nodes in zip(*broadcast(inputs, shape), strict=True)], shape)]
+        return [
+            arrange_nodes(
+                [node(op, type, *nodes) for nodes in zip(*broadcast_entries(inputs, shape), strict=True)], shape
+            )
+        ]
 
     return rule
 
 
-def _make_rule(function: Any) -> Rule:
+def _make_rule_of_entries(function: Any) -> Rule:
     """Make a rule from one of entries: function(graph, type, parameters, *entries)."""
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
         shape, type, graph = result_shape(equation), result_type(equation), lowering.graph
-        entries = zip(*broadcast(inputs, shape), strict=True)
-        return [array_of([function(graph, type, equation.params, *entry) for entry in entries], shape)]
+        entries = zip(*broadcast_entries(inputs, shape), strict=True)
+        return [arrange_nodes([function(graph, type, equation.params, *entry) for entry in entries], shape)]
 
     return rule
 
@@ -75,8 +79,8 @@ def _select_n(graph: Graph, type: Type, params: Any, which: Node, *cases: Any) -
 def _lower_select_n(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
     """Lower `select_n`, of numbers or of keys: the first input says for each entry which of the others is taken."""
     shape = result_shape(equation)
-    entries = zip(*broadcast(inputs, shape), strict=True)
-    return [array_of([_select_n(lowering.graph, "u32", None, *entry) for entry in entries], shape)]
+    entries = zip(*broadcast_entries(inputs, shape), strict=True)
+    return [arrange_nodes([_select_n(lowering.graph, "u32", None, *entry) for entry in entries], shape)]
 
 
 def _power(graph: Graph, type: Type, params: Any, x: Node) -> Node:
@@ -115,12 +119,12 @@ def _bitcast(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -
     numbers = x.ravel().tolist()
     kinds = {n.type for n in numbers}
     if shape == x.shape and all(kind[1:] == type[1:] for kind in kinds):
-        return [array_of([n if n.type == type else node("bitcast", type, n) for n in numbers], shape)]
+        return [arrange_nodes([n if n.type == type else node("bitcast", type, n) for n in numbers], shape)]
     if shape == (*x.shape, 2) and kinds <= {"f64", "u64"} and type == "u32":
         bits = [n if n.type == "u64" else node("bitcast", "u64", n) for n in numbers]
         half = lowering.graph.constant(32, "u64")
         words = [node("convert", "u32", w) for b in bits for w in (b, node("shift_right", "u64", b, half))]
-        return [array_of(words, shape)]
+        return [arrange_nodes(words, shape)]
     raise Unsupported(f"bitcast from {', '.join(sorted(kinds))} to {type}")
 
 
@@ -164,12 +168,12 @@ def _round(graph: Graph, type: Type, params: Any, x: Node) -> Node:
     return graph.node("round_even" if int(params["rounding_method"]) else "round_away", type, x)
 
 
-def _as_it_is(lowering: Lowering, equation: JaxprEqn, inputs: list[Any]) -> list[Any]:
+def _return_arguments(lowering: Lowering, equation: JaxprEqn, inputs: list[Any]) -> list[Any]:
     """Return the arguments: an operation that changes no number."""
     return inputs
 
 
-def _total_order(op: str) -> Callable[..., Node]:
+def _make_total_order_rule(op: str) -> Callable[..., Node]:
     """Return the comparison by the total order of IEEE 754, -NaN < -inf < ... < -0 < 0 < ... < inf < NaN."""
 
     def rank(graph: Graph, x: Node) -> Node:
@@ -208,16 +212,20 @@ def _shift_right_arithmetic(graph: Graph, type: Type, params: Any, x: Node, by: 
     return graph.node("shift_right_signed", type, x, by)
 
 
-RULES |= {name: _elementwise(op) for name, op in ELEMENTWISE.items()}
+RULES |= {name: _make_elementwise_rule(op) for name, op in ELEMENTWISE.items()}
 RULES |= {
-    "select_n": _lower_select_n, "integer_pow": _make_rule(_power), "square": _make_rule(_square),
-    "pow": _make_rule(_power_of_number),
-    "rsqrt": _make_rule(_root_reciprocal), "logistic": _make_rule(_logistic), "clamp": _make_rule(_clamp),
-    "convert_element_type": _make_rule(_convert), "bitcast_convert_type": _bitcast,
-    "one_minus_square": _make_rule(_one_minus_square), "log2": _make_rule(_log2), "polynomial": _make_rule(_polynomial),
-    "eq_to": _make_rule(_total_order("eq")), "le_to": _make_rule(_total_order("le")),
-    "lt_to": _make_rule(_total_order("lt")), "round": _make_rule(_round),
-    "nextafter": _make_rule(_next_after), "shift_right_arithmetic": _make_rule(_shift_right_arithmetic),
+    "select_n": _lower_select_n, "integer_pow": _make_rule_of_entries(_power), "square": _make_rule_of_entries(_square),
+    "pow": _make_rule_of_entries(_power_of_number),
+    "rsqrt": _make_rule_of_entries(_root_reciprocal), "logistic": _make_rule_of_entries(_logistic),
+    "clamp": _make_rule_of_entries(_clamp),
+    "convert_element_type": _make_rule_of_entries(_convert), "bitcast_convert_type": _bitcast,
+    "one_minus_square": _make_rule_of_entries(_one_minus_square), "log2": _make_rule_of_entries(_log2),
+    "polynomial": _make_rule_of_entries(_polynomial),
+    "eq_to": _make_rule_of_entries(_make_total_order_rule("eq")),
+    "le_to": _make_rule_of_entries(_make_total_order_rule("le")),
+    "lt_to": _make_rule_of_entries(_make_total_order_rule("lt")), "round": _make_rule_of_entries(_round),
+    "nextafter": _make_rule_of_entries(_next_after),
+    "shift_right_arithmetic": _make_rule_of_entries(_shift_right_arithmetic),
 }  # fmt: skip
 PASSED_ON = ("copy", "copy_p", "stop_gradient", "optimization_barrier")
-RULES |= dict.fromkeys(PASSED_ON, _as_it_is)
+RULES |= dict.fromkeys(PASSED_ON, _return_arguments)

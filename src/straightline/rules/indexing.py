@@ -9,24 +9,31 @@ from jax.lax import GatherDimensionNumbers
 
 from straightline.limits import FEW
 from straightline.lowering import RULES, Lowering, known_integers
-from straightline.memory import contiguous
+from straightline.memory import contiguous_strides
 from straightline.nodes import Unsupported
 from straightline.rules.elementwise import select
 from straightline.rules.loops import put_in_memory
-from straightline.rules.places import clamp_place, fill_of, fills, find_window_places, inside, narrowed
+from straightline.rules.places import (
+    clamp_place,
+    convert_to_32_bits,
+    fills_outside,
+    find_window_places,
+    is_inside,
+    make_filling,
+)
 from straightline.rules.shapes import select_array
 
 
 def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
     """Gather windows at clipped indices; where the mode fills, a window that is not inside is filled with a value."""
     x, indices = inputs
-    if not fills(equation):
+    if not fills_outside(equation):
         return [_gather_clipped(equation, lowering, x, indices)]
-    indices = narrowed(lowering, indices)
-    flags, missing = _is_inside(lowering, equation, x.shape, indices), fill_of(lowering, equation)
+    indices = convert_to_32_bits(lowering, indices)
+    flags, missing = _is_inside(lowering, equation, x.shape, indices), make_filling(lowering, equation)
     gathered, numbers = _gather_clipped(equation, lowering, x, indices), equation.params["dimension_numbers"]
     for entry in np.ndindex(*gathered.shape):
-        gathered[entry] = select(lowering.graph, flags[_row(entry, numbers)], gathered[entry], missing)
+        gathered[entry] = select(lowering.graph, flags[_find_index_row(entry, numbers)], gathered[entry], missing)
     return [gathered]
 
 
@@ -36,7 +43,7 @@ def _is_inside(lowering: Lowering, equation: JaxprEqn, shape: tuple[int, ...], i
     flags = np.full(indices.shape[:-1], lowering.graph.constant(True, "bool"), dtype=object)
     for row in np.ndindex(*flags.shape):
         for axis, start in zip(axes, indices[row], strict=True):
-            here = inside(lowering.graph, start, shape[axis] - sizes[axis])
+            here = is_inside(lowering.graph, start, shape[axis] - sizes[axis])
             before: Any = flags[row]
             flags[row] = lowering.graph.node("and", "bool", before, here)
     return flags
@@ -85,7 +92,7 @@ def _gather_by_cases(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indi
     ]
     selected = cases[-1].copy()
     for entry in np.ndindex(*selected.shape):
-        which = indices[(*_row(entry, numbers), column)]
+        which = indices[(*_find_index_row(entry, numbers), column)]
         if which.op != "constant":
             here = [np.array(case[entry], dtype=object) for case in cases]
             selected[entry] = select_array(lowering.graph, which, here)[()]
@@ -116,10 +123,10 @@ def _gather_from_memory(
         raise Unsupported("gather at two places that data decide")
     offsets = _gather_clipped(equation, lowering, np.arange(x.size, dtype=object).reshape(x.shape), with_zero)
     # Each is loaded that index times the axis' stride behind it.
-    buffer, stride = put_in_memory(lowering, x).buffer, contiguous(x.shape)[axis]
+    buffer, stride = put_in_memory(lowering, x).buffer, contiguous_strides(x.shape)[axis]
     loaded = np.empty(offsets.shape, dtype=object)
     for entry in np.ndindex(*loaded.shape):
-        index = indices[(*_row(entry, numbers), column)]
+        index = indices[(*_find_index_row(entry, numbers), column)]
         if index.op == "constant":
             loaded[entry] = x.ravel()[offsets[entry]]
         else:
@@ -138,7 +145,7 @@ def _replace_indices(lowering: Lowering, indices: np.ndarray, column: int, numbe
     return replaced
 
 
-def _row(entry: tuple[int, ...], numbers: Any) -> tuple[int, ...]:
+def _find_index_row(entry: tuple[int, ...], numbers: Any) -> tuple[int, ...]:
     """Return the row of indices from which an entry of the result is gathered."""
     return tuple(i for axis, i in enumerate(entry) if axis not in numbers.offset_dims)
 

@@ -10,7 +10,7 @@ from jax.extend.core import JaxprEqn
 
 from straightline.graph import Graph
 from straightline.limits import WRITTEN_OUT
-from straightline.lowering import IN_MEMORY, Lowering, Value, array_of, scalars
+from straightline.lowering import IN_MEMORY, Lowering, Value, arrange_nodes, list_nodes
 from straightline.memory import InMemory
 from straightline.nodes import Block, Buffer, Loop, LoopExit, Node, RandomKey, Type, Unsupported
 from straightline.rules.elementwise import select
@@ -56,7 +56,7 @@ def _lower_loop(
     by_triangle = [is_symmetric(x) for x in carry]
     while True:
         nodes_before = graph.serial
-        loop = Loop(Block(outer), length, _entries(carry, by_triangle))
+        loop = Loop(Block(outer), length, _flatten_carry(carry, by_triangle))
         # In the body the carry is a parameter; the turn is traced once.
         loop.parameters = _make_stand_ins(graph, "parameter", loop, loop.body)
         graph.current = loop.body
@@ -68,7 +68,7 @@ def _lower_loop(
         # Once more; the nodes of this try do not count.
         by_triangle = still_symmetric
         graph.max_nodes += graph.serial - nodes_before
-    loop.following = _entries(following, by_triangle)
+    loop.following = _flatten_carry(following, by_triangle)
     outer.items.append(loop)
     # After the loop the carry is a result.
     loop.results = _make_stand_ins(graph, "result", loop, outer)
@@ -87,10 +87,10 @@ def is_symmetric(x: np.ndarray) -> bool:
     return all(a is b for a, b in zip(x.ravel().tolist(), np.swapaxes(x, -1, -2).ravel().tolist(), strict=True))
 
 
-def _entries(arrays: Sequence[np.ndarray], halves: Sequence[bool]) -> list[Node]:
+def _flatten_carry(arrays: Sequence[np.ndarray], halves: Sequence[bool]) -> list[Node]:
     """Return the nodes of arrays, of those marked the upper triangles alone."""
     parts = [x[..., *np.triu_indices(x.shape[-1])] if h else x for x, h in zip(arrays, halves, strict=True)]
-    return [n for x in parts for n in scalars(x)]
+    return [n for x in parts for n in list_nodes(x)]
 
 
 def _store_row(
@@ -118,7 +118,7 @@ def _list_numbers(value: np.ndarray) -> list[Node]:
 
 
 def _restore_arrays(arrays: Sequence[np.ndarray], nodes: Sequence[Node], halves: Sequence[bool]) -> list[np.ndarray]:
-    """Restore arrays of the same shapes, and keys, from nodes as `_entries` returns them."""
+    """Restore arrays of the same shapes, and keys, from nodes as `_flatten_carry` returns them."""
     rest = iter(nodes)
     results = []
     for a, half in zip(arrays, halves, strict=True):
@@ -127,7 +127,7 @@ def _restore_arrays(arrays: Sequence[np.ndarray], nodes: Sequence[Node], halves:
         new = [
             RandomKey(next(rest), next(rest)) if isinstance(x, RandomKey) else next(rest) for x in old.ravel().tolist()
         ]
-        restored = array_of(new, old.shape)
+        restored = arrange_nodes(new, old.shape)
         results.append(_mirror(restored, n) if half else restored)
     return results
 
@@ -193,7 +193,7 @@ class CarriedMemory:
 
     def __init__(self, lowering: Lowering, start: Value):
         self._graph = lowering.graph
-        self.memory = copied(lowering, put_in_memory(lowering, start)).buffer
+        self.memory = copy_in_memory(lowering, put_in_memory(lowering, start)).buffer
         self.memory.kind = "carried"
 
     def in_turn(self) -> InMemory:
@@ -207,7 +207,7 @@ class CarriedMemory:
 
     def fill(self, lowering: Lowering, x: InMemory) -> None:
         """Fill the memory with an array that is elsewhere."""
-        self._part(copied(lowering, x).buffer)
+        self._part(copy_in_memory(lowering, x).buffer)
 
     def _part(self, buffer: Buffer) -> InMemory:
         """Place a buffer in this memory; return the view of it."""
@@ -222,7 +222,7 @@ def fill_carried_memory(lowering: Lowering, filled: Sequence[tuple[CarriedMemory
     """
     memory = {carried.memory for carried, _ in filled}
     arrays = [(carried, put_in_memory(lowering, x)) for carried, x in filled]
-    arrays = [(carried, copied(lowering, x) if x.buffer.owner[0] in memory else x) for carried, x in arrays]
+    arrays = [(carried, copy_in_memory(lowering, x) if x.buffer.owner[0] in memory else x) for carried, x in arrays]
     for carried, x in arrays:
         carried.fill(lowering, x)
 
@@ -243,7 +243,7 @@ def _write_out_scan(
     stacked: list[list[Value]] = []
     turns = range(params["length"])
     for turn in reversed(turns) if params["reverse"] else turns:
-        items = [x.row(turn) if isinstance(x, InMemory) else _entry(x, turn) for x in rows]
+        items = [x.row(turn) if isinstance(x, InMemory) else _take_row(x, turn) for x in rows]
         results = lowering.inline_program(params["jaxpr"], [*fixed, *carry, *items])
         carry = results[: len(carry)]
         stacked.append([lowering.nodes(x) for x in results[len(carry) :]])
@@ -255,7 +255,7 @@ def _write_out_scan(
     return [*carry, *(np.stack(leaves) for leaves in zip(*stacked, strict=True))]
 
 
-def _entry(x: np.ndarray, turn: int) -> np.ndarray:
+def _take_row(x: np.ndarray, turn: int) -> np.ndarray:
     """Return x[turn] as an array, also for one axis."""
     return x[turn : turn + 1].reshape(x.shape[1:])
 
@@ -276,7 +276,7 @@ def put_in_memory(lowering: Lowering, value: Value) -> InMemory:
     return InMemory.whole(buffer)
 
 
-def copied(lowering: Lowering, x: InMemory) -> InMemory:
+def copy_in_memory(lowering: Lowering, x: InMemory) -> InMemory:
     """Copy a long array to new memory, row by row in a loop; return the copy."""
     return repeat_turns(lowering, x.shape[0], [], lambda row, _: ([], [lowering.nodes(x.row(row))]))[1][0]
 
@@ -293,7 +293,7 @@ def _lower_while(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
     def body(loop: Loop, carry: list[np.ndarray]) -> tuple[list[np.ndarray], None]:
         """Write the check, then the body; return the next carry, selected by each run's condition."""
         active = lowering.nodes(lowering.inline_program(params["cond_jaxpr"], [*of_condition, *carry])[0])
-        loop.condition = reduce(lambda a, b: graph.node("or", "bool", a, b), scalars(active))
+        loop.condition = reduce(lambda a, b: graph.node("or", "bool", a, b), list_nodes(active))
         loop.body.items.append(LoopExit(loop))
         moved = [lowering.nodes(x) for x in lowering.inline_program(params["body_jaxpr"], [*of_body, *carry])]
         return [_where_active(graph, active, new, old) for new, old in zip(moved, carry, strict=True)], None
@@ -305,7 +305,7 @@ def _where_active(graph: Graph, active: np.ndarray, new: np.ndarray, old: np.nda
     """Return new entries where a loop goes on, and the old ones elsewhere."""
     conditions = np.repeat(active.ravel(), new.size // active.size).tolist()
     entries = zip(conditions, new.ravel().tolist(), old.ravel().tolist(), strict=True)
-    return array_of([select(graph, condition, x, y) for condition, x, y in entries], old.shape)
+    return arrange_nodes([select(graph, condition, x, y) for condition, x, y in entries], old.shape)
 
 
 def estimate_size(lowering: Lowering, jaxpr: Any) -> int:
@@ -314,14 +314,14 @@ def estimate_size(lowering: Lowering, jaxpr: Any) -> int:
         return lowering.sizes[jaxpr]
     total = 0
     for equation in jaxpr.eqns:
-        inner = [estimate_size(lowering, getattr(p, "jaxpr", p)) for p in _programs(equation.params)]
+        inner = [estimate_size(lowering, getattr(p, "jaxpr", p)) for p in _list_inner_programs(equation.params)]
         turns = equation.params["length"] if equation.primitive.name == "scan" else 1
         total += turns * sum(inner) + sum(math.prod(v.aval.shape) for v in equation.outvars)
     lowering.sizes[jaxpr] = total
     return total
 
 
-def _programs(params: dict[str, Any]) -> list[Any]:
+def _list_inner_programs(params: dict[str, Any]) -> list[Any]:
     """Return the programs among the parameters of an operation."""
     values = [x for p in params.values() for x in (p if isinstance(p, tuple) else (p,))]
     return [x for x in values if hasattr(x, "eqns") or hasattr(x, "jaxpr")]

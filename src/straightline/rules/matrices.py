@@ -10,11 +10,11 @@ from jax.extend.core import JaxprEqn
 
 from straightline.folding import DTYPES
 from straightline.graph import Graph
-from straightline.lowering import RULES, Lowering, Rule, array_of, result_shape, result_type
+from straightline.lowering import RULES, Lowering, Rule, arrange_nodes, result_shape, result_type
 from straightline.nodes import REAL, Node, Type, Unsupported
 
 
-def total(graph: Graph, op: str, type: Type, nodes: Sequence[Node], empty: float) -> Node:
+def combine_nodes(graph: Graph, op: str, type: Type, nodes: Sequence[Node], empty: float) -> Node:
     """Combine nodes one by one; return `empty` if there are none."""
     if not nodes:
         return graph.constant(empty, type)
@@ -30,7 +30,7 @@ def _reduce_by(op: str, empty: float) -> Rule:
         terms = math.prod(inputs[0].shape[axis] for axis in axes)
         x = np.moveaxis(inputs[0], axes, range(-len(axes), 0)).reshape(math.prod(shape), terms)
         neutral = _clip_to_type(type, empty)
-        return [array_of([total(lowering.graph, op, type, row, neutral) for row in x.tolist()], shape)]
+        return [arrange_nodes([combine_nodes(lowering.graph, op, type, row, neutral) for row in x.tolist()], shape)]
 
     return lower_operation
 
@@ -65,7 +65,7 @@ def _accumulate_by(op: str) -> Rule:
         rows = [x[0].tolist()]
         for row in x[1:].tolist():
             rows.append([lowering.graph.node(op, type, a, b) for a, b in zip(rows[-1], row, strict=True)])
-        cumulated = array_of([n for row in rows for n in row], shape)
+        cumulated = arrange_nodes([n for row in rows for n in row], shape)
         return [np.moveaxis(cumulated[::-1] if reverse else cumulated, 0, axis)]
 
     return lower_operation
@@ -78,7 +78,7 @@ def _find_extreme(op: str) -> Rule:
         axis = equation.params["axes"][0]
         x = np.moveaxis(inputs[0], axis, -1).reshape(-1, inputs[0].shape[axis])
         indices = [_find_first_extreme(lowering.graph, op, result_type(equation), row) for row in x.tolist()]
-        return [array_of(indices, result_shape(equation))]
+        return [arrange_nodes(indices, result_shape(equation))]
 
     return lower_argument_of_extreme
 
@@ -107,7 +107,7 @@ def write_product(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarra
     x, y = (_convert(lowering.graph, type, x) for x in inputs)
     a, b = _as_matrices(x, left, left_batch), _as_matrices(y, right, right_batch)
     products = [_multiply_matrices(lowering, type, rows, columns) for rows, columns in zip(a, b, strict=True)]
-    return [array_of([n for product in products for n in product.ravel().tolist()], result_shape(equation))]
+    return [arrange_nodes([n for product in products for n in product.ravel().tolist()], result_shape(equation))]
 
 
 def _multiply_matrices(lowering: Lowering, type: Type, a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -119,18 +119,18 @@ def _multiply_matrices(lowering: Lowering, type: Type, a: np.ndarray, b: np.ndar
     is_symmetric = any(_is_weighted(x, y) or _is_congruence(lowering, x, y) for x, y in ((a, b), (b, a)))
     places = [(i, j) for i in range(len(a)) for j in range(i if is_symmetric else 0, len(b))]
     product = np.empty((len(a), len(b)), dtype=object)
-    sums = _sums_of_products(lowering.graph, type, [(a[i], b[j]) for i, j in places])
+    sums = _sum_products(lowering.graph, type, [(a[i], b[j]) for i, j in places])
     for (i, j), entry in zip(places, sums, strict=True):
         product[i, j] = entry
         if is_symmetric:
             product[j, i] = entry
     # What the product is made of, by which a later product knows that it is a congruence.
     for entries, factors in ((product, (a, b)), (product.T, (b, a))):
-        lowering.products[_key(entries)] = factors
+        lowering.products[_make_matrix_key(entries)] = factors
     return product
 
 
-def _sums_of_products(graph: Graph, type: Type, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[Node]:
+def _sum_products(graph: Graph, type: Type, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[Node]:
     """Return sum_k a_k b_k of each pair of vectors (a, b).
 
     All sums grow term by term at once, so that none waits for the last of another. A term of data that is multiplied by
@@ -170,7 +170,7 @@ def _find_weight(x: Node, y: Node) -> Node | None:
 
 def _is_congruence(lowering: Lowering, a: np.ndarray, b: np.ndarray) -> bool:
     """Return whether A was computed as B P of a symmetric P."""
-    factor, p = lowering.products.get(_key(a), (a[:0], a[:0]))
+    factor, p = lowering.products.get(_make_matrix_key(a), (a[:0], a[:0]))
     return _is_same(factor, b) and _is_same(p, p.T)
 
 
@@ -179,14 +179,14 @@ def _is_same(a: np.ndarray, b: np.ndarray) -> bool:
     return a.shape == b.shape and all(x is y for x, y in zip(a.ravel().tolist(), b.ravel().tolist(), strict=True))
 
 
-def _key(matrix: np.ndarray) -> Any:
+def _make_matrix_key(matrix: np.ndarray) -> Any:
     """Return the shape and the nodes of a matrix, by which it is known."""
     return matrix.shape, *matrix.ravel().tolist()
 
 
 def _convert(graph: Graph, type: Type, x: np.ndarray) -> np.ndarray:
     """Return an array in another type: integers and truth values, with which numbers may be multiplied."""
-    return array_of((n if n.type == type else graph.node("convert", type, n) for n in x.ravel().tolist()), x.shape)
+    return arrange_nodes((n if n.type == type else graph.node("convert", type, n) for n in x.ravel().tolist()), x.shape)
 
 
 def _as_matrices(x: np.ndarray, contracted: Sequence[int], batch: Sequence[int]) -> np.ndarray:
@@ -202,7 +202,7 @@ def _for_each_matrix(function: Any) -> Rule:
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
         flat = [x.reshape(math.prod(x.shape[:-2]), *x.shape[-2:]) for x in inputs]
         items = [function(lowering.graph, equation.params, *matrices) for matrices in zip(*flat, strict=True)]
-        return [array_of((x for item in items for x in item.ravel().tolist()), result_shape(equation))]
+        return [arrange_nodes((x for item in items for x in item.ravel().tolist()), result_shape(equation))]
 
     return rule
 
@@ -241,7 +241,7 @@ def _cholesky(graph: Graph, params: Any, a: np.ndarray) -> np.ndarray:
         for i in range(j + 1, n):
             lower[i, j] = graph.node("mul", real, remainders[i - j], scale)
     numbers = [graph.node("select", real, definite, x, nan) for x in lower.ravel().tolist()]
-    return array_of(numbers, lower.shape)
+    return arrange_nodes(numbers, lower.shape)
 
 
 def _triangular_solve(graph: Graph, params: Any, a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ from jax.extend.core import ClosedJaxpr, JaxprEqn, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 
 from straightline.limits import MANY_TERMS
-from straightline.lowering import IN_MEMORY, Lowering, Value, like
+from straightline.lowering import IN_MEMORY, Lowering, Value, make_placeholder
 from straightline.nodes import Unsupported
 
 P = ParamSpec("P")
@@ -70,7 +70,7 @@ def operation(native: Callable[P, R]) -> Callable[[Callable[P, R]], Callable[P, 
                 result_tree[:] = [structure]
                 return results
 
-            traced = jax.make_jaxpr(partial(call_on_leaves, plain))(*(like(*kind) for kind in kinds))
+            traced = jax.make_jaxpr(partial(call_on_leaves, plain))(*(make_placeholder(*kind) for kind in kinds))
             name = f"{plain.__module__}.{plain.__qualname__}"
             return _OperationProgram(name, traced, partial(call_on_leaves, native), x64), result_tree[0]
 
@@ -103,7 +103,9 @@ def _apply_plain(
     return list(function(*leaves))
 
 
-def _shapes(*_: Any, program: _OperationProgram, levels: tuple[Axes, ...], sizes: tuple[int, ...]) -> list[Any]:
+def _find_result_shapes(
+    *_: Any, program: _OperationProgram, levels: tuple[Axes, ...], sizes: tuple[int, ...]
+) -> list[Any]:
     """Return shapes and types of the results: those of the plain function, behind an axis for each level of vmap."""
     return [jax.core.ShapedArray((*sizes, *aval.shape), aval.dtype) for aval in program.plain.out_avals]
 
@@ -157,7 +159,7 @@ def _trace_in_loops(lowering: Lowering, equation: JaxprEqn, function: Callable[.
         for axes in levels:
             function = partial(_apply_one_by_one, function, axes)
         with jax.enable_x64(program.x64):
-            lowering.kernels[key] = jax.make_jaxpr(function)(*(like(*kind) for kind in kinds))
+            lowering.kernels[key] = jax.make_jaxpr(function)(*(make_placeholder(*kind) for kind in kinds))
     return lowering.kernels[key]
 
 
@@ -174,7 +176,7 @@ def _apply_one_by_one(function: Callable[..., list[Any]], axes: Axes, *leaves: A
 
 
 _primitive.def_impl(jax.jit(_apply_plain, static_argnames=("program", "levels", "sizes")))
-_primitive.def_abstract_eval(_shapes)
+_primitive.def_abstract_eval(_find_result_shapes)
 batching.primitive_batchers[_primitive] = _batch_operation
 ad.primitive_jvps[_primitive] = _differentiate
 mlir.register_lowering(_primitive, mlir.lower_fun(_apply_plain, multiple_results=True))

@@ -9,8 +9,8 @@ from jax.extend.core import JaxprEqn
 from jax.lax import GatherScatterMode
 
 from straightline.graph import Graph
-from straightline.lowering import Lowering, array_of
-from straightline.memory import contiguous
+from straightline.lowering import Lowering, arrange_nodes
+from straightline.memory import contiguous_strides
 from straightline.nodes import Node, Unsupported
 
 
@@ -29,7 +29,7 @@ def clamp_place(lowering: Lowering, start: Node, last: int) -> Node | int:
     )
 
 
-def inside(graph: Graph, start: Node, last: int) -> Node:
+def is_inside(graph: Graph, start: Node, last: int) -> Node:
     """Return the node of whether a place is one of 0 ... last."""
     below = graph.node("le", "bool", start, graph.constant(last, start.type))
     if start.type[0] == "u":
@@ -37,18 +37,18 @@ def inside(graph: Graph, start: Node, last: int) -> Node:
     return graph.node("and", "bool", below, graph.node("ge", "bool", start, graph.constant(0, start.type)))
 
 
-def fills(equation: JaxprEqn) -> bool:
+def fills_outside(equation: JaxprEqn) -> bool:
     """Return whether a gather fills what is outside of the array with a value, and a scatter drops it."""
     return bool(equation.params["mode"] == GatherScatterMode.FILL_OR_DROP)
 
 
-def narrowed(lowering: Lowering, indices: np.ndarray) -> np.ndarray:
+def convert_to_32_bits(lowering: Lowering, indices: np.ndarray) -> np.ndarray:
     """Return indices that may be outside converted to 32 bits with a sign, as JAX does."""
     nodes = [lowering.graph.node("convert", "i32", n) for n in indices.ravel().tolist()]
-    return array_of(nodes, indices.shape)
+    return arrange_nodes(nodes, indices.shape)
 
 
-def fill_of(lowering: Lowering, equation: JaxprEqn) -> Node:
+def make_filling(lowering: Lowering, equation: JaxprEqn) -> Node:
     """Return the node of the value that a gather has in place of what is outside of the array."""
     aval: Any = equation.outvars[0].aval
     if jax.numpy.issubdtype(aval.dtype, jax.dtypes.prng_key):
@@ -89,7 +89,7 @@ def find_window_places(
     # Its place in row-major order.
     last = np.array(shape) - np.array(sizes)
     inside = np.all((starts >= 0) & (starts <= last), axis=-1)
-    strides = np.array(contiguous(shape), dtype=np.int64)
+    strides = np.array(contiguous_strides(shape), dtype=np.int64)
     base = np.sum(np.clip(starts, 0, last) * strides, axis=-1)
     if not clips:  # so far below 0 that adding an offset, at most the array's size - 1, leaves it below 0
         base = np.where(inside, base, -1 - int(np.prod(shape, dtype=np.int64)))

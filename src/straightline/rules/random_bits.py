@@ -17,9 +17,9 @@ from jax.extend.core import JaxprEqn
 
 from straightline.graph import Graph
 from straightline.limits import LOADED
-from straightline.lowering import RULES, Lowering, array_of, keys_of, result_shape
+from straightline.lowering import RULES, Lowering, arrange_nodes, make_keys, result_shape
 from straightline.nodes import Node, RandomKey, Unsupported
-from straightline.rules.elementwise import broadcast
+from straightline.rules.elementwise import broadcast_entries
 
 Word = Any  # of 32 bits, in an integer or an array of wider ones
 ROTATIONS = (13, 15, 26, 6), (17, 29, 16, 24)
@@ -41,40 +41,40 @@ def _new_key(graph: Graph, key: RandomKey, high: Node, low: Node) -> RandomKey:
     return RandomKey(graph.node("convert", "u32", shifted), graph.node("convert", "u32", both))
 
 
-def _wrap(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+def _make_keys(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
     """Return keys (...) made of words (..., 2)."""
-    _check(equation.outvars[0])
-    return [keys_of(inputs[0])]
+    _check_key_type(equation.outvars[0])
+    return [make_keys(inputs[0])]
 
 
-def _unwrap(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+def _read_key_words(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
     """Return the words (..., 2) of keys (...)."""
-    _check(equation.invars[0])
+    _check_key_type(equation.invars[0])
     words = [word for key in inputs[0].ravel().tolist() for word in (key.first, key.second)]
-    return [array_of(words, result_shape(equation))]
+    return [arrange_nodes(words, result_shape(equation))]
 
 
 def _fold_in(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
     """Return the key that is the hash of (0, number)."""
-    _check(equation.invars[0])
+    _check_key_type(equation.invars[0])
     shape, zero = result_shape(equation), lowering.graph.constant(0, "u32")
-    pairs = zip(*broadcast(inputs, shape), strict=True)
-    return [array_of([_new_key(lowering.graph, key, zero, number) for key, number in pairs], shape)]
+    pairs = zip(*broadcast_entries(inputs, shape), strict=True)
+    return [arrange_nodes([_new_key(lowering.graph, key, zero, number) for key, number in pairs], shape)]
 
 
 def _split(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
     """Return for each key the keys that are the hashes of 0, 1, 2, ..."""
-    _check(equation.invars[0])
-    graph, counters = lowering.graph, _counters(lowering.graph, equation.params["shape"])
+    _check_key_type(equation.invars[0])
+    graph, counters = lowering.graph, _make_counters(lowering.graph, equation.params["shape"])
     keys = [_new_key(graph, key, *counter) for key in inputs[0].ravel().tolist() for counter in counters]
-    return [array_of(keys, result_shape(equation))]
+    return [arrange_nodes(keys, result_shape(equation))]
 
 
 def _bits(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
     """Return for each key the hashes of 0, 1, 2, ...; 32 bits are the exclusive or of both words."""
-    _check(equation.invars[0])
+    _check_key_type(equation.invars[0])
     graph, width = lowering.graph, equation.params["bit_width"]
-    counters = _counters(graph, equation.params["shape"])
+    counters = _make_counters(graph, equation.params["shape"])
     drawn = [threefry(graph, key, *counter) for key in inputs[0].ravel().tolist() for counter in counters]
     if width == 32:
         shift = graph.constant(32, "u64")
@@ -82,12 +82,12 @@ def _bits(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> l
         drawn = [graph.node("convert", "u32", x) for x in mixed]
     elif width != 64:
         raise Unsupported(f"random numbers of {width} bits")
-    return [array_of(drawn, result_shape(equation))]
+    return [arrange_nodes(drawn, result_shape(equation))]
 
 
 def _seed(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
     """Return the key whose words are those of the number."""
-    _check(equation.outvars[0])
+    _check_key_type(equation.outvars[0])
     graph = lowering.graph
 
     def words(number: Node) -> RandomKey:
@@ -98,15 +98,15 @@ def _seed(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> l
         shifted = graph.node("shift_right", "u64", whole, graph.constant(32, "u64"))
         return RandomKey(graph.node("convert", "u32", shifted), graph.node("convert", "u32", whole))
 
-    return [array_of(map(words, inputs[0].ravel().tolist()), result_shape(equation))]
+    return [arrange_nodes(map(words, inputs[0].ravel().tolist()), result_shape(equation))]
 
 
-def _hash(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+def _hash_word_pairs(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
     """Hash words (...) with Threefry; return both words of each pair."""
     shape = result_shape(equation)
-    items = zip(*broadcast(inputs, shape), strict=True)
+    items = zip(*broadcast_entries(inputs, shape), strict=True)
     keys = [_new_key(lowering.graph, RandomKey(first, second), high, low) for first, second, high, low in items]
-    return [array_of([key.first for key in keys], shape), array_of([key.second for key in keys], shape)]
+    return [arrange_nodes([key.first for key in keys], shape), arrange_nodes([key.second for key in keys], shape)]
 
 
 def _gamma(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> Any:
@@ -117,19 +117,19 @@ def _gamma(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> 
     return [lowering.nodes(x) for x in lowering.inline_program(program, inputs)]
 
 
-def _same(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+def _return_keys(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
     """Return the keys as they are."""
     return inputs
 
 
-def _counters(graph: Graph, shape: tuple[int, ...]) -> list[tuple[Node, Node]]:
+def _make_counters(graph: Graph, shape: tuple[int, ...]) -> list[tuple[Node, Node]]:
     """Return 0, 1, 2, ... as two words each; hashes of so many that no program would hold them are refused at once."""
     if math.prod(shape) > LOADED:
         raise Unsupported(f"{math.prod(shape):,} random numbers at once")
     return [(graph.constant(i >> 32, "u32"), graph.constant(i & 0xFFFFFFFF, "u32")) for i in range(math.prod(shape))]
 
 
-def _check(variable: Any) -> None:
+def _check_key_type(variable: Any) -> None:
     """Raise unless keys are of JAX's default hash, counted as its newer releases do."""
     if str(variable.aval.dtype) != "key<fry>":
         raise Unsupported(f"keys of type {variable.aval.dtype}")
@@ -138,8 +138,9 @@ def _check(variable: Any) -> None:
 
 
 RULES |= {
-    "random_wrap": _wrap, "random_unwrap": _unwrap, "random_fold_in": _fold_in, "random_split": _split,
-    "random_bits": _bits, "random_seed": _seed, "random_clone": _same, "threefry2x32": _hash, "random_gamma": _gamma,
+    "random_wrap": _make_keys, "random_unwrap": _read_key_words, "random_fold_in": _fold_in, "random_split": _split,
+    "random_bits": _bits, "random_seed": _seed, "random_clone": _return_keys, "threefry2x32": _hash_word_pairs,
+    "random_gamma": _gamma,
 }  # fmt: skip
 
 

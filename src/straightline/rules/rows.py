@@ -13,12 +13,22 @@ from jax.extend.core import JaxprEqn
 
 from straightline.graph import Graph
 from straightline.limits import LOADED, MANY_TERMS, TABLE, WRITTEN_OUT
-from straightline.lowering import IN_MEMORY, RULES, Lowering, Rule, Value, array_of, like, result_shape, result_type
+from straightline.lowering import (
+    IN_MEMORY,
+    RULES,
+    Lowering,
+    Rule,
+    Value,
+    arrange_nodes,
+    make_placeholder,
+    result_shape,
+    result_type,
+)
 from straightline.memory import InMemory
 from straightline.nodes import Node, Type
 from straightline.rules.elementwise import ELEMENTWISE
 from straightline.rules.loops import Turn, put_in_memory, repeat_turns
-from straightline.rules.matrices import total, write_product
+from straightline.rules.matrices import combine_nodes, write_product
 
 OF_ENTRIES = (
     *ELEMENTWISE, "select_n", "integer_pow", "square", "rsqrt", "logistic", "clamp", "convert_element_type",
@@ -73,21 +83,23 @@ def _apply_by_row(name: str) -> Rule:
 
         def turn(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
             """Return no carry, and the operation's result for one row."""
-            rows = [row_of(lowering, x, row, ndim) for x in items]
+            rows = [take_row(lowering, x, row, ndim) for x in items]
             return [], list(lowering.lower_equation(row_equation, rows))
 
-        return list(repeat_turns(lowering, shape[0], [], lambda p, c: as_nodes(lowering, turn(p, c)))[1])
+        return list(repeat_turns(lowering, shape[0], [], lambda p, c: load_as_nodes(lowering, turn(p, c)))[1])
 
     return lower_row_by_row
 
 
-def as_nodes(lowering: Lowering, results: tuple[list[Value], list[Value]]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+def load_as_nodes(
+    lowering: Lowering, results: tuple[list[Value], list[Value]]
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Return the carried and the stacked arrays of a turn as nodes, loaded where they are in memory."""
     carried, stacked = results
     return [lowering.nodes(x) for x in carried], [lowering.nodes(x) for x in stacked]
 
 
-def row_of(lowering: Lowering, x: Value, row: Node, ndim: int) -> Value:
+def take_row(lowering: Lowering, x: Value, row: Node, ndim: int) -> Value:
     """Return the part of an argument that a row of the result needs: its only row, or all where it has fewer axes."""
     if x.ndim < ndim:
         return x
@@ -99,7 +111,7 @@ def row_of(lowering: Lowering, x: Value, row: Node, ndim: int) -> Value:
 def make_row_equation(equation: JaxprEqn, **params: Any) -> Any:
     """Return the same operation for one row."""
     avals: list[Any] = [v.aval for v in equation.outvars]
-    rows = [SimpleNamespace(aval=like(a.shape[1:], a.dtype)) for a in avals]
+    rows = [SimpleNamespace(aval=make_placeholder(a.shape[1:], a.dtype)) for a in avals]
     return SimpleNamespace(
         primitive=equation.primitive, params=equation.params | params, outvars=rows, invars=equation.invars,
         source_info=equation.source_info,
@@ -139,15 +151,15 @@ def _multiply_by_row(lowering: Lowering, equation: JaxprEqn, a: InMemory, b: InM
     if is_summed:
         (a_axis, *a_contracted), (b_axis, *b_contracted) = a_contracted, b_contracted
     # The operation on one row: dimension numbers without the axis of the loop.
-    contracted = _without(a_contracted, a_axis), _without(b_contracted, b_axis)
-    batch = _without(a_batch[1:], a_axis), _without(b_batch[1:], b_axis)
+    contracted = _renumber_axes(a_contracted, a_axis), _renumber_axes(b_contracted, b_axis)
+    batch = _renumber_axes(a_batch[1:], a_axis), _renumber_axes(b_batch[1:], b_axis)
     row_equation = make_row_equation(equation, dimension_numbers=(contracted, batch))
     by_row = [(x if axis is None else _move_to_front(x, axis), axis) for x, axis in ((a, a_axis), (b, b_axis))]
 
     def multiply_row(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """Return no carry, and the product for one row."""
         rows: list[Value] = [x if axis is None else x.row(row) for x, axis in by_row]
-        return as_nodes(lowering, ([], list(lowering.lower_equation(row_equation, rows))))
+        return load_as_nodes(lowering, ([], list(lowering.lower_equation(row_equation, rows))))
 
     count = next(x.shape[0] for x, axis in by_row if axis is not None)
     if is_summed:
@@ -229,8 +241,8 @@ def _write_out_product(
     for a in left:
         for b in right:
             terms = [graph.node("mul", type, a[k], b[k]) for k in a if k in b]
-            entries.append(total(graph, "add", type, terms, 0.0))
-    return [array_of(entries, result_shape(equation))]
+            entries.append(combine_nodes(graph, "add", type, terms, 0.0))
+    return [arrange_nodes(entries, result_shape(equation))]
 
 
 def _find_data(graph: Graph, type: Type, row: np.ndarray) -> dict[int, Node]:
@@ -246,7 +258,7 @@ def _move_to_front(x: InMemory, axis: int) -> InMemory:
     return x.view([x.shape[a] for a in order], [x.strides[a] for a in order])
 
 
-def _without(axes: Sequence[int], removed: int | None) -> tuple[int, ...]:
+def _renumber_axes(axes: Sequence[int], removed: int | None) -> tuple[int, ...]:
     """Return the numbers of these axes in an array without the removed axis, or as they are if none is."""
     return tuple(axes) if removed is None else tuple(a - (a > removed) for a in axes)
 
@@ -272,7 +284,7 @@ def _reduce_long(lowering: Lowering, equation: JaxprEqn, name: str, x: Value) ->
     # The same operation within a row, and on two rows to one; both have a result of the shape of a reduced row.
     row_axes = tuple(a - 1 for a in axes if a)
     shape = tuple(n for a, n in enumerate(x.shape[1:]) if a not in row_axes)
-    result = SimpleNamespace(aval=like(shape, equation.outvars[0].aval.dtype))  # type: ignore[attr-defined]
+    result = SimpleNamespace(aval=make_placeholder(shape, equation.outvars[0].aval.dtype))  # type: ignore[attr-defined]
     within_row: Any = SimpleNamespace(params=equation.params | {"axes": row_axes}, outvars=[result])
     of_two_rows: Any = SimpleNamespace(params=equation.params | {"axes": (0,)}, outvars=[result])
 

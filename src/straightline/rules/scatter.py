@@ -14,7 +14,7 @@ from straightline.limits import WRITTEN_OUT
 from straightline.lowering import RULES, Lowering, Rule, known_integers
 from straightline.nodes import Node, Unsupported
 from straightline.rules.elementwise import select
-from straightline.rules.places import fills, find_window_places, narrowed
+from straightline.rules.places import convert_to_32_bits, fills_outside, find_window_places
 
 
 def _make_scatter_rule(op: str | None) -> Rule:
@@ -27,7 +27,7 @@ def _make_scatter_rule(op: str | None) -> Rule:
         """
         x, indices, updates = inputs
         numbers = equation.params["dimension_numbers"]
-        indices = narrowed(lowering, indices) if fills(equation) else indices
+        indices = convert_to_32_bits(lowering, indices) if fills_outside(equation) else indices
         # Axes that a window does not have, and its size along all others.
         removed = (*numbers.inserted_window_dims, *numbers.operand_batching_dims)
         windows = iter(updates.shape[a] for a in numbers.update_window_dims)

@@ -8,11 +8,11 @@ from jax.extend.core import JaxprEqn
 
 from straightline.graph import Graph
 from straightline.limits import FEW
-from straightline.lowering import RULES, Lowering, Rule, array_of, result_shape
+from straightline.lowering import RULES, Lowering, Rule, arrange_nodes, result_shape
 from straightline.nodes import Node, Unsupported
 
 
-def _moved(function: Callable[[np.ndarray, Any, tuple[int, ...]], np.ndarray]) -> Rule:
+def _make_rearranging_rule(function: Callable[[np.ndarray, Any, tuple[int, ...]], np.ndarray]) -> Rule:
     """Make a rule of one array: function(array, parameters, shape of the result)."""
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
@@ -83,7 +83,7 @@ def _iota(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> l
     ]
 
 
-def _empty(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[Any]:
+def _make_empty_array(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[Any]:
     """Return the memory that a loop fills, as the transpose of a scan begins with: zeros."""
     return [lowering.make_known_array(np.zeros(result_shape(equation), equation.params["dtype"]))]
 
@@ -96,7 +96,7 @@ def select_array(graph: Graph, which: Node, cases: list[np.ndarray]) -> np.ndarr
     for number, case in reversed(list(enumerate(cases[:-1]))):
         here = graph.node("le", "bool", which, graph.constant(number, which.type))
         pairs = zip(case.ravel().tolist(), selected.ravel().tolist(), strict=True)
-        selected = array_of([select(graph, here, a, b) for a, b in pairs], case.shape)
+        selected = arrange_nodes([select(graph, here, a, b) for a, b in pairs], case.shape)
     return selected
 
 
@@ -131,15 +131,15 @@ def _update_at(
 
 
 RULES |= {
-    "broadcast_in_dim": _moved(_broadcast_in_dim),
-    "reshape": _moved(lambda x, params, shape: x.reshape(shape)),
-    "squeeze": _moved(lambda x, params, shape: x.reshape(shape)),
-    "expand_dims": _moved(lambda x, params, shape: x.reshape(shape)),
-    "transpose": _moved(lambda x, params, shape: np.transpose(x, params["permutation"])),
-    "rev": _moved(lambda x, params, shape: np.flip(x, params["dimensions"])),
-    "tile": _moved(lambda x, params, shape: np.tile(x, params["reps"])),
-    "slice": _moved(_slice), "split": _split, "concatenate": _concatenate, "stack": _stack,
+    "broadcast_in_dim": _make_rearranging_rule(_broadcast_in_dim),
+    "reshape": _make_rearranging_rule(lambda x, params, shape: x.reshape(shape)),
+    "squeeze": _make_rearranging_rule(lambda x, params, shape: x.reshape(shape)),
+    "expand_dims": _make_rearranging_rule(lambda x, params, shape: x.reshape(shape)),
+    "transpose": _make_rearranging_rule(lambda x, params, shape: np.transpose(x, params["permutation"])),
+    "rev": _make_rearranging_rule(lambda x, params, shape: np.flip(x, params["dimensions"])),
+    "tile": _make_rearranging_rule(lambda x, params, shape: np.tile(x, params["reps"])),
+    "slice": _make_rearranging_rule(_slice), "split": _split, "concatenate": _concatenate, "stack": _stack,
     "unstack": _unstack, "pad": _lower_pad,
-    "iota": _iota, "empty": _empty, "empty2": _empty,
+    "iota": _iota, "empty": _make_empty_array, "empty2": _make_empty_array,
     "dynamic_update_slice": _lower_dynamic_update_slice,
 }  # fmt: skip

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, JaxprEqn
 
-from straightline.lowering import IN_MEMORY, Lowering, Value, array_of, like, type_of
+from straightline.lowering import IN_MEMORY, Lowering, Value, arrange_nodes, make_placeholder, type_of
 from straightline.nodes import Type, Unsupported
 
 EPSILON = float(np.finfo(np.float64).eps)
@@ -251,7 +251,7 @@ def _inline_in_double(
 def _convert(lowering: Lowering, type: Type, value: Value) -> Value:
     """Return an array's numbers in another type."""
     nodes = lowering.nodes(value)
-    return array_of((lowering.graph.node("convert", type, n) for n in nodes.ravel().tolist()), nodes.shape)
+    return arrange_nodes((lowering.graph.node("convert", type, n) for n in nodes.ravel().tolist()), nodes.shape)
 
 
 @cache
@@ -261,7 +261,7 @@ def _trace_over(function: Callable[..., Any], count: int, shape: tuple[int, ...]
     for _ in shape:
         over_arrays = jax.vmap(over_arrays)
     with jax.enable_x64(True):
-        return jax.make_jaxpr(over_arrays)(*[like(shape, np.float64)] * count)
+        return jax.make_jaxpr(over_arrays)(*[make_placeholder(shape, np.float64)] * count)
 
 
 OF_ONE: dict[str, Callable[[jax.Array], jax.Array]] = {

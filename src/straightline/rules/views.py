@@ -8,12 +8,12 @@ import numpy as np
 from jax.extend.core import JaxprEqn
 
 from straightline.limits import FEW, LOADED, TABLE
-from straightline.lowering import IN_MEMORY, RULES, Lowering, Rule, Value, array_of, result_shape
-from straightline.memory import InMemory, contiguous
+from straightline.lowering import IN_MEMORY, RULES, Lowering, Rule, Value, arrange_nodes, result_shape
+from straightline.memory import InMemory, contiguous_strides
 from straightline.nodes import Buffer, Node, RandomKey
 from straightline.rules.elementwise import PASSED_ON, select
-from straightline.rules.loops import copied, put_in_memory, repeat_turns
-from straightline.rules.places import clamp_place, fill_of, fills, inside, narrowed
+from straightline.rules.loops import copy_in_memory, put_in_memory, repeat_turns
+from straightline.rules.places import clamp_place, convert_to_32_bits, fills_outside, is_inside, make_filling
 from straightline.rules.shapes import select_array
 
 View = Callable[[InMemory, Any, tuple[int, ...]], InMemory | None]
@@ -129,18 +129,18 @@ def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list
     The inputs are the array and the indices (..., k) of the windows' first places.
     """
     numbers, indices = equation.params["dimension_numbers"], lowering.nodes(inputs[1])
-    indices = narrowed(lowering, indices) if fills(equation) else indices
+    indices = convert_to_32_bits(lowering, indices) if fills_outside(equation) else indices
     x = make_indexable(lowering, inputs[0], [indices])
     is_one_window = indices.size == len(numbers.start_index_map) and not numbers.operand_batching_dims
     if not isinstance(x, InMemory) or not is_one_window:
         return list(RULES["gather"](lowering, equation, [lowering.nodes(i) for i in inputs]))
-    window, is_inside = _view_window(lowering, equation, x, indices.ravel().tolist())
-    is_known_inside = is_inside.op == "constant" and is_inside.value
-    if not fills(equation) or is_known_inside:
+    window, fits = _view_window(lowering, equation, x, indices.ravel().tolist())
+    is_known_inside = fits.op == "constant" and fits.value
+    if not fills_outside(equation) or is_known_inside:
         return [window]
     # A window that is not inside is filled with a value.
-    filling, nodes = fill_of(lowering, equation), lowering.nodes(window)
-    return [array_of([select(lowering.graph, is_inside, n, filling) for n in nodes.ravel().tolist()], nodes.shape)]
+    filling, nodes = make_filling(lowering, equation), lowering.nodes(window)
+    return [arrange_nodes([select(lowering.graph, fits, n, filling) for n in nodes.ravel().tolist()], nodes.shape)]
 
 
 def _view_window(lowering: Lowering, equation: JaxprEqn, x: InMemory, starts: list[Node]) -> tuple[InMemory, Node]:
@@ -150,18 +150,18 @@ def _view_window(lowering: Lowering, equation: JaxprEqn, x: InMemory, starts: li
     """
     graph, numbers, sizes = lowering.graph, equation.params["dimension_numbers"], equation.params["slice_sizes"]
     # Known places add to the offset; those that data decide move the view.
-    offset, moves, is_inside = 0, [], graph.constant(True, "bool")
+    offset, moves, fits = 0, [], graph.constant(True, "bool")
     for axis, start in zip(numbers.start_index_map, starts, strict=True):
         last = x.shape[axis] - sizes[axis]
         first = clamp_place(lowering, start, last)
-        is_inside = graph.node("and", "bool", is_inside, inside(graph, start, last))
+        fits = graph.node("and", "bool", fits, is_inside(graph, start, last))
         if isinstance(first, int):
             offset += x.strides[axis] * first
         else:
             moves.append((x.strides[axis], first))
     window_axes = [a for a in range(x.ndim) if a not in numbers.collapsed_slice_dims]
     view = x.view([sizes[a] for a in window_axes], [x.strides[a] for a in window_axes], offset, *moves)
-    return view.view(result_shape(equation), _match_strides(view, result_shape(equation))), is_inside
+    return view.view(result_shape(equation), _match_strides(view, result_shape(equation))), fits
 
 
 def _match_strides(view: InMemory, shape: tuple[int, ...]) -> list[int]:
@@ -191,13 +191,13 @@ def _concatenate(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
 def join_arrays(lowering: Lowering, parts: list[Value], shape: tuple[int, ...]) -> InMemory:
     """Return arrays one after another in one buffer of this shape, which is that of their concatenation.
 
-    An array that has a buffer of its own (`_is_alone`) is computed into it directly, all others are copied.
+    An array that has a buffer of its own (`_is_whole_buffer`) is computed into it directly, all others are copied.
     """
     graph = lowering.graph
     type = next(x for x in parts if isinstance(x, InMemory)).type
     buffer, start = Buffer("scratch", type, shape, graph.current), 0
     for x in parts:
-        if isinstance(x, InMemory) and _is_alone(x, graph.current):
+        if isinstance(x, InMemory) and _is_whole_buffer(x, graph.current):
             buffer.take_in(x.buffer, start)
         else:
             _copy_into(lowering, x, buffer, start)
@@ -205,10 +205,10 @@ def join_arrays(lowering: Lowering, parts: list[Value], shape: tuple[int, ...]) 
     return InMemory.whole(buffer)
 
 
-def _is_alone(x: InMemory, block: Any) -> bool:
+def _is_whole_buffer(x: InMemory, block: Any) -> bool:
     """Return whether an array is all of a buffer that this block fills and that has no place in another buffer."""
     buffer = x.buffer
-    whole = not x.moves and x.offset == 0 and x.size == buffer.size and x.strides == contiguous(x.shape)
+    whole = not x.moves and x.offset == 0 and x.size == buffer.size and x.strides == contiguous_strides(x.shape)
     return whole and buffer.kind == "scratch" and buffer.inside is None and buffer.block is block
 
 
@@ -219,7 +219,7 @@ def _copy_into(lowering: Lowering, x: Value, buffer: Buffer, start: int) -> None
         for index, node in enumerate(lowering.nodes(x).ravel().tolist()):
             graph.store(buffer, node, start + index, (), ())
     else:
-        buffer.take_in(copied(lowering, x).buffer, start)
+        buffer.take_in(copy_in_memory(lowering, x).buffer, start)
 
 
 VIEWS: dict[str, View] = {

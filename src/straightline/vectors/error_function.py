@@ -4,7 +4,7 @@ import math
 
 import jaxlib.version
 
-from straightline.vectors.exponential import exp_of_sum, format_of, log, log1p
+from straightline.vectors.exponential import exp_of_sum, find_format, log, log1p
 from straightline.vectors.formulas import Vector, copy_sign, fma, polynomial, select, sqrt
 
 # erf x = x + x P / Q in x^2, |x| < 27/32.
@@ -106,7 +106,7 @@ def _evaluate_ranges(size: Vector) -> tuple[Vector, Vector, Vector]:
     middle = polynomial(argument, above) / polynomial(argument, below)
     # e^(-x^2) to all digits: x = z + (x - z), z of so few digits that z^2 is exact.
     dropped = 32 if size.scalar == "double" else 13
-    z = (size.as_type(format_of(size).word) & -(1 << dropped)).as_type(size.scalar)
+    z = (size.as_type(find_format(size).word) & -(1 << dropped)).as_type(size.scalar)
     square, rest = fma(-z, z, -0.5625), fma(z - size, z + size, middle)
     power = square + rest
     tail = exp_of_sum(power, (square - power) + rest) / size

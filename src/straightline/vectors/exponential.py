@@ -53,50 +53,54 @@ FORMATS = {
 }  # fmt: skip
 
 
-def format_of(x: Vector) -> PrecisionFormat:
+def find_format(x: Vector) -> PrecisionFormat:
     """Return the format of a vector's numbers."""
     return FORMATS[x.scalar]
 
 
 def exp(x: Vector) -> Vector:
     """Return e^x = 2^n e^r, r = x - n ln 2."""
-    form = format_of(x)
-    count, n = nearest(x * LOG2_E)
+    form = find_format(x)
+    count, n = round_to_nearest(x * LOG2_E)
     r = fma(n, -form.ln2[1], fma(n, -form.ln2[0], x))
-    return _limited(x, _scaled(1 + fma(r * r, polynomial(r, form.exp), r), count), form.largest, form.smallest)
+    return _limit_result(
+        x, _scale_by_power_of_two(1 + fma(r * r, polynomial(r, form.exp), r), count), form.largest, form.smallest
+    )
 
 
 def exp_of_sum(x: Vector, low: Vector) -> Vector:
     """Return e^(x + low), |low| small against 1, within 0.6 units of rounding: 1 + r as a sum of two numbers."""
-    form = format_of(x)
-    count, n = nearest(x * LOG2_E)
+    form = find_format(x)
+    count, n = round_to_nearest(x * LOG2_E)
     first, rest = _reduce_argument(x, n)
     r = first + (rest + low)
     rest = (first - r) + (rest + low)
     leading = 1 + r
     small = fma(r * r, polynomial(r, form.exp), fma(r, rest, rest))
-    return _limited(x, _scaled(leading + ((1 - leading + r) + small), count), form.largest, form.smallest)
+    return _limit_result(
+        x, _scale_by_power_of_two(leading + ((1 - leading + r) + small), count), form.largest, form.smallest
+    )
 
 
 def expm1(x: Vector) -> Vector:
     """Return e^x - 1 = 2 (2^(n-1) (e^r - 1) + 2^(n-1) - 1/2), which neither overflows early nor cancels."""
-    form = format_of(x)
-    count, n = nearest(select(x < -50.0, -50.0, x) * LOG2_E)
+    form = find_format(x)
+    count, n = round_to_nearest(select(x < -50.0, -50.0, x) * LOG2_E)
     r, low = _reduce_argument(select(x < -50.0, -50.0, x), n)
     # e^(r + low) - 1 = r + low + r low + r^2/2 + ...
     small = r + fma(r * r, polynomial(r, form.exp), fma(r, low, low))
-    power = _power(form, count - 1)
+    power = _power_of_two(form, count - 1)
     whole = 2 * fma(power, small, power - 0.5)
-    return _limited(x, select(abs(x) < form.negligible, x, whole), form.largest, -math.inf)
+    return _limit_result(x, select(abs(x) < form.negligible, x, whole), form.largest, -math.inf)
 
 
 def log(x: Vector) -> Vector:
     """Return log(2^k m) = k ln 2 + log m, m between sqrt(1/2) and sqrt(2)."""
-    form = format_of(x)
+    form = find_format(x)
     small, lifted = x < form.tiny, form.fraction + 2
     k, m = _split_exponent(select(small, x * 2.0**lifted, x))
     value = _log(k - select(small, x.like(lifted), 0.0), m - 1, 0.0)
-    return _with_domain(x, value)
+    return _set_outside_domain(x, value)
 
 
 def log1p(x: Vector) -> Vector:
@@ -105,7 +109,7 @@ def log1p(x: Vector) -> Vector:
     rounded = select(abs(x) < 1.0, x - (u - 1), 1 - (u - x))
     k, m = _split_exponent(u)
     value = _log(k, m - 1, rounded / u)
-    return select(abs(x) < format_of(x).negligible, x, _with_domain(u, value))
+    return select(abs(x) < find_format(x).negligible, x, _set_outside_domain(u, value))
 
 
 def tanh(x: Vector) -> Vector:
@@ -117,41 +121,41 @@ def tanh(x: Vector) -> Vector:
     return copy_sign(select(large, 1 + ratio, ratio), x)
 
 
-def nearest(x: Vector) -> tuple[Vector, Vector]:
+def round_to_nearest(x: Vector) -> tuple[Vector, Vector]:
     """Return the nearest integer, as one and as a real number; of doubles |x| < 2^51, of floats 2^22."""
-    form = format_of(x)
+    form = find_format(x)
     moved = x + form.round
     return moved.as_type(form.word) - form.round_bits, moved - form.round
 
 
 def _reduce_argument(x: Vector, n: Vector) -> tuple[Vector, Vector]:
     """Return x - n ln 2 as the sum of two numbers."""
-    high, low = format_of(x).ln2
+    high, low = find_format(x).ln2
     first = fma(n, -high, x)
     rest = n * low
     r = first - rest
     return r, (first - r) - rest
 
 
-def _power(form: PrecisionFormat, n: Vector) -> Vector:
+def _power_of_two(form: PrecisionFormat, n: Vector) -> Vector:
     """Return 2^n of integers -1022 ... 1023, of floats -126 ... 127."""
     return ((n << form.fraction) + form.one_bits).as_type("double" if form.word == "i64" else "float")
 
 
-def _scaled(x: Vector, n: Vector) -> Vector:
+def _scale_by_power_of_two(x: Vector, n: Vector) -> Vector:
     """Return x 2^n in two factors, each of which is a normal number."""
-    form, half = format_of(x), n >> 1
-    return x * _power(form, half) * _power(form, n - half)
+    form, half = find_format(x), n >> 1
+    return x * _power_of_two(form, half) * _power_of_two(form, n - half)
 
 
-def _limited(x: Vector, value: Vector, largest: float, smallest: float) -> Vector:
+def _limit_result(x: Vector, value: Vector, largest: float, smallest: float) -> Vector:
     """Return the result; infinity for x beyond the largest, 0 below the smallest, NaN of NaN."""
     return select(x > largest, math.inf, select(x < smallest, 0.0, value))
 
 
 def _split_exponent(x: Vector) -> tuple[Vector, Vector]:
     """Return k and m of x = 2^k m, sqrt(1/2) <= m < sqrt(2), of a positive normal number."""
-    form = format_of(x)
+    form = find_format(x)
     bits = x.as_type(form.word)
     k = (bits - form.root_half_bits) >> form.fraction
     m = (bits - (k << form.fraction)).as_type(x.scalar)
@@ -160,7 +164,7 @@ def _split_exponent(x: Vector) -> tuple[Vector, Vector]:
 
 def _log(k: Vector, f: Vector, more: Vector | float) -> Vector:
     """Return K ln 2 + log(1 + f) + more, where `more` is small against the rest or the rest is zero."""
-    form = format_of(f)
+    form = find_format(f)
     s = f / (2 + f)
     z = s * s
     half = 0.5 * f * f
@@ -168,7 +172,7 @@ def _log(k: Vector, f: Vector, more: Vector | float) -> Vector:
     return fma(k, form.ln2[0], f - (half - fma(s, half + r, fma(k, form.ln2[1], more))))
 
 
-def _with_domain(x: Vector, value: Vector) -> Vector:
+def _set_outside_domain(x: Vector, value: Vector) -> Vector:
     """Return a logarithm's result; -infinity of 0, NaN below, infinity of infinity."""
     special = select(x.equals(0.0), -math.inf, select(x > 0.0, x, math.nan))
     return select((x > 0.0) & (x < math.inf), value, special)

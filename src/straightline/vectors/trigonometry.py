@@ -2,7 +2,7 @@
 
 import math
 
-from straightline.vectors.exponential import format_of, nearest
+from straightline.vectors.exponential import find_format, round_to_nearest
 from straightline.vectors.formulas import Vector, copy_sign, fma, polynomial, rounded, select
 
 HALF_PI = 1.57079632679489661923, 6.12323399573676603587e-17, -1.4973849048591833e-33  # pi / 2 as a sum
@@ -55,7 +55,7 @@ def sin(x: Vector) -> Vector:
     quarter, r, low = _reduce_to_quarter(x)
     value = select((quarter & 1).equals(0), _sin(r, low), _cos(r, low))
     value = select((quarter & 2).equals(0), value, -value)
-    return _of_any_size(x, select(abs(x) < 2.0 ** -(27 if x.scalar == "double" else 13), x, value), "sin")
+    return _use_library_where_large(x, select(abs(x) < 2.0 ** -(27 if x.scalar == "double" else 13), x, value), "sin")
 
 
 def cos(x: Vector) -> Vector:
@@ -63,12 +63,12 @@ def cos(x: Vector) -> Vector:
     quarter, r, low = _reduce_to_quarter(x)
     value = select((quarter & 1).equals(0), _cos(r, low), _sin(r, low))
     value = select(((quarter + 1) & 2).equals(0), value, -value)
-    return _of_any_size(x, value, "cos")
+    return _use_library_where_large(x, value, "cos")
 
 
 def _reduce_to_quarter(x: Vector) -> tuple[Vector, Vector, Vector]:
     """Return the number of quarter turns in x, and the rest as a sum; the first difference is exact."""
-    quarter, n = nearest(x * (2 / math.pi))
+    quarter, n = round_to_nearest(x * (2 / math.pi))
     parts = HALF_PI if x.scalar == "double" else HALF_PI_OF_FLOATS
     first = fma(n, -parts[0], x)
     # first - n parts[1] as a sum: the product and the difference each with what rounding takes from it.
@@ -85,7 +85,7 @@ def _sin(x: Vector, low: Vector) -> Vector:
     """Return sin(x + low), |x| <= pi / 4."""
     z = x * x
     v = z * x
-    r = polynomial(z, _terms(x, SIN)[1:])
+    r = polynomial(z, _select_coefficients(x, SIN)[1:])
     return x - ((z * (0.5 * low - v * r) - low) - v * SIN[0])
 
 
@@ -94,15 +94,15 @@ def _cos(x: Vector, low: Vector) -> Vector:
     z = x * x
     half = 0.5 * z
     w = 1 - half
-    return w + (((1 - w) - half) + (z * (z * polynomial(z, _terms(x, COS))) - x * low))
+    return w + (((1 - w) - half) + (z * (z * polynomial(z, _select_coefficients(x, COS))) - x * low))
 
 
-def _terms(x: Vector, coefficients: list[float]) -> list[float]:
+def _select_coefficients(x: Vector, coefficients: list[float]) -> list[float]:
     """Return the coefficients that count in a vector's precision."""
     return coefficients if x.scalar == "double" else coefficients[:TERMS_OF_FLOATS]
 
 
-def _of_any_size(x: Vector, value: Vector, name: str) -> Vector:
+def _use_library_where_large(x: Vector, value: Vector, name: str) -> Vector:
     """Return the value where |x| is small enough for it, else that of the scalar library, if a lane needs it."""
     return x.body.compute_where_needed(abs(x) >= LARGEST[x.scalar], lambda: x.body.call(name, x), value)
 
@@ -138,7 +138,7 @@ def atan2(y: Vector, x: Vector) -> Vector:
     # 0/0 and infinity/infinity: along an axis, or a diagonal.
     ratio = select(both, select(y.equals(0.0), y.like(0.0), 1.0), ratio)
     angle = _atan_of_positive(ratio)
-    behind = x.as_type(format_of(x).word) < 0
+    behind = x.as_type(find_format(x).word) < 0
     angle = select(behind, math.pi - (angle - PI_LOW[x.scalar]), angle)
     return copy_sign(select(_is_number(x) & _is_number(y), angle, math.nan), y)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from straightline.c_source import CSource, write_literal
-from straightline.lowering import scalars
+from straightline.lowering import list_nodes
 from straightline.memory import InMemory
 from straightline.nodes import Unsupported
 from straightline.program import lower_function
@@ -23,7 +23,7 @@ def written(function, x, real="double"):
     """The statements, tables and results of a function of one array."""
     program = lower_function(function, x)
     arrays = [x.nodes(program.graph) if isinstance(x, InMemory) else x for x in program.outputs]
-    results = [node for array in arrays for node in scalars(array)]
+    results = [node for array in arrays for node in list_nodes(array)]
     source = CSource(results, {program.inputs[0]: "x[{}]".format}, real, "made")
     body = source.write_statements(program.graph.top)
     stores = [f"    out[{i}] = {source.name(node)};" for i, node in enumerate(results)]

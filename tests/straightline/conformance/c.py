@@ -9,7 +9,7 @@ import numpy as np
 
 from straightline.c_source import CSource, c_type
 from straightline.folding import DTYPES
-from straightline.lowering import scalars
+from straightline.lowering import list_nodes
 from straightline.nodes import Unsupported
 from tests.straightline.conformance.case import Case
 from tests.straightline.conformance.engines import program_of
@@ -51,7 +51,7 @@ def is_written(case: Case) -> bool:
 def _function(case: Case, name: str) -> tuple[str, str, list[tuple[str, tuple[int, ...]]]]:
     program = program_of([case])
     places = {b: f"x{n}[{{}}]".format for n, b in enumerate(program.inputs)}
-    nodes = [scalars(x) if x.size else [] for x in program.outputs]
+    nodes = [list_nodes(x) if x.size else [] for x in program.outputs]
     source = CSource([n for x in nodes for n in x], places, "double", name)
     body, arrays, ends, types = source.write_statements(program.graph.top), [], [], []
     for number, buffer in enumerate(program.inputs):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from straightline.compiled import compile
-from straightline.jax_function import function_of
+from straightline.jax_function import make_jax_function
 from straightline.llvm.module import choose_output_buffers
 from straightline.nodes import Node
 from straightline.program import list_needed, lower_function
@@ -48,7 +48,7 @@ def test_nan_and_infinity_pass_through_a_known_matrix_to_what_depends_on_them_an
     np.testing.assert_allclose(compile(function, x[0])(x), expected, rtol=1e-14, atol=1e-14)
     program = lower_function(function, x[0])
     with jax.enable_x64(True):
-        np.testing.assert_allclose(jax.vmap(function_of(program))(x), expected, rtol=1e-14, atol=1e-14)
+        np.testing.assert_allclose(jax.vmap(make_jax_function(program))(x), expected, rtol=1e-14, atol=1e-14)
 
 
 def test_nan_shows_in_what_depends_on_it_through_a_chain_of_known_matrices():

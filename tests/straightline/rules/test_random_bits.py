@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from straightline.folding import DTYPES, EVALUATED
-from straightline.lowering import scalars
+from straightline.lowering import list_nodes
 from straightline.nodes import Node, Unsupported
 from straightline.program import lower_function
 from straightline.rules.random_bits import hash_words, write_hash_function
@@ -34,7 +34,7 @@ def computed(function: Callable[..., Any], *arguments: Any) -> list[np.ndarray]:
             known[node] = _computed(node, [value(a) for a in node.args], given)
         return known[node]
 
-    return [np.array([value(node) for node in scalars(output)]) for output in program.outputs]
+    return [np.array([value(node) for node in list_nodes(output)]) for output in program.outputs]
 
 
 def _computed(node: Node, numbers: list[Any], given: dict[Any, np.ndarray]) -> Any:
@@ -123,7 +123,7 @@ def test_the_hash_of_jax() -> None:
 
 def test_known_keys_are_computed_before() -> None:
     program = lower_function(lambda: jax.random.uniform(jax.random.fold_in(jax.random.key(5), 3), (2,), dtype=float))
-    assert all(node.op == "constant" for node in scalars(program.outputs[0]))
+    assert all(node.op == "constant" for node in list_nodes(program.outputs[0]))
 
 
 def test_keys_of_another_hash_are_refused() -> None:
