@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 import heliograph as hg
 from heliograph.h_infinity import growth_check
-from heliograph.h_infinity.certificate import theorem_matrix
+from heliograph.h_infinity.certificate import make_theorem_matrix
 from tests.h_infinity.h_infinity_problems import node
 from tests.oracles import h_infinity_fusion as paper
 
@@ -28,7 +28,7 @@ def random_problem(seed):
 def test_theorem_1_three_times_over(seed, i, beta):
     """Rounding only: entries up to some 1e2."""
     K, P, P_next, l1, l2, g = random_problem(seed)
-    ours = theorem_matrix(node(i, beta=beta), 0, K, P, P_next, np.array([l1, l1, l2, l2]), g)
+    ours = make_theorem_matrix(node(i, beta=beta), 0, K, P, P_next, np.array([l1, l1, l2, l2]), g)
     np.testing.assert_allclose(ours, paper.Phi(i, K, P, P_next, l1, l2, g, beta), atol=1e-11)
     np.testing.assert_allclose(ours, paper.Phi_by_enumeration(i, K, P, P_next, l1, l2, g, beta), atol=1e-11)
 

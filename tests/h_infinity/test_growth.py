@@ -8,7 +8,7 @@ import pytest
 import heliograph as hg
 from heliograph.h_infinity import certify_level, check_growth
 from heliograph.h_infinity.growth_check import slope_bound
-from heliograph.h_infinity.interval import ARITHMETIC, Interval, evaluate
+from heliograph.h_infinity.interval import ARITHMETIC, Interval, bound_program
 
 REFUTED = {
     "a slope above it": (lambda x: 0.5 * x + jnp.array([1e-5 * jnp.sin(1e5 * x[0])]), 0.7, "slope 1.5"),
@@ -79,7 +79,7 @@ def test_values_are_inside_their_intervals():
                 lows, highs = np.maximum(middle - width, -3), np.minimum(middle + width, 3)
                 sampled = np.asarray(values_(random.uniform(lows, highs, size=(50, 20, 2))))
                 for low, high, values in zip(lows, highs, np.moveaxis(sampled, 1, 0), strict=True):
-                    (result,) = evaluate(jaxpr, [Interval(low, high)], continuous=True)
+                    (result,) = bound_program(jaxpr, [Interval(low, high)], continuous=True)
                     assert np.all(values >= result.low) and np.all(values <= result.high)
 
 

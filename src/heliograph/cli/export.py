@@ -39,7 +39,7 @@ def export(
     """
     from heliograph.disk.quoting import visible
     from heliograph.export.c_files import PRECISIONS, check_source_path, measure_cost, write_filter
-    from heliograph.export.text import claim_of
+    from heliograph.export.text import find_claim
     from heliograph.files.network_file import load_network
     from heliograph.simulation.centres.named_filter import find_filter_by_name
 
@@ -50,7 +50,7 @@ def export(
     written = write_filter(named.filter, named.received, out, precision, apart, size, window)
     exported, real = named.filter, PRECISIONS[precision]
     measured = measure_cost(written.header, written.source, exported.received, len(exported.inputs), real)
-    claim = claim_of(exported, real)
+    claim = find_claim(exported, real)
     print(visible(f"{written.header}, {written.source}: {named.place}/{filter} ({claim}), {precision} precision"))
     print("\n".join(describe_costs(written, measured)))
 

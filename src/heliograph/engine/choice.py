@@ -32,7 +32,7 @@ ENGINES = ("native", "xla")
 
 
 @cache
-def threads() -> ThreadPoolExecutor:
+def get_thread_pool() -> ThreadPoolExecutor:
     """Return a pool of threads for parts of one computation, one thread for each core."""
     return ThreadPoolExecutor(os.cpu_count() or 1)
 

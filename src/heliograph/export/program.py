@@ -106,7 +106,7 @@ def write_step_program(
         can_be_set = isinstance(state, Gaussian | SplitMeanGaussian) and apart
         start_at = _write_start_function(filter, kept, names, prefix, real) if can_be_set else None
     except Unsupported as error:
-        raise no_c(error.operation, error.where) from None
+        raise make_unsupported_error(error.operation, error.where) from None
     mean, covariance = (candidates[n].name for n in places)
     uses_step_number = any(code.arguments[-1].used for code in computes)
     return StepProgram(
@@ -231,7 +231,7 @@ def _find_symmetric_arrays(parts: Sequence[PartOfStep]) -> set[int]:
     return symmetric
 
 
-def no_c(operation: str, where: str) -> InputError:
+def make_unsupported_error(operation: str, where: str) -> InputError:
     """Return an error, in one line, about an operation that cannot be exported."""
     return fail("export", "operations that C has", f"{operation} at {where}")
 

@@ -113,7 +113,7 @@ def _write_start(program: StepProgram) -> str:
     return f"    {program.initial.name}({members});" + ("\n    state->step = 0;" if program.counts else "")
 
 
-def claim_of(filter: AbstractFilter, real: Real) -> Claim:
+def find_claim(filter: AbstractFilter, real: Real) -> Claim:
     """Return the filter's claim; single precision proves nothing, since its rounding is not bounded."""
     return filter.claim if real == "double" or filter.claim == "none" else "nominal"
 
@@ -126,7 +126,7 @@ def _write_comment(program: StepProgram, form: TextOptions, window: WindowText |
         form: names and options of the text.
         window: the functions for measurements that come late; None where there are none.
     """
-    filter, prefix, claim = program.filter, form.prefix, claim_of(program.filter, form.real)
+    filter, prefix, claim = program.filter, form.prefix, find_claim(program.filter, form.real)
     # Beside each measurement, the range of single precision; "" in double.
     ranges = explain_ranges(filter) if form.real == "float" else [""] * filter.received
     rounding = explain_rounding(filter, any(ranges)) if form.real == "float" else []

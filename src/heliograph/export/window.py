@@ -186,8 +186,8 @@ def _write_functions(window: Window, prefix: str, real: Real) -> list[str]:
         "places": f"{window.places}U",
         "rows": f"{window.rows}U",
         "check": "\n".join([*(f"    if (isinf(z[{i}]) != 0) {{ return 1; }}" for i in range(received)), nothing]),
-        "copy_z": _copy("row->z", "z", received),
-        "copy_u": _copy("row->u", "u", inputs),
+        "copy_z": _write_copy("row->z", "z", received),
+        "copy_u": _write_copy("row->u", "u", inputs),
         "received": received,
         "head": _list_heads(window, prefix, real)[2],
     }
@@ -197,7 +197,7 @@ def _write_functions(window: Window, prefix: str, real: Real) -> list[str]:
     return [text.format(**names) for text in (_PLACE, _RUN, _FILL, _START, _STEP, late)]
 
 
-def _copy(target: str, source: str, count: int) -> str:
+def _write_copy(target: str, source: str, count: int) -> str:
     """Return the statements that copy an array; none of an empty one."""
     if not count:
         return f"    (void){source};"

@@ -61,7 +61,7 @@ def noise_beside_rounding(n: int, least: jax.Array) -> jax.Array:
     return 1024 / (ROUNDING_UNITS * n * unit_of(least)) ** 2 * least
 
 
-def _clear(numbers: jax.Array, least: jax.Array) -> jax.Array:
+def _zero_rounding(numbers: jax.Array, least: jax.Array) -> jax.Array:
     """Return numbers, and zero where they are no larger than `least`; NaN stays."""
     return jnp.where(jnp.abs(numbers) <= least, 0.0, numbers)
 
@@ -73,7 +73,7 @@ def _triangularise_row_by_row(rows: jax.Array, weights: jax.Array) -> WeightedCo
     for j in range(m):
         row = lax.index_in_dim(rows, j, keepdims=False)
         if 0 < j < m - 1:
-            row = _clear(row, share * lax.index_in_dim(size, j, keepdims=False))
+            row = _zero_rounding(row, share * lax.index_in_dim(size, j, keepdims=False))
         weighted = scale(weights, row)
         variances.append(lax.dot(row, weighted))
         over = lax.reshape(reciprocal_or_one(variances[j]), (1,))
@@ -91,7 +91,7 @@ def _triangularise_in_loop(rows: jax.Array, weights: jax.Array) -> WeightedColum
     def eliminate_row(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         """Take row j, its rounding cleared, off the rows below it, and put it into L and d."""
         rows, size, lower, variances = carry
-        row = _clear(rows[j], share * size[j])
+        row = _zero_rounding(rows[j], share * size[j])
         weighted = weights * row
         d = row @ weighted
         below = jnp.where(np.arange(m) > j, rows @ weighted * reciprocal_or_one(d), 0.0)

@@ -172,7 +172,7 @@ def _measure_in_turns(
         value = -news[n]
         rounded = jnp.where(least[0] < 0, rounding_of_products(n, total), least[0])
         least = carry_rounding(least, gain[n:], rounded)
-        carry = _put_last(after, n), d, _put_last(news + gain * value, n), _put_last(least, 0)
+        carry = _move_row_to_end(after, n), d, _move_row_to_end(news + gain * value, n), _move_row_to_end(least, 0)
         return carry, (value, total)
 
     start = root, d, news, jnp.concatenate([jnp.full_like(least[:1], -1.0), least[1:]])
@@ -180,7 +180,7 @@ def _measure_in_turns(
     return root, d, news, values, totals
 
 
-def _put_last(rows: jax.Array, i: int) -> jax.Array:
+def _move_row_to_end(rows: jax.Array, i: int) -> jax.Array:
     """Return rows with row i behind all others."""
     return jnp.concatenate([rows[:i], rows[i + 1 :], rows[i : i + 1]])
 

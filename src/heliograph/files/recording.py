@@ -17,7 +17,7 @@ from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail, flag, instance
 from heliograph.numerics.module import readable
 from heliograph.numerics.times.dates import seconds_between
-from heliograph.numerics.times.row_times import backwards, backwards_text
+from heliograph.numerics.times.row_times import backwards_text, find_backwards_row
 from heliograph.numerics.types import append_unit
 from heliograph.simulation.network import Network
 
@@ -235,7 +235,7 @@ def _make_inputs(
 
     A missing dt is the difference of the times.
     """
-    row = backwards(time)
+    row = find_backwards_row(time)
     if row is not None:
         where = f"{source}, row {rows.numbers[row]}, column {TIME!r}"
         raise fail(where, "a time that does not go backwards", backwards_text(time, row))

@@ -9,7 +9,7 @@ from heliograph.files.table import TIME
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail
 from heliograph.numerics.times.row_order import SECOND, YEAR, find_out_of_order, find_unset_stamps
-from heliograph.numerics.times.row_times import backwards
+from heliograph.numerics.times.row_times import find_backwards_row
 from heliograph.simulation.network import Network
 
 MOST_OUT = 0.5  # share of the rows that may be out of order where each row is a step
@@ -52,7 +52,7 @@ def order_rows(cells: RowsAsColumns, network: Network, source: str) -> tuple[Row
         network: the network that they belong to.
         source: name of the table, for errors.
     """
-    if backwards(cells.time) is None:
+    if find_backwards_row(cells.time) is None:
         return cells, [], 0
     dated = cells.time.dtype.kind == "M"
     stamps = cells.time.astype(np.int64) if dated else cells.time

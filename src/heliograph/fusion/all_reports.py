@@ -74,24 +74,24 @@ class AllReports(AbstractInformedFusion):
 
     def start(self, errors: ErrorMoments) -> ReportsBelief:
         """Return the state before the first report, over lossless links."""
-        return initial_belief(errors, 0, errors.bias.shape[1], quantized=False)
+        return make_initial_belief(errors, 0, errors.bias.shape[1], quantized=False)
 
     def fuse_step(self, state: ReportsBelief, happened: CentreStep, means: Means) -> tuple[ReportsBelief, Fused]:
         """Predict plant and all errors, then correct with the reports; one that is NaN did not arrive."""
         nodes, n = means.shape
-        prior = propagate_errors(state, happened, lossless_links(nodes, n))
+        prior = propagate_errors(state, happened, make_lossless_links(nodes, n))
         # The means are the reports, all of age 0.
         after, _ = correct_with_reports(prior, jnp.asarray(means)[None])
         return after, estimate_state(after, n)
 
 
-def lossless_links(nodes: int, n: int) -> ReportModel:
+def make_lossless_links(nodes: int, n: int) -> ReportModel:
     """Return the model of links that deliver what is sent, unchanged and at once."""
     zero = np.zeros((nodes, n))
     return ReportModel(np.tile(np.eye(n), (nodes, 1, 1)), zero, np.zeros((nodes, n, n, n + 1, n + 1)), zero)
 
 
-def initial_belief(errors: ErrorMoments, delays: int, received: int, quantized: bool) -> ReportsBelief:
+def make_initial_belief(errors: ErrorMoments, delays: int, received: int, quantized: bool) -> ReportsBelief:
     """Return the state before the first report, for so many `delays` and `received` numbers per report.
 
     Every error is that of x_0 then, up to a constant; nothing has been sent.

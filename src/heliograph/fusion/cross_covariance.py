@@ -126,7 +126,7 @@ class ErrorMoments(NamedTuple):
         return self.covariance[n:, n:].reshape(nodes, n, nodes, n)
 
 
-def initial_errors(
+def make_initial_errors(
     mean: Float[Array, " n"], covariance: Float[Array, "n n"], starts: Float[Array, "node n"]
 ) -> ErrorMoments:
     """Return the moments before the first step, when filters start at known means: errors are x_0 up to a constant."""
@@ -142,8 +142,8 @@ def make_error_step(filters: LinearStep, motion: Motion, observation: JointObser
     # A - F, and U (b - f) - L b - K (o - c).
     matrices = _subtract(jnp.broadcast_to(motion.matrix, filters.transition.shape), filters.transition)
     drifts = _subtract(jnp.broadcast_to(motion.shift, filters.drift.shape), filters.drift)
-    shift = _apply(keep, drifts) - wrong_gain @ jnp.asarray(motion.shift)
-    shift = shift - _apply(gain, _subtract(observation.offset, filters.offset))
+    shift = _multiply_by_node(keep, drifts) - wrong_gain @ jnp.asarray(motion.shift)
+    shift = shift - _multiply_by_node(gain, _subtract(observation.offset, filters.offset))
     of_state = keep @ matrices - wrong_gain @ motion.matrix
     return ErrorStep(
         transition=ErrorMap(motion.matrix, of_state, keep @ filters.transition),
@@ -222,7 +222,7 @@ class SourceFactors(NamedTuple):
         return ErrorSources(self.roots[n:].reshape(-1, n, self.roots.shape[1]), self.independent)
 
 
-def initial_factors(errors: ErrorMoments, sources: int) -> SourceFactors:
+def make_initial_factors(errors: ErrorMoments, sources: int) -> SourceFactors:
     """Return the factors before the first step, with room for `sources` more: all is the deviation of x_0."""
     nodes, n = errors.bias.shape
     state = jnp.zeros((n, n + sources)).at[:, :n].set(cholesky(errors.state_covariance))
@@ -253,6 +253,6 @@ def _subtract(a: Array, b: Array) -> jax.Array:
     return jnp.where(jnp.abs(a - b) <= rounding(SAME, a) * (jnp.abs(a) + jnp.abs(b)), 0.0, a - b)
 
 
-def _apply(matrix: Array, vector: Array) -> jax.Array:
+def _multiply_by_node(matrix: Array, vector: Array) -> jax.Array:
     """Return the product of matrix and vector for each node."""
     return jnp.einsum("iab,ib->ia", matrix, vector)

@@ -106,7 +106,7 @@ def widen(covariance: Float[Array, "n n"], error: Float[Array, "n"]) -> Float[ja
 Parameter = Float[Array, "..."]  # of all components, or of each
 
 
-def segment_of(x: Float[jax.Array, "*n"], amplitude: Parameter, levels: Float[Array, ""]) -> Float[jax.Array, "*n"]:
+def find_segment(x: Float[jax.Array, "*n"], amplitude: Parameter, levels: Float[Array, ""]) -> Float[jax.Array, "*n"]:
     """Return the index, from 0, of the segment of [-amplitude, amplitude] that holds x."""
     return jnp.clip(jnp.floor((x / amplitude + 1) * levels / 2), 0, levels - 1)
 
@@ -119,7 +119,7 @@ def midpoint(segment: Array, amplitude: Parameter, levels: Float[Array, ""]) -> 
     return jnp.asarray((2 * segment + 1 - levels) / levels * amplitude)
 
 
-def levels_of(value: int) -> Float[np.ndarray, ""]:
+def check_levels(value: int) -> Float[np.ndarray, ""]:
     """Return the number of segments, at least two, as a float."""
     check_count("levels", value, 2)
     return np.asarray(value, dtype=np.float64)
@@ -176,7 +176,7 @@ class UniformQuantizer(AbstractQuantizer):
     scale: Parameter
 
     def __init__(self, levels: int, amplitude: Float[ArrayLike, "*n"], scale: Float[ArrayLike, "*n"] = 1.0):
-        self.levels = levels_of(levels)
+        self.levels = check_levels(levels)
         self.amplitude, self.scale = check_positive("amplitude", amplitude), check_positive("scale", scale)
         check_amplitude("amplitude times scale", self.amplitude, self.scale, self.levels)
 
@@ -205,7 +205,7 @@ def _quantize_uniformly(
     d is the amplitude; what is returned is in the unit of x.
     """
     scaled = x / scale
-    inside = midpoint(segment_of(scaled, amplitude, levels), amplitude, levels)
+    inside = midpoint(find_segment(scaled, amplitude, levels), amplitude, levels)
     value = jnp.where(scaled >= amplitude, amplitude, jnp.where(scaled < -amplitude, -amplitude, inside))
     saturated = jnp.abs(scaled) > amplitude
     error = jnp.where(saturated | ~jnp.isfinite(x), jnp.nan, scale * amplitude / levels)
@@ -287,7 +287,7 @@ class EscapeQuantizer(AbstractQuantizer):
         interval: int | None = None,
     ):
         """Check the arguments, which the class describes; even the smallest amplitude must hold all levels apart."""
-        self.levels = levels_of(levels)
+        self.levels = check_levels(levels)
         if levels % 2 == 0:
             raise fail("levels", "an odd number, so that zero is a level", levels)
         self.amplitude, self.smallest = (
@@ -322,7 +322,7 @@ class EscapeQuantizer(AbstractQuantizer):
         most = np.finfo(x.dtype).maxexp - power  # the largest that leaves d 2^m a number
         is_value, beyond = ~jnp.isnan(x), jnp.isinf(x) | (doublings > most)
         escapes = jnp.where(x != 0, jnp.clip(jnp.where(beyond, most, doublings), 0), 0)
-        segment = segment_of(x, jnp.ldexp(amplitude, escapes), self.levels)
+        segment = find_segment(x, jnp.ldexp(amplitude, escapes), self.levels)
         segment = jnp.where(beyond, jnp.where(x > 0, ABOVE, BELOW), jnp.where(is_value, segment, NOTHING))
         numbers = jnp.broadcast_to(state.number, x.shape)
         return UplinkSymbols(

@@ -63,10 +63,10 @@ def certify_level(
 ) -> "HInfinityCertificate":
     """Return whether gains K guarantee an H-infinity level, given weights P and multipliers that are meant to prove it.
 
-    With Phi_k the matrix of step k (`theorem_matrix`) and e the error, v and rho the disturbances of plant and channel,
-    W the initial weight: Phi_k < 0 at every step, P_k > 0, level^2 W - P_0 > 0 and multipliers >= 0 together prove
-    sum |M e|^2 < level^2 (sum |v|^2 + |rho|^2 + xi_0' W xi_0). A level that rests on a refuted growth constant, or on a
-    finding about a constant above the system's, is not certified.
+    With Phi_k the matrix of step k (`make_theorem_matrix`), e the error, v and rho the disturbances of plant and
+    channel and W the initial weight: Phi_k < 0 at every step, P_k > 0, level^2 W - P_0 > 0 and multipliers >= 0
+    together prove sum |M e|^2 < level^2 (sum |v|^2 + |rho|^2 + xi_0' W xi_0). A level that rests on a refuted growth
+    constant, or on a finding about a constant above the system's, is not certified.
 
     Args:
         system: the system with its growth constants, from `growth_system`.
@@ -92,9 +92,9 @@ def certify_level(
     P = symmetric_weight("weights", array("weights", weights, (T + 1, 2 * n, 2 * n)))
     lam = _complete_multipliers(array("multipliers", multipliers, (T, None)))
     # Phi_k < 0 of every step.
-    matrices = [theorem_matrix(system, k, K[k], P[k], P[k + 1], lam[k], level) for k in range(T)]
+    matrices = [make_theorem_matrix(system, k, K[k], P[k], P[k + 1], lam[k], level) for k in range(T)]
     largest = np.array([_largest_eigenvalue(phi) for phi in matrices])
-    negative = np.array([is_negative(phi) for phi in matrices])
+    negative = np.array([is_negative_definite(phi) for phi in matrices])
     # Initial condition level^2 W - P_0 > 0, and how far all these are from failing, free of units.
     allowed = level**2 * system.initial_weight
     initial = float(np.linalg.eigvalsh(allowed - P[0])[0])
@@ -177,7 +177,7 @@ def _list_wrong_signs(
     return reasons + [f"step {k}: a multiplier is negative" for k in np.flatnonzero((multipliers < 0).any(axis=1))]
 
 
-def theorem_matrix(
+def make_theorem_matrix(
     system: GrowthSystem,
     k: int,
     gain: Float[np.ndarray, "n m"],
@@ -299,7 +299,7 @@ def _largest_eigenvalue(phi: Float[np.ndarray, "q q"]) -> float:
     return float(np.linalg.eigvalsh((phi + phi.T) / 2)[-1])
 
 
-def is_negative(phi: Float[np.ndarray, "q q"]) -> bool:
+def is_negative_definite(phi: Float[np.ndarray, "q q"]) -> bool:
     """Decide whether a symmetric matrix is negative definite beyond rounding, after scaling its diagonal to -1.
 
     Scaling preserves definiteness and lets weights of very different sizes stand in one matrix.

@@ -4,7 +4,7 @@ import numpy as np
 
 from heliograph.h_infinity.design import HInfinityDesign
 from heliograph.h_infinity.error_system import GrowthSystem
-from heliograph.h_infinity.step_inequality import StepMatrices, step_matrices
+from heliograph.h_infinity.step_inequality import StepMatrices, list_step_matrices
 from heliograph.numerics.check import TINY, array, fail, instance, scalar
 from heliograph.numerics.types import ArrayLike, Float
 
@@ -71,7 +71,7 @@ def _run_riccati(system: GrowthSystem, level: float, multipliers: Float[np.ndarr
     )
     design.weights[0] = np.diag(np.repeat([state_weight, error_weight], n))
     # Step by step: K and P2 in closed form, p small enough that it does no harm.
-    for k, step in enumerate(step_matrices(system, separate=True)):
+    for k, step in enumerate(list_step_matrices(system, separate=True)):
         found = _compute_best_gain(system, step, design.weights[k, n:, n:], inner_level, multipliers[k])
         if found is None:
             text = f"no gain exists at step {k} of {steps} with these multipliers"

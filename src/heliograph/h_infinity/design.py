@@ -25,9 +25,9 @@ from heliograph.h_infinity.step_inequality import (
     StepMatrices,
     Unknowns,
     UnknownsLayout,
-    all_multipliers,
-    next_energy,
-    step_matrices,
+    complete_multipliers,
+    compute_next_energy,
+    list_step_matrices,
 )
 from heliograph.numerics.check import TINY, array, fail, flag, instance, scalar
 from heliograph.numerics.module import readable
@@ -154,7 +154,7 @@ def horizon_design(
     given_gains = None if gains is None else np.asarray(array("gains", gains, (system.steps, n, m)))
     # Coordinates of order one, and the unknowns of every step: a correction of its nominal gain among them, which is
     # zero where gains are given.
-    steps, coordinates = scale_steps(system, step_matrices(system, flag("separate", separate)), given_gains)
+    steps, coordinates = scale_steps(system, list_step_matrices(system, flag("separate", separate)), given_gains)
     given_correction = None if given_gains is None else np.zeros((n, m))
     layouts = [UnknownsLayout(n, m, len(s.growth), given_correction) for s in steps]
     start = None if initial is None else coordinates.initial_weight(_check_initial_weight(initial, n))
@@ -183,7 +183,7 @@ def horizon_design(
         level=float(np.sqrt(level_squared)) * coordinates.unit,
         gains=np.array(found) if given_gains is None else given_gains,
         weights=np.array([coordinates.weight(weight, k) for k, weight in enumerate(weights)]),
-        multipliers=all_multipliers(system, multipliers, separate),
+        multipliers=complete_multipliers(system, multipliers, separate),
         feasible=True,
         status=status,
     )
@@ -209,7 +209,7 @@ class _Recursion:
 
     def __init__(self, system: GrowthSystem, objective: Objective, solver: Solver, separate: bool):
         self.system, self.objective, self.solver, self.separate = system, objective, solver, separate
-        self.steps, self.coordinates = scale_steps(system, step_matrices(system, separate))
+        self.steps, self.coordinates = scale_steps(system, list_step_matrices(system, separate))
         self.layout = UnknownsLayout(system.states, system.received, len(self.steps[0].growth))
         self.compiled: list[tuple[StepMatrices, tuple[float, float], np.ndarray | None, StepProblem]] = []
 
@@ -246,7 +246,7 @@ class _Recursion:
             design.gains[k] = coordinates.gain(step.nominal + _gain_correction(unknowns), k)
             design.weights[k + 1] = level_squared * coordinates.weight(weight, k + 1)
             multipliers = level_squared * coordinates.multipliers(unknowns, k)
-            design.multipliers[k] = all_multipliers(system, multipliers, self.separate)
+            design.multipliers[k] = complete_multipliers(system, multipliers, self.separate)
         return design._replace(feasible=True, status="optimal")
 
     def _find_problem(self, k: int, start: Float[np.ndarray, "w w"] | None) -> StepProblem:
@@ -285,7 +285,7 @@ def _inequality_holds(
     gain = _gain_correction(unknowns)
     exact = unknowns._replace(product=unknowns.error @ gain, gain_square=gain.T @ unknowns.error @ gain)
     positive = min(np.linalg.eigvalsh(unknowns.state)[0], np.linalg.eigvalsh(unknowns.error)[0]) > 0
-    return bool(positive and np.linalg.eigvalsh(next_energy(step, exact) + fixed)[-1] < -strictness)
+    return bool(positive and np.linalg.eigvalsh(compute_next_energy(step, exact) + fixed)[-1] < -strictness)
 
 
 def _gain_correction(unknowns: Unknowns) -> Float[np.ndarray, "n m"]:

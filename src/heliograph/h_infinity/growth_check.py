@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 from typing_extensions import TypeAliasType
 
-from heliograph.h_infinity.interval import Interval, UnknownError, evaluate
+from heliograph.h_infinity.interval import Interval, UnknownError, bound_program
 from heliograph.numerics.check import array, check_seed, error_text, fail, flag, scalar
 from heliograph.numerics.check import function as check_callable
 from heliograph.numerics.float64 import compile_in_float64
@@ -342,7 +342,7 @@ def slope_bound(
             # The function itself over the whole box: refused unless it is continuous.
             values = jax.vmap(lambda x: jnp.atleast_1d(function(x)))
             whole_box = Interval(np.tile(low, (BOXES, 1)), np.tile(high, (BOXES, 1)))
-            evaluate(jax.make_jaxpr(values)(example), [whole_box], continuous=True)
+            bound_program(jax.make_jaxpr(values)(example), [whole_box], continuous=True)
             slopes = jax.make_jaxpr(jax.vmap(jax.jacfwd(lambda x: jnp.atleast_1d(function(x)))))(example)
             return SlopeBound(_sharpen_bound(slopes, low, high, goal), "")
     except UnknownError as reason:
@@ -375,7 +375,7 @@ def _bound_slopes(
     # The program is for BOXES boxes: fewer are padded.
     padding = BOXES - len(low)
     ends = [np.concatenate([end, np.repeat(end[-1:], padding, axis=0)]) for end in (low, high)]
-    (jacobian,) = evaluate(slopes, [Interval(*ends)], continuous=False)
+    (jacobian,) = bound_program(slopes, [Interval(*ends)], continuous=False)
     # |J| <= |C| + |R| for J in C +- R.
     finite = np.isfinite(jacobian.low) & np.isfinite(jacobian.high)
     least, largest = np.where(finite, jacobian.low, 0.0), np.where(finite, jacobian.high, 0.0)

@@ -34,7 +34,7 @@ class Interval(NamedTuple):
     high: Numbers
 
 
-def evaluate(jaxpr: core.ClosedJaxpr, arguments: Sequence[Interval], continuous: bool) -> list[Interval]:
+def bound_program(jaxpr: core.ClosedJaxpr, arguments: Sequence[Interval], continuous: bool) -> list[Interval]:
     """Return intervals that hold a traced function's results wherever its arguments lie in these intervals.
 
     Args:
@@ -59,9 +59,9 @@ def evaluate(jaxpr: core.ClosedJaxpr, arguments: Sequence[Interval], continuous:
         inputs = [read(atom) for atom in equation.invars]
         name = equation.primitive.name
         if (called := called_program(equation)) is not None:
-            results = evaluate(called, inputs, continuous)
+            results = bound_program(called, inputs, continuous)
         elif name == "mul" and equation.invars[0] is equation.invars[1]:  # x x is never below 0, as x y may be
-            results = [_square(inputs[0])]
+            results = [_bound_square(inputs[0])]
         elif name == "stop_gradient" and continuous and not np.array_equal(*inputs[0]):  # no point
             raise UnknownError("a slope that is stopped")
         # What moves entries about, and whole numbers, are not rounded: the ends' results are the ends.
@@ -118,10 +118,10 @@ def _apply_operation(equation: Any, x: list[Interval], continuous: bool) -> Inte
             return point_interval(equation.primitive.bind(**params))
         # What may be true in a part of the interval alone is not decided.
         case "lt" | "le" | "gt" | "ge" | "eq" | "ne":
-            return _decide(_compare(name, *x), continuous)
+            return _check_decided(_compare(name, *x), continuous)
         case "sign":
             sign = Interval(np.sign(x[0].low), np.sign(x[0].high))
-            return _decide(sign, continuous)
+            return _check_decided(sign, continuous)
         case "and" | "or":
             combine = np.logical_and if name == "and" else np.logical_or
             return Interval(combine(x[0].low, x[1].low), combine(x[0].high, x[1].high))
@@ -132,7 +132,7 @@ def _apply_operation(equation: Any, x: list[Interval], continuous: bool) -> Inte
     raise UnknownError(name)
 
 
-def _decide(interval: Interval, continuous: bool) -> Interval:
+def _check_decided(interval: Interval, continuous: bool) -> Interval:
     """Return the interval of a decision, refused where it is open and the function has to be continuous."""
     if continuous and not np.array_equal(interval.low, interval.high):
         raise UnknownError("a decision that depends on where in the region x is")
@@ -146,11 +146,11 @@ def _apply_to_ends(equation: Any, x: list[Interval]) -> list[Interval]:
     """
     if any(a.low.dtype.kind in "iu" and not np.array_equal(a.low, a.high) for a in x):
         raise UnknownError("a place that depends on x")
-    lows, highs = _compute(equation, [a.low for a in x]), _compute(equation, [a.high for a in x])
+    lows, highs = _apply_to_numbers(equation, [a.low for a in x]), _apply_to_numbers(equation, [a.high for a in x])
     return [Interval(low, high) for low, high in zip(lows, highs, strict=True)]
 
 
-def _compute(equation: Any, ends: list[Numbers]) -> list[Numbers]:
+def _apply_to_numbers(equation: Any, ends: list[Numbers]) -> list[Numbers]:
     """Return the operation's results on numbers."""
     outputs = equation.primitive.bind(*map(jax.device_put, ends), **equation.params)
     return list(map(np.asarray, outputs if equation.primitive.multiple_results else [outputs]))
@@ -187,7 +187,7 @@ def _select_case(x: list[Interval]) -> Interval:
     return Interval(low.astype(kind), high.astype(kind))
 
 
-def _multiply(a: Interval, b: Interval) -> tuple[Numbers, Numbers]:
+def _bound_product(a: Interval, b: Interval) -> tuple[Numbers, Numbers]:
     """Return the least and the largest product of ends, not rounded outward."""
     ends = [x * y for x in a for y in b]
     # 0 times an infinite end is 0 for every finite number near it; the other ends say the rest.
@@ -204,7 +204,7 @@ def _bound_quotient(a: Interval, b: Interval) -> Interval:
     return round_outward(np.where(holds_zero, -np.inf, low), np.where(holds_zero, np.inf, high))
 
 
-def _square(a: Interval) -> Interval:
+def _bound_square(a: Interval) -> Interval:
     """Return the interval of x^2, from 0 where x may be 0; as x * x it would begin at low * high."""
     low, high = np.minimum(a.low**2, a.high**2), np.maximum(a.low**2, a.high**2)
     square = round_outward(np.where((a.low <= 0) & (a.high >= 0), 0.0, low), high)
@@ -216,12 +216,12 @@ def _raise_interval_to_power(a: Interval, exponent: int) -> Interval:
     if exponent < 0:
         return _bound_quotient(point_interval(np.ones_like(a.low)), _raise_interval_to_power(a, -exponent))
     if exponent % 2 == 0:
-        inner = _absolute(a)
+        inner = _bound_absolute(a)
         return round_outward(inner.low**exponent, inner.high**exponent, ULPS)
     return round_outward(a.low**exponent, a.high**exponent, ULPS)
 
 
-def _absolute(a: Interval) -> Interval:
+def _bound_absolute(a: Interval) -> Interval:
     """Return the interval of |x|, from 0 where x may be 0."""
     least, largest = np.minimum(np.abs(a.low), np.abs(a.high)), np.maximum(np.abs(a.low), np.abs(a.high))
     return Interval(np.where((a.low <= 0) & (a.high >= 0), 0.0, least), largest)
@@ -279,7 +279,7 @@ def _bound_contraction(a: Interval, b: Interval, dimensions: Contraction) -> Int
     free_b = b.low.ndim - len(right) - len(left_batch)
     wide_a = Interval(*(lay_out(end, left, left_batch, 0, free_b) for end in a))
     wide_b = Interval(*(lay_out(end, right, right_batch, free_a, 0) for end in b))
-    product = round_outward(*_multiply(wide_a, wide_b))
+    product = round_outward(*_bound_product(wide_a, wide_b))
     axes = tuple(range(product.low.ndim - len(left), product.low.ndim))
     return _sum_intervals(product, axes)
 
@@ -288,14 +288,16 @@ ARITHMETIC: dict[str, Callable[..., Interval]] = {
     "add": lambda a, b: round_outward(a.low + b.low, a.high + b.high),
     "add_any": lambda a, b: round_outward(a.low + b.low, a.high + b.high),
     "sub": lambda a, b: round_outward(a.low - b.high, a.high - b.low),
-    "mul": lambda a, b: round_outward(*_multiply(a, b)),
+    "mul": lambda a, b: round_outward(*_bound_product(a, b)),
     "div": _bound_quotient,
     "neg": lambda a: Interval(-a.high, -a.low),
     "max": lambda a, b: Interval(np.maximum(a.low, b.low), np.maximum(a.high, b.high)),
     "min": lambda a, b: Interval(np.minimum(a.low, b.low), np.minimum(a.high, b.high)),
-    "abs": _absolute,
-    "square": _square,
-    "one_minus_square": lambda a: ARITHMETIC["sub"](point_interval(np.ones_like(a.low)), _square(a)),  # a slope of tanh
+    "abs": _bound_absolute,
+    "square": _bound_square,
+    "one_minus_square": lambda a: ARITHMETIC["sub"](
+        point_interval(np.ones_like(a.low)), _bound_square(a)
+    ),  # a slope of tanh
     "exp": _extend_monotone(np.exp, 0.0),
     "log": _extend_monotone(lambda x: np.where(x > 0, np.log(np.maximum(x, 0.0)), np.nan)),
     "log1p": _extend_monotone(lambda x: np.where(x > -1, np.log1p(np.maximum(x, -1.0)), np.nan)),

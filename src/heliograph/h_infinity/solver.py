@@ -15,8 +15,8 @@ from heliograph.h_infinity.step_inequality import (
     StepMatrices,
     Unknowns,
     UnknownsLayout,
-    independent_parts,
-    linear_forms,
+    find_independent_parts,
+    make_linear_forms,
 )
 from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.process.extras import how_to_install
@@ -108,7 +108,7 @@ class StepProblem:
         self.layout, self.solver = layout, solver
         self.unknowns = cp.Variable(layout.size)
         self.fixed = cp.Parameter(step.energy.shape, symmetric=True)
-        forms, n = linear_forms(step, layout), layout.states
+        forms, n = make_linear_forms(step, layout), layout.states
         constraints = self._list_constraints(cp, step, forms, start)
         # Objectives on L, one problem after another; `reached`: the best value of the first, which the next keeps.
         weight = cp.reshape(forms.weight @ self.unknowns, (2 * n, 2 * n), order="C")
@@ -126,7 +126,7 @@ class StepProblem:
         q, layout = len(step.energy), self.layout
         phi = cp.reshape(forms.next @ self.unknowns, (q, q), order="C") + self.fixed
         constraints = [self.unknowns[layout.size - layout.multipliers :] >= 0]
-        for coupled in independent_parts(step, forms, start):
+        for coupled in find_independent_parts(step, forms, start):
             constraints.append(phi[coupled][:, coupled] << -MARGIN * np.eye(len(coupled)))
         for form in forms.positive:
             size = math.isqrt(len(form))
@@ -238,7 +238,7 @@ class HorizonProblem:
             # The forms of the step before serve an equal step with free gains.
             is_like_last = forms is not None and layout.gain is None and all(map(np.array_equal, step, steps[k - 1]))
             if forms is None or not is_like_last:
-                forms = linear_forms(step, layout)
+                forms = make_linear_forms(step, layout)
             self._add_step(k, step, forms, before, fixed, start)
             multipliers = self.unknowns[self.places[k + 1]][layout.size - layout.multipliers :]
             self.constraints.append(multipliers >= 0)
@@ -270,7 +270,7 @@ class HorizonProblem:
         # the places of the part's matrix in the flat q x q one.
         constant = -step.target
         constant[:width, :width] += fixed
-        for coupled in independent_parts(step, forms, start):
+        for coupled in find_independent_parts(step, forms, start):
             entries = (coupled[:, None] * q + coupled).ravel()
             blocks = {0: (step.energy - MARGIN * np.eye(q)).ravel()[entries][:, None], k + 1: -forms.next[entries]}
             for index, form in before.items():

@@ -51,7 +51,7 @@ class Unknowns(NamedTuple):
     multipliers: Float[np.ndarray, "multipliers"]
 
 
-def step_matrices(system: GrowthSystem, separate: bool) -> list[StepMatrices]:
+def list_step_matrices(system: GrowthSystem, separate: bool) -> list[StepMatrices]:
     """Return the matrices of every step; a function that is zero throughout, as a linear h, is left out of eta.
 
     `separate`: one multiplier for each of f, f~, h, h~ in place of one for (f, f~) and one for (h, h~).
@@ -63,7 +63,7 @@ def step_matrices(system: GrowthSystem, separate: bool) -> list[StepMatrices]:
     return [_make_step_matrices(system, k, padded[k], separate) for k in range(system.steps)]
 
 
-def all_multipliers(
+def complete_multipliers(
     system: GrowthSystem, given: Float[np.ndarray, "*steps present"], separate: bool
 ) -> Float[np.ndarray, "*steps count"]:
     """Return all multipliers, zeros for functions that were left out: (steps, 4) for f, f~, h, h~, or (steps, 2).
@@ -170,7 +170,7 @@ def _make_growth_form(q: int, parts: list[tuple[slice, slice, float]]) -> Float[
     return diagonal
 
 
-def next_energy(step: StepMatrices, unknowns: Unknowns) -> Float[np.ndarray, "q q"]:
+def compute_next_energy(step: StepMatrices, unknowns: Unknowns) -> Float[np.ndarray, "q q"]:
     """Return the quadratic form E[next weight of (x+, e+)] + sum_i lambda_i N_i of eta, linear in the unknowns."""
     X, E, U = step.state, step.error, step.received
     p1, p2, Y, Z, multipliers = unknowns
@@ -244,10 +244,10 @@ class LinearForms(NamedTuple):
     weight: Float[np.ndarray, "ww size"]
 
 
-def linear_forms(step: StepMatrices, layout: UnknownsLayout) -> LinearForms:
+def make_linear_forms(step: StepMatrices, layout: UnknownsLayout) -> LinearForms:
     """Return the linear forms of a step, whose columns are their values at the unit vectors of the unknowns."""
     units = [layout.unpack(unit) for unit in np.eye(layout.size)]
-    forward = np.array([next_energy(step, u).ravel() for u in units]).T
+    forward = np.array([compute_next_energy(step, u).ravel() for u in units]).T
     positive = [np.array([u.state.ravel() for u in units]).T]
     if layout.gain is None:
         positive.append(
@@ -255,17 +255,17 @@ def linear_forms(step: StepMatrices, layout: UnknownsLayout) -> LinearForms:
         )
     else:
         positive.append(np.array([u.error.ravel() for u in units]).T)
-    return LinearForms(forward, tuple(positive), weight_form(layout))
+    return LinearForms(forward, tuple(positive), make_weight_form(layout))
 
 
-def weight_form(layout: UnknownsLayout) -> Float[np.ndarray, "ww size"]:
+def make_weight_form(layout: UnknownsLayout) -> Float[np.ndarray, "ww size"]:
     """Return the linear map from the vector of unknowns to diag(P1, P2), written row by row."""
     units = [layout.unpack(unit) for unit in np.eye(layout.size)]
     upper, lower = np.diag([1.0, 0.0]), np.diag([0.0, 1.0])
     return np.array([(np.kron(upper, u.state) + np.kron(lower, u.error)).ravel() for u in units]).T
 
 
-def independent_parts(
+def find_independent_parts(
     step: StepMatrices, forms: LinearForms, start: Float[np.ndarray, "w w"] | None = None
 ) -> list[Int[np.ndarray, "_"]]:
     """Return the index sets of eta that Phi never couples: a smaller inequality for each says the same.

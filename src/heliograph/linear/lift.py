@@ -205,7 +205,7 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
         steps,
         mean=mean,
         covariance=spread,
-        projection=linear_rows(n, degree),
+        projection=make_linear_rows(n, degree),
         rounding=process_rounding,
         received_rounding=received_rounding,
         start_rounding=EPS * np.diag(second)[:-1],
@@ -224,7 +224,9 @@ def _lift_chain(
     distinct = {id(r.measurement): r.measurement for r in routes}
     modes_by_id = {i: joint_modes(measurement, order=degree) for i, measurement in distinct.items()}
     refuse_lift(degree, n, m, len(routes), max(len(modes.initial) for modes in modes_by_id.values()))
-    projection = np.pad(linear_rows(n, degree), ((0, 0), (0, 1)))  # Y ends with the constant 1, which x has no part of
+    projection = np.pad(
+        make_linear_rows(n, degree), ((0, 0), (0, 1))
+    )  # Y ends with the constant 1, which x has no part of
     chains = [modes_by_id[id(r.measurement)] for r in routes]
     return lift_modes([r.plant for r in routes], chains, degree, moments, projection)
 
@@ -262,8 +264,8 @@ def _lift_steps(
         moments = plant_lift.push(moments)
         check_finite_moments(moments, k, 2 * degree)
         noise, rounding_of_noise = measurement_lift.conditional_spread(moments)
-        transition, drift = affine(plant_lift.matrix)
-        output, offset = affine(measurement_lift.matrix)
+        transition, drift = split_homogeneous(plant_lift.matrix)
+        output, offset = split_homogeneous(measurement_lift.matrix)
         steps.append(Steps(transition, drift, process, output, offset, noise))
         roundings.append((rounding_of_process, rounding_of_noise))
     over_time = Steps(*(repeat_last(values, len(routes)) for values in zip(*steps, strict=True)))
@@ -341,14 +343,14 @@ def mean_and_spread(
     return mean, second[:-1, :-1] + rounding - np.outer(mean, mean)
 
 
-def affine(
+def split_homogeneous(
     homogeneous: Float[np.ndarray, "m n"],
 ) -> tuple[Float[np.ndarray, "m-1 n-1"], Float[np.ndarray, "m-1"]]:
     """Return the matrix and offset of a homogeneous matrix [[A, a], [0, 1]]."""
     return homogeneous[:-1, :-1], homogeneous[:-1, -1]
 
 
-def linear_rows(variables: int, degree: int, expected: int | None = None) -> Float[np.ndarray, "wanted monomials"]:
+def make_linear_rows(variables: int, degree: int, expected: int | None = None) -> Float[np.ndarray, "wanted monomials"]:
     """Return rows that read the first `expected` variables off their C(variables + degree, degree) - 1 monomials."""
     places = {powers: i for i, powers in enumerate(list_exponents(variables + 1, degree))}
     rows = np.zeros((variables if expected is None else expected, len(places) - 1))

@@ -3,7 +3,7 @@
 import numpy as np
 
 from heliograph.linear.jump_system import mix_modes, propagate_by_mode
-from heliograph.linear.step_maps import each_step
+from heliograph.linear.step_maps import list_checked_steps
 from heliograph.linear.system import LinearSystem, Steps
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import first
@@ -55,7 +55,7 @@ def modal_system(
     mean = np.append(array("initial mean", initial_mean, (n,)), 1.0)
     spread = np.pad(covariance("initial covariance", initial_covariance, n), ((0, 1), (0, 1)))
     wanted = np.eye(n) if projection is None else array("what is to be known", projection, (None, n))
-    pairs = zip(each_step(move, horizon), each_step(measure, horizon), strict=True)
+    pairs = zip(list_checked_steps(move, horizon), list_checked_steps(measure, horizon), strict=True)
     modes_by_step = [joint_modes(Stack(pair)) for pair in pairs]
     # E_i = E[y~ y~' 1{i}] and Cov(y~ 1{i}) at the start, where the chain of the modes has not moved yet.
     law, chain = np.asarray(modes_by_step[0].initial), np.eye(len(modes_by_step[0].initial))

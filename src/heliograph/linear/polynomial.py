@@ -7,12 +7,12 @@ from itertools import combinations_with_replacement
 import numpy as np
 
 from heliograph.linear.lift import (
-    affine,
     initial_monomial_moments,
     lifted_system,
-    linear_rows,
+    make_linear_rows,
     mean_and_spread,
     refuse_lift,
+    split_homogeneous,
 )
 from heliograph.linear.recursion import lmmse
 from heliograph.linear.step_maps import check_model, make_step_maps
@@ -81,13 +81,13 @@ def quadratic_system_with_linear_estimate(
         next_second = products_of_monomials(moments, total + 1, 2)
         # Cov(w) = E[Y+ Y+'] - M E[Y Y'] M'.
         process = next_second - transition @ second @ transition.T
-        matrix, drift = affine(transition)
+        matrix, drift = split_homogeneous(transition)
         no_offset, no_noise = np.zeros(len(received)), np.zeros((len(received), len(received)))
         steps.append(Steps(matrix, drift, process[:-1, :-1], received, no_offset, no_noise))
         rounding.append(np.finfo(float).eps * np.diag(next_second)[:-1])
         second = next_second
     over_time = Steps(*map(np.array, zip(*steps, strict=True)))
-    system = LinearSystem(over_time, mean, spread, projection=linear_rows(total, 2, n), rounding=rounding)
+    system = LinearSystem(over_time, mean, spread, projection=make_linear_rows(total, 2, n), rounding=rounding)
     return on_premise(system, Premise(plant, sensor, channel, order=4))
 
 

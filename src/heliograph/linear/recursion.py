@@ -79,7 +79,7 @@ def _root_with_rounding(covariance: Float[np.ndarray, "n n"], seconds: Float[np.
     return np.concatenate([roots_of(covariance), rounding.matrix * np.sqrt(rounding.weights)], axis=1)
 
 
-def covariance_step(root: Float[np.ndarray, "N _"], s: Steps, noises: NoiseRoots) -> RecursionStep:
+def step_covariance(root: Float[np.ndarray, "N _"], s: Steps, noises: NoiseRoots) -> RecursionStep:
     """Return P- = A P A' + Cov(w), O = C P- C' + Cov(v), G = P- C' O^-1, P = P- - G C P-, on roots.
 
     O may be singular (products of a measurement with few values repeat): what repeats has the gain zero.
@@ -120,7 +120,7 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
         s = system.step(k)
         if 0 < k <= steady_from:  # later steps have the noises of step `steady_from`
             noises = take_noise_roots(s, second_moments)
-        step = covariance_step(root, s, noises)
+        step = step_covariance(root, s, noises)
         gains, root = _make_gains(system, s, step), step.root
         rounding = rounding.after_step(system, k, s, gains)
         gains_by_step.append(gains)

@@ -43,8 +43,8 @@ def check_model(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> None:
 
 def make_step_maps(plant: AnyPlant, sensor: AnySensor, channel: Channel, order: int, horizon: int) -> list[StepMaps]:
     """Return the maps of each step, with the noises' moments up to `order` computed once for what does not vary."""
-    plants = _convert_models(each_step(plant, horizon), order)
-    sensors, channels = each_step(sensor, horizon), each_step(channel, horizon)
+    plants = _convert_models(list_checked_steps(plant, horizon), order)
+    sensors, channels = list_checked_steps(sensor, horizon), list_checked_steps(channel, horizon)
     if not isinstance(sensor, OverTime) and not isinstance(channel, OverTime):
         measurements = [_make_measurement_maps(sensors[:1], channels[:1], order)[0]] * horizon
     else:
@@ -84,7 +84,7 @@ def _convert_models(models: Sequence[PyTree], order: int) -> list[GainAndNoise]:
     return maps
 
 
-def each_step(model: T | OverTime, horizon: int) -> list[T]:
+def list_checked_steps(model: T | OverTime, horizon: int) -> list[T]:
     """Return a plant, sensor or channel at each of `horizon` steps."""
     check_horizon(horizon)
     check_horizon(horizon, steps_covered(model))

@@ -24,8 +24,8 @@ from heliograph.model.over_time import first
 from heliograph.model.trigger import AbstractTrigger
 from heliograph.numerics.caching import share_by_object
 from heliograph.numerics.float64 import understood
-from heliograph.numerics.trees.program_text import hash_numbers, text_of
-from heliograph.numerics.trees.static import Static, cast
+from heliograph.numerics.trees.program_text import hash_numbers, write_program_text
+from heliograph.numerics.trees.static import Static, split_structure
 from heliograph.numerics.types import Float, PyTree
 from straightline import Unsupported, compile_one
 
@@ -267,7 +267,7 @@ class CompiledFilter:
             self.values = filter.received - sender.trigger.side_information(sender.outputs)
         # The filter in double precision as arrays and the rest; its initial state.
         with jax.enable_x64(True):
-            self.numbers, self._static = cast(filter)
+            self.numbers, self._static = split_structure(filter)
             self._start: PyTree = jax.device_put(jax.tree.map(np.asarray, filter.init()))  # no program for each shape
         self.state: PyTree = jax.tree.structure(self._start)
         self.layout = {path: part.shape for path, part in split_by_path(self._start).items()}
@@ -292,7 +292,9 @@ class CompiledFilter:
     def identity(self) -> Identity:
         """Return versions, names, numbers and a hash of the step's program, whichever engine runs it."""
         with jax.enable_x64(True):
-            text = text_of(compile_xla_step(self._static).trace(self.numbers, self._start, *self._data).jaxpr)
+            text = write_program_text(
+                compile_xla_step(self._static).trace(self.numbers, self._start, *self._data).jaxpr
+            )
         filter = self.filter
         return {
             **versions(),

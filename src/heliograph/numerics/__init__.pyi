@@ -137,7 +137,7 @@ from .times.row_order import SECOND as SECOND
 from .times.row_order import YEAR as YEAR
 from .times.row_order import find_out_of_order as find_out_of_order
 from .times.row_order import find_unset_stamps as find_unset_stamps
-from .times.row_times import backwards as backwards
+from .times.row_times import find_backwards_row as find_backwards_row
 from .times.row_times import backwards_text as backwards_text
 from .times.row_times import check_times as check_times
 from .times.row_times import row_dates as row_dates
@@ -165,12 +165,12 @@ from .traced import stack_parts as stack_parts
 from .traced import trace_shape as trace_shape
 from .traced import within as within
 from .trees.flat import FlatLayout as FlatLayout
-from .trees.flat import flat_like as flat_like
-from .trees.flat import row_of as row_of
+from .trees.flat import make_flat_layout as make_flat_layout
+from .trees.flat import flatten_to_row as flatten_to_row
 from .trees.program_text import hash_numbers as hash_numbers
-from .trees.program_text import text_of as text_of
+from .trees.program_text import write_program_text as write_program_text
 from .trees.static import Static as Static
-from .trees.static import cast as cast
+from .trees.static import split_structure as split_structure
 from .types import Array as Array
 from .types import ArrayLike as ArrayLike
 from .types import Bool as Bool

@@ -71,7 +71,7 @@ def factor(a: jax.Array) -> tuple[jax.Array, jax.Array]:
         return _factor_in_loop(a)
     growth = jnp.zeros((), a.dtype)
     for j in range(n):
-        scales.append(pivot_scale(left[0, 0], a[j, j], growth))
+        scales.append(compute_pivot_reciprocal_root(left[0, 0], a[j, j], growth))
         growth = jnp.maximum(growth, a[j, j] * scales[j] * scales[j])
         column = left[:, 0] * scales[j]
         columns.append(jnp.concatenate([jnp.zeros(j, a.dtype), column]))
@@ -87,7 +87,7 @@ def _factor_in_loop(a: jax.Array) -> tuple[jax.Array, jax.Array]:
     def eliminate(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         """Take column j of the factor off what is left of the matrix, and put it in its place."""
         left, lower, scales, growth = carry
-        scale = pivot_scale(left[j, j], whole[j], growth)
+        scale = compute_pivot_reciprocal_root(left[j, j], whole[j], growth)
         column = jnp.where(np.arange(n) >= j, left[:, j] * scale, 0.0)
         growth = jnp.maximum(growth, whole[j] * scale * scale)
         here = np.arange(n) == j
@@ -99,7 +99,7 @@ def _factor_in_loop(a: jax.Array) -> tuple[jax.Array, jax.Array]:
     return lower, scales
 
 
-def pivot_scale(pivot: jax.Array, whole: jax.Array, growth: jax.Array) -> jax.Array:
+def compute_pivot_reciprocal_root(pivot: jax.Array, whole: jax.Array, growth: jax.Array) -> jax.Array:
     """Return 1 / root of a pivot; 0 of one that is zero up to rounding of the `whole` entry, NaN of a negative one.
 
     `whole` is the diagonal entry of the matrix, of which the pivot is left. `growth` is the largest ratio of a diagonal

@@ -53,22 +53,24 @@ def refuse_attribute(owner: object, name: str, remedies: Mapping[str, str] | Non
 
 def suggest_names(name: str, known: Mapping[str, str]) -> str:
     """Return the end of a message that offers the known names most like one that does not exist."""
-    near = closest(name, known)
+    near = list_closest_names(name, known)
     return f"; closest: {', '.join(near)}" if near else ""
 
 
-def closest(name: str, known: Mapping[str, str]) -> list[str]:
+def list_closest_names(name: str, known: Mapping[str, str]) -> list[str]:
     """Return what stands for the known names most like a name, the nearest first; capitals and _ count for nothing."""
     plain: dict[str, str] = {}
     for public, shown in known.items():
-        plain.setdefault(_plain(public), shown)
-    meant = [candidate for candidate in plain if candidate == MEANT.get(_plain(name))]
-    alike = get_close_matches(_plain(name), plain, MOST, ALIKE)
-    around = [candidate for candidate in plain if len(name) > 2 and _plain(name) in candidate]  # kalman: kalman_filter
+        plain.setdefault(_strip_name(public), shown)
+    meant = [candidate for candidate in plain if candidate == MEANT.get(_strip_name(name))]
+    alike = get_close_matches(_strip_name(name), plain, MOST, ALIKE)
+    around = [
+        candidate for candidate in plain if len(name) > 2 and _strip_name(name) in candidate
+    ]  # kalman: kalman_filter
     return [plain[candidate] for candidate in dict.fromkeys([*meant, *alike, *around])][:MOST]
 
 
-def _plain(name: str) -> str:
+def _strip_name(name: str) -> str:
     """Return a name in small letters without underscores."""
     return name.lower().replace("_", "")
 

@@ -58,7 +58,7 @@ def warn_of_single(name: str, value: object) -> None:
     rounded = find_rounded_to_single(value)
     if rounded is not None:
         got = f"a JAX array of single precision of shape {np.asarray(value).shape}"
-        _say(f"{name}: expected double precision, got {got}, {describe_rounded(rounded)}; make it {DOUBLE}")
+        _warn_once(f"{name}: expected double precision, got {got}, {describe_rounded(rounded)}; make it {DOUBLE}")
 
 
 def describe_rounded(rounded: tuple[float, float]) -> str:
@@ -67,7 +67,7 @@ def describe_rounded(rounded: tuple[float, float]) -> str:
 
 
 @cache
-def _say(text: str) -> None:
+def _warn_once(text: str) -> None:
     """Warn once in a process, at the line that called the check of a user's array."""
     warnings.warn(text, stacklevel=4)
 

@@ -336,7 +336,7 @@ class RelaySide(NamedTuple):
     noise: Float[jax.Array, "*time d+r d+r"]
 
 
-def relay_side(step: RelaySteps, moments: Float[Array, "d d"], gain: Float[Array, "Fn R"]) -> RelaySide:
+def make_relay_side(step: RelaySteps, moments: Float[Array, "d d"], gain: Float[Array, "Fn R"]) -> RelaySide:
     """Return the linear system of zeta = (x, e_1 ... e_relays) that the receiver estimates, in one step.
 
     Args:
@@ -368,12 +368,12 @@ def relay_side(step: RelaySteps, moments: Float[Array, "d d"], gain: Float[Array
 
 @compile_in_float64
 def _list_relay_sides(steps: RelaySteps, start: Float[Array, "d d"], gains: Float[Array, "time Fn R"]) -> RelaySide:
-    """Return the system of (x, e_relays) that `relay_side` describes, at each step."""
+    """Return the system of (x, e_relays) that `make_relay_side` describes, at each step."""
 
     def move(moments: jax.Array, row: tuple[RelaySteps, jax.Array]) -> tuple[jax.Array, RelaySide]:
         """Return the moments after a step, and the system at it."""
         step, gain = row
         after = correct_moments(step_moments(step, moments)[0], gain * step.receives_in_slot)
-        return after, relay_side(step, moments, gain)
+        return after, make_relay_side(step, moments, gain)
 
     return jax.lax.scan(move, jnp.asarray(start), (steps, jnp.asarray(gains)))[1]

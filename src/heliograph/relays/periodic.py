@@ -20,8 +20,8 @@ from heliograph.relays.design import (
     RelaySide,
     join_gains,
     make_design,
+    make_relay_side,
     relay_gains,
-    relay_side,
     split_gains,
     start_moments,
 )
@@ -150,7 +150,7 @@ def steady_receiver_covariance(steps: RelaySteps, gains: Float[Array, "slots Fn 
         gains: of all filters as one block matrix for each slot; those of the receiver are not used.
     """
     moments = steady_moments(steps, gains).moments[:-1]
-    sides = jax.vmap(relay_side)(steps, moments, gains)
+    sides = jax.vmap(make_relay_side)(steps, moments, gains)
     d = sides.transition.shape[-1]
 
     def predict(covariance: jax.Array, side: RelaySide) -> jax.Array:

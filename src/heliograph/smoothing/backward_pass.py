@@ -94,12 +94,12 @@ def sweep_means(steps: SmootherStep) -> jax.Array:
         """Smooth the mean between two steps, given the smoothed one after both."""
         previous, step = pair
         mean = step.mean_back(later)
-        return mean, _plant_mean(previous, mean)
+        return mean, _take_plant_mean(previous, mean)
 
     last = take_step(steps, -1)
     end = jnp.asarray(last.mean)
     _, earlier = jax.lax.scan(body, end, _pair_with_next(steps), reverse=True)
-    return _append_last(earlier, _plant_mean(last, end))
+    return _append_last(earlier, _take_plant_mean(last, end))
 
 
 def sweep_over_lag(steps: SmootherStep, lag: int | Int[Array, ""]) -> Estimate:
@@ -139,7 +139,7 @@ def carry_ahead(steps: SmootherStep, step: int) -> Estimate:
     return whole
 
 
-def _plant_mean(step: SmootherStep, mean: jax.Array) -> jax.Array:
+def _take_plant_mean(step: SmootherStep, mean: jax.Array) -> jax.Array:
     """Return the mean of the plant's state for this mean of the filter's."""
     return jnp.asarray(step.estimate_from(step.after._replace(mean=mean)).mean)
 

@@ -71,13 +71,13 @@ def _draw_path_back(steps: SmootherStep, key: jax.Array) -> jax.Array:
         left, manifold = step.before.left, step.manifold
         mean = step.before.mean_given(manifold.unsettle(step.before.ahead, later))
         x = manifold.settle(left.mean, _draw_gaussian(left._replace(mean=mean), key))
-        return x, _plant_state(previous, x)
+        return x, _take_plant_state(previous, x)
 
     last, keys = take_step(steps, -1), jax.random.split(key, len(steps.mean))
     end = last.manifold.settle(last.after.mean, _draw_gaussian(last.after, keys[-1]))
     pairs = take_steps(steps, slice(None, -1)), take_steps(steps, slice(1, None)), keys[:-1]
     _, earlier = jax.lax.scan(body, end, pairs, reverse=True)
-    return jnp.concatenate([earlier, _plant_state(last, end)[None]])
+    return jnp.concatenate([earlier, _take_plant_state(last, end)[None]])
 
 
 def _draw_gaussian(law: Gaussian, key: jax.Array) -> jax.Array:
@@ -86,7 +86,7 @@ def _draw_gaussian(law: Gaussian, key: jax.Array) -> jax.Array:
     return jnp.asarray(law.mean + law.root @ (square_root(law.variances) * normal))
 
 
-def _plant_state(step: SmootherStep, x: jax.Array) -> jax.Array:
+def _take_plant_state(step: SmootherStep, x: jax.Array) -> jax.Array:
     """Return the plant's state x of the filter's, angles between -pi and pi."""
     x = x if step.projection is None else step.projection @ x
     return wrap_angles(x if step.shift is None else x + step.shift, step.angles)

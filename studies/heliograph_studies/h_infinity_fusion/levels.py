@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 import heliograph as hg
-from heliograph.h_infinity.certificate import theorem_matrix
+from heliograph.h_infinity.certificate import make_theorem_matrix
 from heliograph.h_infinity.solver import Objective
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import Float
@@ -218,7 +218,7 @@ def enumeration_gap(setting: Setting, node: int, seed: int = 0) -> float:
             weights[:, block, block] = root @ np.swapaxes(root, 1, 2)
         trial = Trial(random.normal(size=(2, 2)), weights[0], weights[1], random.uniform(size=2))
         eta = random.normal(size=sum(WIDTHS))
-        phi = theorem_matrix(system, 0, *trial[:3], np.repeat(trial.multipliers, 2), level)
+        phi = make_theorem_matrix(system, 0, *trial[:3], np.repeat(trial.multipliers, 2), level)
         counted, size = _counted(setting, node, trial, np.split(eta, np.cumsum(WIDTHS)[:-1]))
         worst = max(worst, abs(float(eta @ phi @ eta) - counted) / size)
     return worst

@@ -24,9 +24,9 @@ def test_with_the_papers_start_only_the_start_counts():
 
 def test_theorem_1_survives_enumeration_and_the_enumeration_finds_a_wrong_term(monkeypatch):
     assert all(levels.enumeration_gap(SETTING, i) < 1e-14 for i in range(4))  # rounding
-    honest = levels.theorem_matrix
+    honest = levels.make_theorem_matrix
     off = SETTING.system(1, hop=lambda uplink, noise: SETTING.lossy(uplink, noise if uplink else 1.01 * noise))
-    monkeypatch.setattr(levels, "theorem_matrix", lambda system, *rest: honest(off, *rest))
+    monkeypatch.setattr(levels, "make_theorem_matrix", lambda system, *rest: honest(off, *rest))
     assert levels.enumeration_gap(SETTING, 1) > 1e-6  # one noise's variance 1 % too large
 
 

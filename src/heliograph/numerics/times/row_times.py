@@ -39,7 +39,7 @@ def check_times(name: str, value: ArrayLike, count: int) -> np.ndarray:
     elif clock.shape != (count,) or np.isnat(clock).any():
         missing = np.count_nonzero(np.isnat(clock))
         raise fail(name, f"{count} dates", f"shape {clock.shape}, {missing} of them missing")
-    row = backwards(clock)
+    row = find_backwards_row(clock)
     if row is not None:
         raise fail(name, "times that do not go backwards", f"{backwards_text(clock, row)} in row {row + 1}")
     return clock
@@ -134,7 +134,7 @@ def _is_moment(part: object) -> bool:
     return _is_date(part)
 
 
-def backwards(clock: np.ndarray) -> int | None:
+def find_backwards_row(clock: np.ndarray) -> int | None:
     """Return the first row whose time is before that of the row above, None if there is none."""
     falls = np.flatnonzero(clock[1:] < clock[:-1])
     return int(falls[0]) + 1 if falls.size else None

@@ -31,12 +31,12 @@ class FlatLayout(NamedTuple):
         return self.structure.unflatten(parts)
 
 
-def flat_like(tree: PyTree) -> FlatLayout:
+def make_flat_layout(tree: PyTree) -> FlatLayout:
     """Return the layout of a tree of arrays."""
     leaves, structure = jax.tree.flatten(tree)
     return FlatLayout(structure, tuple(leaf.shape for leaf in leaves), tuple(str(leaf.dtype) for leaf in leaves))
 
 
-def row_of(tree: PyTree) -> jax.Array:
+def flatten_to_row(tree: PyTree) -> jax.Array:
     """Concatenate the leaves of a tree of arrays in a row of doubles."""
     return jnp.concatenate([jnp.zeros(0), *(jnp.ravel(leaf).astype(np.float64) for leaf in jax.tree.leaves(tree))])

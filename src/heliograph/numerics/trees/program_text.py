@@ -27,7 +27,7 @@ def hash_numbers(numbers: PyTree) -> str:
     return digest.hexdigest()[:DIGITS]
 
 
-def text_of(program: ClosedJaxpr) -> str:
+def write_program_text(program: ClosedJaxpr) -> str:
     """Return operations, parameters and constants, a line for each operation; inner programs by their hash.
 
     A lowered program says the same, and takes as long to write as half of the trace.

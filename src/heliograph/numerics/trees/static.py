@@ -25,7 +25,7 @@ class Static(NamedTuple):
         return self.tree.unflatten([next(rest) if leaf is None else leaf for leaf in self.parts])
 
 
-def cast(whole: object) -> tuple[list[jax.Array], Static]:
+def split_structure(whole: object) -> tuple[list[jax.Array], Static]:
     """Split an object into arrays, on the device, and its structure. To be called in the float64 scope."""
     leaves, tree = jax.tree.flatten(jax.tree.map(_convert_leaf, whole))
     numbers = [jax.device_put(leaf) for leaf in leaves if eqx.is_array(leaf)]  # no program for each shape

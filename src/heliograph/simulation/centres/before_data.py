@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.linear.plan import LinearStep
-from heliograph.fusion.cross_covariance import ErrorSources, SourceFactors, initial_factors
+from heliograph.fusion.cross_covariance import ErrorSources, SourceFactors, make_initial_factors
 from heliograph.fusion.joint_covariance_fusion import MatrixWeights
 from heliograph.fusion.joint_covariance_weights import matrix_weights, solve_factored_weights
 from heliograph.fusion.network_fusion import Fusion
@@ -216,7 +216,7 @@ def _compute_factors(filters: AllFilters, u: np.ndarray) -> SourceFactors:
     nodes, n = centre_state.errors.bias.shape
     # New sources of each step: the plant's noise, and noises of measurements where nodes share them.
     sources = n + (nodes * centre.size if isinstance(centre.observation_model, Together) else 0)
-    start = filter_states, initial_factors(centre_state.errors, sources * len(u))
+    start = filter_states, make_initial_factors(centre_state.errors, sources * len(u))
 
     def compute_matrices(states: PyTree, u_k: jax.Array, k: jax.Array) -> LinearStep:
         """Return the matrices of all nodes' filters in step k, from their states before it."""

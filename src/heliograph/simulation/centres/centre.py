@@ -16,7 +16,7 @@ from heliograph.fusion.all_reports import (
     ReportsBelief,
     correct_with_reports,
     estimate_state,
-    initial_belief,
+    make_initial_belief,
     propagate_errors,
 )
 from heliograph.fusion.cross_covariance import (
@@ -24,8 +24,8 @@ from heliograph.fusion.cross_covariance import (
     ErrorStep,
     Motion,
     SourceFactors,
-    initial_errors,
     make_error_step,
+    make_initial_errors,
     propagate_errors_jointly,
     propagate_factors,
     propagate_state,
@@ -78,7 +78,7 @@ class FusionCentre(Module):
     def init(self, starts: Sequence[jax.Array]) -> CentreState:
         """Return the state before the first step, from the initial means (node, n) of each source's filters."""
         plant = at(self.plant, 0)
-        errors = initial_errors(plant.initial_mean, plant.initial_covariance, jnp.concatenate(starts)[self.order])
+        errors = make_initial_errors(plant.initial_mean, plant.initial_covariance, jnp.concatenate(starts)[self.order])
         return CentreState(errors, {name: rule.start(errors) for name, rule in self.rules.items()})
 
     def step_errors(self, errors: ErrorMoments, filters: LinearStep, u: jax.Array, k: jax.Array) -> CentreStep:
@@ -323,7 +323,7 @@ class CentreFilter(AbstractSizedFilter):
         """Return the state before any report."""
         states, _, _, known, *_ = self.filters.init()
         errors = known[0].errors
-        return CentreBelief(states, errors, initial_belief(errors, self.ages - 1, self.widest, self.quantized))
+        return CentreBelief(states, errors, make_initial_belief(errors, self.ages - 1, self.widest, self.quantized))
 
     @predicts
     def predict(self, state: CentreBelief, u: ArrayLike = (), k: Step = 0) -> CentreBelief:

@@ -15,7 +15,7 @@ from heliograph.fusion.cross_covariance import (
     ErrorMoments,
     ErrorStep,
     Motion,
-    initial_errors,
+    make_initial_errors,
     propagate_errors_jointly,
 )
 from heliograph.fusion.joint_covariance_fusion import AbstractInformedFusion, CentreStep
@@ -62,7 +62,7 @@ class LinearisedCentre(Module):
         `starts`: initial means (node, n) of each source's filters.
         """
         plant = at(self.plant, 0)
-        errors = initial_errors(plant.initial_mean, plant.initial_covariance, jnp.concatenate(starts)[self.order])
+        errors = make_initial_errors(plant.initial_mean, plant.initial_covariance, jnp.concatenate(starts)[self.order])
         mean = jnp.asarray(plant.initial_mean)
         return {name: FollowedFusion(errors, mean, rule.start(errors)) for name, rule in self.rules.items()}
 

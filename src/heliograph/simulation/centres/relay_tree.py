@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.smoother_step import gaussian_of
-from heliograph.fusion.cross_covariance import ErrorSources, initial_factors
+from heliograph.fusion.cross_covariance import ErrorSources, make_initial_factors
 from heliograph.fusion.joint_covariance_fusion import MatrixWeights
 from heliograph.fusion.joint_covariance_weights import matrix_weights
 from heliograph.fusion.network_fusion import Fusion
@@ -197,7 +197,7 @@ def _propagate_leaves(leaves: _Leaves, numbers: PyTree, u: np.ndarray) -> ErrorS
     zeros = jnp.zeros((count, filters.received))
     states = alike.init()
     n = len(first(leaves.plant).states)
-    factors_before = initial_factors(centre.init([gaussian_of(states).mean]).errors, n * len(u))
+    factors_before = make_initial_factors(centre.init([gaussian_of(states).mean]).errors, n * len(u))
     factors = centre.propagate_error_factors(
         (states, factors_before),
         compute_matrices=lambda before, u_k, k: alike.compute_by_node(

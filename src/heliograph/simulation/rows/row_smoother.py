@@ -17,7 +17,7 @@ from heliograph.model.estimate import Claim, Estimate, lower_unsound_claim
 from heliograph.numerics.check import InputError, fail, instance, is_whole, show_value
 from heliograph.numerics.float64 import to_numpy, understood
 from heliograph.numerics.module import Module, readable
-from heliograph.numerics.trees.static import Static, cast
+from heliograph.numerics.trees.static import Static, split_structure
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.centres.fusions import StackedFusions
 from heliograph.simulation.network import Network
@@ -181,7 +181,7 @@ class RowSmoother:
         fusions = tuple(fusion for fusion in AllFilters(network).fusions if self._fuses(fusion, kinds))
         with jax.enable_x64(True):
             self.sweep = BackwardSweep(NetworkStep(network, AllFilters(alone, kinds)), fusions, kinds)
-            self._numbers, static = cast(self.sweep)
+            self._numbers, static = split_structure(self.sweep)
         self._run, self._by_xla = make_backward_sweep(static, dt)
         self._programs = dict[tuple[int, str], Callable[[RowHistory, np.ndarray], PyTree]]()
 

@@ -13,9 +13,9 @@ from heliograph.filters.remark import Remark
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.float64 import in_float64, in_haste, understood
 from heliograph.numerics.module import Module, readable
-from heliograph.numerics.trees.flat import FlatLayout, flat_like, row_of
-from heliograph.numerics.trees.program_text import text_of
-from heliograph.numerics.trees.static import Static, cast
+from heliograph.numerics.trees.flat import FlatLayout, flatten_to_row, make_flat_layout
+from heliograph.numerics.trees.program_text import write_program_text
+from heliograph.numerics.trees.static import Static, split_structure
 from heliograph.numerics.types import Float, PyTree
 from heliograph.simulation.description.remarks import find_remarking, list_remarks
 from heliograph.simulation.network import Network
@@ -101,11 +101,11 @@ class RowStep:
         filters = AllFilters(network, judges=True, tests=True)
         _check_reports(filters)
         start = initial_states(filters)
-        numbers, static = cast(NetworkStep(network, filters))
+        numbers, static = split_structure(NetworkStep(network, filters))
         self._shapes = tuple(_make_shape(leaf.shape, leaf.dtype) for leaf in numbers)
-        self.state = flat_like(start)
+        self.state = make_flat_layout(start)
         self._layout = RowLayout(static, self.state, received, inputs)
-        self.outputs = flat_like(_trace_step(self._layout, self._shapes).out_info[1])
+        self.outputs = make_flat_layout(_trace_step(self._layout, self._shapes).out_info[1])
         self.columns = find_filter_columns(network, self.outputs)
         self.start = np.concatenate([np.zeros(0), *(np.ravel(leaf).astype(float) for leaf in jax.tree.leaves(start))])
         # Native code with the network's numbers filled in, where it takes the step.
@@ -247,7 +247,7 @@ def _make_row_function(layout: RowLayout) -> Any:
 
     def step(numbers: list[jax.Array], row: jax.Array) -> jax.Array:
         """Step a row; return states and outputs side by side."""
-        return jnp.concatenate([row_of(tree) for tree in _make_step(layout)(numbers, row)])
+        return jnp.concatenate([flatten_to_row(tree) for tree in _make_step(layout)(numbers, row)])
 
     return step
 
@@ -261,7 +261,7 @@ def _trace_step(layout: RowLayout, numbers: tuple[jax.ShapeDtypeStruct, ...]) ->
 @lru_cache(TEXTS)
 def _text(layout: RowLayout, numbers: tuple[jax.ShapeDtypeStruct, ...]) -> str:
     """Return the step as text, once for networks that differ in numbers alone."""
-    return text_of(_trace_step(layout, numbers).jaxpr)
+    return write_program_text(_trace_step(layout, numbers).jaxpr)
 
 
 @lru_cache

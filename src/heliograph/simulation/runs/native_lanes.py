@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from heliograph.engine.choice import threads
+from heliograph.engine.choice import get_thread_pool
 from heliograph.engine.limits import BLOCK
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.runs.lanes import LANES, batch_counts
@@ -43,7 +43,7 @@ class NativeLanes:
             collected: list[np.ndarray | None] = self.code.begun.add(runs_of_lane[lane], sums)
             return collected
 
-        collected_by_lane = list(threads().map(simulate_lane, used))
+        collected_by_lane = list(get_thread_pool().map(simulate_lane, used))
         # Each leaf of all lanes, as runs in order; None where all runs share it.
         order = np.argsort(np.concatenate([runs_of_lane[lane] for lane in used]), kind="stable")
         leaves: list[np.ndarray | None] = []

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import jax
 import numpy as np
 
-from heliograph.engine.choice import choose_code, threads
+from heliograph.engine.choice import choose_code, get_thread_pool
 from heliograph.numerics.check import check_count, fail, show_value
 from heliograph.numerics.float64 import fully_optimised, to_numpy
 from heliograph.numerics.masked import fill_masked
@@ -65,7 +65,7 @@ def _apply_by_xla(function: Callable[..., PyTree], values: list[np.ndarray], wid
         return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[: last - first], outputs)
 
     # Each core computes its blocks, then copies them to their place.
-    computed = list(threads().map(compute_share, range(-(-runs // (share * width)))))
+    computed = list(get_thread_pool().map(compute_share, range(-(-runs // (share * width)))))
     results = jax.tree.map(lambda leaf: np.empty((runs, *leaf.shape[1:]), leaf.dtype), computed[0])
 
     def copy_back(core: int) -> None:
@@ -73,7 +73,7 @@ def _apply_by_xla(function: Callable[..., PyTree], values: list[np.ndarray], wid
         for target, leaf in zip(jax.tree.leaves(results), jax.tree.leaves(computed[core]), strict=True):
             target[core * share * width :][: len(leaf)] = leaf
 
-    list(threads().map(copy_back, range(len(computed))))
+    list(get_thread_pool().map(copy_back, range(len(computed))))
     return results
 
 
