@@ -62,7 +62,7 @@ def keep_cycles(graph: Graph, outputs: Sequence[Buffer]) -> dict[Any, None]:
 def _find_recurring(loop: Loop, needed: Collection[Any]) -> Recurring | None:
     """Return S and C of a loop's body, and the tests of rows that S needs; None where S is no more than DEAR nodes.
 
-    `needed`: items that the outputs need. It is gone through only for large S: a program may have hundreds of small loops.
+    `needed`: items that the outputs need, gone through for a large S only: some programs have hundreds of small loops.
     """
     body = loop.body
     nodes = [x for x in body.items if isinstance(x, Node) and x in needed]

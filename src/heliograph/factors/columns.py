@@ -162,14 +162,10 @@ def _triangularise_row_by_row(columns: WeightedColumns) -> WeightedColumns:
 def absorb_columns(factors: WeightedColumns, columns: WeightedColumns) -> WeightedColumns:
     """Return the factors (unit lower triangular M, e) with M diag(e) M' = L diag(d) L' + W diag(w) W'.
 
-    Args:
-        factors: L (n, n), unit lower triangular, and d (n,).
-        columns: W (n, count), of which one column after another is absorbed in a loop, and w (count,).
-
-    A column c of weight w goes from row to row j: with d_j' = d_j + w c_j^2, s = d_j / d_j' and g = w c_j / d_j',
-    column j of L becomes s L_j + g c, c loses c_j L_j, and w becomes s w. These rotations without roots keep each row
-    to eps of itself, as `triangularise` does. They take half as many products again, and a reciprocal for each d and
-    column, but the loop is a shorter program.
+    `factors` are L (n, n), unit lower triangular, and d (n,); `columns` W (n, count) and w (count,), absorbed one after
+    another in a loop, a shorter program than `triangularise`. A column c of weight w goes from row to row j: with
+    d_j' = d_j + w c_j^2, s = d_j / d_j' and g = w c_j / d_j', column j of L becomes s L_j + g c, c loses c_j L_j, and w
+    becomes s w. These rotations without roots keep each row to eps of itself.
 
     Source: Gentleman, Least squares computations by Givens transformations without square roots (1973).
     """
@@ -180,9 +176,7 @@ def absorb_columns(factors: WeightedColumns, columns: WeightedColumns) -> Weight
 
     def absorb(carry: tuple[jax.Array, jax.Array], column: tuple[jax.Array, jax.Array]) -> tuple[Any, None]:
         """Rotate one column (c, w) into the factors (entries below the diagonal, d), from the first row down."""
-        lower, variances = map(list, carry)
-        entries_of_column, weight = column
-        c = list(entries_of_column)
+        (lower, variances), (c, weight) = map(list, carry), (list(column[0]), column[1])
         for j in range(n):
             d = variances[j] + weight * c[j] ** 2
             reciprocal = reciprocal_or_one(d)
