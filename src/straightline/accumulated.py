@@ -26,6 +26,7 @@ class AccumulatedProgram:
     """
 
     def __init__(self, program: Program, summed: SummedOutputs):
+        """Write the code of a program; `summed`: which results are summed, and which argument is a run's number."""
         differs = [n == summed.number for n in range(len(program.inputs))]
         self.summed, self.tree = summed, program.tree
         self.types = [DTYPES[b.type] for n, b in enumerate(program.inputs) if n != summed.number]
@@ -111,6 +112,7 @@ class BegunProgram:
     """A program with its arguments; `shared` has the results that all runs share, None for all others."""
 
     def __init__(self, program: AccumulatedProgram, arguments: Sequence[Any], runs: int):
+        """Convert the arguments, compute what all runs share, and make code for about so many runs."""
         self.program, self.summed = program, program.summed.outputs
         self.arguments = [convert_to_memory(x, t) for x, t in zip(arguments, program.types, strict=True)]
         self.memory = allocate_aligned(program.code.shared)

@@ -188,13 +188,17 @@ class CSource:
     """
 
     def __init__(self, roots: Iterable[Node], places: Mapping[Buffer, Place], real: Real, prefix: str):
+        """Begin with no statement; `roots` are the nodes to compute, `places` tell where arguments are read.
+
+        `real` is the type of numbers, and `prefix` begins the tables' names.
+        """
         self.places, self.real, self.prefix = places, real, prefix
         self.needed = list_needed(roots)
-        self.names: dict[Node, str] = {}
-        self.arrays: dict[Buffer, str] = {}
-        self.tables: dict[tuple[str, bytes], tuple[str, str]] = {}
-        self.operations: dict[str, int] = {}
-        self.count = 0
+        self.names: dict[Node, str] = {}  # variable of each node that is computed
+        self.arrays: dict[Buffer, str] = {}  # local array of each buffer that is filled
+        self.tables: dict[tuple[str, bytes], tuple[str, str]] = {}  # name and definition, by type and numbers
+        self.operations: dict[str, int] = {}  # how many of each
+        self.count = 0  # of variables
 
     def name(self, node: Node) -> str:
         """Return the variable or literal of a number."""
@@ -324,7 +328,7 @@ class CSource:
         return f"for (int64_t {counter} = 0; {counter} < {loop.length}; ++{counter}) {{"
 
     def _write_guard(self, guard: Guard, indent: str) -> list[str]:
-        """Write a guarded block; its results are zero if the condition does not hold."""
+        """Return the lines of a guarded block, after `indent`; its results are zero if the condition does not hold."""
         results = [(r, v) for r, v in zip(guard.results, guard.values, strict=True) if r in self.needed]
         lines = []
         for outcome, _ in results:

@@ -147,12 +147,12 @@ class Ring:
         self._graph, self._places = graph, [(buffers[type], types[:k].count(type)) for k, type in enumerate(types)]
 
     def store(self, nodes: Iterable[Node], row: Node) -> None:
-        """Store a row."""
+        """Store these numbers, in the order of the types, as a row of the ring."""
         for n, (buffer, place) in zip(nodes, self._places, strict=True):
             self._graph.store(buffer, n, place, buffer.shape[1:], (row,))
 
     def load(self, row: Node) -> list[Node]:
-        """Load a row."""
+        """Return the nodes that load a row, in the order of the types."""
         return [self._graph.load(buffer, place, buffer.shape[1:], (row,)) for buffer, place in self._places]
 
 

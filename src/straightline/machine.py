@@ -51,6 +51,7 @@ class Machine:
     """
 
     def __init__(self, source: FunctionSource, level: int, width: int):
+        """Generate code of a text for vectors of `width` runs, at LLVM's level 0 (in haste) or 1 (with care)."""
         self.level, self.width = level, width
         cpu, flags, *_ = find_processor_features()
         machine = find_llvm_target().create_target_machine(cpu=cpu, features=flags, opt=level)
@@ -120,6 +121,7 @@ class TieredCode:
     """
 
     def __init__(self, source: FunctionSource, widths: tuple[int, int]):
+        """Begin without code; `widths`: runs of a vector of code in haste, and of code made with care."""
         self._source, self._widths, self._executions, self._lock = source, widths, 0.0, Lock()
         self._machine: Machine | None = None
         self._careful: Future[Machine] | None = None

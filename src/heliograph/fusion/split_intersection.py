@@ -37,6 +37,7 @@ class SplitIntersection(AbstractIntersection):
     known: Float[Array, "node n node n"]
 
     def __init__(self, known: Float[ArrayLike, "node n *joint"]):
+        """Check P^a, (node, n, node, n), or (node, n, n) of known parts that are independent between nodes."""
         values = array("known part", known, (None,) * rank("known part", known))
         # Independent parts: the blocks of a block-diagonal P^a.
         if values.ndim == 3 and values.shape[1] == values.shape[2]:

@@ -246,7 +246,11 @@ def _find_unobservable_part(output: np.ndarray, space: np.ndarray) -> np.ndarray
 
 
 def is_excited_by_noise(vectors: np.ndarray, matrix: Float[np.ndarray, "n n"], noise: Float[np.ndarray, "n n"]) -> bool:
-    """Return whether the noise excites every one of these directions within n steps (controllable subspace)."""
+    """Return whether the noise excites every one of these directions within n steps, n the number of states.
+
+    They are columns (n, d) in the controllable subspace, which W, A W, A^2 W, ... span, with A the `matrix` and W the
+    noise's.
+    """
     basis, columns = np.zeros((len(matrix), 0)), noise
     for _ in range(len(matrix)):
         size = np.linalg.norm(columns, 2) if columns.size else 0.0

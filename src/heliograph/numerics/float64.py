@@ -102,6 +102,7 @@ def to_numpy(tree: PyTree) -> PyTree:
     """Turn every concrete numeric JAX array of a pytree into a NumPy array; leave keys and traced values alone."""
 
     def convert(leaf: object) -> object:
+        """Return one leaf, a known array of numbers as NumPy's."""
         if isinstance(leaf, jax.core.Tracer) or not isinstance(leaf, jax.Array):
             return leaf
         return leaf if jnp.issubdtype(leaf.dtype, jax.dtypes.extended) else np.asarray(leaf)
@@ -121,6 +122,7 @@ def in_float64(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def scoped(*args: P.args, **kwargs: P.kwargs) -> R:
+        """Call the function in the float64 scope; inside a trace as it is."""
         if is_traced((args, kwargs)):
             return function(*args, **kwargs)
         refuse_forked_process()
@@ -156,6 +158,7 @@ def _known_in_float64(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def scoped(*args: P.args, **kwargs: P.kwargs) -> R:
+        """Call the function in the float64 scope where no number is traced."""
         if jax.dtypes.canonicalize_dtype(float).itemsize == 8 or is_traced((args, kwargs)):
             return function(*args, **kwargs)
         with jax.ensure_compile_time_eval(), jax.enable_x64(True):

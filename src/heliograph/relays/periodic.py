@@ -220,12 +220,14 @@ def _repeat_until_steady(
     """Repeat a period until its relative change is below `tolerance`; return the last value and its change."""
 
     def repeat(carry: SteadyState) -> SteadyState:
+        """Return the value after one more period, its relative change, and the count of periods."""
         value, _, count = carry
         after = period(value)
         size = jnp.maximum(jnp.max(jnp.abs(after)), np.finfo(float).tiny)
         return after, jnp.max(jnp.abs(after - value)) / size, count + 1
 
     def changes(carry: SteadyState) -> jax.Array:
+        """Return whether the last change is above the tolerance, and periods are left."""
         _, change, count = carry
         return (change > tolerance) & (count < PERIODS)
 

@@ -143,6 +143,7 @@ def _scale_into_limit(
     relay_rows = local_gains.shape[1] - problem.steps.transition.shape[-1]  # without the receiver's, the last
 
     def scale_relays(factor: float) -> np.ndarray:
+        """Return the gains with the relays' multiplied by a factor."""
         return np.concatenate([factor * local_gains[:, :relay_rows], local_gains[:, relay_rows:]], axis=1)
 
     low, high = 0.0, 2.0  # the first middle is 1, the gains as they are
@@ -183,6 +184,7 @@ def _compute_cost_with_barrier(
     """Return the cost and barrier at gains moved by x, infinite outside the limit, and its gradient."""
 
     def value(x: jax.Array) -> jax.Array:
+        """Return the cost and barrier at gains moved by x."""
         cost, slack = _compute_cost_and_slack(problem, _change_gains(gains, units, x, problem.steps))
         inside = jnp.all(slack > 0)
         logarithms = jnp.log(jnp.where(inside, slack, 1.0))
@@ -357,6 +359,7 @@ def _alternate_sweeps(
     """Alternate backward and forward sweeps from the local gains, `count` of them, and return the best gains."""
 
     def sweep(search: SweepSearch, _: jax.Array) -> tuple[SweepSearch, None]:
+        """Sweep backward and forward once; keep the best gains so far with their cost."""
         gains, moments = _sweep_forward(steps, start, search.gains, _sweep_backward(steps, start, cost, search.gains))
         value = jnp.sum(cost * moments)
         better = value < search.cost

@@ -34,9 +34,10 @@ def find_longest_loop(items: Iterable[Any]) -> Loop | None:
 
 
 def count_lines_per_turn(bytes: int, width: int, loop: Loop) -> int:
-    """Return the lines of rows of W runs that a loop asks for in each of its turns.
+    """Return how many cache lines a loop asks for in each of its turns, so that it asks for all rows of W runs.
 
     0 where these take longer than its operations: a loop that does little but move numbers hides nothing beside them.
+    `bytes` are those of a row, `width` is W.
     """
     lines = -(-bytes * width // ((loop.length or 1) * LINE))
     operations = sum(isinstance(x, Node) and x.op != "load" for x in loop.body.items)
@@ -44,7 +45,7 @@ def count_lines_per_turn(bytes: int, width: int, loop: Loop) -> int:
 
 
 def write_requests(rows: PrefetchedRows, turns: int, counter: str, lanes: str, add: Callable[[str], str]) -> list[str]:
-    """Write what one turn asks for.
+    """Return the lines of LLVM IR by which one turn of a loop asks for its share of the memory of some rows.
 
     Args:
         rows: the rows.

@@ -79,7 +79,8 @@ def _make_tournament_turn(
     moved = [*((i + 1) % turns for i in range(turns)), *range(turns, n)]
 
     def turn(state: tuple[Numbers, Numbers], _: None) -> tuple[tuple[Numbers, Numbers], None]:
-        entries, vectors = dict(state[0]), dict(state[1])
+        """Rotate each pair of rows in (entries of A, eigenvectors), then move the rows on."""
+        entries, vectors = map(dict, state)
         for p, q in pairs:
             _rotate(entries, vectors, p, q, n)
         entries = {(i, j): entries[min(moved[i], moved[j]), max(moved[i], moved[j])] for i, j in entries}

@@ -38,6 +38,7 @@ def _make_elementwise_rule(op: str) -> Rule:
     """Return the rule of an operation that is applied to each entry."""
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+        """Return a node of the operation for each entry of the result."""
         shape, type, node = result_shape(equation), result_type(equation), lowering.graph.node
         return [
             arrange_nodes(
@@ -52,6 +53,7 @@ def _make_rule_of_entries(function: Any) -> Rule:
     """Make a rule from one of entries: function(graph, type, parameters, *entries)."""
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+        """Return what the function makes of the arguments' entries, for each entry of the result."""
         shape, type, graph = result_shape(equation), result_type(equation), lowering.graph
         entries = zip(*broadcast_entries(inputs, shape), strict=True)
         return [arrange_nodes([function(graph, type, equation.params, *entry) for entry in entries], shape)]

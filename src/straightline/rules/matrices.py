@@ -25,6 +25,7 @@ def _reduce_by(op: str, empty: float) -> Rule:
     """Return the rule that reduces along axes by `op`; over nothing the result is `empty`."""
 
     def lower_operation(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+        """Return the array reduced along the axes of the operation."""
         axes, shape, type = equation.params["axes"], result_shape(equation), result_type(equation)
         # (entry of the result, terms); no terms of a sum over nothing.
         terms = math.prod(inputs[0].shape[axis] for axis in axes)
@@ -55,6 +56,7 @@ def _accumulate_by(op: str) -> Rule:
     """Return the rule that accumulates along an axis by `op`."""
 
     def lower_operation(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+        """Return the array with each entry combined with all before it along the axis, or all behind it in reverse."""
         axis, type, reverse = equation.params["axis"], result_type(equation), equation.params["reverse"]
         if not inputs[0].size:
             return inputs
@@ -75,6 +77,7 @@ def _find_extreme(op: str) -> Rule:
     """Return the rule of `argmax` (op "gt") or `argmin` ("lt"): along one axis, with the result's other axes."""
 
     def lower_argument_of_extreme(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+        """Return the index along the axis for each of the other entries."""
         axis = equation.params["axes"][0]
         x = np.moveaxis(inputs[0], axis, -1).reshape(-1, inputs[0].shape[axis])
         indices = [_find_first_extreme(lowering.graph, op, result_type(equation), row) for row in x.tolist()]

@@ -182,6 +182,7 @@ def _concatenate(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
         parts = [put_in_memory(lowering, x) for x in inputs]
 
         def turn(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+            """Return no carry, and one row of all arrays concatenated."""
             return [], [np.concatenate([lowering.nodes(x.row(row)) for x in parts], axis=axis - 1)]
 
         return list(repeat_turns(lowering, shape[0], [], turn)[1])

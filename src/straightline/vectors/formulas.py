@@ -57,6 +57,7 @@ def _make_operator(real: str, whole: str, turned: bool = False) -> Callable[["Ve
     """
 
     def apply(self: "Vector", other: Operand) -> "Vector":
+        """Return self op other, or other op self."""
         pair = (self, self.like(other))
         a, b = reversed(pair) if turned else pair
         return self.body.add(self.scalar, f"{real if self.scalar in REALS else whole} {self.type} {a.name}, {b.name}")
@@ -68,6 +69,7 @@ def _make_comparison(real: str, whole: str) -> Callable[["Vector", Operand], "Ve
     """Return the method that compares vectors, of reals or of whole numbers."""
 
     def compare(self: "Vector", other: Operand) -> "Vector":
+        """Return the truth values of self op other."""
         how = f"fcmp {real}" if self.scalar in REALS else f"icmp {whole}"
         return self.body.add("i1", f"{how} {self.type} {self.name}, {self.like(other).name}")
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from heliograph.numerics import text_of
+from heliograph.numerics import write_program_text
 from straightline import operation
 
 
@@ -22,7 +22,7 @@ def text(table, power: int = 2, dtype=np.float64, below: float = 1.0) -> str:
         y = jax.lax.cond(x[0] > 0, inner, lambda x: jax.nn.relu(x) + jax.random.normal(key, x.shape), inner(x))
         return y.astype(dtype), jnp.cumsum(y)
 
-    return text_of(jax.jit(program).trace(np.zeros(3)).jaxpr)
+    return write_program_text(jax.jit(program).trace(np.zeros(3)).jaxpr)
 
 
 def test_the_same_program_has_the_same_text_whatever_was_traced_before():
@@ -57,6 +57,6 @@ def test_operations_of_the_same_shapes_differ_by_their_names():
     """What they compute is not in the text: it is the library's, whose version is compared beside it."""
 
     def text_with(one):
-        return text_of(jax.make_jaxpr(jax.vmap(one))(np.zeros((3, 2))))
+        return write_program_text(jax.make_jaxpr(jax.vmap(one))(np.zeros((3, 2))))
 
     assert text_with(doubled) == text_with(doubled) != text_with(squared)

@@ -190,6 +190,7 @@ def _weigh_neighbours(
     believed = NeighbourEstimates(jnp.zeros((n, n)), jnp.zeros(degree), jnp.zeros((degree, n, n)), joint, arrived[0])
 
     def body(_: None, present: jax.Array) -> tuple[None, tuple[jax.Array, jax.Array]]:
+        """Return no carry, and the weights' parts and covariance for what arrived in one step."""
         weights = rule.neighbour_weights(believed._replace(present=present))
         return None, (weights.parts, weights.covariance)
 
