@@ -36,7 +36,7 @@ class AccumulatedProgram:
         self.blocks = TieredCode(self.code.blocks, (choose_hasty_width(self.width), self.width))
         self.once = None if self.code.once is None else TieredCode(self.code.once, (1, 1))
 
-    def memory(self, runs: int, lanes: int, in_flight: int) -> tuple[float, float, float]:
+    def measure_memory(self, runs: int, lanes: int, in_flight: int) -> tuple[float, float, float]:
         """Return bytes of what is collected of `runs`, of `lanes` sums kept apart, and of the variables of all runs.
 
         Of those variables all runs share some; each of the blocks that are computed at once (`in_flight`) has others.
@@ -74,7 +74,7 @@ class AccumulatedProgram:
         begun = self.begin(jax.tree.leaves(arguments), runs)
         part_length = -(-runs // (PARTS * self.width)) * self.width
         starts = range(first, first + runs, part_length)
-        sums = [begun.zeros() for _ in starts]
+        sums = [begun.make_zero_sums() for _ in starts]
 
         def compute_part(part: int) -> list[np.ndarray | None]:
             """Add the runs of a part to its sums; return its results that are collected, None for all others."""
@@ -96,7 +96,7 @@ class AccumulatedProgram:
         A summed result is the sum over all parts; one that is collected has the parts one behind another; one that all
         runs share is repeated for each run, or counts once for each run of a batch.
         """
-        totals, runs_by_batch = iter(begun.total(sums)), _count_by_batch(first, runs, self.summed.batches)
+        totals, runs_by_batch = iter(begun.add_parts(sums)), _count_by_batch(first, runs, self.summed.batches)
         leaves: list[Any] = []
         for shared, is_summed, *parts in zip(begun.shared, self.summed.outputs, *collected, strict=True):
             if shared is None:
@@ -130,8 +130,8 @@ class BegunProgram:
                 self.shared[n] = computed.view(kind).reshape(buffer.shape).copy()
         self._machine = None if all(program.common) else program.blocks.choose_machine(-(-runs // program.width))
 
-    def zeros(self, memory: list[list[np.ndarray]] | None = None) -> list[np.ndarray]:
-        """Return sums over no runs, of each summed result that runs do not share, as `add` and `total` take them.
+    def make_zero_sums(self, memory: list[list[np.ndarray]] | None = None) -> list[np.ndarray]:
+        """Return sums over no runs, of each summed result that runs do not share, as `add` and `add_parts` take them.
 
         `memory`: sums that nobody needs any more, of which the last are taken, and filled, if their shapes fit.
         """
@@ -179,7 +179,7 @@ class BegunProgram:
             collected.append(None if summed or common else outputs[-1])
         return outputs, collected
 
-    def total(self, parts: Sequence[Sequence[np.ndarray]]) -> list[np.ndarray]:
+    def add_parts(self, parts: Sequence[Sequence[np.ndarray]]) -> list[np.ndarray]:
         """Return the sums (..., batch) of several sums, of each summed result that runs do not share.
 
         The first of them is overwritten.

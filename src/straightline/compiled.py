@@ -118,9 +118,9 @@ class Compiled:
             arguments: trees like the examples; arrays of which each run has its own have a leading axis of runs.
             cores: threads that compute; those of the machine by default.
         """
-        return self.join([arguments], cores)
+        return self.compute_calls([arguments], cores)
 
-    def join(self, calls: Sequence[Sequence[PyTree]], cores: int | None = None) -> PyTree:
+    def compute_calls(self, calls: Sequence[Sequence[PyTree]], cores: int | None = None) -> PyTree:
         """Return the results of the runs of several calls, one after another, in the same arrays.
 
         Args:

@@ -129,7 +129,7 @@ class TieredCode:
     def prepare(self, blocks: float) -> None:
         """Generate code for a first execution for so many blocks, if there is none."""
         with self._lock:
-            self._first(self._executions + self._of(blocks))
+            self._make_first(self._executions + self._count_executions(blocks))
 
     def choose_machine(self, blocks: float) -> Machine:
         """Return code that is about to be executed for so many blocks of the most runs; hold it while it runs."""
@@ -137,10 +137,10 @@ class TieredCode:
         if made is not None and made.level:  # nothing better is to come
             return made
         with self._lock:
-            executions = self._of(blocks)
+            executions = self._count_executions(blocks)
             self._executions += executions
-            machine = self._first(self._executions)
-            if not machine.level and self._level(self._executions):  # JAX takes 30 us to say its setting
+            machine = self._make_first(self._executions)
+            if not machine.level and self._choose_level(self._executions):  # JAX takes 30 us to say its setting
                 self._careful = self._careful or get_careful_thread().submit(
                     _generate_with_care, self._source, self._widths[1], machine
                 )
@@ -148,18 +148,18 @@ class TieredCode:
                     self._machine = machine = self._careful.result()
             return machine
 
-    def _first(self, executions: float) -> Machine:
+    def _make_first(self, executions: float) -> Machine:
         """Return the code that is made at the first call, at a level for so many executions."""
         if self._machine is None:
-            level = self._level(executions)
+            level = self._choose_level(executions)
             self._machine = generate(self._source, level, self._widths[level])
         return self._machine
 
-    def _of(self, blocks: float) -> float:
+    def _count_executions(self, blocks: float) -> float:
         """Return the executions of each operation, on average, for so many blocks."""
         return blocks * self._source.work / max(self._source.operations, 1)
 
-    def _level(self, executions: float) -> int:
+    def _choose_level(self, executions: float) -> int:
         """Return 1, with care, if that pays for so many executions and JAX's setting allows it, else 0, in haste."""
         pays = executions >= OFTEN
         return int(pays and not jax.config.values["jax_disable_most_optimizations"])

@@ -236,6 +236,6 @@ def test_one_run_has_the_bits_of_many_in_memory_of_its_own():
 def test_runs_of_several_arrays_are_those_of_one(place):
     x, matrix = np.random.default_rng(4).normal(size=(50, 3)), np.arange(9.0).reshape(3, 3)
     code = compile(lambda x, matrix: (matrix @ jnp.sin(x), matrix.T), x[0], matrix, shared=[1])
-    joined = code.join([(x[:place], matrix), (x[place:], matrix)])
+    joined = code.compute_calls([(x[:place], matrix), (x[place:], matrix)])
     for a, b in zip(joined, code(x, matrix), strict=True):
         np.testing.assert_array_equal(a, b)

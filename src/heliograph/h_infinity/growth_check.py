@@ -149,14 +149,14 @@ def check_growth(
     _check_function(check_callable("function", function, "the state"), bottom)
     if not differences and (np.any(bottom > 0) or np.any(top < 0)):
         raise fail("region", "a box around 0", f"{bottom.tolist()} and {top.tolist()}")
-    tools, random = _SlopesAndRatios(function, float(np.linalg.norm(top - bottom))), np.random.default_rng(seed)
+    meter, random = _SlopeMeter(function, float(np.linalg.norm(top - bottom))), np.random.default_rng(seed)
     starts = bottom + (top - bottom) * scipy.stats.qmc.Sobol(len(bottom), seed=seed).random(POINTS)
     if differences:
-        points, pairs = _search_slopes_and_pairs(tools, starts, bottom, top, random)
+        points, pairs = _search_slopes_and_pairs(meter, starts, bottom, top, random)
     else:  # |f(x)| <= a |x| alone: pairs of a point and 0
-        points = _climb_at_random(lambda x: tools.ratio(_pair_with_zero(x)), starts, bottom, top, random)
+        points = _climb_at_random(lambda x: meter.measure_ratios(_pair_with_zero(x)), starts, bottom, top, random)
         pairs = _pair_with_zero(points)
-    return _make_finding(name, constant, bottom, top, tools, points, pairs, differences)
+    return _make_finding(name, constant, bottom, top, meter, points, pairs, differences)
 
 
 def _check_function(function: Function, point: Float[np.ndarray, "n"]) -> None:
@@ -180,7 +180,7 @@ def _check_box(low: ArrayLike, high: ArrayLike) -> tuple[Float[np.ndarray, "n"],
     return bottom, top
 
 
-class _SlopesAndRatios:
+class _SlopeMeter:
     """Slopes and ratios of a function at points (count, n) or pairs (count, 2n), compiled once; width: of the box."""
 
     def __init__(self, function: Function, width: float):
@@ -188,18 +188,18 @@ class _SlopesAndRatios:
         self.jacobian = _compile_by_part(jax.vmap(jax.jacfwd(lambda x: jnp.atleast_1d(function(x)))))
         self.values = _compile_by_part(jax.vmap(lambda x: jnp.atleast_1d(function(x))))
 
-    def slope(self, points: Float[np.ndarray, "count n"]) -> Float[np.ndarray, "count"]:
+    def measure_slopes(self, points: Float[np.ndarray, "count n"]) -> Float[np.ndarray, "count"]:
         """Return the norm of the Jacobian at each point; infinite where it is no number."""
         values = np.asarray(self.jacobian(points))
         finite = np.isfinite(values).all(axis=(-2, -1))
         safe = np.where(finite[:, None, None], values, 0.0)
         return np.where(finite, np.linalg.norm(safe, 2, axis=(-2, -1)), np.inf)
 
-    def steepest(self, points: Float[np.ndarray, "count n"]) -> Float[np.ndarray, "count n"]:
+    def find_steepest_directions(self, points: Float[np.ndarray, "count n"]) -> Float[np.ndarray, "count n"]:
         """Return the unit direction in which the function changes most at each point."""
         return np.linalg.svd(np.nan_to_num(self.jacobian(points), posinf=0.0, neginf=0.0))[2][:, 0]
 
-    def ratio(self, pairs: Float[np.ndarray, "count both"]) -> Float[np.ndarray, "count"]:
+    def measure_ratios(self, pairs: Float[np.ndarray, "count both"]) -> Float[np.ndarray, "count"]:
         """Return the ratio |f(x) - f(y)| / |x - y| of each pair; 0 for points too close for it to have digits."""
         x, y = np.split(pairs, 2, axis=1)
         distance = np.linalg.norm(x - y, axis=1)
@@ -207,7 +207,7 @@ class _SlopesAndRatios:
         change = np.linalg.norm(np.asarray(self.values(x)) - self.values(y), axis=1)
         return np.where(apart, np.where(np.isfinite(change), change, np.inf) / np.where(apart, distance, 1), 0)
 
-    def at_zero(self, n: int) -> float:
+    def measure_at_zero(self, n: int) -> float:
         """Return the size |f(0)|, infinite where it is no number."""
         size = float(np.linalg.norm(self.values(np.zeros((1, n)))))
         return size if np.isfinite(size) else np.inf
@@ -219,7 +219,7 @@ def _pair_with_zero(points: Float[np.ndarray, "points n"]) -> Float[np.ndarray, 
 
 
 def _search_slopes_and_pairs(
-    tools: _SlopesAndRatios,
+    meter: _SlopeMeter,
     starts: Float[np.ndarray, "points n"],
     low: Float[np.ndarray, "n"],
     high: Float[np.ndarray, "n"],
@@ -227,13 +227,13 @@ def _search_slopes_and_pairs(
 ) -> tuple[Float[np.ndarray, "points n"], Float[np.ndarray, "pairs n+n"]]:
     """Return points of large slopes in the box, and pairs (x, y) of large ratios |f(x) - f(y)| / |x - y|."""
     # Largest slope: the starts, then random moves from the steepest.
-    points = _climb_at_random(tools.slope, starts, low, high, random)
+    points = _climb_at_random(meter.measure_slopes, starts, low, high, random)
     # Largest ratio: close pairs along the steepest directions, and as many pairs of any two points of the box.
-    move = tools.steepest(points) * NEARBY * tools.width / 2
+    move = meter.find_steepest_directions(points) * NEARBY * meter.width / 2
     close = np.concatenate([np.clip(points - move, low, high), np.clip(points + move, low, high)], axis=1)
     far = low + (high - low) * random.random((POINTS, 2, len(low)))
     pairs = np.concatenate([close, far.reshape(POINTS, -1)])
-    return points, _climb_at_random(tools.ratio, pairs, np.tile(low, 2), np.tile(high, 2), random)
+    return points, _climb_at_random(meter.measure_ratios, pairs, np.tile(low, 2), np.tile(high, 2), random)
 
 
 def _compile_by_part(function: Callable[[Any], jax.Array]) -> Callable[[np.ndarray], np.ndarray]:
@@ -255,7 +255,7 @@ def _make_finding(
     constant: float,
     low: np.ndarray,
     high: np.ndarray,
-    tools: _SlopesAndRatios,
+    meter: _SlopeMeter,
     points: np.ndarray,
     pairs: np.ndarray,
     differences: bool,
@@ -267,12 +267,12 @@ def _make_finding(
         constant: a, the growth constant in question.
         low: lower corner of the box (n,).
         high: upper corner of the box (n,).
-        tools: slopes and ratios of the function.
+        meter: slopes and ratios of the function.
         points: (points, n), of which the steepest is reported.
         pairs: (pairs, 2n), x and y of each, of which that of the largest ratio is reported.
         differences: whether the constant bounds |f(x) - f(y)| / |x - y|; else |f(x)| / |x|.
     """
-    slopes, ratios = tools.slope(points), tools.ratio(pairs)
+    slopes, ratios = meter.measure_slopes(points), meter.measure_ratios(pairs)
     steepest, largest_ratio = int(np.argmax(slopes)), int(np.argmax(ratios))
     x, y = np.split(pairs[largest_ratio], 2)
     finding = GrowthFinding(
@@ -284,14 +284,14 @@ def _make_finding(
         point=points[steepest],
         pair=(x, y),
         ratio=float(ratios[largest_ratio]),
-        at_zero=tools.at_zero(len(low)),
+        at_zero=meter.measure_at_zero(len(low)),
         bound=None,
         reason="",
         differences=differences,
     )
     if finding.refuted:
         return finding
-    bound = slope_bound(tools.function, low, high, finding.limit)
+    bound = slope_bound(meter.function, low, high, finding.limit)
     return finding._replace(bound=bound.value if np.isfinite(bound.value) else None, reason=bound.reason)
 
 

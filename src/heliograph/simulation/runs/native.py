@@ -76,7 +76,7 @@ def check_memory_of_parts(code: NativeProgram, parts: int, runs: int, horizon: i
         ValueError: more memory than is available.
     """
     lanes = min(LANES, -(-runs // BLOCK))
-    collected, sums, variables = code.begun.program.memory(runs, lanes, min(lanes, os.cpu_count() or 1))
+    collected, sums, variables = code.begun.program.measure_memory(runs, lanes, min(lanes, os.cpu_count() or 1))
     collected *= 2 if precision == "float32" else 1  # results are handed back in double precision
     check_memory(NeededMemory(parts * collected, sums, variables), runs, horizon)
 
