@@ -84,13 +84,15 @@ class Graph:
     def _find_or_make(self, op: str, type: Type, args: tuple[Node, ...], value: Any, depth: int = 0) -> Node:
         """Return the equal node of an open block, or make one: in the outermost block that may have it.
 
-        That has all arguments and at least this depth, or is pinned: such a block holds what is made within it.
+        That block has all arguments in it or around it, and is at least `depth` blocks deep; a pinned block keeps what
+        is made within it.
         """
         key, block = (op, type, args, value), self.current
         while (equal := block.seen.get(key)) is None and block.parent is not None:
             block = block.parent
         if equal is not None:
             return equal
+        # Outwards from the open block, as far as the arguments allow.
         block = self.current
         if block.parent is not None:
             depth = max(depth, *[a.block.depth for a in args], 0)

@@ -82,7 +82,7 @@ class WindowText(NamedTuple):
 
 
 def write_window(program: StepProgram, steps: int, state: Layout, prefix: str, real: Real) -> WindowText:
-    """Write the window of a filter whose plant counts steps, or has a time step among its inputs.
+    """Return the text of the window of a filter whose plant counts steps, or has a time step among its inputs.
 
     Args:
         program: the step.
@@ -94,16 +94,17 @@ def write_window(program: StepProgram, steps: int, state: Layout, prefix: str, r
     filter = program.filter
     inputs, received = filter.inputs, filter.received
     window = Window(steps, inputs.index(TIME_STEP) if TIME_STEP in inputs else None, received, len(inputs))
+    # The struct: the present state, rows of a state with the measurement and the inputs after it, and four counters.
     data = [lay_out_array(real, max(count, 1)) for count in (received, len(inputs))]
     row = lay_out_struct([state, *data])
     counters = [lay_out_array("uint32_t", 1)] * 4
     whole = lay_out_struct([state, Layout(window.places * row.size, row.alignment), *counters])
     return WindowText(
-        _explain_window(window, prefix, whole.size),
-        _declare_window(window, prefix, real),
-        _list_heads(window, prefix, real),
-        _write_functions(window, prefix, real),
-        whole.size,
+        comment=_explain_window(window, prefix, whole.size),
+        types=_declare_window(window, prefix, real),
+        heads=_list_heads(window, prefix, real),
+        functions=_write_functions(window, prefix, real),
+        size=whole.size,
     )
 
 

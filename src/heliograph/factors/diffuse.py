@@ -71,10 +71,11 @@ class LevelWeights(NamedTuple):
 def triangularise_levels(
     rows: jax.Array, weights: LevelWeights, count: int, whole: jax.Array | None = None
 ) -> tuple[jax.Array, LevelWeights, jax.Array]:
-    """Make the first `count` rows (c columns) orthogonal in the weights, from the first down.
+    """Make the first `count` rows (c columns) orthogonal in the weights w, from the first down.
 
-    Row j has s = sum of w a^2 over infinite columns: where more than rounding is left of it, L_ij by them alone and
-    d_inf,j = s; else that part is put to 0, and the finite ones count. All rows below lose L_ij row j.
+    Row j, a, has s = sum of w a^2 over infinite columns. Where more than rounding is left of s, L_ij follows from these
+    columns alone, and d_inf,j = s; else their part of the row is put to 0, and the finite columns count. Each row i
+    below loses L_ij row j.
 
     Args:
         rows: (rows, c).
@@ -86,19 +87,20 @@ def triangularise_levels(
         L (rows, count), the weights (count,) of its columns, and what is left of the rows.
     """
     whole = rows**2 @ weights.infinite if whole is None else whole
-    columns, finite, infinite = [], [], []
+    columns, finite, infinite, numbers = [], [], [], np.arange(len(rows))
     for j in range(count):
-        far = rows[j] ** 2 @ weights.infinite
-        is_far = far > FALLEN * whole[j]
-        row = jnp.where((weights.infinite > 0) & ~is_far, 0.0, rows[j])
-        near = row**2 @ weights.finite
-        weighted = jnp.where(is_far, weights.infinite, weights.finite) * row
-        share = rows @ weighted * reciprocal_or_zero(jnp.where(is_far, far, near))
-        share = jnp.where(np.arange(len(rows)) == j, 1.0, jnp.where(np.arange(len(rows)) > j, share, 0.0))
-        columns.append(share)
-        finite.append(jnp.where(is_far, 0.0, near))
-        infinite.append(jnp.where(is_far, far, 0.0))
-        rows = jnp.where((np.arange(len(rows)) > j)[:, None], rows - share[:, None] * row, rows)
+        infinite_s = rows[j] ** 2 @ weights.infinite
+        is_infinite = infinite_s > FALLEN * whole[j]
+        row = jnp.where((weights.infinite > 0) & ~is_infinite, 0.0, rows[j])
+        finite_s = row**2 @ weights.finite
+        # Column j of L: what of each row below is along this one.
+        weighted = jnp.where(is_infinite, weights.infinite, weights.finite) * row
+        along = rows @ weighted * reciprocal_or_zero(jnp.where(is_infinite, infinite_s, finite_s))
+        column = jnp.where(numbers == j, 1.0, jnp.where(numbers > j, along, 0.0))
+        columns.append(column)
+        finite.append(jnp.where(is_infinite, 0.0, finite_s))
+        infinite.append(jnp.where(is_infinite, infinite_s, 0.0))
+        rows = jnp.where((numbers > j)[:, None], rows - column[:, None] * row, rows)
     return jnp.stack(columns, axis=1), LevelWeights(jnp.stack(finite), jnp.stack(infinite)), rows
 
 
@@ -141,26 +143,34 @@ class DiffuseEvidence(NamedTuple):
 def observe_diffuse(
     x: Diffuse, matrix: jax.Array, innovation: jax.Array, noise: WeightedColumns
 ) -> tuple[Diffuse, DiffuseEvidence]:
-    """Condition x on z = H x + v, given z - H m - E v; NaN where a component did not arrive.
+    """Condition x on z = H x + v; return it and what z says of the model.
 
-    A component that hears an unknown direction adds -1/2 log s_inf to the log-likelihood, the others log N: their sum
+    A component that shows an unknown direction adds -1/2 log s_inf to the log-likelihood, the others log N: their sum
     is the log of the integral of p(z | delta) over the unknown delta.
+
+    Args:
+        x: the state's law.
+        matrix: H (m, n).
+        innovation: z - H m - E v (m,), m the mean of x; NaN where a component did not arrive.
+        noise: Cov v.
     """
     present = ~jnp.isnan(innovation)
-    fresh = triangularise_noise(WeightedColumns(jnp.where(present[:, None], noise.matrix, 0.0), noise.weights))
+    # Components with uncorrelated noises: (H, innovation) times the inverse of the noise's unit lower factor. What did
+    # not arrive is a row of zeros with the noise 1, which says nothing.
+    factors = triangularise_noise(WeightedColumns(jnp.where(present[:, None], noise.matrix, 0.0), noise.weights))
     rows = jnp.concatenate([matrix, jnp.where(present, innovation, 0.0)[:, None]], axis=1)
-    rows = decorrelate(fresh.matrix, jnp.where(present[:, None], rows, 0.0))
-    shift, density, unknown = jnp.zeros_like(x.mean), jnp.asarray(0.0), []
+    rows = decorrelate(factors.matrix, jnp.where(present[:, None], rows, 0.0))
+    shift, density, shows_unknown = jnp.zeros_like(x.mean), jnp.asarray(0.0), []
     state = x
     for i in range(len(innovation)):
-        h, noise_i = rows[i, :-1], jnp.where(present[i], fresh.weights[i], 1.0)
-        state, gain, s, heard = _observe_scalar(state, h, noise_i)
+        h, noise_i = rows[i, :-1], jnp.where(present[i], factors.weights[i], 1.0)
+        state, gain, s, shows = _observe_scalar(state, h, noise_i)
         e = rows[i, -1] - h @ shift
         shift = shift + gain * e
-        log = jnp.where(heard, -jnp.log(s) / 2, -(e**2 / s + jnp.log(s) + LOG_TURN) / 2)
+        log = jnp.where(shows, -jnp.log(s) / 2, -(e**2 / s + jnp.log(s) + LOG_TURN) / 2)
         density = density + jnp.where(present[i], log, 0.0)
-        unknown.append(heard & present[i])
-    return state._replace(mean=x.mean + shift), DiffuseEvidence(density, jnp.stack(unknown))
+        shows_unknown.append(shows & present[i])
+    return state._replace(mean=x.mean + shift), DiffuseEvidence(density, jnp.stack(shows_unknown))
 
 
 def _observe_scalar(x: Diffuse, h: jax.Array, noise: jax.Array) -> tuple[Diffuse, jax.Array, jax.Array, jax.Array]:

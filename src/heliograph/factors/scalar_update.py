@@ -168,12 +168,14 @@ def _measure_in_turns(
     def turn(carry: Carried, noise: jax.Array) -> tuple[Carried, tuple[jax.Array, jax.Array]]:
         """Measure the row of this noise; return what is next, and its innovation with the variance."""
         root, d, news, least = carry
-        after, d, gain, total = measure_row(root, d, root[n], noise, least[0])
-        value = -news[n]
-        rounded = jnp.where(least[0] < 0, rounding_of_products(n, total), least[0])
-        least = carry_rounding(least, gain[n:], rounded)
-        carry = _move_row_to_end(after, n), d, _move_row_to_end(news + gain * value, n), _move_row_to_end(least, 0)
-        return carry, (value, total)
+        rows, d, gain, variance_of_row = measure_row(root, d, root[n], noise, least[0])
+        innovation = -news[n]
+        # Of the first row, marked by -1, the rounding is that of its own products.
+        rounding = jnp.where(least[0] < 0, rounding_of_products(n, variance_of_row), least[0])
+        least = carry_rounding(least, gain[n:], rounding)
+        news = news + gain * innovation
+        carry = _move_row_to_end(rows, n), d, _move_row_to_end(news, n), _move_row_to_end(least, 0)
+        return carry, (innovation, variance_of_row)
 
     start = root, d, news, jnp.concatenate([jnp.full_like(least[:1], -1.0), least[1:]])
     (root, d, news, _), (values, totals) = lax.scan(turn, start, variance)

@@ -313,7 +313,10 @@ def _make_unsolved_design(system: GrowthSystem, separate: bool, level: float, st
 
 
 def _bisect_level(works: Callable[[float], bool], guess: float) -> float | None:
-    """Return the smallest level that works, to SEARCH_ACCURACY, by doubling and bisection of its logarithm."""
+    """Return the smallest level that works, to SEARCH_ACCURACY; None if none does up to SEARCH_LIMIT times the guess.
+
+    By doubling or halving the guess until one level works and half of it does not, then bisection of the logarithm.
+    """
     high = guess
     while not works(high):
         high *= 2.0

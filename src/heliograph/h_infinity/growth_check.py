@@ -220,7 +220,7 @@ def _pair_with_zero(points: Float[np.ndarray, "points n"]) -> Float[np.ndarray, 
 
 def _search_slopes_and_pairs(
     meter: _SlopeMeter,
-    starts: Float[np.ndarray, "points n"],
+    starts: Float[np.ndarray, "starts n"],
     low: Float[np.ndarray, "n"],
     high: Float[np.ndarray, "n"],
     random: np.random.Generator,
@@ -303,16 +303,17 @@ def _climb_at_random(
     random: np.random.Generator,
 ) -> Float[np.ndarray, "climbers n"]:
     """Return the CLIMBERS best starts, each moved to the best of random moves around it ROUNDS times, in the box."""
-    best = starts[np.argsort(-objective(starts), kind="stable")[:CLIMBERS]]
-    size = (high - low) / 2
+    climbers = starts[np.argsort(-objective(starts), kind="stable")[:CLIMBERS]]
+    deviation = (high - low) / 2
     for _ in range(ROUNDS):
-        moved = best[:, None] + size * random.normal(size=(len(best), TRIALS, len(low)))
-        moved[:, 0] = best
-        moved = np.clip(moved, low, high)
-        values = objective(moved.reshape(-1, len(low))).reshape(len(best), TRIALS)
-        best = moved[np.arange(len(best)), values.argmax(axis=1)]
-        size = SHRINK * size
-    return best
+        # TRIALS normal moves of each, the first of which stays, then smaller ones.
+        trials = climbers[:, None] + deviation * random.normal(size=(len(climbers), TRIALS, len(low)))
+        trials[:, 0] = climbers
+        trials = np.clip(trials, low, high)
+        values = objective(trials.reshape(-1, len(low))).reshape(len(climbers), TRIALS)
+        climbers = trials[np.arange(len(climbers)), values.argmax(axis=1)]
+        deviation = SHRINK * deviation
+    return climbers
 
 
 BOXES = 256  # looked at together

@@ -265,7 +265,10 @@ def _sum_intervals(a: Interval, axes: tuple[int, ...]) -> Interval:
 
 
 def _bound_contraction(a: Interval, b: Interval, dimensions: Contraction) -> Interval:
-    """Return the interval of a contraction: products first, then their sum."""
+    """Return the interval of a contraction (`dot_general`): that of all products, then of their sums.
+
+    dimensions: the contracted axes of a and of b, and the axes of both that are a batch.
+    """
     (left, right), (left_batch, right_batch) = dimensions
 
     def lay_out(x: Numbers, contracted: Sequence[int], batch: Sequence[int], before: int, after: int) -> Numbers:

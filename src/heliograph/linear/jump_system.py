@@ -99,19 +99,24 @@ class JumpSystem(NamedTuple):
         """
         shape = self.shape
 
-        def back(behind: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-            """Return what L sends back from before the first step, and L of each, given what comes from behind."""
-            ahead = []
-            for chain, maps, weight in zip(self.chain[::-1], self.maps[::-1], weights[::-1], strict=True):
-                ahead.append(weight + behind)
-                behind = mix_modes(chain.T, propagate_by_mode(maps.swapaxes(-1, -2), ahead[-1], 0.0))
-            return behind[..., : shape[0], :, :], ahead[::-1]
+        def go_back(later: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+            """Return the derivative by X before the first step, and L of each step; `later`: that by X after the last.
 
-        behind = np.zeros(shape)
-        if forever:
-            behind = solve_fixed_point(lambda later: back(later, 0.0 * weights)[0], back(behind, weights)[0])
-        ahead = np.array([np.broadcast_to(value, self.maps.shape[1:]) for value in back(behind, weights)[1]])
-        return np.asarray(ahead + ahead.swapaxes(-1, -2)) / 2
+            L of a step is its weight and the derivative through later steps.
+            """
+            derivatives = []
+            for chain, maps, weight in zip(self.chain[::-1], self.maps[::-1], weights[::-1], strict=True):
+                derivatives.append(weight + later)
+                later = mix_modes(chain.T, propagate_by_mode(maps.swapaxes(-1, -2), derivatives[-1], 0.0))
+            return later[..., : shape[0], :, :], derivatives[::-1]
+
+        later = np.zeros(shape)
+        if forever:  # the derivative after the period is that before the next one: a linear fixed point
+            of_own_weights, _ = go_back(later, weights)
+            later = solve_fixed_point(lambda x: go_back(x, 0.0 * weights)[0], of_own_weights)
+        _, derivatives = go_back(later, weights)
+        by_step = np.array([np.broadcast_to(value, self.maps.shape[1:]) for value in derivatives])
+        return np.asarray(by_step + by_step.swapaxes(-1, -2)) / 2
 
     def _propagate_one_period(self, moments: Array) -> Any:
         """Propagate X from before the first step to after the last, summed over modes that are redrawn there."""

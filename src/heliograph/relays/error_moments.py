@@ -154,18 +154,22 @@ class Propagated(NamedTuple):
 def propagate_slots(
     steps: RelaySteps, start: Float[Array, "d d"], gains: Float[Array, "time Fn R"] | None = None
 ) -> Propagated:
-    """Propagate the covariance of eta from `start`, under given gains or, without, those of `local_gain`.
+    """Propagate the covariance of eta = (x, e_1 ... e_F) over the steps; return it with gains and powers over time.
 
-    Entries of given gains on rows that receive nothing are not used.
+    Args:
+        steps: of the network.
+        start: the covariance before the first step.
+        gains: K of all filters as one block matrix for each step, whose entries on rows that receive nothing are not
+            used; those of `local_gain` if None.
     """
 
     def move(moments: jax.Array, row: tuple[RelaySteps, jax.Array | None]) -> tuple[jax.Array, tuple[jax.Array, ...]]:
         """Return the moments after a step; and its gains, these moments and the powers."""
         step, gain = row
-        z, sent = step_moments(step, moments)
-        used = local_gain(z, step) if gain is None else gain * step.receives_in_slot
-        after = correct_moments(z, used)
-        return after, (used if gain is None else gain, after, sent.power)
+        uncorrected, sent = step_moments(step, moments)
+        used = local_gain(uncorrected, step) if gain is None else gain * step.receives_in_slot
+        corrected = correct_moments(uncorrected, used)
+        return corrected, (used if gain is None else gain, corrected, sent.power)
 
     start = jnp.asarray(start)
     items = (steps, None if gains is None else jnp.asarray(gains))

@@ -238,7 +238,7 @@ def _count_arguments(params: dict[str, Any]) -> tuple[int, int]:
 def _write_out_scan(
     lowering: Lowering, equation: JaxprEqn, fixed: list[Value], carry: list[Value], rows: list[Value]
 ) -> list[Value]:
-    """Lower a short `scan` as its turns one after another."""
+    """Lower a short `scan` as its turns one after another; return its carry, then what it stacks."""
     params = equation.params
     stacked: list[list[Value]] = []
     turns = range(params["length"])
@@ -247,7 +247,7 @@ def _write_out_scan(
         results = lowering.inline_program(params["jaxpr"], [*fixed, *carry, *items])
         carry = results[: len(carry)]
         stacked.append([lowering.nodes(x) for x in results[len(carry) :]])
-    if not stacked:
+    if not stacked:  # of no turns the results that are stacked have no rows
         avals: list[Any] = [v.aval for v in equation.outvars[len(carry) :]]
         return [*carry, *(np.empty(a.shape, dtype=object) for a in avals)]
     if params["reverse"]:

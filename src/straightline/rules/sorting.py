@@ -16,16 +16,17 @@ def _sort(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> l
     count, kind = inputs[0].shape[axis], type_of(equation.invars[0].aval)
     if equation.params["num_keys"] != 1 or kind == "bool" or count > FEW:
         raise Unsupported("sort")
-    moved = [np.moveaxis(x, axis, -1).copy() for x in inputs]
-    for index in np.ndindex(*moved[0].shape[:-1]):
-        rows = [x[index] for x in moved]
+    arrays = [np.moveaxis(x, axis, -1).copy() for x in inputs]
+    for index in np.ndindex(*arrays[0].shape[:-1]):
+        keys, *_ = rows = [x[index] for x in arrays]
+        # Odd-even transposition: neighbours at even places are exchanged if in the wrong order, then those at odd ones.
         for turn in range(count):
             for i in range(turn % 2, count - 1, 2):
-                wrong = _is_behind(graph, rows[0][i], rows[0][i + 1])
+                is_wrong = _is_behind(graph, keys[i], keys[i + 1])
                 for row in rows:
                     a, b = row[i], row[i + 1]
-                    row[i], row[i + 1] = select(graph, wrong, b, a), select(graph, wrong, a, b)
-    return [np.moveaxis(x, -1, axis) for x in moved]
+                    row[i], row[i + 1] = select(graph, is_wrong, b, a), select(graph, is_wrong, a, b)
+    return [np.moveaxis(x, -1, axis) for x in arrays]
 
 
 def _is_behind(graph: Graph, a: Node, b: Node) -> Node:
