@@ -9,7 +9,7 @@ from heliograph.files.table_rows import RowsAsColumns
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail
 from heliograph.numerics.times.row_order import SECOND, YEAR
-from heliograph.numerics.times.row_times import backwards, backwards_text
+from heliograph.numerics.times.row_times import backwards_text, find_backwards_row
 from heliograph.simulation.network import Network
 
 
@@ -52,8 +52,8 @@ class BlockOrder:
             where, before = f"{self._path}, row {ordered.numbers[0]}, column {TIME!r}", self.last.time.dtype
             raise RowsNotInBlocksError(str(fail(where, f"numbers of the kind before, {before}", ordered.time.dtype)))
         rows = ordered if self.last is None else _append(self.last, ordered)
-        if (row := backwards(rows.time)) is not None:
-            raise self._refuse(rows.of(slice(row - 1, row + 1)), "a time that does not go backwards")
+        if (row := find_backwards_row(rows.time)) is not None:
+            raise self._refuse(rows.of(slice(row - 1, row + 1)), "a time that does not go find_backwards_row")
         self.last = ordered.of(slice(-1, None))
         if self._first is None:
             self._first = ordered.of(slice(1))
@@ -62,7 +62,7 @@ class BlockOrder:
         year = _year(rows.time)
         if len(jumps := np.flatnonzero(np.diff(rows.time) > year)):
             self._jump = rows.of(slice(int(jumps[0]), int(jumps[0]) + 2))
-        if (row := backwards(came.time)) is not None:
+        if (row := find_backwards_row(came.time)) is not None:
             self._disordered = came.of(slice(row - 1, row + 1))
         if self._jump is not None and self._disordered is not None:
             raise self._refuse(self._disordered, "times in order, in a recording with steps of more than a year")
