@@ -53,7 +53,7 @@ class BlockOrder:
             raise RowsNotInBlocksError(str(fail(where, f"numbers of the kind before, {before}", ordered.time.dtype)))
         rows = ordered if self.last is None else _append(self.last, ordered)
         if (row := find_backwards_row(rows.time)) is not None:
-            raise self._refuse(rows.of(slice(row - 1, row + 1)), "a time that does not go find_backwards_row")
+            raise self._refuse(rows.of(slice(row - 1, row + 1)), "a time that does not go backwards")
         self.last = ordered.of(slice(-1, None))
         if self._first is None:
             self._first = ordered.of(slice(1))
