@@ -60,7 +60,7 @@ class NativeLanes:
         """Return the sums over all runs, by batch, and give their memory back."""
         code = self.code.begun
         used = [sums for sums in self.sums if sums is not None]
-        totals = iter(code.total(used))
+        totals = iter(code.add_parts(used))
         self.memory += used
         leaves, common = [], []
         # Results that all runs share stand as of one run.
