@@ -67,7 +67,7 @@ def join_results(function: Callable[..., PyTree], parts: Sequence[tuple[Any, ...
     """
     choices = [choose_code(function, arguments, differs) for arguments in parts]
     codes = [choice.code for choice in choices]
-    return None if None in codes else codes[0].join([choice.arrays for choice in choices])
+    return None if None in codes else codes[0].compute_calls([choice.arrays for choice in choices])
 
 
 def take(states: PyTree, which: Which) -> PyTree:
