@@ -128,6 +128,9 @@ def scan_with_last_state(
         begin: number of the first row.
     """
 
+    # A derivative backwards keeps of each row the state before it, and computes the row again: all numbers of a row
+    # would be some 540 for 17, which take longer to store and read than to compute.
+    @partial(jax.checkpoint, prevent_cse=False)
     def step(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:
         """Predict and correct over one row (number, measurement, input); return the state after it, and its output."""
         k, z_k, u_k = row
