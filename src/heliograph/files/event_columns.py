@@ -51,7 +51,7 @@ class NodeEvents:
         """Return times, arrivals and counts of the events, (events,) each."""
         return np.array(self.time), np.array(self.arrival), np.array(self.sequence, dtype=np.int64)
 
-    def keep(self, which: np.ndarray) -> None:
+    def keep_events(self, which: np.ndarray) -> None:
         """Keep only the events of the mask `which`, (events,)."""
         columns, matrix = self.arrays(), self.matrix()[which]
         # NumPy's name of 64-bit integers is "l" on some systems, that of `array` is "q".
@@ -160,7 +160,7 @@ class NodeEvents:
         moment = f"{first:.10g}" if self.numbers else str(np.datetime64(int(first), "ns"))
         near = "that of arrival" if are_arrivals_known else "the others in order"
         why = fail(name, f"a time that was set, near {near}", f"{moment} in {count} of {len(time)} messages")
-        self.keep(~unset)
+        self.keep_events(~unset)
         return "", str(why), count
 
     def _note_unset(self, unset: Bool[np.ndarray, " events"], are_arrivals_known: bool) -> None:

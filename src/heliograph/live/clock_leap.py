@@ -65,7 +65,7 @@ class Leap(NamedTuple):
             return self._replace(back=back)
         return self._replace(earlier=self.earlier and self.earlier.with_back(of, back))
 
-    def taken_back_by(self, clock: str, time: float, now: float) -> bool:
+    def is_taken_back_by(self, clock: str, time: float, now: float) -> bool:
         """Return whether `clock` takes the leap back by saying `time`, which lies between the leap's two sides.
 
         `now`: the newest arrival after it.

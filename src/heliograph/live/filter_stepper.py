@@ -280,7 +280,7 @@ class CompiledFilter:
         # With so many degrees of freedom nis is chi-square of an honest filter; nothing exceeds it where none arrived.
         self.rare = [np.inf, *(float(chi2.isf(RARE, count)) for count in range(1, self.received + 1))]
 
-    def stepper(self) -> NativeFilterStepper | XlaFilterStepper:
+    def make_stepper(self) -> NativeFilterStepper | XlaFilterStepper:
         """Return a new stepper whose state is the prior."""
         code = compile_native_step(self._static, self.numbers, self._start, self._data)
         if code is None:

@@ -86,7 +86,7 @@ class Fleet:
         self.deciding = {name: rule.trigger for name, rule in self.watched.items() if rule.trigger is not None}
         self._values_before_losses = count_values_before_losses(network, self.deciding)
         # A slot with the prior, for plants that have not begun.
-        self._blank = self.pool.take()
+        self._blank = self.pool.take_slot()
         self.pool.write_prior(self._blank, -1.0)
 
     @property
@@ -107,7 +107,7 @@ class Fleet:
         """
         by_steps = self.program.dt is None
         prior_time = -1.0 if by_steps else time
-        slot = self.pool.take()
+        slot = self.pool.take_slot()
         self.pool.write_prior(slot, prior_time)
         base = HeldRow((prior_time, BEFORE, 0), slot, self.width)
         base.numbers[-1] = prior_time
@@ -116,7 +116,7 @@ class Fleet:
     def end_plant(self, plant: PlantState) -> None:
         """Remove a plant and free its slots."""
         self.end_silence(plant)
-        self.pool.give(plant.slots)
+        self.pool.free_slots(plant.slots)
 
     def pass_silence(self, plants: Iterable[tuple[PlantState, float]]) -> None:
         """Predict each plant to the step beside it, at which nothing came; `silence` of the plant becomes that row.
@@ -129,7 +129,7 @@ class Fleet:
             before = plant.silence or plant.rows.held[-1]
             if step <= before.key[0]:  # it is that far already
                 continue
-            slot = plant.silence.slot if plant.silence is not None else self.pool.take()
+            slot = plant.silence.slot if plant.silence is not None else self.pool.take_slot()
             plant.silence = HeldRow((step, 0, 0), slot, self.width)
             self.pool.table[slot, self.pool.numbers] = plant.silence.numbers
             chains.append([before, plant.silence])
@@ -138,7 +138,7 @@ class Fleet:
     def end_silence(self, plant: PlantState) -> None:
         """Forget the silence of a plant."""
         if plant.silence is not None:
-            self.pool.give([plant.silence.slot])
+            self.pool.free_slots([plant.silence.slot])
             plant.silence = None
 
     def count_values(self, node: int) -> int:
@@ -271,7 +271,7 @@ class Fleet:
         verdict = plant.rows.judge_event(event, key, now - self.options.window, self.options.ahead)
         if verdict == "used":
             self.end_silence(plant)
-            plant.add_event(event, key, self.pool.take, self.width, self._find_lost_column(event.node_index))
+            plant.add_event(event, key, self.pool.take_slot, self.width, self._find_lost_column(event.node_index))
             plant.pass_time(clock_name, clock_time, now, longest_gap, agreed)
         return verdict
 
@@ -288,7 +288,7 @@ class Fleet:
 
     def undo_events(self, plant: PlantState, clock: tuple[float, Leap | None]) -> None:
         """Restore a plant to its state before the events taken since it was last finalised; `clock`: its own then."""
-        self.pool.give(plant.undo_changes())
+        self.pool.free_slots(plant.undo_changes())
         plant.clock = clock
 
     def finalise_plants(self, touched: Iterable[PlantState], all_: bool = False) -> list[FinalisedPlant]:
@@ -374,7 +374,7 @@ class Fleet:
 
     def count_event(self, plant: PlantState, node: str, screened: ScreenedEvent, verdict: Verdict) -> None:
         """Count an event of a node by its verdict, what was screened of it, and the silence before it."""
-        link, event, rule = plant.link(node), screened.event, self.watched.get(node)
+        link, event, rule = plant.link_counts(node), screened.event, self.watched.get(node)
         if rule is not None and rule.timeout is not None and verdict == "used":
             link.count_timeout(event.time, plant.begun, rule.timeout)
         link.count(verdict, event.sequence, event.time, self.periods.get(node, 0))
@@ -383,7 +383,7 @@ class Fleet:
     def free_slots(self, finalised: Iterable[FinalisedPlant]) -> None:
         """Free the slots that are not needed any more, once the outputs of the final rows have been read."""
         for of_plant in finalised:
-            self.pool.give(of_plant.left)
+            self.pool.free_slots(of_plant.left)
 
 
 def _check_options(options: Options) -> Options:

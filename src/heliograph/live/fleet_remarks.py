@@ -24,7 +24,7 @@ class FleetRemarks:
     def find_new(self, plants: Iterable[PlantState]) -> Iterator[tuple[str, str]]:
         """Yield the name of a plant and a line for each filter that has something new to say."""
         for plant in plants if self.counts else ():
-            for place, said in self._read(plant.rows.held[-1]).items():
+            for place, said in self._read_remarks(plant.rows.held[-1]).items():
                 new = said.times - plant.remarked.get(place, 0)
                 if new > 0:
                     self.counts[place] += new
@@ -33,9 +33,9 @@ class FleetRemarks:
 
     def note_said(self, plant: PlantState) -> None:
         """Note that all remarks on a plant were made before it was stored, so that none is made again."""
-        plant.remarked = {place: said.times for place, said in self._read(plant.rows.held[-1]).items()}
+        plant.remarked = {place: said.times for place, said in self._read_remarks(plant.rows.held[-1]).items()}
 
-    def _read(self, row: HeldRow) -> dict[tuple[str, str], Any]:
+    def _read_remarks(self, row: HeldRow) -> dict[tuple[str, str], Any]:
         """Return the remark of each filter on its state after a row, by node and filter."""
         if not self.counts:
             return {}

@@ -64,9 +64,9 @@ class JudgementReader:
         """
         if not plants:
             return []
-        return [self.why_inputs(row) for row in self.fleet.predict_outputs(plants, given)]
+        return [self.explain_inputs(row) for row in self.fleet.predict_outputs(plants, given)]
 
-    def why_inputs(self, outputs: Float[np.ndarray, " outputs"]) -> str | None:
+    def explain_inputs(self, outputs: Float[np.ndarray, " outputs"]) -> str | None:
         """Return why the inputs that led to these outputs of a row are implausible; None if they are not."""
         return Judgement.why_inputs(outputs[self._all_columns])
 
@@ -80,7 +80,7 @@ class JudgementReader:
         if not taken:
             return {}
         flagged = self._find_flagged(taken)
-        reasons = {i: why for i in flagged if (why := self._explain(taken[i]))}
+        reasons = {i: why for i in flagged if (why := self._explain_event(taken[i]))}
         # Of several nodes' events that were judged together only the one to blame; of one node in one row the largest.
         self._drop_blameless(taken, reasons)
         largest: dict[tuple[int, int], int] = {}
@@ -106,12 +106,12 @@ class JudgementReader:
         flagged: list[int] = np.flatnonzero((pool.table[slots[:, None], flags] > 0).any(axis=1)).tolist()
         return flagged
 
-    def _explain(self, candidate: Candidate) -> str | None:
+    def _explain_event(self, candidate: Candidate) -> str | None:
         """Return why a candidate is implausible by the judgements of its row; None if it is not, or has no number."""
         event, pool = candidate.event, self.fleet.pool
         outputs = pool.table[candidate.row.slot, pool.outputs]
         if event.node_index < 0:  # inputs
-            return self.why_inputs(outputs)
+            return self.explain_inputs(outputs)
         if _largest_number(event) < 0:
             return None
         return Judgement.why_values(outputs[self._judgement_columns[event.node_index]])
@@ -147,7 +147,7 @@ class JudgementReader:
     def _find_row_before(self, candidate: Candidate) -> HeldRow:
         """Return the row before the candidate's; there is one, since the first that is held takes no event."""
         rows = candidate.plant.rows
-        return rows.held[rows.index(candidate.row.key) - 1]
+        return rows.held[rows.find_index(candidate.row.key) - 1]
 
     def _estimate_after(self, row: HeldRow, filter: AbstractFilter, columns: FilterColumns) -> Estimate:
         """Return what a filter estimated after a row, from its columns; before all events its initial estimate."""
@@ -181,14 +181,14 @@ class JudgementReader:
         # A copy of the row in a slot of its own, with NaN for the node's numbers.
         event, row = candidate.event, candidate.row
         pool, rows = self.fleet.pool, candidate.plant.rows
-        trial = HeldRow(row.key, pool.take(), self.fleet.width)
+        trial = HeldRow(row.key, pool.take_slot(), self.fleet.width)
         trial.numbers = row.numbers.copy()
         columns = rows.columns_by_node[event.node_index]
         trial.numbers[columns] = [nan] * (columns.stop - columns.start)
         # Stepped from the row before, judged, and let go.
         self.fleet.step_row(self._find_row_before(candidate), trial)
         judged = pool.table[trial.slot, pool.outputs][self._judgement_columns[event.node_index]]
-        pool.give([trial.slot])
+        pool.free_slots([trial.slot])
         return Judgement.why_values(judged) is None
 
 

@@ -118,7 +118,7 @@ class PlantState:
         if self.leap is None or found is None:
             return
         leap, newest = found
-        if agreed or leap.taken_back_by(clock, time, newest):
+        if agreed or leap.is_taken_back_by(clock, time, newest):
             self.undo_leap(leap, longest_gap, names)
         elif clock == leap.clock:
             self.leap = self.leap.with_back(leap, time)
@@ -181,10 +181,10 @@ class PlantState:
         gone = held[first_after:]
         self.aside.append(RowsOfLeap(held, self.kept, changes=len(self.changes), gone=gone, rows=not_final))
         if all_after and self.kept is not None:
-            self.rows.hold([self.kept.row])  # the base again
+            self.rows.replace_rows([self.kept.row])  # the base again
             self.kept = None
         else:
-            self.rows.hold(held[:first_after])
+            self.rows.replace_rows(held[:first_after])
         if self.dirty is not None and self.dirty >= len(self.rows.held):
             self.dirty = None
         self.now, self.leap = leap.now, leap.earlier
@@ -197,9 +197,9 @@ class PlantState:
             for node, _, _ in row.events:
                 counts[names[node]] = counts.get(names[node], 0) + 1
         for name, count in counts.items():
-            self.link(name).count_withdrawn(count, leap.moments.get(name))
+            self.link_counts(name).count_withdrawn(count, leap.moments.get(name))
 
-    def holds(self, leap: Leap, time: float, longest_gap: float) -> bool:
+    def holds_rows_before(self, leap: Leap, time: float, longest_gap: float) -> bool:
         """Return whether rows from before a leap are held, and `time` comes after the first of them."""
         return self.rows.first_from(leap.time - longest_gap) > 0 and time > self.rows.keys[0][0]
 
@@ -222,7 +222,7 @@ class PlantState:
             losses: name of the event's node and the column of the number of messages lost before it, where its running
                 count says this; else None.
         """
-        index, row = self.rows.find(key)
+        index, row = self.rows.find_row(key)
         if row is None:
             row = HeldRow(key, take_slot(), width)
             self.rows.keys.insert(index, key)
@@ -230,7 +230,7 @@ class PlantState:
             change: Change = row, None
         else:
             change = row, (row.numbers.copy(), dict(row.events))
-        self.rows.fill(row, event)
+        self.rows.write_event(row, event)
         if losses is not None:
             self._write_lost(index, row, event, *losses)
         self.changes.append(change)  # last: that of the event itself
@@ -265,12 +265,12 @@ class PlantState:
         # Newest first: what changed after each leap that was taken back, then this itself.
         for leap in reversed(self.aside):
             slots += self._undo_since(leap.changes)
-            self.rows.hold(leap.held)
+            self.rows.replace_rows(leap.held)
             self.kept = leap.kept
         slots += self._undo_since(0)
         self.aside = []
         # Step again from the first row that was changed, which is never the base.
-        index = max(min(map(self.rows.index, keys), default=len(self.rows.held)), 1)
+        index = max(min(map(self.rows.find_index, keys), default=len(self.rows.held)), 1)
         self.dirty = index if index < len(self.rows.held) else None
         return slots
 
@@ -279,14 +279,14 @@ class PlantState:
         slots = []
         for row, before in reversed(self.changes[count:]):
             if before is None:  # the row was new
-                self.rows.remove(self.rows.index(row.key))
+                self.rows.remove_row(self.rows.find_index(row.key))
                 slots.append(row.slot)
             else:
                 row.numbers, row.events = before
         del self.changes[count:]
         return slots
 
-    def link(self, node: str) -> LinkCounts:
+    def link_counts(self, node: str) -> LinkCounts:
         """Return the counts of a node."""
         link = self.links.get(node)
         if link is None:

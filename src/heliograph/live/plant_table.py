@@ -45,7 +45,7 @@ class SlotTable:
         """Return how many slots are taken."""
         return len(self.table) - len(self._free)
 
-    def take(self) -> int:
+    def take_slot(self) -> int:
         """Take a free slot."""
         if not self._free:
             count = len(self.table)
@@ -53,7 +53,7 @@ class SlotTable:
             self._free = list(range(2 * count - 1, count - 1, -1))
         return self._free.pop()
 
-    def give(self, slots: list[int]) -> None:
+    def free_slots(self, slots: list[int]) -> None:
         """Give slots back."""
         self._free += slots
 
@@ -133,7 +133,7 @@ class SlotTable:
         after = pass_long_gap(step, self.step_rows.start, row[self.state].copy(), at, to - at, places)
         self.table[slot, self.state], self.table[slot, self.at.start] = after, to
 
-    def history(self, slots: Sequence[int]) -> PyTree:
+    def gather_history(self, slots: Sequence[int]) -> PyTree:
         """Return the rows in these slots, in order, as a smoother takes them.
 
         Copies of the last row behind them make their number a power of two, so that few lengths are compiled.

@@ -51,7 +51,7 @@ class SortedRows:
         self.held, self.keys = [base], [base.key]
         self.joint, self.columns_by_node, self.capacity = joint, columns, capacity
 
-    def hold(self, rows: list[HeldRow]) -> None:
+    def replace_rows(self, rows: list[HeldRow]) -> None:
         """Replace all rows by these, in their order."""
         self.held, self.keys = rows, [row.key for row in rows]
 
@@ -81,7 +81,7 @@ class SortedRows:
         if key > self.keys[-1]:  # as most are: nothing can be said against what is newest
             return "used"
         base, _ = self.find_base(watermark)
-        index, row = self.find(key)
+        index, row = self.find_row(key)
         values_held = None if row is None else row.events.get(event.name)
         if index < base or (index == base and values_held is None):
             return "late"
@@ -95,7 +95,7 @@ class SortedRows:
         both = any(old == old and new == new for old, new in zip(there, event.values, strict=True))
         return "conflict" if both else "used"
 
-    def find(self, key: Key) -> tuple[int, HeldRow | None]:
+    def find_row(self, key: Key) -> tuple[int, HeldRow | None]:
         """Return the index of the row with this key, and the row if it exists."""
         if key > self.keys[-1]:
             return len(self.keys), None
@@ -103,15 +103,15 @@ class SortedRows:
         exists = self.keys[index] == key
         return index, self.held[index] if exists else None
 
-    def index(self, key: Key) -> int:
+    def find_index(self, key: Key) -> int:
         """Return the index of the row with this key, or the index at which it would be inserted."""
         return bisect_left(self.keys, key)
 
-    def remove(self, index: int) -> None:
+    def remove_row(self, index: int) -> None:
         """Remove the row with this index."""
         del self.keys[index], self.held[index]
 
-    def fill(self, row: HeldRow, event: CheckedEvent) -> None:
+    def write_event(self, row: HeldRow, event: CheckedEvent) -> None:
         """Write an event's values into its row; NaN is left out."""
         columns, values = self.columns_by_node[event.node_index], event.values
         if row.events:  # else nothing is there yet

@@ -94,7 +94,7 @@ class Stream:
         self._inputs = np.full(len(filter.inputs), np.nan)  # of the newest step
         # The compiled step, with the state; what to warn of its angles.
         self._compiled, self._angles = compile_once(filter), WideAngles(filter)
-        self._stepper = self._compiled.stepper()
+        self._stepper = self._compiled.make_stepper()
 
     @property
     def doubt(self) -> str:
@@ -339,7 +339,7 @@ class Stream:
         state = data["state"]
         vars(self).update({name: value for name, value in data.items() if name != "state"})
         self._compiled = compile_once(self.filter)
-        self._stepper = self._compiled.stepper()
+        self._stepper = self._compiled.make_stepper()
         self._stepper.set_state(state)
 
 

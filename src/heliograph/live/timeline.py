@@ -92,7 +92,7 @@ class Timeline:
             warnings.warn(f"timeline: predictions depend on when others are asked for: {what}", stacklevel=2)
         # A fleet of one plant, and a slot of its table to predict into.
         self._fleet = Fleet(self._program, Options(self.window, self.ahead, capacity=self.capacity), alone=True)
-        self._plant, self._spare = self._fleet.begin_plant("", start, None), self._fleet.pool.take()
+        self._plant, self._spare = self._fleet.begin_plant("", start, None), self._fleet.pool.take_slot()
         # What judges events, and what is warned of: angles, states of filters, readings that repeat.
         self._judges = JudgementReader(self._fleet)
         self.reasons: dict[str, str] = {}
@@ -207,7 +207,7 @@ class Timeline:
         why = self._judges.find_implausible([Candidate(0, plant, event, row)]).get(0)
         if why is None and event.node_index < 0 and self._program.dt is not None:
             after = fleet.pool.predict_outputs(np.array([row.slot]), np.full((1, self._program.given), np.nan), np.inf)
-            why = self._judges.why_inputs(after[0])
+            why = self._judges.explain_inputs(after[0])
         return why
 
     def advance(self, now: float) -> None:
@@ -268,7 +268,7 @@ class Timeline:
         if not has_row:
             self._fleet.predict_into(rows.held[after - 1], time, self._spare)
             slots.insert(1, self._spare)
-        return self._program.smoother.estimates(self._fleet.pool.history(slots), 1, len(slots))
+        return self._program.smoother.estimates(self._fleet.pool.gather_history(slots), 1, len(slots))
 
     def final(self) -> Record:
         """Return the estimates that became final since the last call, one for each row with a measurement.

@@ -58,7 +58,7 @@ class CountTotals:
         self.by_node: dict[str, Counter[str]] = {}
         self._seen: dict[tuple[str, str], tuple[int, ...]] = {}
 
-    def add(self, plant: str, links: Mapping[str, LinkTotals]) -> None:
+    def add_plant(self, plant: str, links: Mapping[str, LinkTotals]) -> None:
         """Add what has changed in a plant's counts since they were added last."""
         for node, link in links.items():
             now = tuple(counts_of(link).values())

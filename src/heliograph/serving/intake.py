@@ -101,7 +101,7 @@ class BatchIntake:
         while waiting:
             self._before, self._taken = {}, []
             for i in waiting:
-                outcomes[i] = self._take_one(i, messages[i], wall)
+                outcomes[i] = self._take_message(i, messages[i], wall)
             restored = self._refuse_implausible()
             waiting = [i for i in waiting if plant_of(messages[i]) in restored]
         self._taken = []
@@ -120,7 +120,7 @@ class BatchIntake:
             self._restore_plant(name)
         return restored
 
-    def _take_one(self, number: int, message: Read, wall: datetime) -> Outcome:
+    def _take_message(self, number: int, message: Read, wall: datetime) -> Outcome:
         """Give a message to its plant, as far as it was read; return its outcome."""
         if isinstance(message, str):
             return Outcome(why=message)
@@ -190,7 +190,7 @@ class BatchIntake:
         if why_refused is None:
             self._give_to_plant(number, plant, message, timed.inputs, timed.clock)
             return []
-        plant.link(INPUTS).implausible += 1
+        plant.link_counts(INPUTS).implausible += 1
         return [f"inputs {message.inputs}: {why_refused}; the rest is used"]
 
     def _read_events(self, message: AnyMessage, plant: PlantState | None, wall: datetime) -> TimedEvents:
@@ -223,7 +223,7 @@ class BatchIntake:
             at = self._time_as_number(message.time, plant.origin, plant.name)
         except InputError:  # a time of another kind
             return None
-        link = self._note_before(plant, at).link(node)
+        link = self._note_before(plant, at).link_counts(node)
         if unread.counted:
             link.count_unread(message.sequence, at, self.fleet.periods.get(node, 0))
         if unread.reason is not None:
@@ -264,8 +264,8 @@ class BatchIntake:
             clock, clock_time = ARRIVAL, self._time_as_number(message.arrival, plant.origin, plant.name)
         # The leap with which the plant began: the message takes that back if it goes on from before.
         first, newest = find_leap(plant.leap, plant.now, clock_time, longest_gap) or (None, at)
-        began_with_it = first is not None and first.now == -inf and not plant.holds(first, at, longest_gap)
-        if first is not None and began_with_it and first.taken_back_by(clock, clock_time, newest):
+        began_with_it = first is not None and first.now == -inf and not plant.holds_rows_before(first, at, longest_gap)
+        if first is not None and began_with_it and first.is_taken_back_by(clock, clock_time, newest):
             return None
         # The clock on the wall agrees with the message, and not with the plant.
         if plant.origin is not None:
@@ -286,7 +286,9 @@ class BatchIntake:
             events = [WithdrawnEvent(*event) for row in old.rows.held for event in row.events]
             self.replaced.append((old, events))
             for node, sequence, time in events:
-                plant.link(INPUTS if node < 0 else self.fleet.network.names[node]).count("future", sequence, time)
+                plant.link_counts(INPUTS if node < 0 else self.fleet.network.names[node]).count(
+                    "future", sequence, time
+                )
             self._before.pop(name, None)
             self._taken = [taken for taken in self._taken if taken.plant is not old]
             self.fleet.end_plant(old)

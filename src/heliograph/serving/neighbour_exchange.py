@@ -36,12 +36,15 @@ class NeighbourMessenger:
         """Return whether this is a node that sends messages to its neighbours."""
         return self._node is not None
 
-    def messages(self, plants: Iterable[PlantState]) -> list[Output]:
+    def make_messages(self, plants: Iterable[PlantState]) -> list[Output]:
         """Return the messages that the events taken since the last finalisation make due, after their steps."""
         if self._node is None:
             return []
         return [
-            output for plant in plants for row in self._find_due_rows(plant) for output in self._send_row(plant, row)
+            output
+            for plant in plants
+            for row in self._find_due_rows(plant)
+            for output in self._make_row_messages(plant, row)
         ]
 
     def _find_due_rows(self, plant: PlantState) -> list[HeldRow]:
@@ -72,7 +75,7 @@ class NeighbourMessenger:
         assert self._node is not None
         return any(node == 0 or (node > 0 and not self._node.measured[0]) for node, _, _ in events)
 
-    def _send_row(self, plant: PlantState, row: HeldRow) -> list[Output]:
+    def _make_row_messages(self, plant: PlantState, row: HeldRow) -> list[Output]:
         """Return a row's message to each receiver: estimate and covariance before the step, and the measurement."""
         assert self._node is not None
         pool, network = self.fleet.pool, self.fleet.network

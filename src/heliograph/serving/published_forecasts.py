@@ -75,7 +75,7 @@ class ForecastPublisher:
             raise fail("--forecast", f"whole steps of {step:g} s", f"{seconds:g} s")
         return count
 
-    def forecasts(self, rows: Sequence[HeldRow]) -> list[list[Ahead]]:
+    def make_forecasts(self, rows: Sequence[HeldRow]) -> list[list[Ahead]]:
         """Return the forecasts from each row, by horizon: its time, how far ahead it is, and what each filter says.
 
         The rows of all plants are predicted side by side. A row whose horizons reach behind the last step has none. How

@@ -238,7 +238,7 @@ class Service:
         self._tell_doubts(list(touched.values()))
         entries, malformed, known = self._report_unused(messages, payloads, outcomes)
         # Step what is due; estimates of final rows are committed, provisional ones and messages only published.
-        sent = self._exchange.messages(touched.values())
+        sent = self._exchange.make_messages(touched.values())
         finalised = self.fleet.finalise_plants(touched.values())
         withdrawn = [*self._intake.replaced, *((each.plant, each.withdrawn) for each in finalised)]
         entries += [entry for plant, events in withdrawn for entry in self._write_withdrawn(plant, events)]
@@ -343,7 +343,7 @@ class Service:
     def _forget_plant(self, name: str) -> None:
         """Let a plant leave the memory."""
         self.fleet.end_plant(self.plants.pop(name))
-        self._silence.forget(name)
+        self._silence.forget_plant(name)
 
     def _load_plants(self, names: Iterable[str]) -> None:
         """Load the plants of these names that are not in memory from the store; note which of them are damaged."""
@@ -373,7 +373,9 @@ class Service:
         """Return outputs with the estimates after these rows, their forecasts, and what the senders' silence means."""
         outputs = []
         self._silence.note_published(rows)
-        forecasts = self._ahead.forecasts([row for _, row in rows]) if self._ahead is not None else [None] * len(rows)
+        forecasts = (
+            self._ahead.make_forecasts([row for _, row in rows]) if self._ahead is not None else [None] * len(rows)
+        )
         bodies = self._write_estimates(b"provisional", rows)
         for (plant, _), body, horizons in zip(rows, bodies, forecasts, strict=True):
             # Members are added before the closing brace of the line.

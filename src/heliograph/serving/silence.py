@@ -64,7 +64,7 @@ class SilenceWatch:
         step, due = self.fleet.options.step, list[tuple[PlantState, float]]()
         if step is None or not self.fleet.deciding:
             return due
-        for plant, origin in self._dated(plants):
+        for plant, origin in self._iterate_dated_plants(plants):
             passed = min((now - origin) // timedelta(seconds=step), self.fleet.end_step)
             # The clock also confirms or contradicts a leap in time that no other clock has confirmed so far.
             leap = plant.leap
@@ -82,10 +82,10 @@ class SilenceWatch:
             return []
         self._looked = monotonic()
         step, found = self.fleet.options.step, list[tuple[PlantState, float]]()
-        for plant, origin in self._dated(plants):
+        for plant, origin in self._iterate_dated_plants(plants):
             at = (now - origin) / timedelta(seconds=step or 1.0)
             at = at if step is None else min(floor(at), self.fleet.end_step)
-            if at > plant.now and set(self._dead_senders(plant, at)) - set(self._told_dead(plant)):
+            if at > plant.now and set(self._dead_senders(plant, at)) - set(self._published_dead_senders(plant)):
                 found.append((plant, float(at)))
         return found
 
@@ -97,7 +97,7 @@ class SilenceWatch:
         in_time = lag < self.fleet.shortest_timeout * (self.fleet.options.step or 1.0) < inf
         return in_time and monotonic() > self._looked + SHORTEST
 
-    def _dated(self, plants: Iterable[PlantState]) -> Iterator[tuple[PlantState, datetime]]:
+    def _iterate_dated_plants(self, plants: Iterable[PlantState]) -> Iterator[tuple[PlantState, datetime]]:
         """Yield the plants whose time is a date's, with their origins; not those of which messages may wait."""
         if self._resumed and monotonic() > self._begun + GRACE:
             self._resumed.clear()
@@ -113,7 +113,7 @@ class SilenceWatch:
                 self._published[plant.name] = PublishedEstimate(output, self._dead_senders(plant), row.key[0])
                 self._resumed.discard(plant.name)
 
-    def forget(self, name: str) -> None:
+    def forget_plant(self, name: str) -> None:
         """Forget a plant that leaves the memory."""
         self._published.pop(name, None)
 
@@ -140,7 +140,7 @@ class SilenceWatch:
         """Return the dead senders of a plant, by now."""
         return tuple(name for name, status in self.fleet.find_sender_status(plant, now).items() if status.dead)
 
-    def _told_dead(self, plant: PlantState) -> tuple[str, ...]:
+    def _published_dead_senders(self, plant: PlantState) -> tuple[str, ...]:
         """Return the senders of a plant that were told to be dead."""
         return self._published[plant.name].dead if plant.name in self._published else ()
 

@@ -188,7 +188,7 @@ def test_what_is_lost_of_messages_without_a_count_is_not_counted():
     uncounted = Sources(sources, network).uncounted
     assert uncounted == {"a"}
     watch = watch_of(network, "house", uncounted)
-    watch.totals.add("", {name: LinkCounts(used=3, lost=0) for name in "ab"})
+    watch.totals.add_plant("", {name: LinkCounts(used=3, lost=0) for name in "ab"})
     assert {name: link["lost"] for name, link in watch.links().items()} == {"a": None, "b": 0}
     said = metrics_of(watch)
     assert 'heliograph_lost{node="b"} 0' in said and 'heliograph_lost{node="a"}' not in said

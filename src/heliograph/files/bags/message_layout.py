@@ -70,7 +70,7 @@ class Layout:
             fits &= _read_column(table, begin, "uint32") == length
         return fits
 
-    def columns(self, table: np.ndarray) -> dict[str, np.ndarray]:
+    def read_columns(self, table: np.ndarray) -> dict[str, np.ndarray]:
         """Return each wanted field of messages of this layout, (messages,)."""
         return {path: _read_column(table, begin, kind) for path, (begin, kind) in self.fields.items()}
 
@@ -204,7 +204,7 @@ class Decoder:
                 paths = {path for source, *_ in self._sources.of(connection.topic) for path in _list_paths(source)}
                 known.append(Layout(self._definitions, connection.msgtype, table[left[0]].tobytes(), paths))
             fits = known[index].fits(table[left])
-            yield left[fits], known[index].columns(table[left[fits]])
+            yield left[fits], known[index].read_columns(table[left[fits]])
             left, index = left[~fits], index + 1
 
 

@@ -119,7 +119,7 @@ def unpack_plant(name: str, data: bytes, fleet: Fleet) -> PlantState:
     kept = None if moment_before is None else BeforeLeap(rows.pop(0), moment_before)
     base = rows[0]
     sorted_rows = fleet.make_rows(base)
-    sorted_rows.hold(rows)
+    sorted_rows.replace_rows(rows)
     return PlantState(
         name=name,
         rows=sorted_rows,
@@ -167,7 +167,7 @@ def _unpack_leap(parts: Any) -> Leap:
 
 def _make_held_row(fleet: Fleet, numbers: np.ndarray, node: int, sequence: int) -> HeldRow:
     """Return a row with the key (time, node, sequence), whose numbers stand in a new slot of the fleet's table."""
-    slot = fleet.pool.take()
+    slot = fleet.pool.take_slot()
     fleet.pool.table[slot] = numbers
     row = HeldRow((float(numbers[-1]), node, sequence), slot, fleet.width)
     row.numbers = numbers[fleet.pool.numbers].tolist()

@@ -44,7 +44,7 @@ class ArrivalOrder:
         """Take messages; return those that no longer wait, since more than HELD would."""
         results = list[Payload]()
         for payload in payloads:
-            self._last = self._moment(payload)
+            self._last = self._find_moment(payload)
             entry = HeldPayload(self._last, self._count, payload)
             self._count += 1
             if len(self._held) < HELD:
@@ -53,7 +53,7 @@ class ArrivalOrder:
                 results.append(heappushpop(self._held, entry).payload)
         return results
 
-    def end(self) -> list[Payload]:
+    def take_rest(self) -> list[Payload]:
         """Return all messages that still wait, in order."""
         if self._count == len(self._held):  # all are here, so that times can be compared with all others
             self._refuse_unset_times()
@@ -78,7 +78,7 @@ class ArrivalOrder:
                 error = str(fail(where, expected, time.isoformat() if isinstance(time, datetime) else time))
                 self._held[self._held.index(entry)] = entry._replace(payload=error)
 
-    def _moment(self, payload: Payload) -> float:
+    def _find_moment(self, payload: Payload) -> float:
         """Return when a payload arrived, or else was measured; for what is no message, the moment of the one before."""
         message = payload.read if isinstance(payload, UnreadMessage) else payload
         if not isinstance(message, Message | NumberedMessage):

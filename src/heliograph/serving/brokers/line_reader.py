@@ -95,7 +95,7 @@ class LineReader:
             rest = self._table.end()
         else:
             rest = [] if self._document is None else self._read_document_or_lines(self._document)
-        return rest if self._order is None else [*self._order.add_messages(rest), *self._order.end()]
+        return rest if self._order is None else [*self._order.add_messages(rest), *self._order.take_rest()]
 
     def _read_line(self, line: bytes) -> list[Payload]:
         """Return the messages of a line that is none of a table; [] while a document over several lines goes on."""

@@ -155,7 +155,7 @@ class Nats:
             except AWAY as error:
                 await self._retry.wait(error)
             else:
-                self._retry.worked()
+                self._retry.note_success()
                 return done
 
     def _is_connected(self) -> bool:

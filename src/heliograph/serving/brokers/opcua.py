@@ -172,7 +172,7 @@ class OpcUa:
                     await self._client.check_connection()
                     return
                 await self._subscribe()
-                self._retry.worked()
+                self._retry.note_success()
                 return
             except AWAY as error:
                 if self._client is not None:

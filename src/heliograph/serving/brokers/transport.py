@@ -107,7 +107,7 @@ class Retry:
         self._wait = min(2 * self._wait, LONGEST)
         await asyncio.sleep(wait)
 
-    def worked(self) -> None:
+    def note_success(self) -> None:
         """Reset the wait after a success."""
         self._wait = FIRST
 

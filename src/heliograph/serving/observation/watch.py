@@ -127,7 +127,7 @@ class Watch:
             self._batches.observe(last)
         plants = {output.plant for output in outputs}
         for name, plant in self._iterate_plants(plants):
-            self.totals.add(name, plant.links)
+            self.totals.add_plant(name, plant.links)
         for name in plants:
             self._overview.touch(name)
         for output in outputs:
