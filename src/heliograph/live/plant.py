@@ -1,4 +1,8 @@
-"""State of one plant of a fleet: its rows, its time, and changes that can be undone."""
+"""State of one plant of a fleet: its rows, its time, and changes that can be undone.
+
+A leap is a jump in time that one clock alone has made so far (`clock_leap`); rows before the watermark, the newest
+confirmed arrival less the window, become final, and are never stepped again.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
