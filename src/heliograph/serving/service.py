@@ -371,11 +371,9 @@ class Service:
 
     def _write_provisional(self, rows: Sequence[tuple[PlantState, HeldRow]]) -> list[Output]:
         """Return outputs with the estimates after these rows, their forecasts, and what the senders' silence means."""
-        outputs = []
+        outputs, held = [], [row for _, row in rows]
         self._silence.note_published(rows)
-        forecasts = (
-            self._ahead.make_forecasts([row for _, row in rows]) if self._ahead is not None else [None] * len(rows)
-        )
+        forecasts = [None] * len(rows) if self._ahead is None else self._ahead.make_forecasts(held)
         bodies = self._write_estimates(b"provisional", rows)
         for (plant, _), body, horizons in zip(rows, bodies, forecasts, strict=True):
             # Members are added before the closing brace of the line.
