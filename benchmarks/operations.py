@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 import heliograph as hg
-from heliograph.simulation.arguments import key_of
+from heliograph.simulation.arguments import make_run_key
 from heliograph.simulation.runs.native import compile_network_runs
 
 HERE = Path(__file__).resolve().parent
@@ -75,7 +75,7 @@ def of_networks() -> list[Row]:
 
 def _of_node(network: hg.Network) -> int:
     """Count the operations that differ between runs and that these share, of a step and node."""
-    code = compile_network_runs(network, np.zeros((STEPS, 0)), key_of(0), hg.Statistics(), 64).begun.program.code
+    code = compile_network_runs(network, np.zeros((STEPS, 0)), make_run_key(0), hg.Statistics(), 64).begun.program.code
     work: float = code.blocks.work + (0 if code.once is None else code.once.work)
     return round(work / STEPS / len(network.names))
 

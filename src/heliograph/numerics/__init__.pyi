@@ -137,9 +137,9 @@ from .times.row_order import SECOND as SECOND
 from .times.row_order import YEAR as YEAR
 from .times.row_order import find_out_of_order as find_out_of_order
 from .times.row_order import find_unset_stamps as find_unset_stamps
-from .times.row_times import find_backwards_row as find_backwards_row
 from .times.row_times import backwards_text as backwards_text
 from .times.row_times import check_times as check_times
+from .times.row_times import find_backwards_row as find_backwards_row
 from .times.row_times import row_dates as row_dates
 from .trace_settings import evaluate_at_points as evaluate_at_points
 from .trace_settings import precision_in_use as precision_in_use
@@ -165,8 +165,8 @@ from .traced import stack_parts as stack_parts
 from .traced import trace_shape as trace_shape
 from .traced import within as within
 from .trees.flat import FlatLayout as FlatLayout
-from .trees.flat import make_flat_layout as make_flat_layout
 from .trees.flat import flatten_to_row as flatten_to_row
+from .trees.flat import make_flat_layout as make_flat_layout
 from .trees.program_text import hash_numbers as hash_numbers
 from .trees.program_text import write_program_text as write_program_text
 from .trees.static import Static as Static

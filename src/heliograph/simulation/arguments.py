@@ -17,8 +17,8 @@ from heliograph.simulation.node import Node, ReceivingNode
 Precision = TypeAliasType("Precision", Literal["float64", "float32"])  # of the numbers that a run computes
 
 
-def key_of(key: object) -> jax.Array:
-    """Return the key of a seed, or the key itself."""
+def make_run_key(key: object) -> jax.Array:
+    """Return the JAX key of a seed, or the key itself; raise ValueError for anything else."""
     if isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.shape == ():
         return key
     if isinstance(key, jax.Array | np.ndarray):

@@ -1,4 +1,9 @@
-"""Boundedness for all time of the mean error covariance of a network's best filter, certified or refuted."""
+"""Boundedness for all time of the mean error covariance of a network's best filter, certified or refuted.
+
+The plant is x+ = A x + w, and z = G (H x + v) + n arrives, G and n random. P is the filter's prior error covariance, E
+its mean over what is lost. A kind of losses is a set of components that arrive; a mode that of the links' chain, where
+it is not one of the plant (an eigenvector of A).
+"""
 
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
@@ -60,7 +65,13 @@ class Boundedness(NamedTuple):
 class JointLinks(NamedTuple):
     """Joint model of all links: a chain of modes, the outcomes of each, and the sensors, one above the other.
 
-    m: measured components of all nodes; n: states; outcomes: one list per mode.
+    Args:
+        initial: probabilities of the modes at the first step.
+        chain: [i, j]: probability that mode j follows mode i.
+        outcomes: what may arrive in each mode, a list for each.
+        sensing: H, m measured components of all nodes by n states.
+        sensor_mean: E v.
+        sensor_noise: Cov v.
     """
 
     initial: Float[np.ndarray, "modes"]
@@ -94,7 +105,7 @@ def certify_boundedness(network: Network) -> Boundedness:
     instance("network", network, Network, "a Network")
     a, q = plant_matrices(network.plant)
     links = _join_links(network, len(a))
-    # Rows of known gain on all of x, or on the modes that do not decay.
+    # By rows of known gain on all of x; or, which are more, on the modes alone that do not decay.
     growing = _find_unstable_modes(a)
     for space in (np.eye(len(a)), growing):
         known = _group_losses(a, q, links, space)
@@ -107,21 +118,24 @@ def certify_boundedness(network: Network) -> Boundedness:
                 reason=_describe_certificate(a, radius),
                 radius=radius,
                 growth=0.0,
-                gains=known.gains(gains),
+                gains=known.map_gains(gains),
                 bound=bound,
             )
-    # Not certified: is there an unstable mode that losses hide?
+    # Not certified, by the last of these: is there an unstable mode that losses hide?
     unseen = find_fastest_unobserved_mode(a, known.system.chain, [known.system.outputs[s] for s in known.system.known])
     verdict, reason = _judge_unseen(network, links, growing, known, unseen, radius)
     return Boundedness(
-        verdict=verdict, reason=reason, radius=radius, growth=unseen.growth, gains=known.gains(gains), bound=None
+        verdict=verdict, reason=reason, radius=radius, growth=unseen.growth, gains=known.map_gains(gains), bound=None
     )
 
 
 def _join_links(network: Network, states: int) -> JointLinks:
     """Return the joint model of all nodes' links: sensors stacked, channels in parallel, modes that occur.
 
-    Raises ValueError for relays that filter, and for channels that vary, deliver late or have uncertain probabilities.
+    `states`: number of the plant's.
+
+    Raises:
+        ValueError: relays that filter, channels that vary, deliver late or have uncertain probabilities.
     """
     if network.relays is not None:
         raise fail("nodes", "ones that receive the sensors over channels", "relays that filter")
@@ -150,7 +164,7 @@ def _join_links(network: Network, states: int) -> JointLinks:
 
 
 def _require_constant(channel: Channel) -> AbstractRandomAffine:
-    """Return a channel that neither varies nor delays; raise at another."""
+    """Return a channel that neither varies nor delays as it is; raise ValueError for another."""
     if isinstance(channel, OverTime):
         raise fail("channel", "one that does not vary", "one that varies")
     if channel.past:
@@ -165,7 +179,13 @@ def _find_unstable_modes(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, 
 
 
 class KnownLosses(NamedTuple):
-    """Usable measurements of a receiver, for each of the `kinds` of losses: flags of the components that arrive."""
+    """Usable measurements of a receiver, by kind of losses.
+
+    Args:
+        system: the plant, measured by sums of what arrives.
+        kinds: flags of the components that arrive.
+        parts: the sums that are used in each kind.
+    """
 
     system: KnownLossSystem
     kinds: list[tuple[bool, ...]]
@@ -181,21 +201,27 @@ class KnownLosses(NamedTuple):
         """True where random gains make something unusable."""
         return any(part.random for part in self.parts)
 
-    def gains(self, gains: KindGains) -> dict[tuple[bool, ...], np.ndarray]:
+    def map_gains(self, gains: KindGains) -> dict[tuple[bool, ...], np.ndarray]:
         """Return K D (n, received) by kind: gains on what arrives, from gains K on its sums D z of known gain."""
         return {kind: k @ part.combine for kind, k, part in zip(self.kinds, gains, self.parts, strict=True)}
 
 
 def _group_losses(a: np.ndarray, q: np.ndarray, links: JointLinks, space: Float[np.ndarray, "n d"]) -> KnownLosses:
-    """Group the outcomes by set of losses, each with the sums of what arrives whose gain on a subspace of x is known.
+    """Return the outcomes by kind of losses, each with the sums of what arrives whose gain on a subspace of x is known.
 
     Modes that look the same to the receiver are one kind: a gain that differs between them is unknown.
+
+    Args:
+        a: A (n, n).
+        q: Cov w (n, n).
+        links: joint model of all links.
+        space: basis of the subspace, one column each.
     """
     # Cases, one for each outcome of each mode: its mode i, and its flags of what arrives.
     outcomes = [outcome for of_mode in links.outcomes for outcome in of_mode]
     mode = np.array([i for i, of_mode in enumerate(links.outcomes) for _ in of_mode])
     flags = [tuple(outcome.arrived.tolist()) for outcome in outcomes]
-    # Sets of losses, and the sums of rows with known gain in each.
+    # Kinds of losses, which kind each case is, and the sums of rows with known gain in each kind.
     kinds = list(dict.fromkeys(flags))
     kind_of_case = np.array([kinds.index(arrived) for arrived in flags])
     parts = [
@@ -206,7 +232,9 @@ def _group_losses(a: np.ndarray, q: np.ndarray, links: JointLinks, space: Float[
     probability = np.array([outcome.probability for outcome in outcomes])
     chain = links.chain[np.ix_(mode, mode)] * probability
     law = long_run_law(links.initial[mode] * probability, chain)
-    noises = tuple(parts[s].noise(outcome, links) for outcome, s in zip(outcomes, kind_of_case, strict=True))
+    noises = tuple(
+        parts[kind].find_noise_of_sums(outcome, links) for outcome, kind in zip(outcomes, kind_of_case, strict=True)
+    )
     system = KnownLossSystem(a, q, chain, law, kind_of_case, tuple(part.rows for part in parts), noises)
     return KnownLosses(system, kinds, parts)
 
@@ -214,8 +242,12 @@ def _group_losses(a: np.ndarray, q: np.ndarray, links: JointLinks, space: Float[
 class KnownGainSums(NamedTuple):
     """Sums D z of received rows whose gain on x is known: D z = rows x + noise.
 
-    `combine`: D (r, m). `mean`: of the channel's gain and offset (m, p + 1), over the outcomes that look the same.
-    `exact`: nothing that arrives is left out, and offsets are known. `random`: something is left out.
+    Args:
+        combine: D, r sums of m received components.
+        rows: their gain on x.
+        mean: of the channel's gain and offset, over the outcomes that look the same; p: measured components.
+        exact: nothing that arrives is left out, and offsets are known.
+        random: something is left out.
     """
 
     combine: Float[np.ndarray, "r m"]
@@ -224,17 +256,18 @@ class KnownGainSums(NamedTuple):
     exact: bool
     random: bool
 
-    def noise(self, outcome: ArrivalOutcome, links: JointLinks) -> Float[np.ndarray, "r r"]:
+    def find_noise_of_sums(self, outcome: ArrivalOutcome, links: JointLinks) -> Float[np.ndarray, "r r"]:
         """Return Cov(D z) in one outcome, at x = 0 and about the mean over the outcomes that look the same.
 
-        With z = G y, E y = v and the common mean M v: E[(G y - M v)(G y - M v)'].
+        With z = G y, y = (v, 1) at x = 0, and M the mean of G over these outcomes: E[(G y - M E y) (G y - M E y)'],
+        where the last entry of y takes G's offset.
         """
-        mean, second = second_moments(outcome.map)
-        v = np.append(links.sensor_mean, 1.0)
-        signal = np.outer(v, v)
+        mean, second = second_moments(outcome.map)  # E G, and E[G_ia G_jb] as [i, j, a, b], in this outcome
+        mean_signal = np.append(links.sensor_mean, 1.0)
+        signal = np.outer(mean_signal, mean_signal)  # E[y y']
         signal[:-1, :-1] += links.sensor_noise
-        about = self.mean @ v
-        center = mean @ v
+        about = self.mean @ mean_signal
+        center = mean @ mean_signal
         total = np.einsum("ijab,ab->ij", second, signal) - np.outer(center, about) - np.outer(about, center)
         return np.asarray(self.combine @ (total + np.outer(about, about)) @ self.combine.T)
 
@@ -242,27 +275,28 @@ class KnownGainSums(NamedTuple):
 def _find_known_sums(
     alike: Sequence[ArrivalOutcome], links: JointLinks, space: Float[np.ndarray, "n d"]
 ) -> KnownGainSums:
-    """Return the sums of known gain: the null space of E[(G - M) C Y Y' C' (G - M)'] over outcomes that look the same.
+    """Return the sums of known gain: the null space of E[(G - M) H Y Y' H' (G - M)'] over outcomes that look the same.
 
-    G is the random gain of mean M, C the sensors' matrix, Y (n, d) the basis `space` of the states that matter.
+    G is the random gain of mean M, H the sensors' matrix, Y (n, d) the basis `space` of the states that matter.
+    `alike`: the outcomes, in which the same components arrive.
     """
-    moments = [second_moments(o.map) for o in alike]
-    mean = np.mean([m for m, _ in moments], axis=0)
+    # E G, and E[G_ia G_jb] as [i, j, a, b], of each outcome; the last column of G is its offset. M over all of them.
+    moments = [second_moments(outcome.map) for outcome in alike]
+    mean = np.mean([mean_of_outcome for mean_of_outcome, _ in moments], axis=0)
     arrived = np.flatnonzero(alike[0].arrived)
-    # M C, and C Y Y' C'.
-    rows = mean[:, :-1] @ links.sensing
-    seen = links.sensing @ space @ (links.sensing @ space).T
-    # Spread of the gain in mean square, as correlations.
+    rows = mean[:, :-1] @ links.sensing  # M H
+    seen = links.sensing @ space @ (links.sensing @ space).T  # H Y Y' H'
+    # Spread of the gain in mean square, E[G seen G'] - M seen M', as correlations of what arrives.
     second = np.mean([np.einsum("ijab,ab->ij", t[..., :-1, :-1], seen) for _, t in moments], axis=0)
     about = mean[:, :-1] @ seen @ mean[:, :-1].T
     scale = np.sqrt(np.diag(second)[arrived])
     scale = np.where(scale > 0, scale, 1.0)
     spread = (second - about)[np.ix_(arrived, arrived)] / scale / scale[:, None]
-    # Eigenvalues that are zero: sums of known gain.
+    # Its eigenvectors of eigenvalue zero are sums of known gain.
     values, vectors = np.linalg.eigh(spread)
     combine = np.zeros((int(np.sum(values <= CERTAIN)), len(mean)))
     combine[:, arrived] = vectors[:, values <= CERTAIN].T / scale
-    offset_is_known = all(np.array_equal(m[:, -1], mean[:, -1]) for m, _ in moments)
+    offset_is_known = all(np.array_equal(mean_of_outcome[:, -1], mean[:, -1]) for mean_of_outcome, _ in moments)
     all_states = space.shape[1] == len(space)
     return KnownGainSums(
         combine=combine,
@@ -274,7 +308,7 @@ def _find_known_sums(
 
 
 def _describe_certificate(a: Float[np.ndarray, "n n"], radius: float) -> str:
-    """Return the reason of a certificate: whether the plant itself is stable, and the radius that gains leave."""
+    """Return the reason of a certificate in words: whether the plant is stable, and the radius that gains leave."""
     if spectral_radius(a) < BELOW_ONE:
         return f"the plant is stable, and fixed gains leave the error a spectral radius of {radius:.6g}"
     return f"fixed gains leave the mean square of the error a spectral radius of {radius:.6g}"
@@ -288,7 +322,16 @@ def _judge_unseen(
     unseen: UnobservedGrowth,
     radius: float,
 ) -> tuple[Verdict, str]:
-    """Return "impossible" if an unobserved eigenvector grows and noise keeps exciting it, else "undecided"."""
+    """Return verdict and reason: "impossible" if an unobserved mode grows and noise excites it, else "undecided".
+
+    Args:
+        network: the network.
+        links: joint model of all links.
+        growing: basis of the plant's modes that do not decay.
+        known: what is measured in each kind of losses.
+        unseen: the plant's mode that grows most while the links do not observe it.
+        radius: that the best gains found leave.
+    """
     if unseen.growth < 1:
         best = f"no gains are certified: the best that were found leave {radius:.6g}"
         return "undecided", f"{best}, and nothing that losses hide grows: {unseen.growth:.6g} < 1"
@@ -299,12 +342,16 @@ def _judge_unseen(
 
 
 def _explain_growth(links: JointLinks, system: KnownLossSystem, unseen: UnobservedGrowth) -> str:
-    """Say why no filter's error can stay bounded: the plant's mode, and why what is received does not show it."""
+    """Return why no filter's error can stay bounded, in words: the plant's mode, and why nothing received shows it."""
     value = unseen.eigenvalue
     mode = f"the plant's mode of eigenvalue {value.real:.6g}" + (f" +- {value.imag:.6g}i" if value.imag else "")
     if len(unseen.modes) < len(system.chain):
         return f"{mode} grows by {unseen.growth:.6g} >= 1 a step in mean square while what would show it is lost"
-    powers = [np.einsum("iiab->ab", second_moments(o.map)[1])[:-1, :-1] for outcome in links.outcomes for o in outcome]
+    # E[G' G] of each outcome, without offsets: is there any gain on the mode, if none that is known?
+    powers = []
+    for outcome in (outcome for of_mode in links.outcomes for outcome in of_mode):
+        _, second = second_moments(outcome.map)
+        powers.append(np.einsum("iiab->ab", second)[:-1, :-1])
     seen = links.sensing @ unseen.vectors
     if max(float(np.real(np.einsum("ad,ab,bd->", seen.conj(), power, seen))) for power in powers) > 0:
         return f"{mode} is seen only through random gains that are not known, which make noise as large as the state"
@@ -312,10 +359,10 @@ def _explain_growth(links: JointLinks, system: KnownLossSystem, unseen: Unobserv
 
 
 def _is_excited(network: Network, growing: np.ndarray, known: KnownLosses, unseen: UnobservedGrowth) -> bool:
-    """Test whether P stays above eps v v': noise enters along v at once, or reaches it and every measurement has noise.
+    """Return whether P stays above eps v v' for some eps > 0: noise keeps exciting the unseen eigenvector v.
 
-    v is the unseen eigenvector. The noise of random gains grows only where noise reaches all that is unstable, so with
-    such gains all of `growing` must be reached too.
+    So it is if noise enters along v at once, or reaches it and every measurement has noise. The noise of random gains
+    grows only where noise reaches all that is unstable, so with such gains all of `growing` must be reached too.
     """
     a, q = known.system.transition, known.system.process
     directions = np.concatenate([unseen.vectors, growing], axis=1) if known.random else unseen.vectors

@@ -23,8 +23,8 @@ def check_flags(name: str, filter: AbstractFilter, channels: Sequence[AbstractRa
     Raises:
         ValueError: a flag of another step; no flag where a filter uses the mode.
     """
+    # Flags stand after the measurement; each comes from one row of the channels: `rows`, the part that each row is of.
     rows = [part for channel in channels for part in channel.in_parallel for _ in range(part.outputs)]
-    # Flags stand after the measurement; each comes from one row of the channels.
     for reader in _find_flag_filters(filter):
         if isinstance(reader, ModeObservedFilter):
             sent, expected = first(reader.channel).outputs, LATE if reader.late else NOW

@@ -1,4 +1,7 @@
-"""What a claim is in a network: the filter's own where it believes the world of its place, else nominal at most."""
+"""What a claim is in a network: the filter's own where it believes the world of its place, else nominal at most.
+
+A premise is the world that a filter was made for, or in which it stands: plant, sensor, channel and so on.
+"""
 
 from collections.abc import Iterator, Mapping
 from copy import copy
@@ -8,20 +11,31 @@ import jax
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.scheduled import ScheduledFilter
+from heliograph.fusion.joint_covariance_fusion import AbstractInformedFusion
 from heliograph.fusion.network_fusion import Fusion
 from heliograph.model.estimate import Claim
 from heliograph.model.premises.agreement import RANGE, join_premises, list_differences, restrict_premise_to_rows
 from heliograph.model.premises.premise import Premise, StaticPremise
+from heliograph.numerics.check import fail
+from heliograph.simulation.centres.centre import (
+    find_claim_of_informed_fusion,
+    find_claim_of_report_fusion,
+    has_data_dependent_gains,
+)
+from heliograph.simulation.centres.mesh_check import find_claim_of_mesh
 from heliograph.simulation.node import FUSED, HasNodes, Node, ReceivingNode
 
 UNSAID = "something that it does not say"
 
 
 class OtherBelief(NamedTuple):
-    """What a filter of a network believes that is not so at its node (`FUSED` for a filter of all measurements).
+    """What a filter of a network believes that is not so at its place.
 
-    `parts`: the parts of the model in which it believes another world. `lowered`: whether it would claim more than
-    "nominal" in the world that it believes.
+    Args:
+        node: name of the node; `FUSED` for a filter of all measurements.
+        filter: its name.
+        parts: the parts of the model in which it believes another world, such as "sensor".
+        lowered: whether it would claim more than "nominal" in the world that it believes.
     """
 
     node: str
@@ -63,28 +77,30 @@ def lower_to_nominal(filter: AbstractFilter) -> AbstractFilter:
     return twin
 
 
-def judge_filter(own: Premise, filter: AbstractFilter) -> AbstractFilter:
+def lower_claim_if_mistaken(own: Premise, filter: AbstractFilter) -> AbstractFilter:
     """Return the filter with its claim if it believes the world where it stands, else lowered to nominal.
 
     Args:
-        own: plant, sensor, channel and trigger of the place where it stands.
+        own: the world at the place where it stands: plant, sensor, channel and trigger.
         filter: the filter, which keeps its claim outside of the network.
     """
     is_weak = lower_claim(filter.claim) == filter.claim
-    return filter if is_weak or not parts_apart(own, filter) else lower_to_nominal(filter)
+    return filter if is_weak or not list_mistaken_parts(own, filter) else lower_to_nominal(filter)
 
 
-def judge_nodes(network: HasNodes) -> dict[str, Node | ReceivingNode]:
+def lower_claims_of_nodes(network: HasNodes) -> dict[str, Node | ReceivingNode]:
     """Return the nodes, with each filter lowered to nominal that believes another world than its node's."""
     results = dict(network.nodes)
     for name, node in network.nodes.items():
         if node.filters:
             own = find_premise(network, name)
-            results[name] = _replace_filters(node, {f: judge_filter(own, filter) for f, filter in node.filters.items()})
+            results[name] = _replace_filters(
+                node, {f: lower_claim_if_mistaken(own, filter) for f, filter in node.filters.items()}
+            )
     return results
 
 
-def nodes_alike(nodes: Mapping[str, Node | ReceivingNode]) -> dict[str, Node | ReceivingNode]:
+def pad_filters_alike(nodes: Mapping[str, Node | ReceivingNode]) -> dict[str, Node | ReceivingNode]:
     """Return the nodes with filters whose arrays are padded to the largest of all filters, so that they stack."""
     every = [filter for node in nodes.values() for filter in node.filters.values()]
     return {
@@ -95,15 +111,18 @@ def nodes_alike(nodes: Mapping[str, Node | ReceivingNode]) -> dict[str, Node | R
     }
 
 
-def judge_fused_standing(network: HasNodes) -> dict[str, Fusion | AbstractFilter]:
+def lower_claims_of_central_filters(network: HasNodes) -> dict[str, Fusion | AbstractFilter]:
     """Return the fusions, with each filter of all measurements lowered to nominal that believes another world."""
     if not any(isinstance(fusion, AbstractFilter) for fusion in network.fused.values()):
         return network.fused
-    own = premise_of_all(network)
-    return {name: judge_filter(own, f) if isinstance(f, AbstractFilter) else f for name, f in network.fused.items()}
+    own = find_common_premise(network)
+    return {
+        name: lower_claim_if_mistaken(own, f) if isinstance(f, AbstractFilter) else f
+        for name, f in network.fused.items()
+    }
 
 
-def nominal_nodes(network: HasNodes) -> dict[str, Node | ReceivingNode]:
+def make_nodes_nominal(network: HasNodes) -> dict[str, Node | ReceivingNode]:
     """Return the nodes with filters that claim "nominal" at most."""
     return {
         name: _replace_filters(node, {label: lower_to_nominal(filter) for label, filter in node.filters.items()})
@@ -111,7 +130,7 @@ def nominal_nodes(network: HasNodes) -> dict[str, Node | ReceivingNode]:
     }
 
 
-def nominal_fused(network: HasNodes) -> dict[str, Fusion | AbstractFilter]:
+def make_fusions_nominal(network: HasNodes) -> dict[str, Fusion | AbstractFilter]:
     """Return the fusions, with filters that claim "nominal" at most."""
     return {name: lower_to_nominal(f) if isinstance(f, AbstractFilter) else f for name, f in network.fused.items()}
 
@@ -125,13 +144,16 @@ def _replace_filters(node: Node | ReceivingNode, filters: dict[str, AbstractFilt
     return twin
 
 
-def parts_apart(own: Premise, filter: AbstractFilter) -> tuple[str, ...]:
-    """Return the parts in which a filter believes another world than its own."""
+def list_mistaken_parts(own: Premise, filter: AbstractFilter) -> tuple[str, ...]:
+    """Return the parts of the model in which a filter believes another world than that of its place, `own`."""
     return (UNSAID,) if filter.premise is None else list_differences(filter.premise, own)
 
 
 def find_premise(network: HasNodes, name: str) -> Premise:
-    """Return the world at a node: plant, sensor, channel and trigger, and its limits where they refuse values."""
+    """Return the world at a node: plant, sensor, channel and trigger, and its limits where they refuse values.
+
+    In a network of relays: plant, the relays, and the gains that they run.
+    """
     node, plant = network.nodes[name], network.plant
     if isinstance(node, Node):
         limits = node.limits if node.limits is not None and node.limits.bounded else None
@@ -152,7 +174,7 @@ def find_premise(network: HasNodes, name: str) -> Premise:
     return Premise(plant, relays=network.relays, gains=gains)
 
 
-def premise_of_all(network: HasNodes) -> Premise:
+def find_common_premise(network: HasNodes) -> Premise:
     """Return plant, sensors and channels of all nodes together, in their order."""
     if network.common is not None:
         return Premise(network.plant, network.common.sensor, network.common.channel)
@@ -171,12 +193,57 @@ def list_other_beliefs(network: HasNodes) -> Iterator[OtherBelief]:
             yield from _collect_beliefs(name, find_premise(network, name), filters)
     central = {name: fusion for name, fusion in network.fused.items() if isinstance(fusion, AbstractFilter)}
     if central:
-        yield from _collect_beliefs(FUSED, premise_of_all(network), central)
+        yield from _collect_beliefs(FUSED, find_common_premise(network), central)
 
 
 def _collect_beliefs(node: str, own: Premise, filters: Mapping[str, AbstractFilter]) -> Iterator[OtherBelief]:
-    """Yield the filters of a node that claim something and were made for another world, with what differs."""
+    """Yield the filters of a node that claim something and were made for another world than its `own`."""
     for label, filter in filters.items():
         says = filter.premise is not None or filter.kept.lowered
-        if filter.claim != "none" and says and (parts := parts_apart(own, filter)):
+        if filter.claim != "none" and says and (parts := list_mistaken_parts(own, filter)):
             yield OtherBelief(node, label, parts, filter.kept.lowered)
+
+
+def find_claims(network: HasNodes) -> dict[tuple[str, str], Claim]:
+    """Return the claim of each estimate of a network, by (node, name); those of the centre last, under FUSED."""
+    claims = {(name, f): filter.claim for name, node in network.nodes.items() for f, filter in node.filters.items()}
+    for name, mesh in network.meshes.items():
+        claims |= dict.fromkeys(
+            ((node, name) for node in network.mesh_nodes(name)), find_claim_of_mesh(name, mesh, network)
+        )
+    # Where data decide what arrives, no fusion can claim more than "nominal".
+    by_data = any(isinstance(node, Node) and node.chosen_by_value for node in network.nodes.values())
+    for name, fusion in network.fused.items():
+        claim = _find_claim_of_fusion(network, fusion)
+        claims[FUSED, name] = lower_claim(claim) if by_data and isinstance(fusion, Fusion) else claim
+    return claims
+
+
+def _find_claim_of_fusion(network: HasNodes, fusion: Fusion | AbstractFilter) -> Claim:
+    """Return what a fusion can claim of its covariance, from its rule, its nodes' claims and how they report.
+
+    Raises:
+        ValueError: an informed rule that lacks what it has to know.
+    """
+    if isinstance(fusion, AbstractFilter):
+        return fusion.claim
+    names = network.nodes_with(fusion.filter)
+    # A rule that needs nothing but the estimates.
+    if not isinstance(fusion.rule, AbstractInformedFusion):
+        return fusion.claim([network.nodes[n].filters[fusion.filter].claim for n in names])
+    # An informed rule: it needs the joint moments of the errors, and so all links between them and itself.
+    rule = type(fusion.rule).__name__
+    if fusion.quantizer is not None and not fusion.by_report:
+        raise fail(f"fusion by {rule}", "uplinks that deliver what is sent", "a quantizer")
+    parts = network.parts_of(fusion.filter)
+    if len(parts) < len(names):
+        raise fail(f"fusion by {rule}", "nodes that receive sensors through channels", "relays")
+    # Along estimates, moments of the errors are known but not the plant's own.
+    if (fusion.by_report or fusion.rule.needs_plant_moments) and has_data_dependent_gains(parts):
+        (_, _, filter), *_ = parts.values()
+        raise fail(f"fusion by {rule}", "filters whose gains depend on no data, for the plant's own moments",
+                   type(filter).__name__)  # fmt: skip
+    claim = find_claim_of_informed_fusion(rule, network.plant, parts, shared=network.common is not None)
+    if not fusion.by_report:
+        return claim
+    return find_claim_of_report_fusion(rule, claim, fusion, {n: network.nodes[n].complete for n in names})

@@ -10,7 +10,6 @@ import equinox as eqx
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.scheduled import ScheduledFilter
-from heliograph.fusion.joint_covariance_fusion import AbstractInformedFusion
 from heliograph.fusion.network_fusion import Fusion
 from heliograph.linear.system import Schedule
 from heliograph.model.channel import Channel, check_link, find_received_angles
@@ -19,25 +18,24 @@ from heliograph.model.over_time import first, steps_covered
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.relays import RECEIVER, RelayNetwork
 from heliograph.model.sensor import AnySensor, without_output_names
-from heliograph.model.words.word_channel import find_places
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import check_horizon, fail, table
 from heliograph.numerics.frozen_mapping import FrozenMapping
 from heliograph.numerics.module import Module, readable
 from heliograph.random_affine.base import check_forgets
-from heliograph.random_affine.memory import drop_names, memories
-from heliograph.simulation.centres.centre import along_estimates, claim_of_informed, claim_of_reports
-from heliograph.simulation.centres.mesh_check import check_mesh, mesh_claim
+from heliograph.random_affine.memory import memories
+from heliograph.simulation.centres.mesh_check import check_mesh
 from heliograph.simulation.channel_flags import check_flags
 from heliograph.simulation.claims import (
     OtherBelief,
-    judge_fused_standing,
-    judge_nodes,
+    find_claims,
     list_other_beliefs,
     lower_claim,
-    nodes_alike,
-    nominal_fused,
-    nominal_nodes,
+    lower_claims_of_central_filters,
+    lower_claims_of_nodes,
+    make_fusions_nominal,
+    make_nodes_nominal,
+    pad_filters_alike,
 )
 from heliograph.simulation.description.diagram import short_text_of, text_of, write_html_table
 from heliograph.simulation.network_index import (
@@ -58,6 +56,7 @@ from heliograph.simulation.node import (
     check_filters,
     check_received,
     check_states,
+    describe_received,
 )
 from heliograph.simulation.sender_checks import check_type
 
@@ -115,7 +114,9 @@ class Network(Module):
         relays: "RelayNetwork | None" = None,
         common: "CommonReception | None" = None,
     ):
+        """Check that all parts fit, lower the filters' claims to what their places allow, and index what there is."""
         self.plant, self.relays, self.common = plant, relays, common
+        # Nodes, and fusions between neighbours apart from those at a centre.
         self.nodes = {
             name: SENSORLESS if node is None else node for name, node in table("nodes", nodes, "nodes").items()
         }
@@ -131,25 +132,27 @@ class Network(Module):
         self.states, self.inputs = first(plant).states, first(plant).inputs
         self._check_nodes()
         self.rows = FrozenMapping(join_rows({name: node.received for name, node in self.nodes.items()}))
-        self.nodes = nodes_alike(judge_nodes(self))
+        # Filters that believe another world than their node's claim less; arrays get one length, so that they stack.
+        self.nodes = pad_filters_alike(lower_claims_of_nodes(self))
         # Groups of nodes and kinds of filters, by structure.
         meshes = {name: tuple(m for m in self.meshes if name in self.mesh_nodes(m)) for name in self.names}
         self.groups = group_by_structure(
-            (name, without_output_names((_describe_received(n), n.filters, meshes[name])))
+            (name, without_output_names((describe_received(n), n.filters, meshes[name])))
             for name, n in self.nodes.items()
         )
         self.kinds = list_kinds(self.groups, {name: node.filters for name, node in self.nodes.items()})
         self.mesh_kinds = list_mesh_kinds(self.groups, meshes)
         self.places = FrozenMapping(find_estimate_places(self.groups, self.kinds))
+        # Links and fusions, which are checked by group.
         self._check_links()
         self._check_fused()
-        self.fused = judge_fused_standing(self)
+        self.fused = lower_claims_of_central_filters(self)
         for name, mesh in self.meshes.items():
             check_mesh(name, mesh, self)
-        self.claimed = FrozenMapping(self._find_claims())
+        self.claimed = FrozenMapping(find_claims(self))
 
     def _check_nodes(self) -> None:
-        """Check that nodes and filters fit the plant, and that names have distinct checksums, as draws need them."""
+        """Raise ValueError unless nodes and filters fit the plant, and names have distinct checksums, for draws."""
         kind = Node if self.relays is None and self.common is None else ReceivingNode
         for name, node in self.nodes.items():
             if not isinstance(node, ReceivingNode) or node.filters:  # else what neighbours send, or nothing
@@ -162,7 +165,7 @@ class Network(Module):
             raise fail("node names", f"no node called {FUSED!r}, which stands for fused results", list(self.nodes))
 
     def _check_links(self) -> None:
-        """Check that sensors and channels fit each other, one of each group."""
+        """Raise ValueError unless sensors and channels fit each other; looked at is one node of each group."""
         for names in self.groups:
             node = self.nodes[names[0]]
             if isinstance(node, Node):
@@ -200,14 +203,14 @@ class Network(Module):
         Raises:
             ValueError: relays without a schedule, schedules of the wrong shape.
         """
+        # A schedule for each relay, of gains (n, received).
         check_type("relays", relays, RelayNetwork)
         schedules = table("relay schedules", schedules, "schedules")
         if set(schedules) != set(relays.relays):
             raise fail("relay schedules", f"those of {list(relays.relays)}", list(schedules))
-        # Each relay runs its schedule.
         filters: dict[str, dict[str, AbstractFilter]] = {}
         n = len(relays.states)
-        for name, size in zip(relays.relays, relays.received, strict=False):
+        for name, size in zip(relays.relays, relays.received, strict=False):  # the receiver stands last
             check_type(f"schedule of {name!r}", schedules[name], Schedule)
             shape = schedules[name].gains.direct.shape[1:]
             if shape != (n, size):
@@ -215,8 +218,8 @@ class Network(Module):
             filters[name] = {LOCAL: ScheduledFilter(schedules[name])}
         filters[RECEIVER] = table("receiver's filters", receivers, "filters")
         check_filters(filters[RECEIVER], relays.received[-1])
-        outputs = tuple(first(relays.sensor).outputs)
         # All places, the receiver last, receive sums of hops.
+        outputs = tuple(first(relays.sensor).outputs)
         nodes = {
             name: ReceivingNode(filters[name], size, outputs, relays.always_receives(name))
             for name, size in zip(relays.filters, relays.received, strict=True)
@@ -244,10 +247,11 @@ class Network(Module):
         Raises:
             ValueError: filters that do not use all outputs once, a channel with memory, parts that do not fit.
         """
+        # Sensor and channel fit.
         check_link(first(sensor), first(channel), len(first(plant).states), late=True)
         find_received_angles(plant, sensor, channel)
         check_forgets("channel of nodes that share it", first(channel))
-        # Each output goes to one node.
+        # Each output goes to one node, as many as its filters receive.
         received = {
             name: max((filter.received for filter in by_name.values()), default=0) for name, by_name in filters.items()
         }
@@ -255,16 +259,16 @@ class Network(Module):
             raise fail(
                 "nodes that share a channel", f"to receive its {first(channel).outputs} outputs, each once", received
             )
-        names, complete = tuple(first(sensor).outputs), not first(channel).erases
         for name, by_name in filters.items():
             check_filters(by_name, received[name])
+        names, complete = tuple(first(sensor).outputs), not first(channel).erases
         nodes = {
             name: ReceivingNode(dict(by_name), received[name], names, complete) for name, by_name in filters.items()
         }
         return Network(plant, nodes, fused, common=CommonReception(sensor, channel))
 
     def restricted_to(self, names: Iterable[str]) -> "Network":
-        """Return the network of a recording that lacks the measurements of some relays, without their filters.
+        """Return the network of a recording with measurements of these nodes alone: without the relays that lack.
 
         Raises:
             ValueError: a node that is not a relay is lacking, or there is one too many.
@@ -327,52 +331,21 @@ class Network(Module):
             claims[node][name] = claim
         return claims
 
-    def _find_claims(self) -> dict[tuple[str, str], Claim]:
-        """Return the claim of each filter, by (node, name); fused ones under the name of the fused estimates."""
-        claims = {(name, f): filter.claim for name, node in self.nodes.items() for f, filter in node.filters.items()}
-        for name, mesh in self.meshes.items():
-            claims |= dict.fromkeys(((node, name) for node in self.mesh_nodes(name)), mesh_claim(name, mesh, self))
-        by_data = any(isinstance(node, Node) and node.chosen_by_value for node in self.nodes.values())
-        for name, fusion in self.fused.items():
-            claim = self._find_claim_of_fusion(fusion)
-            claims[FUSED, name] = lower_claim(claim) if by_data and isinstance(fusion, Fusion) else claim
-        return claims
-
     def beliefs(self) -> tuple[OtherBelief, ...]:
-        """Return filters that believe another world than that in which they stand, node after node, fused ones last."""
+        """Return filters that believe another world than their place's, node after node, fused ones last."""
         return tuple(list_other_beliefs(self))
 
     def with_nominal_claims(self) -> "Network":
         """Return the network that claims "nominal" at most, as where digits are lost that nothing bounds."""
         lowered = copy(self)
         claimed = FrozenMapping({place: lower_claim(claim) for place, claim in self.claimed.items()})
-        for field, value in (("nodes", nominal_nodes(self)), ("fused", nominal_fused(self)), ("claimed", claimed)):
+        for field, value in (
+            ("nodes", make_nodes_nominal(self)),
+            ("fused", make_fusions_nominal(self)),
+            ("claimed", claimed),
+        ):
             object.__setattr__(lowered, field, value)
         return lowered
-
-    def _find_claim_of_fusion(self, fusion: Fusion | AbstractFilter) -> Claim:
-        """Return what a fusion can claim of its covariance, from its rule, its nodes' claims and how they report."""
-        if isinstance(fusion, AbstractFilter):
-            return fusion.claim
-        names = self.nodes_with(fusion.filter)
-        # A rule that needs nothing but the estimates.
-        if not isinstance(fusion.rule, AbstractInformedFusion):
-            return fusion.claim([self.nodes[n].filters[fusion.filter].claim for n in names])
-        rule, nodes = type(fusion.rule).__name__, {n: self.nodes[n] for n in names}
-        if fusion.quantizer is not None and not fusion.by_report:
-            raise fail(f"fusion by {rule}", "uplinks that deliver what is sent", "a quantizer")
-        # An informed rule: it needs the joint moments of the errors.
-        parts = self.parts_of(fusion.filter)
-        if len(parts) < len(nodes):
-            raise fail(f"fusion by {rule}", "nodes that receive sensors through channels", "relays")
-        if (fusion.by_report or fusion.rule.needs_plant_moments) and along_estimates(parts):
-            (_, _, filter), *_ = parts.values()
-            raise fail(f"fusion by {rule}", "filters whose gains depend on no data, for the plant's own moments",
-                       type(filter).__name__)  # fmt: skip
-        claim = claim_of_informed(rule, self.plant, parts, shared=self.common is not None)
-        if not fusion.by_report:
-            return claim
-        return claim_of_reports(rule, claim, fusion, {n: node.complete for n, node in nodes.items()})
 
     def parts_of(self, name: str) -> dict[str, tuple[AnySensor, Channel, AbstractFilter]]:
         """Return sensor, channel and the filter `name` of each node that has it and receives over a channel."""
@@ -389,12 +362,3 @@ class Network(Module):
 readable(Network)
 Network.__repr__ = short_text_of  # type: ignore[method-assign, assignment]
 Network._repr_html_ = write_html_table  # type: ignore[attr-defined]
-
-
-def _describe_received(node: Node | ReceivingNode) -> object:
-    """Return the parts of a node that determine its measurements."""
-    if isinstance(node, Node):
-        places = None if node.encoder is None else find_places(node.channel)
-        link = drop_names(node.channel)
-        return node.sensor, link, node.informed_by, node.trigger, node.encoder, places, node.predictor
-    return node.received, node.complete

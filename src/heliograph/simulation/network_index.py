@@ -37,7 +37,7 @@ def find_estimate_places(
 
 
 def group_by_structure(items: Iterable[tuple[str, object]]) -> tuple[tuple[str, ...], ...]:
-    """Group names by the structure of their items, in order of first appearance."""
+    """Return names in groups, by the structure of their items, in order of first appearance."""
     results: dict[object, list[str]] = {}
     for name, described in items:
         results.setdefault(structure(described), []).append(name)

@@ -26,6 +26,7 @@ from heliograph.numerics.frozen_mapping import FrozenMapping
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.memory import drop_names
 from heliograph.simulation.channel_flags import check_flags
 from heliograph.simulation.sender_checks import (
     check_encoder,
@@ -93,33 +94,34 @@ class Node(Module):
         stuck: "StuckLike" = None,
         timeout: float | None = None,
     ):
+        """Check that sensor, channel, trigger, encoder and filters fit, and find what the filters receive."""
         self.timeout = None if timeout is None else float(scalar("timeout", timeout, TINY))
         self.trigger, self.encoder = trigger, encoder
         self.sensor, self.channel, self.filters = sensor, channel, table("filters of a node", filters, "filters")
-        # Sensor, channel and filters fit.
+        # Sensor and channel fit.
         check_type("sensor", first(sensor), AbstractSensor)
         check_type("channel", first(channel), AbstractRandomAffine)
         check_sent(first(sensor), first(channel))
+        # A sender that decides, and one that sends words, add numbers beside the values: reasons, dithers.
         if trigger is not None:
             check_trigger(trigger, first(sensor), first(channel), self.filters)
         side_information = 0 if trigger is None else trigger.side_information(len(self.outputs))
         if encoder is not None:
             check_encoder(encoder, first(sensor), channel, trigger, self.filters)
             side_information += count_subtracted_dithers(encoder, channel)
+        # What the filters receive, and whether it is always all of it.
         self.received = int(first(channel).outputs) + side_information
         self.complete = not first(channel).erases and trigger is None
         check_filters(self.filters, self.received)
         self.limits = make_limits(self.received, limits, invalid, stuck, self.sensor, self.channel)
-        # Side information of the right step; feedback to one filter alone.
+        # Flags of the step that each filter's model has. A sensor with feedback sends what the informed filter did not
+        # predict: no other filter could use that.
         for name, filter in self.filters.items():
             check_flags(f"filter {name!r}", filter, [first(channel)])
-        observation = [name for name, filter in self.filters.items() if filter.received]
-        if self.informed_by is not None and observation != [self.informed_by]:
-            raise fail(
-                "node whose sensor has feedback",
-                f"no filter with measurements besides {self.informed_by!r}",
-                observation,
-            )
+        receiving = [name for name, filter in self.filters.items() if filter.received]
+        if self.informed_by is not None and receiving != [self.informed_by]:
+            expected = f"no filter with measurements besides {self.informed_by!r}"
+            raise fail("node whose sensor has feedback", expected, receiving)
 
     @property
     def chosen_by_value(self) -> bool:
@@ -145,12 +147,13 @@ class Node(Module):
 
     @property
     def received_names(self) -> tuple[str, ...]:
-        """Names of the components of the measurement."""
+        """Names of the components of the measurement: values, side information, then dithers "dither_OUTPUT"."""
         channel = first(self.channel)
         if self.encoder is None or not self.encoder.subtracts:
             return name_received(self.outputs, channel, self.received - channel.outputs)
         dithers = [f"dither_{self.outputs[place]}" for place in find_places(channel) if place != FLAG]
         values = name_received(self.outputs, channel, self.received - channel.outputs - len(dithers))
+        # Of an output that arrives several times, such as over two links, the dithers are numbered.
         several = {name for name in dithers if dithers.count(name) > 1}
         return values + tuple(
             f"{name}_{dithers[: i + 1].count(name)}" if name in several else name for i, name in enumerate(dithers)
@@ -207,6 +210,10 @@ class HasNodes(Protocol):
         """Fusions of the nodes' estimates, and filters of all measurements, by name."""
 
     @property
+    def meshes(self) -> dict[str, Fusion]:
+        """Fusions between neighbours, by name."""
+
+    @property
     def relays(self) -> RelayNetwork | None:
         """Relays that filter and forward."""
 
@@ -243,6 +250,9 @@ class HasNodes(Protocol):
     def mesh_nodes(self, name: str) -> tuple[str, ...]:
         """Return the nodes of a fusion between neighbours."""
 
+    def parts_of(self, name: str) -> dict[str, tuple[AnySensor, Channel, AbstractFilter]]:
+        """Return sensor, channel and the filter `name` of each node that has it and receives over a channel."""
+
 
 def name_values(outputs: tuple[str, ...], received: int) -> tuple[str, ...]:
     """Return the names of the received components: the sensor's outputs where these are as many, else z0, z1, ..."""
@@ -250,7 +260,10 @@ def name_values(outputs: tuple[str, ...], received: int) -> tuple[str, ...]:
 
 
 def check_received(name: str, filter: AbstractFilter, received: int) -> None:
-    """Refuse a filter of another number of components than arrive, unless it uses no measurements."""
+    """Raise ValueError for a filter of another number of components than arrive, unless it uses no measurements.
+
+    `name`: of the filter, for errors. `received`: how many arrive.
+    """
     if filter.received not in (0, received):  # 0: it uses no measurements
         raise fail(
             name, f"one that receives the {received} numbers that arrive", f"one that receives {filter.received}"
@@ -258,16 +271,19 @@ def check_received(name: str, filter: AbstractFilter, received: int) -> None:
 
 
 def check_states(name: str, filter: object, network: HasNodes) -> None:
-    """Raise ValueError unless a filter has as many states and inputs as the plant, and it or a fusion its attitudes."""
+    """Raise ValueError unless a filter has as many states and inputs as the plant, and it, or a fusion, its attitudes.
+
+    `name`: of the filter or fusion, for errors.
+    """
     plant = first(network.plant)
     if isinstance(filter, AbstractFilter):
         for what, ours, theirs in (("states", plant.states, filter.states), ("inputs", plant.inputs, filter.inputs)):
             if len(ours) != len(theirs):
                 raise fail(name, f"the plant's {len(ours)} {what} {list(ours)}", f"{len(theirs)} {list(theirs)}")
     # Attitudes are turned where others are added.
-    attitudes = plant.manifold.rotations, getattr(filter, "attitude", ())
-    if attitudes[0] != attitudes[1]:
-        expected, got = ([network.states[i] for i in places] for places in attitudes)
+    of_plant, of_filter = plant.manifold.rotations, getattr(filter, "attitude", ())
+    if of_plant != of_filter:
+        expected, got = ([network.states[i] for i in places] for places in (of_plant, of_filter))
         raise fail(name, f"a filter of all that is received, whose attitudes are the plant's, {expected}", got)
 
 
@@ -290,8 +306,17 @@ def check_angles(name: str, filter: AbstractFilter, network: HasNodes) -> None:
 
 
 def check_filters(filters: Mapping[str, object], received: int) -> None:
-    """Refuse filters that do not fit the measurement of their node."""
+    """Raise ValueError for filters that are none, or that do not receive as many components as their node."""
     for name, filter in filters.items():
         check_type(f"filter {name!r}", filter, AbstractFilter)
         if isinstance(filter, AbstractFilter):
             check_received(f"filter {name!r}", filter, received)
+
+
+def describe_received(node: Node | ReceivingNode) -> object:
+    """Return the parts of a node that determine its measurements; nodes where their structure is one are a group."""
+    if isinstance(node, Node):
+        places = None if node.encoder is None else find_places(node.channel)
+        link = drop_names(node.channel)
+        return node.sensor, link, node.informed_by, node.trigger, node.encoder, places, node.predictor
+    return node.received, node.complete

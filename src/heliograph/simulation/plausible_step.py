@@ -15,6 +15,7 @@ from heliograph.model.trigger import AbstractThreshold
 from heliograph.numerics.types import Float, PyTree
 from heliograph.simulation.centres.uplinks import UplinkDraws
 from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.network_index import EstimatePlace
 from heliograph.simulation.node import Node, ReceivingNode
 from heliograph.simulation.stepping import AllFilters
 
@@ -23,22 +24,21 @@ Stepped = tuple[PyTree, dict[str, PyTree]]  # the filters' states after a step, 
 RIM = 1e-9  # share of delta by which a value may lie inside for rounding
 
 
-def implausible(outputs: Mapping[str, PyTree]) -> jax.Array:
-    """Return, within a program, whether some filter judges its measurement implausible."""
+def is_implausible(outputs: Mapping[str, PyTree]) -> jax.Array:
+    """Return, within a program, whether some filter judges its measurement implausible; `outputs` of a step."""
     flags = [jnp.any(j.implausible) for j in (*outputs["judged"], *outputs["judged_centrally"].values())]
     return jnp.any(jnp.stack(flags)) if flags else jnp.asarray(False)
 
 
 def any_implausible(outputs: Mapping[str, PyTree]) -> bool:
-    """Return whether some filter judged a measurement implausible in stored results, NumPy arrays."""
+    """Return whether some filter judged a measurement implausible, in stored `outputs` of many rows (NumPy arrays)."""
     return any((j.reason > 0).any() for j in (*outputs["judged"], *outputs["judged_centrally"].values()))
 
 
-def reasons(outputs: Mapping[str, PyTree]) -> tuple[list[jax.Array], dict[str, jax.Array]]:
+def read_reasons(outputs: Mapping[str, PyTree]) -> tuple[list[jax.Array], dict[str, jax.Array]]:
     """Return each filter's reason not to use its measurement, 0 for none: of nodes by kind, of central ones by name."""
-    return [judgement.reason for judgement in outputs["judged"]], {
-        n: judgement.reason for n, judgement in outputs["judged_centrally"].items()
-    }
+    by_kind = [judgement.reason for judgement in outputs["judged"]]
+    return by_kind, {name: judgement.reason for name, judgement in outputs["judged_centrally"].items()}
 
 
 # Traced once, for the shapes of its results and for the loop's body: tracing is most of what a step takes to compile.
@@ -57,7 +57,19 @@ def step_plausibly(
 
     In the second turn each filter skips what it judged implausible in the first; the judgements of the first stay. A
     loop of at most two turns, so that the second is left out where it is not needed.
+
+    Args:
+        filters: of the network.
+        states: before the step.
+        z: measurements (node, received) by group.
+        u: inputs of the plant over the step.
+        k: number of the step.
+        drawn: what uplinks and links between neighbours do, by fusion; without, nothing is lost.
+
+    Returns:
+        The states after the step, and its outputs, as of `AllFilters.step`.
     """
+    # Outputs' shapes, for the zeros before the first turn, in which no filter skips anything.
     by_kind = [jnp.zeros((a.count, a.nodes)) for a in filters.alike]
     none_skipped = by_kind, {name: jnp.zeros(()) for name in filters.central}
     _, outputs = eqx.filter_eval_shape(_step, filters, states, z, u, k, drawn, none_skipped)
@@ -65,18 +77,19 @@ def step_plausibly(
     def needs_turn(carry: tuple[jax.Array, Stepped]) -> jax.Array:
         """Return whether to step: in turn 0 always, in turn 1 where something was implausible."""
         turn, (_, outputs) = carry
-        return (turn == 0) | (turn == 1) & implausible(outputs)
+        return (turn == 0) | (turn == 1) & is_implausible(outputs)
 
     def step(carry: tuple[jax.Array, Stepped]) -> tuple[jax.Array, Stepped]:
         """Step from the states before, without what the turn before judged implausible; in turn 0 that is nothing."""
         turn, (_, before) = carry
-        after, outputs = _step(filters, states, z, u, k, drawn, reasons(before))
+        after, outputs = _step(filters, states, z, u, k, drawn, read_reasons(before))
         for name in ("judged", "judged_centrally"):
             outputs[name] = jax.tree.map(lambda old, new: jnp.where(turn == 0, new, old), before[name], outputs[name])
         return turn + 1, (after, outputs)
 
     start = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), outputs)
-    stepped: Stepped = jax.lax.while_loop(needs_turn, step, (jnp.asarray(0), (states, start)))[1]
+    stepped: Stepped
+    _, stepped = jax.lax.while_loop(needs_turn, step, (jnp.asarray(0), (states, start)))
     return stepped
 
 
@@ -84,30 +97,34 @@ class FilterJudges:
     """The filters that judge what each node received; reads their judgements of a step, or of a recording's rows."""
 
     def __init__(self, network: Network):
-        self._places: dict[str, list[tuple[int, int, int]]] = {name: [] for name in network.names}
-        for (node, name), position in network.places.items():
+        """Find, for each node, the places of its filters that receive measurements."""
+        self._places: dict[str, list[EstimatePlace]] = {name: [] for name in network.names}
+        for (node, name), place in network.places.items():
             if network.nodes[node].filters[name].received:
-                self._places[node].append(position)
+                self._places[node].append(place)
 
-    def of_node(self, outputs: Mapping[str, PyTree], node: str) -> Float[np.ndarray, "... filters 4"]:
+    def read_node(self, outputs: Mapping[str, PyTree], node: str) -> Float[np.ndarray, "... filters 4"]:
         """Return the judgements of the filters that receive from a node; where it has none, of the central ones."""
         return self._stack_judgements(outputs, self._places[node], not self._places[node])
 
-    def of_all(self, outputs: Mapping[str, PyTree]) -> Float[np.ndarray, "... filters 4"]:
-        """Return the judgements of all filters."""
+    def read_all(self, outputs: Mapping[str, PyTree]) -> Float[np.ndarray, "... filters 4"]:
+        """Return the judgements of all filters, those of the nodes by kind and then central ones."""
         places = []
         for kind, judgement in enumerate(outputs["judged"]):
-            places += [(kind, f, i) for f, i in np.ndindex(*judgement[0].shape[-2:])]
+            filters, nodes = judgement.distance.shape[-2:]
+            places += [EstimatePlace(kind, f, i) for f, i in np.ndindex(filters, nodes)]
         return self._stack_judgements(outputs, places, central=True)
 
     def _stack_judgements(
-        self, outputs: Mapping[str, PyTree], places: Sequence[tuple[int, int, int]], central: bool
+        self, outputs: Mapping[str, PyTree], places: Sequence[EstimatePlace], central: bool
     ) -> Float[np.ndarray, "... filters 4"]:
         """Return the judgements of these filters, and those of the centre behind them if `central`.
 
         Axes: the recording's, filter, field of a Judgement.
         """
-        judgements = [[field[..., f, i] for field in outputs["judged"][k]] for k, f, i in places]
+        judgements = [
+            [field[..., place.filter, place.node] for field in outputs["judged"][place.kind]] for place in places
+        ]
         judgements += [list(judgement) for judgement in outputs["judged_centrally"].values()] if central else []
         if not judgements:
             return np.zeros((0, len(Judgement._fields)))
@@ -122,16 +139,17 @@ class FilterJudges:
 def find_refused_rows(
     network: Network, outcome: Mapping[str, PyTree]
 ) -> tuple[dict[str, dict[int, str]], dict[int, str]]:
-    """Return the rows that a filter calls implausible, with the reason: by node with filters, and of the central ones.
+    """Return the rows whose values all filters of a node refuse, with the reason: by node, and of the central filters.
 
-    Nodes without filters of their own are judged by the central ones, all alike: the first tells for all.
+    Nodes without filters of their own are judged by the central ones, all alike: the first tells for all. `outcome`:
+    what filtering the rows with judgements put out.
     """
     judges, refused = FilterJudges(network), dict[str, dict[int, str]]()
     without_own = judges.without_own
     for name in network.names:
-        if name not in without_own and (reasons_by_row := _list_reasons(judges.of_node(outcome, name))):
+        if name not in without_own and (reasons_by_row := _list_reasons(judges.read_node(outcome, name))):
             refused[name] = reasons_by_row
-    central = _list_reasons(judges.of_node(outcome, without_own[0])) if without_own else {}
+    central = _list_reasons(judges.read_node(outcome, without_own[0])) if without_own else {}
     return refused, central
 
 
@@ -147,29 +165,40 @@ def describe_doubts(
     refused: Mapping[str, Mapping[int, str]],
     u: Float[np.ndarray, "steps inputs"],
 ) -> list[str]:
-    """Return messages about a recording: rows that are implausible to all filters or to one alone, and inputs."""
+    """Return messages about a recording: rows that are implausible to all filters or to one alone, and inputs.
+
+    Args:
+        network: the network.
+        outputs: of filtering the rows with judgements, by row.
+        refused: rows that all filters of a node refuse, by node, with the reason.
+        u: inputs of the plant.
+    """
     # Rows that are implausible for all filters of a node.
     faults = _FaultFinder(network, outputs, u)
     lines = []
     for node, by_row in refused.items():
         row, why = next(iter(by_row.items()))
-        named = [faults.of(node, name, row) for name in network.nodes[node].filters]
+        named = [faults.name_fault(node, name, row) for name in network.nodes[node].filters]
         fault = next((words for words in named if words), "")
         lines.append(f"node {node!r}: {_format_rows(list(by_row))} implausible, as if not arrived: {why}{fault}")
-    # Rows that a single filter skips.
-    at_nodes = {(node, name): [field[:, f, i] for field in outputs["judged"][kind]]
-            for (node, name), (kind, f, i) in network.places.items()}  # fmt: skip
-    at_centres = {(FUSED, name): list(judgement) for name, judgement in outputs["judged_centrally"].items()}
+    # Rows that a single filter skips, those of above aside.
+    judgements = {
+        place: Judgement(*(field[:, at.filter, at.node] for field in outputs["judged"][at.kind]))
+        for place, at in network.places.items()
+    }
+    judgements |= {(FUSED, name): judgement for name, judgement in outputs["judged_centrally"].items()}
     all_rows = {k: "" for rows in refused.values() for k in rows}
-    for (node, name), (distance, _, reason, _) in (at_nodes | at_centres).items():
+    for (node, name), judgement in judgements.items():
         reported = all_rows if node == FUSED else refused.get(node, {})
-        rows = [int(k) for k in np.flatnonzero(reason > 0) if k not in reported]
+        rows = [int(k) for k in np.flatnonzero(judgement.reason > 0) if k not in reported]
         if rows:
-            why = Judgement.describe(reason[rows[0]], distance[rows[0]]) + faults.of(node, name, rows[0])
+            row = rows[0]
+            reason, distance = np.asarray(judgement.reason)[row], np.asarray(judgement.distance)[row]
+            why = Judgement.describe(reason, distance) + faults.name_fault(node, name, row)
             lines.append(f"filter {name!r} of {node!r} alone: {_format_rows(rows)} implausible, left out: {why}")
     # Inputs, judged by all filters.
     if network.inputs:
-        votes = FilterJudges(network).of_all(outputs)
+        votes = FilterJudges(network).read_all(outputs)
         rows = [k for k in _find_flagged(votes, "input") if Judgement.why_inputs(votes[k])]
         lines += [f"inputs: {_format_rows(rows)} implausible: {INPUT}"] if rows else []
     return lines
@@ -179,11 +208,15 @@ class _FaultFinder:
     """Names functions of the filters' models that returned no number in a recording."""
 
     def __init__(self, network: Network, outputs: Mapping[str, PyTree], u: Float[np.ndarray, "steps inputs"]):
+        """Hold the network, what its filters put out by row, and the inputs of the plant."""
         self.network, self.u = network, u
         self.outputs = outputs.get("filtered", outputs)  # those of filters, where smoothed ones stand beside them
 
-    def of(self, node: str, name: str, row: int) -> str:
-        """Name the function of a filter that returned no number in a row, after a semicolon; "" where none did."""
+    def name_fault(self, node: str, name: str, row: int) -> str:
+        """Return "; " and what function of a filter returned no number in a row; "" where none did.
+
+        `node`: where the filter `name` stands, FUSED for a central one.
+        """
         central = node == FUSED
         filter = self.network.fused[name] if central else self.network.nodes[node].filters[name]
         if not isinstance(filter, AbstractFilter):
@@ -193,8 +226,8 @@ class _FaultFinder:
         elif central:
             before = jax.tree.map(lambda leaf: leaf[row - 1], self.outputs["fused"][name])
         else:
-            kind, f, i = self.network.places[node, name]
-            before = jax.tree.map(lambda leaf: leaf[row - 1, f, i], self.outputs["estimates"][kind])
+            at = self.network.places[node, name]
+            before = jax.tree.map(lambda leaf: leaf[row - 1, at.filter, at.node], self.outputs["estimates"][at.kind])
         fault = find_function_fault(filter, before, self.u[row], row)
         return f"; {fault}" if fault else ""
 
@@ -226,17 +259,17 @@ def find_forbidden_rows(node: Node | ReceivingNode, z: Float[np.ndarray, "steps 
     channel = first(node.channel)
     if channel.erases or channel.remembers or channel.outputs != len(node.outputs):
         return []
-    # Each value against the one before it.
+    # Each row that came whole against the one before it, `last`.
     forbidden, last = list[int](), None
     for k, row in enumerate(z[:, : len(node.outputs)]):
         if np.isnan(row).any():
             continue
         if last is not None:
-            due = trigger.heartbeat is not None and k - last >= trigger.heartbeat
-            error = np.abs(row - z[last, : len(row)])
+            heartbeat_is_due = trigger.heartbeat is not None and k - last >= trigger.heartbeat
+            change = np.abs(row - z[last, : len(row)])
             delta = (1 - RIM) * np.asarray(trigger.delta)
-            inside = np.linalg.norm(error) <= delta if trigger.region == "ball" else np.all(error <= delta)
-            if inside and not due:
+            is_inside = np.linalg.norm(change) <= delta if trigger.region == "ball" else np.all(change <= delta)
+            if is_inside and not heartbeat_is_due:
                 forbidden.append(k)
         last = k
     return forbidden

@@ -18,8 +18,8 @@ from heliograph.smoothing.backward_pass import plan_with_past
 
 def plan_filters(filters: AllFilters, u: Float[Array, "horizon inputs"]) -> AllFilters:
     """Return the filters with all that depends on no data precomputed for inputs u, where all data arrive."""
+    planned = [_plan_stack(a, u) if filters.complete[a.group] else a for a in filters.alike]
     central = filters.central if all(filters.complete) else {}
-    planned = [_plan_alike(a, u) if filters.complete[a.group] else a for a in filters.alike]
     central = {
         name: compute_once(_plan_filter, _planned_by_xla, (filter, u, filters.smooths))
         for name, filter in central.items()
@@ -28,7 +28,7 @@ def plan_filters(filters: AllFilters, u: Float[Array, "horizon inputs"]) -> AllF
     return cast(AllFilters, to_numpy(changed))
 
 
-def _plan_alike(alike: StackedFilters, u: Array) -> StackedFilters:
+def _plan_stack(alike: StackedFilters, u: Array) -> StackedFilters:
     """Return filters that differ in numbers alone, planned by one program: native code, or XLA's where it must be."""
     count, arguments = alike.count * alike.nodes, (alike.filters, u, alike.smooths)
     with jax.enable_x64(True):

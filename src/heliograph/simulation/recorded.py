@@ -29,12 +29,12 @@ from heliograph.simulation.plausible_step import (
     find_refused_rows,
 )
 from heliograph.simulation.recorded_rows import (
-    Begin,
     FilteringTask,
-    central_states_before_rows,
+    RecordingStart,
     filter_rows,
+    find_central_states_before_rows,
     join_behind,
-    origin_behind,
+    read_origin,
 )
 from heliograph.simulation.results.no_numbers import warn_of_no_numbers
 from heliograph.simulation.results.record import Record
@@ -101,11 +101,11 @@ def run(
     measured = table("measurements", measurements, example)
     network = network.restricted_to(measured)
     steps = _count_rows(next(iter(measured.values())))
-    # Measurements, inputs and times of one length.
+    # Measurements, filters, and where they go on behind earlier rows.
     z = {name: read_measurements(name, measurements[name], steps, node) for name, node in network.nodes.items()}
     smoothing = None if smooth is None else select_smoothed_part(network, smooth, steps)
     filters = AllFilters(network, None if smoothing is None else smoothing.kinds, judges=True)
-    before = None if after is None else origin_behind(filters, after, smooths=smooth is not None)
+    before = None if after is None else read_origin(filters, after, smooths=smooth is not None)
     first = 0 if before is None else int(before.step)
     network.check_horizon(first + steps)
     u = read_plant_inputs(network, inputs, steps)
@@ -116,10 +116,11 @@ def run(
     joined = join_behind(before, clock)
     warn_of_unequal_steps(network.inputs, None if times is None else joined)
     refuse_shared_dithers(network, z)
+    # Readings that the nodes refuse count as not arrived.
     z, refused, said, repeats = screen_recording(network, z, u, {} if before is None else before.repeats)
     _warn_of_each((*said, *warn_beyond_a_turn(network, z)))
-    # Filters, on what a recording without implausible data has.
-    begin = None if before is None else Begin(before.state, np.asarray(first))
+    # Filters, on what is left without implausible data.
+    begin = None if before is None else RecordingStart(before.state, np.asarray(first))
     with jax.enable_x64(True):
         arrivals = _collect_arrivals(filters, {} if reports is None else reports, steps)
         smoother = None if smoothing is None else smoothing.smoother(filters)
@@ -129,21 +130,27 @@ def run(
     if time is not None and (unit := units_in(network.inputs).get(TIME_STEP)):
         record = replace(record, units=record.units | {"time": unit})
     _warn_of_record(network, record, state)
-    # Row numbers are one apart: two of them say so.
+    # Where the rows end, for forecasts and later rows; numbered rows are one apart, as the first two say.
     origin = _make_origin(network, record, state, u, usual_spacing(clock if times is not None else clock[:2]))
     record = record if true is None else add_truth(record, network.plant, true, smooth)
     return record.with_origin(replace(origin, step=first + steps, repeats=repeats)).with_refused(refused)
 
 
 def _warn_of_record(network: Network, record: Record, state: PyTree) -> None:
-    """Warn of what a record shows: no numbers, wide angles, impossible estimates, what filters left out or remark."""
+    """Warn of what a record shows: no numbers, wide angles, impossible estimates, what filters left out or remark.
+
+    `state`: of all filters after the last row.
+    """
     warn_of_no_numbers(record)
     doubts = *warn_wide_in_rows(network, record), *doubt_estimates(network, record)
     _warn_of_each((*doubts, *_describe_left_out(network, record), *say_remarks(network, state)))
 
 
 def _make_record(network: Network, smoothing: SmoothingPlan | None, outputs: PyTree, clock: np.ndarray) -> Record:
-    """Return the record of what all filters made of the rows, with its smoothed part where there is one."""
+    """Return the record of what all filters made of the rows (`outputs`), with its smoothed part where there is one.
+
+    `clock`: times of the rows.
+    """
     if smoothing is None:
         return trajectories_record(network, {"truth": None, **outputs}, clock)
     return make_smoothed_record(network, smoothing, outputs, clock)
@@ -156,7 +163,7 @@ def _warn_of_each(lines: Sequence[str]) -> None:
 
 
 def _count_rows(measurements: ArrayLike) -> int:
-    """Return the number of rows of a node's measurements, one of a scalar; raise where there is none."""
+    """Return the number of rows of a node's measurements, one of a scalar; raise ValueError where there is none."""
     steps = len(measurements) if rank("measurements", measurements) else 1  # type: ignore[arg-type]
     if steps == 0:
         raise fail("measurements", "at least one row", "none")
@@ -164,7 +171,15 @@ def _count_rows(measurements: ArrayLike) -> int:
 
 
 def _make_origin(network: Network, record: Record, state: PyTree, u: np.ndarray, spacing: float) -> Origin:
-    """Return where forecasts start: behind the last row, whose time between rows is dt where the plant has it."""
+    """Return where forecasts start, behind the last row.
+
+    Args:
+        network: the network.
+        record: of all rows.
+        state: of all filters after the last row.
+        u: inputs of the plant (steps, inputs).
+        spacing: usual time between rows; a plant with the input dt takes the median of that instead.
+    """
     last_estimates = {
         node: {name: jax.tree.map(lambda leaf: np.asarray(leaf)[-1], e) for name, e in by_filter.items()}
         for node, by_filter in record.estimates.items()
@@ -178,7 +193,10 @@ def _make_origin(network: Network, record: Record, state: PyTree, u: np.ndarray,
 def _find_times(
     measured: Mapping[str, ArrayLike], others: Mapping[str, object], time: ArrayLike | None, steps: int
 ) -> np.ndarray | None:
-    """Return the times of the rows: those given, else the dates by which the tables know them; None where neither."""
+    """Return the times of the rows: `time`, else the dates by which the tables know them; None where there are none.
+
+    `measured`: tables of measurements by node. `others`: further tables by name. `steps`: number of rows.
+    """
     if time is not None:
         return check_times("time", time, steps)
     return common_dates({**{f"measurements of node {name!r}": z for name, z in measured.items()}, **others})
@@ -197,7 +215,7 @@ def _describe_left_out(network: Network, record: Record) -> Iterator[str]:
 
 
 def _collect_arrivals(filters: AllFilters, reports: Reports, steps: int) -> dict[str, PyTree]:
-    """Return what arrived of reports and between neighbours, by fusion."""
+    """Return what arrived of reports and between neighbours in each step, by fusion, from what was recorded."""
     reports = table("reports", reports, "reports by fusion")
     centre_arrivals: dict[str, PyTree] = {
         name: centre.uplinks.read_recorded(name, centre.nodes, reports.get(name), steps)
@@ -217,8 +235,14 @@ def _filter_plausible(
 
     If there are any, the recording is first filtered step by step without them to find all rows; then, without those
     that all filters of a node refuse, once again as a recording that never had them. Of what central filters refuse
-    one node is to blame in each row, and the others' values are judged again without it. What is refused goes from `z`,
-    with its reason into `left_out`.
+    one node is to blame in each row, and the others' values are judged again without it.
+
+    Args:
+        network: the network.
+        z: measurements by node (steps, received); what is refused is taken out.
+        left_out: numbers of the reasons why readings do not count, by node (steps, received); those of what is refused
+            are added.
+        task: filters and all else that the recording is filtered with.
     """
 
     def group_measurements() -> tuple[np.ndarray, ...]:
@@ -236,9 +260,11 @@ def _filter_plausible(
         while new := _find_refused_rows(network, outputs, z, group_measurements(), task, refused):
             for name, rows in new.items():
                 refused[name] = dict(sorted((refused.get(name, {}) | rows).items()))
+                # Out of a copy of the measurements, since they are the caller's.
+                numbers = list(rows)
                 z[name] = z[name].copy()
-                left_out[name][list(rows)] += ~np.isnan(z[name][list(rows)]) * np.int8(number_of("implausible"))
-                z[name][list(rows)] = np.nan
+                left_out[name][numbers] += ~np.isnan(z[name][numbers]) * np.int8(number_of("implausible"))
+                z[name][numbers] = np.nan
             again = filter_rows(task, group_measurements(), judged=False)
             outputs = filter_rows(task, group_measurements(), judged=True) if any_implausible(again) else again
         doubts = describe_doubts(network, first_time, refused, task.u)
@@ -254,11 +280,19 @@ def _find_refused_rows(
     """Return, by node, the rows that its filters refuse and that were not refused `before`, with the reason.
 
     Rows that the central filters refuse are those of the node to blame.
+
+    Args:
+        network: the network.
+        outputs: of filtering the rows with judgements, by row.
+        z: measurements by node.
+        grouped: the same (steps, node, received) by group.
+        task: filters and all else that the recording is filtered with.
+        before: rows that were refused already, by node, with the reason.
     """
     refused, centrally = find_refused_rows(network, outputs)
     filters, u = task.filters, task.u
     if centrally:
-        states = central_states_before_rows(task, grouped)
+        states = find_central_states_before_rows(task, grouped)
         in_order = {name: z[name] for name in network.names}
         nodes = FilterJudges(network).without_own
         refused |= refuse_centrally(filters.central, states, in_order, u, centrally, nodes)

@@ -22,38 +22,50 @@ EXPECTED = "what hg.run of this network returned for the rows before"
 ROWS = 128  # of a recording with fusions between neighbours, whose weights are in memory at a time
 
 
-class Begin(NamedTuple):
-    """Where rows begin that go on behind others: the filters' states there, and the number of the first row."""
+class RecordingStart(NamedTuple):
+    """Where rows begin that go on behind others: the filters' states there, and the number of the first row (step)."""
 
     states: PyTree
     step: np.ndarray
 
 
 class FilteringTask(NamedTuple):
-    """All that a recording is filtered with but its measurements: filters, smoother, inputs (steps, inputs), arrivals.
+    """All that a recording is filtered with but its measurements.
 
-    `arrivals`: which reports arrived of each fusion by reports, and which messages of one between neighbours, by name.
-    `begin`: of rows behind others; None of the first ones.
+    Args:
+        filters: of the network.
+        smoother: of their estimates; None where they are not smoothed.
+        u: inputs of the plant (steps, inputs).
+        arrivals: which reports arrived of each fusion by reports, and which messages of one between neighbours, by
+            name.
+        begin: of rows behind others; None of the first ones.
     """
 
     filters: AllFilters
     smoother: NetworkSmoother | None
     u: np.ndarray
     arrivals: dict[str, PyTree]
-    begin: Begin | None = None
+    begin: RecordingStart | None = None
 
     def first_states(self) -> PyTree:
         """Return the states before the first of these rows."""
         return self.filters.init() if self.begin is None else jax.tree.map(jnp.asarray, self.begin.states)
 
     def rows(self, z: tuple[np.ndarray, ...]) -> tuple[PyTree, ...]:
-        """Return the rows: their numbers, inputs, measurements, and what arrived."""
-        numbers = jnp.arange(len(self.u))
-        return numbers if self.begin is None else self.begin.step + numbers, self.u, z, self.arrivals
+        """Return the rows, with a leading axis of steps: their numbers, inputs, measurements z, and what arrived."""
+        numbers: Array = jnp.arange(len(self.u))
+        if self.begin is not None:
+            numbers = self.begin.step + numbers
+        return numbers, self.u, z, self.arrivals
 
 
-def origin_behind(filters: AllFilters, after: Record, smooths: bool) -> Origin:
-    """Return the states behind earlier rows, of these filters.
+def read_origin(filters: AllFilters, after: Record, smooths: bool) -> Origin:
+    """Return where the rows of a record ended, with the states there of these filters.
+
+    Args:
+        filters: of the network.
+        after: record of the rows before.
+        smooths: whether estimates are to be smoothed.
 
     Raises:
         ValueError: no such record; smoothing, which needs all rows; a fusion whose messages may come rows later.
@@ -71,7 +83,7 @@ def origin_behind(filters: AllFilters, after: Record, smooths: bool) -> Origin:
 
 
 def join_behind(origin: Origin | None, clock: np.ndarray) -> np.ndarray:
-    """Return the times of rows behind that of the last one before them, where there is one.
+    """Return the times of rows (`clock`) behind that of the last row before them, where `origin` has one.
 
     Raises:
         ValueError: their first time is before it, or is a date where that is a number, or the reverse.
@@ -87,9 +99,13 @@ def join_behind(origin: Origin | None, clock: np.ndarray) -> np.ndarray:
 def filter_rows(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool) -> PyTree:
     """Return what all filters made of a recording's rows, as NumPy arrays: what `AllFilters.step` puts out, by row.
 
-    z are the measurements (steps, node, received) by group; if `judged`, what is implausible is left out. Beside them
-    stand "measurements", z, and "state", the last one; with a smoother it is what `NetworkSmoother.smooth_run` returns.
-    It is computed in chunks side by side, by native code, or by XLA.
+    Beside that stand "measurements", z, and "state", the last one; with a smoother it is what
+    `NetworkSmoother.smooth_run` returns. It is computed in chunks side by side, by native code, or by XLA.
+
+    Args:
+        task: filters and all else.
+        z: measurements (steps, node, received) by group.
+        judged: leave out what is implausible.
     """
     results = None if judged else _filter_in_chunks(task, z)
     if results is not None:
@@ -100,7 +116,10 @@ def filter_rows(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool) ->
 
 
 class NetworkRecursion(Recursion):
-    """Recursion of all filters of a network over rows; each row's output is all that they estimate and judge."""
+    """Recursion of all filters of a network over rows, of which `begin` is the number of the first.
+
+    Each row's output is all that they estimate and judge.
+    """
 
     filters: AllFilters
     begin: Array
@@ -118,13 +137,16 @@ def _filter_in_chunks(task: FilteringTask, z: tuple[np.ndarray, ...]) -> PyTree 
     """
     if task.smoother is not None or not task.filters.are_linear_and_unfused:
         return None
-    begin = task.begin or Begin(initial_states(task.filters), np.asarray(0))
+    begin = task.begin or RecordingStart(initial_states(task.filters), np.asarray(0))
     filtered = scan_in_chunks(NetworkRecursion(task.filters, begin.step), to_numpy(begin.states), (z, task.u))
     return None if filtered is None else _collect_results(None, z, *filtered)
 
 
 def _scan_in_parts(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool) -> PyTree:
-    """Return what `filter_rows` does, by XLA, some rows at a time, whose weights between neighbours come ahead."""
+    """Return what `filter_rows` does, by XLA, some rows at a time.
+
+    Weights between neighbours that depend on arrivals alone are computed ahead, for these rows at once.
+    """
     filters, smoother, u, arrivals, _ = task  # rows of such a network are behind no others
     # As few parts of at most ROWS rows as there can be, of one size, so that they share a program.
     count = -(-len(u) // ROWS)
@@ -135,8 +157,8 @@ def _scan_in_parts(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool)
         indices = np.minimum(np.arange(start, start + size), len(u) - 1)
         k, u_k, z_k, drawn = jax.tree.map(lambda leaf, rows=indices: np.asarray(leaf)[rows], rows)
         drawn |= {name: (drawn[name], mesh.compute_weights_ahead(drawn[name])) for name, mesh in filters.meshes.items()}
-        counts = np.arange(start, start + size) < len(u)
-        states, results = _scanned_by_xla(filters, states, (k, u_k, z_k, drawn), judged, counts)
+        is_counted = np.arange(start, start + size) < len(u)
+        states, results = _scanned_by_xla(filters, states, (k, u_k, z_k, drawn), judged, is_counted)
         parts.append(to_numpy(results))
     all_rows = jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(u)], *parts)
     return to_numpy(_collect_results(smoother, z, states, all_rows))
@@ -148,45 +170,57 @@ def _run_filters(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool) -
 
 
 def _scan_rows(
-    filters: AllFilters, states: PyTree, rows: tuple[PyTree, ...], judged: bool, counts: np.ndarray | None = None
+    filters: AllFilters, states: PyTree, rows: tuple[PyTree, ...], judged: bool, is_counted: np.ndarray | None = None
 ) -> tuple[PyTree, dict[str, PyTree]]:
-    """Step over rows: return the last states, and the results by row; rows that do not count change no state."""
+    """Step over rows: return the last states, and the results by row.
+
+    Args:
+        filters: of the network.
+        states: before the first row.
+        rows: as `FilteringTask.rows` returns them.
+        judged: leave out what is implausible.
+        is_counted: rows that are not change no state (steps,); None: all are.
+    """
 
     def step_row(states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
-        (k, u_k, z_k, drawn), row_counts = row
+        """Step all filters over one row."""
+        (k, u_k, z_k, drawn), row_is_counted = row
         step = step_plausibly if judged else AllFilters.step
         after, results = step(filters, states, z_k, u_k, k, drawn)
-        if row_counts is not None:
-            after = jax.tree.map(lambda new, old: jnp.where(row_counts, new, old), after, states)
+        if row_is_counted is not None:
+            after = jax.tree.map(lambda new, old: jnp.where(row_is_counted, new, old), after, states)
         return after, results
 
-    states, results = jax.lax.scan(step_row, states, (rows, counts))
+    states, results = jax.lax.scan(step_row, states, (rows, is_counted))
     return states, results
 
 
 def _collect_results(
     smoother: NetworkSmoother | None, z: tuple[np.ndarray, ...], state: PyTree, results: dict[str, PyTree]
 ) -> PyTree:
-    """Return what the filters judged, their last state, and their results, smoothed if there is a smoother."""
+    """Return what `filter_rows` does from the filters' `results` by row and their last `state`, smoothed if to be."""
     results = {"measurements": z, **results}
     judged = {name: results.pop(name) for name in ("judged", "judged_centrally")}
     return (results if smoother is None else smoother.smooth_run(results)) | judged | {"state": state}
 
 
-def central_states_before_rows(task: FilteringTask, z: tuple[np.ndarray, ...]) -> PyTree:
-    """Return the states of the central filters before each row, by name; z as of `filter_rows`."""
+def find_central_states_before_rows(task: FilteringTask, z: tuple[np.ndarray, ...]) -> PyTree:
+    """Return the states of the central filters before each row (steps, ...), by name; z as of `filter_rows`."""
     return compute_once(_collect_central_states, _central_states_by_xla, (task._replace(smoother=None), z))
 
 
 def _collect_central_states(task: FilteringTask, z: tuple[np.ndarray, ...]) -> PyTree:
-    """Return the states of the central filters before each row."""
+    """Return what `find_central_states_before_rows` does, by a scan over the rows."""
 
     def step(states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
         """Step all filters; the central ones' states before the step are the output."""
         k, u_k, z_k, drawn = row
-        return step_plausibly(task.filters, states, z_k, u_k, k, drawn)[0], states[1]
+        after, _ = step_plausibly(task.filters, states, z_k, u_k, k, drawn)
+        _, central, *_ = states
+        return after, central
 
-    before: PyTree = jax.lax.scan(step, task.first_states(), task.rows(z))[1]
+    before: PyTree
+    _, before = jax.lax.scan(step, task.first_states(), task.rows(z))
     return before
 
 

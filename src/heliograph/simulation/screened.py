@@ -46,6 +46,7 @@ def screen_recording(
     kept, refused, said = dict[str, np.ndarray](), dict[str, np.ndarray](), list[str]()
     repeats = dict[str, Repeats]()
     for name, node in network.nodes.items():
+        # Readings beyond limits, codes, and readings that are stuck.
         kept[name], refused[name], lines = z[name], np.zeros(z[name].shape, dtype=np.int8), list[str]()
         if node.limits is not None:
             screened = node.limits.screen(z[name], before.get(name, Repeats()))
@@ -55,12 +56,14 @@ def screen_recording(
                 _describe_refused(reason, node.limits, z[name], refused[name], node)
                 for reason in count_by_reason(refused[name])
             ]
+        # Values that their sender should not have sent stay.
         if rows := find_forbidden_rows(node, kept[name]):
             lines.append(
                 f"{len(rows)} values came that the rule of their sender forbids; row {rows[0] + 1}: "
                 "within delta of the value before, and no heartbeat due"
             )
         said += [f"node {name!r}: {line}" for line in lines]
+    # Silences longer than a node's timeout.
     timeouts = {name: node.timeout for name, node in network.nodes.items()}
     silences = find_long_silences(timeouts, kept, u, network.inputs)
     said += [f"node {name!r}: {found.describe()}" for name, found in silences.items()]
@@ -74,7 +77,15 @@ def _describe_refused(
     refused: Int[np.ndarray, "steps m"],
     node: Node | ReceivingNode,
 ) -> str:
-    """Say how many readings a node refused for one reason, and which they are in the first such row."""
+    """Return how many readings a node refused for one reason, and which they are in the first such row, in words.
+
+    Args:
+        reason: the reason.
+        limits: of the node.
+        z: its measurements, NaN where nothing arrived.
+        refused: number of the reason of each reading, 0 where it is kept.
+        node: the node.
+    """
     here = np.where(refused == number_of(reason), refused, 0)
     row, came = int(np.argmax(here.any(axis=1))), int(np.count_nonzero(~np.isnan(z)))
     why = limits.describe_missing(z[row], here[row], node.received_names)

@@ -18,7 +18,7 @@ from heliograph.random_affine.words.flips import Flips
 
 
 def compares_with_prediction(filter: AbstractFilter, trigger: AbstractTrigger) -> bool:
-    """Return whether this is a filter of a sender that compares with its prediction."""
+    """Return whether a filter is made for a sender with this trigger's rule that compares with its prediction."""
     return isinstance(filter, EventFilter | StochasticEventFilter) and filter.trigger.reference == "prediction"
 
 
@@ -27,12 +27,19 @@ def check_trigger(
 ) -> None:
     """Raise ValueError unless a trigger fits the sensor, the channel and the filters of a node.
 
+    Args:
+        trigger: when the sender transmits.
+        sensor: of the node.
+        channel: of the node.
+        filters: of the node, by name.
+
     Raises:
         ValueError: numbers for another count of components; a channel that is late, or that does not carry each
             component for itself where each is sent alone; no filter whose prediction the sender could know.
     """
     check_type("trigger", trigger, AbstractTrigger)
-    # The trigger, the sensor and the channel fit.
+    # Numbers for as many components as the sensor has, none of them an angle; a channel that delivers at once, each
+    # component for itself where each is sent alone.
     trigger.check_outputs(len(sensor.outputs))
     if sensor.circular:
         raise fail("trigger", "a sensor without angles", list(sensor.circular))
@@ -42,7 +49,7 @@ def check_trigger(
         )
     if trigger.region == "each" and channel.outputs != len(sensor.outputs):
         raise fail("channel of components that are each sent alone", f"{len(sensor.outputs)} outputs", channel.outputs)
-    # A sender that compares with a prediction knows one filter.
+    # The sender knows the prediction of one filter at most: it runs that too.
     if any(isinstance(filter, FedBackFilter) for filter in filters.values()):
         raise fail("trigger", "no filter that is fed back", "one")
     if trigger.reference == "prediction" and not any(
@@ -60,10 +67,18 @@ def check_encoder(
 ) -> None:
     """Raise ValueError unless an encoder fits the sensor, channel, trigger and filters of a node.
 
+    Args:
+        encoder: of the words that the sender sends.
+        sensor: of the node.
+        channel: of the node, which carries the words.
+        trigger: when the sender transmits; None where it always does.
+        filters: of the node, by name.
+
     Raises:
         ValueError: a range for another count of components, angles, words that are amplified, a trigger whose ends do
             not share what it compares with, a filter that is fed back.
     """
+    # Sensor, filters and channel.
     check_type("encoder", encoder, Words)
     encoder.check_outputs(len(sensor.outputs))
     if sensor.circular:
@@ -71,6 +86,7 @@ def check_encoder(
     if any(isinstance(filter, FedBackFilter) for filter in filters.values()):
         raise fail("encoder", "no filter that is fed back", "one")
     find_places(channel)  # raises where words are amplified
+    # A trigger that compares values compares words, which both ends must share.
     if trigger is not None and not isinstance(trigger, Periodic):
         if encoder.subtracts:
             raise fail("trigger of a node with an encoder", "a dither that is not taken off, or Periodic", "subtracted")
@@ -85,12 +101,12 @@ def count_subtracted_dithers(encoder: Words, channel: Channel) -> int:
 
 
 def flips_words(channel: AbstractRandomAffine) -> bool:
-    """Test whether a channel of words may flip bits."""
+    """Return whether a channel of words may flip bits."""
     links = [link for link in [channel, *all_inner_maps(channel)] if isinstance(link, Flips)]
     return any(float(link.error.moment(1)) > 0 for link in links)
 
 
 def check_type(name: str, value: object, expected: type) -> None:
-    """Refuse an object of another class, in one line."""
+    """Raise ValueError for an object of another class than `expected`; `name`: what it is, for the error."""
     if not isinstance(value, expected):
         raise fail(name, f"{'an' if expected.__name__[0] in 'AEIOU' else 'a'} {expected.__name__}", show_value(value))

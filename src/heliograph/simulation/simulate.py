@@ -19,7 +19,7 @@ from heliograph.numerics.float64 import quickly_compiled, refuse_forked_process
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.random_affine.memory import drop_identities
-from heliograph.simulation.arguments import Precision, check_precision, key_of, read_plant_inputs
+from heliograph.simulation.arguments import Precision, check_precision, make_run_key, read_plant_inputs
 from heliograph.simulation.centres.mesh_building import build_meshes
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
@@ -28,18 +28,18 @@ from heliograph.simulation.results.no_numbers import warn_of_no_numbers
 from heliograph.simulation.results.record import Record
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Result, Trajectories
 from heliograph.simulation.results.statistics import BATCHES
-from heliograph.simulation.runs.by_run import apply_to_each_run, read_by, simulate_trajectories
+from heliograph.simulation.runs.by_run import apply_to_each_run, list_used_leaves, simulate_trajectories
 from heliograph.simulation.runs.lanes import (
     LANES,
     RunLanes,
     SharedResult,
-    added,
+    add_sums,
     advance_in_chunks,
-    batch_counts,
+    count_runs_by_batch,
+    has_processor_alone,
     is_shared,
-    one_processor,
 )
-from heliograph.simulation.runs.memory import NeededMemory, check_memory, explain_out_of_memory, size_of
+from heliograph.simulation.runs.memory import NeededMemory, check_memory, count_bytes, explain_out_of_memory
 from heliograph.simulation.runs.native import simulate_natively
 from heliograph.simulation.simulation_step import World
 from heliograph.simulation.smoothed import NetworkSmoother, ReducedRuns, finish_result, reduce_run, select_smoothed_part
@@ -102,21 +102,21 @@ def monte_carlo(
     reducer = cast(AbstractReducer[Result], Trajectories()) if keep is None else keep
     instance("keep", reducer, AbstractReducer, "what is kept, such as Statistics()")
     u = read_plant_inputs(network, inputs, horizon)
-    base = key_of(key)
+    base = make_run_key(key)
     check_precision(precision)
     if precision == "float32":
-        _warn_if_lost(network)
+        _warn_of_numbers_lost_in_float32(network)
         network = network.with_nominal_claims()
     smoothing = None if smooth is None else select_smoothed_part(network, smooth, horizon)
     # Native code, where it supports network and reducer.
-    if one_processor() and not any(mesh.is_long for mesh in build_meshes(network).values()):
+    if has_processor_alone() and not any(mesh.is_long for mesh in build_meshes(network).values()):
         with explain_out_of_memory(runs, horizon):
             by_native_code = simulate_natively(
                 network, u, base, reducer, first_run, runs, chunk, progress, smoothing, precision
             )
         if by_native_code is not None:
-            return _warn_of_nan(by_native_code, network)
-    # Otherwise XLA: the world, and what is collected of it.
+            return _warn_of_invalid_numbers(by_native_code, network)
+    # Otherwise XLA: the world, with gains computed beforehand where they depend on no data, and what is collected.
     filters = AllFilters(network, None if smoothing is None else smoothing.kinds)
     planned = plan_filters(filters, u) if has_plan(filters) else filters
     job = _SimulationJob(
@@ -128,15 +128,15 @@ def monte_carlo(
         reducer=reducer,
         precision=precision,
     )
-    if one_processor():
+    if has_processor_alone():
         check_memory(_estimate_memory(job, runs, chunk), runs, horizon)
     with explain_out_of_memory(runs, horizon):
         recorded = _run_chunks(job, first_run, runs, chunk, progress)
-    return _warn_of_nan(finish_result(reducer, recorded, network, smoothing), network)
+    return _warn_of_invalid_numbers(finish_result(reducer, recorded, network, smoothing), network)
 
 
-def _warn_of_nan(result: Result, network: Network) -> Result:
-    """Return a result, with a warning where a record holds what is no number, or a state beyond its limits."""
+def _warn_of_invalid_numbers(result: Result, network: Network) -> Result:
+    """Return the result as it is; warn where a record holds what is no number, or a state beyond its limits."""
     if isinstance(result, Record):
         _warn_beyond_limits(result, network)
         complete = [name for name, node in network.nodes.items() if isinstance(node, Node) and node.complete]
@@ -145,7 +145,7 @@ def _warn_of_nan(result: Result, network: Network) -> Result:
 
 
 def _warn_beyond_limits(record: Record, network: Network) -> None:
-    """Warn where a state that was drawn is beyond the limits that filters believe: the world does not know them."""
+    """Warn where a true state is beyond the limits that filters believe, which the plant itself does not keep."""
     for name, (low, high) in first(network.plant).limits if record.truth is not None else ():
         x = np.asarray(record.truth)[..., network.states.index(name)]
         beyond = ((x < low) | (x > high)).reshape(-1, x.shape[-1])
@@ -164,8 +164,8 @@ def _check_counts(horizon: int, runs: int, chunk: int, first_run: int) -> None:
         raise fail("first_run", f"a multiple of {BLOCK}", first_run)
 
 
-def _warn_if_lost(network: Network) -> None:
-    """Warn if some covariance or matrix of plant and sensors is nothing but 0 in single precision."""
+def _warn_of_numbers_lost_in_float32(network: Network) -> None:
+    """Warn if all numbers of some covariance or matrix of plant and sensors are 0 in single precision."""
     sensors = [node.sensor for node in network.nodes.values() if isinstance(node, Node)]
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves((network.plant, sensors)) if eqx.is_inexact_array(leaf)]
     if any(0 < np.max(np.abs(leaf), initial=0.0) < np.finfo(np.float32).tiny for leaf in leaves):
@@ -174,7 +174,17 @@ def _warn_if_lost(network: Network) -> None:
 
 
 class _SimulationJob(Module):
-    """What a simulation by XLA needs: world, smoother, inputs and key, the run after its last, reducer, precision."""
+    """What a simulation by XLA needs.
+
+    Args:
+        world: the network, as a step.
+        later: smooths each run; None where nothing is smoothed.
+        inputs: of the plant (horizon, inputs).
+        key: of all runs.
+        stop: number after that of the last run.
+        reducer: says what is collected of a run.
+        precision: in which runs are computed.
+    """
 
     world: World
     later: NetworkSmoother | None
@@ -186,7 +196,7 @@ class _SimulationJob(Module):
 
 
 def _run_chunks(job: _SimulationJob, first_run: int, runs: int, chunk: int, progress: Progress | None) -> ReducedRuns:
-    """Return the sums over all runs, and what is collected of them, chunk by chunk."""
+    """Simulate all runs, chunk by chunk: return the sums over them, and what is collected of them."""
     with jax.enable_x64(True):
         lanes = RunLanes(
             lambda blocks, carry: _simulate_lane((job, blocks), carry),
@@ -197,55 +207,57 @@ def _run_chunks(job: _SimulationJob, first_run: int, runs: int, chunk: int, prog
         )
         parts = advance_in_chunks(lanes.advance, lanes.count, lanes.wide, (runs, chunk), progress)
     collected = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:runs], *parts)  # without padding
+    # Sums, and for each whether it is a value that all runs share.
     total = lanes.total()
-    sums, common = (
-        jax.tree.map(read, total, is_leaf=is_shared)
-        for read in (lambda leaf: leaf.value if is_shared(leaf) else leaf, is_shared)
-    )
-    return ReducedRuns(OfStep(*sums), OfStep(*common), batch_counts(first_run, first_run + runs), collected)
+    sums = jax.tree.map(lambda leaf: leaf.value if is_shared(leaf) else leaf, total, is_leaf=is_shared)
+    common = jax.tree.map(is_shared, total, is_leaf=is_shared)
+    return ReducedRuns(OfStep(*sums), OfStep(*common), count_runs_by_batch(first_run, first_run + runs), collected)
 
 
 @quickly_compiled
 def _make_zero_sums(job: _SimulationJob) -> PyTree:
     """Return the sums of zero before the first block; compiled, so that shapes are worked out once a network."""
-    shapes = eqx.filter_eval_shape(_simulate_block, job, np.arange(BLOCK))[0]
+    shapes, _ = eqx.filter_eval_shape(_simulate_block, job, np.arange(BLOCK))
     return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), shapes)
 
 
 @partial(quickly_compiled, donate="all-except-first")
 def _simulate_lane(todo: tuple[_SimulationJob, PyTree], carry: PyTree) -> tuple[PyTree, PyTree]:
-    """Simulate (job, blocks) as `_simulate_blocks` does, compiled, in the memory of the carry."""
+    """Simulate (job, blocks) as `_simulate_blocks` does, compiled; the result takes the memory of the carry."""
     return _simulate_blocks(*todo, carry)
 
 
 def _simulate_blocks(job: _SimulationJob, blocks: PyTree, carry: PyTree) -> tuple[PyTree, PyTree]:
-    """Simulate blocks (block, BLOCK) one after another; return the carry with their sums, and what is collected.
+    """Simulate blocks (block, BLOCK) of runs in turn: return the carry with their sums, and what is collected.
 
     Width and order of the sums are fixed, so that chunks do not change a bit.
     """
 
     def add_block(carry: PyTree, runs: jax.Array) -> tuple[PyTree, PyTree]:
-        """Add the sums of one block."""
+        """Simulate one block: return the carry with its sums, and what is collected of it."""
         sums, collected = _simulate_block(job, runs)
-        return added(carry, sums), collected
+        return add_sums(carry, sums), collected
 
     return jax.lax.scan(add_block, carry, jnp.asarray(blocks))
 
 
 @quickly_compiled
 def _simulate_all_lanes(job: _SimulationJob, blocks: PyTree, carries: PyTree) -> tuple[PyTree, PyTree]:
-    """Simulate the blocks of all lanes, which are the leading axis of everything."""
+    """Simulate the blocks of all lanes as `_simulate_blocks` does, with a leading axis of lanes everywhere."""
     sums: tuple[PyTree, PyTree] = jax.vmap(partial(_simulate_blocks, job))(blocks, carries)
     return sums
 
 
 def _simulate_block(job: _SimulationJob, runs: jax.Array) -> tuple[tuple[PyTree, PyTree], PyTree]:
-    """Return the sums by batch of one block of runs and flags likewise, and what is collected, (run, time, ...)."""
-    recorded = _reduced(job.reducer, job.later, _simulate_outputs(job, runs))
+    """Return the sums and the flags of one block of runs, by batch, and what is collected, (run, time, ...)."""
+    recorded = _reduce(job.reducer, job.later, _simulate_outputs(job, runs))
     valid, start = jnp.asarray(runs) < job.stop, runs[0] % BATCHES
 
     def sum_by_batch(leaf: jax.Array) -> PyTree:
-        """Return (run, ...) as (..., batch), without runs beyond the last; what all runs share as of one."""
+        """Return the sums over each batch (..., batch) of `leaf` (run, ...), without runs beyond the last.
+
+        What all runs share, (1, ...), is not summed.
+        """
         if len(leaf) < len(runs):
             return SharedResult(leaf[0].astype(float))
         return group_by_batch(jnp.where(valid, jnp.moveaxis(leaf, 0, -1).astype(float), 0.0), start)
@@ -258,32 +270,32 @@ def _simulate_block(job: _SimulationJob, runs: jax.Array) -> tuple[tuple[PyTree,
 def _simulate_outputs(job: _SimulationJob, runs: jax.Array) -> PyTree:
     """Return trajectories of one block of runs, (run, time, ...), in double precision whatever simulated them."""
     if job.precision == "float64":
-        return _trajectories(job.world, job.inputs, job.key, runs)
+        return _simulate_trajectories(job.world, job.inputs, job.key, runs)
     with jax.enable_x64(False):
         world, inputs = jax.tree.map(_convert_to_single, (job.world, job.inputs))
-        outputs = _trajectories(world, inputs, job.key, runs)
+        outputs = _simulate_trajectories(world, inputs, job.key, runs)
     return jax.tree.map(lambda leaf: leaf.astype(float) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, outputs)
 
 
 def _estimate_memory(job: _SimulationJob, runs: int, chunk: int) -> NeededMemory:
     """Return the memory of a simulation by XLA on a processor, from its shapes.
 
-    Sums stand once in each lane; a lane in flight also has those after its block, and rows of batches from which they
-    are made. Of trajectories the program has those that its reducer reads.
+    Sums stand once in each lane; a lane that is computed also has those after its block, and rows of batches from which
+    they are made. Of trajectories the program has those that its reducer reads. `chunk`: runs that are begun together.
     """
     with jax.enable_x64(True):
         block = np.arange(BLOCK)
         sums, collected = eqx.filter_eval_shape(_simulate_block, job, block)
         outputs = eqx.filter_eval_shape(_simulate_outputs, job, block)
-        read = read_by(partial(_reduced, job.reducer, job.later), outputs)
-    blocks, at_once = -(-runs // BLOCK), -(-min(runs, chunk) // BLOCK)
-    in_flight = 1 if job.world.filters.meshes else min(LANES, at_once, os.cpu_count() or 1)
-    rows = size_of(sums) * (BATCHES + BLOCK - 1) / BATCHES  # as `group_by_batch` makes them
-    kept = blocks * size_of(collected)
+        read = list_used_leaves(partial(_reduce, job.reducer, job.later), outputs)
+    blocks, blocks_of_chunk = -(-runs // BLOCK), -(-min(runs, chunk) // BLOCK)
+    computed_at_once = 1 if job.world.filters.meshes else min(LANES, blocks_of_chunk, os.cpu_count() or 1)
+    rows = count_bytes(sums) * (BATCHES + BLOCK - 1) / BATCHES  # as `group_by_batch` makes them
+    kept = blocks * count_bytes(collected)
     return NeededMemory(
         collected=2 * kept,  # by chunk, then joined, when no trajectories are left
-        sums=min(LANES, blocks) * size_of(sums) + in_flight * (size_of(sums) + rows),
-        trajectories=max(0.0, in_flight * size_of(read) - kept),
+        sums=min(LANES, blocks) * count_bytes(sums) + computed_at_once * (count_bytes(sums) + rows),
+        trajectories=max(0.0, computed_at_once * count_bytes(read) - kept),
     )
 
 
@@ -300,7 +312,7 @@ def group_by_batch(values: jax.Array, start: jax.Array | int) -> jax.Array:
 
 
 def _convert_to_single(leaf: PyTree) -> PyTree:
-    """Convert an array to the type that JAX has for it without enable_x64."""
+    """Return an array in the type that JAX has for it without enable_x64; anything else as it is."""
     halved = {"float64": "float32", "int64": "int32", "uint64": "uint32"}
     return leaf.astype(halved.get(str(leaf.dtype), leaf.dtype)) if eqx.is_array(leaf) else leaf
 
@@ -318,8 +330,8 @@ def _reduce_runs(reducer: AbstractReducer[Any], later: NetworkSmoother | None, o
 
 
 # Traced once, for their shapes and for the program alike: tracing is half of what a first call takes.
-_trajectories: Callable[..., PyTree] = eqx.filter_jit(_simulate_world, inline=True)  # type: ignore[call-overload]
-_reduced: Callable[..., OfStep] = eqx.filter_jit(_reduce_runs, inline=True)  # type: ignore[call-overload]
+_simulate_trajectories: Callable[..., PyTree] = eqx.filter_jit(_simulate_world, inline=True)  # type: ignore[call-overload]
+_reduce: Callable[..., OfStep] = eqx.filter_jit(_reduce_runs, inline=True)  # type: ignore[call-overload]
 
 
 def simulate(

@@ -34,34 +34,53 @@ class World(Module):
     filters: AllFilters
 
     def init(self, key: jax.Array) -> PyTree:
-        """Return the state before the first step of the run with this key."""
+        """Return the state before the first step of the run with this key.
+
+        A tuple: state x of the plant (n,); of the medium; of all filters; of the links between neighbours, by fusion;
+        of the plant's memories.
+        """
         plant = at(self.plant, 0)
         if isinstance(plant, ModalPlant) and plant.rates is not None:
             expected = "transitions of a plant's modes by steps (with rates filter recordings, simulate T = exp(G dt))"
             raise fail("simulation", expected, "rates of switches")
-        x, modes = plant.sample_initial(draw_key(key, 0, WORLD, INITIAL)), start_modes(plant, key, self._places)
+        x = plant.sample_initial(draw_key(key, 0, WORLD, INITIAL))
+        modes = start_modes(plant, key, self._memory_numbers)
         edges = {name: mesh.edges.init(key) for name, mesh in self.filters.meshes.items()}
         return x, self.medium.init(key), self.filters.init(), edges, modes
 
     @property
-    def _places(self) -> np.ndarray:
-        """Places of the memories of the plant, (memories,)."""
+    def _memory_numbers(self) -> np.ndarray:
+        """Numbers that seed the draws of the plant's memories (memories,)."""
         return number_memories({PLANT: self.plant}, self.plant)[PLANT]
 
     def step(self, carry: PyTree, key: jax.Array, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
-        """Step to k with the input u: next state, and truth (n,), measurements and estimates."""
+        """Step the world over step k: return its next state, and what is recorded of the step.
+
+        Args:
+            carry: state before the step, as `init` returns it.
+            key: of the run.
+            row: (k, inputs of the plant over step k).
+
+        Returns:
+            The next state, and "truth" (n,), "measurements" (node, received) by group, "transmissions" by group, and
+            all that `AllFilters.step` puts out.
+        """
         (x, medium, states, edges, modes), (k, u) = carry, row
+        # The plant moves, in the present modes of its memories, and its nodes receive.
         plant = condition_on_memories(at(self.plant, k), modes)
         x = plant.plus(plant.transition(x, u), plant.sample_noise(draw_key(key, k, WORLD, PROCESS), u))
         medium, z = self.medium.receive(medium, x, u, key, k)
         # Where nothing is ever missing, native code is told so.
         z = tuple(present(values) if full else values for values, full in zip(z, self.filters.complete, strict=True))
-        drawn: dict[str, PyTree] = {name: link.uplinks.draw(key, k) for name, link in self.filters.reporting.items()}
+        # What reports and messages between neighbours do; then all filters.
+        drawn: dict[str, PyTree] = {
+            name: by_report.uplinks.draw(key, k) for name, by_report in self.filters.reporting.items()
+        }
         drawn_edges = {name: mesh.edges.draw(edges[name], key, k) for name, mesh in self.filters.meshes.items()}
         edges = {name: state for name, (state, _) in drawn_edges.items()}
         drawn |= {name: arrived for name, (_, arrived) in drawn_edges.items()}
         states, outputs = self.filters.step(states, z, u, k, drawn)
-        modes = move_modes(self.plant, modes, key, k, self._places)
+        modes = move_modes(self.plant, modes, key, k, self._memory_numbers)
         after = x, self.medium.feed_back(medium, outputs["estimates"]), states, edges, modes
         results = {
             "truth": x,
@@ -78,7 +97,7 @@ def _turn_to_truth(plant: AbstractPlant, x: jax.Array, outputs: dict[str, PyTree
         return outputs
 
     def turn(estimate: Estimate) -> Estimate:
-        """Turn the angles of one estimate."""
+        """Return an estimate with its angles near those of x."""
         return replace(estimate, mean=plant.near(jnp.asarray(estimate.mean), x))
 
     estimates = {key: outputs[key] for key in ("estimates", "fused")}

@@ -36,9 +36,13 @@ from heliograph.smoothing.fixed_interval_lag_point import AbstractSmoothing, nis
 
 
 class NetworkSmoother(Module):
-    """Smooths a network's filters: `kinds` are the numbers of those smoothed, `groups` of the nodes that have them.
+    """Smooths the filters of a network's run, and fuses the smoothed estimates.
 
-    `fusions`: of smoothed estimates at the same time.
+    Args:
+        smoothing: which estimates are made, such as those of a fixed interval.
+        fusions: of smoothed estimates of the same time.
+        kinds: numbers of the kinds of filters that are smoothed.
+        groups: numbers of the groups of nodes that have them.
     """
 
     smoothing: AbstractSmoothing
@@ -47,11 +51,15 @@ class NetworkSmoother(Module):
     groups: tuple[int, ...] = eqx.field(static=True)
 
     def smooth_run(self, outputs: PyTree) -> PyTree:
-        """Return filtered and smoothed results of a run (time, ...), as a reducer takes them, and sums of the NIS."""
+        """Return a run's results "filtered" and "smoothed", as a reducer takes them, and sums of the "nis".
+
+        NIS: e' S^-1 e of an innovation e of covariance S, which is about its number of components if a filter is
+        consistent. `outputs` (time, ...): of `AllFilters.step`, with smoother steps.
+        """
         steps_by_kind = [outputs["smoother_steps"][k] for k in self.kinds]
         filtered = {name: values for name, values in outputs.items() if name not in ("smoother_steps", "central_steps")}
-        # Smoothed estimates of nodes and central filters, then their fusions.
-        # Of one kind they are (time, filter, node, ...): each filter of each node is swept back over time by itself.
+        # Smoothed estimates of nodes and central filters, then their fusions. Steps of one kind are
+        # (time, filter, node, ...): each filter of each node is swept back over time by itself.
         sweep = jax.vmap(jax.vmap(self.smoothing.sweep, in_axes=1, out_axes=1), in_axes=1, out_axes=1)
         estimates = tuple(sweep(steps) for steps in steps_by_kind)
         fused = {name: self.smoothing.sweep(steps) for name, steps in outputs["central_steps"].items()}
@@ -82,10 +90,16 @@ class NetworkSmoother(Module):
 def _turn_to_truth(
     truth: jax.Array, smoothed: Mapping[str, PyTree], angles_of_kinds: Sequence[Angles]
 ) -> dict[str, PyTree]:
-    """Return the estimates with their angles within half a turn of the truth, so that x - xhat is the error."""
+    """Return the estimates with their angles within half a turn of the truth, so that x - xhat is the error.
+
+    Args:
+        truth: states x (time, n).
+        smoothed: "estimates" by kind and "fused" by name, (time, ..., n).
+        angles_of_kinds: which states are angles for the filters of each kind.
+    """
 
     def turn(estimate: Estimate, angles: Angles) -> Estimate:
-        """Turn the angles of an estimate (time, ..., n); truth (time, n)."""
+        """Return an estimate (time, ..., n) with its angles turned."""
         mean = jnp.asarray(estimate.mean)
         truth_at_each = truth.reshape(len(truth), *[1] * (mean.ndim - 2), -1)
         return replace(estimate, mean=wrap_near(mean, truth_at_each, angles))
@@ -97,13 +111,22 @@ def _turn_to_truth(
 
 
 def _fuse_at_each_time(fusion: StackedFusions, estimates: Sequence[Estimate]) -> dict[str, Estimate]:
-    """Fuse estimates (time, filter, node, ...) at each time."""
-    fused: dict[str, Estimate] = jax.vmap(lambda parts: fusion.step((), parts, jnp.asarray(0))[1])(estimates)
+    """Return the fused estimates (time, ...) by name, of estimates (time, filter, node, ...) by kind."""
+
+    def fuse(estimates: Sequence[Estimate]) -> dict[str, Estimate]:
+        """Return the fused estimates of one time, by name."""
+        _, fused, _ = fusion.step((), estimates, jnp.asarray(0))
+        return fused
+
+    fused: dict[str, Estimate] = jax.vmap(fuse)(estimates)
     return fused
 
 
 def reduce_run(reducer: AbstractReducer[Result], later: NetworkSmoother | None, outputs: PyTree) -> OfStep:
-    """Reduce the results of a run (time, ...); with a smoother pairs of filtered and smoothed ones, and its NIS."""
+    """Return what a reducer makes of a run's `outputs` (time, ...); with a smoother, pairs: of filtered, of smoothed.
+
+    Its sums then end with those of the NIS.
+    """
     if later is None:
         return reduce_rows(reducer, outputs)
     results = later.smooth_run(outputs)
@@ -116,7 +139,15 @@ def reduce_run(reducer: AbstractReducer[Result], later: NetworkSmoother | None, 
 
 
 class SmoothingPlan(NamedTuple):
-    """Smoothed part of a network: places of its kinds and groups among the network's, and the claims."""
+    """Part of a network that is smoothed.
+
+    Args:
+        network: the part, as a network.
+        smoothing: which estimates are made.
+        kinds: numbers of its kinds of filters in the whole network.
+        groups: numbers of its groups of nodes in the whole network.
+        claims: of smoothed estimates and their fusions, by node and filter.
+    """
 
     network: Network
     smoothing: AbstractSmoothing
@@ -130,7 +161,12 @@ class SmoothingPlan(NamedTuple):
 
 
 def select_smoothed_part(network: Network, smoothing: AbstractSmoothing, horizon: int) -> SmoothingPlan:
-    """Select the part of a network that is smoothed: all its estimates; where relays run schedules, the receiver's.
+    """Return the part of a network that is smoothed: all its estimates; where relays run schedules, the receiver's.
+
+    Args:
+        network: the network.
+        smoothing: which estimates are made.
+        horizon: number of steps.
 
     Raises:
         ValueError: no filter, a filter or a fusion that cannot be smoothed, a horizon too short for the smoothing.
@@ -144,7 +180,8 @@ def select_smoothed_part(network: Network, smoothing: AbstractSmoothing, horizon
     smoothed = network
     if network.relays is not None:
         smoothed = Network(network.plant, {RECEIVER: network.nodes[RECEIVER]}, relays=network.relays)
-    if not any(by_name for by_name in (*(node.filters for node in smoothed.nodes.values()), smoothed.fused)):
+    has_filters = any(node.filters for node in smoothed.nodes.values())
+    if not has_filters and not smoothed.fused:
         raise fail("smoothing", "a filter at a node or the centre", "a network without filters")
     # Claims of smoothed estimates and of their fusions.
     claims: Claims = {
@@ -155,6 +192,7 @@ def select_smoothed_part(network: Network, smoothing: AbstractSmoothing, horizon
         claims[FUSED] = {
             name: _find_claim_of_fusion(smoothed, name, fusion, claims) for name, fusion in smoothed.fused.items()
         }
+    # Where the part's nodes and filters stand in the whole network.
     groups = tuple(g for g, names in enumerate(network.groups) if set(names) & set(smoothed.names))
     kinds = tuple(k for k, kind in enumerate(network.kinds) if kind.group in groups)
     return SmoothingPlan(smoothed, smoothing, kinds, groups, claims)
@@ -171,7 +209,17 @@ def _find_claim_of_smoother(filter: AbstractFilter) -> Claim:
 
 
 def _find_claim_of_fusion(network: Network, name: str, fusion: Fusion | AbstractFilter, claims: Claims) -> Claim:
-    """Return what a fusion of smoothed estimates can claim; raise where it has no smoothed form."""
+    """Return what a fusion of smoothed estimates, or a smoothed central filter, can claim.
+
+    Args:
+        network: the part of the network that is smoothed.
+        name: of the fusion.
+        fusion: the fusion.
+        claims: of the nodes' smoothed estimates, by node and filter.
+
+    Raises:
+        ValueError: a fusion that has no smoothed form.
+    """
     if isinstance(fusion, AbstractFilter):
         return _find_claim_of_smoother(fusion)
     if isinstance(fusion.rule, AbstractInformedFusion):
@@ -183,7 +231,7 @@ def _find_claim_of_fusion(network: Network, name: str, fusion: Fusion | Abstract
 
 
 def _warn_of_inconsistency(network: Network, nis: PyTree) -> None:
-    """Warn of filters that are not consistent, from sums of the NIS over blocks and runs."""
+    """Warn of filters that are not consistent, from sums of the NIS as `smooth_run` returns them, over all runs."""
     for (group, names), sums in zip(network.kinds, nis["estimates"], strict=True):
         for f, name in enumerate(names):
             for i, node in enumerate(network.groups[group]):
@@ -193,7 +241,14 @@ def _warn_of_inconsistency(network: Network, nis: PyTree) -> None:
 
 
 def make_smoothed_record(network: Network, smoothing: SmoothingPlan, outputs: PyTree, time: np.ndarray) -> Record:
-    """Return the record of a recording with its smoothed part, by `NetworkSmoother`; warn of bad consistency."""
+    """Return the record of a recording with its smoothed part; warn of filters that are not consistent.
+
+    Args:
+        network: the whole network.
+        smoothing: its smoothed part.
+        outputs: what `NetworkSmoother.smooth_run` returned.
+        time: times of the rows.
+    """
     _warn_of_inconsistency(smoothing.network, outputs["nis"])
     filtered = trajectories_record(network, {"truth": None, **outputs["filtered"]}, time)
     length = outputs["smoothed"]["measurements"][0].shape[0]
@@ -202,10 +257,13 @@ def make_smoothed_record(network: Network, smoothing: SmoothingPlan, outputs: Py
 
 
 def add_truth(record: Record, plant: AnyPlant, truth: np.ndarray, smoothing: AbstractSmoothing | None) -> Record:
-    """Return the record of a recording with the true states, angles of estimates within half a turn of them."""
+    """Return the record of a recording with its true states (time, n), NaN where unknown, also in its smoothed part.
+
+    Angles of estimates are then within half a turn of them.
+    """
 
     def turn(estimate: Estimate, x: np.ndarray) -> Estimate:
-        """Turn an estimate's angles towards x where x is known."""
+        """Return an estimate with its angles near those of x, where x is known."""
         mean = np.asarray(estimate.mean)
         known = np.where(np.isnan(x), mean, x)
         return replace(estimate, mean=first(plant).near(mean, known))
@@ -222,7 +280,14 @@ def add_truth(record: Record, plant: AnyPlant, truth: np.ndarray, smoothing: Abs
 
 
 class ReducedRuns(NamedTuple):
-    """Sums by batch of `runs` each and what is collected of all runs; `common`: whether all runs share a sum."""
+    """What a reducer made of all runs.
+
+    Args:
+        sums: over the runs of each batch, (..., batch); of what all runs share, its value.
+        common: of each of these, whether all runs share it.
+        runs: how many there are in each batch (batch,).
+        collected: what is kept of each run (run, ...).
+    """
 
     sums: OfStep
     common: OfStep
@@ -233,7 +298,14 @@ class ReducedRuns(NamedTuple):
 def finish_result(
     reducer: AbstractReducer[Result], recorded: ReducedRuns, network: Network, smoothing: SmoothingPlan | None
 ) -> Result:
-    """Make the result of a network, with that of its smoothed part; warn of filters that are not consistent."""
+    """Return the result of a network's runs, with that of its smoothed part; warn of filters that are not consistent.
+
+    Args:
+        reducer: by which the runs were reduced.
+        recorded: sums over the runs, and what was collected.
+        network: the network.
+        smoothing: its smoothed part; None where nothing was smoothed.
+    """
     sums, common, count, collected = recorded
     # Without smoothing the result of the network alone.
     if smoothing is None:
@@ -241,10 +313,12 @@ def finish_result(
     # As `reduce_run` has them: sums are of filtered estimates, of smoothed ones, and of the NIS.
     *_, nis_sums_by_batch = sums.sums
     *_, is_common = common.sums
+    # Summed over all runs: what all runs share counts once for each.
     nis = jax.tree.map(
-        lambda leaf, same: leaf * count.sum() if same else leaf.sum(axis=-1), nis_sums_by_batch, is_common
+        lambda leaf, is_same: leaf * count.sum() if is_same else leaf.sum(axis=-1), nis_sums_by_batch, is_common
     )
     _warn_of_inconsistency(smoothing.network, nis)
+    # Filtered (0), then smoothed (1).
     results = []
     for i, part in enumerate((network, smoothing.network)):
         sums_of_part, common_of_part = (OfStep(sums=x.sums[i], ever=x.ever[i]) for x in (sums, common))

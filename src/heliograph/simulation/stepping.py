@@ -31,7 +31,7 @@ from heliograph.simulation.centres.fusions import (
     list_centres,
     list_stacked_fusions,
 )
-from heliograph.simulation.centres.linearised import FollowedFusion, LinearisedCentre
+from heliograph.simulation.centres.linearised import LinearisedCentre, LinearisedFusionState
 from heliograph.simulation.centres.mesh import Mesh
 from heliograph.simulation.centres.mesh_building import build_meshes
 from heliograph.simulation.network import Network
@@ -85,7 +85,7 @@ class AllFilters(Module):
         judges: bool = False,
         tests: bool = False,
     ):
-        """Stack the filters of a network, and build its fusions.
+        """Stack the filters of a network by kind, and build its fusions.
 
         Args:
             network: the network.
@@ -122,7 +122,7 @@ class AllFilters(Module):
 
     def _init_centre(
         self, centre: FusionCentre | LinearisedCentre, states: Sequence[PyTree]
-    ) -> CentreState | dict[str, FollowedFusion]:
+    ) -> CentreState | dict[str, LinearisedFusionState]:
         """Return a centre's state before the first step, from the first means of the filters whose estimates it fuses.
 
         `states`: of the nodes' filters by kind. Means of one kind are (filter and node, n), filter after filter.

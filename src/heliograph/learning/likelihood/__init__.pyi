@@ -15,8 +15,8 @@ from .predictive_density import ChannelDensities as ChannelDensities
 from .predictive_density import NODES as NODES
 from .predictive_density import Predictive as Predictive
 from .predictive_density import evaluate_predictive as evaluate_predictive
-from .predictive_density import predictive as predictive
 from .predictive_density import make_signal_filter as make_signal_filter
+from .predictive_density import predictive as predictive
 from .surface import LikelihoodSurface as LikelihoodSurface
 from .transforms import link as link
 from .transforms import map_from_line as map_from_line

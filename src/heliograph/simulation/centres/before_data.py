@@ -17,7 +17,7 @@ from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.simulation.arguments import read_plant_inputs
-from heliograph.simulation.centres.observation_model import Together
+from heliograph.simulation.centres.observation_model import SharedObservation
 from heliograph.simulation.network import Network
 from heliograph.simulation.precomputed_filters import plan_filters
 from heliograph.simulation.stepping import AllFilters
@@ -215,7 +215,7 @@ def _compute_factors(filters: AllFilters, u: np.ndarray) -> SourceFactors:
     filter_states, _, _, (centre_state,), *_ = filters.init()
     nodes, n = centre_state.errors.bias.shape
     # New sources of each step: the plant's noise, and noises of measurements where nodes share them.
-    sources = n + (nodes * centre.size if isinstance(centre.observation_model, Together) else 0)
+    sources = n + (nodes * centre.size if isinstance(centre.observation_model, SharedObservation) else 0)
     start = filter_states, make_initial_factors(centre_state.errors, sources * len(u))
 
     def compute_matrices(states: PyTree, u_k: jax.Array, k: jax.Array) -> LinearStep:

@@ -42,7 +42,7 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, PyTree
-from heliograph.simulation.centres.observation_model import Apart, Together
+from heliograph.simulation.centres.observation_model import SeparateObservations, SharedObservation
 
 
 class CentreState(NamedTuple):
@@ -66,7 +66,7 @@ class FusionCentre(Module):
     """
 
     plant: AnyPlant
-    observation_model: Apart | Together
+    observation_model: SeparateObservations | SharedObservation
     rules: dict[str, AbstractInformedFusion]
     order: np.ndarray
     sources: tuple[tuple[int, int], ...] = eqx.field(static=True)
@@ -186,7 +186,7 @@ def gather_steps(parts: Sequence[Matrices], order: np.ndarray, size: int) -> Mat
 Parts = Mapping[str, tuple[AnySensor, Channel, AbstractFilter]]  # sensor, channel and filter of each node
 
 
-def claim_of_informed(rule: str, plant: AnyPlant, nodes: Parts, shared: bool) -> Claim:
+def find_claim_of_informed_fusion(rule: str, plant: AnyPlant, nodes: Parts, shared: bool) -> Claim:
     """Return the claim of fusion by an informed rule: "exact", "upper" where noise is known by bounds, else "nominal".
 
     Args:
@@ -204,20 +204,20 @@ def claim_of_informed(rule: str, plant: AnyPlant, nodes: Parts, shared: bool) ->
             expected = f"fusion by {rule}: node {name!r}"
             raise fail(expected, "a channel that forgets", f"{type(first(channel)).__name__}, which remembers")
     refuse_angles(f"fusion by {rule}", plant, *(sensor for sensor, _, _ in nodes.values()))
-    if along_estimates(nodes):
-        _check_along_estimates(rule, nodes, shared)
+    if has_data_dependent_gains(nodes):
+        _check_data_dependent_gains(rule, nodes, shared)
         return "nominal"
     _check_linear(rule, plant, nodes)
     known: Claim = "nominal" if any(_has_uncertain_law(channel) for _, channel, _ in nodes.values()) else "exact"
     return lower_by_noise(known, plant, [(sensor, channel) for sensor, channel, _ in nodes.values()])
 
 
-def along_estimates(nodes: Parts) -> bool:
-    """Test whether errors can only be propagated along the estimates: some filter's gains depend on data."""
+def has_data_dependent_gains(nodes: Parts) -> bool:
+    """Return whether some filter's gains depend on data, so that errors can only be propagated along the estimates."""
     return any(isinstance(filter, GaussianFilter) and not filter.linear for _, _, filter in nodes.values())
 
 
-def _check_along_estimates(rule: str, nodes: Parts, shared: bool) -> None:
+def _check_data_dependent_gains(rule: str, nodes: Parts, shared: bool) -> None:
     """Raise unless all filters are cubature or extended ones, of nodes that share nothing but the plant."""
     for name, (_, _, filter) in nodes.items():
         if not isinstance(filter, GaussianFilter) or filter.linear:
@@ -239,7 +239,7 @@ def _check_linear(rule: str, plant: AnyPlant, nodes: Parts) -> None:
             raise fail(where, "a filter of the plant's state whose gains depend on no data", type(filter).__name__)
 
 
-def claim_of_reports(rule: str, claim: Claim, fusion: Fusion, complete: Mapping[str, bool]) -> Claim:
+def find_claim_of_report_fusion(rule: str, claim: Claim, fusion: Fusion, complete: Mapping[str, bool]) -> Claim:
     """Return the claim of fusion by reports: that of the fusion, lowered by quantizers and uplinks of uncertain laws.
 
     `complete`: for each node whether it loses no measurement.
@@ -259,7 +259,7 @@ def claim_of_reports(rule: str, claim: Claim, fusion: Fusion, complete: Mapping[
 
 
 def _has_uncertain_law(channel: Channel) -> bool:
-    """Test whether probabilities of the channel's laws are known up to a radius only."""
+    """Return whether probabilities of the channel's laws are known up to a radius only."""
     try:
         return any(step.condition_on_arrival().corner_count() > 1 for step in unstack(channel))
     except ValueError:  # too many corners to list

@@ -23,12 +23,17 @@ from heliograph.simulation.centres.centre import (
     CentreFilter,
     FusionCentre,
     NodesFilters,
-    along_estimates,
-    claim_of_reports,
+    find_claim_of_report_fusion,
+    has_data_dependent_gains,
 )
 from heliograph.simulation.centres.linearised import LinearisedCentre
-from heliograph.simulation.centres.observation_model import Apart, Together, describe_channel, stack_nodes
-from heliograph.simulation.centres.uplinks import InFlight, UplinkDraws, Uplinks, build_uplinks
+from heliograph.simulation.centres.observation_model import (
+    SeparateObservations,
+    SharedObservation,
+    describe_channel,
+    stack_nodes,
+)
+from heliograph.simulation.centres.uplinks import ReportsInTransit, UplinkDraws, Uplinks, build_uplinks
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.network_index import EstimatePlace
 from heliograph.simulation.node import Node, ReceivingNode
@@ -128,18 +133,18 @@ class ReportFusion(Module):
     sources: tuple[tuple[int, int], ...] = eqx.field(static=True)
     nodes: tuple[str, ...] = eqx.field(static=True)
 
-    def init(self) -> tuple[InFlight, PyTree]:
+    def init(self) -> tuple[ReportsInTransit, PyTree]:
         """Return the state before any report is sent."""
         return self.uplinks.init(), initial_state(self.centre)
 
     def step(
         self,
-        state: tuple[InFlight, PyTree],
+        state: tuple[ReportsInTransit, PyTree],
         estimates: Sequence[Estimate],
         drawn: UplinkDraws,
         u: jax.Array,
         k: jax.Array,
-    ) -> tuple[tuple[InFlight, PyTree], Estimate, dict[str, jax.Array], tuple[jax.Array, Array]]:
+    ) -> tuple[tuple[ReportsInTransit, PyTree], Estimate, dict[str, jax.Array], tuple[jax.Array, Array]]:
         """Send the nodes' means as reports, and correct the centre's filter with those that arrive at step k.
 
         Args:
@@ -192,7 +197,7 @@ def build_centre_filter(
     # The centre's claim, from those of the nodes' filters and what their uplinks do.
     names = network.nodes_with(fusion.filter)
     complete = {node: network.nodes[node].complete for node in names}
-    claim = claim_of_reports(type(fusion.rule).__name__, network.claims()[FUSED][name], fusion, complete)
+    claim = find_claim_of_report_fusion(type(fusion.rule).__name__, network.claims()[FUSED][name], fusion, complete)
     # The nodes with that filter alone, for the moments of its errors.
     alone = Network(
         network.plant,
@@ -291,7 +296,7 @@ def _build_centre(
     size = max(network.nodes[node].received for node in nodes)
     claim = claims[next(iter(rules))]  # the same of all rules on one filter
     # Gains that depend on data: moments along the estimates.
-    if along_estimates(network.parts_of(name)):
+    if has_data_dependent_gains(network.parts_of(name)):
         return LinearisedCentre(network.plant, rules, order, sources, size, claim)
     return FusionCentre(
         plant=network.plant,
@@ -327,7 +332,7 @@ def find_source_filters(
 
 def _model_measurements(
     network: Network, nodes: Sequence[str], groups: Sequence[Sequence[str]], order: np.ndarray, size: int
-) -> Apart | Together:
+) -> SeparateObservations | SharedObservation:
     """Return the measurement models of these nodes for a centre.
 
     Args:
@@ -340,9 +345,9 @@ def _model_measurements(
     if network.common is not None:
         rows = network.rows
         padded = [np.pad(rows[name], (0, size - len(rows[name])), constant_values=-1) for name in nodes]
-        return Together(network.common.sensor, describe_channel(network.common.channel), np.array(padded))
+        return SharedObservation(network.common.sensor, describe_channel(network.common.channel), np.array(padded))
     stacked = []
     for names in groups:
         members = [node for node in map(network.nodes.__getitem__, names) if isinstance(node, Node)]
         stacked.append(stack_nodes([node.sensor for node in members], [node.channel for node in members]))
-    return Apart(tuple(stacked), order, size)
+    return SeparateObservations(tuple(stacked), order, size)

@@ -27,7 +27,7 @@ from heliograph.numerics.types import PyTree
 from heliograph.simulation.centres.centre import gather_steps
 
 
-class FollowedFusion(NamedTuple):
+class LinearisedFusionState(NamedTuple):
     """State of one fusion: moments of the nodes' errors, its last estimate `known` (n,), and its rule's state."""
 
     errors: ErrorMoments
@@ -56,7 +56,7 @@ class LinearisedCentre(Module):
 
     compute_matrices = staticmethod(linearise_step)
 
-    def init(self, starts: Sequence[jax.Array]) -> dict[str, FollowedFusion]:
+    def init(self, starts: Sequence[jax.Array]) -> dict[str, LinearisedFusionState]:
         """Return the states of all fusions before the first step, by name.
 
         `starts`: initial means (node, n) of each source's filters.
@@ -64,16 +64,16 @@ class LinearisedCentre(Module):
         plant = at(self.plant, 0)
         errors = make_initial_errors(plant.initial_mean, plant.initial_covariance, jnp.concatenate(starts)[self.order])
         mean = jnp.asarray(plant.initial_mean)
-        return {name: FollowedFusion(errors, mean, rule.start(errors)) for name, rule in self.rules.items()}
+        return {name: LinearisedFusionState(errors, mean, rule.start(errors)) for name, rule in self.rules.items()}
 
     def step(
         self,
-        state: dict[str, FollowedFusion],
+        state: dict[str, LinearisedFusionState],
         parts: Sequence[Linearised],
         means: Sequence[jax.Array],
         u: jax.Array,
         k: jax.Array,
-    ) -> tuple[dict[str, FollowedFusion], dict[str, Estimate]]:
+    ) -> tuple[dict[str, LinearisedFusionState], dict[str, Estimate]]:
         """Return the next state and the fused estimates of step k, both by name of the fusion.
 
         Args:
@@ -102,7 +102,7 @@ class LinearisedCentre(Module):
                 drift = _compute_drift(before.rule, matrix, moved, keep, linear)
                 step = step._replace(shift=jnp.concatenate([motion.shift, drift.reshape(-1)]))
             rule_state, (mean, covariance) = rule.fuse_step(before.rule, CentreStep(step, errors), reports)
-            following[name] = FollowedFusion(errors, known=mean, rule=rule_state)
+            following[name] = LinearisedFusionState(errors, known=mean, rule=rule_state)
             results[name] = Estimate(mean, covariance, self.claim)
         return following, results
 

@@ -46,7 +46,7 @@ from heliograph.simulation.centres.neighbour_messages import (
     gather_messages,
     step_messages_on_the_way,
 )
-from heliograph.simulation.centres.observation_model import Apart
+from heliograph.simulation.centres.observation_model import SeparateObservations
 
 
 class Mesh(Module):
@@ -71,7 +71,7 @@ class Mesh(Module):
     buckets: tuple[NodeBucket, ...]
     ranks: np.ndarray
     edges: MeshEdges
-    observation_model: Apart
+    observation_model: SeparateObservations
     senders: np.ndarray
     places: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     nodes: tuple[str, ...] = eqx.field(static=True)

@@ -10,7 +10,7 @@ from heliograph.numerics.check import fail
 from heliograph.simulation.centres.mesh import Mesh
 from heliograph.simulation.centres.mesh_parts import NodeBucket
 from heliograph.simulation.centres.neighbour_edges import build_edges
-from heliograph.simulation.centres.observation_model import Apart, ObservationModel, stack_nodes
+from heliograph.simulation.centres.observation_model import ObservationModel, SeparateObservations, stack_nodes
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
@@ -47,7 +47,7 @@ def build_mesh(network: Network, name: str) -> Mesh:
     )
 
 
-def _model_measurements(network: Network, nodes: Sequence[str]) -> Apart:
+def _model_measurements(network: Network, nodes: Sequence[str]) -> SeparateObservations:
     """Return the measurement models of these nodes of a network, in their order; those without a sensor have none."""
     groups: list[ObservationModel | None] = []
     places: dict[str, int] = {}  # of each node among all, group after group
@@ -55,7 +55,7 @@ def _model_measurements(network: Network, nodes: Sequence[str]) -> Apart:
         sensors = [node for node in map(network.nodes.__getitem__, names) if isinstance(node, Node)]
         groups.append(stack_nodes([n.sensor for n in sensors], [n.channel for n in sensors]) if sensors else None)
         places |= {node: len(places) + i for i, node in enumerate(names)}
-    return Apart(
+    return SeparateObservations(
         groups=tuple(groups),
         order=np.array([places[node] for node in nodes]),
         size=max(1, *(node.received for node in network.nodes.values())),

@@ -20,9 +20,14 @@ from heliograph.model.plant import LinearPlant
 from heliograph.model.sensor import LinearSensor, refuse_angles
 from heliograph.numerics.check import fail, instance, spread_over_names
 from heliograph.random_affine.moments.second_moments import second_order
-from heliograph.simulation.centres.centre import claim_of_informed
+from heliograph.simulation.centres.centre import find_claim_of_informed_fusion
 from heliograph.simulation.centres.fixed_shares import check_decay
-from heliograph.simulation.centres.neighbour_edges import arrival_chance, build_edges, find_loss_decay, links_by_edge
+from heliograph.simulation.centres.neighbour_edges import (
+    build_edges,
+    find_arrival_probability,
+    find_loss_decay,
+    links_by_edge,
+)
 from heliograph.simulation.node import HasNodes, Node
 
 MODE = 1e-6  # a mode of 1 - MODE counts as one that does not decay: double ones are computed to half of the digits
@@ -66,14 +71,14 @@ def check_mesh(name: str, fusion: Fusion, network: HasNodes) -> None:
     graph = graph_of(neighbours, network.mesh_nodes(name))
     _check_messages(what, fusion, network, graph)
     fusion.rule.placed(graph)
-    mesh_claim(name, fusion, network)
+    find_claim_of_mesh(name, fusion, network)
     # Whether errors stay bounded.
     _check_detectability(what, name, fusion, network)
     _check_losses(what, fusion, network, graph)
     _check_fixed_shares(what, fusion, network, graph)
 
 
-def error_claim(name: str, fusion: Fusion, network: HasNodes) -> Claim:
+def find_claim_of_errors(name: str, fusion: Fusion, network: HasNodes) -> Claim:
     """Return the claim of the joint covariance of all nodes' errors: "exact", weaker where laws or noises are bounds.
 
     `name`: of the fusion between neighbours `fusion` in the network.
@@ -83,10 +88,12 @@ def error_claim(name: str, fusion: Fusion, network: HasNodes) -> Claim:
         node = network.nodes[name_of_node]
         if isinstance(node, Node):
             parts[name_of_node] = node.sensor, node.channel, node.filters[fusion.filter]
-    return claim_of_informed(f"{type(fusion.rule).__name__} between neighbours", network.plant, parts, shared=False)
+    return find_claim_of_informed_fusion(
+        f"{type(fusion.rule).__name__} between neighbours", network.plant, parts, shared=False
+    )
 
 
-def mesh_claim(name: str, fusion: Fusion, network: HasNodes) -> Claim:
+def find_claim_of_mesh(name: str, fusion: Fusion, network: HasNodes) -> Claim:
     """Return the claim of every node's estimate: "upper" by intersection, "exact" by the joint covariance.
 
     `name`: of the fusion between neighbours `fusion` in the network.
@@ -94,7 +101,7 @@ def mesh_claim(name: str, fusion: Fusion, network: HasNodes) -> Claim:
     Weaker where laws are known up to a radius, weights are frozen means over losses, or data decide what arrives: a
     sender by what it measured, limits by what they refuse, a quantizer by what it cannot send.
     """
-    known = error_claim(name, fusion, network)
+    known = find_claim_of_errors(name, fusion, network)
     senders = [n for node in network.mesh_nodes(name) if isinstance(n := network.nodes[node], Node)]
     by_data = fusion.quantizer is not None or any(n.chosen_by_value for n in senders)
     if by_data or isinstance(fusion.rule, FrozenWeights):
@@ -299,7 +306,7 @@ def _check_fixed_shares(what: str, fusion: Fusion, network: HasNodes, graph: Gra
     nodes = [network.nodes[name] for name in names]
     # Judged where the plant does not decay, each edge's losses are independent over steps, and nodes are steady.
     links = [None] * len(graph.edges) if link is None else list(links_by_edge(link, graph).values())
-    rates = [arrival_chance(channel) for channel in links]
+    rates = [find_arrival_probability(channel) for channel in links]
     arrival = np.array([p for p in rates if p is not None])
     steady = all(_is_steady(node) for node in nodes if isinstance(node, Node))
     if np.abs(np.linalg.eigvals(a)).max() < 1 - MODE or len(arrival) < len(rates) or not steady:
@@ -312,7 +319,7 @@ def _check_fixed_shares(what: str, fusion: Fusion, network: HasNodes, graph: Gra
 
 
 def _is_steady(node: Node) -> bool:
-    """Test whether a node's measurement is the same at every step, and no signal adds to its noise."""
+    """Return whether a node's measurement is the same at every step, and no signal adds to its noise."""
     if isinstance(node.sensor, OverTime) or isinstance(node.channel, OverTime):
         return False
     return not np.any(np.asarray(second_order(node.channel.condition_on_arrival()).nominal.center)[:, :, :-1, :-1])

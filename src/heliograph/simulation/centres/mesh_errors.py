@@ -29,10 +29,10 @@ from heliograph.numerics.check import check_count, fail, instance, is_whole
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Bool, Float, PyTree
-from heliograph.simulation.arguments import key_of, read_plant_inputs
+from heliograph.simulation.arguments import make_run_key, read_plant_inputs
 from heliograph.simulation.centres.mesh import Mesh
 from heliograph.simulation.centres.mesh_building import build_mesh
-from heliograph.simulation.centres.mesh_check import error_claim
+from heliograph.simulation.centres.mesh_check import find_claim_of_errors
 from heliograph.simulation.centres.mesh_parts import MeshStep
 from heliograph.simulation.centres.neighbour_edges import MeshEdges
 from heliograph.simulation.network import Network
@@ -83,7 +83,7 @@ def mesh_arrivals(network: Network, fusion: str, horizon: int, key: int | jax.Ar
     mesh = find_mesh(network, fusion)
     steps = check_count("horizon", horizon)
     with jax.enable_x64(True):
-        return np.asarray(_draw_arrivals(mesh.edges, key_of(key), np.arange(steps)))
+        return np.asarray(_draw_arrivals(mesh.edges, make_run_key(key), np.arange(steps)))
 
 
 @quickly_compiled
@@ -140,7 +140,7 @@ def mesh_errors(
         actual=np.stack(actual),
         claimed=np.stack(claimed),
         joint=last.reshape(nodes, n, nodes, n),
-        claim=error_claim(fusion, network.meshes[fusion], network),
+        claim=find_claim_of_errors(fusion, network.meshes[fusion], network),
     )
 
 

@@ -37,10 +37,10 @@ from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.simulation.arguments import read_plant_inputs
 from heliograph.simulation.centres.mesh import Mesh
-from heliograph.simulation.centres.mesh_check import error_claim
+from heliograph.simulation.centres.mesh_check import find_claim_of_errors
 from heliograph.simulation.centres.mesh_errors import MeshErrors, compute_full_step, find_mesh
 from heliograph.simulation.centres.mesh_parts import MeshStep, NodeBucket
-from heliograph.simulation.centres.neighbour_edges import arrival_chance, links_by_edge
+from heliograph.simulation.centres.neighbour_edges import find_arrival_probability, links_by_edge
 from heliograph.simulation.network import Network
 
 NODES, DEGREE = 200, 10  # most nodes and neighbours of one node whose patterns are listed: 2^degree rows a node
@@ -111,7 +111,7 @@ def mean_mesh_errors(
         actual=np.stack(errors),
         claimed=np.stack(errors),
         joint=joint.reshape(nodes, n, nodes, n),
-        claim=error_claim(fusion, between, network),
+        claim=find_claim_of_errors(fusion, between, network),
     )
 
 
@@ -223,7 +223,7 @@ def _compute_pattern_probabilities(mesh: Mesh, chances: np.ndarray) -> ArrivalPa
 
 def _get_known_probability(edge: str, link: Channel) -> float:
     """Return the probability that a message of this edge arrives, at every step the same and drawn anew."""
-    chance = arrival_chance(link)
+    chance = find_arrival_probability(link)
     if chance is None:
         expected = "losses that are independent over steps (mesh_errors of drawn arrivals for others)"
         raise fail(f"mean errors: link {edge!r}", expected, type(link).__name__)

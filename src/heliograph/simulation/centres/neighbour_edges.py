@@ -101,7 +101,7 @@ class MeshEdges(Module):
             channel = at(edge.channel, k)
             state, z = deliver_signal(channel, state, jnp.zeros(signal_size(channel)), key, count,
                                       edge.checksums, edge.memories)  # fmt: skip
-            arrives, late = ~jnp.any(jnp.isnan(z)), late_part(channel)
+            arrives, late = ~jnp.any(jnp.isnan(z)), find_delay(channel)
             if not self.past:
                 return state, arrives
             age: jax.Array | int = 0
@@ -199,11 +199,11 @@ def links_by_edge(link: Channel | Mapping[str, Channel], graph: Graph) -> dict[s
 
 
 def check_edge(what: str, link: Channel) -> None:
-    """Refuse a link that changes a message, and losses or delays that the receiver does not know of."""
+    """Raise ValueError for a link that changes a message, or whose losses or delays its receiver does not know of."""
     instance(what, first(link), AbstractRandomAffine, "a channel such as erasure(perfect(), 0.8)")
     for step in unstack(link):
         # Delays that are the same for all, or stamped on the message.
-        late = late_part(step)
+        late = find_delay(step)
         if late is not None and not (late.constant or late.timestamped):
             raise fail(what, "delays that the receiver knows (timestamped=True)", "others")
         # Inside losses and delays, and inside the losses of each mode: a link that changes nothing.
@@ -215,7 +215,7 @@ def check_edge(what: str, link: Channel) -> None:
                 raise fail(what, expected, type(first(link)).__name__)
 
 
-def late_part(channel: AbstractRandomAffine) -> Delayed | None:
+def find_delay(channel: AbstractRandomAffine) -> Delayed | None:
     """Return the delay inside a link, whose messages may also be lost; None of a link without delay."""
     _, inside = _open_link(channel)
     return inside if isinstance(inside, Delayed) else None
@@ -230,7 +230,7 @@ def _open_link(channel: AbstractRandomAffine, kinds: type | UnionType = Erasure)
     return arrival, channel
 
 
-def arrival_chance(channel: Channel | None) -> float | None:
+def find_arrival_probability(channel: Channel | None) -> float | None:
     """Return the probability that a message arrives; None where it differs between steps or depends on earlier ones."""
     if channel is None or isinstance(channel, OverTime):
         return 1.0 if channel is None else None
@@ -249,7 +249,7 @@ def find_loss_decay(channel: Channel | None) -> float | None:
     arrival, inside = _open_link(channel, Erasure | Delayed)
     if not isinstance(inside, Modes):
         return None if inside.erases else 1 - float(arrival)
-    chances = [arrival_chance(mode) for mode in inside.maps]
+    chances = [find_arrival_probability(mode) for mode in inside.maps]
     if inside.memory.name is not None or None in chances:
         return None
     losses = 1 - float(arrival) * np.array(chances, dtype=float)  # l, by mode
@@ -257,7 +257,7 @@ def find_loss_decay(channel: Channel | None) -> float | None:
 
 
 def _is_perfect(channel: AbstractRandomAffine) -> bool:
-    """Test whether a channel delivers what is sent."""
+    """Return whether a channel delivers exactly what is sent."""
     if channel.inputs != channel.outputs:
         return False
     moments = second_order(channel.condition_on_arrival())

@@ -26,7 +26,7 @@ from heliograph.simulation.centres.mesh import Mesh
 from heliograph.simulation.centres.mesh_parts import MeshState, NodeBucket
 from heliograph.simulation.centres.neighbour_edges import MeshEdges
 from heliograph.simulation.centres.neighbour_messages import MessagesOnTheWay, quantize_estimate
-from heliograph.simulation.centres.observation_model import Apart, stack_nodes
+from heliograph.simulation.centres.observation_model import SeparateObservations, stack_nodes
 from heliograph.simulation.claims import find_premise
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node, ReceivingNode
@@ -191,7 +191,9 @@ def _build_row(network: Network, fusion: str, node: str) -> Mesh:
         buckets=(NodeBucket(between.rule.placed(row), rows=np.zeros(1, dtype=int), width=count),),
         ranks=np.zeros(1, dtype=int),
         edges=MeshEdges((), np.zeros(0, dtype=int), row.present, 1),
-        observation_model=Apart(tuple(models), order=np.arange(count), size=max(1, *sizes), counts=(1,) * count),
+        observation_model=SeparateObservations(
+            tuple(models), order=np.arange(count), size=max(1, *sizes), counts=(1,) * count
+        ),
         senders=np.arange(count)[None],
         places=((0,),),
         nodes=names,

@@ -62,7 +62,7 @@ def _linearise_observation(
     return JointObservation(gain @ c, gain @ sensor.noise.mean + channel.offset, gain @ noise @ gain.T + spread)
 
 
-class Apart(Module):
+class SeparateObservations(Module):
     """Measurement models of nodes that share nothing.
 
     Args:
@@ -90,7 +90,7 @@ class Apart(Module):
         return JointObservation(*(jnp.concatenate(leaves)[self.order] for leaves in zip(*parts, strict=True)))
 
 
-class Together(Module):
+class SharedObservation(Module):
     """Measurement models of nodes that share a sensor and a channel, of whose outputs each node receives some.
 
     `rows` (node, size): which outputs of the channel each node receives, -1 beyond its own.

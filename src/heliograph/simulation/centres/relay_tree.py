@@ -23,7 +23,7 @@ from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 from heliograph.simulation.arguments import read_plant_inputs
 from heliograph.simulation.centres.centre import FusionCentre
-from heliograph.simulation.centres.observation_model import Apart, ObservationModel, describe_channel
+from heliograph.simulation.centres.observation_model import ObservationModel, SeparateObservations, describe_channel
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.runs.side_by_side import StackedFilters
@@ -56,7 +56,7 @@ class RelayTree:
         return np.asarray(self.covariances[-1][0])
 
     def fused(self, estimates: ArrayLike) -> Float[np.ndarray, "... n"]:
-        """Estimate of the root from those of the leaves, (..., node, n), for filters whose model is the world.
+        """Return the root's estimate from those of the leaves, (..., node, n), for filters whose model is the world.
 
         Raises:
             ValueError: another number of estimates than of leaves; leading axes are free.
@@ -186,7 +186,9 @@ def _propagate_leaves(leaves: _Leaves, numbers: PyTree, u: np.ndarray) -> ErrorS
     alike = StackedFilters(filters=filters, group=0, count=1, nodes=count)
     centre = FusionCentre(
         plant=leaves.plant,
-        observation_model=Apart((ObservationModel(nodes.sensor, channels),), np.arange(count), filters.received),
+        observation_model=SeparateObservations(
+            (ObservationModel(nodes.sensor, channels),), np.arange(count), filters.received
+        ),
         rules={},
         order=np.arange(count),
         sources=((0, 0),),

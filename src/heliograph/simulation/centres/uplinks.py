@@ -51,7 +51,7 @@ class SentReports(NamedTuple):
     delay: ArrayLike
 
 
-class InFlight(NamedTuple):
+class ReportsInTransit(NamedTuple):
     """Reports in transit, and the quantizers' states.
 
     Args:
@@ -92,7 +92,7 @@ class Uplinks(Module):
         exists = np.arange(max(self.received)) < np.array(self.received)[:, None]
         return np.flatnonzero(np.broadcast_to(exists, (self.delay.shape[1], *exists.shape)))
 
-    def init(self) -> InFlight:
+    def init(self) -> ReportsInTransit:
         """Return the state with no report in transit."""
         nodes, ages = self.delay.shape
         values = jnp.full((ages - 1, nodes, max(self.received)), jnp.nan)  # NaN: nothing was sent
@@ -100,7 +100,7 @@ class Uplinks(Module):
             lambda quantizer: quantizer.init(self.n), in_axes=(eqx.if_array(0),), axis_size=nodes
         )
         quantizers = () if self.quantizers is None else begin_all(self.quantizers)
-        return InFlight(values, delays=jnp.zeros((ages - 1, nodes), dtype=int), quantizers=quantizers)
+        return ReportsInTransit(values, delays=jnp.zeros((ages - 1, nodes), dtype=int), quantizers=quantizers)
 
     def draw(self, key: jax.Array, k: jax.Array) -> UplinkDraws:
         """Draw the uplinks of step k in the run with this key; the same for all fusions of the same nodes.
@@ -176,8 +176,8 @@ class Uplinks(Module):
         return jnp.argmax(jnp.asarray(self.delay), axis=1)
 
     def send(
-        self, state: InFlight, means: jax.Array, drawn: UplinkDraws, k: jax.Array
-    ) -> tuple[InFlight, jax.Array, dict[str, jax.Array]]:
+        self, state: ReportsInTransit, means: jax.Array, drawn: UplinkDraws, k: jax.Array
+    ) -> tuple[ReportsInTransit, jax.Array, dict[str, jax.Array]]:
         """Send the reports of step k: return the next state, what arrives of them, now or later, and their traffic.
 
         A value that saturates a quantizer becomes an infinite number: nothing is known of it, and the estimate shows
@@ -209,7 +209,7 @@ class Uplinks(Module):
         z = jnp.einsum("imn,in->im", drawn.gain, values) + drawn.offset
         return state, jnp.where(saturated[:, None], jnp.inf, z), traffic
 
-    def arrive(self, state: InFlight, sent: jax.Array, delay: Array) -> tuple[InFlight, jax.Array]:
+    def arrive(self, state: ReportsInTransit, sent: jax.Array, delay: Array) -> tuple[ReportsInTransit, jax.Array]:
         """Return the next state, and what arrives now of this step's reports and earlier ones (age, node, m).
 
         `sent` (node, m): values of this step's reports, which arrive `delay` (node,) steps later. NaN: nothing arrives.

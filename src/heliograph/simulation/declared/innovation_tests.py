@@ -18,8 +18,10 @@ LAGS = 10  # messages over which correlations are tested, at most
 class InnovationTests(NamedTuple):
     """Tests of innovations over their claimed deviation: sizes by class, and correlation over time.
 
-    `nis`: mean square of each class, with the ends of its interval for a true claim. `correlation`: over one message.
-    `p_value`: of the correlations over up to ten messages.
+    Args:
+        nis: mean square of each class, with the lower and upper end of its interval for a true claim.
+        correlation: over one message.
+        p_value: of the correlations over up to ten messages, if there were none in truth.
     """
 
     nis: list[tuple[float, float, float]]
@@ -35,7 +37,14 @@ class InnovationTests(NamedTuple):
 def examine_innovations(
     declared: DeclaredRows, filter: ToldFilter, classes: Int[np.ndarray, " steps"]
 ) -> InnovationTests:
-    """Test the innovations of a filter: their mean squares by class, and their correlation over messages."""
+    """Test the innovations of a filter: their mean squares by class, and their correlation over messages.
+
+    Args:
+        declared: the recording, and the link that is judged.
+        filter: the filter, as declared or refitted.
+        classes: class of each row, -1 of a row that is not used.
+    """
+    # Innovations u over their claimed deviation, of the values of this link.
     white = whitened_innovations(declared.z, filter, declared.u)[:, declared.place.values]
     # Two tails of each class, so that all classes together contradict a true claim with probability LEVEL.
     tail, nis = LEVEL / declared.classes / 2, list[tuple[float, float, float]]()
@@ -47,7 +56,7 @@ def examine_innovations(
             quantiles = (2 * scipy.special.gammaincinv(count / 2, p) / count for p in (tail, 1 - tail))
             low, high = quantiles if count else (0, 1)
         else:  # Gaussian, with an error that counts correlations between rows
-            error = average_correlated(np.nanmean(squares, axis=1))[1]
+            _, error = average_correlated(np.nanmean(squares, axis=1))
             low, high = 1 + error * scipy.special.ndtri(tail), 1 - error * scipy.special.ndtri(tail)
         nis.append((mean, float(low), float(high)))
     return InnovationTests(nis, *_correlate(white[classes >= 0], filter.knows_gain))

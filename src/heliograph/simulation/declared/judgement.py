@@ -22,10 +22,10 @@ from heliograph.simulation.declared.refit import (
     DeclaredRows,
     LinkPlace,
     Refit,
-    declared_noises,
     find_interval_end,
     find_place,
     list_declaring,
+    list_noise_variances,
     refit_filter,
     refit_scales,
     refit_with_bias,
@@ -127,13 +127,13 @@ class DeclaredJudgement:
         if not self.contradicted:
             return []
         if self.bias is not None:
-            return _say_bias(self.bias, unit)
+            return _describe_bias(self.bias, unit)
         if self.refit_p_value < LEVEL:
             return [
                 "neither a scale of the declared variances nor a bias explains the innovations: correlated over one "
                 f"message ({self.refit_correlation:.2f}) after a refit, by something that the model forgets"
             ]
-        return [line for one in self.classes for line in _say_scale(one, len(self.classes) > 1)]
+        return [line for one in self.classes for line in _describe_scale(one, len(self.classes) > 1)]
 
 
 def judge_declared(
@@ -205,20 +205,25 @@ def judge_declared_links(
 def _judge_link(
     filter: ToldFilter, link: int, z: Float[np.ndarray, "steps received"], u: Float[np.ndarray, "steps inputs"]
 ) -> tuple[DeclaredJudgement | None, int]:
-    """Return the judgement of one link, None where too few of its values came; and how many rows had some."""
+    """Return the judgement of one link, None where too few of its values came; and how many rows had some.
+
+    `link`: its number, as of `list_declaring`. `z` and `u`: measurements and inputs.
+    """
     declared, classes = _classify_rows(filter, link, z, u)
     heard = int(np.sum(classes >= 0))
     if heard < FEWEST:
         return None, heard
+    # As declared: where nothing is wrong, all scales are 1.
     before = examine_innovations(declared, filter, classes)
     if not before.contradicts:
         ones = np.ones(declared.classes)
         return _make_judgement(declared, classes, (before, before), (ones, ones, ones), None), heard
+    # With scales that fit best; and with a bias beside them where that does not explain the correlation over time.
     refit = refit_scales(declared)
     after = examine_innovations(declared, refit_filter(declared, refit.logs), classes)
     bias = _find_bias(declared, refit) if after.p_value < LEVEL else None
     low, high = ([find_interval_end(declared, refit, c, sign) for c in range(declared.classes)] for sign in (-1, 1))
-    scales = np.exp(refit.logs), np.exp(low), np.exp(high)
+    scales = np.exp(refit.logs), np.exp(low), np.exp(high)  # of each class, with the ends of their intervals
     return _make_judgement(declared, classes, (before, after), scales, bias), heard
 
 
@@ -228,11 +233,13 @@ class _DeclaredNoises(eqx.Module):
     told: AbstractTold
 
     def __call__(self, numbers: Array) -> Array:
-        """Return the variances, one after another."""
-        return declared_noises(self.told.believed(numbers))
+        """Return the variances of these numbers' noises, one after another."""
+        return list_noise_variances(self.told.believed(numbers))
 
 
-def _declared_variances(place: LinkPlace, z: Float[np.ndarray, "steps received"]) -> Float[np.ndarray, "steps outputs"]:
+def _compute_declared_variances(
+    place: LinkPlace, z: Float[np.ndarray, "steps received"]
+) -> Float[np.ndarray, "steps outputs"]:
     """Return the variances that the message of each row declares, NaN where one of its numbers is missing.
 
     Typical numbers stand for missing ones meanwhile, so that the law has a variance for every row.
@@ -249,17 +256,19 @@ def _classify_rows(
 ) -> tuple[DeclaredRows, Int[np.ndarray, " steps"]]:
     """Divide a link's rows into classes of similar declared variances.
 
-    Returns: the recording with the edges of the classes, and the class of each row, -1 of a row that is not used.
+    Returns the recording with the edges of the classes, and the class of each row, -1 of a row that is not used.
+    Arguments as of `_judge_link`.
     """
     z, place = z.copy(), find_place(filter, link)
     with np.errstate(all="ignore"):
         # Messages whose numbers give no positive variance count as lost: they would spoil the filter's state.
         for number in list_declaring(filter):
             declaring = find_place(filter, number)
-            valid = np.all(_declared_variances(declaring, z) > 0, axis=1, keepdims=True)
+            valid = np.all(_compute_declared_variances(declaring, z) > 0, axis=1, keepdims=True)
             z[~valid & np.isin(np.arange(z.shape[1]), declaring.values + declaring.numbers)] = np.nan
-        variances = _declared_variances(place, z)
+        variances = _compute_declared_variances(place, z)
         log_size = np.mean(np.log(variances), axis=1)
+    # Rows in which the link declared something and a value came.
     heard = ~np.isnan(log_size) & ~np.isnan(z[:, place.values]).all(axis=1)
     # Edges at quantiles, so that each class has as many rows, and at least EACH numbers.
     count = int(np.sum(~np.isnan(z[heard][:, place.values])))
@@ -276,22 +285,23 @@ def _classify_rows(
 def _find_bias(declared: DeclaredRows, scales: Refit) -> DeclaredBias | None:
     """Return the bias of each output that fits beside the scales; None where it is not significant, at 1 %."""
     filter = declared.filter
-    vary = not (isinstance(filter.plant, AbstractPlant) and isinstance(filter.sensor, AbstractSensor))
-    if vary or declared.place.outputs is None:
+    # A bias is a further state: not for models that vary over time, nor for values that are no outputs one by one.
+    varies = not (isinstance(filter.plant, AbstractPlant) and isinstance(filter.sensor, AbstractSensor))
+    if varies or declared.place.outputs is None:
         return None
     best = refit_with_bias(declared, scales)
     gain = best.likelihood - scales.likelihood
-    if gain < scipy.special.gammainccinv(1, LEVEL):  # half of a chi-squared number with two degrees of freedom
+    # With two numbers more and no bias in truth, twice the gain is chi-squared of two degrees of freedom.
+    if gain < scipy.special.gammainccinv(1, LEVEL):
         return None
     # best.logs: scale of each class, then the bias's deviation over the root of its memory, then the memory.
     count = declared.classes
+    memory = count + 1
     rate, time = np.exp(best.logs[count:])
-    low, high = (float(np.exp(find_interval_end(declared, best, count + 1, sign))) for sign in (-1, 1))
+    low, high = (float(np.exp(find_interval_end(declared, best, memory, sign))) for sign in (-1, 1))
     # A scale s = (white / declared deviation)^2: declared over white is s^-1/2, smallest for the largest s.
-    largest, largest_end = (
-        np.max(best.logs[:count]),
-        max(find_interval_end(declared, best, number, 1) for number in range(count)),
-    )
+    largest = np.max(best.logs[:count])
+    largest_end = max(find_interval_end(declared, best, number, 1) for number in range(count))
     return DeclaredBias(
         deviation=rate * np.sqrt(time) * declared.deviation,
         time=float(time),
@@ -312,20 +322,25 @@ def _make_judgement(
 ) -> DeclaredJudgement:
     """Return the judgement of what was found, class by class.
 
-    `tested`: before and after the refit. `scales`: of each class, with the ends of their intervals.
+    Args:
+        declared: the filter and the recording.
+        classes: class of each row, -1 of a row that is not used.
+        tested: tests of the innovations, before and after the refit.
+        scales: of each class, with the lower and the upper ends of their intervals, (classes,) each.
+        bias: what explains the innovations where no scale does; None without.
     """
     before, after = tested
     place, results = declared.place, []
     for number, (nis, low, high) in enumerate(before.nis):
+        # Declared variances of the class's messages: geometric means over the outputs.
         rows = declared.z[classes == number]
-        size = np.exp(np.mean(np.log(_declared_variances(place, rows)), axis=1))
-        count = int(np.sum(~np.isnan(rows[:, place.values])))
+        variances = np.exp(np.mean(np.log(_compute_declared_variances(place, rows)), axis=1))
         scale, scale_low, scale_high = (float(values[number]) for values in scales)
         results.append(
             DeclaredClass(
-                low=float(size.min()),
-                high=float(size.max()),
-                numbers=count,
+                low=float(variances.min()),
+                high=float(variances.max()),
+                numbers=int(np.sum(~np.isnan(rows[:, place.values]))),
                 nis=nis,
                 nis_low=low,
                 nis_high=high,
@@ -346,23 +361,23 @@ def _make_judgement(
     )
 
 
-def _say_bias(bias: DeclaredBias, unit: str) -> list[str]:
-    """Return lines on how large a bias is, how long it lasts, and what to do."""
+def _describe_bias(bias: DeclaredBias, unit: str) -> list[str]:
+    """Return lines on how large a bias is, how long it lasts in this unit of time, and what to do."""
     lines = []
     if bias.times_white_low > np.sqrt(LEAST):
         bounded = bias.times_white < 2 * bias.times_white_low
-        times = f"{_round(bias.times_white)}" if bounded else f"at least {_round(bias.times_white_low)}"
+        times = f"{_rounded(bias.times_white)}" if bounded else f"at least {_rounded(bias.times_white_low)}"
         lines.append(f"the declared deviation is {times} times the white part of the error")
-    ends = f"{_round(bias.time_low)} to {_round(bias.time_high)}" if np.isfinite(bias.time_high) else (
-        f"at least {_round(bias.time_low)}")  # fmt: skip
+    ends = f"{_rounded(bias.time_low)} to {_rounded(bias.time_high)}" if np.isfinite(bias.time_high) else (
+        f"at least {_rounded(bias.time_low)}")  # fmt: skip
     lines.append(
-        f"the error has a memory of about {_round(bias.time)} {unit} ({ends}): give it a bias state (with_bias)"
+        f"the error has a memory of about {_rounded(bias.time)} {unit} ({ends}): give it a bias state (with_bias)"
     )
     return lines
 
 
-def _say_scale(one: DeclaredClass, several: bool) -> list[str]:
-    """Say that the variances of a class are too large or too small, where the interval of the scale does."""
+def _describe_scale(one: DeclaredClass, several: bool) -> list[str]:
+    """Return a line on how much too large or small a class's variances are, if any; it is named if `several` are."""
     if one.scale_low < LEAST and one.scale_high > 1 / LEAST:
         return []
     times, low, high = one.scale, one.scale_low, one.scale_high
@@ -370,12 +385,10 @@ def _say_scale(one: DeclaredClass, several: bool) -> list[str]:
     if one.scale < 1:
         times, low, high, kind = 1 / one.scale, 1 / one.scale_high, 1 / one.scale_low, "large"
     of = f" from {one.low:.3g} to {one.high:.3g}" if several else ""
-    return [
-        f"declared variances{of} are {_round(times)} times too {kind} ({_round(low)} to {_round(high)}); scaled so, "
-        "the innovations pass"
-    ]
+    factor = f"{_rounded(times)} times too {kind} ({_rounded(low)} to {_rounded(high)})"
+    return [f"declared variances{of} are {factor}; scaled so, the innovations pass"]
 
 
-def _round(value: float) -> str:
+def _rounded(value: float) -> str:
     """Return a number, rounded to two digits, as text."""
     return f"{float(f'{value:.2g}'):,.15g}"

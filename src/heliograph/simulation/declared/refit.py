@@ -1,4 +1,8 @@
-"""Refit of declared noise to a recording: a scale for each class of messages, and a bias beside it, by likelihood."""
+"""Refit of declared noise to a recording: a scale for each class of messages, and a bias beside it, by likelihood.
+
+Messages that declare noise tell their receiver how precise they are; such numbers are called told. Classes are messages
+of similar declared variance. A bias is an error of an output that fades with a time constant, its memory.
+"""
 
 from typing import NamedTuple
 
@@ -23,14 +27,14 @@ from heliograph.simulation.likelihood import log_likelihood
 from heliograph.simulation.runs.over_runs import over_runs
 
 ALMOST = 2**-20  # by which typical numbers are moved, to see whether a noise depends on them
-REACH = 1.92  # nats below the maximum at the ends of a 95 % interval of one number
-FARTHEST = 40.0  # nats of a logarithm beyond which a scale has no end
+REACH = 1.92  # nats below the maximum at the ends of a 95 % interval of one number: half of chi-squared's 3.84
+FARTHEST = 40.0  # of a logarithm, beyond which a scale has no end
 FAST, SLOW = 0.5, 1e4  # of a bias's memory: shortest in steps, longest in lengths of the recording
 TIMES = (5.0, 50.0)  # steps: memories from which the search begins
 DIFFERENCE = 1e-4  # of logarithms, for slopes
 SLOPE = 3e-3  # nats for a factor of e in a number, at which it is at its best
 CLOSE = 0.05  # of a logarithm: as near as the end of an interval is found
-LOST = 1e12  # nats that numbers lose which give no likelihood
+LOST = 1e12  # nats by which numbers that give no likelihood (NaN) are worse than any
 
 
 class DeclaredRows(NamedTuple):
@@ -86,6 +90,7 @@ def find_place(filter: ToldFilter, link: int) -> LinkPlace:
         filter: the filter of all.
         link: its number among `told_maps`.
     """
+    # Columns of its numbers among all that are told, and rows of the values on which they have an effect.
     maps, sensor = told_maps(first(filter.link)), first(filter.sensor)
     before = sum(affine.memory.announced for affine in maps[:link])
     columns = list(range(before, before + maps[link].memory.announced))
@@ -101,16 +106,23 @@ def find_place(filter: ToldFilter, link: int) -> LinkPlace:
 
 
 class ScaledNoise(eqx.Module):
-    """The link that declared numbers give, its noise times the scale of their class."""
+    """The link that declared numbers give, its noise times the scale of their class.
+
+    Args:
+        make: the link of these numbers, as it is declared.
+        edges: logarithms of variances between classes (classes - 1,).
+        scales: of the classes (classes,).
+    """
 
     make: LinkGivenNumbers
     edges: Array
     scales: Array
 
     def __call__(self, numbers: Array) -> AbstractRandomAffine:
-        """Return the link of these numbers."""
+        """Return the link of these declared numbers, with its noise scaled."""
         link = self.make(numbers)
-        size = jnp.mean(jnp.log(declared_noises(link)))
+        # Class: how many edges the mean logarithm of the variances is above.
+        size = jnp.mean(jnp.log(list_noise_variances(link)))
         scale = jnp.asarray(self.scales)[jnp.sum(size > jnp.asarray(self.edges))]
 
         def rescale(leaf: object) -> object:
@@ -121,8 +133,8 @@ class ScaledNoise(eqx.Module):
         return scaled
 
 
-def declared_noises(link: AbstractRandomAffine) -> jax.Array:
-    """Return the variances of a link's noises, one after another."""
+def list_noise_variances(link: AbstractRandomAffine) -> jax.Array:
+    """Return the variances of all noises inside a link, one after another."""
     return jnp.concatenate([jnp.diagonal(jnp.asarray(noise.covariance)) for noise in _list_noises(link)])
 
 
@@ -149,6 +161,7 @@ def _list_noises(link: AbstractRandomAffine) -> list[AbstractNoise]:
 
 
 def _is_noise(leaf: object) -> bool:
+    """Return whether a part of a link is a noise."""
     return isinstance(leaf, AbstractNoise)
 
 
@@ -172,6 +185,7 @@ def refit_filter(declared: DeclaredRows, logs: Array) -> ToldFilter:
 
     link = jax.tree.map(rescale, filter.link, is_leaf=lambda leaf: isinstance(leaf, ToldMap))
     plant, sensor = filter.plant, filter.sensor
+    # A bias of the outputs that the link carries: one more state of the plant for each.
     if len(logs) > declared.classes:
         assert isinstance(plant, AbstractPlant) and isinstance(sensor, AbstractSensor)
         rate, time = numbers[declared.classes :]
@@ -187,7 +201,7 @@ class RefitLikelihood(eqx.Module):
     declared: DeclaredRows
 
     def __call__(self, logs: Array) -> Array:
-        """Return the log-likelihood, in nats."""
+        """Return the log-likelihood of these numbers, in nats."""
         refit = refit_filter(self.declared, logs)
         return jnp.asarray(log_likelihood(refit, self.declared.z, self.declared.u))
 
@@ -205,12 +219,15 @@ class Refit(NamedTuple):
 
 
 def refit_scales(declared: DeclaredRows) -> Refit:
-    """Fit the scale of each class, with everything else as the filter has it."""
+    """Return the scale of each class that fits best, with everything else as the filter has it."""
     return _maximise_likelihood(declared, np.zeros(declared.classes))
 
 
 def refit_with_bias(declared: DeclaredRows, scales: Refit) -> Refit:
-    """Fit the scales, and deviation and memory of a bias of each output, from scales without one."""
+    """Return the scales, and the deviation and memory of a bias of each output, that fit best.
+
+    `scales`: the best without a bias, from which the search begins.
+    """
     step = usual_step(declared)
     white = scales.logs - np.log(4)  # the search begins with three quarters of the variance in the bias
     starts = [np.append(white, [(np.mean(scales.logs) - np.log(step)) / 2, np.log(time * step)]) for time in TIMES]
@@ -218,15 +235,15 @@ def refit_with_bias(declared: DeclaredRows, scales: Refit) -> Refit:
 
 
 def usual_step(declared: DeclaredRows) -> float:
-    """Return the usual time of a step: 1 where the plant counts steps."""
+    """Return the median time of a step of the recording; 1 where the plant counts steps."""
     inputs = declared.filter.inputs
     return float(np.median(declared.u[:, inputs.index(TIME_STEP)])) if TIME_STEP in inputs else 1.0
 
 
 def find_interval_end(declared: DeclaredRows, best: Refit, number: int, sign: int) -> float:
-    """Return the end of the 95 % interval of the logarithm of a number; infinite where the likelihood never falls.
+    """Return an end of the 95 % interval of the logarithm of a number; infinite where the likelihood never falls.
 
-    There the likelihood, the other numbers at their best, is 1.92 nats below its maximum.
+    At the end the likelihood, the other numbers at their best, is 1.92 nats (REACH) below its maximum.
 
     Args:
         declared: the filter and the recording.
@@ -236,8 +253,8 @@ def find_interval_end(declared: DeclaredRows, best: Refit, number: int, sign: in
     """
     constrained = best
 
-    def miss(distance: float) -> float:
-        """Return by how much the likelihood has fallen at this distance, less what it falls at the end."""
+    def compute_excess_fall(distance: float) -> float:
+        """Return by how much the likelihood falls at this distance from the best number, less REACH."""
         nonlocal constrained  # each search starts from the last one's result
         start = constrained.logs.copy()
         start[number] = best.logs[number] + sign * distance
@@ -246,25 +263,27 @@ def find_interval_end(declared: DeclaredRows, best: Refit, number: int, sign: in
 
     # Doubled until the end is passed, then halved.
     near, far = 0.0, 0.25
-    while miss(far) < 0:
+    while compute_excess_fall(far) < 0:
         near, far = far, 2 * far
         if far > FARTHEST:
             return sign * np.inf
     while far - near > CLOSE:
         middle = (near + far) / 2
-        near, far = (middle, far) if miss(middle) < 0 else (near, middle)
+        near, far = (middle, far) if compute_excess_fall(middle) < 0 else (near, middle)
     return float(best.logs[number] + sign * far)
 
 
 def _maximise_likelihood(
     declared: DeclaredRows, start: Float[np.ndarray, " numbers"], fixed: int | None = None
 ) -> Refit:
-    """Return the maximum of the likelihood found from a start.
+    """Return the maximum of the likelihood that a search finds from a start.
 
-    `start`: logarithms of each class's scale and, with a bias, its two, as of `refit_filter`. `fixed`: the index of one
-    that stays; None if all are free.
+    Args:
+        declared: the filter and the recording.
+        start: logarithms of each class's scale and, with a bias, its two, as of `refit_filter`.
+        fixed: index of one that stays; None if all are free.
     """
-    # Limits of the logarithms: FARTHEST nats either way; of a bias's memory FAST steps and SLOW recordings.
+    # Limits of the logarithms: FARTHEST either way; of a bias's memory FAST steps and SLOW recordings.
     free = np.arange(len(start)) != fixed
     low, high = np.full(len(start), -FARTHEST), np.full(len(start), FARTHEST)
     if len(start) > declared.classes:
@@ -273,16 +292,21 @@ def _maximise_likelihood(
     likelihood, steps = RefitLikelihood(declared), DIFFERENCE * np.eye(len(start))[free]
 
     def compute_loss(logs: Float[np.ndarray, " free"]) -> tuple[float, Float[np.ndarray, " free"]]:
-        """Return -l and its slope by central differences, all points in one call."""
-        every = start.copy()
-        every[free] = logs
-        points = np.clip(np.stack([every, *(every + steps), *(every - steps)]), low, high)  # flat beyond the limits
+        """Return -l and its slope by central differences, l the log-likelihood; all points in one call.
+
+        `logs`: the free ones of all logarithms.
+        """
+        all_logs = start.copy()
+        all_logs[free] = logs
+        points = np.stack([all_logs, *(all_logs + steps), *(all_logs - steps)])
+        points = np.clip(points, low, high)  # flat beyond the limits
         values = -np.nan_to_num(over_runs(likelihood, points), nan=-LOST)
         above, below = np.split(values[1:], 2)
         return float(values[0]), (above - below) / (2 * DIFFERENCE)
 
     if not free.any():
-        return Refit(start, -compute_loss(start[free])[0])
+        loss, _ = compute_loss(start[free])
+        return Refit(start, -loss)
     found = scipy.optimize.minimize(compute_loss, start[free], jac=True, method="BFGS", options={"gtol": SLOPE})
     logs = start.copy()
     logs[free] = found.x

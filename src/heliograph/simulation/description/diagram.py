@@ -27,25 +27,25 @@ class DiagramLine(NamedTuple):
 
 
 def diagram(network: HasNodes) -> list[DiagramLine]:
-    """Return the parts of a network in the order in which data flow."""
+    """Return a line for each part of a network, in the order in which data flow: from the plant to fused estimates."""
     plant = first(network.plant)
     inputs = f"; inputs {', '.join(network.inputs)}" if network.inputs else ""
     parts = [DiagramLine("plant", f"{type(plant).__name__} of {', '.join(network.states)}{inputs}")]
     claims = claims_in_words(network)
     # Nodes that are alike share a line.
-    alike: dict[str, list[str]] = {}
+    names_by_words: dict[str, list[str]] = {}
     for name in network.names:
-        alike.setdefault(_describe_node(network, name, claims[name]), []).append(name)
-    parts += [DiagramLine(join_names(names), words) for words, names in alike.items()]
-    # Fused estimates, then what several nodes share.
+        names_by_words.setdefault(_describe_node(network, name, claims[name]), []).append(name)
+    parts += [DiagramLine(join_names(names), words) for words, names in names_by_words.items()]
+    # Fused estimates.
     for name, fusion in network.fused.items():
         if isinstance(fusion, AbstractFilter):
             words = f"{type(fusion).__name__} of all measurements"
         else:
-            words = (
-                f"{type(fusion.rule).__name__} of {fusion.filter!r} of {join_names(network.nodes_with(fusion.filter))}"
-            )
+            nodes = join_names(network.nodes_with(fusion.filter))
+            words = f"{type(fusion.rule).__name__} of {fusion.filter!r} of {nodes}"
         parts.append(DiagramLine(f"fused {name}", f"{words} ({claims[FUSED][name]})"))
+    # What several nodes share, and numbers that lost digits.
     parts += [DiagramLine("shared", words) for words in list_shared(network)]
     parts += [DiagramLine("digits", words) for words in list_rounded(network)]
     return [DiagramLine(visible(line.name), visible(line.words)) for line in parts]
@@ -60,7 +60,7 @@ def claims_in_words(network: HasNodes) -> dict[str, dict[str, str]]:
 
 
 def _describe_node(network: HasNodes, name: str, claims: Mapping[str, str]) -> str:
-    """Return what a node receives, through which hops, and its filters with their claims."""
+    """Return in words what a node receives, through which hops, and its filters with their `claims` by name."""
     node = network.nodes[name]
     filters = ", ".join(f"{label} ({claim})" for label, claim in claims.items()) or "no filter of its own"
     if isinstance(node, Node):
@@ -82,15 +82,15 @@ def list_shared(network: HasNodes) -> list[str]:
     if network.common is not None:
         return [f"sensor and channel of all nodes: {link_in_words(network.common.channel)}"]
     channels = {name: node.channel for name, node in network.nodes.items() if isinstance(node, Node)}
-    places = number_memories(channels)
-    # Nodes of each memory.
+    numbers_of = number_memories(channels)
+    # Nodes of each memory, and its name, by the number that memories have in common where they are one.
     nodes: dict[int, list[str]] = {}
     names: dict[int, str] = {}
     for name, channel in channels.items():
-        for row, memory in zip(places[name].tolist(), memories(channel).values(), strict=True):
-            nodes.setdefault(row, []).append(name)
-            names[row] = type(memory).__name__ if memory.name is None else repr(memory.name)
-    return [f"fading {names[row]}: {join_names(sharing)}" for row, sharing in nodes.items() if len(sharing) > 1]
+        for number, memory in zip(numbers_of[name].tolist(), memories(channel).values(), strict=True):
+            nodes.setdefault(number, []).append(name)
+            names[number] = type(memory).__name__ if memory.name is None else repr(memory.name)
+    return [f"fading {names[number]}: {join_names(sharing)}" for number, sharing in nodes.items() if len(sharing) > 1]
 
 
 def list_rounded(network: HasNodes) -> list[str]:
@@ -116,7 +116,7 @@ def short_text_of(network: HasNodes) -> str:
 
 
 def _format_lines(network: HasNodes) -> list[str]:
-    """Return the title, and a line for each part with its name in a column."""
+    """Return the diagram's title, and a line for each part with its name in a column."""
     parts = diagram(network)
     width = max(len(line.name) for line in parts)
     return [_make_title(network), *(f"{line.name:{width}}  {line.words}" for line in parts)]

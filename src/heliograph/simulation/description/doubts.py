@@ -63,9 +63,11 @@ def doubts_before_data(network: Network) -> list[Doubt]:
         ValueError: what is no network.
     """
     instance("network", network, Network, "a Network")
+    # What an estimate may lack: states that nothing shows, bounds, links, memories, the world, angles.
     lines = [*_find_unobservable(network), *_doubt_boundedness(network), *_find_unheard(network)]
     lines += [*_find_forgetful_filters(network), *_find_other_beliefs(network)]
     lines += [Doubt(True, words) for words in (*warn_wide_at_start(network), *warn_degrees_at_start(network))]
+    # What is good to know: digits, what is shared, what takes long, what messages declare, what is independent.
     lines += [Doubt(False, f"digits: {words}; make tables {DOUBLE}") for words in list_rounded(network)]
     lines += [Doubt(False, f"shared, so that losses come together: {words}") for words in list_shared(network)]
     lines += [Doubt(False, f"by XLA, which takes longer: {words}") for words in list_fallbacks(network)]
@@ -91,7 +93,10 @@ def _find_overloads(network: Network) -> Iterator[Doubt]:
 
 
 def _find_unobservable(network: Network) -> Iterator[Doubt]:
-    """Yield the directions that no sensor shows within n steps, by the names of their states."""
+    """Yield a doubt if there are directions of the state that no sensor shows within n steps, by their states' names.
+
+    They are the null space of the observability matrix, the derivatives of all outputs with respect to the state.
+    """
     # At a state drawn around the initial mean, since a symmetric point may hide what every other one shows.
     plant = first(network.plant)
     spread = np.sqrt(np.diagonal(np.asarray(plant.initial_covariance)))
@@ -105,7 +110,7 @@ def _find_unobservable(network: Network) -> Iterator[Doubt]:
     rows = matrix / np.where(lengths > 0, lengths, 1.0)
     lengths = np.linalg.norm(rows, axis=0)
     _, singular, right = np.linalg.svd(rows / np.where(lengths > 0, lengths, 1.0))
-    # States with a part in the null space.
+    # States with a part in the null space, whose basis are the last right singular vectors.
     rank = int(np.sum(singular > HIDDEN * max(singular[0], 1e-300)))
     hidden = np.abs(right[rank:]).max(axis=0, initial=0.0) > np.sqrt(HIDDEN)
     names = [repr(name) for name, unseen in zip(network.states, hidden, strict=True) if unseen]
@@ -133,7 +138,10 @@ def _doubt_boundedness(network: Network) -> Iterator[Doubt]:
 
 
 def _warn_if_unbounded(network: Network, what: str, serious: bool) -> Iterator[Doubt]:
-    """Yield a warning where an error grows without end, or where this cannot be decided."""
+    """Yield a doubt where the error of the best filter of all nodes grows without end, or this cannot be decided.
+
+    `what`: whose error, in words. `serious`: whether its growth is.
+    """
     try:
         boundedness = certify_boundedness(network)
     except InputError as error:
@@ -147,7 +155,7 @@ def _warn_if_unbounded(network: Network, what: str, serious: bool) -> Iterator[D
 
 
 def _find_unheard(network: Network) -> Iterator[Doubt]:
-    """Yield sums of links whose mean gains cancel, and links of mean gain zero; linear filters hear nothing of them."""
+    """Yield doubts on sums of links whose mean gains cancel, and links of mean gain zero, useless to linear filters."""
     for name, node in network.nodes.items():
         if not isinstance(node, Node):
             continue
@@ -169,7 +177,7 @@ def _find_unheard(network: Network) -> Iterator[Doubt]:
 
 
 def _find_declared_noise(network: Network) -> Iterator[Doubt]:
-    """Yield the nodes whose messages declare their noise, which is true as far as a recording says."""
+    """Yield a line on the nodes whose messages declare their noise, which is taken for true."""
     names = []
     for name, node in network.nodes.items():
         told = [one for one in node.filters.values() if isinstance(one, ToldFilter)] if isinstance(node, Node) else []
@@ -183,7 +191,7 @@ def _find_declared_noise(network: Network) -> Iterator[Doubt]:
 
 
 def _find_reservations(network: Network) -> Iterator[Doubt]:
-    """Yield the nodes of whose told numbers no claim is made, with the reason that the model gives."""
+    """Yield a doubt for each node told numbers (by its messages) of which no claim can be made, with the reason."""
     for name, node in network.nodes.items():
         if not isinstance(node, Node) or not node.filters:
             continue
@@ -216,20 +224,20 @@ def _find_forgetful_filters(network: Network) -> Iterator[Doubt]:
         )
 
 
-def _leave_out_told(channel: AbstractRandomAffine) -> AbstractRandomAffine:
-    """Return a channel as its receiver knows it: what it is told at typical values, since that takes no memory."""
+def _fix_told_numbers(channel: AbstractRandomAffine) -> AbstractRandomAffine:
+    """Return a channel with typical values of the numbers that messages tell, since being told takes no memory."""
     link, _, numbers = separate_told(channel)
     return believe_typical(link) if numbers else channel
 
 
 def _list_forgetful_nodes(network: Network) -> dict[str, list[str]]:
-    """Return the nodes of each filter that ignores the memory of their links."""
+    """Return, by name of the filter, the nodes at which it ignores the memory of their links."""
     nodes: dict[str, list[str]] = {}
     for name, node in network.nodes.items():
         if not isinstance(node, Node):
             continue
         try:
-            remembers = memory_matters(at_each_step(_leave_out_told, node.channel))
+            remembers = memory_matters(at_each_step(_fix_told_numbers, node.channel))
         except InputError:  # a memory that nothing is known of
             continue
         for label, filter_ in node.filters.items() if remembers else ():

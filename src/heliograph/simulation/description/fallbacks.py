@@ -48,7 +48,7 @@ def _find_refused_filters(network: Network) -> Iterator[tuple[str, str]]:
 
 
 def _step(filter: AbstractFilter, *arguments: jax.Array) -> PyTree:
-    """Return what one step of a filter does, as it would be compiled."""
+    """Return what one step of a filter returns for (state, z, u, k), as it would be compiled."""
     state, z, u, k = arguments
     return filter.step(state, z, u, k)
 

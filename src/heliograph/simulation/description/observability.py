@@ -30,7 +30,7 @@ def make_observability_matrix(
     return np.asarray(_differentiate_outputs(plant, tuple(sensors), state, np.arange(steps)))
 
 
-def measure_from(
+def simulate_outputs(
     plant: AbstractPlant, sensors: Sequence[AbstractSensor], states: Float[np.ndarray, "states n"], steps: int
 ) -> Float[np.ndarray, "states rows"]:
     """Return y_1, ..., y_steps of all sensors from each of some states, without noise, with inputs of 1."""

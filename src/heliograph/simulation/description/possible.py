@@ -14,7 +14,7 @@ from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor, is_linear
 from heliograph.numerics.check import instance
 from heliograph.numerics.types import Bool, Float
-from heliograph.simulation.description.observability import list_sensors, make_observability_matrix, measure_from
+from heliograph.simulation.description.observability import list_sensors, make_observability_matrix, simulate_outputs
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.results.record import Record
@@ -44,16 +44,17 @@ def doubt_estimates(network: Network, record: Record) -> tuple[str, ...]:
 def _warn_unseen_at_end(network: Network, record: Record) -> Iterator[str]:
     """Yield a line for each filter that ends where no sensor shows a state that one showed at the start.
 
-    A state is shown where an output within n steps depends on it, as far as the filter looks (`_Look`). Where none
-    does, as beyond the end of a table, the gain of the state is by its correlations alone: what arrives says nothing of
-    where it is. Not judged: states with limits, which bring an estimate back; particles and mixtures; models that vary
-    over time or have modes; estimates that are no numbers.
+    A state is shown where an output within n steps depends on it, as far as the filter looks (`_FilterView`). Where
+    none does, as beyond the end of a table, the gain of the state is by its correlations alone: what arrives says
+    nothing of where it is. Not judged: states with limits, which bring an estimate back; particles and mixtures; models
+    that vary over time or have modes; estimates that are no numbers.
     """
     plant = network.plant
     if not isinstance(plant, AbstractPlant) or isinstance(plant, ModalPlant):
         return
     limited = {name for name, _ in plant.limits}
     for node, label, filter, sensors in _find_filters(network):
+        # A filter of one Gaussian, of a nonlinear sensor and of models that do not vary.
         transform = getattr(filter, "transform", None)
         if not isinstance(transform, AbstractTransform):
             continue
@@ -61,24 +62,32 @@ def _warn_unseen_at_end(network: Network, record: Record) -> Iterator[str]:
         if varies or all(is_linear(plant, sensor) for sensor in sensors):
             continue
         estimate = record.estimates[node][label]
-        means, covariances = (np.asarray(part) for part in (estimate.mean, estimate.covariance))
+        means, covariances = np.asarray(estimate.mean), np.asarray(estimate.covariance)
         if len(means) <= LAST or not np.all(np.isfinite(means[[-1 - LAST, -1]])):
             continue
-        looks = _Look(plant, [first(sensor) for sensor in sensors], isinstance(transform, Linearization))
-        start = np.asarray(plant.initial_mean), np.asarray(plant.initial_covariance)
-        end, before = (means[-1], covariances[-1]), (means[-1 - LAST], covariances[-1 - LAST])
-        # Over one step first, which is cheap: hardly any recording ends so.
-        if not np.any(looks.find_shown(*start, 1) & ~looks.find_shown(*end, 1)):
-            continue
-        steps = len(plant.states)
-        unseen = looks.find_shown(*start, steps) & ~looks.find_shown(*end, steps) & ~looks.find_shown(*before, steps)
-        for i in np.flatnonzero(unseen):
+        view = _FilterView(plant, [first(sensor) for sensor in sensors], isinstance(transform, Linearization))
+        for i in np.flatnonzero(_find_unseen_states(view, means, covariances)):
             name = network.states[i]
             if name not in limited:
                 yield (
-                    f"{node}/{label}: {name!r} ends at {end[0][i]:.4g}, where no sensor shows it, as beyond the end "
+                    f"{node}/{label}: {name!r} ends at {means[-1, i]:.4g}, where no sensor shows it, as beyond the end "
                     "of a table: what arrives does not move it. If it cannot be there, limits= of the plant say so"
                 )
+
+
+def _find_unseen_states(
+    view: "_FilterView", means: Float[np.ndarray, "time n"], covariances: Float[np.ndarray, "time n n"]
+) -> Bool[np.ndarray, " n"]:
+    """Return which states outputs depend on at the start, but neither at the last estimate nor LAST rows before it."""
+    plant = view.plant
+    start = np.asarray(plant.initial_mean), np.asarray(plant.initial_covariance)
+    end, before = (means[-1], covariances[-1]), (means[-1 - LAST], covariances[-1 - LAST])
+    # Over one step first, which is cheap: hardly any recording ends so.
+    if not np.any(view.find_shown(*start, 1) & ~view.find_shown(*end, 1)):
+        return np.zeros(len(plant.states), dtype=bool)
+    steps = len(plant.states)
+    unseen = view.find_shown(*start, steps) & ~view.find_shown(*end, steps) & ~view.find_shown(*before, steps)
+    return np.asarray(unseen)
 
 
 def _warn_at_limits(network: Network, record: Record) -> Iterator[str]:
@@ -88,16 +97,16 @@ def _warn_at_limits(network: Network, record: Record) -> Iterator[str]:
     sqrt(2 / pi) s inside it, and the deviation sqrt(1 - 2 / pi) s: of ratio HELD, and of a larger one where the mean
     is inside. That holds of one limited state; of several, of which each changes those before it, nearly.
     """
-    for node, label, limited, _ in _find_filters(network):
-        if not isinstance(limited, LimitedFilter):
+    for node, label, filter, _ in _find_filters(network):
+        if not isinstance(filter, LimitedFilter):
             continue
         estimate = record.estimates[node][label]
-        for place, *limits in limited.limits:
+        for place, *limits in filter.limits:
             mean = np.asarray(estimate.mean)[:, place]
             deviation = np.sqrt(np.maximum(np.asarray(estimate.covariance)[:, place, place], 0.0))
             for limit in (end for end in limits if np.isfinite(end)):
                 held = (np.abs(mean - limit) <= HELD * (1 + CLOSE) * deviation) & (deviation > 0)
-                held &= np.ptp(limits) > APART * deviation
+                held &= np.ptp(limits) > APART * deviation  # so that the other limit changes nothing
                 if np.count_nonzero(held) > MOST * len(mean):
                     yield (
                         f"{node}/{label}: {network.states[place]!r} is held at its limit {limit:g} in "
@@ -117,8 +126,8 @@ def _find_filters(network: Network) -> Iterator[tuple[str, str, AbstractFilter, 
             yield FUSED, label, fusion, every
 
 
-class _Look(NamedTuple):
-    """How far a filter looks for a state: at the tangent of the sensors, or at their outputs beside its mean.
+class _FilterView(NamedTuple):
+    """What a filter sees of its state: by the tangent of the sensors, or by their outputs beside its mean.
 
     Args:
         plant: the plant.
@@ -133,7 +142,7 @@ class _Look(NamedTuple):
     def find_shown(
         self, mean: Float[np.ndarray, " n"], covariance: Float[np.ndarray, "n n"], steps: int
     ) -> Bool[np.ndarray, " n"]:
-        """Return which states change an output within some steps.
+        """Return which states change an output within some steps, for a filter with this mean and covariance.
 
         Of a tangent those whose column of the observability matrix is not zero. Of points also those for which outputs
         differ at mean +- sqrt(n) deviations, where `Cubature` has its points if states are not correlated.
@@ -143,6 +152,6 @@ class _Look(NamedTuple):
             return np.asarray(by_tangent)
         spread = np.sqrt(len(mean) * np.maximum(np.diagonal(covariance), 0.0))
         ahead, behind = (
-            measure_from(self.plant, self.sensors, mean + sign * np.diag(spread), steps) for sign in (1.0, -1.0)
+            simulate_outputs(self.plant, self.sensors, mean + sign * np.diag(spread), steps) for sign in (1.0, -1.0)
         )
         return np.asarray(by_tangent | np.any(ahead != behind, axis=1))

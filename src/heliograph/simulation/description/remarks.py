@@ -14,7 +14,7 @@ Place = tuple[str, str]  # node and filter
 
 def find_remarking(network: Network) -> tuple[Place, ...]:
     """Return the places of the filters that may remark on their state."""
-    places = [place for place in network.places if network.nodes[place[0]].filters[place[1]].remarks]
+    places = [(node, name) for node, name in network.places if network.nodes[node].filters[name].remarks]
     fused = [(FUSED, name) for name, one in network.fused.items() if isinstance(one, AbstractFilter) and one.remarks]
     return *places, *fused
 
@@ -26,7 +26,7 @@ def list_remarks(network: Network, state: PyTree) -> Iterator[tuple[Place, Remar
         network: the network.
         state: states of all its filters, as the step of the network has them.
     """
-    alike, central = state[0], state[1]
+    alike, central, *_ = state
     for node, name in find_remarking(network):
         if node == FUSED:
             fusion = network.fused[name]

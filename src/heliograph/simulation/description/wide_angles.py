@@ -112,7 +112,7 @@ class WideAngles:
 
 
 def _find_filters(network: Network) -> Iterator[tuple[str, str, AbstractFilter]]:
-    """Yield the filters that have angles, with their places."""
+    """Yield (node, name, filter) of the filters that have angles."""
     if not first(network.plant).circular:
         return
     for node, here in network.nodes.items():
@@ -125,7 +125,7 @@ def _find_filters(network: Network) -> Iterator[tuple[str, str, AbstractFilter]]
 def _yield_deviations(
     network: Network, filter: AbstractFilter, covariance: Float[np.ndarray, "*steps n n"]
 ) -> Iterator[tuple[str, Float[np.ndarray, "*steps"]]]:
-    """Yield each angle's name and deviation."""
+    """Yield the name and the deviation of each angle of a filter that claims this covariance."""
     used = filter.angles_used()
     for i in () if used is None or filter.claim == "none" else used.states:
         yield network.states[i], np.sqrt(np.maximum(np.nan_to_num(covariance[..., i, i]), 0.0))
@@ -134,20 +134,24 @@ def _yield_deviations(
 def warn_degrees_at_start(network: Network) -> Iterator[str]:
     """Yield a line for each angle that a model has beyond a full turn before any data, as degrees are.
 
-    Looked at are initial means of states, what sensors measure there with inputs of 1, and limits of nodes.
+    Looked at are initial means of states, limits of nodes, and what sensors measure at that mean with inputs of 1.
     """
     plant = first(network.plant)
     start, u = np.asarray(plant.initial_mean, dtype=float), np.ones(len(plant.inputs))
+    # Initial means.
     for i in plant.angles:
         if line := say_degrees(plant.states[i], start[i]):
             yield f"degrees: the initial mean of {line}"
+    # The larger limit of each angle that a node receives.
     for name, angles in network.angles.items():
         node, limits = network.nodes[name], network.nodes[name].limits
-        for i in angles if limits is not None else ():
-            assert limits is not None
+        if limits is None:
+            continue
+        for i in angles:
             ends = [float(end[i]) for end in (limits.low, limits.high) if np.isfinite(end[i])]
             if line := say_degrees(node.received_names[i], max(ends, key=abs, default=0.0)):
                 yield f"degrees: a limit at node {name!r} of {line}"
+    # Angles that sensors measure.
     for sensor in list_sensors(network):
         if sensor.angles:
             with jax.enable_x64(True):
@@ -158,7 +162,7 @@ def warn_degrees_at_start(network: Network) -> Iterator[str]:
 
 
 def say_degrees(name: str, value: float) -> str:
-    """Say that a value of an angle is beyond a full turn; "" where it is not."""
+    """Return a line that this value of the angle `name` is beyond a full turn; "" where it is not."""
     return f"{name!r}, an angle in radians, is {value:.4g}, beyond 2 pi: degrees?" if abs(value) > TURN else ""
 
 

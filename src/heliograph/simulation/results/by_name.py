@@ -15,7 +15,10 @@ from heliograph.simulation.network import FUSED, Network
 def reports_by_name(
     network: Network, outcome: dict[str, tuple[np.ndarray, np.ndarray]]
 ) -> dict[str, dict[str, SentReports]]:
-    """Return the reports by fusion and node, without a node's padding, from (..., node, m) and (..., node)."""
+    """Return the reports by fusion and node, without a node's padding.
+
+    `outcome`: by fusion, what was sent (..., node, m) and its delays (..., node); between neighbours what arrived.
+    """
     reports: dict[str, dict[str, SentReports]] = {}
     for name, (values, delay) in outcome.items():
         if name in network.meshes:
@@ -38,7 +41,7 @@ def _name_arrivals(network: Network, name: str, arrived: np.ndarray) -> dict[str
     reports = {}
     for i, node in enumerate(network.mesh_nodes(name)):
         if count := len(neighbours[node]):
-            flags = arrived[..., i, :, 1 : count + 1]
+            flags = arrived[..., i, :, 1 : count + 1]  # without the node's own message, and without padding
             ages = np.where(flags >= 0, flags, np.nan) if flags.dtype != bool else np.where(flags, 1.0, np.nan)
             values = ages.reshape(*flags.shape[:-2], -1)
             reports[node] = SentReports(values, np.zeros(values.shape[:-1], dtype=int))
@@ -62,7 +65,7 @@ def split_measurements(
     return {name: received[name] for name in network.names}
 
 
-def transmissions_of(network: Network, groups: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def transmissions_by_name(network: Network, groups: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return why the nodes' senders transmitted, by node, from (..., node, m) of groups by number."""
     return {
         name: np.asarray(node_group)[..., i, :]
@@ -74,21 +77,22 @@ def transmissions_of(network: Network, groups: dict[str, np.ndarray]) -> dict[st
 def collect_modes(network: Network, batch: PyTree) -> dict[tuple[str, str], np.ndarray]:
     """Return the modes' probabilities (..., M) of the filters that weigh modes, by node and filter."""
     parts, fused = batch["estimates"], batch["fused"] if network.fused else {}
-    central = {(FUSED, name): np.asarray(one.modes) for name, one in fused.items() if one.modes is not None}
-    return central | {
-        name: np.moveaxis(np.asarray(parts[kind].modes), (-3, -2), (0, 1))[f, i]
-        for name, (kind, f, i) in network.places.items()
-        if kind < len(parts) and parts[kind].modes is not None
-    }
+    modes = {(FUSED, name): np.asarray(one.modes) for name, one in fused.items() if one.modes is not None}
+    for name, place in network.places.items():
+        # Of nodes' filters (..., filter, node, M).
+        if place.kind < len(parts) and parts[place.kind].modes is not None:
+            modes[name] = np.asarray(parts[place.kind].modes)[..., place.filter, place.node, :]
+    return modes
 
 
 def collect_weighed(network: Network, batch: PyTree) -> dict[str, dict[str, Weighed]]:
     """Return the innovations of the filters that weigh, by node and filter, from (time, filter, node, m) by kind."""
     parts = batch.get("weighed", ())
     weighed: dict[str, dict[str, Weighed]] = {}
-    for (node, name), (kind, f, i) in network.places.items() if parts else ():
-        if parts[kind] is not None:
-            weighed.setdefault(node, {})[name] = Weighed(*(np.asarray(columns)[:, f, i] for columns in parts[kind]))
+    for (node, name), place in network.places.items() if parts else ():
+        if parts[place.kind] is not None:
+            fields = [np.asarray(field)[:, place.filter, place.node] for field in parts[place.kind]]
+            weighed.setdefault(node, {})[name] = Weighed(*fields)
     central = {name: values for name, values in batch.get("weighed_centrally", {}).items() if values is not None}
     return weighed | ({FUSED: central} if central else {})
 

@@ -15,7 +15,7 @@ from heliograph.numerics.angle import wrap_angles
 from heliograph.numerics.check import array, check_count, fail, rank, scalar
 from heliograph.numerics.linalg import squared_distance
 from heliograph.numerics.module import readable
-from heliograph.numerics.types import Array, ArrayLike, Float
+from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 
 DIMENSION_WORDS = "the degrees of freedom: a positive number, or one of each value"
 
@@ -123,7 +123,10 @@ def _normalise_square(
 ) -> Float[np.ndarray, "*steps"]:
     """Return x' P^-1 x of each step, over the components that are not NaN; NaN where all are.
 
-    `size`: what x is a difference of, for its rounding.
+    Args:
+        x: errors or innovations.
+        covariance: P of each step.
+        size: numbers of which x is a difference, by which its rounding is judged.
     """
     # A missing component counts as zero, of variance 1, correlated with nothing: it adds 0^2 / 1.
     present, n = ~np.isnan(x), x.shape[-1]
@@ -136,7 +139,7 @@ def _normalise_square(
 
 @compile_on_call
 def _square_distances(a: Array, x: Array, size: Array) -> Array:
-    """Return x' A^-1 x of each row."""
+    """Return x' A^-1 x of each row; `size`: numbers of which x is a difference, by which its rounding is judged."""
     return jax.vmap(squared_distance)(jnp.asarray(a), jnp.asarray(x), jnp.asarray(size))
 
 
@@ -165,34 +168,28 @@ def consistency(
 
     Source: Bar-Shalom, Li and Kirubarajan, Estimation with applications to tracking and navigation (2001), section 5.4.
     """
-    # Arguments: values (runs, steps) and degrees of freedom of each.
     entries = array("values", values, (None,) * (2 if rank("values", values) == 2 else 1), missing=True)
-    rows = np.atleast_2d(entries)
+    rows = np.atleast_2d(entries)  # (runs, steps)
     level = float(scalar("confidence", confidence, 0.0, 1.0))
     if not 0 < level < 1:
         raise fail("confidence", "a number between 0 and 1", confidence)
     present = ~np.isnan(rows)
-    try:
-        degrees = np.broadcast_to(np.asarray(dimension, dtype=np.float64), rows.shape)
-    except (TypeError, ValueError):
-        raise fail("dimension", DIMENSION_WORDS, repr(dimension)[:60]) from None
+    degrees = _broadcast_degrees(dimension, present)
     if not present.any():
         raise fail("values", "at least one that is not NaN", f"shape {entries.shape}")
-    if not (np.isfinite(degrees[present]).all() and (degrees[present] > 0).all()):
-        raise fail("dimension", DIMENSION_WORDS, repr(dimension)[:60])
     # Means and intervals: of all values, and of each step over the runs.
-    freedom = np.where(present, degrees, 0.0)
     total = np.where(present, rows, 0.0)
-    count = present.sum(axis=0)
+    count = present.sum(axis=0)  # by step
     by_step = np.divide(total.sum(axis=0), count, out=np.full(len(count), np.nan), where=count > 0)
     quantiles = np.array([(1 - level) / 2, (1 + level) / 2])
-    ends = _bound_mean(freedom.sum(), present.sum(), quantiles)
-    ends_by_step = np.stack([_bound_mean(f, c, quantiles) for f, c in zip(freedom.sum(axis=0), count, strict=True)])
+    ends = _bound_mean(degrees.sum(), present.sum(), quantiles)
+    ends_by_step = np.stack([_bound_mean(d, c, quantiles) for d, c in zip(degrees.sum(axis=0), count, strict=True)])
+    # Correlation over the steps of deviations from the mean of all.
     deviations = np.where(present, rows - total.sum() / present.sum(), 0.0)
     correlation = _autocorrelation(deviations, min(check_count("lags", lags), len(count) - 1))
     return Consistency(
         mean=float(total.sum() / present.sum()),
-        expected=float(freedom.sum() / present.sum()),
+        expected=float(degrees.sum() / present.sum()),
         interval=(float(ends[0]), float(ends[1])),
         means=by_step,
         intervals=ends_by_step,
@@ -201,13 +198,30 @@ def consistency(
     )
 
 
+def _broadcast_degrees(
+    dimension: ArrayLike, present: Bool[np.ndarray, "runs steps"]
+) -> Float[np.ndarray, "runs steps"]:
+    """Return the degrees of freedom of each value, 0 where none is present.
+
+    Raises:
+        ValueError: another shape, or degrees that are not positive.
+    """
+    try:
+        degrees = np.broadcast_to(np.asarray(dimension, dtype=np.float64), present.shape)
+    except (TypeError, ValueError):
+        raise fail("dimension", DIMENSION_WORDS, repr(dimension)[:60]) from None
+    if not (np.isfinite(degrees[present]).all() and (degrees[present] > 0).all()):
+        raise fail("dimension", DIMENSION_WORDS, repr(dimension)[:60])
+    return np.where(present, degrees, 0.0)
+
+
 def _bound_mean(degrees: float, count: int, quantiles: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
     """Return quantiles of the mean of `count` chi-squared values with so many degrees of freedom in all."""
     return np.asarray(2 * scipy.special.gammaincinv(degrees / 2, quantiles) / count) if count else np.full(2, np.nan)
 
 
 def _autocorrelation(apart: Float[np.ndarray, "runs steps"], lags: int) -> Float[np.ndarray, " lags"]:
-    """Return the correlation of deviations from their mean over 1, 2, ... steps, a missing one as zero."""
+    """Return the correlation over 1, 2, ... steps of deviations from their mean; a missing one is given as zero."""
     power = np.sum(apart**2)
     sums = [np.sum(apart[:, :-t] * apart[:, t:]) for t in range(1, lags + 1)]
     return np.asarray([s / power if power > 0 else 0.0 for s in sums])

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from operator import itemgetter
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,15 +27,18 @@ from heliograph.simulation.runs.over_runs import over_runs
 class RunSums(NamedTuple):
     """Sums over runs of all filters' estimates, which lie along one axis `part`; run r goes to batch r mod BATCHES.
 
-    `runs` (batch,): their number. `pairs` (time, part, pair, batch): sums of e_i e_j, i <= j. `nees` (time, part,
-    batch): of e' B^-1 e. `claimed` (time, part, pair, batch): of covariances that differ between runs, the first parts;
-    `shared` (time, part, pair): of those that all runs share, the other parts, summed once, without batches.
-
-    failed (time, 2, part): runs whose mean is not finite, and whose error has no distance by the covariance, which is
-    then not finite or indefinite; failed_runs (2, 1, part): in how many runs this happened at some step.
-
-    `order`: whose estimates the parts are, by number: kinds first and then fused ones. The first `by_run` of these have
-    covariances that differ between runs.
+    Args:
+        runs: their number (batch,).
+        pairs: sums of e_i e_j, i <= j (time, part, pair, batch).
+        nees: sums of e' B^-1 e, B the claimed covariance (time, part, batch).
+        claimed: sums of covariances that differ between runs, the first parts (time, part, pair, batch).
+        shared: sums of those that all runs share, the other parts, without batches (time, part, pair).
+        failed: in how many runs the mean is not finite (0), and the error has no distance by the covariance, which is
+            then not finite or indefinite (1), (time, 2, part).
+        failed_runs: in how many runs this happened at some step (2, 1, part).
+        uplinks: sums of what the quantizers did.
+        order: whose estimates the parts are, by number: kinds first and then fused ones.
+        by_run: how many of these, the first ones, have covariances that differ between runs.
     """
 
     runs: np.ndarray
@@ -54,7 +57,11 @@ class Statistics(AbstractReducer[StatisticsByName]):
     """Reduce to error statistics of every filter of every node; memory does not grow with the number of runs."""
 
     def of_step(self, step: PyTree) -> OfStep:
-        """Return the products of errors, e' B^-1 e, claimed covariances, and flags of invalid estimates."""
+        """Return what is summed of a step: products of errors, e' B^-1 e, claimed covariances, and flags of failures.
+
+        `step`: as of `AbstractReducer`. Estimates of all kinds, then fused ones by name, lie along one axis `part`, but
+        claimed covariances, which are a tuple by kind.
+        """
         truth = jnp.asarray(step["truth"])
         parts = [*step["estimates"], *(step["fused"][name] for name in sorted(step["fused"]))]
         n = len(truth)
@@ -79,7 +86,7 @@ class Statistics(AbstractReducer[StatisticsByName]):
         return OfStep(sums=sums, ever=failed)
 
     def summed(self, sums: OfStep, common: OfStep, count: np.ndarray) -> RunSums:
-        """Return the carry after all runs: filters with a covariance of their own in each run first, the others last.
+        """Return the sums over all runs, with filters whose covariance differs between runs first, the others last.
 
         Args:
             sums: what was summed over runs, by batch, (time, filter, ..., batch); without a last axis where `common`.
@@ -118,20 +125,23 @@ class Statistics(AbstractReducer[StatisticsByName]):
         )
 
     def finish(self, carry: RunSums, collected: PyTree, network: Network) -> StatisticsByName:
-        """Make the statistics by node and filter."""
+        """Return the statistics by node and filter, from the sums over all runs; nothing is collected.
+
+        `carry`: what `summed` returned.
+        """
         # Sums by kind and fusion, then by name.
         all_kinds = network.kinds + network.mesh_kinds
         count, parts = _split_sums(carry, [(len(kind.filters), len(network.groups[kind.group])) for kind in all_kinds])
         of_kinds, of_fused = parts[: len(all_kinds)], parts[len(all_kinds) :]
         named = {"estimates": of_kinds, "fused": dict(zip(sorted(network.fused), of_fused, strict=True))}
-        # Axis of the filters in pairs, NEES, claims, and the two of failures.
-        filter_axes = enumerate((-3, -2, -3, -2, -2))
-        sums_by_name = [split_by_name(network, named, itemgetter(i), axis) for i, axis in filter_axes]
+        # Each sum by node and filter; the number is its axis of filters, before that of nodes.
+        filter_axes = _FilterSums(pairs=-3, nees=-2, claimed=-3, failed=-2, failed_runs=-2)
+        sums_by_name = [split_by_name(network, named, itemgetter(i), axis) for i, axis in enumerate(filter_axes)]
         # Statistics with their claims, then those of the quantizers.
         statistics = StatisticsByName({}, network.states)
         for node, claims in network.claims().items():
             statistics[node] = {
-                name: _make_statistics(count, [sums[node][name] for sums in sums_by_name], claim)
+                name: _make_statistics(count, _FilterSums(*(sums[node][name] for sums in sums_by_name)), claim)
                 for name, claim in claims.items()
             }
         for name, uplink in uplinks_by_name(network, carry.uplinks).items():
@@ -141,14 +151,14 @@ class Statistics(AbstractReducer[StatisticsByName]):
         return statistics
 
     def joined(self, results: Sequence[StatisticsByName], network: Network) -> StatisticsByName:
-        """Join the nodes of all parts, in the network's order."""
+        """Return the statistics of all nodes, in the network's order, from those of parts of a network."""
         collected = {name: filters for statistics in results for name, filters in statistics.items()}
         return StatisticsByName({name: collected[name] for name in network.names}, network.states)
 
     def others(
         self, filtered: StatisticsByName, smoothed: StatisticsByName, claims: Mapping[str, Mapping[str, Claim]]
     ) -> StatisticsByName:
-        """Return the statistics with `smoothed`."""
+        """Return the statistics with those of smoothed estimates, which have these claims, as their `smoothed`."""
         results = {
             node: {name: replace(score, claim=claims[node][name]) for name, score in filters.items()}
             for node, filters in smoothed.items()
@@ -157,36 +167,49 @@ class Statistics(AbstractReducer[StatisticsByName]):
         return filtered
 
 
-def _make_statistics(count: np.ndarray, sums: Sequence[np.ndarray], claim: Claim) -> ErrorStatistics:
-    """Return the statistics of one filter from its sums over runs."""
-    pairs, nees, claimed, failed, failed_runs = sums
+class _FilterSums(NamedTuple):
+    """Sums over runs of a kind, a fused estimate or one filter; or a number for each of these sums.
+
+    Shapes: pairs and claimed (batch, time, filter, node, pair), nees (batch, time, filter, node), failed (2, time,
+    filter, node), failed_runs (2, 1, filter, node); of one filter, or of what is fused, without filter and node.
+    claimed: the mean over the runs of each batch.
+    """
+
+    pairs: Any
+    nees: Any
+    claimed: Any
+    failed: Any
+    failed_runs: Any
+
+
+def _make_statistics(count: np.ndarray, sums: _FilterSums, claim: Claim) -> ErrorStatistics:
+    """Return the statistics of one filter from its sums over runs; `count`: runs in each batch."""
     tests = 0 if claim == "none" else slice(None)  # means alone are tested where no covariance is claimed
     return ErrorStatistics(
         count=count,
-        pairs=pairs,
-        claimed_pairs=claimed,
-        nees=nees,
+        pairs=sums.pairs,
+        claimed_pairs=sums.claimed,
+        nees=sums.nees,
         claim=claim,
-        failed=np.max(np.atleast_2d(failed[tests]), axis=0),
-        failed_runs=round(float(np.max(failed_runs[tests]))),
+        failed=np.max(np.atleast_2d(sums.failed[tests]), axis=0),
+        failed_runs=round(float(np.max(sums.failed_runs[tests]))),
     )
 
 
-def _split_sums(carry: RunSums, kinds: list[tuple[int, int]]) -> tuple[np.ndarray, list[tuple[np.ndarray, ...]]]:
-    """Return the runs by batch, and (pairs, NEES, mean claims, failures, failed runs) of each kind and fused estimate.
+def _split_sums(carry: RunSums, kinds: list[tuple[int, int]]) -> tuple[np.ndarray, list[_FilterSums]]:
+    """Return the number of runs in each batch, and the sums of each kind and then of each fused estimate, as views.
 
-    `kinds`: numbers of filters and of nodes of each kind; estimates beyond them are fused ones. Axes (batch, time,
-    filter, node, pair) for the kinds, without filter and node for what is fused; failures without batch. Views.
+    `kinds`: numbers of filters and of nodes of each kind; estimates beyond them are fused ones.
     """
-    # The axis of batches first: views, in which it is last in memory.
+    # The axis of batches first, and the two failures: views, in which batches are last in memory.
     sums = carry.runs, carry.pairs, carry.nees, carry.claimed
     count, pairs, nees, varying = (np.moveaxis(np.asarray(values), -1, 0) for values in sums)
-    # Mean claimed covariances.
-    varying = varying / np.maximum(count, 1.0).reshape(-1, *[1] * (varying.ndim - 1))
     failed, failed_runs = np.asarray(carry.failed).swapaxes(0, 1), np.asarray(carry.failed_runs)
+    # Mean claimed covariances: by batch where they differ between runs, else the same for all batches.
+    varying = varying / np.maximum(count, 1.0).reshape(-1, *[1] * (varying.ndim - 1))
     shared = np.broadcast_to(carry.shared / count.sum(), (BATCHES, *carry.shared.shape))
     split, start = {}, 0
-    # Rows of each part, in the order of the sums.
+    # Places of each kind's estimates along the axis of parts, in the order of the sums.
     for position, i in enumerate(carry.order):
         axes = kinds[i] if i < len(kinds) else ()
         rows = slice(start, start + int(np.prod(axes)))
@@ -194,10 +217,8 @@ def _split_sums(carry: RunSums, kinds: list[tuple[int, int]]) -> tuple[np.ndarra
             claimed = varying[:, :, rows]
         else:  # the shared ones are counted from the first of them
             claimed = shared[:, :, rows.start - varying.shape[2] : rows.stop - varying.shape[2]]
-        split[i] = tuple(
-            a.reshape(*a.shape[:2], *axes, *a.shape[3:])
-            for a in (pairs[:, :, rows], nees[:, :, rows], claimed, failed[:, :, rows], failed_runs[:, :, rows])
-        )
+        of_kind = pairs[:, :, rows], nees[:, :, rows], claimed, failed[:, :, rows], failed_runs[:, :, rows]
+        split[i] = _FilterSums(*(values.reshape(*values.shape[:2], *axes, *values.shape[3:]) for values in of_kind))
         start = rows.stop
     return count, [split[i] for i in range(len(split))]
 
@@ -221,16 +242,16 @@ def error_statistics(record: Record, node: str, name: str) -> ErrorStatistics:
     if not (isinstance(node, str) and isinstance(name, str) and (node, name) in known):
         raise fail("node and filter", f"one of {known}", show_value((node, name)))
     estimate = record.estimates[node][name]
-    # The sums of a simulation, in which this is the only estimate; runs are dealt to batches.
+    # Sums as of a simulation in which this is the only estimate, a fused one; runs are dealt to batches.
     arrays = (np.asarray(values, dtype=float) for values in (record.truth, estimate.mean, estimate.covariance))
     step: OfStep = over_runs(partial(_reduce_run, attitude=estimate.attitude), *arrays)
     sums, ever = jax.tree.map(_sum_batches, (step.sums, step.ever))
     count = np.bincount(np.arange(len(record.truth)) % BATCHES, minlength=BATCHES).astype(float)
-    common = jax.tree.map(lambda leaf: False, OfStep(sums, ever))
-    count, (parts,) = _split_sums(Statistics().summed(OfStep(sums, ever), common, count), [])
+    none_common = jax.tree.map(lambda leaf: False, OfStep(sums, ever))
+    count, (filter_sums,) = _split_sums(Statistics().summed(OfStep(sums, ever), none_common, count), kinds=[])
     sent = record.uplinks.get(name) if node == FUSED else None
     uplink = None if sent is None else Uplink(sent.nodes, sent.saturated.mean(axis=0), sent.symbols.mean(axis=0))
-    return replace(_make_statistics(count, parts, estimate.claim), uplink=uplink)
+    return replace(_make_statistics(count, filter_sums, estimate.claim), uplink=uplink)
 
 
 def _reduce_run(truth: Array, mean: Array, covariance: Array, attitude: tuple[int, ...]) -> OfStep:
@@ -241,5 +262,5 @@ def _reduce_run(truth: Array, mean: Array, covariance: Array, attitude: tuple[in
 
 
 def _sum_batches(values: np.ndarray) -> np.ndarray:
-    """Sum values (run, ...) over the runs of each batch, (..., batch)."""
+    """Return the sums of values (run, ...) over the runs of each batch, (..., batch)."""
     return np.stack([values[batch::BATCHES].sum(axis=0, dtype=float) for batch in range(BATCHES)], axis=-1)

@@ -7,7 +7,7 @@ import numpy as np
 
 from heliograph.numerics.linalg import find_not_finite
 from heliograph.simulation.network import FUSED
-from heliograph.simulation.results.record import Record, describe_when
+from heliograph.simulation.results.record import Record, describe_bad_steps
 
 
 def warn_of_no_numbers(record: Record, complete: Iterable[str] = (), stacklevel: int = 3) -> None:
@@ -24,7 +24,7 @@ def warn_of_no_numbers(record: Record, complete: Iterable[str] = (), stacklevel:
     for name in complete:
         simulated[f"measurements of node {name!r}, where nothing is lost"] = record.measurements[name]
     for what, values in simulated.items():
-        for when in describe_when(~np.isfinite(values).all(axis=-1)):
+        for when in describe_bad_steps(~np.isfinite(values).all(axis=-1)):
             warnings.warn(f"{what}: no finite number {when}", stacklevel=stacklevel + 1)
     for node, filters in record.estimates.items():
         for name, estimate in filters.items():
@@ -32,5 +32,5 @@ def warn_of_no_numbers(record: Record, complete: Iterable[str] = (), stacklevel:
             if estimate.claim != "none" and node != FUSED:  # there a quantizer may say that it knows no bound
                 bad |= find_not_finite(np.asarray(estimate.covariance), 2)
             what = "mean" if estimate.claim == "none" else "covariance"
-            for when in describe_when(bad):
+            for when in describe_bad_steps(bad):
                 warnings.warn(f"{node}/{name}: no valid {what} {when}", stacklevel=stacklevel + 1)

@@ -34,8 +34,8 @@ def choose_filters(
     return chosen, names
 
 
-def state_places(states: Sequence[str] | None, known: Sequence[str]) -> list[int]:
-    """Return the places of the named states, all by default."""
+def find_state_places(states: Sequence[str] | None, known: Sequence[str]) -> list[int]:
+    """Return the places of the named states among the `known` ones, all by default; raise ValueError at others."""
     chosen = list(known) if states is None else [states] if isinstance(states, str) else list(states)
     for name in chosen:
         if name not in known:
@@ -44,7 +44,10 @@ def state_places(states: Sequence[str] | None, known: Sequence[str]) -> list[int
 
 
 def make_panels(axes: object, count: int, time: np.ndarray, units: Mapping[str, str]) -> "list[Axes]":
-    """Return the given axes, or those of a new figure, one below the other."""
+    """Return the given axes as a list, or those of a new figure, `count` one below the other; raise at another number.
+
+    `time`: of what is drawn; dates have no unit. `units`: by name, that of "time" too.
+    """
     if axes is None:
         import matplotlib.pyplot as plt
 
@@ -68,15 +71,18 @@ def check_run(run: int, runs: int | None) -> None:
 def draw_state(
     panel: "Axes", time: np.ndarray, estimates: Mapping[str, Estimate], run_and_state: tuple[Any, int], sigmas: float
 ) -> None:
-    """Draw one state of several estimates, of a run, with bands of +-`sigmas` claimed deviations."""
+    """Draw one state of several estimates, of a run, with bands of +-`sigmas` claimed deviations.
+
+    `run_and_state`: index of the run (... without an axis of runs), and number of the state.
+    """
     run, i = run_and_state
     for number, (name, estimate) in enumerate(estimates.items()):
         mean, variance = np.asarray(estimate.mean)[run][..., i], np.asarray(estimate.covariance)[run][..., i, i]
         deviation = np.sqrt(np.where(variance >= 0, variance, np.nan))
         shown, mean, band = insert_gaps_at_wraps(time, mean, sigmas * deviation)
-        panel.plot(shown, mean, color=colour_of(number), label=quote_for_figure(name))
+        panel.plot(shown, mean, color=choose_colour(number), label=quote_for_figure(name))
         if estimate.claim != "none":
-            panel.fill_between(shown, mean - band, mean + band, color=colour_of(number), alpha=0.2, linewidth=0)
+            panel.fill_between(shown, mean - band, mean + band, color=choose_colour(number), alpha=0.2, linewidth=0)
 
 
 def draw_truth(panel: "Axes", time: ArrayLike, truth: ArrayLike) -> None:
@@ -92,17 +98,31 @@ def draw_modes(
     run: int | None,
     clock: tuple[np.ndarray, Mapping[str, str]],
 ) -> "Axes":
-    """Draw the probabilities of the modes of a node's filters: a colour for each filter, a style for each mode."""
+    """Draw the probabilities of the modes of a node's filters: a colour for each filter, a style for each mode.
+
+    Args:
+        estimates: by node and filter.
+        node: name of the node; None: the first with a filter that weighs modes.
+        filters: names of its filters; None: all that weigh modes.
+        axes: to draw on; None: new ones.
+        run: number of the run; None without an axis of runs.
+        clock: times of the rows, and units by name.
+
+    Returns:
+        The axes.
+    """
+    # Filters that weigh modes.
     weighing = {
-        name: {label: e for label, e in by_filter.items() if e.modes is not None}
+        name: {label: estimate for label, estimate in by_filter.items() if estimate.modes is not None}
         for name, by_filter in estimates.items()
     }
     node, chosen = choose_filters(weighing, node, filters)
-    panel, styles = make_panels(None if axes is None else [axes], 1, *clock)[0], ("-", "--", ":", "-.")
+    time, units = clock
+    (panel,), styles = make_panels(None if axes is None else [axes], 1, time, units), ("-", "--", ":", "-.")
     for number, name in enumerate(chosen):
         modes = np.asarray(weighing[node][name].modes)[... if run is None else run]
         for j in range(modes.shape[-1]):
-            panel.plot(clock[0], modes[:, j], styles[j % len(styles)], color=colour_of(number),
+            panel.plot(time, modes[:, j], styles[j % len(styles)], color=choose_colour(number),
                        label=quote_for_figure(f"{name}, mode {j}"))  # fmt: skip
     panel.set_ylim(-0.02, 1.02)
     panel.set_ylabel("probability")
@@ -115,8 +135,8 @@ def legend_outside(axes: "Axes", title: str | None = None) -> None:
     axes.legend(frameon=False, title=title, loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
 
-def colour_of(number: int) -> str:
-    """Return the colour of the pages for a filter, by its number."""
+def choose_colour(number: int) -> str:
+    """Return the colour of the pages for the filter of this number; colours repeat."""
     return COLOURS[number % len(COLOURS)]
 
 

@@ -23,10 +23,10 @@ from heliograph.simulation.results.labelled import (
     TIME,
     FilterLabels,
     check_title,
+    count_modes,
     iterate_filters,
-    modes_of,
-    names_of,
     read_estimate,
+    read_labels,
     read_modes,
     read_units,
     read_uplinks,
@@ -39,14 +39,14 @@ from heliograph.simulation.results.plots import (
     draw_modes,
     draw_state,
     draw_truth,
+    find_state_places,
     legend_outside,
     make_panels,
-    state_places,
 )
 from heliograph.simulation.results.record_html import draw_record
 from heliograph.simulation.results.refusals import Refusal, list_refusals
 from heliograph.simulation.results.saved import Saved
-from heliograph.simulation.results.wide_table import record_fields, record_frame
+from heliograph.simulation.results.wide_table import make_frame, read_frame
 
 if TYPE_CHECKING:  # extras
     import pandas as pd
@@ -230,27 +230,30 @@ class Record(Saved):
         Raises:
             ModuleNotFoundError: without xarray (extra "results").
         """
+        # Labels, and lengths of the axes: those of rows, and of the longest measurement and the most modes.
         nodes = list(dict.fromkeys([*self.measurements, *self.estimates]))
-        received = [((nodes.index(node),), z) for node, z in self.measurements.items()]
         rows = {TIME: len(self.time)} if self.runs is None else {"run": self.runs, TIME: len(self.time)}
-        longest_of = {"received": max((z.shape[-1] for _, z in received), default=0)}
-        longest_of |= {"mode": modes} if (modes := modes_of(self.estimates)) else {}
-        labels = FilterLabels(nodes, self.estimates, self.states, rows, longest_of, self.uplinks)
         lengths = {node: z.shape[-1] for node, z in self.measurements.items()}
+        longest = {"received": max(lengths.values(), default=0)}
+        if modes := count_modes(self.estimates):
+            longest["mode"] = modes
+        labels = FilterLabels(nodes, self.estimates, self.states, rows, longest, self.uplinks)
         fields = {
-            "measurement": labels.fill("measurement", received),
+            "measurement": labels.fill_field(
+                "measurement", [((nodes.index(node),), z) for node, z in self.measurements.items()]
+            ),
             "length": np.array([lengths.get(node, -1) for node in nodes], dtype=np.int64),
             "estimated": np.array([node in self.estimates for node in nodes], dtype=bool),
             "claim": labels.claims(),
-            "mean": labels.of_filters("mean", lambda estimate: estimate.mean),
-            "covariance": labels.of_filters("covariance", lambda estimate: estimate.covariance),
-            **labels.sent(),
-            **labels.attitudes(),
+            "mean": labels.fill_from_results("mean", lambda estimate: estimate.mean),
+            "covariance": labels.fill_from_results("covariance", lambda estimate: estimate.covariance),
+            **labels.make_quantizer_fields(),
+            **labels.make_attitude_field(),
         }
         if modes:
-            fields["modes"] = labels.of_filters("modes", read_modes)
+            fields["modes"] = labels.fill_from_results("modes", read_modes)
         fields |= {} if self.truth is None else {"truth": self.truth}
-        return labels.dataset(RECORD, fields, self.time, self.units)
+        return labels.make_dataset(RECORD, fields, self.time, self.units)
 
     @classmethod
     def from_xarray(cls, dataset: "xr.Dataset") -> "Record":
@@ -260,7 +263,8 @@ class Record(Saved):
             ValueError: no such dataset.
         """
         check_title(dataset, RECORD)
-        lead, nodes = ["run", TIME] if "run" in dataset.dims else [TIME], names_of(dataset, "node")
+        lead, nodes = ["run", TIME] if "run" in dataset.dims else [TIME], read_labels(dataset, "node")
+        # Estimates by name, of the nodes for which any are kept.
         measurement, length = read_values(dataset, "measurement", lead), read_values(dataset, "length", lead)
         estimated = np.flatnonzero(read_values(dataset, "estimated", lead))
         estimates: dict[str, dict[str, Estimate]] = {nodes[i]: {} for i in estimated}
@@ -269,9 +273,9 @@ class Record(Saved):
             estimates[node][name] = read_estimate(dataset, claim, values)
         return cls(
             time=np.asarray(dataset[TIME].values),
-            states=tuple(names_of(dataset, "state")),
+            states=tuple(read_labels(dataset, "state")),
             truth=read_values(dataset, "truth", lead) if "truth" in dataset else None,
-            measurements={
+            measurements={  # without padding; a length of -1 is of a place that receives nothing
                 node: measurement[..., i, : length[i]].copy() for i, node in enumerate(nodes) if length[i] >= 0
             },
             estimates=estimates,
@@ -287,7 +291,7 @@ class Record(Saved):
         Raises:
             ModuleNotFoundError: without pandas (extra "results").
         """
-        return record_frame(vars(self), self.runs)
+        return make_frame(vars(self), self.runs)
 
     @classmethod
     def from_pandas(cls, frame: "pd.DataFrame") -> "Record":
@@ -296,7 +300,7 @@ class Record(Saved):
         Raises:
             ValueError: no such table.
         """
-        return cls(**record_fields(frame))
+        return cls(**read_frame(frame))
 
     def apart(self) -> list[str]:
         """Return the names of the parts that are saved separately."""
@@ -328,9 +332,9 @@ class Record(Saved):
             ModuleNotFoundError: without matplotlib (extra "report").
         """
         node, filters = choose_filters(self.estimates, node, filters)
-        places = state_places(states, self.states)
+        places = find_state_places(states, self.states)
         check_run(run, self.runs)
-        of_run: Any = ... if self.runs is None else run
+        of_run: Any = ... if self.runs is None else run  # index of the run; all of a record without runs
         drawn = make_panels(axes, len(places), self.time, self.units)
         for panel, i in zip(drawn, places, strict=True):
             draw_state(panel, self.time, {name: self.estimates[node][name] for name in filters}, (of_run, i), sigmas)
@@ -370,7 +374,7 @@ class Record(Saved):
         for node, filters in self.estimates.items():
             for name, estimate in filters.items():
                 what = "mean" if estimate.claim == "none" else "covariance"
-                lines += [f"{node}/{name}: no valid {what} {when}" for when in describe_when(~is_sound(estimate))]
+                lines += [f"{node}/{name}: no valid {what} {when}" for when in describe_bad_steps(~is_sound(estimate))]
         # Quantizers that saturated.
         for name, uplink in self.uplinks.items():
             for i, node in enumerate(uplink.nodes):
@@ -381,8 +385,8 @@ class Record(Saved):
         return lines
 
 
-def describe_when(bad: np.ndarray) -> list[str]:
-    """Say from which step on, and in how many runs, something (..., time) is bad; nothing where it never is."""
+def describe_bad_steps(bad: np.ndarray) -> list[str]:
+    """Return [a phrase: from which step on, in how many runs, flags `bad` (..., time) hold]; [] where they never do."""
     if not np.any(bad):
         return []
     by_time = bad.reshape(-1, bad.shape[-1])

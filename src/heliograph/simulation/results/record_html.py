@@ -56,6 +56,7 @@ def draw_record(record: DrawableRecord) -> str:
     Returns:
         HTML that fetches nothing, runs nothing, and fits any width.
     """
+    # Title; of Monte Carlo runs the first.
     node = next((name for name, filters in record.estimates.items() if filters), None)
     rows, runs = len(record.time), record.runs
     title = f"{type(record).__name__}: {rows} row{'s' * (rows != 1)}"
@@ -63,13 +64,15 @@ def draw_record(record: DrawableRecord) -> str:
     if node is None or rows == 0 or runs == 0:
         return f"<div>{title}, no estimates</div>"
     one = record if runs is None else record.of_run(0)
+    # At most so many filters, rows and states, with notes on what is left out.
     filters = dict(list(one.estimates[node].items())[:FILTERS])
     chosen = np.unique(np.linspace(0, rows - 1, min(rows, POINTS)).round().astype(int))
     left_out = {"filters": len(one.estimates[node]) - len(filters), "states": len(one.states) - PANELS}
     notes = [f"{count} more {what}" for what, count in left_out.items() if count > 0]
     notes += [f"{len(chosen)} rows of {rows} drawn"] if len(chosen) < rows else []
+    # A panel for each state, and the first and last time below.
     panels = [_draw_panel(one, filters, i, chosen) for i in range(min(len(one.states), PANELS))]
-    times = "".join(f"<span>{escape(_print_time(record.time[k]))}</span>" for k in (0, -1))
+    times = "".join(f"<span>{escape(_format_time(record.time[k]))}</span>" for k in (0, -1))
     note = f"<div>{escape('; '.join(notes))}</div>" if notes else ""
     return (
         '<div style="max-width:640px;font-size:13px;line-height:1.4">'
@@ -94,7 +97,15 @@ def _make_legend(filters: Mapping[str, Estimate], record: DrawableRecord) -> str
 
 
 def _draw_panel(record: DrawableRecord, filters: Mapping[str, Estimate], state: int, chosen: np.ndarray) -> str:
-    """Return one state: its name and last value, the range of its axis, and the drawing."""
+    """Return one state as HTML: its name and last value, the range of its axis, and the drawing.
+
+    Args:
+        record: one run.
+        filters: estimates by name of the filter.
+        state: number of the state.
+        chosen: rows that are drawn.
+    """
+    # Means and ends of the bands of each filter, the truth, and the range of all.
     curves = [_read_curve(estimate, state, chosen) for estimate in filters.values()]
     truth = None if record.truth is None else np.asarray(record.truth)[chosen, state]
     low, high = _find_range([part for curve in curves for part in curve] + ([] if truth is None else [truth]))
@@ -103,6 +114,7 @@ def _draw_panel(record: DrawableRecord, filters: Mapping[str, Estimate], state: 
         """Return the heights of values in the drawing, downwards from the top."""
         return HIGH * (high - values) / (high - low)
 
+    # Band and mean of each filter in its colour; the truth dashed.
     parts = []
     for colour, (mean, lower, upper) in zip(COLOURS, curves, strict=False):
         parts += [f'<path d="{d}" fill="{colour}" fill-opacity="0.2" stroke="none"/>'
@@ -110,6 +122,7 @@ def _draw_panel(record: DrawableRecord, filters: Mapping[str, Estimate], state: 
         parts.append(_draw_line(to_height(mean), colour))
     if truth is not None:
         parts.append(_draw_line(to_height(truth), "currentColor", ' stroke-dasharray="4 3"'))
+    # Last mean of the first filter, with half of its band.
     (mean, _, upper), *_ = curves
     last = f"{mean[-1]:.4g}" + (f" ± {upper[-1] - mean[-1]:.2g}" if np.isfinite(upper[-1]) else "")
     name = escape(visible(label_with_unit(record.states[state], record.units)))
@@ -125,7 +138,7 @@ def _draw_panel(record: DrawableRecord, filters: Mapping[str, Estimate], state: 
 
 
 def _read_curve(estimate: Estimate, state: int, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return mean, lower and upper end of the band; NaN where nothing is claimed."""
+    """Return mean, lower and upper end of the band of a state in the chosen rows; NaN where nothing is claimed."""
     mean = np.asarray(estimate.mean)[chosen, state]
     variance = np.asarray(estimate.covariance)[chosen, state, state]
     claimed = (variance >= 0) & (estimate.claim != "none")
@@ -144,20 +157,20 @@ def _find_range(parts: Sequence[np.ndarray]) -> tuple[float, float]:
     return low - room, high + room
 
 
-def _places(count: int) -> np.ndarray:
-    """Return where the points of a curve are from left to right."""
+def _compute_x_places(count: int) -> np.ndarray:
+    """Return where the `count` points of a curve are from left to right, in units of the drawing."""
     return WIDE * (np.arange(count) + 0.5) / count if count == 1 else np.linspace(0, WIDE, count)
 
 
 def _split_at_gaps(finite: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield the numbers of points that follow one another without a gap."""
+    """Yield the numbers of each run of points that are `finite` without a gap."""
     numbers = np.flatnonzero(finite)
     yield from (piece for piece in np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1) if len(piece))
 
 
 def _draw_line(y: np.ndarray, colour: str, attributes: str = "") -> str:
-    """Return a curve as an SVG path with more attributes, broken where there is no value."""
-    x = _places(len(y))
+    """Return a curve of heights y as an SVG path with more attributes, broken where there is no value."""
+    x = _compute_x_places(len(y))
     d = "".join("M" + "L".join(f"{x[k]:.1f} {y[k]:.2f}" for k in piece) for piece in _split_at_gaps(np.isfinite(y)))
     return (
         f'<path d="{d}" fill="none" stroke="{colour}" stroke-width="1.5" vector-effect="non-scaling-stroke"'
@@ -166,13 +179,13 @@ def _draw_line(y: np.ndarray, colour: str, attributes: str = "") -> str:
 
 
 def _draw_outlines(lower: np.ndarray, upper: np.ndarray) -> Iterator[str]:
-    """Yield the outlines of a band, one for each piece without a gap."""
-    x = _places(len(lower))
+    """Yield the outlines of a band between two curves of heights, as SVG paths, one for each piece without a gap."""
+    x = _compute_x_places(len(lower))
     for piece in _split_at_gaps(np.isfinite(lower) & np.isfinite(upper)):
         ends = [f"{x[k]:.1f} {upper[k]:.2f}" for k in piece] + [f"{x[k]:.1f} {lower[k]:.2f}" for k in piece[::-1]]
         yield f"M{'L'.join(ends)}Z"
 
 
-def _print_time(time: np.generic) -> str:
-    """Return a time to the second, or a number."""
+def _format_time(time: np.generic) -> str:
+    """Return a date to the second, or a number, as text."""
     return np.datetime_as_string(time, "s") if isinstance(time, np.datetime64) else f"{float(time):g}"

@@ -22,7 +22,7 @@ from heliograph.simulation.results.by_name import (
     reports_by_name,
     split_by_name,
     split_measurements,
-    transmissions_of,
+    transmissions_by_name,
     uplinks_by_name,
 )
 from heliograph.simulation.results.record import Record
@@ -67,7 +67,7 @@ class AbstractReducer(Module, Generic[Result]):
         return ()
 
     def finish(self, carry: PyTree, collected: PyTree, network: Network) -> Result:
-        """Make the result; collected parts are joined along the run axis."""
+        """Return the result, from what `summed` returned and what was collected of all runs, (run, time, ...)."""
         raise unwritten(self, "finish")
 
     def joined(self, results: Sequence[Result], network: Network) -> Result:
@@ -97,7 +97,9 @@ class AbstractReducer(Module, Generic[Result]):
         return split_measurements(network, groups)
 
     def others(self, filtered: Result, smoothed: Result, claims: Mapping[str, Mapping[str, Claim]]) -> Result:
-        """Return the result with that of smoothed estimates, whose claims these are, as its `smoothed`.
+        """Return the result with that of smoothed estimates as its `smoothed`.
+
+        `claims`: of the smoothed estimates, by node and filter.
 
         Raises:
             ValueError: a reducer without results for smoothed estimates.
@@ -106,7 +108,7 @@ class AbstractReducer(Module, Generic[Result]):
 
 
 def reduce_rows(reducer: AbstractReducer[Result], rows: PyTree) -> OfStep:
-    """Reduce a run from its steps (time, ...): stacked over time, but for flags that hold if true at any step."""
+    """Return what a reducer makes of a run's steps (time, ...), stacked over time; flags `ever` are one for the run."""
     _, items = jax.lax.scan(lambda carry, row: (carry, reducer.of_step(row)), (), rows)
     return items._replace(ever=jax.tree.map(lambda leaf: jnp.any(leaf, axis=0), items.ever))
 
@@ -119,12 +121,12 @@ class Trajectories(AbstractReducer[Record]):
         return OfStep(collected=step)
 
     def finish(self, carry: PyTree, collected: PyTree, network: Network) -> Record:
-        """Make the record; its time is the step, starting at 1."""
+        """Return the record of what was collected; its time is the step, starting at 1."""
         time = np.arange(1, collected["truth"].shape[1] + 1, dtype=np.float64)
         return trajectories_record(network, collected, time)
 
     def joined(self, results: Sequence[Record], network: Network) -> Record:
-        """Join the nodes of all parts, in the network's order."""
+        """Return the record of all nodes, in the network's order, from records of parts of a network."""
         measurements = {name: z for record in results for name, z in record.measurements.items()}
         estimates = {name: filters for record in results for name, filters in record.estimates.items()}
         return replace(
@@ -134,7 +136,10 @@ class Trajectories(AbstractReducer[Record]):
         )
 
     def others(self, filtered: Record, smoothed: Record, claims: Mapping[str, Mapping[str, Claim]]) -> Record:
-        """Return the record with `smoothed`, whose time is that of the last steps if there are fewer."""
+        """Return the record with that of smoothed estimates, which have these claims, as its `smoothed`.
+
+        Its time is that of the last steps if there are fewer.
+        """
         estimates = {
             node: {name: replace(score, claim=claims[node][name]) for name, score in filters.items()}
             for node, filters in smoothed.estimates.items()
@@ -144,7 +149,14 @@ class Trajectories(AbstractReducer[Record]):
 
 
 def trajectories_record(network: Network, batch: PyTree, time: np.ndarray) -> Record:
-    """Return the record from the scan's output; nodes in the network's order."""
+    """Return the record of trajectories, with nodes in the network's order.
+
+    Args:
+        network: the network.
+        batch: what a scan over time put out, as `AbstractReducer` describes a step, with leading axes (run, time) or
+            (time).
+        time: of the steps.
+    """
     measurements = split_measurements(network, batch["measurements"])
     mean = split_by_name(network, batch, attrgetter("mean"), -3)
     covariance = split_by_name(network, batch, attrgetter("covariance"), -4)
@@ -165,6 +177,6 @@ def trajectories_record(network: Network, batch: PyTree, time: np.ndarray) -> Re
         estimates=estimates,
         uplinks=uplinks,
         reports=reports,
-        transmissions=transmissions_of(network, batch.get("transmissions", {})),
+        transmissions=transmissions_by_name(network, batch.get("transmissions", {})),
         weighed=collect_weighed(network, batch),
     )

@@ -41,16 +41,16 @@ def list_refusals(
         refused: by node the number of each reading's reason, 0 where it is kept (time, received).
         weighed: by node and filter the weights of its components, NaN where nothing arrived (time, received).
     """
-    counted = [refusal for node, reasons in refused.items() for refusal in _count(node, "", reasons)]
+    counted = [refusal for node, reasons in refused.items() for refusal in _count_refusals(node, "", reasons)]
     for node, filters in weighed.items():
         for filter, parts in filters.items():
             gate = np.where(np.asarray(parts.weight) == 0, number_of("gate"), 0)
-            counted += _count(node, filter, gate)
+            counted += _count_refusals(node, filter, gate)
     return tuple(counted)
 
 
-def _count(node: str, filter: str, refused: np.ndarray) -> Iterator[Refusal]:
-    """Yield the counts of one table of reasons (time, received)."""
+def _count_refusals(node: str, filter: str, refused: np.ndarray) -> Iterator[Refusal]:
+    """Yield, by component and reason, how many readings one table of reasons (time, received) has."""
     for reason, counts in count_by_reason(refused).items():
         for i in np.flatnonzero(counts).tolist():
             row = int(np.argmax(refused[:, i] == number_of(reason)))

@@ -40,7 +40,7 @@ class Saved:
         return changed
 
     def to_xarray(self) -> "xr.Dataset":
-        """Convert to labelled arrays.
+        """Return the results as labelled arrays.
 
         Raises:
             ModuleNotFoundError: without xarray (extra "results").
@@ -49,7 +49,7 @@ class Saved:
 
     @classmethod
     def from_xarray(cls, dataset: "xr.Dataset") -> Self:
-        """Convert back from labelled arrays.
+        """Return the results that labelled arrays hold.
 
         Raises:
             ValueError: no such dataset.
@@ -93,10 +93,10 @@ def save(dataset: "xr.Dataset", path: str | Path) -> None:
     """
     path = file_path("file of results", path)
     package = _find_package(path)
-    import_module(package)
+    import_module(package)  # raises now if the extra is not installed
     # Names as text that any file can hold; floats without a fill value.
     plain = dataset.assign_coords(
-        {name: (c.dims, _map_names(quote_for_file, c), c.attrs) for name, c in _texts(dataset)}
+        {name: (c.dims, _map_names(quote_for_file, c), c.attrs) for name, c in _list_names(dataset)}
     )
     encoding: Any = {name: {"_FillValue": None} for name in plain.variables if plain[name].dtype.kind == "f"}
     if dataset["time"].dtype.kind == "M":
@@ -115,7 +115,7 @@ def save(dataset: "xr.Dataset", path: str | Path) -> None:
 
 
 def open_dataset(path: str | Path) -> "xr.Dataset":
-    """Read a dataset into memory.
+    """Return the dataset of a NetCDF file or a Zarr folder, read into memory.
 
     Raises:
         ValueError: no such file, or one that is none.
@@ -123,7 +123,7 @@ def open_dataset(path: str | Path) -> "xr.Dataset":
     """
     path = file_path("file of results", path)
     package = _find_package(path)
-    import_module(package)
+    import_module(package)  # raises now if the extra is not installed
     import xarray as xr
 
     if not path.exists():
@@ -133,24 +133,26 @@ def open_dataset(path: str | Path) -> "xr.Dataset":
             dataset = stored.load()
     except (OSError, ValueError, KeyError) as error:
         raise fail(str(path), "a file of results that can be read", f"{type(error).__name__}: {error}") from None
-    return dataset.assign_coords({name: (c.dims, _map_names(unquote_file, c), c.attrs) for name, c in _texts(dataset)})
+    return dataset.assign_coords(
+        {name: (c.dims, _map_names(unquote_file, c), c.attrs) for name, c in _list_names(dataset)}
+    )
 
 
 def _find_package(path: Path) -> str:
-    """Return the name of the package that writes the format."""
+    """Return the name of the package for files with this ending; raise ValueError at another ending."""
     kinds = {NETCDF: "h5netcdf", ZARR: "zarr"}
     if path.suffix.lower() not in kinds:
         raise fail(str(path), f"a name that ends in {' or '.join(kinds)}", repr(path.suffix))
     return kinds[path.suffix.lower()]
 
 
-def _texts(dataset: "xr.Dataset") -> list[tuple[object, "xr.DataArray"]]:
-    """Return the coordinates that are names."""
+def _list_names(dataset: "xr.Dataset") -> list[tuple[object, "xr.DataArray"]]:
+    """Return (name, coordinate) of the coordinates of a dataset that are names, not numbers."""
     return [(name, c) for name, c in dataset.coords.items() if c.dtype.kind in "OUT"]
 
 
 def _map_names(change: Callable[[str], str], names: "xr.DataArray") -> np.ndarray:
-    """Return changed names, for files as texts of fixed length and else as objects."""
+    """Return names changed each by `change`: for files as texts of fixed length, else as objects."""
     changed = [change(str(name)) for name in names.values]
     if change is quote_for_file:
         return np.array(changed, dtype="U")

@@ -54,19 +54,19 @@ class ErrorStatistics:
         return f"no valid {what} from step {step} in {self.failed_runs} of {self.runs} runs"
 
     def _warn_of_failures(self) -> None:
-        """Warn where figures are NaN since some run had no valid estimate."""
+        """Warn, at the caller of a public method, that figures are NaN since some run had no valid estimate."""
         if self.failed_runs:
             warnings.warn(self.failure, stacklevel=3)
 
     @property
     def outer(self) -> np.ndarray:
         """Sums of e e', (batch, time, n, n)."""
-        return matrices(self.pairs)
+        return expand_pairs(self.pairs)
 
     @property
     def covariance(self) -> np.ndarray:
         """Sums of claimed covariances, (batch, time, n, n)."""
-        sums: np.ndarray = matrices(self.claimed_pairs) * self.count[:, None, None, None]
+        sums: np.ndarray = expand_pairs(self.claimed_pairs) * self.count[:, None, None, None]
         return sums
 
     @property
@@ -76,7 +76,7 @@ class ErrorStatistics:
 
     def actual(self) -> np.ndarray:
         """Return E[e e'] over the runs, (time, n, n)."""
-        moments: np.ndarray = matrices(self.pairs.sum(axis=0)) / self.runs
+        moments: np.ndarray = expand_pairs(self.pairs.sum(axis=0)) / self.runs
         return moments
 
     def claimed(self) -> np.ndarray:
@@ -143,20 +143,23 @@ class ErrorStatistics:
         if self.runs < 4:
             raise fail("worst direction", "at least 4 runs", self.runs)
         outer, covariance = self.outer, self.covariance
-        broken = ~(np.isfinite(outer) & np.isfinite(covariance)).all(axis=(0, 2, 3))
+        broken = ~(np.isfinite(outer) & np.isfinite(covariance)).all(axis=(0, 2, 3))  # by step
         self._warn_of_failures()
         if np.any(broken):
             undefined = np.full(outer.shape[-1], np.nan)
             return WorstDirection(np.nan, np.nan, int(np.argmax(broken)), undefined)
         halves = [self._estimate_worst_ratio(np.arange(BATCHES) % 2 == side, outer, covariance) for side in (0, 1)]
-        return max(halves, key=lambda w: w.ratio)
+        return max(halves, key=lambda found: found.ratio)
 
     def _estimate_worst_ratio(
         self, held_out: np.ndarray, outer: np.ndarray, covariance: np.ndarray
     ) -> "WorstDirection":
         """Return the ratio in the batches held out, in the direction of largest error over claim in the others.
 
-        `held_out` (batch,); `outer` and `covariance` (batch, time, n, n).
+        Args:
+            held_out: whether each batch is held out (batch,).
+            outer: sums of e e' (batch, time, n, n).
+            covariance: sums of claimed covariances (batch, time, n, n).
         """
         # Step and direction of the largest ratio in the batches that choose.
         chosen = ~held_out & (self.count > 0)
@@ -169,15 +172,20 @@ class ErrorStatistics:
         error = np.einsum("i,bij,j->b", d, outer[judged, step], d)
         bound = np.einsum("i,bij,j->b", d, covariance[judged, step], d)
         ratio = float(error.sum() / bound.sum())
-        # Linearised error of a ratio of means: residuals error - ratio bound have mean zero over the batches.
-        weights = self.count[judged]
-        _, residual_error = _average_batches(error - ratio * bound, weights)
-        scale = bound.sum() / weights.sum()
-        standard_error = float(residual_error / scale)
-        return WorstDirection(ratio, standard_error, step, d / np.linalg.norm(d))
+        # Linearised error of a ratio of means, E[error] / E[bound]: that of the mean of error - ratio bound, which is 0
+        # over all batches, over the mean bound.
+        counts = self.count[judged]
+        _, residual_error = _average_batches(error - ratio * bound, counts)
+        mean_bound = bound.sum() / counts.sum()
+        return WorstDirection(
+            ratio=ratio,
+            standard_error=float(residual_error / mean_bound),
+            step=step,
+            direction=d / np.linalg.norm(d),
+        )
 
 
-def matrices(pairs: np.ndarray) -> np.ndarray:
+def expand_pairs(pairs: np.ndarray) -> np.ndarray:
     """Return the symmetric matrices (..., n, n) from their entries i <= j, row by row."""
     n = (math.isqrt(8 * pairs.shape[-1] + 1) - 1) // 2
     index = np.zeros((n, n), dtype=int)
@@ -238,7 +246,10 @@ class WorstDirection:
 
 
 def _average_batches(sums: np.ndarray, count: np.ndarray) -> tuple[float, float]:
-    """Return the mean of per-run values from batch sums, and its standard error from the scatter of batch means."""
+    """Return the mean of per-run values from their sums by batch, and its standard error from the scatter of batches.
+
+    `count`: number of runs in each batch.
+    """
     used = count > 0
     sums, count = sums[used], count[used]
     mean = float(sums.sum() / count.sum())
@@ -250,7 +261,7 @@ def _average_batches(sums: np.ndarray, count: np.ndarray) -> tuple[float, float]
 
 
 def _root_mean(sums: np.ndarray, count: np.ndarray) -> tuple[float, float]:
-    """Return the root of the mean of per-run values, and its standard error."""
+    """Return the root of the mean of per-run values from their sums by batch, and its standard error."""
     mean, error = _average_batches(sums, count)
     root = float(np.sqrt(mean))
     return root, error / (2 * root) if root else 0.0

@@ -16,21 +16,21 @@ from heliograph.simulation.results.labelled import (
     FilterLabels,
     check_title,
     iterate_filters,
-    names_of,
+    read_labels,
     read_units,
     read_uplinks,
     read_values,
 )
 from heliograph.simulation.results.plots import (
     FAR,
+    choose_colour,
     choose_filters,
-    colour_of,
+    find_state_places,
     legend_outside,
     make_panels,
-    state_places,
 )
 from heliograph.simulation.results.saved import Saved
-from heliograph.simulation.results.statistics import ErrorStatistics, matrices
+from heliograph.simulation.results.statistics import ErrorStatistics, expand_pairs
 
 if TYPE_CHECKING:  # extras
     import pandas as pd
@@ -72,33 +72,39 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
         first = next((score for filters in self.values() for score in filters.values()), None)
         if first is None:
             raise fail("statistics", "those of one filter at least", "none")
-        n, rows, batches = len(self.states), {TIME: first.nees.shape[1]}, {"batch": len(first.count)}
-        uplinks = {name: score.uplink for name, score in self.get(FUSED, {}).items() if score.uplink}
-        labels = FilterLabels(list(self), self, self.states, rows, batches, uplinks)
+        n, steps = len(self.states), first.nees.shape[1]
+        labels = FilterLabels(
+            nodes=list(self),
+            by_node=self,
+            states=self.states,
+            rows={TIME: steps},
+            lengths={"batch": len(first.count)},
+            uplinks={name: score.uplink for name, score in self.get(FUSED, {}).items() if score.uplink},
+        )
 
-        def variances(covariances: np.ndarray) -> np.ndarray:
+        def take_variances(covariances: np.ndarray) -> np.ndarray:
             """Return the diagonals (..., n) of covariances (..., n, n)."""
             return np.diagonal(covariances, axis1=-2, axis2=-1)
 
-        # fill(name, read): what `read` returns of each filter's score, along the axes of this field.
-        fill, none_failed = labels.of_filters, np.full(rows[TIME], np.nan)
-        claimed = fill("deviation", lambda s: variances(s.claimed()))
+        # fill(name, read): the array of the field `name`, of what `read` returns of each filter's statistics.
+        fill, none_failed = labels.fill_from_results, np.full(steps, np.nan)
+        claimed = fill("deviation", lambda score: take_variances(score.claimed()))
         fields = {
             # Sums by batch, from which the statistics can be restored.
             "runs": first.count,
-            "errors": fill("errors", lambda s: matrices(s.pairs)),
-            "claimed": fill("claimed", lambda s: matrices(s.claimed_pairs)),
-            "nees": fill("nees", lambda s: s.nees),
+            "errors": fill("errors", lambda score: expand_pairs(score.pairs)),
+            "claimed": fill("claimed", lambda score: expand_pairs(score.claimed_pairs)),
+            "nees": fill("nees", lambda score: score.nees),
             "claim": labels.claims(),
-            "failed": fill("failed", lambda s: none_failed if s.failed is None else s.failed),
-            "failed_runs": fill("failed_runs", lambda s: s.failed_runs),
-            # Figures.
-            "rmse": np.sqrt(fill("rmse", lambda s: variances(s.actual()))),
+            "failed": fill("failed", lambda score: none_failed if score.failed is None else score.failed),
+            "failed_runs": fill("failed_runs", lambda score: score.failed_runs),
+            # Figures made from these; of a claimed variance that is negative there is no deviation.
+            "rmse": np.sqrt(fill("rmse", lambda score: take_variances(score.actual()))),
             "deviation": np.sqrt(np.where(claimed >= 0, claimed, np.nan)),
-            "nees_per_dimension": fill("nees_per_dimension", lambda s: s.nees.sum(axis=0) / s.runs / n),
-            **labels.sent(),
+            "nees_per_dimension": fill("nees_per_dimension", lambda score: score.nees.sum(axis=0) / score.runs / n),
+            **labels.make_quantizer_fields(),
         }
-        return labels.dataset(STATISTICS, fields, np.arange(1.0, rows[TIME] + 1), self.units)
+        return labels.make_dataset(STATISTICS, fields, np.arange(1.0, steps + 1), self.units)
 
     @classmethod
     def from_xarray(cls, dataset: "xr.Dataset") -> "StatisticsByName":
@@ -108,10 +114,10 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
             ValueError: no such dataset.
         """
         check_title(dataset, STATISTICS)
-        states, count = names_of(dataset, "state"), read_values(dataset, "runs", [TIME])
+        states, count = read_labels(dataset, "state"), read_values(dataset, "runs", [TIME])
         upper, uplinks = np.triu_indices(len(states)), read_uplinks(dataset, [TIME])
         # Back to nodes and filters by name; of symmetric matrices the pairs i <= j.
-        results: dict[str, dict[str, ErrorStatistics]] = {node: {} for node in names_of(dataset, "node")}
+        results: dict[str, dict[str, ErrorStatistics]] = {node: {} for node in read_labels(dataset, "node")}
         sums = ("errors", "claimed", "nees", "failed", "failed_runs")
         for node, name, claim, values in iterate_filters(dataset, sums, [TIME]):
             results[node][name] = ErrorStatistics(
@@ -134,10 +140,9 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
         """
         import pandas as pd
 
-        # Failed runs stand in the row, without a warning each.
         rows, index = [], []
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the row says in how many runs it failed
+            warnings.simplefilter("ignore")  # of failed runs: the row says how many
             for node, filters in self.items():
                 for name, score in filters.items():
                     index.append((node, name))
@@ -166,13 +171,13 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
         """
         # What is drawn, on which axes.
         node, filters = choose_filters(self, node, filters)
-        places = state_places(states, self.states)
+        places = find_state_places(states, self.states)
         time = np.arange(1.0, self[node][filters[0]].nees.shape[1] + 1)
         drawn = make_panels(axes, len(places), time, self.units)
         for panel, i in zip(drawn, places, strict=True):
             for number, name in enumerate(filters):
                 # Solid: actual; dashed: claimed.
-                score, colour = self[node][name], colour_of(number)
+                score, colour = self[node][name], choose_colour(number)
                 claimed = score.claimed()[:, i, i]
                 panel.plot(time, np.sqrt(score.actual()[:, i, i]), color=colour, label=quote_for_figure(name))
                 panel.plot(time, np.sqrt(np.where(claimed >= 0, claimed, np.nan)), color=colour, linestyle="--")
@@ -204,12 +209,10 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
 
 def _summarise(score: "ErrorStatistics", states: Sequence[str]) -> Mapping[str, object]:
     """Return a filter's figures by name: RMSE, NEES with its interval, and RMSE and claim of each state."""
-    # Figures of all states together, then of each state.
     nees, low, high = score.nees_per_dimension()
     rmse, error = score.rmse()
-    # Figures of each state, after those of all together.
-    by_state = zip(states, *score.rmse_by_state(), score.deviation_by_state(), strict=True)
-    total = {
+    # All states together.
+    figures = {
         "claim": "none" if score.failed_runs else score.claim,
         "runs": score.runs,
         "failed runs": score.failed_runs,
@@ -219,10 +222,12 @@ def _summarise(score: "ErrorStatistics", states: Sequence[str]) -> Mapping[str, 
         "nees low": low,
         "nees high": high,
     }
+    # Each state.
+    by_state = zip(states, *score.rmse_by_state(), score.deviation_by_state(), strict=True)
     for state, rmse_of_state, error_of_state, claimed in by_state:
-        total |= {
+        figures |= {
             f"rmse of {state}": rmse_of_state,
             f"rmse error of {state}": error_of_state,
             f"claimed of {state}": claimed,
         }
-    return total
+    return figures

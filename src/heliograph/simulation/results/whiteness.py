@@ -52,7 +52,14 @@ class MemoryTest:
 
     @staticmethod
     def of(white: Float[np.ndarray, "steps m"], lags: int, claimed: bool) -> "MemoryTest":
-        """Return the test of whitened innovations; their power only where they are in units of a claim (`claimed`).
+        """Return the test of whitened innovations.
+
+        r_t = sum_k w_k w_(k+t) / sum_k w_k^2 at lags t, each product the mean over the components.
+
+        Args:
+            white: innovations w over their deviations, NaN where nothing arrived.
+            lags: number of lags.
+            claimed: whether they are in units of a claimed covariance, so that their power tells of it.
 
         Raises:
             ValueError: too few steps for the lags, nothing but zeros, innovations beyond all numbers.
@@ -63,25 +70,29 @@ class MemoryTest:
             raise fail("data", "innovations of which some are not zero", "nothing but zeros and missing ones")
         if np.isinf(white).any():
             raise fail("data", "innovations that are finite numbers of their deviations", "infinite ones")
-        # Correlations and their standard errors by lag: the same in any unit, so in one whose squares are numbers.
-        unit = 2.0 ** (int(np.frexp(np.nanmax(np.abs(white)))[1]) - 1)
+        # Correlations are the same in any unit: here one in which no square is too large for a number.
+        _, exponent = np.frexp(np.nanmax(np.abs(white)))
+        unit = 2.0 ** (int(exponent) - 1)
         white = white / unit
+        # Correlations and their standard errors by lag.
         size, size_error = average_correlated(_average_components(white**2))
         parts = [average_correlated(_average_components(white[:-t] * white[t:])) for t in range(1, lags + 1)]
         correlation, error = (np.array(column) / size for column in zip(*parts, strict=True))
-        # Lag 1 by itself; all lags for the predictable share (Yule and Walker).
+        # Lag 1 by itself: Gaussian; without an error, known.
         if error[0] > 0:
             p_value = float(2 * scipy.special.ndtr(-abs(correlation[0]) / error[0]))
         else:
             p_value = float(correlation[0] == 0)
-        # All together: a sum of squares, where an error that few numbers tell is no less than that of independent ones.
-        sure = correlation / np.maximum(error, 1 / np.sqrt(np.count_nonzero(~np.isnan(white).all(axis=1))))
+        # All together: sum of squares in errors, chi-squared; an error is at least that of as many independent rows.
+        rows = np.count_nonzero(~np.isnan(white).all(axis=1))
+        in_errors = correlation / np.maximum(error, 1 / np.sqrt(rows))
+        # Share of the variance that the best linear prediction from earlier ones takes (Yule and Walker).
         share = correlation @ np.linalg.lstsq(scipy.linalg.toeplitz([1.0, *correlation[:-1]]), correlation)[0]
         return MemoryTest(
             correlation=correlation,
             standard_error=error,
             p_value=p_value,
-            p_value_of_all=float(scipy.special.chdtrc(lags, np.sum(sure**2))),
+            p_value_of_all=float(scipy.special.chdtrc(lags, np.sum(in_errors**2))),
             predictable=float(share),
             power=size * unit * unit if claimed else np.nan,
             power_error=size_error * unit * unit if claimed else np.nan,
@@ -148,7 +159,7 @@ def whitened_innovations(
 
 
 def _average_components(parts: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, " steps"]:
-    """Return the mean over the components that are not NaN; NaN where none is."""
+    """Return the mean over each row's components that are not NaN; NaN where none is."""
     count = np.sum(~np.isnan(parts), axis=1)
     return np.asarray(np.where(count > 0, np.nansum(parts, axis=1) / np.maximum(count, 1), np.nan))
 
@@ -179,7 +190,7 @@ def score_innovations(
 
 
 def _whiten_innovations(filter: AbstractFilter, z: Array, u: Array) -> PyTree:
-    """Run a filter; return each row's log-likelihood, and its innovation made white, NaN where nothing arrived."""
+    """Return each row's log-likelihood (steps,) and its innovation made white (steps, m), NaN where nothing arrived."""
 
     def score_row(state: PyTree, innovation: Innovation, k: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return one row's log-likelihood and its whitened innovation (m,)."""

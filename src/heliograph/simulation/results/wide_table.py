@@ -13,23 +13,22 @@ if TYPE_CHECKING:
     import pandas as pd
 from heliograph.simulation.results.labelled import SENT
 
-LEVELS = ["node", "filter", "quantity", "component", "other"]  # of a table's columns
+LEVELS = ["node", "filter", "quantity", "component", "other"]  # of a table's columns; "" where one does not apply
+Column = tuple[str, str, str, str, str]  # labels of a column, one for each of LEVELS
+COVARIANCE: dict[str, Claim] = {f"covariance ({claim})": claim for claim in STRENGTH}  # claims by quantity
+MODES = "mode probability"  # a quantity
+_Key = tuple[str, str, str]  # node, filter, quantity
+_Places = dict[_Key, list[int]]  # of columns
 
 
-Column = tuple[str, str, str, str, str]
+def make_frame(fields: Mapping[str, Any], runs: int | None) -> "pd.DataFrame":
+    """Return the table of a record: a row for each time, or run and time; columns labelled as in LEVELS.
 
-
-COVARIANCE: dict[str, Claim] = {f"covariance ({claim})": claim for claim in STRENGTH}
-
-
-MODES = "mode probability"
-
-
-def record_frame(fields: Mapping[str, Any], runs: int | None) -> "pd.DataFrame":
-    """Return the table of a record's fields: a row for each time, or run and time; columns as in LEVELS."""
+    `fields`: the record's, by name. `runs`: number of its runs; None without an axis of runs.
+    """
     import pandas as pd
 
-    # Columns: truth, measurements, estimates, uplinks.
+    # Columns (run, time) by label: truth, measurements, estimates, uplinks.
     columns: dict[Column, np.ndarray] = {}
     if fields["truth"] is not None:
         columns |= {("", "", "truth", s, ""): fields["truth"][..., i] for i, s in enumerate(fields["states"])}
@@ -52,50 +51,66 @@ def record_frame(fields: Mapping[str, Any], runs: int | None) -> "pd.DataFrame":
     return frame
 
 
-def record_fields(frame: "pd.DataFrame") -> dict[str, Any]:
-    """Return the fields of the record of such a table.
+def read_frame(frame: "pd.DataFrame") -> dict[str, Any]:
+    """Return the fields of a record, by name, from a table that `make_frame` made.
 
     Raises:
         ValueError: no such table.
     """
     if list(getattr(getattr(frame, "columns", None), "names", ())) != LEVELS:
         raise fail("table", f"columns {LEVELS}, as Record.to_pandas makes them", type(frame).__name__)
-    # Values by (node, filter, quantity), components along the last axis.
+    # Places of the columns, and values (run, time, component), by (node, filter, quantity).
     runs = len(frame.index.unique("run")) if "run" in frame.index.names else None
     steps = len(frame) // (runs or 1)
     lead = (steps,) if runs is None else (runs, steps)
-    columns: dict[tuple[str, str, str], list[int]] = {}
-    for i, column in enumerate(frame.columns):
-        columns.setdefault(column[:3], []).append(i)
-    values = {key: frame.iloc[:, places].to_numpy().reshape(*lead, -1) for key, places in columns.items()}
+    places: _Places = {}
+    for i, (node, name, quantity, _, _) in enumerate(frame.columns):
+        places.setdefault((node, name, quantity), []).append(i)
+    values = {key: frame.iloc[:, columns].to_numpy().reshape(*lead, -1) for key, columns in places.items()}
     # States as the truth, else the first mean, has them.
-    named = next((places for (_, _, quantity), places in columns.items() if quantity in ("truth", "mean")), [])
-    states = tuple(frame.columns[i][3] for i in named)
+    named = next((columns for (_, _, quantity), columns in places.items() if quantity in ("truth", "mean")), [])
     measurements = {node: z for (node, _, quantity), z in values.items() if quantity == "measurement"}
     estimates: dict[str, dict[str, Estimate]] = {node: {} for node in measurements}
-    uplinks: dict[str, list[str]] = {}
-    for (node, name, quantity), value in values.items():
+    for node, name, quantity in values:
         if quantity in COVARIANCE:
-            # The last level numbers the states of attitudes.
-            order = [frame.columns[i][4] for i in columns[node, name, "mean"]]
-            attitude = tuple(order.index(str(i)) for i in range(len(order) - order.count("")))
-            moments = values[node, name, "mean"], value.reshape(*lead, len(states), len(states))
-            modes = values.get((node, name, MODES))
-            estimate = Estimate(*moments, COVARIANCE[quantity], modes, attitude=attitude)
-            estimates.setdefault(node, {})[name] = estimate
-        elif quantity == SENT[0]:
-            uplinks.setdefault(name, []).append(node)
+            estimates.setdefault(node, {})[name] = _read_estimate(frame, places, values, (node, name, quantity))
     return {
         "time": np.asarray(frame.index.get_level_values("time"))[:steps],
-        "states": states,
+        "states": tuple(frame.columns[i][LEVELS.index("component")] for i in named),
         "truth": values.get(("", "", "truth")),
         "measurements": measurements,
         "estimates": estimates,
-        # Uplinks with their nodes side by side.
-        "uplinks": {
-            name: Uplink(tuple(nodes), *(np.stack([values[n, name, q] for n in nodes], axis=-2) for q in SENT))
-            for name, nodes in uplinks.items()
-        },
+        "uplinks": _read_uplinks(values),
+    }
+
+
+def _read_estimate(frame: "pd.DataFrame", places: _Places, values: Mapping[_Key, np.ndarray], key: _Key) -> Estimate:
+    """Return the estimate of a node's filter; `key`: that of its covariance, which says the claim.
+
+    `places` of the columns and `values` (run, time, component), by key.
+    """
+    node, name, quantity = key
+    mean, covariance = values[node, name, "mean"], values[key]
+    # The last level of a mean's columns numbers the states of attitudes.
+    order = [frame.columns[i][LEVELS.index("other")] for i in places[node, name, "mean"]]
+    return Estimate(
+        mean,
+        covariance.reshape(*mean.shape, mean.shape[-1]),
+        COVARIANCE[quantity],
+        values.get((node, name, MODES)),
+        attitude=tuple(order.index(str(i)) for i in range(len(order) - order.count(""))),
+    )
+
+
+def _read_uplinks(values: Mapping[_Key, np.ndarray]) -> dict[str, Uplink]:
+    """Return what quantizers sent, by fusion, its nodes side by side; `values` (run, time, component) by key."""
+    nodes_of: dict[str, list[str]] = {}
+    for node, name, quantity in values:
+        if quantity == SENT[0]:
+            nodes_of.setdefault(name, []).append(node)
+    return {
+        name: Uplink(tuple(nodes), *(np.stack([values[node, name, q] for node in nodes], axis=-2) for q in SENT))
+        for name, nodes in nodes_of.items()
     }
 
 
@@ -109,7 +124,7 @@ def _keep_labels(columns: Sequence[Column]) -> Any:
 
 
 def _label_estimate(node: str, name: str, estimate: Estimate, states: Sequence[str]) -> dict[Column, np.ndarray]:
-    """Return the columns of an estimate: means, covariances with their claim, and probabilities of modes."""
+    """Return the columns (run, time) of an estimate by label: means, covariances with their claim, modes."""
     mean, covariance = np.asarray(estimate.mean), np.asarray(estimate.covariance)
     # Of an attitude's numbers, which one: "0", "1", "2" of the first, and so on.
     order = {place: str(i) for i, place in enumerate(estimate.attitude)}

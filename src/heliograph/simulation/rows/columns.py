@@ -72,12 +72,15 @@ class FilterColumns(NamedTuple):
 
 
 def find_filter_columns(network: Network, outputs: FlatLayout) -> tuple[FilterColumns, ...]:
-    """Return the columns of each filter's outputs: a row of the column numbers, read by name as outputs are."""
+    """Return the columns of each filter's outputs in rows that are laid out so.
+
+    They are found from a row that holds the numbers of its columns, read by name as outputs are.
+    """
     numbered = jax.tree.map(lambda leaf: leaf.astype(int), outputs.tree(np.arange(float(outputs.size))))
     mean = split_by_name(network, numbered, attrgetter("mean"), -3)
     covariance = split_by_name(network, numbered, attrgetter("covariance"), -4)
     judged, weighed = _collect_judgements(network, numbered), _collect_weights(network, numbered)
-    modes = {name: (int(c[0]), int(c[-1]) + 1) for name, c in collect_modes(network, numbered).items()}
+    modes = {name: (int(of[0]), int(of[-1]) + 1) for name, of in collect_modes(network, numbered).items()}
     tested = {(FUSED, name): TestColumns(*map(int, columns)) for name, columns in numbered["tested"].items()}
     return tuple(
         FilterColumns(
@@ -97,11 +100,14 @@ def find_filter_columns(network: Network, outputs: FlatLayout) -> tuple[FilterCo
 
 
 def _collect_weights(network: Network, outcome: PyTree) -> dict[tuple[str, str], WeighingColumns]:
-    """Return the columns of what each filter that weighs made of its components, by node and filter."""
+    """Return the columns of what each filter that weighs made of its components, by node and filter.
+
+    `outcome`: outputs of a step, with the numbers of their columns as values.
+    """
     parts = {
-        name: [np.asarray(field)[f, i] for field in outcome["weighed"][kind]]
-        for name, (kind, f, i) in network.places.items()
-        if outcome["weighed"][kind] is not None
+        name: [np.asarray(field)[place.filter, place.node] for field in outcome["weighed"][place.kind]]
+        for name, place in network.places.items()
+        if outcome["weighed"][place.kind] is not None
     }
     centrally = outcome["weighed_centrally"].items()
     central = {(FUSED, name): list(columns) for name, columns in centrally if columns is not None}
@@ -112,7 +118,7 @@ def _collect_weights(network: Network, outcome: PyTree) -> dict[tuple[str, str],
 
 
 def _collect_judgements(network: Network, outcome: PyTree) -> dict[str, dict[str, JudgementColumns]]:
-    """Return the columns of each part of a judgement, by node and filter."""
+    """Return the columns of each part of a judgement, by node and filter; `outcome` as of `_collect_weights`."""
     judged = {"estimates": outcome["judged"], "fused": {}}
     parts = [split_by_name(network, judged, partial(_read_field, i), -2) for i in range(len(JudgementColumns._fields))]
     by_node = {

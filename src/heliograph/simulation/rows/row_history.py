@@ -30,7 +30,7 @@ class RowHistory(NamedTuple):
     step: Int[Array, " row"]
     outputs: PyTree
 
-    def parts(self, row: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def read_row(self, row: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Return the measurements, the inputs and the time of a row."""
         given = self.held.shape[1]
         numbers = self.rows[row]
@@ -40,15 +40,18 @@ class RowHistory(NamedTuple):
         """Return the filters' states after a row."""
         return jax.tree.map(lambda leaf: leaf[row], self.state)
 
-    def interval(self, row: jax.Array, dt: int) -> jax.Array:
-        """Return the inputs (held ones, with the time since the row before at place `dt`) that led to a row."""
+    def inputs_into_row(self, row: jax.Array, dt: int) -> jax.Array:
+        """Return the inputs that led to a row: those held before it, with the time since then at place `dt`."""
         held = self.held[row - 1]
-        (_, _, time), (_, _, time_before) = self.parts(row), self.parts(row - 1)
+        (_, _, time), (_, _, time_before) = self.read_row(row), self.read_row(row - 1)
         return jnp.concatenate([held[:dt], (time - time_before)[None], held[dt:]])
 
-    def at_step(self, row: jax.Array, k: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return measurements and inputs at step k, which is the row's or one between it and the row before."""
-        received, given, step_of_row = self.parts(row)
+    def read_step(self, row: jax.Array, k: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return measurements and inputs at step k, which is the row's or one between it and the row before.
+
+        Between rows nothing is measured, and inputs are those held.
+        """
+        received, given, step_of_row = self.read_row(row)
         is_row, held = k == step_of_row.astype(self.step.dtype), self.held[row - 1]
         u = jnp.where(is_row, jnp.where(jnp.isnan(given), held, given), held)
         return jnp.where(is_row, received, jnp.nan), u

@@ -1,4 +1,8 @@
-"""Smoothed estimates after a row, given the rows after it: a sweep back over the history of the rows."""
+"""Smoothed estimates after a row, given the rows after it: a sweep back over the history of the rows.
+
+Where the plant has a time step dt as input, a row is one step of it; where time counts steps, there may be steps
+without measurements between rows.
+"""
 
 from collections.abc import Callable
 from functools import lru_cache
@@ -21,7 +25,7 @@ from heliograph.numerics.trees.static import Static, split_structure
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.centres.fusions import StackedFusions
 from heliograph.simulation.network import Network
-from heliograph.simulation.plausible_step import reasons
+from heliograph.simulation.plausible_step import read_reasons
 from heliograph.simulation.rows.row_history import RowHistory
 from heliograph.simulation.rows.row_step import NetworkStep
 from heliograph.simulation.stepping import AllFilters
@@ -30,7 +34,13 @@ NetworkSmootherStep: TypeAlias = "tuple[dict[int, SmootherStep], dict[str, Smoot
 
 
 class BackwardSweep(Module):
-    """What a sweep back over rows computes with: the filters that can be smoothed, by `kinds`, and their fusions."""
+    """What a sweep back over rows computes with.
+
+    Args:
+        network_step: step of the network's filters that can be smoothed.
+        fusions: of their estimates.
+        kinds: numbers of the kinds that can be smoothed.
+    """
 
     network_step: NetworkStep
     fusions: tuple[StackedFusions, ...]
@@ -39,32 +49,54 @@ class BackwardSweep(Module):
     def step(
         self, history: RowHistory, row: jax.Array, state: PyTree, received: jax.Array, u: jax.Array, k: jax.Array
     ) -> tuple[PyTree, NetworkSmootherStep]:
-        """Step all filters into a row, without implausible measurements; return also their smoother steps."""
-        by_kind, central = reasons(jax.tree.map(lambda leaf: leaf[row], history.outputs))
+        """Step all filters by step k into a row, without measurements that were implausible there.
+
+        Args:
+            history: what the filters made of each row at first.
+            row: number of the row.
+            state: of the filters before the step.
+            received: measurements of all nodes at step k.
+            u: inputs of the plant over the step.
+            k: number of the step, which is the row's or before it.
+
+        Returns:
+            The filters' states after the step, and their smoother steps.
+        """
+        by_kind, central = read_reasons(jax.tree.map(lambda leaf: leaf[row], history.outputs))
         skip = by_kind, {name: central[name] for name in self.network_step.filters.central}
-        after, outputs = self.network_step.filters.step(state, self.network_step.groups(received), u, k, skip=skip)
+        after, outputs = self.network_step.filters.step(
+            state, self.network_step.group_measurements(received), u, k, skip=skip
+        )
         return after, ({kind: outputs["smoother_steps"][kind] for kind in self.kinds}, outputs["central_steps"])
 
-    def start(self, history: RowHistory, row: jax.Array) -> PyTree:
-        """Return the filters' states after a row of the history."""
+    def states_after(self, history: RowHistory, row: jax.Array) -> PyTree:
+        """Return the states after a row of the filters that can be smoothed, as `AllFilters.step` takes them."""
         by_kind, central, *_ = history.state_after(row)
         return by_kind, {name: central[name] for name in self.network_step.filters.central}, (), (), {}, {}
 
-    def outputs(self, steps: NetworkSmootherStep, later: PyTree) -> tuple[dict[int, Estimate], dict[str, Estimate]]:
-        """Return the estimates after a step given what is later, by kind and by name; fused ones of these."""
+    def make_estimates(
+        self, steps: NetworkSmootherStep, later: PyTree
+    ) -> tuple[dict[int, Estimate], dict[str, Estimate]]:
+        """Return the smoothed estimates after a step: of nodes by kind, of the centre by name, with fused ones.
+
+        `steps`: smoother steps into it. `later`: each filter's Gaussian of the state given all data, in the same form.
+        """
         by_kind, central = _map_filters(lambda step, later: step.estimate_from(later), steps, later)
         parts = [by_kind.get(kind) for kind in range(max(self.kinds, default=-1) + 1)]
         for fusion in self.fusions:
-            central |= fusion.step((), parts, jnp.asarray(0))[1]
+            _, fused, _ = fusion.step((), parts, jnp.asarray(0))
+            central |= fused
         return by_kind, central
 
 
 def _map_filters(function: Callable[..., object], steps: NetworkSmootherStep, *rest: PyTree) -> PyTree:
-    """Map a function of one filter's step over the filters of each kind, (filter, node, ...), and the central ones."""
-    by_kind = {
-        kind: jax.vmap(jax.vmap(function))(step, *(tree[0][kind] for tree in rest)) for kind, step in steps[0].items()
-    }
-    return by_kind, {name: function(step, *(tree[1][name] for tree in rest)) for name, step in steps[1].items()}
+    """Return function(step, ...) of every filter, by kind (filter, node, ...) and by name as `steps` and `rest`."""
+    steps_by_kind, central_steps = steps
+    by_kind = {}
+    for kind, step in steps_by_kind.items():
+        by_kind[kind] = jax.vmap(jax.vmap(function))(step, *(rest_by_kind[kind] for rest_by_kind, _ in rest))
+    central = {name: function(step, *(by_name[name] for _, by_name in rest)) for name, step in central_steps.items()}
+    return by_kind, central
 
 
 StepOfRow: TypeAlias = "tuple[jax.Array, jax.Array]"  # a row, and a step at it or before it
@@ -73,23 +105,26 @@ StepInto: TypeAlias = "Callable[[BackwardSweep, RowHistory, StepOfRow], NetworkS
 
 @lru_cache
 def make_backward_sweep(static: Static, dt: int | None) -> tuple[Callable[..., PyTree], Callable[..., PyTree]]:
-    """Return (numbers, history, (begin, stop)) -> estimates after row `begin`, given the rows after it, up to `stop`.
+    """Return the function that smooths rows, and XLA's program of it.
 
-    The function, and XLA's program of it.
+    It takes the arrays of a `BackwardSweep`, the history, and (begin, stop), and returns the estimates after row
+    `begin` > 0 given the rows after it, up to `stop`. The smoother's terms of a step are computed again from the state
+    before it, and so are the steps between rows where time counts steps.
 
-    The smoother's terms of a step are computed again from the state before it, and so are the steps between rows where
-    time counts steps; begin > 0.
+    Args:
+        static: all of a `BackwardSweep` but its arrays.
+        dt: place of the time step among the inputs; None where time counts steps.
     """
     # Continuous time: one step per row. Discrete time: also the steps between the rows.
-    step_into: StepInto = _make_smoother_step_into if dt is None else _make_step_into_row(dt)
+    step_into: StepInto = _compute_step_into_k if dt is None else _make_step_into_row(dt)
     find_earlier = _find_earlier_step if dt is None else _find_earlier_row
 
     def run(numbers: list[jax.Array], history: RowHistory, span: jax.Array) -> PyTree:
-        """Smooth rows `begin` to `stop` from the last one back; return the outputs of the first."""
+        """Smooth rows `begin` to `stop` from the last one back; return the estimates after the first."""
         sweep: BackwardSweep = static.filled(numbers)
         begin, stop = span
         last = stop - 1, history.step[stop - 1]
-        # Steps from the last row back to row `begin`.
+        # How many steps lead from the last row back to row `begin`.
         count = stop - 1 - begin if dt is not None else history.step[stop - 1] - history.step[begin]
         # Zeros of the shapes of a smoother step, without computing one.
         shapes = jax.eval_shape(lambda: step_into(sweep, history, last))
@@ -98,7 +133,10 @@ def make_backward_sweep(static: Static, dt: int | None) -> tuple[Callable[..., P
         def step_back(
             i: jax.Array, carry: tuple[StepOfRow, NetworkSmootherStep, PyTree]
         ) -> tuple[StepOfRow, NetworkSmootherStep, PyTree]:
-            """Go one step back: x_k|N from x_(k+1)|N and the smoother step into k + 1; at first, i = 0, x_N|N."""
+            """Go one step back, i from 0 on: x_k|N from x_(k+1)|N and the smoother step into k + 1; at i = 0, x_N|N.
+
+            The carry: the step k + 1 (row and number), the smoother step into it, and x_(k+1)|N of each filter.
+            """
             place, steps_after, later = carry
             steps = step_into(sweep, history, place)
             passed = _map_filters(lambda step, later: step.back(later), steps_after, later)
@@ -108,7 +146,7 @@ def make_backward_sweep(static: Static, dt: int | None) -> tuple[Callable[..., P
 
         start = last, zeros, _map_filters(lambda step: step.end, zeros)
         _, steps, later = jax.lax.fori_loop(0, count + 1, step_back, start)
-        return sweep.outputs(steps, later)
+        return sweep.make_estimates(steps, later)
 
     return run, jax.jit(run, compiler_options=understood())
 
@@ -119,8 +157,10 @@ def _make_step_into_row(dt: int) -> StepInto:
     def step_into_row(sweep: BackwardSweep, history: RowHistory, place: StepOfRow) -> NetworkSmootherStep:
         """Return the smoother step into a row from the state after the row before."""
         row, _ = place
-        state, received = sweep.start(history, row - 1), history.parts(row)[0]
-        return sweep.step(history, row, state, received, history.interval(row, dt), history.step[row])[1]
+        state, (received, _, _) = sweep.states_after(history, row - 1), history.read_row(row)
+        u = history.inputs_into_row(row, dt)
+        _, smoother_steps = sweep.step(history, row, state, received, u, history.step[row])
+        return smoother_steps
 
     return step_into_row
 
@@ -131,16 +171,21 @@ def _find_earlier_row(history: RowHistory, place: StepOfRow) -> StepOfRow:
     return row - 1, history.step[row - 1]
 
 
-def _make_smoother_step_into(sweep: BackwardSweep, history: RowHistory, place: StepOfRow) -> NetworkSmootherStep:
-    """Return the smoother step at step k, by way of the steps without measurements since the row before."""
+def _compute_step_into_k(sweep: BackwardSweep, history: RowHistory, place: StepOfRow) -> NetworkSmootherStep:
+    """Return the smoother step into step k, by way of the steps without measurements since the row before.
+
+    `place`: the row that k is or leads to, and k.
+    """
     row, k = place
 
     def step_on(j: jax.Array, state: PyTree) -> PyTree:
         """Step the filters' states by step j."""
-        return sweep.step(history, row, state, *history.at_step(row, j), j)[0]
+        after, _ = sweep.step(history, row, state, *history.read_step(row, j), j)
+        return after
 
-    state = jax.lax.fori_loop(history.step[row - 1] + 1, k, step_on, sweep.start(history, row - 1))
-    return sweep.step(history, row, state, *history.at_step(row, k), k)[1]
+    state = jax.lax.fori_loop(history.step[row - 1] + 1, k, step_on, sweep.states_after(history, row - 1))
+    _, smoother_steps = sweep.step(history, row, state, *history.read_step(row, k), k)
+    return smoother_steps
 
 
 def _find_earlier_step(history: RowHistory, place: StepOfRow) -> StepOfRow:
@@ -168,6 +213,7 @@ class RowSmoother:
         if dt is not None and not (is_whole(dt) and 0 <= dt < len(network.inputs)):
             raise fail("dt", f"the place of one of {len(network.inputs)} inputs, or None", show_value(dt))
         self.network = network
+        # Filters that can be smoothed: of the nodes by kind, of the centre by name.
         kinds = tuple(
             k for k, kind in enumerate(network.kinds) if _can_smooth(_get_filter(network, k, kind.filters[0]))
         )
@@ -177,8 +223,10 @@ class RowSmoother:
             raise fail(
                 "smoothing", "a filter that keeps its covariance and says how its state moves", "none in the network"
             )
+        # The network's filters without its fusions, which have no part in a sweep: they fuse what comes out of it.
         alone = Network(network.plant, network.nodes, central, network.relays, network.common)
         fusions = tuple(fusion for fusion in AllFilters(network).fusions if self._fuses(fusion, kinds))
+        # The sweep as a function of its arrays, compiled when a history's length is known.
         with jax.enable_x64(True):
             self.sweep = BackwardSweep(NetworkStep(network, AllFilters(alone, kinds)), fusions, kinds)
             self._numbers, static = split_structure(self.sweep)
@@ -203,20 +251,27 @@ class RowSmoother:
         return self._programs[key]
 
     def estimates(self, history: RowHistory, begin: int, stop: int) -> dict[str, dict[str, Estimate]]:
-        """Return the estimates after row `begin` given the rows after it, up to `stop`, by node and filter."""
+        """Return the estimates after row `begin` given the rows after it, up to `stop`, by node and filter.
+
+        Args:
+            history: the rows.
+            begin: number of the row, from 1.
+            stop: number after that of the last row that is used.
+        """
         with jax.enable_x64(True):
             by_kind, fused = self._find_program(history)(history, np.array([begin, stop], dtype=np.int32))
         results: dict[str, dict[str, Estimate]] = {name: {} for name in self.network.names}
         for k, outputs in by_kind.items():
             for f, name in enumerate(self.network.kinds[k].filters):
                 for i, node in enumerate(self.network.groups[self.network.kinds[k].group]):
-                    results[node][name] = _estimate_of(outputs, outputs.claim, (f, i))
+                    results[node][name] = _take_estimate(outputs, outputs.claim, (f, i))
+        # Fused ones; a rule's claim follows from those of what it fuses.
         claims = {node: {name: outputs.claim for name, outputs in filters.items()} for node, filters in results.items()}
         for name, outputs in fused.items():
             fusion, claim = self.network.fused[name], outputs.claim
             if isinstance(fusion, Fusion):
                 claim = fusion.claim([claims[node][fusion.filter] for node in self.network.nodes_with(fusion.filter)])
-            results.setdefault(Network.FUSED, {})[name] = _estimate_of(outputs, claim, ())
+            results.setdefault(Network.FUSED, {})[name] = _take_estimate(outputs, claim, ())
         return {node: filters for node, filters in results.items() if filters}
 
 
@@ -225,7 +280,7 @@ def _take_only_run(results: PyTree) -> PyTree:
     return map_arrays(lambda leaf: leaf[0, ...], results)
 
 
-def _estimate_of(outputs: Estimate, claim: Claim, index: tuple[int, ...]) -> Estimate:
+def _take_estimate(outputs: Estimate, claim: Claim, index: tuple[int, ...]) -> Estimate:
     """Return the estimate at an index (filter, node) of stacked ones, with this claim where it is sound."""
     modes = None if outputs.modes is None else np.asarray(outputs.modes)[index]
     mean, covariance = (np.asarray(part)[index] for part in (outputs.mean, outputs.covariance))
@@ -233,12 +288,12 @@ def _estimate_of(outputs: Estimate, claim: Claim, index: tuple[int, ...]) -> Est
 
 
 def _get_filter(network: Network, kind: int, name: str) -> AbstractFilter:
-    """Return a filter of a kind at the first node of its group."""
+    """Return the filter `name` of a kind at the first node of its group, which stands for all of the kind."""
     return network.nodes[network.groups[network.kinds[kind].group][0]].filters[name]
 
 
 def _can_smooth(filter: AbstractFilter) -> bool:
-    """Return whether a filter can be smoothed."""
+    """Return whether a filter can be smoothed: whether it puts out smoother steps, by the shapes of one."""
     u, z = np.zeros(len(filter.inputs)), np.zeros(filter.received)
     try:
         with jax.enable_x64(True):

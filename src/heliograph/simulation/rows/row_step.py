@@ -32,32 +32,49 @@ NUMBERS_TOGETHER, NUMBERS = 2**14, 2**18  # in the rows of a turn and of a call:
 
 
 class NetworkStep(Module):
-    """Step of all filters of a network; `places` are the indices of each group's nodes in a row, (node, received)."""
+    """Step of all filters of a network on one row.
+
+    Args:
+        network: the network.
+        filters: its filters.
+
+    Field `places`: by group, where each node's measurements stand among all of a row (node, received).
+    """
 
     filters: AllFilters
     places: tuple[tuple[tuple[int, ...], ...], ...] = eqx.field(static=True)
 
     def __init__(self, network: Network, filters: AllFilters):
+        """Hold the filters, and where the nodes' measurements stand."""
         rows = network.rows
         self.filters = filters
         self.places = tuple(tuple(tuple(rows[name]) for name in names) for names in network.groups)
 
     def step(self, state: PyTree, received: jax.Array, u: jax.Array, k: jax.Array) -> tuple[PyTree, PyTree]:
-        """Step all filters, without implausible measurements; return the states and the outputs.
+        """Step all filters, without implausible measurements: return their next states and the outputs.
+
+        `received`: measurements of all nodes in their order.
 
         The outputs are "estimates" by kind and "fused" by name, and the judgements of the measurements, "judged" by
         kind and "judged_centrally" by name; "weighed" and "weighed_centrally" likewise, of filters that weigh.
         """
-        after, outputs = step_plausibly(self.filters, state, self.groups(received), u, k)
+        after, outputs = step_plausibly(self.filters, state, self.group_measurements(received), u, k)
         return after, {name: outputs[name] for name in OUTPUTS}
 
-    def groups(self, received: jax.Array) -> list[jax.Array]:
-        """Return the measurements of each group's nodes, (node, received)."""
+    def group_measurements(self, received: jax.Array) -> list[jax.Array]:
+        """Return the measurements (node, received) of each group, from those of all nodes in their order."""
         return [received[np.array(columns, dtype=int)] for columns in self.places]  # of nodes without a sensor none
 
 
 class RowLayout(NamedTuple):
-    """Structure of a network's step, and the columns of its rows: (state, received, inputs, step number)."""
+    """Structure of a network's step, and the columns of its rows: (state, received, inputs, step number).
+
+    Args:
+        static: all of a `NetworkStep` but its arrays.
+        state: how the filters' states stand in the first columns.
+        received: how many measurements follow.
+        inputs: how many inputs follow these.
+    """
 
     static: Static
     state: FlatLayout
@@ -69,7 +86,7 @@ class RowLayout(NamedTuple):
         """Length of a row before a step."""
         return self.state.size + self.received + self.inputs + 1
 
-    def parts(self, row: jax.Array) -> tuple[PyTree, jax.Array, jax.Array, jax.Array]:
+    def split_row(self, row: jax.Array) -> tuple[PyTree, jax.Array, jax.Array, jax.Array]:
         """Return the filters' states, the measurements, the inputs and the step number of a row."""
         known, rest = row[: self.state.size], row[self.state.size :]
         u, k = rest[self.received : self.received + self.inputs], rest[-1].astype(np.int64)
@@ -97,7 +114,7 @@ class RowStep:
         instance("network", network, Network, "a Network")
         self._network = network
         received, inputs = sum(node.received for node in network.nodes.values()), len(network.inputs)
-        # All filters, their states before the first step, and the layouts of both.
+        # All filters, apart from the arrays in them, and how their states before the first step stand in a row.
         filters = AllFilters(network, judges=True, tests=True)
         _check_reports(filters)
         start = initial_states(filters)
@@ -105,9 +122,11 @@ class RowStep:
         self._shapes = tuple(_make_shape(leaf.shape, leaf.dtype) for leaf in numbers)
         self.state = make_flat_layout(start)
         self._layout = RowLayout(static, self.state, received, inputs)
-        self.outputs = make_flat_layout(_trace_step(self._layout, self._shapes).out_info[1])
-        self.columns = find_filter_columns(network, self.outputs)
         self.start = np.concatenate([np.zeros(0), *(np.ravel(leaf).astype(float) for leaf in jax.tree.leaves(start))])
+        # How the outputs stand in a row, from the shapes of a step.
+        _, output_shapes = _trace_step(self._layout, self._shapes).out_info
+        self.outputs = make_flat_layout(output_shapes)
+        self.columns = find_filter_columns(network, self.outputs)
         # Native code with the network's numbers filled in, where it takes the step.
         self._numbers = [np.asarray(leaf) for leaf in numbers]
         row = np.zeros((1, self._layout.size))
@@ -178,7 +197,10 @@ class RowStep:
         return OneRowStep(self, None if self._code is None else self._code.for_runs(1))
 
     def __call__(self, rows: Float[np.ndarray, "row column"], alone: bool = False) -> Float[np.ndarray, "row column"]:
-        """Step each row; `alone`: calls with a single row, for which XLA needs no loop."""
+        """Return the states and outputs after each row's step.
+
+        `alone`: for calls with a single row, for which XLA needs no loop.
+        """
         if self._code is not None:
             stepped: np.ndarray = self._code(rows)
             return stepped
@@ -218,8 +240,8 @@ class OneRowStep:
 
 def _check_reports(filters: AllFilters) -> None:
     """Raise ValueError for reports lost by chance: a row says what a node measured, not which report arrived."""
-    for name, link in filters.reporting.items():
-        if link.uplinks.groups:
+    for name, by_report in filters.reporting.items():
+        if by_report.uplinks.groups:
             expected = "reports that arrive as they are sent, or the fusion as a filter (centre_filter)"
             raise fail(f"timeline: fusion {name!r}", expected, "links that chance has a part in")
 
@@ -231,11 +253,14 @@ def _make_shape(shape: tuple[int, ...], dtype: Any) -> Any:
 
 @lru_cache
 def _make_step(layout: RowLayout) -> Any:
-    """Return the function of one row to states and outputs, traced once for the outputs' layout, code and text."""
+    """Return the function (numbers, row) -> (states, outputs), traced once for the outputs' layout, code and text.
+
+    `numbers`: the arrays of the network's step.
+    """
 
     def step(numbers: list[jax.Array], row: jax.Array) -> tuple[PyTree, PyTree]:
         """Step a row of the network that has these numbers as its arrays; return states and outputs."""
-        stepped: tuple[PyTree, PyTree] = layout.static.filled(numbers).step(*layout.parts(row))
+        stepped: tuple[PyTree, PyTree] = layout.static.filled(numbers).step(*layout.split_row(row))
         return stepped
 
     return jax.jit(step, inline=True)
@@ -243,7 +268,7 @@ def _make_step(layout: RowLayout) -> Any:
 
 @lru_cache
 def _make_row_function(layout: RowLayout) -> Any:
-    """Return the function of one row to another, the same one for layouts that are equal."""
+    """Return the function (numbers, row) -> row of states and outputs, the same one for layouts that are equal."""
 
     def step(numbers: list[jax.Array], row: jax.Array) -> jax.Array:
         """Step a row; return states and outputs side by side."""
@@ -253,7 +278,10 @@ def _make_row_function(layout: RowLayout) -> Any:
 
 
 def _trace_step(layout: RowLayout, numbers: tuple[jax.ShapeDtypeStruct, ...]) -> Any:
-    """Return the traced step of a row, which JAX holds for networks that differ in numbers alone."""
+    """Return the traced step of a row, which JAX holds for networks that differ in numbers alone.
+
+    `numbers`: shapes and types of the step's arrays.
+    """
     with jax.enable_x64(True):
         return _make_step(layout).trace(list(numbers), _make_shape((layout.size,), np.float64))
 

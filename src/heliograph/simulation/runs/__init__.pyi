@@ -1,21 +1,21 @@
 """Names that other folders take; the package loads them when first used."""
 
 from .by_run import apply_to_each_run as apply_to_each_run
-from .by_run import read_by as read_by
+from .by_run import list_used_leaves as list_used_leaves
 from .by_run import simulate_trajectories as simulate_trajectories
 from .compilation_cache import keep_compilations as keep_compilations
 from .lanes import LANES as LANES
 from .lanes import RunLanes as RunLanes
 from .lanes import SharedResult as SharedResult
-from .lanes import added as added
+from .lanes import add_sums as add_sums
 from .lanes import advance_in_chunks as advance_in_chunks
-from .lanes import batch_counts as batch_counts
+from .lanes import count_runs_by_batch as count_runs_by_batch
+from .lanes import has_processor_alone as has_processor_alone
 from .lanes import is_shared as is_shared
-from .lanes import one_processor as one_processor
 from .memory import NeededMemory as NeededMemory
 from .memory import check_memory as check_memory
+from .memory import count_bytes as count_bytes
 from .memory import explain_out_of_memory as explain_out_of_memory
-from .memory import size_of as size_of
 from .native import simulate_natively as simulate_natively
 from .side_by_side import StackedFilters as StackedFilters
 from .side_by_side import StepOutput as StepOutput

@@ -16,40 +16,47 @@ from heliograph.numerics.types import PyTree
 def simulate_trajectories(
     init: Callable[[jax.Array], PyTree], step: Callable[..., tuple[PyTree, PyTree]], keys: jax.Array, rows: PyTree
 ) -> PyTree:
-    """Return outputs of `step(carry, key, row)` from `init(key)` on, (run, time, ...); (1, time, ...) if common.
+    """Return the outputs over time of all runs, (run, time, ...), or (1, time, ...) of what all runs share.
 
-    The axis of runs is the last one of every array inside: a processor works through them contiguously.
+    Inside, the axis of runs is the last one of every array: a processor works through them contiguously.
+
+    Args:
+        init: of a run's key, its state before the first step.
+        step: of (state, key, row), the next state and the outputs.
+        keys: of the runs (run,).
+        rows: what the steps are given, with a leading axis of time; common to all runs.
     """
-    start, varies, tree = _start_runs(init, keys)
-    example = jax.tree.map(lambda leaf: leaf[0], rows)
-    example_carry = [leaf[..., 0] if v else leaf for leaf, v in zip(start, varies, strict=True)]
+    start, start_varies, tree = _start_runs(init, keys)
+    example_row = jax.tree.map(lambda leaf: leaf[0], rows)
+    example_state = [leaf[..., 0] if v else leaf for leaf, v in zip(start, start_varies, strict=True)]
+    count = len(example_state)  # results of a step: so many leaves of the next state, then the outputs'
     # One run's step, without operations that no result needs.
-    traced, shape = jax.make_jaxpr(
-        lambda carry, key, row: step(jax.tree.unflatten(tree, carry), key, row), return_shape=True
-    )(example_carry, keys[0], example)
+    traced, (_, output_shape) = jax.make_jaxpr(
+        lambda state, key, row: step(jax.tree.unflatten(tree, state), key, row), return_shape=True
+    )(example_state, keys[0], example_row)
     body = _drop_unused(traced)
-    row_varies = [False] * len(jax.tree.leaves(example))
-    # Parts of the carry that depend on the key at some step, as a fixed point; then those of the outputs.
-    carry_varies = _find_fixed_point(
-        lambda marks: _dependent(body, [*marks, True, *row_varies])[: len(example_carry)], varies
+    row_varies = [False] * len(jax.tree.leaves(example_row))
+    # Parts of the state that depend on the key at some step, as a fixed point; then those of the outputs.
+    state_varies = _find_fixed_point(
+        lambda marks: _mark_dependent_results(body, [*marks, True, *row_varies])[:count], start_varies
     )
-    output_varies = _dependent(body, [*carry_varies, True, *row_varies])[len(example_carry) :]
-    # The step for all runs: an axis of runs only where values differ. The arguments are carry, key and row.
-    in_axes = [*_axes(carry_varies), 0, *_axes(row_varies)]
-    advance = jax.vmap(jaxpr_as_fun(body), in_axes=in_axes, out_axes=_axes([*carry_varies, *output_varies]))
+    output_varies = _mark_dependent_results(body, [*state_varies, True, *row_varies])[count:]
+    # The step for all runs: an axis of runs only where values differ. The arguments are state, key and row.
+    in_axes = [*_axes(state_varies), 0, *_axes(row_varies)]
+    advance = jax.vmap(jaxpr_as_fun(body), in_axes=in_axes, out_axes=_axes([*state_varies, *output_varies]))
 
-    def step_all(carry: list[jax.Array], row: PyTree) -> tuple[list[jax.Array], list[jax.Array]]:
-        """Step all runs."""
-        results = advance(*carry, keys, *jax.tree.leaves(row))
-        return results[: len(example_carry)], results[len(example_carry) :]
+    def step_all(state: list[jax.Array], row: PyTree) -> tuple[list[jax.Array], list[jax.Array]]:
+        """Step all runs: return the leaves of their next states, and those of their outputs."""
+        results = advance(*state, keys, *jax.tree.leaves(row))
+        return results[:count], results[count:]
 
     # What is common at first and differs later begins as copies.
     begin = [jnp.broadcast_to(leaf[..., None], (*leaf.shape, len(keys))) if later and not now else leaf
-             for leaf, now, later in zip(start, varies, carry_varies, strict=True)]  # fmt: skip
-    outcome = jax.lax.scan(step_all, begin, rows)[1]
+             for leaf, now, later in zip(start, start_varies, state_varies, strict=True)]  # fmt: skip
+    _, outcome = jax.lax.scan(step_all, begin, rows)
     # The axis of runs first again.
     outputs = [jnp.moveaxis(leaf, -1, 0) if v else leaf[None] for leaf, v in zip(outcome, output_varies, strict=True)]
-    return jax.tree.unflatten(jax.tree.structure(shape[1]), outputs)
+    return jax.tree.unflatten(jax.tree.structure(output_shape), outputs)
 
 
 def apply_to_each_run(function: Callable[[PyTree], PyTree], values: PyTree) -> PyTree:
@@ -61,12 +68,15 @@ def apply_to_each_run(function: Callable[[PyTree], PyTree], values: PyTree) -> P
     runs = max(len(leaf) for leaf in leaves)
     varies = [len(leaf) == runs for leaf in leaves]
     of_first = [leaf[0] for leaf in leaves]
-    # Which results depend on values of single runs: those that, alone, keep an operand that varies.
     traced, shape = jax.make_jaxpr(lambda *leaves: function(jax.tree.unflatten(tree, leaves)), return_shape=True)(
         *of_first
     )
+    # Which results depend on values of single runs: a program of one result alone still needs such an argument.
     results = range(len(traced.jaxpr.outvars))
-    result_varies = [_any_of(varies, dce_jaxpr(traced.jaxpr, [i == j for j in results])[1]) for i in results]
+    result_varies = []
+    for i in results:
+        _, needed = dce_jaxpr(traced.jaxpr, [i == j for j in results])
+        result_varies.append(any(v and n for v, n in zip(varies, needed, strict=True)))
     # The axis of runs last inside, first outside.
     apply = jax.vmap(jaxpr_as_fun(traced), in_axes=_axes(varies), out_axes=_axes(result_varies), axis_size=runs)
     arguments = [jnp.moveaxis(leaf, 0, -1) if v else leaf[0] for leaf, v in zip(leaves, varies, strict=True)]
@@ -75,23 +85,21 @@ def apply_to_each_run(function: Callable[[PyTree], PyTree], values: PyTree) -> P
     return jax.tree.unflatten(jax.tree.structure(shape), outputs)
 
 
-def read_by(function: Callable[[PyTree], PyTree], values: PyTree) -> list[PyTree]:
-    """Return the leaves of values (or their shapes) that a result of the function depends on."""
+def list_used_leaves(function: Callable[[PyTree], PyTree], values: PyTree) -> list[PyTree]:
+    """Return the leaves of `values` (or their shapes) on which some result of the function depends."""
     leaves, tree = jax.tree.flatten(values)
     traced = jax.make_jaxpr(lambda *leaves: function(jax.tree.unflatten(tree, leaves)))(*leaves)
-    used = dce_jaxpr(traced.jaxpr, [True] * len(traced.jaxpr.outvars))[1]
-    return [leaf for leaf, u in zip(leaves, used, strict=True) if u]
-
-
-def _any_of(varies: Sequence[bool], used: Sequence[bool]) -> bool:
-    """Return whether something that varies is used."""
-    return any(v and u for v, u in zip(varies, used, strict=True))
+    _, used = dce_jaxpr(traced.jaxpr, [True] * len(traced.jaxpr.outvars))
+    return [leaf for leaf, is_used in zip(leaves, used, strict=True) if is_used]
 
 
 def _start_runs(init: Callable[[jax.Array], PyTree], keys: jax.Array) -> tuple[list[jax.Array], list[bool], PyTree]:
-    """Return the leaves of each run's first state, which of them differ between runs, and their structure."""
+    """Return the leaves of all runs' first states, which of them differ between runs, and their structure.
+
+    Those that differ are (..., run).
+    """
     traced, shape = jax.make_jaxpr(init, return_shape=True)(keys[0])
-    varies = _dependent(traced, [True])
+    varies = _mark_dependent_results(traced, [True])
     start = jax.vmap(jaxpr_as_fun(traced), out_axes=_axes(varies))(keys)
     return start, varies, jax.tree.structure(shape)
 
@@ -102,7 +110,7 @@ def _drop_unused(program: ClosedJaxpr) -> ClosedJaxpr:
     return ClosedJaxpr(jaxpr, program.consts)
 
 
-def _find_dependent(program: ClosedJaxpr, inputs: Sequence[bool]) -> set[Var]:
+def _find_dependent_variables(program: ClosedJaxpr, inputs: Sequence[bool]) -> set[Var]:
     """Return the variables that depend on the marked inputs; each operation is assumed to use all its arguments."""
     marked = {v for v, mark in zip(program.jaxpr.invars, inputs, strict=True) if mark}
     for operation in program.jaxpr.eqns:
@@ -111,14 +119,14 @@ def _find_dependent(program: ClosedJaxpr, inputs: Sequence[bool]) -> set[Var]:
     return marked
 
 
-def _dependent(program: ClosedJaxpr, inputs: Sequence[bool]) -> list[bool]:
+def _mark_dependent_results(program: ClosedJaxpr, inputs: Sequence[bool]) -> list[bool]:
     """Return the mask of the results that depend on the marked inputs."""
-    marked = _find_dependent(program, inputs)
+    marked = _find_dependent_variables(program, inputs)
     return [not isinstance(v, Literal) and v in marked for v in program.jaxpr.outvars]
 
 
 def _find_fixed_point(step: Callable[[list[bool]], list[bool]], marks: list[bool]) -> list[bool]:
-    """Return the marks of a carry that steps do not change any more; a step only adds marks."""
+    """Return the marks that `step` does not change any more, from `marks` on; marks are only added."""
     more = [before or after for before, after in zip(marks, step(marks), strict=True)]
     return marks if more == marks else _find_fixed_point(step, more)
 

@@ -50,21 +50,22 @@ def _find_default_folder() -> Path:
 
 
 def _make_private(path: Path) -> None:
-    """Make the folder so that nobody else can write to it; raise one line if it is another user's."""
+    """Make a folder to which nobody else can write; raise ValueError if it is another user's."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.mkdir(mode=PRIVATE, exist_ok=True)
-        there = path.stat()
-        if hasattr(os, "getuid") and there.st_uid == os.getuid() and there.st_mode & OTHERS_WRITE:
+        status = path.stat()
+        if hasattr(os, "getuid") and status.st_uid == os.getuid() and status.st_mode & OTHERS_WRITE:
             path.chmod(PRIVATE)  # as an earlier release made it
-            there = path.stat()
+            status = path.stat()
     except OSError as error:
         raise _fail(f"folder {path}", "one that can be made", error.strerror) from None
-    if hasattr(os, "getuid") and there.st_uid not in (os.getuid(), 0):
-        raise _fail(f"folder {path}", "the user's own", f"that of user {there.st_uid}")
+    if hasattr(os, "getuid") and status.st_uid not in (os.getuid(), 0):
+        raise _fail(f"folder {path}", "the user's own", f"that of user {status.st_uid}")
 
 
 def _fail(name: str, expected: str, got: object) -> ValueError:
+    """Return the error that the library's `fail` makes, importing it only now."""
     from heliograph.numerics.check import fail  # it loads NumPy and JAX, for which --help need not wait
 
     return fail(name, expected, got)

@@ -26,8 +26,8 @@ Progress = Callable[[int, int], None]
 Advance = Callable[[np.ndarray, PyTree], tuple[PyTree, PyTree]]  # blocks of runs, carry -> carry, collected results
 
 
-def one_processor() -> bool:
-    """Test whether JAX sees nothing but a processor."""
+def has_processor_alone() -> bool:
+    """Return whether JAX sees nothing but a processor."""
     return len(jax.devices()) == 1 and jax.default_backend() == "cpu"
 
 
@@ -35,14 +35,21 @@ class RunLanes:
     """Carries of all lanes, and their advance over the blocks of a chunk.
 
     A lane is a row of blocks that are summed one after another; its carry is the sum so far.
-
-    `alone` advances one lane over blocks (count, BLOCK) of runs, `together` all lanes at once, with a leading axis.
-    `one_by_one`: for programs that decompose large matrices: two at once wait for each other's threads forever.
     """
 
     def __init__(
         self, alone: Advance, together: Advance, start: Callable[[], PyTree], first_run: int, one_by_one: bool = False
     ):
+        """Begin before the first block.
+
+        Args:
+            alone: advances one lane over blocks (count, BLOCK) of runs, from its carry.
+            together: advances all lanes at once, with a leading axis of lanes.
+            start: makes the carry of a lane before its first block.
+            first_run: number of the first run.
+            one_by_one: one lane at a time, for programs that decompose large matrices: two at once wait for each
+                other's threads forever.
+        """
         self.one_by_one = one_by_one
         self.alone, self.together, self.start, self.first_run = alone, together, start, first_run
         devices, processor = len(jax.devices()), jax.default_backend() == "cpu"
@@ -61,7 +68,10 @@ class RunLanes:
         return jax.tree.map(lambda *parts: _order_blocks(np.concatenate(parts), dealt), *recorded)
 
     def _run_in_threads(self, runs: np.ndarray, lanes: list[np.ndarray]) -> list[PyTree]:
-        """Run each lane in a thread of its own, carrying its sums on; return what is recorded of each run, by lane."""
+        """Run each lane in a thread of its own, carrying its sums on; return what is recorded of each run, by lane.
+
+        `runs` (block, BLOCK): numbers of the runs. `lanes`: which of these blocks are each lane's.
+        """
 
         def advance_lane(lane: int) -> PyTree:
             """Advance one lane over its blocks."""
@@ -75,7 +85,10 @@ class RunLanes:
         return list(self.pool.map(advance_lane, [lane for lane, blocks in enumerate(lanes) if len(blocks)]))
 
     def _run_on_devices(self, runs: np.ndarray, lanes: list[np.ndarray]) -> list[PyTree]:
-        """Run one lane on each device, carrying their sums on; return what is recorded of each run, by lane."""
+        """Run all lanes at once, dealt to the devices; return what is recorded of each run, by lane.
+
+        Arguments as of `_run_in_threads`; all lanes have as many blocks.
+        """
         shared = NamedSharding(Mesh(np.array(jax.devices()), ("lane",)), PartitionSpec("lane"))  # type: ignore[no-untyped-call]
         if isinstance(self.carries, list):
             carries = jax.tree.map(lambda leaf: np.stack([leaf] * self.count), to_numpy(self.start()))
@@ -94,7 +107,7 @@ class RunLanes:
         else:
             lanes = [jax.tree.map(lambda leaf: np.asarray(leaf)[lane], self.carries) for lane in range(self.count)]  # noqa: B023
         with jax.enable_x64(True):
-            return to_numpy(reduce(added, lanes))
+            return to_numpy(reduce(add_sums, lanes))
 
 
 class SharedResult(NamedTuple):
@@ -104,12 +117,12 @@ class SharedResult(NamedTuple):
 
 
 def is_shared(leaf: PyTree) -> bool:
-    """Test whether a part of the sums is common to all runs."""
+    """Return whether a part of the sums over runs is a result that all runs share, and no sum."""
     return isinstance(leaf, SharedResult)
 
 
 @partial(jax.jit, donate_argnums=0)
-def added(total: PyTree, more: PyTree) -> PyTree:
+def add_sums(total: PyTree, more: PyTree) -> PyTree:
     """Return the sums of two trees, in the memory of the first; values that all runs share stay as they are.
 
     In place, since of many nodes these are hundreds of megabytes, which take longer to allocate than to add.
@@ -122,11 +135,17 @@ def advance_in_chunks(
 ) -> list[PyTree]:
     """Advance over all blocks, chunk by chunk, with progress between; return what each chunk collected.
 
-    `runs`: how many there are, and how many a chunk has. A chunk has fewer blocks than there are lanes, or a multiple
-    of their number.
+    A chunk has fewer blocks than there are lanes, or a multiple of their number.
+
+    Args:
+        advance: over (number of the first block, count of blocks); returns what is collected.
+        lanes: their number.
+        wide: always a multiple of it.
+        runs: how many there are, and how many a chunk has.
+        progress: is called with how many runs are done, and of how many.
     """
     count, chunk = runs
-    blocks = -(-min(chunk, count) // BLOCK)
+    blocks = -(-min(chunk, count) // BLOCK)  # of a chunk
     if blocks >= lanes or wide:
         blocks = lanes * -(-blocks // lanes)
     parts = []
@@ -137,13 +156,13 @@ def advance_in_chunks(
     return parts
 
 
-def batch_counts(first_run: int, stop: int) -> np.ndarray:
-    """Return the number of runs of each batch, (batch,)."""
+def count_runs_by_batch(first_run: int, stop: int) -> np.ndarray:
+    """Return how many runs from number `first_run` up to `stop` are in each batch, (batch,)."""
     return np.bincount(np.arange(first_run, stop) % BATCHES, minlength=BATCHES).astype(float)
 
 
 def _order_blocks(recorded: np.ndarray, dealt: np.ndarray) -> np.ndarray:
-    """Return blocks (block, BLOCK, ...) that came lane by lane, `dealt` their numbers, as runs in order."""
+    """Return what was recorded of blocks (block, BLOCK, ...) as (run, ...) in order; `dealt`: number of each block."""
     ordered = np.empty_like(recorded)
     ordered[dealt] = recorded
     return ordered.reshape(recorded.shape[0] * recorded.shape[1], *recorded.shape[2:])  # a length may be zero

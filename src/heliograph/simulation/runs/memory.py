@@ -20,7 +20,10 @@ FEWER = f"fewer runs at once (`first_run` goes on from there), keep=Statistics()
 class NeededMemory(NamedTuple):
     """Bytes that runs hold at the same time.
 
-    `collected` of single runs, `sums` over runs by step and batch, and `trajectories` of the runs in flight.
+    Args:
+        collected: results of single runs.
+        sums: over runs, by step and batch.
+        trajectories: of the runs that are computed at once.
     """
 
     collected: float
@@ -28,8 +31,8 @@ class NeededMemory(NamedTuple):
     trajectories: float
 
 
-def size_of(tree: PyTree) -> float:
-    """Return the bytes of the arrays of a tree, or of their shapes."""
+def count_bytes(tree: PyTree) -> float:
+    """Return how many bytes the arrays of a tree have, or arrays of its shapes would have."""
     return float(sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree)))
 
 
@@ -47,7 +50,7 @@ def find_available_memory() -> float | None:
 
 
 def check_memory(needed: NeededMemory, runs: int, horizon: int) -> None:
-    """Refuse runs that need more memory than there is.
+    """Raise ValueError for runs that need more memory than there is; nothing where the machine does not say.
 
     Raises:
         ValueError: more is needed, with both numbers, the largest part, and what needs less.
@@ -57,7 +60,8 @@ def check_memory(needed: NeededMemory, runs: int, horizon: int) -> None:
         return
     part, most = max(needed._asdict().items(), key=lambda item: item[1])
     less = FEWER if part == "collected" else LESS
-    got = f"{total / GB:.3g} GB for runs={runs}, horizon={horizon}, {most / GB:.3g} GB of them {_WORDS[part]}: {less}"
+    largest = f"{most / GB:.3g} GB of them {_DESCRIPTIONS[part]}"
+    got = f"{total / GB:.3g} GB for runs={runs}, horizon={horizon}, {largest}: {less}"
     raise fail("memory of a simulation", f"at most {free / GB:.3g} GB, which are available", got)
 
 
@@ -77,7 +81,7 @@ def explain_out_of_memory(runs: int, horizon: int) -> Iterator[None]:
         raise fail("memory of a simulation", "what the system gives", got) from None
 
 
-_WORDS = {
+_DESCRIPTIONS = {
     "collected": "results of single runs",
     "sums": "sums by step and batch of runs",
     "trajectories": "trajectories of runs side by side",

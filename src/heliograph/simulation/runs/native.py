@@ -46,8 +46,14 @@ def compile_runs(
 ) -> NativeProgram:
     """Compile the native code of a network's runs, of which a reducer collects the results of its `of_step`.
 
-    `runs`: how many will follow. With `later`, the results are a pair: of filtered and of smoothed estimates; and sums
-    of the NIS.
+    Args:
+        world: the network to be simulated, as a step.
+        inputs: of the plant (horizon, inputs).
+        key: of all runs.
+        reducer: says what is collected of each run.
+        runs: how many will follow.
+        later: smooths each run; then results are pairs, of filtered and of smoothed estimates, and sums of the NIS.
+        precision: in which runs are computed.
 
     Raises:
         Unsupported: a program that native code does not support.
@@ -57,7 +63,7 @@ def compile_runs(
     (of_world, arrays), (of_rest, others) = _describe_world(world), _describe((later, inputs, reducer))
     try:
         compiled = _find_program(of_world, of_rest, bool(jax.threefry_partitionable.value), precision)
-    except TypeError as error:
+    except TypeError as error:  # structures are keys of a cache
         if "unhashable" not in str(error):
             raise
         raise Unsupported("a network with an object that cannot be compared with another") from None
@@ -68,13 +74,19 @@ def compile_runs(
 
 
 def check_memory_of_parts(code: NativeProgram, parts: int, runs: int, horizon: int, precision: Precision) -> None:
-    """Refuse runs that need more memory than there is; the results of all parts of a network are held together.
+    """Raise ValueError for runs that need more memory than there is.
 
-    `code`: of the first part; the others are no larger.
+    Args:
+        code: of the first part of a network; the others are no larger.
+        parts: how many parts the network was split into, whose results are held together.
+        runs: how many.
+        horizon: number of steps.
+        precision: in which runs are computed.
 
     Raises:
         ValueError: more memory than is available.
     """
+    # Memory of what is collected, of sums in each lane, and of lanes that run at once.
     lanes = min(LANES, -(-runs // BLOCK))
     collected, sums, variables = code.begun.program.measure_memory(runs, lanes, min(lanes, os.cpu_count() or 1))
     collected *= 2 if precision == "float32" else 1  # results are handed back in double precision
@@ -94,9 +106,13 @@ def _read_key(key: jax.Array) -> np.ndarray:
 
 
 class _KnownEntries:
-    """Knowledge of an array when a program is made: its shape and type, zeros and ones, and all entries of integers."""
+    """Knowledge of an array when a program is made: its shape and type, zeros and ones, and all entries of integers.
+
+    Two are equal if all of this is, so that programs are cached by it.
+    """
 
     def __init__(self, shape: tuple[int, ...], kind: str, known: bytes, values: bytes):
+        """Hold the shape, the type `kind`, the mask of entries that are known, and all values with 0 for the others."""
         self.shape, self.kind, self.known, self.values = shape, kind, known, values
         self.key = shape, kind, known, values
 
@@ -109,8 +125,8 @@ class _KnownEntries:
     @classmethod
     def of(cls, array: np.ndarray) -> "_KnownEntries":
         """Describe an array: shape, type, which of its entries are known to a program, and their values."""
-        known = _is_plain(array) if array.dtype.kind == "f" else np.full(array.shape, not _is_given(array))
-        if array.size > FEW and _is_given(array):
+        known = _find_plain(array) if array.dtype.kind == "f" else np.full(array.shape, not _is_argument(array))
+        if array.size > FEW and _is_argument(array):
             known[...] = False
         values = np.where(known, array, 0).astype(array.dtype)
         return cls(array.shape, array.dtype.str, known.tobytes(), values.tobytes())
@@ -126,21 +142,28 @@ class _KnownEntries:
         return np.frombuffer(self.values, dtype=self.kind).reshape(self.shape)
 
 
-def _is_plain(array: np.ndarray) -> np.ndarray:
-    """Return which entries are numbers that a program knows, those of PLAIN."""
+def _find_plain(array: np.ndarray) -> np.ndarray:
+    """Return the mask of the entries that are 0, 1 or -1 (PLAIN)."""
     plain: np.ndarray = np.logical_or.reduce([array == number for number in PLAIN])
     return plain
 
 
-def _is_given(array: np.ndarray) -> bool:
-    """Test whether an array is an argument of a program: reals, and checksums of names. Other integers are known."""
+def _is_argument(array: np.ndarray) -> bool:
+    """Return whether an array is an argument of a program: reals, and checksums of names (uint32).
+
+    Other integers are part of the program.
+    """
     return array.dtype.kind == "f" or array.dtype == np.uint32
 
 
 class _Structure(NamedTuple):
-    """All of a tree but the numbers of its arrays: `fixed` leaves, such as a user's functions, None in place of arrays.
+    """All of a tree but the numbers of its arrays.
 
-    `known`: what is known of each array when a program is made.
+    Args:
+        tree: structure of the tree, as JAX has it.
+        fixed: leaves that are no arrays, such as a user's functions; None in place of arrays.
+        is_fixed: which leaves are no arrays.
+        known: what is known of each array when a program is made.
     """
 
     tree: Any
@@ -155,7 +178,7 @@ class _Structure(NamedTuple):
 
 
 def _describe(tree: PyTree) -> tuple[_Structure, tuple[np.ndarray, ...]]:
-    """Take a tree apart into its structure and its arrays."""
+    """Return a tree's structure and its arrays, of which `_Structure.restore` makes the tree again."""
     leaves, structure = jax.tree.flatten(tree)
     is_fixed = tuple(not eqx.is_array(leaf) for leaf in leaves)
     fixed = tuple(leaf if f else None for leaf, f in zip(leaves, is_fixed, strict=True))
@@ -165,7 +188,7 @@ def _describe(tree: PyTree) -> tuple[_Structure, tuple[np.ndarray, ...]]:
 
 @cache_by_object
 def _describe_world(world: World) -> tuple[_Structure, tuple[np.ndarray, ...]]:
-    """Take a world apart, once for all simulations of it."""
+    """Return a world's structure and its arrays, once for all simulations of it."""
     return _describe(world)
 
 
@@ -173,9 +196,9 @@ def _describe_world(world: World) -> tuple[_Structure, tuple[np.ndarray, ...]]:
 def _find_program(
     world: _Structure, rest: _Structure, counting: bool, precision: Precision
 ) -> tuple[Any, Any] | Unsupported:
-    """Return what `_compile_program` does, cached; returned and not raised, so cached too, is why there is none.
+    """Return what `_compile_program` does, cached, or the reason why there is none, which is cached so too.
 
-    `counting` is only part of the cache's key: what is traced depends on JAX's way of counting draws.
+    `counting` (JAX's way of counting draws) is only part of the cache's key: what is traced depends on it.
     """
     try:
         return _compile_program(world, rest, precision)
@@ -184,42 +207,52 @@ def _find_program(
 
 
 def _compile_program(of_world: _Structure, of_rest: _Structure, precision: Precision) -> tuple[Any, Any]:
-    """Compile the code of worlds of one structure; also return the structure of what is collected of a run.
+    """Return the code of worlds of one structure, and the structure of what its runs return, as an `OfStep`.
 
-    `of_rest`: of the smoother that follows, the inputs and the reducer.
+    Args:
+        of_world: structure of the world.
+        of_rest: structure of (smoother that follows or None, inputs, reducer).
+        precision: in which runs are computed.
     """
     form: list[Any] = []  # filled when `run` is traced
 
     def run(key: jax.Array, *leaves: Any) -> tuple[PyTree, PyTree]:
         """Simulate one run from the program's arrays and the run's number; return what is summed, and what is kept."""
         *arrays, number = leaves
-        items = iter(arrays)
-        world, (later, inputs, reducer) = of_world.restore(items), of_rest.restore(items)
+        remaining = iter(arrays)
+        world, (later, inputs, reducer) = of_world.restore(remaining), of_rest.restore(remaining)
         run_key, u = jax.random.fold_in(key, number), jnp.asarray(inputs)
         if later is None:
             reduced = _simulate_run(world, u, reducer, run_key)
         else:
-            reduced = _collect_smoothed(world, later, u, reducer, run_key)
+            reduced = _simulate_smoothed_run(world, later, u, reducer, run_key)
+        # Sums over runs by batch; flags too, which hold for a batch if the sum is above zero.
         summed = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=float), (reduced.sums, reduced.ever))
         form[:] = [jax.tree.structure(OfStep(summed[0], summed[1], reduced.collected))]
         return summed, reduced.collected
 
-    # Sums over runs by batch; the rest is collected.
+    # Traced with a key, argument 0, and examples of the arrays; some of their entries are known.
     key, known = jax.eval_shape(lambda: jax.random.key(0)), of_world.known + of_rest.known
-    masks = {n: k.mask for n, k in enumerate(known, start=1) if k.mask.any()}
+    masks = {i: entries.mask for i, entries in enumerate(known, start=1) if entries.mask.any()}
     single = precision == "float32"
-    program = accumulate(run, key, *(k.example for k in known), batches=BATCHES, known=masks, single=single)
+    program = accumulate(run, key, *(entries.example for entries in known), batches=BATCHES, known=masks, single=single)
     return program, form[0]
 
 
 @eqx.filter_jit
 def _step_world(world: World, state: PyTree, key: jax.Array, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
-    """Step a world, traced once for worlds that differ in numbers alone, however long and whatever is collected."""
+    """Step a world as `World.step` does, traced once for worlds that differ in numbers alone.
+
+    So it is however long the run and whatever is collected of it.
+    """
     return world.step(state, key, row)
 
 
 def _simulate_run(world: World, inputs: jax.Array, reducer: AbstractReducer[Any], key: jax.Array) -> OfStep:
-    """Collect the results of a run: stacked over time, but for flags that hold if true at any step."""
+    """Simulate a run with these inputs (horizon, inputs): return what the reducer collects, stacked over time.
+
+    Flags (`ever`) hold if true at any step.
+    """
 
     def step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, OfStep]:
         """Step the world, and reduce the step."""
@@ -230,10 +263,10 @@ def _simulate_run(world: World, inputs: jax.Array, reducer: AbstractReducer[Any]
     return recorded._replace(ever=jax.tree.map(lambda leaf: jnp.any(leaf, axis=0), recorded.ever))
 
 
-def _collect_smoothed(
+def _simulate_smoothed_run(
     world: World, later: NetworkSmoother, inputs: jax.Array, reducer: AbstractReducer[Any], key: jax.Array
 ) -> OfStep:
-    """Collect the results of a run's filtered and smoothed estimates, from the whole run with its smoother steps."""
+    """Simulate a run: return what the reducer collects of filtered and of smoothed estimates, as `reduce_run` does."""
 
     def step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
         """Step the world; the step is reduced later, with what comes after it."""
@@ -255,22 +288,50 @@ def simulate_natively(
     smoothing: SmoothingPlan | None = None,
     precision: Precision = "float64",
 ) -> Result | None:
-    """Simulate a network by native code and reduce its runs; a part of it is smoothed.
+    """Simulate a network by native code, and return what the reducer makes of its runs.
 
-    Returns None where native code does not support the network or the reducer. Draws depend on names alone, and so do
-    nodes that share nothing but the plant: they are simulated a few at a time.
+    Args:
+        network: the network.
+        inputs: of the plant (horizon, inputs).
+        key: of all runs.
+        reducer: says what is collected of the runs.
+        first_run: number of the first run, which seeds its draws.
+        runs: how many.
+        chunk: how many between two reports of progress.
+        progress: is called with how many runs are done, and of how many.
+        smoothing: the part of the network that is smoothed; None if nothing is.
+        precision: in which runs are computed.
+
+    Returns:
+        None where native code does not support the network or the reducer.
     """
-    # Smoothing, few nodes, or nodes that share something: one program.
+    # Smoothing, few nodes, nodes that share something, or a reducer that cannot join parts: one program.
     is_whole = smoothing is not None or len(network.names) <= NODES or not is_apart(network)
-    if is_whole or type(reducer).joined is AbstractReducer.joined:  # that of the base class cannot join parts
-        code = try_native(
-            lambda: compile_network_runs(network, inputs, key, reducer, runs, smoothing, precision=precision)
-        )
-        if code is None:
-            return None
-        check_memory_of_parts(code, 1, runs, len(inputs), precision)
-        return finish_result(reducer, _run_chunks(code, first_run, runs, chunk, progress), network, smoothing)
-    # Many independent nodes: one program for a few of them, with other numbers.
+    if not is_whole and type(reducer).joined is not AbstractReducer.joined:
+        return _simulate_in_parts(network, inputs, key, reducer, (first_run, runs, chunk), progress, precision)
+    code = try_native(lambda: compile_network_runs(network, inputs, key, reducer, runs, smoothing, precision=precision))
+    if code is None:
+        return None
+    check_memory_of_parts(code, 1, runs, len(inputs), precision)
+    return finish_result(reducer, _run_chunks(code, first_run, runs, chunk, progress), network, smoothing)
+
+
+def _simulate_in_parts(
+    network: Network,
+    inputs: np.ndarray,
+    key: jax.Array,
+    reducer: AbstractReducer[Result],
+    span: tuple[int, int, int],
+    progress: Progress | None,
+    precision: Precision,
+) -> Result | None:
+    """Simulate a network of many independent nodes, a few at a time, by one program with other numbers for each few.
+
+    The result is the same: draws depend on names, and these nodes share nothing but the plant, which is simulated
+    again. `span`: number of the first run, how many there are, and how many between two reports of progress. Other
+    arguments and the result as of `simulate_natively`.
+    """
+    first_run, runs, chunk = span
     results, parts, memory = [], count_parts(network), list[list[np.ndarray]]()
     for number, (some, world) in enumerate(split_nodes(network)):
         make = partial(compile_runs, world, inputs, key, reducer, runs, precision=precision)
@@ -299,7 +360,7 @@ def compile_network_runs(
     smoothing: SmoothingPlan | None = None,
     precision: Precision = "float64",
 ) -> NativeProgram:
-    """Make the native code of a network's runs, as `compile_runs` of its world; a part of it may be smoothed."""
+    """Compile the native code of a network's runs, as `compile_runs` of its world; a part of it may be smoothed."""
     world = build_world(network, None if smoothing is None else smoothing.kinds)
     later = None if smoothing is None else smoothing.smoother(world.filters)
     return compile_runs(world, inputs, key, reducer, runs, later, precision=precision)
@@ -313,7 +374,10 @@ def _run_chunks(
     progress: Progress | None,
     memory: list[list[np.ndarray]] | None = None,
 ) -> ReducedRuns:
-    """Return the sums over all runs, and what is collected of them, chunk by chunk; `memory` as of `NativeLanes`."""
+    """Run a native program: return the sums over all runs, and what is collected of them.
+
+    `chunk`: how many runs between two reports of progress. `memory`: as of `NativeLanes`; None: new memory.
+    """
     lanes = NativeLanes(code, first_run, first_run + runs, [] if memory is None else memory)
     parts = advance_in_chunks(lanes.advance, LANES, False, (runs, chunk), progress)
-    return lanes.total()._replace(collected=lanes.joined(parts))
+    return lanes.total()._replace(collected=lanes.join_chunks(parts))

@@ -9,30 +9,38 @@ import numpy as np
 from heliograph.engine.choice import get_thread_pool
 from heliograph.engine.limits import BLOCK
 from heliograph.numerics.types import PyTree
-from heliograph.simulation.runs.lanes import LANES, batch_counts
+from heliograph.simulation.runs.lanes import LANES, count_runs_by_batch
 from heliograph.simulation.smoothed import ReducedRuns
 
 
 class NativeProgram(NamedTuple):
-    """A program begun with a network's numbers; `tree` is the structure of what is collected of a run."""
+    """A program begun with a network's numbers; `tree` is the structure of what its runs return, an `OfStep`."""
 
     begun: Any
     tree: Any
 
 
 class NativeLanes:
-    """Blocks of runs dealt to lanes with separate sums, computed by native code.
-
-    `memory`: sums of an earlier simulation that nobody needs, taken for those of this one, and given back. To allocate
-    those of a few nodes and runs would take as long as to compute them.
-    """
+    """Blocks of runs dealt to lanes with separate sums, computed by native code."""
 
     def __init__(self, code: NativeProgram, first_run: int, stop: int, memory: list[list[np.ndarray]]):
+        """Begin with no sums.
+
+        Args:
+            code: the program.
+            first_run: number of the first run.
+            stop: number after that of the last run.
+            memory: sums of an earlier simulation that nobody needs, taken for those of this one, and given back. To
+                allocate those of a few nodes and runs would take as long as to compute them.
+        """
         self.code, self.first_run, self.stop, self.memory = code, first_run, stop, memory
         self.sums: list[list[np.ndarray] | None] = [None] * LANES
 
     def advance(self, start: int, blocks: int) -> list[np.ndarray | None]:
-        """Simulate `blocks` blocks from number `start` on; return the collected results of their runs in order."""
+        """Simulate `blocks` blocks from number `start` on; return what is collected of their runs in order, by leaf.
+
+        A leaf is (run, ...), None where all runs share it.
+        """
         numbers = np.arange(start, start + blocks)
         runs_of_lane = {lane: self._list_runs(numbers[numbers % LANES == lane]) for lane in range(LANES)}
         used = [lane for lane, runs in runs_of_lane.items() if len(runs)]
@@ -57,7 +65,7 @@ class NativeLanes:
         return runs[runs < self.stop]
 
     def total(self) -> ReducedRuns:
-        """Return the sums over all runs, by batch, and give their memory back."""
+        """Return the sums over all runs, by batch, and give their memory back; nothing that is collected."""
         code = self.code.begun
         used = [sums for sums in self.sums if sums is not None]
         totals = iter(code.add_parts(used))
@@ -69,10 +77,13 @@ class NativeLanes:
             leaves.append(by_batch if fixed is None else to_double(fixed))
             common.append(fixed is not None)
         sums, same = (jax.tree.unflatten(self.code.tree, x) for x in (leaves, common))
-        return ReducedRuns(sums, same, batch_counts(self.first_run, self.stop), None)
+        return ReducedRuns(sums, same, count_runs_by_batch(self.first_run, self.stop), None)
 
-    def joined(self, parts: Sequence[list[np.ndarray | None]]) -> PyTree:
-        """Return the collected results of all runs, (run, ...); a view of one where they share it."""
+    def join_chunks(self, parts: Sequence[list[np.ndarray | None]]) -> PyTree:
+        """Return what is collected of all runs (run, ...), from what `advance` returned of each chunk of them.
+
+        A result that all runs share is a view of one.
+        """
         leaves: list[Any] = []
         for fixed, *chunks in zip(self.code.begun.shared, *parts, strict=True):
             if fixed is not None:

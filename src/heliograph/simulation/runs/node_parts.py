@@ -36,12 +36,15 @@ def is_apart(network: Network) -> bool:
 
 @cache_by_object
 def build_world(network: Network, smoothed_kinds: tuple[int, ...] | None = None) -> World:
-    """Build the world of a network, once for all simulations of it; `smoothed_kinds` as of `AllFilters`."""
+    """Return the world of a network, plant, transmission and filters, once for all simulations of it.
+
+    `smoothed_kinds`: as of `AllFilters`.
+    """
     return World(drop_identities(network.plant), make_reception(network), AllFilters(network, smoothed_kinds))
 
 
 def count_parts(network: Network) -> int:
-    """Return how many parts `split_nodes` makes."""
+    """Return how many parts `split_nodes` makes of a network."""
     return sum(-(-len(names) // NODES) for names in network.groups)
 
 
@@ -68,7 +71,7 @@ def _on_host(leaf: PyTree) -> PyTree:
 
 
 def _select_nodes(network: Network, names: tuple[str, ...]) -> Network:
-    """Return the network of some nodes of one structure, unchecked, since the whole network is."""
+    """Return the network of these nodes alone, which are of one structure; unchecked, since the whole network is."""
     group = next(g for g, members in enumerate(network.groups) if names[0] in members)
     kinds = tuple(FilterKind(0, kind.filters) for kind in network.kinds if kind.group == group)
     size = network.nodes[names[0]].received
@@ -86,7 +89,7 @@ def _select_nodes(network: Network, names: tuple[str, ...]) -> Network:
 
 
 def _with_fields(module: M, **changed: object) -> M:
-    """Return a module with some fields changed whose constructor takes others and computes these."""
+    """Return a copy of a module with these fields changed, without its constructor, which would compute them."""
     new = object.__new__(type(module))
     for field in fields(module):
         object.__setattr__(new, field.name, changed.get(field.name, getattr(module, field.name)))
@@ -94,7 +97,7 @@ def _with_fields(module: M, **changed: object) -> M:
 
 
 def _select_rows(world: World, nodes: slice) -> World:
-    """Return the world of some nodes, all of one structure: their rows of all that is stacked."""
+    """Return the world of some nodes of one whose nodes are all of one structure: their rows of all that is stacked."""
     assert isinstance(world.medium, SeparateChannels)
 
     def select(leaf: PyTree) -> PyTree:

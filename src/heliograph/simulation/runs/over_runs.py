@@ -49,36 +49,37 @@ def over_runs(function: Callable[..., PyTree], *arrays: PyTree, width: int = WID
 
 
 def _apply_by_xla(function: Callable[..., PyTree], values: list[np.ndarray], width: int) -> PyTree:
-    """Apply the function as a program of XLA, `width` runs in parallel."""
-    # Width and blocks such that all cores are busy and little is padding.
+    """Return the function's results (run, ...) of `values` (run, ...), by XLA, at most `width` runs in parallel."""
+    # Each core computes `blocks` times `width` runs: such that all cores are busy and little is padding.
     runs, cores = len(values[0]), os.cpu_count() or 1
     width = min(width, runs)
-    share = -(-runs // (width * cores))  # blocks of each core
-    width = -(-runs // (share * cores))  # no wider than it need be: few runs are left to fill up
+    blocks = -(-runs // (width * cores))
+    width = -(-runs // (blocks * cores))  # no wider than it need be: few runs are left to fill up
+    share = blocks * width
 
     def compute_share(core: int) -> PyTree:
-        """Return the results of one core's runs: `share` blocks of `width` runs, filled up and cut again."""
-        first, last = core * share * width, min((core + 1) * share * width, runs)
-        parts = [_pad_runs(a[first:last], share * width).reshape(share, width, *a.shape[1:]) for a in values]
+        """Return the results of one core's runs: blocks of `width` runs, filled up and cut again."""
+        first, stop = core * share, min((core + 1) * share, runs)
+        parts = [_pad_runs(a[first:stop], share).reshape(blocks, width, *a.shape[1:]) for a in values]
         with jax.enable_x64(True):
             outputs = to_numpy(_map_blocks(function, parts))
-        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[: last - first], outputs)
+        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[: stop - first], outputs)
 
-    # Each core computes its blocks, then copies them to their place.
-    computed = list(get_thread_pool().map(compute_share, range(-(-runs // (share * width)))))
+    # Each core computes its blocks, then copies them to their place; few runs need fewer cores.
+    computed = list(get_thread_pool().map(compute_share, range(-(-runs // share))))
     results = jax.tree.map(lambda leaf: np.empty((runs, *leaf.shape[1:]), leaf.dtype), computed[0])
 
     def copy_back(core: int) -> None:
         """Copy one core's results to their place, all cores at once since large results take their time."""
         for target, leaf in zip(jax.tree.leaves(results), jax.tree.leaves(computed[core]), strict=True):
-            target[core * share * width :][: len(leaf)] = leaf
+            target[core * share :][: len(leaf)] = leaf
 
     list(get_thread_pool().map(copy_back, range(len(computed))))
     return results
 
 
 def _read_numbers(value: PyTree) -> np.ndarray:
-    """Return numbers as an array, masked ones as NaN; raise one line of anything else."""
+    """Return numbers as an array, masked ones as NaN; raise ValueError for anything else."""
     try:
         values = np.asarray(fill_masked(value))
     except ValueError:  # rows of different lengths
@@ -89,12 +90,12 @@ def _read_numbers(value: PyTree) -> np.ndarray:
 
 
 def _pad_runs(values: np.ndarray, count: int) -> np.ndarray:
-    """Pad to `count` runs with copies of the last one."""
+    """Return values (run, ...) padded to `count` runs with copies of the last one."""
     missing = count - len(values)
     return values if not missing else np.concatenate([values, np.repeat(values[-1:], missing, axis=0)])
 
 
 @fully_optimised
 def _map_blocks(function: Callable[..., PyTree], parts: list[PyTree]) -> PyTree:
-    """Apply the function of one run to blocks (block, run, ...), one block after another."""
+    """Return a function's results of each run of `parts`, both (block, run, ...), one block after another."""
     return jax.lax.map(lambda block: jax.vmap(function)(*block), parts)

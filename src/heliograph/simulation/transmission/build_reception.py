@@ -20,14 +20,13 @@ from heliograph.simulation.transmission.reception import (
     NodeGroup,
     NoSensor,
     SeparateChannels,
-    SlottedRelays,
-    find_hops_with_memory,
 )
 from heliograph.simulation.transmission.shared_fading import number_memories
+from heliograph.simulation.transmission.slotted_relays import SlottedRelays, find_hops_with_memory
 
 
 def make_reception(network: Network) -> AbstractMedium:
-    """Build the transmission from the plant to the nodes of a network."""
+    """Return the medium of a network: what transmits from the plant to its nodes."""
     if network.relays is not None:
         return _make_slots(network, network.relays)
     if network.common is not None:
@@ -45,55 +44,64 @@ def make_reception(network: Network) -> AbstractMedium:
 
 
 def _make_slots(network: Network, relays: RelayNetwork) -> SlottedRelays:
-    """Build the transmission through relays that send in slots."""
+    """Return the medium of a network's relays, which send in slots."""
     listeners = {name: i for i, name in enumerate(relays.filters)}
     return SlottedRelays(
         relays=relays,
         estimates_at=tuple(network.places[name, LOCAL] for name in relays.relays),
         groups=tuple(tuple(listeners[name] for name in names) for names in network.groups),
-        memories=number_memories({name: hop for name, (_, _, _, hop) in find_hops_with_memory(relays).items()}),
+        memories=number_memories({name: hop.channel for name, hop in find_hops_with_memory(relays).items()}),
     )
 
 
 def _stack_group(network: Network, nodes: Mapping[str, Node], memories_of: Mapping[str, np.ndarray]) -> NodeGroup:
-    """Return the nodes of a group, stacked; `memories_of` each node: places of its sensor's and channel's memories."""
+    """Return the nodes of a group, stacked.
+
+    Args:
+        network: the network.
+        nodes: those of the group, of one structure, by name.
+        memories_of: by node, the numbers that seed the draws of its sensor's and its channel's memories.
+    """
     first_name, first_node = next(iter(nodes.items()))
-    # Sensor, channel, and where their draws and memories stand.
-    pairs = [(without_output_names(node.sensor), _carrying_channel(node)) for node in nodes.values()]
-    # Memories are told apart by their places: without their names the nodes stack.
-    pairs = [drop_names(pair) if len(memories_of[key]) else pair for pair, key in zip(pairs, nodes, strict=True)]
+    # Sensors and channels. Memories are told apart by the numbers that seed them: without their names the nodes stack.
+    pairs = [(without_output_names(node.sensor), _get_carrying_channel(node)) for node in nodes.values()]
+    pairs = [drop_names(pair) if len(memories_of[name]) else pair for pair, name in zip(pairs, nodes, strict=True)]
     sensor, channel = stack(pairs)
-    rows_of = [_split_places((node.sensor, node.channel), memories_of[key]) for key, node in nodes.items()]
-    of_sensor, memory_rows = (np.stack(parts) for parts in zip(*rows_of, strict=True))
+    seeds = [_split_seeds((node.sensor, node.channel), memories_of[name]) for name, node in nodes.items()]
+    sensor_seeds, channel_seeds = (np.stack(parts) for parts in zip(*seeds, strict=True))
     # What a sender that decides knows: its filter, its rule.
     filter_name: str | None = first_node.informed_by or first_node.predictor
     reference: PyTree = None
     if filter_name is not None:
         reference = stack([without_output_names(node.filters[filter_name]) for node in nodes.values()])
+    place = None if filter_name is None else network.places[first_name, filter_name]
     triggers: PyTree = [node.trigger for node in nodes.values()]
     encoders: PyTree = [node.encoder for node in nodes.values()]
     return NodeGroup(
         sensor=sensor,
         inputs=network.inputs,
         channel=channel,
-        checksums=np.array([checksum(key) for key in nodes], dtype=np.uint32),
-        memories=memory_rows,
-        modes=of_sensor,
+        checksums=np.array([checksum(name) for name in nodes], dtype=np.uint32),
+        memories=channel_seeds,
+        modes=sensor_seeds,
         reference_filter=reference,
         trigger=None if triggers[0] is None else stack(triggers),
         encoder=None if encoders[0] is None else stack(encoders),
-        informed_at=None if filter_name is None else network.places[first_name, filter_name][:2],
+        informed_at=None if place is None else (place.kind, place.filter),
         reader=None if encoders[0] is None else reader_of(first_node.channel),
     )
 
 
-def _carrying_channel(node: Node) -> Channel:
+def _get_carrying_channel(node: Node) -> Channel:
     """Return the channel of the numbers by which a node's signal is carried: its words' bits where it sends words."""
     return node.channel if node.encoder is None else rewrite_in_bits(node.encoder, node.channel)
 
 
-def _split_places(observed: tuple[AnySensor, Channel], places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Split the places of the memories of sensor and channel together: return those of the sensor, of the channel."""
-    by_identity = dict(zip(memories(observed), places, strict=True))
+def _split_seeds(observed: tuple[AnySensor, Channel], seeds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return which of the numbers that seed the memories of a sensor and a channel are the sensor's, and the channel's.
+
+    A memory that they share is in both.
+    """
+    by_identity = dict(zip(memories(observed), seeds, strict=True))
     of_sensor, of_channel = ([by_identity[identity] for identity in memories(part)] for part in observed)
     return np.array(of_sensor, np.uint32), np.array(of_channel, np.uint32)

@@ -51,7 +51,10 @@ def transmit(signal: Float[ArrayLike, "*shape"], channel: Channel, seed: int = 0
 
 
 def _transmit_all(channel: Channel, y: Float[Array, "steps m"], seed: Array) -> jax.Array:
-    """Send the rows of y through a channel, by the draws of a seed; NaN where a missing number would be used."""
+    """Return the rows of y (steps, m) as a channel delivers them, by the draws of a seed.
+
+    NaN where a missing number would be used.
+    """
     key = jax.random.key(seed)
 
     def step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, jax.Array]:
@@ -63,7 +66,8 @@ def _transmit_all(channel: Channel, y: Float[Array, "steps m"], seed: Array) -> 
         return state, jnp.where(unsent, jnp.nan, apply(h, jnp.where(missing, 0.0, y_k)))
 
     start = at(channel, 0).init(draw_key(key, 0, SENDER, CHANNEL_START))
-    received: jax.Array = jax.lax.scan(step, start, (jnp.arange(len(y)), jnp.asarray(y)))[1]
+    received: jax.Array
+    _, received = jax.lax.scan(step, start, (jnp.arange(len(y)), jnp.asarray(y)))
     return received
 
 
@@ -103,7 +107,10 @@ def arrivals(record: Record, network: Network, run: int = 0) -> list[Arrival]:
 
 
 def _separate_delays(name: str, node: object, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the values (steps, m), and the delay of each (steps,)."""
+    """Return the values (steps, m) of what a node received, and the delay of each (steps,), NaN where it is lost.
+
+    A time stamp is the last number of each row of z, and is taken off.
+    """
     channel = node.channel if isinstance(node, Node) else None
     link = first(channel)
     if link is None or not link.past:

@@ -1,4 +1,9 @@
-"""Channels in a run: their draws, and those of memories that several of them may share."""
+"""Channels in a run: their draws, and those of memories that several of them may share.
+
+Draws depend on the run's key, the step and a number: a checksum of the channel's name, or of its memory's. Memories
+with one number have the same draws, so that they are one memory. `shared` in arguments: these numbers of a model's
+memories.
+"""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -27,8 +32,7 @@ from heliograph.simulation.random_keys import (
     draw_key,
 )
 
-Places = jax.Array | np.ndarray | tuple[()]  # uint32, one for each memory of a channel
-
+MemoryNumbers = jax.Array | np.ndarray | tuple[()]  # uint32, one for each memory of a channel
 
 PLANT = "plant"  # whose memories others may share, with a name or without
 
@@ -36,8 +40,11 @@ PLANT = "plant"  # whose memories others may share, with a name or without
 def number_memories(channels: Mapping[str, PyTree], plant: PyTree = ()) -> dict[str, np.ndarray]:
     """Return by channel the numbers that seed its memories' draws: equal ones for memories that are shared.
 
-    They come from the memories' names, or from the channel's where these have none. A channel may be any tree of
-    models, such as a sensor and its channel; a memory that the plant has too is the plant's.
+    They come from the memories' names, or from the channel's where these have none.
+
+    Args:
+        channels: by name; each may be any tree of models, such as a sensor and its channel.
+        plant: a memory that it has too is the plant's.
 
     Raises:
         ValueError: one name for memories that differ.
@@ -46,19 +53,19 @@ def number_memories(channels: Mapping[str, PyTree], plant: PyTree = ()) -> dict[
     # One object under many names is looked at once.
     objects = {id(channel): channel for channel in channels.values()}
     memories((plant, tuple(objects.values())))  # raises where one name stands for memories that differ
-    held = {key: memories(channel) for key, channel in objects.items()}
-    unique_memories(memory for by_identity in held.values() for memory in by_identity.values())
-    places = {}
+    memories_of = {key: memories(channel) for key, channel in objects.items()}
+    unique_memories(memory for by_identity in memories_of.values() for memory in by_identity.values())  # raises too
+    numbers = {}
     for name, channel in channels.items():
-        sources = [_name_source(m, i, name, of_plant) for i, m in enumerate(held[id(channel)].values())]
-        places[name] = np.array([checksum(source) for source in sources], dtype=np.uint32)
-    return places
+        sources = [_name_source(m, i, name, of_plant) for i, m in enumerate(memories_of[id(channel)].values())]
+        numbers[name] = np.array([checksum(source) for source in sources], dtype=np.uint32)
+    return numbers
 
 
 def _name_source(memory: AbstractMemory, i: int, name: str, of_plant: Mapping[str, int]) -> str:
     """Return the name by which a memory's draws are seeded: its own, the plant's number of it, or the channel's.
 
-    `i`: number of the memory in the channel `name`.
+    `i`: number of the memory in the channel `name`. `of_plant`: numbers of the plant's memories, by identity.
     """
     if memory.name is not None:
         return memory.identity
@@ -68,9 +75,13 @@ def _name_source(memory: AbstractMemory, i: int, name: str, of_plant: Mapping[st
 
 
 class ChannelGroup(Module):
-    """Channels of one structure, stacked; checksums of their names and of their memories, and their places among all.
+    """Channels of one structure, stacked.
 
-    Shapes: checksums (channel,), memories (channel, memories of each), places (channel,).
+    Args:
+        channel: the stack, with a leading axis of channels.
+        checksums: of their names (channel,), which seed their draws.
+        memories: numbers that seed the draws of their memories (channel, memory).
+        places: of each among all channels (channel,).
     """
 
     channel: Channel
@@ -80,7 +91,10 @@ class ChannelGroup(Module):
 
 
 def channel_groups(channels: Mapping[str, Channel]) -> tuple[ChannelGroup, ...]:
-    """Return the channels by structure, those of one stacked with a row for each name; names of memories aside."""
+    """Return the channels by structure: those of one are stacked, with a row for each name.
+
+    Names of memories do not matter to the structure.
+    """
     listed, memories = list(channels.values()), list(number_memories(channels).values())
     checksums = np.array([checksum(name) for name in channels], dtype=np.uint32)
     # Rows of each structure's channels by their identity: one object under many names is stacked once.
@@ -114,31 +128,33 @@ class LateChannelState(NamedTuple):
     line: jax.Array
 
 
-def start(channel: Channel, key: jax.Array, source: Number, shared: Places) -> PyTree:
-    """Return a channel's state before the first step."""
+def start(channel: Channel, key: jax.Array, source: Number, shared: MemoryNumbers) -> PyTree:
+    """Return a channel's state before the first step of the run with this key.
+
+    `source`: number that seeds its own draws; `shared`: numbers that seed those of its memories.
+    """
     link, link_key = at(channel, 0), draw_key(key, 0, source, CHANNEL_START)
     keys = [draw_key(key, 0, memory, MEMORY_START) for memory in shared]
     state = init_with_shared_memories(link, link_key, keys) if len(shared) else link.init(link_key)
     return LateChannelState(state, jnp.zeros(link.past * signal_size(link))) if link.past else state
 
 
-def start_modes(models: PyTree, key: jax.Array, shared: Places) -> tuple[jax.Array, ...]:
-    """Return the states of the memories of a plant or sensor at the first step."""
-    held = memories(models).values()
-    return tuple(m.begin(draw_key(key, 0, place, MEMORY_START)) for m, place in zip(held, shared, strict=True))
+def start_modes(models: PyTree, key: jax.Array, shared: MemoryNumbers) -> tuple[jax.Array, ...]:
+    """Return the states of the memories of a plant or sensor at the first step of the run with this key."""
+    numbered = zip(memories(models).values(), shared, strict=True)
+    return tuple(memory.begin(draw_key(key, 0, number, MEMORY_START)) for memory, number in numbered)
 
 
 def move_modes(
-    models: PyTree, states: tuple[jax.Array, ...], key: jax.Array, k: jax.Array, shared: Places
+    models: PyTree, states: tuple[jax.Array, ...], key: jax.Array, k: jax.Array, shared: MemoryNumbers
 ) -> tuple[jax.Array, ...]:
-    """Return the states of the memories of a plant or sensor at the step after k; of one place, they move alike."""
-    held = memories(models).values()
-    moves = zip(held, states, shared, strict=True)
-    return tuple(m.move(state, draw_key(key, k, place, MEMORY)) for m, state, place in moves)
+    """Return the states of the memories of a plant or sensor at the step after k; those of one number move alike."""
+    moves = zip(memories(models).values(), states, shared, strict=True)
+    return tuple(memory.move(state, draw_key(key, k, number, MEMORY)) for memory, state, number in moves)
 
 
 def deliver_signal(
-    channel: Channel, state: PyTree, y: jax.Array, key: jax.Array, k: jax.Array, source: Number, shared: Places
+    channel: Channel, state: PyTree, y: jax.Array, key: jax.Array, k: jax.Array, source: Number, shared: MemoryNumbers
 ) -> tuple[PyTree, jax.Array]:
     """Draw the channel at step k and apply it to y, a late one to past signals too; return next state and output.
 
@@ -154,7 +170,7 @@ def deliver_signal(
 
 
 def _draw_link(
-    link: AbstractRandomAffine, state: PyTree, key: jax.Array, k: jax.Array, link_key: jax.Array, shared: Places
+    link: AbstractRandomAffine, state: PyTree, key: jax.Array, k: jax.Array, link_key: jax.Array, shared: MemoryNumbers
 ) -> tuple[PyTree, jax.Array]:
     """Draw a link, its memories by keys of their own; return its next state and its matrix."""
     if not len(shared):

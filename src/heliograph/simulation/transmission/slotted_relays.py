@@ -1,0 +1,170 @@
+"""Transmission over relays that send in turn: slots of hops, which repeat over the steps."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.model.channel import Channel
+from heliograph.model.estimate import Estimate
+from heliograph.model.over_time import OverTime, at, first, over_time, structure
+from heliograph.model.relays import SENSOR as SENDER
+from heliograph.model.relays import RelayNetwork
+from heliograph.numerics.types import PyTree
+from heliograph.simulation.network_index import EstimatePlace
+from heliograph.simulation.random_keys import SENSOR, Number, checksum, draw_key
+from heliograph.simulation.transmission.reception import AbstractMedium, Measurements
+from heliograph.simulation.transmission.shared_fading import deliver_signal, start
+
+
+class RelayStates(NamedTuple):
+    """Estimates that the relays will send, (relay, n), and the states of the hops with memory."""
+
+    estimates: jax.Array
+    hops: dict[str, PyTree]
+
+
+class SlottedRelays(AbstractMedium):
+    """Medium of relays in turn: each sends C s with its estimate s of the step before; slots repeat over the steps.
+
+    A hop with memory moves on at every step, used or not; the same pair in another slot is another hop.
+
+    Args:
+        relays: who sends to whom in each slot, over which hop.
+        estimates_at: where each relay's estimate stands.
+        groups: listeners of each group, by their numbers among `relays.filters`.
+        memories: numbers that seed the draws of the memories of each hop that has some, by its name.
+    """
+
+    relays: RelayNetwork
+    estimates_at: tuple[EstimatePlace, ...] = eqx.field(static=True)
+    groups: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+    memories: dict[str, np.ndarray]
+
+    def init(self, key: jax.Array) -> RelayStates:
+        """Return the initial mean as every relay's estimate, and the hops' initial states."""
+        mean = jnp.asarray(at(self.relays.plant, 0).initial_mean)
+        hops = {
+            name: start(hop.channel, key, hop.source, self.memories[name])
+            for name, hop in find_hops_with_memory(self.relays).items()
+        }
+        return RelayStates(jnp.tile(mean, (len(self.estimates_at), 1)), hops)
+
+    def receive(
+        self, state: RelayStates, x: jax.Array, u: jax.Array, key: jax.Array, k: jax.Array
+    ) -> tuple[RelayStates, Measurements]:
+        """Send over the hops of this step's slot, and sum what comes at each listener.
+
+        Arguments and results as of `AbstractMedium`.
+        """
+        # Signals: of the sensor, and C s of each relay.
+        sensor = at(self.relays.sensor, k)
+        y = sensor.noise.report(sensor.measure(x) + sensor.noise.sample(draw_key(key, k, checksum(SENDER), SENSOR)))
+        signals = [jnp.asarray(sensor.matrix) @ s for s in state.estimates]
+        sent = dict(zip((SENDER, *self.relays.relays), [y, *signals], strict=True))
+        # Hops without memory by a branch for the slot, then those with memory.
+        received = self._sum_without_memory(k, sent, key)
+        hops, slot = {}, k % len(self.relays.slots)
+        for name, hop in find_hops_with_memory(self.relays).items():
+            hops[name], z = deliver_signal(
+                hop.channel, state.hops[name], sent[hop.sender], key, k, hop.source, self.memories[name]
+            )
+            received[hop.listener] = received[hop.listener] + jnp.where(slot == hop.slot, z, 0.0)
+        order = [received[name] for name in self.relays.filters]
+        return RelayStates(state.estimates, hops), tuple(jnp.stack([order[i] for i in group]) for group in self.groups)
+
+    def feed_back(self, state: RelayStates, estimates: Sequence[Estimate]) -> RelayStates:
+        """Return the state with the relays' estimates, to be sent at the next step."""
+        means = [estimates[place.kind].mean[place.filter, place.node] for place in self.estimates_at]
+        return RelayStates(jnp.stack(means) if means else state.estimates, state.hops)
+
+    def _sum_without_memory(self, k: jax.Array, sent: dict[str, jax.Array], key: jax.Array) -> dict[str, jax.Array]:
+        """Return the sum at each listener through hops without memory, by name; NaN where nobody transmits to it.
+
+        `sent`: signal of each sender, by name.
+        """
+        # Slots of one structure share a branch.
+        slots_alike: dict[object, list[int]] = {}
+        for number, slot in enumerate(self.relays.slots):
+            slots_alike.setdefault(structure(slot), []).append(number)
+        # Of each slot its branch, and its position within it.
+        branch, position = np.zeros((2, len(self.relays.slots)), dtype=int)
+        for i, numbers in enumerate(slots_alike.values()):
+            branch[numbers], position[numbers] = i, np.arange(len(numbers))
+        branches = [self._make_branch([self.relays.slots[i] for i in numbers]) for numbers in slots_alike.values()]
+        # The branch of this step's slot.
+        slot_now = k % len(branch)
+        received: dict[str, jax.Array] = jax.lax.switch(
+            jnp.asarray(branch)[slot_now], branches, jnp.asarray(position)[slot_now], k, sent, key
+        )
+        return received
+
+    def _make_branch(self, slots: Sequence[Mapping[str, Mapping[str, Channel]]]) -> Callable[..., dict[str, jax.Array]]:
+        """Return the function that computes what each listener receives in one of these slots, of one structure.
+
+        A slot: by listener, its hop from each sender.
+        """
+        # A single slot is not stacked: its hops may vary over time, and are read at the step.
+        stacked: PyTree = slots[0] if len(slots) == 1 else over_time(slots)
+
+        def branch(
+            position: jax.Array, k: jax.Array, sent: dict[str, jax.Array], key: jax.Array
+        ) -> dict[str, jax.Array]:
+            """Return what each listener receives, by name, in the slot at this position."""
+            slot: PyTree = at(stacked, position) if isinstance(stacked, OverTime) else stacked
+            listeners = zip(self.relays.filters, self.relays.received, strict=True)
+            return {name: _receive_sum(slot.get(name, {}), name, size, k, sent, key) for name, size in listeners}
+
+        return branch
+
+
+class SlotHop(NamedTuple):
+    """A hop of a slot: number of the slot, names of listener and sender, and the channel between them."""
+
+    slot: int
+    listener: str
+    sender: str
+    channel: Channel
+
+    @property
+    def source(self) -> Number:
+        """Number that seeds the hop's draws, from the names of its ends."""
+        return checksum(f"{self.sender} to {self.listener}")
+
+
+def find_hops_with_memory(relays: RelayNetwork) -> dict[str, SlotHop]:
+    """Return the hops whose channels have memory, by a name of slot, listener and sender."""
+    return {
+        f"{number} {listener} {sender}": SlotHop(number, listener, sender, hop)
+        for number, slot in enumerate(relays.slots)
+        for listener, hops in slot.items()
+        for sender, hop in hops.items()
+        if first(hop).remembers
+    }
+
+
+def _receive_sum(
+    hops: Mapping[str, Channel], listener: str, size: int, k: jax.Array, sent: dict[str, jax.Array], key: jax.Array
+) -> jax.Array:
+    """Return the sum of what arrives at a listener over its hops without memory; NaN where nobody sends to it.
+
+    Args:
+        hops: to the listener in this slot, by sender.
+        listener: its name.
+        size: how many numbers it receives.
+        k: number of the step.
+        sent: signal of each sender, by name.
+        key: of the run.
+    """
+    parts = []
+    for sender, hop in hops.items():
+        if not first(hop).remembers:
+            _, z = deliver_signal(hop, (), sent[sender], key, k, checksum(f"{sender} to {listener}"), ())
+            parts.append(z)
+    if parts:
+        return jnp.sum(jnp.stack(parts), axis=0)
+    # Hops with memory alone are added elsewhere.
+    return jnp.zeros(size) if hops else jnp.full(size, jnp.nan)
