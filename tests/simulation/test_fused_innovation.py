@@ -27,7 +27,7 @@ def test_it_is_that_of_all_that_arrives_by_the_prediction_from_the_fused_estimat
     link = hg.hop(hg.Discrete([0.6, 1.2], [0.5, 0.5]), NOISE)
     rules = {"bound": hg.fusion.EqualIntersection(), "weights": hg.fusion.MatrixWeights()}
     lanes = NetworkProgram(network(link, rules))
-    step, places = lanes.step_rows, {p.filter: p for p in lanes.places if p.node == "fused"}
+    step, places = lanes.step_rows, {p.filter: p for p in lanes.filter_columns if p.node == "fused"}
     z = np.random.default_rng(0).normal(0.0, 2.0, (8, 2))
     z[3, 0], z[5] = np.nan, np.nan
     state, h, r = step.start, np.array(ROWS), np.diag(NOISES)
@@ -65,4 +65,4 @@ def test_there_is_none_where_a_state_is_more_than_a_mean_and_a_covariance_or_noi
             for name, row, r in zip("ab", ROWS, NOISES, strict=True)
         }
         item = hg.Network.sharing(PLANT, both, hg.perfect(2), parts, {"bound": hg.Fusion("f", rule)})
-    assert [place.tested for place in NetworkProgram(item).places] == [None] * 3
+    assert [place.tested for place in NetworkProgram(item).filter_columns] == [None] * 3

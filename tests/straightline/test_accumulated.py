@@ -42,7 +42,7 @@ def expected(runs):
 def test_runs_are_added_to_their_batches(begun, count):
     """From any first run on, also where a block of lanes is not full or goes around the last batch."""
     for first in (0, 32, 96):
-        runs, sums = np.arange(first, first + count), begun.zeros()
+        runs, sums = np.arange(first, first + count), begun.make_zero_sums()
         collected = begun.add(runs, sums)
         squares, positions = expected(runs)
         np.testing.assert_allclose(fold_rows(sums[0], BATCHES), squares, rtol=1e-14)
@@ -53,7 +53,7 @@ def test_runs_are_added_to_their_batches(begun, count):
 
 
 def test_sums_go_on(begun):
-    sums = begun.zeros()
+    sums = begun.make_zero_sums()
     for start in range(0, 320, 32):
         begun.add(np.arange(start, start + 32), sums)
     np.testing.assert_allclose(fold_rows(sums[0], BATCHES), expected(np.arange(320))[0], rtol=1e-14)
@@ -70,7 +70,7 @@ def test_sums_have_the_same_bits_whatever_the_number_of_runs_in_a_vector():
     code = AccumulatedProgram(program, SummedOutputs((True,), BATCHES, 1)).begin([np.float64(2.0)], 40)
     results = []
     for width in (1, 2, 4, 8):
-        code._machine, sums = Machine(code.program.code.blocks, 0, width), code.zeros()
+        code._machine, sums = Machine(code.program.code.blocks, 0, width), code.make_zero_sums()
         for start, count in ((0, 37), (37, 120), (160, 53)):
             code.add(np.arange(start, start + count), sums)
         results.append(sums[0])
@@ -97,7 +97,7 @@ def test_a_sum_of_what_is_used_again():
         AccumulatedProgram(program, SummedOutputs((True, False), BATCHES, 1)).begin([np.float64(2.0)], 40),
         np.arange(40),
     )
-    sums = code.zeros()
+    sums = code.make_zero_sums()
     squares, positions = expected(runs)
     before = np.cumsum(positions**2, axis=1) - positions**2
     np.testing.assert_allclose(code.add(runs, sums)[1], before, rtol=1e-14)

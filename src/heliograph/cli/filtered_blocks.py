@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from heliograph.cli.filtered_plant import filter_rows
 from heliograph.cli.reading import ReadingOptions, describe_refused
-from heliograph.files.rows import USUAL_BLOCK, BlockSize
+from heliograph.files.block_size import USUAL_BLOCK, BlockSize
 from heliograph.files.stores.address import StoreAddress
 
 if TYPE_CHECKING:

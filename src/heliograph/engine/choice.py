@@ -159,7 +159,7 @@ def compile_on_call(function: Callable[P, R]) -> Callable[P, R]:
 
 @lru_cache(COMPILED)
 def _trace_once(function: Callable[P, R], structure: Any, settings: object) -> Callable[P, R]:
-    """Return the function as JAX inlines it into a trace, from its own trace for the same shapes.
+    """Return the function as a call within a trace, traced once for the same shapes; its operations keep their lines.
 
     One for each structure of its arguments, so that a trace is forgotten with it: JAX keeps that as long as the
     function. And one for all settings that what is traced depends on.
@@ -168,7 +168,7 @@ def _trace_once(function: Callable[P, R], structure: Any, settings: object) -> C
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         return function(*args, **kwargs)
 
-    program: Callable[P, R] = jax.jit(call, inline=True)
+    program: Callable[P, R] = jax.jit(call)
     return program
 
 

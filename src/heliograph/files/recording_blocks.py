@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from heliograph.files.block_order import BlockOrder
+from heliograph.files.block_size import USUAL_BLOCK, BlockSize
 from heliograph.files.recording import Recording, RowReader
-from heliograph.files.rows import USUAL_BLOCK, BlockSize, Rows
+from heliograph.files.rows import Rows
 from heliograph.files.table import read_row_blocks
 from heliograph.files.text.text_file import Progress
 from heliograph.numerics.check import InputError, fail

@@ -10,16 +10,6 @@ from heliograph.numerics.check import InputError, fail
 EXACT = 2**53  # up to here doubles hold every whole number
 
 
-class BlockSize(NamedTuple):
-    """How much of a table is read at a time: rows of Parquet, bytes of text."""
-
-    rows: int = 1 << 17
-    bytes: int = 1 << 22
-
-
-USUAL_BLOCK = BlockSize()
-
-
 class Rows(NamedTuple):
     """Rows of a table that could be read, as columns; their numbers, from 1; and why others could not be read."""
 

@@ -103,8 +103,9 @@ def _check_fits(filter: AbstractFilter, plant: AnyPlant, sensor: AnySensor, chan
     """Raise ValueError unless plant and sensor are linear, and the filter has the sizes of this world, in any model."""
     check_linear("true error", plant, sensor)
     instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
-    n, received = len(first(plant).states), first(channel).outputs
+    n = len(first(plant).states)
     check_link(first(sensor), first(channel), n, late=True)
+    received = first(channel).outputs
     if filter.received != received or len(filter.states) != n:
         got = f"one of {len(filter.states)} that receives {filter.received}"
         raise fail("filter", f"one of {n} states that receives {received} numbers", got)
