@@ -103,10 +103,10 @@ def to_c(
     real: Real = "float" if single else "double"
     argument_names, result_names = _name_arrays(function, examples, tree, names)
     arguments = _describe_arguments(argument_names, buffers, real)
-    # The body: statements in the order of the graph.
+    # The body: statements in the order of the graph, of what the nodes of the results need.
     result_nodes = [list_nodes(x) for x in outputs]
-    places = {b: _make_entry_expression(x) for b, x in zip(buffers, arguments, strict=True)}
-    source = CSource([node for nodes in result_nodes for node in nodes], places, real, name)
+    entry_texts = {b: _make_entry_expression(x) for b, x in zip(buffers, arguments, strict=True)}
+    source = CSource([node for nodes in result_nodes for node in nodes], entry_texts, real, name)
     try:
         body = source.write_statements(graph.top)
     except Unsupported as error:
@@ -115,7 +115,7 @@ def to_c(
     arguments = [x._replace(used=b in source.needed) for x, b in zip(arguments, buffers, strict=True)]
     results = _describe_results(result_names, program, outputs, result_nodes, real)
     assignments = _write_assignments(source, results, result_nodes)
-    # What is not used is said to be so, for compilers that warn of it.
+    # What is not used is said to be so, for compilers that warn of it: "(void)x;".
     unused = [f"    (void){x.name};" for x in (*arguments, *results) if not x.used or not x.size]
     head = _declare_function(name, arguments, results)
     lines = [f"{head}\n{{", *unused, *source.declarations(), *body, *assignments, "}"]

@@ -95,10 +95,10 @@ def lower_for_c(
         symmetric: numbers of the arguments that are symmetric matrices, of which the upper triangle alone is read.
         short: whether each loop stays a loop; else short ones are written out.
     """
-    lowering, buffers, values = CLowering(), list[Buffer](), list[Any]()
+    lowering, buffers, values = CLowering(), list[Buffer](), list[Any]()  # of each argument its memory and its value
     graph = lowering.graph
     if short:
-        lowering.written_out = 0  # loops of at most so many operations are written out
+        lowering.written_out = 0  # loops of at most so many operations are written out: none
     for number, variable in enumerate(program.jaxpr.invars):
         aval: Any = variable.aval
         buffer = Buffer("input", type_of(aval), tuple(aval.shape), graph.top)

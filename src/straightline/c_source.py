@@ -118,12 +118,13 @@ def write_expression(node: Node, arguments: Sequence[str], real: Real) -> str:
         return f"{QUIET[op]}({', '.join(arguments)})"
     if op in ORDER:
         return f"{arguments[0]} {ORDER[op]} {arguments[1]}"
-    # Integers first, since C's operators on them leave undefined what JAX defines.
+    # Integers before the operators of all types, since C's operators on them leave undefined what JAX defines. Of flags
+    # only the extremes are written as those of integers: the other operators have the same sense for them.
     if source == "bool" and op in ("max", "min"):
         return WHOLE[op](*arguments)
     if source not in (*REAL, "bool") and op in WHOLE:
         return _write_integer(op, source, arguments)
-    # Real numbers, and flags: several operations of C, one operator, or a function.
+    # Real numbers, and flags: several operations of C, one operator, or a function of libm.
     if op in COMPOSED:
         return COMPOSED[op](*arguments)
     if op in INFIX:
@@ -296,8 +297,8 @@ class CSource:
         A loop without a length has in its body the `break` that ends it.
         """
         deeper, lines = f"{indent}    ", []
-        # Carried numbers, by their place in the loop's carry: one variable each, which has the initial number first.
-        # It is the parameter within the loop and the result behind it.
+        # Carried numbers that are needed, by their place in the loop's carry: one variable each, declared with the
+        # initial number. It stands for the parameter within the loop, and for the result after it.
         carried = [k for k, node in enumerate(loop.parameters) if {node, loop.results[k]} & self.needed.keys()]
         for k in carried:
             name, start = self._new_name(), loop.initial[k]
@@ -310,7 +311,7 @@ class CSource:
         for k in carried:
             node = loop.following[k]
             value = self.name(node)
-            if node.op == "parameter":
+            if node.op == "parameter":  # of this loop or of one around it
                 value = self._new_name()
                 lines.append(f"{deeper}const {c_type(node.type, self.real)} {value} = {self.name(node)};")
             next_values.append(value)

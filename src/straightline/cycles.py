@@ -62,34 +62,37 @@ def keep_cycles(graph: Graph, outputs: Sequence[Buffer]) -> dict[Any, None]:
 def _find_recurring(loop: Loop, needed: Collection[Any]) -> Recurring | None:
     """Return S and C of a loop's body, and the tests of rows that S needs; None where S is no more than DEAR nodes.
 
+    S, C, tests and rows are those of this file's beginning. Sets of nodes are the keys of a dict, which keeps an order.
+
     `needed`: items that the outputs need, gone through for a large S only: some programs have hundreds of small loops.
     """
     body = loop.body
     nodes = [x for x in body.items if isinstance(x, Node) and x in needed]
-    rows = _find_of_rows(loop, nodes)
-    tests = {n for n in rows if n.type == "bool" and all(a.type != "bool" for a in n.args)}
+    of_rows = _find_of_rows(loop, nodes)
+    # Tests: flags of rows that are computed of numbers, rather than of other flags.
+    tests = {n for n in of_rows if n.type == "bool" and all(a.type != "bool" for a in n.args)}
     # The largest set C: begin with all carried numbers, and drop those whose next value does not follow from C.
     carried = [k for k, parameter in enumerate(loop.parameters) if parameter in needed]
     operations = [(n, _list_inner(n.args, body)) for n in nodes if n.op not in REFERRING and n not in tests]
     while True:
-        known, following = tests | {loop.parameters[k] for k in carried}, dict[Node, None]()
+        known, computed = tests | {loop.parameters[k] for k in carried}, dict[Node, None]()
         for n, arguments in operations:
             if known.issuperset(arguments):
                 known.add(n)
-                following[n] = None
-        closed = [k for k in carried if known.issuperset(_list_inner([loop.following[k]], body))]
-        if closed == carried:
+                computed[n] = None
+        still_carried = [k for k in carried if known.issuperset(_list_inner([loop.following[k]], body))]
+        if still_carried == carried:
             break
-        carried = closed
-    if not carried or len(following) <= DEAR:
+        carried = still_carried
+    if not carried or len(computed) <= DEAR:
         return None
-    _leave_fused_products(needed, following)
+    _leave_fused_products(needed, computed)
     # Only the tests that S or C's next values use; what these are computed of is no part of S, even where it follows
     # from other tests, since the tests are computed in each turn.
-    used = {a for n in following for a in n.args} | {loop.following[k] for k in carried}
-    used_tests = [n for n in rows if n in tests and n in used]
-    sources = _list_sources(rows, used_tests)
-    recurring = {n: None for n in following if n not in sources}
+    used = {a for n in computed for a in n.args} | {loop.following[k] for k in carried}
+    used_tests = [n for n in of_rows if n in tests and n in used]
+    sources = _list_sources(of_rows, used_tests)
+    recurring = {n: None for n in computed if n not in sources}
     return Recurring(nodes=recurring, carried=carried, tests=used_tests, rows=sources)
 
 
@@ -167,9 +170,10 @@ class Turn(NamedTuple):
 def _rewrite_loop(graph: Graph, items: Iterable[Any], loop: Loop, found: Recurring, kept: Sequence[Node]) -> None:
     """Rewrite a loop so that S is computed only in turns that seek a cycle; all other turns read it from a ring.
 
-    The body becomes: the tests of rows; the choice of the turn's row; a guarded block with S, which stores its row; the
-    rest, which loads from the row. The loop carries in addition the last turn's row of the ring, and the period of the
-    cycle, 0 where none is known.
+    S are the numbers that may come back, C the carried ones that they follow from (this file's beginning). The ring is
+    memory of RING rows, each with the numbers of one turn. The body becomes: the tests of rows; the choice of the
+    turn's row of the ring; a guarded block with S, which stores that row; the rest, which loads from it. The loop
+    carries in addition the last turn's row of the ring, and the period of the cycle, 0 where none is known.
 
     Args:
         graph: the program.
@@ -179,11 +183,13 @@ def _rewrite_loop(graph: Graph, items: Iterable[Any], loop: Loop, found: Recurri
         kept: the numbers of S that something outside of S needs.
     """
     body, enclosing = loop.body, graph.current
-    graph.max_nodes += 8 * (len(found.nodes) + len(found.tests))  # nodes made here are not the program's own
+    # Nodes made here are not the program's own, and do not count: at most some for each number that a ring has.
+    graph.max_nodes += 8 * (len(found.nodes) + len(found.tests))
+    # The body begins anew with the tests alone; `rest` is put at its end.
     rest = [x for x in body.items if x not in found.nodes and x not in found.rows]
     body.items, body.seen, graph.current = [*found.rows], {}, body
     test_ring, value_ring = (Ring(graph, [n.type for n in nodes], loop) for nodes in (found.tests, kept))
-    last_row, period = _carry(graph, loop, RING - 1), _carry(graph, loop, 0)
+    last_row, period = _carry(graph, loop, RING - 1), _carry(graph, loop, 0)  # as if the ring were full: row 0 is next
     turn = _choose_row(graph, found.tests, test_ring, last_row, period)
     # S, the stores of its row, and whether it closes a cycle.
     closes = _guard_nodes(graph, loop, found, kept, turn, (test_ring, value_ring))

@@ -14,17 +14,17 @@ from straightline.nodes import REAL, Block, Buffer, Node, Number, Store, Type, U
 
 
 class Graph:
-    """A program under construction, of at most `max_nodes` nodes, made in `current`, the innermost open block.
+    """A program under construction: blocks of nodes (operations), of which one block is open, to which nodes are added.
 
-    `serial` is that of the last node; `never_nan` has the nodes that are known not to be NaN.
+    By default it may have twice as many nodes as the longest program: folding makes some that the result does not need.
     """
 
     def __init__(self, max_nodes: int = 2 * LONGEST) -> None:
-        self.max_nodes = max_nodes
-        self.top = Block(None)
-        self.current = self.top
-        self.serial = 0
-        self.never_nan: set[Node] = set()
+        self.max_nodes = max_nodes  # of all blocks together; one more is refused
+        self.top = Block(None)  # the outermost block, around all loops
+        self.current = self.top  # the open block
+        self.serial = 0  # number of the last node that was made; nodes are counted from 1
+        self.never_nan: set[Node] = set()  # nodes that are known not to be NaN, whatever the data
 
     def node(self, op: str, type: Type, *args: Node, value: Any = None) -> Node:
         """Return a node of an operation: a constant, an existing equal node, or a new one."""

@@ -114,12 +114,14 @@ class _JaxEvaluation:
         return list(dict.fromkeys(x.buffer.owner[0] for x in sorted(stores, key=lambda x: x.node.serial)))
 
     def _evaluate_loop(self, loop: Loop) -> None:
-        """Evaluate a loop by JAX, and note its results: a carry has the carried numbers, and the memory it fills.
+        """Evaluate a loop by JAX's loop, and note its results.
 
-        A carry is (one number for each carried place that is needed, one array for each buffer that the body fills).
+        The carry of JAX's loop is a pair: the carried numbers that are needed, and the arrays of the buffers that the
+        body fills. Values that are computed in a turn hold in that turn alone: `self.values` is the outer one again
+        behind the loop.
         """
         pairs = zip(loop.parameters, loop.results, strict=True)
-        carried = [k for k, pair in enumerate(pairs) if {*pair} & self.needed.keys()]
+        carried = [k for k, pair in enumerate(pairs) if {*pair} & self.needed.keys()]  # their places in loop.parameters
         filled, outer_values, outer_memory = self._find_filled(loop.body), self.values, self.memory
 
         def begin_turn(carry: PyTree, counter: Any) -> None:
@@ -138,7 +140,7 @@ class _JaxEvaluation:
 
         def goes_on(carry: PyTree) -> jax.Array:
             """Return the loop's condition, after the part of the body before its check."""
-            begin_turn(carry, 0)
+            begin_turn(carry, 0)  # a loop that ends by a condition has no counter
             check = next(i for i, x in enumerate(loop.body.items) if isinstance(x, LoopExit))
             self.evaluate_block(loop.body.items[:check])
             assert loop.condition is not None

@@ -87,9 +87,9 @@ def lower_traced(
         single: whether numbers are float32.
     """
     lowering = Lowering(most)
-    avals: list[Any] = [v.aval for v in traced.jaxpr.invars]
-    inputs, values = [], []
-    for number, aval in enumerate(avals):
+    shapes_and_types: list[Any] = [variable.aval for variable in traced.jaxpr.invars]
+    inputs, values = [], []  # of each argument its memory, and the array that the program computes with
+    for number, aval in enumerate(shapes_and_types):
         is_key = jax.numpy.issubdtype(aval.dtype, jax.dtypes.prng_key)
         shape = (*aval.shape, 2) if is_key else aval.shape  # a key is two words
         buffer = Buffer("input", "u32" if is_key else type_of(aval), shape, lowering.graph.top)
@@ -102,7 +102,7 @@ def lower_traced(
             values.append(make_keys(view.nodes(lowering.graph)) if is_key else view)
     with jax.enable_x64(not single):
         outputs = lowering.lower_whole_program(traced, values)
-    return Program(lowering.graph, inputs, outputs, tree)
+    return Program(graph=lowering.graph, inputs=inputs, outputs=outputs, tree=tree)
 
 
 def _insert_known_entries(lowering: Lowering, view: InMemory, mask: np.ndarray, numbers: np.ndarray) -> Value:
@@ -113,9 +113,8 @@ def _insert_known_entries(lowering: Lowering, view: InMemory, mask: np.ndarray, 
         return view
     graph, kind = lowering.graph, view.type
     entries = zip(mask.ravel().tolist(), numbers.ravel().tolist(), range(view.size), strict=True)
-    return arrange_nodes(
-        [graph.constant(x, kind) if m else graph.load(view.buffer, i) for m, x, i in entries], view.shape
-    )
+    nodes = [graph.constant(x, kind) if is_known else graph.load(view.buffer, place) for is_known, x, place in entries]
+    return arrange_nodes(nodes, view.shape)
 
 
 def list_needed(roots: Iterable[Node | Buffer]) -> dict[Any, None]:
@@ -179,25 +178,26 @@ def find_fused_product(node: Node, products: set[Node]) -> Node | None:
 
 
 def find_fusable_products(items: Iterable[Any]) -> set[Node]:
-    """Return products that are fused with their user, the one sum or difference that uses them, noted as `value`.
+    """Return the products that are fused with the one sum or difference that uses them: a b + c, rounded once.
 
-    Of two products of one user the later one is taken.
+    The attribute `value` of such a product, which no product needs otherwise, becomes that sum. A sum takes one
+    product: of two the later one.
     """
-    users: dict[Node, Any] = {}  # None of products that are used twice
-    for statement in items:
-        for used in list_used_nodes(statement):
+    users: dict[Node, Any] = {}  # of each product the item that uses it; None of products that are used twice
+    for item in items:
+        for used in list_used_nodes(item):
             if used.op == "mul" and used.type in REAL:
-                users[used] = None if used in users else statement
-    results: set[Node] = set()
-    taken: set[Node] = set()
-    for node in sorted(users, key=lambda n: -n.serial):
-        user = users[node]
-        single = isinstance(user, Node) and user.op in ("add", "sub")
-        if single and user.block is node.block and user not in taken:
-            node.value = user
-            results.add(node)
-            taken.add(user)
-    return results
+                users[used] = None if used in users else item
+    fused: set[Node] = set()
+    sums_with_product: set[Node] = set()
+    for product in sorted(users, key=lambda n: -n.serial):  # the later one, which a sum takes, comes first
+        user = users[product]
+        is_sum = isinstance(user, Node) and user.op in ("add", "sub")
+        if is_sum and user.block is product.block and user not in sums_with_product:
+            product.value = user
+            fused.add(product)
+            sums_with_product.add(user)
+    return fused
 
 
 def list_used_nodes(node: Any) -> Sequence[Node]:
@@ -230,12 +230,17 @@ def sort_items(items: Iterable[Any]) -> list[Any]:
 def find_varying(items: Iterable[Any], inputs: Iterable[Buffer]) -> set[Any]:
     """Return which nodes, buffers, loops and guards among `items` differ between runs if these input buffers do.
 
-    The input buffers are among them.
+    The input buffers are among them. What differs is spread step by step, from each item to those that are computed
+    of it.
     """
 
     @cache
     def list_owners(block: Block) -> list[Any]:
-        """Return the loops and guards around a block that may make it differ: not loops of a known length."""
+        """Return the loops and guards around a block that may make it differ: a loop of a known length cannot.
+
+        All runs make the same turns of such a loop; only guards, which have no length, and loops that end by a
+        condition are left.
+        """
         return [
             b.owner
             for b in block.list_enclosing_blocks()
@@ -244,19 +249,19 @@ def find_varying(items: Iterable[Any], inputs: Iterable[Buffer]) -> set[Any]:
 
     # For each item, those that differ if it does.
     followers: defaultdict[Any, list[Any]] = defaultdict(list)
-    for x in items:
-        for source in x.args if is_plain(x) else _list_sources(x, list_owners):
-            followers[source].append(x)
-        if isinstance(x, Store):  # a store makes its buffer differ
-            followers[x].append(x.buffer.owner[0])
+    for item in items:
+        for source in item.args if is_plain(item) else _list_sources(item, list_owners):
+            followers[source].append(item)
+        if isinstance(item, Store):  # a number that differs makes the memory differ that it is stored in
+            followers[item].append(item.buffer.owner[0])
     # From the inputs on, all that follows; each item is visited once.
     differing: set[Any] = set(inputs)
     to_visit = list(differing)
     while to_visit:
-        for x in followers.pop(to_visit.pop(), ()):
-            if x not in differing:
-                differing.add(x)
-                to_visit.append(x)
+        for follower in followers.pop(to_visit.pop(), ()):
+            if follower not in differing:
+                differing.add(follower)
+                to_visit.append(follower)
     return differing
 
 
@@ -266,11 +271,14 @@ def find_differing(items: list[Any], inputs: Iterable[Buffer]) -> set[Any]:
     What runs share is computed once, before them. Of an array that a loop carries in memory the numbers of the last
     turn are left then: where runs need those of every turn, each has an array of its own.
     """
-    spread = find_varying(items, inputs)
+    differing = find_varying(items, inputs)
     carried = {x for x in items if isinstance(x, Buffer) and x.kind == "carried"}
-    while within := (carried and _find_memory_read_in_parts(find_crossing_items(items, spread)) & carried - spread):
-        spread = find_varying(items, [*inputs, *within, *(carried & spread)])
-    return spread
+    # Carried memory that runs read within the loop joins what differs, and what follows from it, until none is left.
+    while read_in_turns := (
+        carried and _find_memory_read_in_parts(find_crossing_items(items, differing)) & carried - differing
+    ):
+        differing = find_varying(items, [*inputs, *read_in_turns, *(carried & differing)])
+    return differing
 
 
 def _find_memory_read_in_parts(items: Iterable[Any]) -> set[Buffer]:

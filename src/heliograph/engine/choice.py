@@ -99,10 +99,11 @@ def choose_code(
     """
     engine = read_setting()
     if engine == "xla":
-        return Choice(None, f"{SETTING} is set to it")
+        return Choice(code=None, why=f"{SETTING} is set to it")
     choice = _find_code(function, arguments, differs, None if engine == "native" else most)
+    # LLVM may refuse what was lowered: only an attempt shows it.
     if choice.code is not None and (why := choice.code.prepare(choice.arrays)):
-        choice = Choice(None, why)
+        choice = Choice(code=None, why=why)
     if choice.code is None and engine == "native":
         raise fail("native code", "a program of operations that it takes", choice.why)
     return choice
@@ -223,10 +224,11 @@ def _find_code(
     try:
         code, why = _compile_structure(structure, tuple(key_leaves), most)
     except TypeError as error:  # a leaf without a hash has no key: XLA computes
-        if "unhashable" not in str(error):
+        is_of_key = "unhashable" in str(error)  # rather than one that the function raises while it is traced
+        if not is_of_key:
             raise
-        return Choice(None, f"the function holds an object that cannot be compared with another: {error}")
-    return Choice(code, why, tuple(arrays))
+        return Choice(code=None, why=f"the function holds an object that cannot be compared with another: {error}")
+    return Choice(code=code, why=why, arrays=tuple(arrays))
 
 
 class _ArrayOfRun(NamedTuple):

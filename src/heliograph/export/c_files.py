@@ -87,12 +87,12 @@ def export_c(
     """
     if isinstance(filter, Network):
         named = find_filter_by_name(filter, "" if name is None else name, node)
-        return write_filter(named.filter, named.received, path, precision, apart, size, window)
+        return write_filter(named.filter, named.received, path, precision, apart=apart, size=size, window=window)
     if name is not None or node is not None:
         raise fail("export by name", "a network", show_value(filter))
     what = "a filter, or a network and the name of its filter or fusion"
     checked: AbstractFilter = instance("export", filter, AbstractFilter, what)
-    return write_filter(checked, _name_received(checked), path, precision, apart, size, window)
+    return write_filter(checked, _name_received(checked), path, precision, apart=apart, size=size, window=window)
 
 
 def _name_received(filter: AbstractFilter) -> tuple[str, ...]:
@@ -110,12 +110,12 @@ def write_filter(
     size: bool = False,
     window: int | None = None,
 ) -> Exported:
-    """Write as `export_c`, with names for the components of z."""
+    """Write as `export_c`, with the names `received` for the components of z; the arguments are those of `export_c`."""
     source = check_source_path(path)
     if precision not in PRECISIONS:
         raise fail("precision", " or ".join(PRECISIONS), show_value(precision))
     late = None if window is None else check_window(filter, window)
-    text = make_text(filter, received, source.stem, PRECISIONS[precision], apart, size, late)
+    text = make_text(filter, received, source.stem, PRECISIONS[precision], apart=apart, size=size, late=late)
     header = source.with_suffix(".h")
     with whole_files([header, source]) as partials:
         for partial, content in zip(partials, (text.header, text.source), strict=True):
@@ -170,9 +170,11 @@ def make_text(
     precision, dtype = ("double", np.float64) if real == "double" else ("single", np.float32)
     kind = f"a {type(filter).__name__} in {precision} precision"
     form = TextOptions(prefix=prefix, real=real, received=received, kind=kind, late=late)
+    # Loops are not always shorter than what they repeat: for a short source both forms are written.
+    forms = (True, False) if size else (False,)
     texts = list[CText]()
     try:
-        for in_loops in (True, False) if size else (False,):
+        for in_loops in forms:
             with use_precision(dtype), write_short_programs(in_loops):
                 program = write_step_program(exported, real, prefix, apart, in_loops)
             texts.append(write_c_text(program, form))

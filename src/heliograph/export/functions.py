@@ -53,8 +53,8 @@ def write_functions(program: StepProgram, prefix: str, real: Real) -> list[str]:
     """Return the text of the functions of C that move the state, in the order of `list_signatures`.
 
     That is `step` alone, or, of a program in two parts, `start_at` (if the state can be set), `predict`, `correct` and
-    `step`, which calls both. Each returns 0, or the number of a reason to refuse, and writes the state only where
-    nothing is refused.
+    `step`, which calls `predict` and `correct`. Each returns 0, or the number of a reason to refuse, and writes the
+    state only where nothing is refused.
     """
     heads = list_signatures(program, prefix, real)
     if len(program.parts) == 1:
@@ -101,8 +101,9 @@ def _check_inputs(program: StepProgram) -> list[str]:
 def _write_part_statements(program: StepProgram, number: int, prefix: str) -> list[str]:
     """Return the statements of C that compute a part, refuse what is wrong, and then write all that changed.
 
-    `number` is that of the part: of the whole step or the prediction 0, of the correction 1. The codes of refusal, 4 to
-    6, are explained in the header.
+    `number` is that of the part: of the whole step or the prediction 0, of the correction 1. All is computed into
+    `after`, a copy of the state. A refusal returns its code: 4 the estimate would not be finite, 5 it would lose its
+    digits, 6 the inputs are none.
     """
     part, code = program.parts[number], program.computes[number]
     is_correction = part.name == "correct"
@@ -112,7 +113,7 @@ def _write_part_statements(program: StepProgram, number: int, prefix: str) -> li
         *([f"    {prefix}_innovation news;"] if is_correction else []),
         *(f"    unsigned char {name}[1];" for name in flags),
     ]
-    # The call: a number without axes is passed by value, all else as an array.
+    # The call: a number without axes is passed by value (as [0] of its member), all else as an array.
     read = [f"state->{m.name}" + ("" if m.start.ndim else "[0]") for m in program.read]
     written = [*(f"after.{m.name}" for m in program.members), *(_place_beside(name) for name in part.beside)]
     arguments = [*read, *part.data, _write_step_number(program, part), *written]
@@ -124,7 +125,7 @@ def _write_part_statements(program: StepProgram, number: int, prefix: str) -> li
         "    }",
         "    if (implausible[0] != 0U) { return 5; }",
     ]
-    # A correction is of the step that was predicted; the others count it.
+    # A prediction or a whole step begins the next step; a correction belongs to the step that was predicted.
     step = "state->step" if is_correction else "state->step + 1"
     return [
         *declarations,

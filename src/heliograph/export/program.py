@@ -83,21 +83,21 @@ def write_step_program(
         ValueError: random numbers, or operations that are not supported; with the operation and its place.
     """
     state = filter.init()
-    leaves, estimate = jax.tree.leaves(state), filter.estimate(state)
-    read = [StateMember(name, np.asarray(leaf)) for name, leaf in zip(name_state_arrays(state), leaves, strict=True)]
-    of_estimate = [
-        StateMember("estimate_mean", np.asarray(estimate.mean)),
-        StateMember("estimate_covariance", np.asarray(estimate.covariance)),
+    read = [
+        StateMember(name, np.asarray(leaf))
+        for name, leaf in zip(name_state_arrays(state), jax.tree.leaves(state), strict=True)
     ]
-    candidates, parts = [*read, *of_estimate], make_parts_of_step(filter, real, apart)
+    candidates = [*read, *_make_estimate_members(filter.estimate(state))]
+    parts = make_parts_of_step(filter, real, apart)
     try:
         symmetric = _find_symmetric_arrays(parts)
-        # Mean and covariance of the estimate are members of their own only if they are no arrays of the state: of each,
-        # the number of the first candidate that equals it after every part, the last of these numbers over the parts.
+        # Mean and covariance of the estimate become members of their own only where no array of the state has the same
+        # numbers after every part. So all are written once to see which results are the same; `holders` are the
+        # numbers of the two candidates that hold mean and covariance, the highest where parts differ.
         with_all = [_write_part(part, symmetric, prefix, real, size) for part in parts]
         numbers = range(len(read), len(candidates))
-        places = [max(_find_same_result(n, code, candidates) for code in with_all) for n in numbers]
-        kept = [*range(len(read)), *(n for n in places if n >= len(read))]
+        holders = [max(_find_same_result(n, code, candidates) for code in with_all) for n in numbers]
+        kept = [*range(len(read)), *(n for n in holders if n >= len(read))]
         members = [candidates[n] for n in kept]
         computes = [_write_part(part, symmetric, prefix, real, size, kept, (read, members)) for part in parts]
         names, starts = [m.name for m in members], [m.start for m in members]
@@ -107,7 +107,8 @@ def write_step_program(
         start_at = _write_start_function(filter, kept, names, prefix, real) if can_be_set else None
     except Unsupported as error:
         raise make_unsupported_error(error.operation, error.where) from None
-    mean, covariance = (candidates[n].name for n in places)
+    mean, covariance = (candidates[n].name for n in holders)
+    # The number of the step is the last argument of each part.
     uses_step_number = any(code.arguments[-1].used for code in computes)
     return StepProgram(
         filter=filter,
@@ -121,6 +122,14 @@ def write_step_program(
         covariance=covariance,
         counts=uses_step_number or filter.horizon is not None,
     )
+
+
+def _make_estimate_members(estimate: Any) -> list[StateMember]:
+    """Return the estimate's mean and covariance as members of the state in C."""
+    return [
+        StateMember("estimate_mean", np.asarray(estimate.mean)),
+        StateMember("estimate_covariance", np.asarray(estimate.covariance)),
+    ]
 
 
 def _find_same_result(number: int, code: Any, named: Sequence[StateMember]) -> int:
@@ -142,8 +151,8 @@ def _write_part(
     """Return a part of a step as a function of C; all its arguments but the measurement are finite.
 
     Args:
-        part: the part, a function of the state's arrays, the data and the step's number; its results are the state's
-            arrays, the estimate's mean and covariance, and what it has beside these.
+        part: the part, a function of the state's arrays, the data and the step's number. Its results are in this order
+            the state's arrays, the estimate's mean and covariance, and what it has beside these, such as flags.
         symmetric: which arrays of the state are symmetric.
         prefix: of its name.
         real: type of its numbers.
@@ -151,27 +160,28 @@ def _write_part(
         kept: which arrays of state and estimate are results; all by default.
         names: the members that are read, and those that are results; used where `kept` is given.
     """
-    count = len(part.examples[0])  # of the state's arrays
-    beside = count + 2
+    state_count = len(part.examples[0])
+    beside = state_count + 2  # number of the first result behind mean and covariance
 
     def choose_results(*arguments: Any) -> list[jax.Array]:
         """Return the results that are kept, then those beside state and estimate."""
         results = part.function(*arguments)
         return results if kept is None else [*(results[n] for n in kept), *results[beside:]]
 
-    array_names: tuple[list[str], list[str]] = ([], [])
+    array_names: tuple[list[str], list[str]] = ([], [])  # of arguments, and of results: by default those of `to_c`
     if kept is not None:
         read, members = ([m.name for m in some] for some in names)
         array_names = [*read, *part.data, "step"], [*(f"next_{name}" for name in members), *part.beside]
-    # Numbers of the arguments that are finite: the arrays of the state, all data but z, and the number of the step.
-    finite_data = [count + n for n, name in enumerate(part.data) if name != "z"]
+    # Arguments that are finite, by number: arrays of the state, data but z (NaN: did not arrive), the step's number.
+    finite_data = [state_count + n for n, name in enumerate(part.data) if name != "z"]
+    step_number = state_count + len(part.data)
     return to_c(
         choose_results,
         *part.examples,
         name=f"{prefix}_compute" if part.name == "step" else f"{prefix}_compute_{part.name}",
         single=real == "float",
         names=array_names,
-        finite={*range(count), *finite_data, count + len(part.data)},
+        finite={*range(state_count), *finite_data, step_number},
         symmetric=symmetric,
         short=size,
     )
@@ -180,8 +190,11 @@ def _write_part(
 def _write_start_function(filter: AbstractFilter, kept: list[int], names: list[str], prefix: str, real: Real) -> Any:
     """Return the function of C that makes the members of a state from a mean and a covariance.
 
-    Its last result, `none`, is a flag: the arguments are no finite mean and no covariance. A matrix that differs from
-    the product of its factors is no covariance, since its elimination keeps each pivot at zero or above.
+    Its last result, `none`, is a flag: the arguments are no finite mean, or no covariance. The state keeps factors of
+    the covariance. An indefinite matrix is changed by its factoring, so the product of these factors differs from it:
+    by this it is refused.
+
+    The results have the names of those of a step, `next_` and the member's, since both write the members of a state.
 
     Args:
         filter: the filter.
@@ -194,12 +207,12 @@ def _write_start_function(filter: AbstractFilter, kept: list[int], names: list[s
 
     @jax.jit
     def start_from_moments(mean: jax.Array, covariance: jax.Array) -> list[jax.Array]:
-        """Return the members of the state of a mean and covariance, and whether these are none."""
+        """Return the members of the state of a mean and covariance, and whether these are invalid."""
         state = make_state(mean, covariance)
         estimate = filter.estimate(state)
         results = [*jax.tree.leaves(state), estimate.mean, estimate.covariance]
         deviations = jnp.sqrt(jnp.abs(jnp.diagonal(covariance)))
-        difference = jnp.abs(jnp.asarray(estimate.covariance) - covariance)
+        difference = jnp.abs(jnp.asarray(estimate.covariance) - covariance)  # of the product of factors from the matrix
         is_covariance = jnp.all(difference <= SAME * jnp.outer(deviations, deviations))
         is_valid = is_covariance & jnp.all(jnp.isfinite(mean)) & jnp.all(jnp.isfinite(covariance))
         return [*(results[n] for n in kept), ~is_valid]

@@ -58,13 +58,13 @@ def write_c_text(program: StepProgram, form: TextOptions) -> CText:
     """
     prefix, real = form.prefix, form.real
     # The struct of the state: (C type, name, count of numbers) of each member, then the step's number. The type of a
-    # member is that of the result "next_<member>".
+    # member is that of the result "next_<member>" of a step. C has no arrays of length 0: an empty one has one number.
     types = {x.name.removeprefix("next_"): x.type for x in program.computes[0].results}
     fields = [(types[m.name], m.name, max(m.start.size, 1)) for m in program.members]
     counter = [lay_out_array("int64_t", 1)] if program.counts else []
-    state = lay_out_struct([*(lay_out_array(kind, count) for kind, _, count in fields), *counter])
-    window = None if form.late is None else write_window(program, form.late, state, prefix, real)
-    # The source has the computing functions, then those that a device calls.
+    state_layout = lay_out_struct([*(lay_out_array(kind, count) for kind, _, count in fields), *counter])
+    window = None if form.late is None else write_window(program, form.late, state_layout, prefix, real)
+    # The source has the functions that compute, then those that a device calls.
     starts = [program.initial] if program.start_at is None else [program.initial, program.start_at]
     source = _SOURCE.format(
         prefix=prefix,
@@ -92,7 +92,7 @@ def write_c_text(program: StepProgram, form: TextOptions) -> CText:
         header=header,
         source=source,
         operations=program.operations,
-        state_bytes=state.size if window is None else window.size,
+        state_bytes=state_layout.size if window is None else window.size,
     )
 
 

@@ -142,13 +142,16 @@ typedef struct {{
 def _explain_window(window: Window, prefix: str, bytes_held: int) -> list[str]:
     """Return lines for the header on the window: what a late measurement is, what it costs, what is refused.
 
+    A row is a step that the window holds. A late measurement has all rows from its own on run again, at most all
+    `places`; where that is refused they are run once more without it, hence twice the time.
+
     Args:
-        window: how many steps it holds, of steps or of times.
+        window: how many steps it holds, and whether time counts steps or is an input.
         prefix: of all names.
         bytes_held: of the window in C.
     """
     late = f"{prefix}_window_late"
-    # How late: in steps, or as a time where the steps have one.
+    # How late: in steps, or as an age where the time step is an input.
     if window.time is None:
         when = [
             f"{late} takes a measurement of an earlier step: of the newest one where `steps`",

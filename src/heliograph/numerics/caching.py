@@ -24,7 +24,7 @@ def cache_by_object(function: Callable[Concatenate[S, P], T]) -> Callable[Concat
     """
     # By identity of the object: a weak reference to it, and the results by the other arguments.
     cache: dict[int, tuple[ref[S], dict[Hashable, T]]] = {}
-    first_parameter = next(iter(signature(function).parameters))
+    first_parameter = next(iter(signature(function).parameters))  # the object may also be given by this name
 
     @wraps(function)
     def look_up(*positional: Any, **named: Any) -> T:

@@ -304,12 +304,11 @@ def covariance(name: str, value: ArrayLike, dimension: int | None = None) -> Any
     """
     report_covariance(name, value)
     matrix = _read_numbers(name, value)
-    if matrix.ndim != 2 and (matrix.ndim or dimension is None):  # neither a matrix nor a multiple of I
-        raise fail(
-            name, "a square matrix, such as [[4, 0], [0, 1]], or [[4]] of one component", f"shape {matrix.shape}"
-        )
-    if dimension is not None and matrix.ndim == 0:
+    if dimension is not None and matrix.ndim == 0:  # c, for c I
         matrix = array(name, matrix, ()) * np.eye(dimension)
+    if matrix.ndim != 2:
+        expected = "a square matrix, such as [[4, 0], [0, 1]], or [[4]] of one component"
+        raise fail(name, expected, f"shape {matrix.shape}")
     matrix = array(name, matrix, (dimension, dimension))
     if matrix.shape[0] != matrix.shape[1]:
         raise fail(name, "a square matrix", f"shape {matrix.shape}")

@@ -224,9 +224,9 @@ def _bind(equation: JaxprEqn, *arguments: Any) -> Any:
 
 
 def _differentiate(function: Callable[..., Any], inputs: Sequence[Compensated], several: bool) -> list[Compensated]:
-    """Return f(high parts) with low parts by f's derivative: the low part of f(x) is f'(high) low, to first order.
+    """Return f of numbers in two parts, as numbers in two parts: f(high), and f'(high) low, to first order.
 
-    A number is high + low, its rounded value and what rounding lost of it; low is None where nothing was.
+    A number is high + low, its rounded value and what rounding lost of it; low is None where nothing was lost.
 
     Args:
         function: f, of the high parts.
@@ -242,13 +242,13 @@ def _differentiate(function: Callable[..., Any], inputs: Sequence[Compensated], 
             arguments[i] = value
         return function(*arguments)
 
-    lows: Any = None
+    lows: Any = None  # the results' low parts; None where no input has one
     if not with_low:
         results = call_with()
     else:
         highs = [jnp.asarray(inputs[i].high) for i in with_low]
-        moves = [jnp.broadcast_to(inputs[i].low, x.shape) for i, x in zip(with_low, highs, strict=True)]
-        results, lows = jax.jvp(call_with, highs, moves)
+        directions = [jnp.broadcast_to(inputs[i].low, x.shape) for i, x in zip(with_low, highs, strict=True)]
+        results, lows = jax.jvp(call_with, highs, directions)
     if not several:
         results, lows = [results], None if lows is None else [lows]
     if lows is None:

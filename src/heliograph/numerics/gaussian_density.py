@@ -41,10 +41,10 @@ def log_density(
 ) -> "Float[jax.Array, '']":
     """Return log N(value; 0, covariance) of the components that are present; 0 if none is.
 
-    Component after component given those before it: sum_j -(e_j^2 / s_j + log(2 pi s_j)) / 2, e_j what is left of the
-    value and s_j of the variance (the pivots of the covariance). A component that those before it determine (s_j = 0)
-    adds nothing where it agrees with them, and -inf where it does not: the density is that of the free components. An
-    indefinite covariance gives NaN.
+    It is the sum over the components of each one's log density given those before it: -(e_j^2 / s_j + log(2 pi s_j)) /
+    2. Here e_j is component j less what those before it predict of it, and s_j its variance given them, a pivot of the
+    covariance. A component that those before it determine (s_j = 0) adds nothing where it agrees with them, and -inf
+    where it does not: the density is that of the free components. An indefinite covariance gives NaN.
 
     Args:
         value: deviations from the mean.
@@ -64,10 +64,9 @@ def log_density(
         """Add log N of component j given those before it, and condition the components behind it on it."""
         e, left = state.value, state.covariance
         pivot = left[j, j]
-        # Zero to rounding, which may leave it negative, the more the components before it were amplified.
-        determined = (pivot <= rounding(PIVOT_TOLERANCE, value) * variance[j]) & (
-            pivot >= -negative_tolerance(value, state.growth) * variance[j]
-        )
+        # Zero but for rounding, which may leave it below zero: by the more, the more rounding was amplified before.
+        highest, lowest = rounding(PIVOT_TOLERANCE, value), -negative_tolerance(value, state.growth)
+        determined = (pivot <= highest * variance[j]) & (pivot >= lowest * variance[j])
         safe_pivot = jnp.where(determined, 1.0, pivot)
         reciprocal = 1 / safe_pivot
         density = -(e[j] ** 2 * reciprocal + jnp.log(safe_pivot) + LOG_TURN) / 2
@@ -100,16 +99,17 @@ def differentiate_log_density(
 ) -> "tuple[Float[jax.Array, ''], Float[jax.Array, ' p'], Float[jax.Array, 'p p']]":
     """Return log N(e; 0, S) of the components that are present, its derivatives in p numbers, and their information.
 
-    -de' S^-1 e - tr(S^-1 dS) / 2 + e' S^-1 dS S^-1 e / 2 and de' S^-1 de + tr(S^-1 dS S^-1 dS) / 2, with the slopes de
-    and dS; see `log_density` for the other arguments.
+    With e the value and S the covariance, the derivatives are -de' S^-1 e - tr(S^-1 dS) / 2 + e' S^-1 dS S^-1 e / 2 and
+    the information is de' S^-1 de + tr(S^-1 dS S^-1 dS) / 2. Here de and dS are the `slopes`, the derivatives of value
+    and covariance in the p numbers; see `log_density` for the other arguments.
     """
-    both = present[:, None] & present
+    both = present[:, None] & present  # pairs of components of which both are present
     density = log_density(value, covariance, size, present)
     e, s = jnp.where(present, value, 0.0), jnp.where(both, covariance, 0.0)
     de, ds = jnp.where(present, slopes[0], 0.0), jnp.where(both, slopes[1], 0.0)
     p, m = de.shape
-    # S^-1 (e, de, dS) by one factorisation
+    # S^-1 e (m,), S^-1 de (m, p) and S^-1 dS (m, p, m) by one factorisation: their right sides stand side by side.
     solved = psd_solve(s, jnp.concatenate([e[:, None], de.T, jnp.moveaxis(ds, 0, 1).reshape(m, p * m)], axis=1))
-    w, v, q = solved[:, 0], solved[:, 1 : 1 + p], solved[:, 1 + p :].reshape(m, p, m)
-    score = -de @ w - jnp.einsum("iai->a", q) / 2 + jnp.einsum("i,aij,j->a", w, ds, w) / 2
-    return density, score, de @ v + jnp.einsum("iaj,jbi->ab", q, q) / 2
+    inv_e, inv_de, inv_ds = solved[:, 0], solved[:, 1 : 1 + p], solved[:, 1 + p :].reshape(m, p, m)
+    score = -de @ inv_e - jnp.einsum("iai->a", inv_ds) / 2 + jnp.einsum("i,aij,j->a", inv_e, ds, inv_e) / 2
+    return density, score, de @ inv_de + jnp.einsum("iaj,jbi->ab", inv_ds, inv_ds) / 2

@@ -19,8 +19,8 @@ FILLED = ("scratch", "carried")  # kinds of memory that the program fills
 class ProgramParts(NamedTuple):
     """Items of a program in order, and what of them differs between runs: `spread`; all else is computed once.
 
-    `lanes` are the inputs that differ. `alone`: there is one run, whose arrays are used in place. A vector has at most
-    `width` runs.
+    `lanes` are the inputs that differ: a block of runs has one run's numbers in each lane of its vectors. `alone`:
+    there is one run, whose arrays are used in place. A vector has at most `width` runs.
     """
 
     program: Program
@@ -77,7 +77,8 @@ def divide_program(
         summed: outputs that are summed over runs.
     """
     lanes = [b for b, differs in zip(program.inputs, differing, strict=True) if differs or alone]
-    # All items if there is one run, but never the tables.
+    # What differs between runs. One run alone computes all in the function of blocks, so all counts as differing; but
+    # tables are constants, which never do.
     spread = {*items, *program.inputs} if alone else find_differing(items, lanes)
     spread = {x for x in spread if not (isinstance(x, Buffer) and x.kind == "table")}
     return ProgramParts(

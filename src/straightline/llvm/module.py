@@ -138,7 +138,7 @@ def write_module(
 ) -> ModuleText:
     """Return the LLVM text of a program: a function for blocks of runs, and one that computes once what runs share.
 
-    The program's graph is freed.
+    A block is as many runs as a vector has, one in each lane. The program's graph is freed.
 
     Args:
         program: the program of one run.
@@ -159,20 +159,21 @@ def write_module(
     # The items of the function of blocks, and where the numbers lie.
     of_blocks = find_crossing_items(items, parts.spread)
     layout = lay_out_memory(parts, of_blocks)
-    # The function of blocks computes what differs, and reads the rest from slots.
+    # The function of blocks computes what differs between runs. All else it reads from slots, places in memory that are
+    # assigned as it is written.
     slots = SharedSlots(layout.shared)
     products = find_fusable_products(items) if fuse else set()
-    blocks = FunctionWriter(single=alone, mine=of_blocks, products=products, spread=parts.spread, slots=slots)
-    blocks.turning, blocks.flushes = layout.turning, _is_single(items)
-    source = _write_blocks(blocks, parts, layout)
-    # The other function fills these slots, once for all runs.
-    once = _write_once(blocks, parts, layout)
-    arrays = [np.ascontiguousarray(b.table, dtype=DTYPES[b.type]) for b in parts.tables if b.table is not None]
+    writer = FunctionWriter(single=alone, mine=of_blocks, products=products, spread=parts.spread, slots=slots)
+    writer.turning, writer.flushes = layout.turning, _is_single(items)
+    blocks = _write_blocks(writer, parts, layout)
+    # The other function, written after it, fills just these slots, once for all runs.
+    once = _write_once(writer, parts, layout)
+    tables = [np.ascontiguousarray(b.table, dtype=DTYPES[b.type]) for b in parts.tables if b.table is not None]
     program.graph.top.free_contents()
     return ModuleText(
-        blocks=source,
+        blocks=blocks,
         once=once,
-        tables=arrays,
+        tables=tables,
         outputs=[OutputShape(b.type, b.shape) for b in outputs],
         common=parts.common,
         places=[layout.in_shared.get(b, 0) for b in outputs],
@@ -221,8 +222,9 @@ HEAD = "(ptr %pointers, ptr %scratch, i64 %begin, i64 %end, i64 %runs)"
 def _write_blocks(writer: FunctionWriter, parts: ProgramParts, layout: MemoryLayout) -> FunctionSource:
     """Return the function for blocks `begin` to `end` of W runs: transpose inputs, compute, transpose outputs back.
 
-    W, the runs of a vector, is a type's size in the text: it is chosen when code is generated. Where there is one run
-    (`parts.alone`), nothing is transposed.
+    Callers' arrays have the numbers of a run one after another; a thread's scratch memory has each number of a block's
+    runs side by side, as lanes of a vector. W, the runs of a vector, is a type's size in the text: it is chosen when
+    code is generated. Where there is one run (`parts.alone`), nothing is transposed.
     """
     names = _write_pointers(writer, parts.pointers, layout.in_shared)
     for buffer, offset in layout.in_scratch.items():
@@ -233,9 +235,11 @@ def _write_blocks(writer: FunctionWriter, parts: ProgramParts, layout: MemoryLay
     writer.start_basic_block("block")
     writer.line("%number = phi i64 [%begin, %entry], [%next, %done]")
     writer.line(f"%first = mul i64 %number, {WIDTH}")
-    # Inputs to lanes, the operations, lanes to outputs. A mover is the function that transposes arrays of one kind.
-    moved = set() if parts.alone else {b for b in layout.in_scratch if b.size}
-    moved_inputs, moved_outputs = [b for b in parts.lanes if b in moved], [b for b in parts.outputs if b in moved]
+    # Inputs to lanes, the operations, lanes to outputs. A mover is the function that transposes arrays of one kind; it
+    # is called here, and written below among the helpers.
+    transposed = set() if parts.alone else {b for b in layout.in_scratch if b.size}
+    moved_inputs = [b for b in parts.lanes if b in transposed]
+    moved_outputs = [b for b in parts.outputs if b in transposed]
     movers = {_write_move(writer, names, buffer, "take") for buffer in moved_inputs}
     _request_rows_ahead(writer, parts, names, moved_inputs, moved_outputs)
     if parts.summed is not None:
@@ -260,7 +264,7 @@ def _write_move(
 ) -> Move:
     """Write the call that takes a buffer's rows into lanes or gives them back; return what it calls."""
     few = buffer.size if buffer.size < FEW else 0
-    called = Move(BITS[buffer.type], kind == "take", buffer.type in SQUARED, few)
+    called = Move(bits=BITS[buffer.type], inwards=kind == "take", squared=buffer.type in SQUARED, few=few)
     pair = f"ptr {names[buffer]}, ptr {writer.bases[buffer]}"
     writer.line(f"call void @{called.name}({pair}, i64 {buffer.size}, i64 %first, i64 %last)")
     return called
@@ -278,13 +282,13 @@ def _request_rows_ahead(
 def _locate_rows(
     writer: FunctionWriter, names: dict[Buffer, str], taken: list[Buffer], given: list[Buffer], width: int, loop: Loop
 ) -> list[PrefetchedRows]:
-    """Locate the rows that a loop asks for: the next block's inputs, and this block's outputs."""
-    following, results = writer.add(f"add i64 %first, {WIDTH}"), list[PrefetchedRows]()
+    """Locate the rows that a loop asks for: the next block's inputs (`taken`), and this block's outputs (`given`)."""
+    first_of_next, results = writer.add(f"add i64 %first, {WIDTH}"), list[PrefetchedRows]()
     for buffer in (*taken, *given):
-        bytes_, writes = buffer.size * BITS[buffer.type] // 8, buffer in given
-        place = writer.add(f"mul i64 {'%first' if writes else following}, {bytes_}")
+        bytes_of_run, writes = buffer.size * BITS[buffer.type] // 8, buffer in given
+        place = writer.add(f"mul i64 {'%first' if writes else first_of_next}, {bytes_of_run}")
         start = writer.add(f"getelementptr i8, ptr {names[buffer]}, i64 {place}")
-        results.append(PrefetchedRows(start, bytes_, count_lines_per_turn(bytes_, width, loop), writes))
+        results.append(PrefetchedRows(start, bytes_of_run, count_lines_per_turn(bytes_of_run, width, loop), writes))
     return results
 
 
@@ -310,7 +314,8 @@ def _add_to_sums(
         outputs: the buffers with rows of sums.
         width: the most runs of a vector, a power of two.
     """
-    # The first of the `width` runs: the block's first run rounded down to a multiple of width, and its batch.
+    # The first of the `width` runs, and its batch: the block's first run rounded down to a multiple of width. That is a
+    # power of two, so that "and" with -width clears the lower bits.
     first_of_width = writer.add(f"and i64 %first, {-width}")
     address = writer.add(f"getelementptr i32, ptr {names[number]}, i64 {first_of_width}")
     run = writer.add(f"load i32, ptr {address}, align 4")
@@ -318,7 +323,7 @@ def _add_to_sums(
     # The place of this vector's first lane.
     behind = writer.add(f"sub i64 %first, {first_of_width}")
     place = writer.add(f"add i64 {batch}, {behind}")
-    # Lanes beyond the last run repeat it, and do not count.
+    # Lanes beyond the last run repeat it, and do not count: those whose number is not below the runs that are left.
     runs_left = writer.write_broadcast(writer.add("sub i64 %runs, %first"), "i64")
     writer.counted = writer.add(f"icmp ult %i64 {writer.add('call %i64 @hg_lanes()')}, {runs_left}")
     for buffer in outputs:
@@ -327,12 +332,16 @@ def _add_to_sums(
 
 
 def _write_once(blocks: FunctionWriter, parts: ProgramParts, layout: MemoryLayout) -> FunctionSource | None:
-    """Return the function that computes what all runs share; None if neither blocks nor a caller need any of it."""
+    """Return the function that computes what all runs share; None if neither blocks nor a caller need any of it.
+
+    `blocks` is the writer of the function of blocks, which has been written: it knows what that one reads.
+    """
     shared_outputs = [b for b, is_common in zip(parts.outputs, parts.common, strict=True) if is_common]
     roots: list[Any] = [*blocks.slots.places, *(b for b in blocks.read if b.kind in FILLED), *shared_outputs]
     if not roots:
         return None
-    writer = FunctionWriter(True, list_needed(roots), blocks.products, set(), blocks.slots)
+    needed = list_needed(roots)
+    writer = FunctionWriter(single=True, mine=needed, products=blocks.products, spread=set(), slots=blocks.slots)
     writer.turning, writer.flushes = blocks.turning, blocks.flushes
     _write_pointers(writer, parts.pointers, layout.in_shared)
     writer.write_block(parts.program.graph.top)

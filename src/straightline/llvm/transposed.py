@@ -96,8 +96,9 @@ def _write_row_addresses(text: TextLines, bits: int, lanes: range) -> list[str]:
 def _write_register_mover(text: TextLines, move: Move, side: int, width: int) -> None:
     """Write the move of few entries of a block in which each lane has a run of its own, and the return after it.
 
-    The entries of the runs of a group follow one another in memory: they are loaded as whole registers, whose numbers
-    are exchanged.
+    The runs of a group, `side` of them, have all their entries one after another in memory. These are loaded as whole
+    registers of `side` numbers; each register of the result gathers its numbers from the loaded ones. Where lanes
+    repeat the last run, the text goes on at "singles", which moves entries one by one.
     """
     text.lines.append(f"  %end = add i64 %first, {width - 1}")
     text.lines.append("  %whole = icmp sle i64 %end, %last")
@@ -108,7 +109,8 @@ def _write_register_mover(text: TextLines, move: Move, side: int, width: int) ->
         runs = [text.add(_write_address(move.bits, start, group * move.few + i * side)) for i in range(move.few)]
         lanes = [text.add(_write_address(move.bits, "%lanes", i * width + group)) for i in range(move.few)]
         sources, targets = (runs, lanes) if move.inwards else (lanes, runs)
-        # Where the numbers of each target are among those of the sources, which follow one another.
+        # For each number of the targets, in order, its place among all numbers of the sources: the transpose of a table
+        # with a row for each run (its entries) or for each entry (its lanes).
         numbers = np.arange(move.few * side)
         in_sources = numbers.reshape(side, move.few).T if move.inwards else numbers.reshape(move.few, side).T
         vector = f"<{side} x i{move.bits}>"
@@ -143,6 +145,8 @@ def _make_square_transposer(
 ) -> Callable[[str], None]:
     """Return a function that writes the move of one square: entries i to i + n - 1 of n runs, to lanes or back.
 
+    A square is n x n numbers, whose rows are runs in a caller's array and entries in lanes.
+
     Args:
         text: where it is written.
         rows: names of the addresses of the n runs' first entries, n a power of two.
@@ -164,12 +168,13 @@ def _make_square_transposer(
         base = text.add(f"getelementptr i{bits}, ptr %lanes, i64 {base}")
         in_lanes = [text.add(f"getelementptr i{bits}, ptr {base}, i64 {k * width + group}") for k in range(len(rows))]
         sources, targets = (in_rows, in_lanes) if inwards else (in_lanes, in_rows)
-        moved = [text.add(f"load {vector}, ptr {p}, align {bits // 8}") for p in sources]
+        moved = [text.add(f"load {vector}, ptr {address}, align {bits // 8}") for address in sources]
+        # Transposed by halves: exchange the off-diagonal quarters, then those of each quarter, down to single numbers.
         half = len(rows) // 2
         while half:
             moved, half = _exchange_squares(text, moved, half, bits), half // 2
-        for p, x in zip(targets, moved, strict=True):
-            text.lines.append(f"  store {vector} {x}, ptr {p}, align {bits // 8}")
+        for address, column in zip(targets, moved, strict=True):
+            text.lines.append(f"  store {vector} {column}, ptr {address}, align {bits // 8}")
 
     return write_square
 
@@ -205,7 +210,7 @@ def _make_entry_mover(
             run = text.add(f"getelementptr i{bits}, ptr {row}, i64 {i}")
             here = text.add(f"getelementptr i{bits}, ptr {base}, i64 {lane}")
             source, target = (run, here) if inwards else (here, run)
-            x = text.add(f"load i{bits}, ptr {source}, align {bits // 8}")
-            text.lines.append(f"  store i{bits} {x}, ptr {target}, align {bits // 8}")
+            number = text.add(f"load i{bits}, ptr {source}, align {bits // 8}")
+            text.lines.append(f"  store i{bits} {number}, ptr {target}, align {bits // 8}")
 
     return write_entry

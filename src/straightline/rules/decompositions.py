@@ -31,12 +31,12 @@ def eigh(a: jax.Array) -> tuple[jax.Array, jax.Array]:
     """
     n, eps = len(a), float(np.finfo(a.dtype).eps)
     finite = jnp.all(jnp.isfinite(a))
-    # The upper triangle of (A + A') / 2, in a unit in which squares of entries neither overflow nor vanish; the
-    # eigenvectors are those of no rotation, I.
+    # The upper triangle of (A + A') / 2, in a unit in which squares of entries neither overflow nor vanish. Before the
+    # first rotation the eigenvectors are the identity matrix.
     unit = _choose_unit(a)
     entries = {(i, j): (a[i, j] / unit + a[j, i] / unit) / 2 for i in range(n) for j in range(i, n)}
     vectors = {(i, j): jnp.asarray(float(i == j), a.dtype) for i in range(n) for j in range(n)}
-    # Off-diagonal entries below eps ||A||_F / n are rounding.
+    # Off-diagonal entries below eps ||A||_F / n are rounding; in the norm those above the diagonal count twice.
     rounding = eps * jnp.sqrt(sum((1 if i == j else 2) * x * x for (i, j), x in entries.items())) / n
 
     def goes_on(state: tuple[Numbers, Numbers, jax.Array]) -> jax.Array:
@@ -53,14 +53,13 @@ def eigh(a: jax.Array) -> tuple[jax.Array, jax.Array]:
         (entries, vectors), _ = jax.lax.scan(turn, (entries, vectors), length=turns)
         return entries, vectors, sweeps + 1
 
-    if n > 1:
+    if n > 1:  # a matrix of one number is its eigenvalue
         entries, vectors, _ = jax.lax.while_loop(goes_on, sweep, (entries, vectors, jnp.asarray(0)))
-    # Eigenvalues in ascending order, with their columns.
-    values, columns = _sort_by_transposition(
-        [entries[i, i] for i in range(n)], [[vectors[i, j] for i in range(n)] for j in range(n)]
-    )
-    rows = jnp.stack([jnp.stack(column) for column in columns], axis=1)
-    return jnp.where(finite, rows, jnp.nan), jnp.where(finite, jnp.stack(values) * unit, jnp.nan)
+    # Eigenvalues, now the diagonal entries, in ascending order, with their columns.
+    diagonal = [entries[i, i] for i in range(n)]
+    values, columns = _sort_by_transposition(diagonal, [[vectors[i, j] for i in range(n)] for j in range(n)])
+    eigenvectors = jnp.stack([jnp.stack(column) for column in columns], axis=1)
+    return jnp.where(finite, eigenvectors, jnp.nan), jnp.where(finite, jnp.stack(values) * unit, jnp.nan)
 
 
 def _choose_unit(a: jax.Array) -> jax.Array:

@@ -116,21 +116,23 @@ def _gather_from_memory(
     """
     numbers, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
     axis = numbers.start_index_map[column]
-    last = x.shape[axis] - sizes[axis]
-    # Where each gathered number lies in the flat array if the index that depends on data were 0.
+    last_start = x.shape[axis] - sizes[axis]
+    # Where each gathered number would lie in the flat array if the index that depends on data were 0: what the same
+    # gather takes from an array of the places 0, 1, 2, ...
     with_zero = _replace_indices(lowering, indices, column, 0)
     if known_integers(with_zero) is None:
         raise Unsupported("gather at two places that data decide")
-    offsets = _gather_clipped(equation, lowering, np.arange(x.size, dtype=object).reshape(x.shape), with_zero)
-    # Each is loaded that index times the axis' stride behind it.
+    places = np.arange(x.size, dtype=object).reshape(x.shape)
+    offsets = _gather_clipped(equation, lowering, places, with_zero)
+    # It lies behind that place by the index, clamped so that the window stays inside, times the stride of its axis.
     buffer, stride = put_in_memory(lowering, x).buffer, contiguous_strides(x.shape)[axis]
     loaded = np.empty(offsets.shape, dtype=object)
     for entry in np.ndindex(*loaded.shape):
         index = indices[(*_find_index_row(entry, numbers), column)]
-        if index.op == "constant":
+        if index.op == "constant":  # its place is right already, since `_replace_indices` keeps what is known
             loaded[entry] = x.ravel()[offsets[entry]]
         else:
-            clamped: Any = clamp_place(lowering, index, last)
+            clamped: Any = clamp_place(lowering, index, last_start)
             loaded[entry] = lowering.graph.load(buffer, int(offsets[entry]), (stride,), (clamped,))
     return loaded
 

@@ -53,7 +53,7 @@ def _lower_loop(
             it and, beside that, anything.
     """
     graph, outer = lowering.graph, lowering.graph.current
-    by_triangle = [is_symmetric(x) for x in carry]
+    by_triangle = [is_symmetric(x) for x in carry]  # which carried arrays are carried as their upper triangle
     while True:
         nodes_before = graph.serial
         loop = Loop(Block(outer), length, _flatten_carry(carry, by_triangle))
@@ -158,8 +158,9 @@ def _lower_long_scan(
 ) -> list[Value]:
     """Lower a scan as a loop, whose long arrays stay in memory; return its carry, then what it stacks.
 
-    Of the carried arrays, by number: one that the body returns unchanged is a constant of the loop; a long one is
-    carried in memory (`in_memory`); all others are carried as numbers (`as_numbers`).
+    `fixed` are arguments that are the same in each turn, `rows` arrays of which a turn has one row. Of the carried
+    arrays, by number: one that the body returns unchanged is a constant of the loop; a long one is carried in memory
+    (`in_memory`); all others are carried as numbers (`as_numbers`).
     """
     program, count = equation.params["jaxpr"], len(carry)
     carried_in, carried_out = program.jaxpr.invars[len(fixed) :], program.jaxpr.outvars

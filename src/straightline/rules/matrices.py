@@ -30,26 +30,32 @@ def _reduce_by(op: str, empty: float) -> Rule:
         # (entry of the result, terms); no terms of a sum over nothing.
         terms = math.prod(inputs[0].shape[axis] for axis in axes)
         x = np.moveaxis(inputs[0], axes, range(-len(axes), 0)).reshape(math.prod(shape), terms)
-        neutral = _clip_to_type(type, empty)
+        neutral = _replace_not_finite(type, empty)
         return [arrange_nodes([combine_nodes(lowering.graph, op, type, row, neutral) for row in x.tolist()], shape)]
 
     return lower_operation
 
 
-ALL_BITS = np.nan  # stands for the neutral element of "and": true, -1, or the greatest unsigned integer
+# Stands for the number of a type that has all bits set, the neutral element of "and": true, -1 of a signed type, or the
+# greatest unsigned integer. It is this NaN object, known by `is`.
+ALL_BITS = np.nan
 
 
-def _clip_to_type(type: Type, number: float) -> float:
-    """Return the number of a type that is nearest to this one, as an integer to infinity; of ALL_BITS all bits set."""
+def _replace_not_finite(type: Type, number: float) -> float:
+    """Return a neutral element as a number of a type: of integers and flags the limits stand for infinities.
+
+    Infinity becomes the greatest number of the type, minus infinity the least, and ALL_BITS the one with all bits set.
+    Finite numbers, and all numbers of a real type, are as they were.
+    """
     if type in REAL or np.isfinite(number):
         return number
-    greatest = number > 0 or number is ALL_BITS
+    has_all_bits = number is ALL_BITS
     if type == "bool":
-        return greatest
+        return has_all_bits or number > 0
     limits = np.iinfo(DTYPES[type])
-    if number is ALL_BITS and limits.min < 0:
-        return -1
-    return limits.max if greatest else limits.min
+    if has_all_bits:
+        return -1 if limits.min < 0 else limits.max
+    return limits.max if number > 0 else limits.min
 
 
 def _accumulate_by(op: str) -> Rule:
@@ -234,8 +240,8 @@ def _cholesky(graph: Graph, params: Any, a: np.ndarray) -> np.ndarray:
             for k in range(j):
                 remainder = graph.node("sub", real, remainder, graph.node("mul", real, lower[i, k], lower[j, k]))
             remainders.append(remainder)
-        # l_jj = sqrt(r_j), l_ij = r_i / l_jj. A pivot r_j <= 0 makes all NaN; one that is NaN (not <= 0) makes NaN
-        # only what is computed of it.
+        # l_jj = sqrt(r_j), l_ij = r_i / l_jj; r_j is the pivot. If it is zero or negative, the whole result is NaN. If
+        # it is NaN, which is not "<= 0", only what is computed of it is NaN.
         root = graph.node("sqrt", real, remainders[0])
         is_bad = graph.node("le", "bool", remainders[0], zero)
         definite = graph.node("and", "bool", definite, graph.node("not", "bool", is_bad))
@@ -260,8 +266,8 @@ def _triangular_solve(graph: Graph, params: Any, a: np.ndarray, b: np.ndarray) -
         transposed, b = not transposed, b.T
     if transposed:
         a, lower = a.T, not lower
-    # x_i = (b_i - sum_j a_ij x_j) / a_ii over the rows j solved before, from the first row on if A is lower triangular,
-    # else from the last.
+    # Now A X = B, for each column of B: x_i = (b_i - sum_j a_ij x_j) / a_ii over the rows j solved before, from the
+    # first row on if A is lower triangular, else from the last.
     n, real = len(a), _type_of(a)
     one = graph.constant(1.0, real)
     reciprocals = [one if params["unit_diagonal"] else graph.node("div", real, one, a[i, i]) for i in range(n)]

@@ -42,11 +42,11 @@ class _OperationProgram(NamedTuple):
 
 
 def operation(native: Callable[P, R]) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorate a function, called plain, in whose place native code and C have another one, `native`.
+    """Decorate a function, here called the plain one, for which native code and C compute another one, `native`.
 
-    XLA compiles, `vmap` maps and JAX differentiates the plain function. Native code calls `native` instead, on one item
-    after another where `vmap` maps them; it calls the plain function where `native` is too long. So each has the form
-    that suits it: all entries side by side for XLA, a straight line for native code.
+    The two are the same function in two forms: all entries side by side, which suits XLA, and a straight line of
+    operations, which suits native code. XLA compiles, `vmap` maps and JAX differentiates the plain one. Native code
+    computes `native`, on one item after another where `vmap` maps them, or the plain one where `native` is too long.
 
     Args:
         native: a function of the same arguments with the same results.
@@ -60,8 +60,11 @@ def operation(native: Callable[P, R]) -> Callable[[Callable[P, R]], Callable[P, 
 
         @cache
         def trace_plain_function(tree: Any, kinds: tuple[Any, ...], x64: bool) -> tuple[_OperationProgram, Any]:
-            """Trace the plain function for arguments of these shapes and types; return it and its results' tree."""
-            result_tree: list[Any] = []
+            """Trace the plain function for arguments of these shapes and types; return it and its results' tree.
+
+            `x64`: whether JAX's numbers are double now, on which the trace depends.
+            """
+            result_tree: list[Any] = []  # filled while it is traced
 
             def call_on_leaves(function: Callable[..., R], *leaves: Any) -> list[Any]:
                 """Return the leaves of the function's results from those of its arguments; note the results' tree."""
@@ -80,7 +83,8 @@ def operation(native: Callable[P, R]) -> Callable[[Callable[P, R]], Callable[P, 
             leaves, tree = jax.tree.flatten((args, kwargs))
             leaves = [jnp.asarray(leaf) for leaf in leaves]
             kinds = tuple((leaf.shape, leaf.dtype) for leaf in leaves)
-            program, result_tree = trace_plain_function(tree, kinds, bool(jnp.result_type(float) == np.float64))
+            is_x64 = bool(jnp.result_type(float) == np.float64)
+            program, result_tree = trace_plain_function(tree, kinds, is_x64)
             flat = _primitive.bind(*leaves, program=program, levels=(), sizes=())  # under no vmap yet
             results: R = jax.tree.unflatten(result_tree, flat)
             return results

@@ -70,10 +70,11 @@ def find_window_places(
     Args:
         shape: of the array, whose entries are in row-major order.
         sizes: of a window, along each axis of the array.
-        indices: first entry of each window, (..., k): `index_map[k]` is the axis of the array that its number k is for.
-        index_map: as said.
-        batching: pairs of an axis of the array and an axis of `indices` along which windows and array correspond.
-        removed: axes of size 1 that the result does not have.
+        indices: first entry of each window (..., k), a number for each of some axes of the array.
+        index_map: for each of these numbers its axis of the array; a window starts at 0 along all other axes.
+        batching: pairs of an axis of the array and an axis of `indices`: the windows at place i along the second axis
+            start at i along the first one.
+        removed: axes of the array, along which windows have the size 1, that the result does not have.
         clips: whether a window that is not inside is moved inside; else all its places are -1.
 
     Returns:
@@ -87,17 +88,18 @@ def find_window_places(
         count = np.arange(indices.shape[along])
         starts[..., axis] = count.reshape([-1 if a == along else 1 for a in range(indices.ndim - 1)])
     # Its place in row-major order.
-    last = np.array(shape) - np.array(sizes)
-    inside = np.all((starts >= 0) & (starts <= last), axis=-1)
+    last_starts = np.array(shape) - np.array(sizes)  # along each axis the last start of a window that is inside
+    inside = np.all((starts >= 0) & (starts <= last_starts), axis=-1)
     strides = np.array(contiguous_strides(shape), dtype=np.int64)
-    base = np.sum(np.clip(starts, 0, last) * strides, axis=-1)
+    first_places = np.sum(np.clip(starts, 0, last_starts) * strides, axis=-1)
     if not clips:  # so far below 0 that adding an offset, at most the array's size - 1, leaves it below 0
-        base = np.where(inside, base, -1 - int(np.prod(shape, dtype=np.int64)))
+        first_places = np.where(inside, first_places, -1 - int(np.prod(shape, dtype=np.int64)))
     # Offsets of a window's entries from its first one: the sum over its axes of stride times number along the axis.
     window_axes = [a for a in range(len(shape)) if a not in removed]
     offsets = np.zeros([sizes[a] for a in window_axes], dtype=np.int64)
     for position, a in enumerate(window_axes):
         along_axis = [-1 if p == position else 1 for p in range(len(window_axes))]
         offsets += strides[a] * np.arange(sizes[a]).reshape(along_axis)
-    places = np.reshape(base, (*base.shape, *[1] * offsets.ndim)) + offsets
+    # Each window's first place plus each offset: the places have the axes of the windows, then those within a window.
+    places = np.reshape(first_places, (*first_places.shape, *[1] * offsets.ndim)) + offsets
     return np.maximum(places, -1)

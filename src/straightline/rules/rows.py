@@ -137,8 +137,10 @@ def _dot_general(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
 def _multiply_by_row(lowering: Lowering, equation: JaxprEqn, a: InMemory, b: InMemory) -> list[Value]:
     """Lower a product of arrays in memory as a loop.
 
-    The loop is over the first batch axis, else over the first free axis of a, else over that of b: each turn computes a
-    row of the result. Where there is no such axis, the loop is over the first contracted one, and turns are summed.
+    As JAX calls them, batch axes are those of both arguments and of the result, contracted ones are summed over, and
+    free ones are of one argument and of the result. The loop is over the first batch axis, else over the first free
+    axis of a, else over that of b: each turn computes a row of the result. Where there is no such axis, the loop is
+    over the first contracted one, and turns are summed.
     """
     (a_contracted, b_contracted), (a_batch, b_batch) = equation.params["dimension_numbers"]
     # The axis of each argument that is looped over, None where an argument is used whole in every turn.
@@ -281,9 +283,10 @@ def _reduce_long(lowering: Lowering, equation: JaxprEqn, name: str, x: Value) ->
     The reduced rows are stacked, or reduced further one after another where the operation's axes include the first.
     """
     axes = equation.params["axes"]
-    # The same operation within a row, and on two rows to one; both have a result of the shape of a reduced row.
-    row_axes = tuple(a - 1 for a in axes if a)
-    shape = tuple(n for a, n in enumerate(x.shape[1:]) if a not in row_axes)
+    # The same operation within a row, and on two rows to one; both have a result of the shape of a reduced row. A row
+    # lacks axis 0, so its other axes have numbers that are lower by one.
+    row_axes = tuple(axis - 1 for axis in axes if axis != 0)
+    shape = tuple(n for axis, n in enumerate(x.shape[1:]) if axis not in row_axes)
     result = SimpleNamespace(aval=make_placeholder(shape, equation.outvars[0].aval.dtype))  # type: ignore[attr-defined]
     within_row: Any = SimpleNamespace(params=equation.params | {"axes": row_axes}, outvars=[result])
     of_two_rows: Any = SimpleNamespace(params=equation.params | {"axes": (0,)}, outvars=[result])
@@ -304,7 +307,7 @@ def _reduce_long(lowering: Lowering, equation: JaxprEqn, name: str, x: Value) ->
     if 0 not in axes:
         _carry, stacked = repeat_turns(lowering, x.shape[0], [], stack_row)
         return list(stacked)
-    # From the neutral element on: the reduction of no row.
+    # Accumulate from the neutral element on, which is the reduction of no rows.
     start = RULES[name](lowering, of_two_rows, [np.empty((0, *shape), dtype=object)])[0]
     total_of_rows, _stacked = repeat_turns(lowering, x.shape[0], [start], accumulate_row)
     return list(total_of_rows)

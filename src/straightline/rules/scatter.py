@@ -28,22 +28,23 @@ def _make_scatter_rule(op: str | None) -> Rule:
         x, indices, updates = inputs
         numbers = equation.params["dimension_numbers"]
         indices = convert_to_32_bits(lowering, indices) if fills_outside(equation) else indices
-        # Axes that a window does not have, and its size along all others.
+        # Axes of the array that a window does not have, along which it has the size 1, and its size along all others.
         removed = (*numbers.inserted_window_dims, *numbers.operand_batching_dims)
-        windows = iter(updates.shape[a] for a in numbers.update_window_dims)
-        sizes = [1 if a in removed else next(windows) for a in range(x.ndim)]
+        window_lengths = iter(updates.shape[axis] for axis in numbers.update_window_dims)
+        sizes = [1 if axis in removed else next(window_lengths) for axis in range(x.ndim)]
         known = known_integers(indices)
-        if known is None:
+        if known is None:  # data decide where the updates land
             return [_scatter_by_cases(lowering, equation, op, inputs, indices, sizes)]
-        # Places of all updates in the flat array, -1 outside, with axes in the order of the updates'.
+        # Places of all updates in the flat array, -1 outside. They have the windows' own axes last; these are moved to
+        # where the updates have them, so that both are in the same order.
         batching = list(zip(numbers.operand_batching_dims, numbers.scatter_indices_batching_dims, strict=True))
         index_map = numbers.scatter_dims_to_operand_dims
         places = find_window_places(x.shape, sizes, known, index_map, batching, removed, _clips(equation))
         places = np.moveaxis(places, range(known.ndim - 1, places.ndim), numbers.update_window_dims)
         updated = x.ravel().copy()
-        for index, new in zip(places.ravel().tolist(), updates.ravel().tolist(), strict=True):
-            if index >= 0:
-                updated[index] = _combine(lowering.graph, op, updated[index], new)
+        for place, new in zip(places.ravel().tolist(), updates.ravel().tolist(), strict=True):
+            if place >= 0:
+                updated[place] = _combine(lowering.graph, op, updated[place], new)
         return [updated.reshape(x.shape)]
 
     return scatter_updates
@@ -67,7 +68,9 @@ def _scatter_by_cases(
     indices: np.ndarray,
     sizes: list[int],
 ) -> np.ndarray:
-    """Scatter at indices that data decide: at every place where an update may land, select(it lands here, new, old).
+    """Scatter at indices that data decide: each entry that an update may change becomes a choice of new and old number.
+
+    The entry is new where the update's window starts at the place that would put it there.
 
     Args:
         lowering: the program.
@@ -83,10 +86,10 @@ def _scatter_by_cases(
     (x, _indices, updates), numbers, graph = inputs, equation.params["dimension_numbers"], lowering.graph
     removed = (*numbers.inserted_window_dims, *numbers.operand_batching_dims)
     window_axes = [a for a in range(x.ndim) if a not in removed]
-    # The updates with the axes of the indices first, then those of a window.
+    # The updates with the axes of the indices first, then those of a window: windows[row] is the window of one index.
     along = numbers.update_window_dims
     windows = np.moveaxis(updates, along, range(updates.ndim - len(along), updates.ndim))
-    updated, count = x.copy(), 0  # of selections
+    updated, count = x.copy(), 0  # count: of selections
     for row in np.ndindex(*indices.shape[:-1]):
         for start, is_here in _yield_starts(graph, equation, x.shape, sizes, row, indices[row]):
             count += math.prod(sizes)
@@ -131,7 +134,8 @@ def _yield_starts(
             last = shape[axis] - sizes[axis]
             if clips and last == 0:  # clipped to the one place there is: always here
                 continue
-            # Clipped, the first place stands for all below it, and the last one for all above.
+            # Where indices are clipped, the first place is meant by all indices up to it, and the last one by all from
+            # it on.
             comparison = "eq"
             if clips and start[axis] == 0:
                 comparison = "le"
@@ -139,7 +143,8 @@ def _yield_starts(
                 comparison = "ge"
             along_axis = graph.node(comparison, "bool", node, graph.constant(start[axis], node.type))
             is_here = graph.node("and", "bool", is_here, along_axis)
-        if is_here.op != "constant" or is_here.value:
+        is_known_to_be_elsewhere = is_here.op == "constant" and not is_here.value
+        if not is_known_to_be_elsewhere:
             yield start, is_here
 
 

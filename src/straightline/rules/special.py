@@ -124,7 +124,7 @@ def gamma_masses_of_large_shape(a: jax.Array, x: jax.Array) -> tuple[jax.Array, 
 
     Source: Temme, The asymptotic expansion of the incomplete gamma functions (1979); DLMF 8.12.3, 8.12.4.
     """
-    m = jnp.clip((x - a) / a, -0.9, 3.0)  # beyond these, the smaller mass is below the least number
+    m = jnp.clip((x - a) / a, -0.9, 3.0)  # beyond these limits the smaller mass is below the least positive number
     # y^2 / 2 = m - log(1 + m) = m s - 2 s (s^2 / 3 + s^4 / 5 + ...), s = m / (2 + m): near 0, where the difference
     # would cancel, by the series up to s^26 / 27, whose next term is below rounding for |m| < 0.4.
     s = m / (2 + m)
@@ -176,8 +176,9 @@ def _keep_from_zero(x: jax.Array) -> jax.Array:
 def scaled_bessel(order: int, x: jax.Array) -> jax.Array:
     """Compute e^-|x| I_v(x), the scaled modified Bessel function of order v = 0 or 1.
 
-    Up to |x| = FAR by the power series I_v = (x / 2)^v sum_k (x^2 / 4)^k / (k! (k + v)!); beyond by the asymptotic one,
-    I_v = e^x / root(2 pi x) (1 + sum_k a_k), a_k = a_k-1 ((2 k - 1)^2 - 4 v^2) / (8 k x), whose terms fall to 1e-26.
+    Up to |x| = FAR by the power series I_v = (x / 2)^v sum_k (x^2 / 4)^k / (k! (k + v)!), v the `order`. Beyond by the
+    asymptotic series I_v = e^x / root(2 pi x) (1 + sum_k a_k), a_k = a_k-1 ((2 k - 1)^2 - 4 v^2) / (8 k x), a_0 = 1,
+    whose terms fall to 1e-26. Both are summed by one loop, whose ratio of terms is that of the series that serves.
 
     Source: Abramowitz and Stegun, Handbook of mathematical functions, 9.6.10 and 9.7.1.
     """

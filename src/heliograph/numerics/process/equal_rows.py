@@ -42,11 +42,12 @@ def _map_rows(row: np.ndarray, count: int) -> np.ndarray | None:
 
     It fails where the system has no such mapping, and is not tried where little memory would be saved.
     """
-    map_memory, size = _system_call(), row.nbytes * count
+    map_memory, size = _find_system_call(), row.nbytes * count
     # A piece: whole rows in whole pages, at least PIECE bytes, and so long that at most PIECES of them are mapped.
     unit = math.lcm(row.nbytes, mmap.PAGESIZE)
-    piece = unit * max(-(-PIECE // unit), -(-size // (unit * PIECES)))
-    if map_memory is None or size < 4 * piece or len(_held) >= MOST:  # of fewer than four pieces little is saved
+    piece = unit * max(-(-PIECE // unit), -(-size // (unit * PIECES)))  # in bytes; -(-a // b) is a / b rounded up
+    saves_little = size < 4 * piece
+    if map_memory is None or saves_little or len(_held) >= MOST:
         return None
     try:
         file = os.memfd_create("heliograph-rows", os.MFD_CLOEXEC)
@@ -83,7 +84,7 @@ MAP_FIXED = 0x10  # of Linux: at this address, in the place of what is mapped th
 
 
 @cache
-def _system_call() -> Any:
+def _find_system_call() -> Any:
     """Return mmap(address, length, protection, flags, file, offset) of the system; None where it is not Linux's."""
     if not hasattr(os, "memfd_create"):
         return None

@@ -26,8 +26,9 @@ def find_out_of_order(time: np.ndarray) -> Bool[np.ndarray, " rows"]:
     least_ends, end_rows = list[float](), list[int]()
     previous = list[int]()
     for row, value in enumerate(reversed_times):
-        length = bisect_right(least_ends, value)
+        length = bisect_right(least_ends, value)  # of the longest subsequence that this row continues
         previous.append(end_rows[length - 1] if length else -1)
+        # It is the new end at place `length`: in the place of a larger one, or, of the longest so far, appended.
         least_ends[length : length + 1], end_rows[length : length + 1] = [value], [row]
     # All rows are out of order but those of the longest subsequence, from its end back.
     out_of_order = np.ones(len(time), dtype=bool)
