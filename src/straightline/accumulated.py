@@ -70,7 +70,7 @@ class AccumulatedProgram:
             runs: how many.
             first: number of the first one; 0 by default.
         """
-        # A part is some whole vectors of runs.
+        # A part is some whole vectors of runs: a PARTS-th of all vectors, rounded up.
         begun = self.begin(jax.tree.leaves(arguments), runs)
         part_length = -(-runs // (PARTS * self.width)) * self.width
         starts = range(first, first + runs, part_length)
@@ -120,7 +120,7 @@ class BegunProgram:
         self.shared: list[np.ndarray | None] = [None] * len(program.common)
         if program.once is not None:
             number, results = np.zeros(1, np.uint32), [np.empty(0)] * len(program.common)
-            pointers = self._pointers(number, results)
+            pointers = self._list_pointers(number, results)
             once = program.once.choose_machine(1)
             once.run(pointers.ctypes.data, 0, 0, 1, 1)
         for n, (buffer, offset) in enumerate(zip(program.code.outputs, program.code.places, strict=True)):
@@ -136,7 +136,7 @@ class BegunProgram:
         `memory`: sums that nobody needs any more, of which the last are taken, and filled, if their shapes fit.
         """
         length = row_length(self.program.width, self.program.summed.batches)
-        shapes = [(*b.shape, length) for b, s in self._outputs() if s]
+        shapes = [(*b.shape, length) for b, s in self._list_outputs() if s]
         try:  # threads may take from it at once
             taken = [] if memory is None else memory.pop()
         except IndexError:
@@ -157,7 +157,7 @@ class BegunProgram:
         # There is no code for runs where they share all results.
         if len(numbers) and self._machine is not None:
             scratch = allocate_aligned(self.program.code.scratch)
-            pointers = self._pointers(numbers, outputs)
+            pointers = self._list_pointers(numbers, outputs)
             blocks = -(-len(numbers) // self._machine.width)  # a block: the runs of one vector
             self._machine.run(pointers.ctypes.data, scratch.ctypes.data, 0, blocks, len(numbers))
         return collected
@@ -170,7 +170,7 @@ class BegunProgram:
         remaining_sums = iter(sums)
         outputs: list[np.ndarray] = []
         collected: list[np.ndarray | None] = []
-        for (buffer, summed), common in zip(self._outputs(), self.program.common, strict=True):
+        for (buffer, summed), common in zip(self._list_outputs(), self.program.common, strict=True):
             if summed:
                 outputs.append(next(remaining_sums))
             else:
@@ -186,12 +186,12 @@ class BegunProgram:
         """
         return [fold_rows(_add_in_order(sums), self.program.summed.batches) for sums in zip(*parts, strict=True)]
 
-    def _outputs(self) -> list[tuple[Any, bool]]:
+    def _list_outputs(self) -> list[tuple[Any, bool]]:
         """Return each output, and whether it is a sum over runs in memory: what all runs share is none."""
         parts = zip(self.program.code.outputs, self.program.summed.outputs, self.program.common, strict=True)
         return [(buffer, summed and not common) for buffer, summed, common in parts]
 
-    def _pointers(self, numbers: np.ndarray, results: Sequence[np.ndarray]) -> np.ndarray:
+    def _list_pointers(self, numbers: np.ndarray, results: Sequence[np.ndarray]) -> np.ndarray:
         """Return the addresses of inputs, tables, results and the memory that all runs share."""
         position = self.program.summed.number
         inputs = [*self.arguments[:position], numbers, *self.arguments[position:]]
@@ -258,5 +258,9 @@ def _add_in_order(sums: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _count_by_batch(first: int, runs: int, batches: int) -> np.ndarray:
-    """Return how many of the runs from `first` on each batch has: equal numbers, and one more of the rest."""
-    return np.bincount(np.arange(first, first + runs % batches) % batches, minlength=batches) + runs // batches
+    """Return how many of the runs from `first` on each batch has; run r is in batch r mod `batches`.
+
+    All have the same number, but for the rest, of which the batches from that of the first run on have one each.
+    """
+    rest = np.arange(first, first + runs % batches)
+    return np.bincount(rest % batches, minlength=batches) + runs // batches

@@ -206,7 +206,10 @@ class CSource:
         return write_literal(node.value, node.type, self.real) if node.op == "constant" else self.names[node]
 
     def _clip_to_range(self, node: Node) -> str:
-        """Return a number as the end of a range: the largest of the precision in place of one beyond it."""
+        """Return a number as the end of a range: the largest of the precision in place of one beyond it.
+
+        A limit that float does not have limits no float, and `write_literal` would refuse it.
+        """
         if node.op != "constant" or self.real != "float" or not math.isfinite(node.value):
             return self.name(node)
         largest = float(np.finfo(np.float32).max)

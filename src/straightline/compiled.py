@@ -167,6 +167,7 @@ class Compiled:
     def _compute_blocks(self, call: "CallMemory", cores: int | None) -> None:
         """Compute all blocks of runs of a call: here if that is little work, else shared among threads."""
         blocks, scratch, work = -(-call.runs // call.machine.width), self.code.scratch, self.code.blocks.work
+        # Blocks of a thread's part: an even share, but no less than is worth a thread. -(-a // b) is a / b rounded up.
         share = max(-(-blocks // ((cores or cpu_count()) * SHARES)), -(-LITTLE // max(work, 1)))
         if cores == 1 or share >= blocks:
             call.compute(0, blocks, scratch)
@@ -270,19 +271,20 @@ class SingleRunCode:
     """
 
     def __init__(self, program: Program, in_place: Mapping[int, int] = MappingProxyType({})):
-        self.code = write_module(program, [True] * len(program.inputs), 1, find_processor_features()[2], True, in_place)
-        level = int(self.code.operations <= ALONE)
+        every, (_name, _flags, fuses) = [True] * len(program.inputs), find_processor_features()
+        self.code = write_module(program, differing=every, width=1, fuse=fuses, alone=True, last=in_place)
+        level = int(self.code.operations <= ALONE)  # 1, with care, unless the program is long
         self.machine, self.tree, self._in_place = generate(self.code.blocks, level, 1), program.tree, in_place
         self._arguments = [(b.shape, DTYPES[b.type]) for b in program.inputs]
-        self._allocate([])
+        self._allocate_memory([])
 
     def again(self, first: Sequence[np.ndarray]) -> "SingleRunCode":
         """Return the same code with new memory; the first arguments are these arrays, which a call only reads."""
         new = copy(self)
-        new._allocate(first)
+        new._allocate_memory(first)
         return new
 
-    def _allocate(self, first: Sequence[np.ndarray]) -> None:
+    def _allocate_memory(self, first: Sequence[np.ndarray]) -> None:
         """Allocate the memory of calls, in which the first arguments are these arrays and results may be arguments."""
         kinds = self._arguments
         self.inputs = [np.ascontiguousarray(x, t).reshape(s) for x, (s, t) in zip(first, kinds, strict=False)]

@@ -189,7 +189,8 @@ def _rewrite_loop(graph: Graph, items: Iterable[Any], loop: Loop, found: Recurri
     rest = [x for x in body.items if x not in found.nodes and x not in found.rows]
     body.items, body.seen, graph.current = [*found.rows], {}, body
     test_ring, value_ring = (Ring(graph, [n.type for n in nodes], loop) for nodes in (found.tests, kept))
-    last_row, period = _carry(graph, loop, RING - 1), _carry(graph, loop, 0)  # as if the ring were full: row 0 is next
+    # Before the first turn it is as if the ring were full, so that row 0 is next.
+    last_row, period = _carry_integer(graph, loop, RING - 1), _carry_integer(graph, loop, 0)
     turn = _choose_row(graph, found.tests, test_ring, last_row, period)
     # S, the stores of its row, and whether it closes a cycle.
     closes = _guard_nodes(graph, loop, found, kept, turn, (test_ring, value_ring))
@@ -265,7 +266,7 @@ def _compare_with_start(graph: Graph, loop: Loop, carried: Sequence[int], begins
     return reduce(partial(graph.node, "and", "bool"), equal)
 
 
-def _carry(graph: Graph, loop: Loop, start: int) -> Node:
+def _carry_integer(graph: Graph, loop: Loop, start: int) -> Node:
     """Make an integer that the loop carries, `start` before the first turn; return its parameter."""
     place = loop, len(loop.parameters)
     loop.initial.append(graph.constant(start, "i64"))
@@ -282,16 +283,16 @@ def _read_bits(graph: Graph, node: Node) -> Node:
 def _replace_uses(x: Any, replaced: Mapping[Node, Node]) -> None:
     """Let a node or a statement use the values of `replaced` in the place of its keys."""
 
-    def of(nodes: Sequence[Node]) -> list[Node]:
+    def replace_all(nodes: Sequence[Node]) -> list[Node]:
         """Return the nodes with those replaced that have a replacement."""
         return [replaced.get(n, n) for n in nodes]
 
     if isinstance(x, Node):
-        x.args = tuple(of(x.args))
+        x.args = tuple(replace_all(x.args))
     elif isinstance(x, Store):
-        x.node, x.indices = replaced.get(x.node, x.node), tuple(of(x.indices))
+        x.node, x.indices = replaced.get(x.node, x.node), tuple(replace_all(x.indices))
     elif isinstance(x, Guard):
-        x.condition, x.values = replaced.get(x.condition, x.condition), of(x.values)
+        x.condition, x.values = replaced.get(x.condition, x.condition), replace_all(x.values)
     elif isinstance(x, Loop):
-        x.initial, x.following = of(x.initial), of(x.following)
+        x.initial, x.following = replace_all(x.initial), replace_all(x.following)
         x.condition = None if x.condition is None else replaced.get(x.condition, x.condition)

@@ -68,17 +68,17 @@ def _divide(a: Any, b: Any) -> Any:
     """Divide; integers toward zero, by 0 to all bits set, the least one by -1 to itself."""
     if isinstance(a, np.floating):
         return np.divide(a, b)
-    return wrap_integer(_quotient(int(a), int(b)) if b else -1, a)
+    return wrap_integer(_divide_toward_zero(int(a), int(b)) if b else -1, a)
 
 
 def _remainder(a: Any, b: Any) -> Any:
     """Return what is left of a division, with the sign of a; of integers by 0 all."""
     if isinstance(a, np.floating):
         return np.fmod(a, b)
-    return wrap_integer(int(a) - _quotient(int(a), int(b)) * int(b) if b else int(a), a)
+    return wrap_integer(int(a) - _divide_toward_zero(int(a), int(b)) * int(b) if b else int(a), a)
 
 
-def _quotient(a: int, b: int) -> int:
+def _divide_toward_zero(a: int, b: int) -> int:
     """Return a / b rounded toward zero."""
     return abs(a) // abs(b) * (1 if (a < 0) == (b < 0) else -1)
 
@@ -324,16 +324,17 @@ def _fold_comparison(op: str) -> Callable[..., Node | None]:
 
 
 def _fold_order(strict: bool, turned: bool) -> Callable[..., Node | None]:
-    """Return the rule that writes an order of flags as logic."""
+    """Return the rule that writes an order of flags as logic; `strict`: < rather than <=, `turned`: > for <."""
 
-    def rule(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
+    def fold_flag_order(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
         """Write the order of two flags, false before true, as logic: LLVM has no such comparison of vectors of them."""
         if a.type != "bool":
             return None
+        # low < high is "not low and high", low <= high is "not low or high".
         low, high = (b, a) if turned else (a, b)
         return graph.node("and" if strict else "or", "bool", graph.node("not", "bool", low), high)
 
-    return rule
+    return fold_flag_order
 
 
 def _fold_convert(graph: NodeMaker, type: Type, a: Node) -> Node | None:

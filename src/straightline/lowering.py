@@ -51,18 +51,18 @@ class Lowering:
             jaxpr, consts = program.jaxpr, program.consts
         values: dict[Var, Value] = dict(zip(jaxpr.constvars, map(self.make_known_array, consts), strict=True))
         values |= zip(jaxpr.invars, inputs, strict=True)
-        for equation in _find_used(jaxpr):
-            arguments = [self._read(values, v) for v in equation.invars]
+        for equation in _list_used_equations(jaxpr):
+            arguments = [self._look_up(values, v) for v in equation.invars]
             values |= zip(equation.outvars, self.lower_equation(equation, arguments), strict=True)
-        return [self._read(values, v) for v in jaxpr.outvars]
+        return [self._look_up(values, v) for v in jaxpr.outvars]
 
     def lower_whole_program(self, program: ClosedJaxpr, inputs: Sequence[Value]) -> list[Value]:
         """Return the results of a whole program; an array without entries, which has no node, is a typed view."""
         avals: list[Any] = [v.aval for v in program.jaxpr.outvars]
         values = self.inline_program(program, inputs)
-        return [x if x.size else self._empty(a) for x, a in zip(values, avals, strict=True)]
+        return [x if x.size else self._make_empty_view(a) for x, a in zip(values, avals, strict=True)]
 
-    def _empty(self, aval: Any) -> InMemory:
+    def _make_empty_view(self, aval: Any) -> InMemory:
         """Return an array without entries, in memory of its type and shape."""
         return InMemory.whole(Buffer("scratch", type_of(aval), tuple(aval.shape), self.graph.top))
 
@@ -117,7 +117,7 @@ class Lowering:
             return InMemory.whole(Buffer("table", type, array.shape, self.graph.top, array))
         return arrange_nodes([self.graph.constant(x, type) for x in array.ravel().tolist()], array.shape)
 
-    def _read(self, values: dict[Var, Value], v: Any) -> Value:
+    def _look_up(self, values: dict[Var, Value], v: Any) -> Value:
         """Return the value of an operation's argument: a literal's constant, else what was computed."""
         return self.make_known_array(_convert_literal(v.val, v)) if isinstance(v, Literal) else values[v]
 
@@ -255,7 +255,7 @@ def trace_function(function: Callable[..., PyTree], *examples: PyTree, single: b
     return program, structure[0]
 
 
-def _find_used(jaxpr: Jaxpr) -> list[JaxprEqn]:
+def _list_used_equations(jaxpr: Jaxpr) -> list[JaxprEqn]:
     """Return the operations on which a program's results depend, or which do something beside, such as printing."""
     needed = {v for v in jaxpr.outvars if isinstance(v, Var)}
     used: list[JaxprEqn] = []

@@ -11,6 +11,7 @@ from heliograph.export.parts import PartOfStep, make_parts_of_step
 from heliograph.factors.gaussian import Gaussian, from_covariance
 from heliograph.factors.two_part_mean import SplitMeanGaussian, centred_from_covariance
 from heliograph.filters.base import AbstractFilter
+from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import InputError, fail
 from heliograph.numerics.types import PyTree
 from straightline import Unsupported, to_c
@@ -83,12 +84,8 @@ def write_step_program(
         ValueError: random numbers, or operations that are not supported; with the operation and its place.
     """
     state = filter.init()
-    read = [
-        StateMember(name, np.asarray(leaf))
-        for name, leaf in zip(name_state_arrays(state), jax.tree.leaves(state), strict=True)
-    ]
-    candidates = [*read, *_make_estimate_members(filter.estimate(state))]
-    parts = make_parts_of_step(filter, real, apart)
+    read, of_estimate = _make_members(state, filter.estimate(state))
+    candidates, parts = [*read, *of_estimate], make_parts_of_step(filter, real, apart)
     try:
         symmetric = _find_symmetric_arrays(parts)
         # Mean and covariance of the estimate become members of their own only where no array of the state has the same
@@ -124,12 +121,15 @@ def write_step_program(
     )
 
 
-def _make_estimate_members(estimate: Any) -> list[StateMember]:
-    """Return the estimate's mean and covariance as members of the state in C."""
-    return [
+def _make_members(state: PyTree, estimate: Estimate) -> tuple[list[StateMember], list[StateMember]]:
+    """Return members of the state in C: the arrays of the filter's state, and the estimate's mean and covariance."""
+    named_arrays = zip(name_state_arrays(state), jax.tree.leaves(state), strict=True)
+    of_state = [StateMember(name, np.asarray(array)) for name, array in named_arrays]
+    of_estimate = [
         StateMember("estimate_mean", np.asarray(estimate.mean)),
         StateMember("estimate_covariance", np.asarray(estimate.covariance)),
     ]
+    return of_state, of_estimate
 
 
 def _find_same_result(number: int, code: Any, named: Sequence[StateMember]) -> int:

@@ -34,14 +34,14 @@ class Manifold(NamedTuple):
     def plus(self, x: Array, d: Array) -> Any:
         """Return x changed by d, (..., n) both: angles between -pi and pi, attitudes turned in their own axes."""
         total: Any = x + d
-        return self._turned(wrap_angles(total, self.angles), turn, x, d)
+        return self._replace_rotations(wrap_angles(total, self.angles), turn, x, d)
 
     def difference(self, x: Array, other: Array) -> Any:
         """Return d with x = other plus d, (..., n): angles and turns of at most pi."""
         change: Any = x - other
-        return self._turned(wrap_angles(change, self.angles), turn_between, x, other)
+        return self._replace_rotations(wrap_angles(change, self.angles), turn_between, x, other)
 
-    def _turned(self, whole: Array, make: Callable[[Array, Array], Any], x: Array, y: Array) -> Any:
+    def _replace_rotations(self, whole: Array, make: Callable[[Array, Array], Any], x: Array, y: Array) -> Any:
         """Return `whole` with its rotation vectors replaced by what is made of those of x and y."""
         for i in range(0, len(self.rotations), 3):
             at = np.array(self.rotations[i : i + 3])
@@ -65,7 +65,7 @@ class Manifold(NamedTuple):
         """
         if not self.rotations:
             return function
-        return lambda x: function(self._turned(x, turn, center, x - center))
+        return lambda x: function(self._replace_rotations(x, turn, center, x - center))
 
     def moved(
         self, function: Callable[[jax.Array], jax.Array], center: jax.Array, middle: jax.Array | None = None
@@ -82,11 +82,11 @@ class Manifold(NamedTuple):
 
     def settle(self, center: Array, x: Array) -> Any:
         """Return the state whose change from `center` is x - center, (..., n); angles stay as they are."""
-        return self._turned(x, turn, center, x - center) if self.rotations else x
+        return self._replace_rotations(x, turn, center, x - center) if self.rotations else x
 
     def unsettle(self, center: Array, x: Array) -> Any:
         """Return center + (x difference center), (..., n), the inverse of `settle`; angles stay as they are."""
-        return self._turned(x, lambda r, other: other + turn_between(r, other), x, center)
+        return self._replace_rotations(x, lambda r, other: other + turn_between(r, other), x, center)
 
     def reset(self, change: jax.Array) -> jax.Array | None:
         """Return d((x + d) difference x')/dd at d = change, x' = x plus change (n, n): the identity but for attitudes.

@@ -33,16 +33,18 @@ def write_gather(bits: int, spread: bool, width: int) -> str:
 
     If `spread`, a place has a number for each lane, of which each lane loads its own.
     """
-    vector, text, total = f"%i{bits}", TextLines(), "poison"
-    row, entry = (f"[{width} x i{bits}]", ", i64 {}") if spread else (f"i{bits}", "")
+    # The vector is put together lane by lane, from one of which no number is set ("poison").
+    vector, text, gathered = f"%i{bits}", TextLines(), "poison"
+    row = f"[{width} x i{bits}]" if spread else f"i{bits}"
     for lane in range(width):
         index = text.add(f"extractelement %i64 %places, i64 {lane}")
-        address = text.add(f"getelementptr {row}, ptr %start, i64 {index}{entry.format(lane)}")
+        in_row = f", i64 {lane}" if spread else ""
+        address = text.add(f"getelementptr {row}, ptr %start, i64 {index}{in_row}")
         number = text.add(f"load i{bits}, ptr {address}, align {bits // 8}")
-        total = text.add(f"insertelement {vector} {total}, i{bits} {number}, i64 {lane}")
+        gathered = text.add(f"insertelement {vector} {gathered}, i{bits} {number}, i64 {lane}")
     head = f"define internal {vector} @{gather_name(bits, spread)}(ptr %start, %i64 %places) noinline nounwind"
     body = "\n".join(text.lines)
-    return f"{head} {{\n{body}\n  ret {vector} {total}\n}}\n"
+    return f"{head} {{\n{body}\n  ret {vector} {gathered}\n}}\n"
 
 
 FLUSH = 0x8040  # of the control word of x86: results and arguments that are subnormal are zeros

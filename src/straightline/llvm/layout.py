@@ -134,7 +134,9 @@ def lay_out_memory(parts: ProgramParts, mine: Collection[Any]) -> MemoryLayout:
     common = [b for b in owners if b not in parts.spread and b.kind in FILLED]
     turning = {b for b in common if list_loops_around(b.block)}
     turning &= _find_read_buffers(mine) if turning else turning
-    return MemoryLayout(*_place_buffers(own, parts.width), *_place_buffers(common, 1, turning), turning)
+    scratch, in_scratch = _place_buffers(own, parts.width)
+    shared, in_shared = _place_buffers(common, 1, turning)
+    return MemoryLayout(scratch=scratch, in_scratch=in_scratch, shared=shared, in_shared=in_shared, turning=turning)
 
 
 def _check_sums(items: Iterable[Any], outputs: Collection[Buffer]) -> None:
@@ -161,5 +163,6 @@ def _place_buffers(
     for buffer in buffers:
         places[buffer] = start
         copies = count_turns(buffer.block) if buffer in turning else 1
+        # Up to the next cache line: -(-a // b) is a / b rounded up.
         start += -(-buffer.size * copies * width * BITS[buffer.type] // 8 // LINE) * LINE
     return start, places

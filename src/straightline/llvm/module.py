@@ -200,20 +200,24 @@ def _is_single(items: Iterable[Any]) -> bool:
     return "f32" in types_ and "f64" not in types_
 
 
-def _finish_source(text: str, writer: FunctionWriter, movers: Sequence[Callable[[int], str]]) -> FunctionSource:
-    """Return the source of a written text, with its helpers and counts; a loop of unknown length counts as one turn."""
+def _finish_source(text: str, writer: FunctionWriter, others: Sequence[Callable[[int], str]]) -> FunctionSource:
+    """Return the source of a written text, with its helpers and counts; a loop of unknown length counts as one turn.
+
+    Helpers write the functions that the text calls: `others`, and those that the writer noted.
+    """
     counts = Counter([x.block for x in writer.mine if isinstance(x, Node)])
     turns = {block: count_turns(block) for block in counts}
     work = sum(count * turns[block] for block, count in counts.items())
-    helpers: list[Callable[[int], str]] = [*movers, *(partial(write_gather, *kind) for kind in sorted(writer.gathered))]
+    helpers: list[Callable[[int], str]] = [*others, *(partial(write_gather, *kind) for kind in sorted(writer.gathered))]
     if writer.flushes:
         helpers.append(write_flush)
     called = writer.called - {"threefry"}
     if called:
         helpers.append(partial(write_functions, called))
-    if "threefry" in writer.called:
+    if "threefry" in writer.called:  # its text is the same for each count of lanes, so it is part of the text
         text = f"{write_hash_function()}\n{text}"
-    return FunctionSource(zlib.compress(text.encode(), 1), helpers, counts.total(), work)
+    compressed = zlib.compress(text.encode(), 1)
+    return FunctionSource(compressed=compressed, helpers=helpers, operations=counts.total(), work=work)
 
 
 HEAD = "(ptr %pointers, ptr %scratch, i64 %begin, i64 %end, i64 %runs)"

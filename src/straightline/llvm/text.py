@@ -45,7 +45,7 @@ class SharedSlots:
 
     def load(self, writer: "FunctionWriter", node: Node) -> str:
         """Load a shared number, a scalar."""
-        address = self._address(writer, node)
+        address = self._write_address(writer, node)
         if node.type == "bool":
             return writer.add(f"trunc i8 {writer.add(f'load i8, ptr {address}, align 8')} to i1")
         return writer.add(f"load {LLVM[node.type]}, ptr {address}, align 8")
@@ -53,12 +53,12 @@ class SharedSlots:
     def store(self, writer: "FunctionWriter", node: Node, name: str) -> None:
         """Store a number, which the other function uses."""
         kind = vector_type(node.type)
-        address = self._address(writer, node)
+        address = self._write_address(writer, node)
         if node.type == "bool":
             name, kind = writer.add(f"zext {kind} {name} to %i8"), "%i8"
         writer.line(f"store {kind} {name}, ptr {address}, align 1")
 
-    def _address(self, writer: "FunctionWriter", node: Node) -> str:
+    def _write_address(self, writer: "FunctionWriter", node: Node) -> str:
         start = writer.add(f"getelementptr i8, ptr {self.base}, i64 {self.offset_of(node)}")
         return writer.write_address_of_turn(start, node.block, 8)
 
@@ -123,7 +123,7 @@ class FunctionWriter:
                 continue
             if isinstance(statement, Node):
                 if statement not in self.products:
-                    self._name(statement, self._write_node(statement))
+                    self._note_name(statement, self._write_node(statement))
             elif isinstance(statement, Store):
                 self._write_store(statement)
             elif isinstance(statement, Loop):
@@ -131,7 +131,7 @@ class FunctionWriter:
             elif isinstance(statement, Guard):
                 self._write_guard(statement)
 
-    def _name(self, node: Node, name: str) -> None:
+    def _note_name(self, node: Node, name: str) -> None:
         """Note the name of a node's value, and store it where the other function reads it."""
         self.scopes[-1][node] = name
         if self.single and node in self.slots.places:
@@ -192,7 +192,7 @@ class FunctionWriter:
             return first
         return self.add(f"shufflevector {kind} {first}, {kind} poison, %i32 zeroinitializer")
 
-    def _address(self, buffer: Buffer, offset: int, strides: Sequence[int], indices: Sequence[Node], entry: str) -> str:
+    def _locate(self, buffer: Buffer, offset: int, strides: Sequence[int], indices: Sequence[Node], entry: str) -> str:
         """Return the address of entry offset + sum strides * indices; `entry` is the type of one."""
         owner, start = buffer.owner
         base = self._write_base(owner)
@@ -237,7 +237,7 @@ class FunctionWriter:
             return self._write_gather(node)
         if buffer.owner[0] not in self.spread:
             return self.write_broadcast(self._write_scalar_load(node), node.type)
-        address = self._address(buffer, offset, strides, node.args, f"%i{BITS[node.type]}")
+        address = self._locate(buffer, offset, strides, node.args, f"%i{BITS[node.type]}")
         if node.type == "bool":
             return self.add(f"icmp ne %i8 {self.add(f'load %i8, ptr {address}, align 1')}, zeroinitializer")
         return self.add(f"load {vector_type(node.type)}, ptr {address}, align {BITS[node.type] // 8}")
@@ -246,7 +246,7 @@ class FunctionWriter:
         """Load a number that all lanes share."""
         buffer, offset, strides = node.value
         self.read.add(buffer.owner[0])
-        address = self._address(buffer, offset, strides, node.args, f"i{BITS[node.type]}")
+        address = self._locate(buffer, offset, strides, node.args, f"i{BITS[node.type]}")
         if node.type == "bool":
             return self.add(f"icmp ne i8 {self.add(f'load i8, ptr {address}, align 1')}, 0")
         return self.add(f"load {LLVM[node.type]}, ptr {address}, align {BITS[node.type] // 8}")
@@ -276,7 +276,7 @@ class FunctionWriter:
         """Write the store of a number; where sums over runs are kept, add it to what is there, in lanes that count."""
         name, kind, bits = self.write_operand(store.node), vector_type(store.node.type), BITS[store.node.type]
         entry = f"[{self.sums[store.buffer]} x i64]" if store.buffer in self.sums else f"%i{bits}"
-        address = self._address(store.buffer, store.offset, store.strides, store.indices, entry)
+        address = self._locate(store.buffer, store.offset, store.strides, store.indices, entry)
         if store.buffer in self.sums:  # of doubles
             if store.node.type == "f32":
                 name, kind = self.add(f"fpext {kind} {name} to %double"), "%double"
@@ -325,16 +325,16 @@ class FunctionWriter:
         self.start_basic_block(f"{name}.end")
         self.scopes.pop()
         for k, final in zip(carried, finals, strict=True):
-            self._name(loop.results[k], final)
+            self._note_name(loop.results[k], final)
 
     def _name_parameters(self, loop: Loop, name: str, counter: str, carried: list[int]) -> None:
         """Note the names of a loop's counter and of its carried numbers within a turn."""
         if loop.counter is not None:
             self.scopes[-1]["scalar", loop.counter] = counter
         for k in carried:
-            self._name(loop.parameters[k], f"%{name}.p{k}")
+            self._note_name(loop.parameters[k], f"%{name}.p{k}")
         if loop.counter is not None and loop.counter in self.mine:
-            self._name(loop.counter, self.write_operand(loop.counter))
+            self._note_name(loop.counter, self.write_operand(loop.counter))
 
     def _write_counted_loop(self, loop: Loop, name: str, counter: str, carried: list[int]) -> list[str]:
         """Write the body and the latch of a loop of known length; return the names of the next turn's numbers."""
@@ -359,7 +359,7 @@ class FunctionWriter:
         self.write_block(head)
         assert loop.condition is not None
         # Another turn if some lane needs it.
-        any_lane = self._any(loop.condition)
+        any_lane = self._write_any_lane(loop.condition)
         self.line(f"br i1 {any_lane}, label %{name}.turn, label %{name}.end")
         self.start_basic_block(f"{name}.turn")
         self.write_block(tail)
@@ -369,7 +369,7 @@ class FunctionWriter:
         self.line(f"br label %{name}")
         return following, [f"%{name}.p{k}" for k in carried]
 
-    def _any(self, condition: Node) -> str:
+    def _write_any_lane(self, condition: Node) -> str:
         """Write whether a condition holds in some lane; return its name."""
         return self.add(f"icmp ne %lanes {self.add(f'bitcast %i1 {self.write_operand(condition)} to %lanes')}, 0")
 
@@ -378,7 +378,7 @@ class FunctionWriter:
         self.count += 1
         name = f"guard{self.count}"
         # Jump past the body if no lane needs it.
-        any_lane = self._any(guard.condition)
+        any_lane = self._write_any_lane(guard.condition)
         label_before = self.label
         self.line(f"br i1 {any_lane}, label %{name}, label %{name}.end")
         self.start_basic_block(name)
@@ -397,4 +397,4 @@ class FunctionWriter:
             kind = vector_type(guard.results[k].type)
             merged.append(self.add(f"phi {kind} [{value}, %{label_after}], [zeroinitializer, %{label_before}]"))
         for k, result in zip(used, merged, strict=True):
-            self._name(guard.results[k], result)
+            self._note_name(guard.results[k], result)

@@ -72,23 +72,25 @@ def _make_tournament_turn(
     n: int,
 ) -> tuple[int, Callable[[tuple[Numbers, Numbers], None], tuple[tuple[Numbers, Numbers], None]]]:
     """Return the count of turns of a sweep, and one turn: A <- J' A J, V <- V J for pairs (p, q), then rows move on."""
-    # As in a tournament of n players, all but the last move around; with n odd one pauses in each turn.
+    # As in a tournament of n players: place k plays place turns - k, all players but the last move on by one place
+    # between turns, and the last one plays whoever is at place 0. With n odd there is no last one, and place 0 pauses.
     turns = n - 1 + n % 2
-    pairs = [(k, turns - k) for k in range(1, turns // 2 + 1)] + [(0, n - 1)] * (1 - n % 2)
-    moved = [*((i + 1) % turns for i in range(turns)), *range(turns, n)]
+    is_even = n % 2 == 0
+    pairs = [(k, turns - k) for k in range(1, turns // 2 + 1)] + ([(0, n - 1)] if is_even else [])
+    moved = [*((i + 1) % turns for i in range(turns)), *range(turns, n)]  # place i gets the row at place moved[i]
 
     def turn(state: tuple[Numbers, Numbers], _: None) -> tuple[tuple[Numbers, Numbers], None]:
         """Rotate each pair of rows in (entries of A, eigenvectors), then move the rows on."""
         entries, vectors = map(dict, state)
         for p, q in pairs:
-            _rotate(entries, vectors, p, q, n)
+            _rotate_in_place(entries, vectors, p, q, n)
         entries = {(i, j): entries[min(moved[i], moved[j]), max(moved[i], moved[j])] for i, j in entries}
         return (entries, {(i, j): vectors[i, moved[j]] for i, j in vectors}), None
 
     return turns, turn
 
 
-def _rotate(a: Numbers, vectors: Numbers, p: int, q: int, n: int) -> None:
+def _rotate_in_place(a: Numbers, vectors: Numbers, p: int, q: int, n: int) -> None:
     """Rotate rows and columns p and q of A, in place, so that a_pq = 0, and columns p and q of the eigenvectors."""
     # The smaller root t = tan(angle) of t^2 + 2 h t - 1 = 0, h = (a_qq - a_pp) / (2 a_pq); c and s: cosine and sine.
     off = a[p, q]
@@ -117,14 +119,14 @@ def _sort_by_transposition(
         """Exchange neighbours in the wrong order: at even places, then at odd ones."""
         values, columns = list(state[0]), list(state[1])
         for i in (*range(0, n - 1, 2), *range(1, n - 1, 2)):
-            _exchange(values, columns, i)
+            _exchange_if_descending(values, columns, i)
         return (values, columns), None
 
     after, _ = jax.lax.scan(exchange_neighbours, (values, columns), length=(n + 1) // 2)
     return after
 
 
-def _exchange(values: list[jax.Array], columns: list[list[jax.Array]], i: int) -> None:
+def _exchange_if_descending(values: list[jax.Array], columns: list[list[jax.Array]], i: int) -> None:
     """Exchange places i and i + 1, in place, unless they are in ascending order."""
     wrong = values[i] > values[i + 1]
     values[i], values[i + 1] = jnp.minimum(values[i], values[i + 1]), jnp.maximum(values[i], values[i + 1])

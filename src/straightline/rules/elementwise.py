@@ -200,13 +200,14 @@ def _next_after(graph: Graph, type: Type, params: Any, x: Node, y: Node) -> Node
     bits = node("bitcast", whole, x)
     # Away from zero one more: where x < y and x is positive, or x > y and it is negative.
     away = node("eq", "bool", node("lt", "bool", x, y), node("lt", "bool", zero, x))
-    beside = node("select", whole, away, node("add", whole, bits, one), node("sub", whole, bits, one))
+    next_bits = node("select", whole, away, node("add", whole, bits, one), node("sub", whole, bits, one))
+    # From zero on it is the smallest number of the sign of y.
     down, up = graph.constant(-smallest, type), graph.constant(smallest, type)
-    tiny = node("select", type, node("lt", "bool", y, zero), down, up)
-    moved = node("select", type, node("eq", "bool", x, zero), tiny, node("bitcast", type, beside))
+    next_to_zero = node("select", type, node("lt", "bool", y, zero), down, up)
+    moved = node("select", type, node("eq", "bool", x, zero), next_to_zero, node("bitcast", type, next_bits))
     moved = node("select", type, node("eq", "bool", x, y), y, moved)
-    known = node("and", "bool", node("eq", "bool", x, x), node("eq", "bool", y, y))
-    return node("select", type, known, moved, graph.constant(math.nan, type))
+    none_is_nan = node("and", "bool", node("eq", "bool", x, x), node("eq", "bool", y, y))
+    return node("select", type, none_is_nan, moved, graph.constant(math.nan, type))
 
 
 def _shift_right_arithmetic(graph: Graph, type: Type, params: Any, x: Node, by: Node) -> Node:

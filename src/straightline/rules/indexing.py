@@ -93,9 +93,9 @@ def _gather_by_cases(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indi
     selected = cases[-1].copy()
     for entry in np.ndindex(*selected.shape):
         which = indices[(*_find_index_row(entry, numbers), column)]
-        if which.op != "constant":
-            here = [np.array(case[entry], dtype=object) for case in cases]
-            selected[entry] = select_array(lowering.graph, which, here)[()]
+        if which.op != "constant":  # where it is known, all cases are the same
+            entry_of_cases = [np.array(case[entry], dtype=object) for case in cases]
+            selected[entry] = select_array(lowering.graph, which, entry_of_cases)[()]
     return selected
 
 

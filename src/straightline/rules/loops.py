@@ -96,13 +96,16 @@ def _flatten_carry(arrays: Sequence[np.ndarray], halves: Sequence[bool]) -> list
 def _store_row(
     lowering: Lowering, length: int, value: np.ndarray, counter: Node, backwards: bool, outer: Block
 ) -> InMemory:
-    """Store one turn's array as one row of memory; return the array (length, ...) of all turns."""
+    """Store one turn's array as one row of memory; return the array (length, ...) of all turns.
+
+    The row's number is that of the turn, `counter`, or counted from the last row back.
+    """
     flat = _list_numbers(value)
     type: Type = flat[0].type if flat else "f64"
     buffer = Buffer("scratch", type, (length, *value.shape), outer)
-    # The first place of each node in a row, if some nodes have several.
-    size, places = len(flat), {node: place for place, node in reversed(list(enumerate(flat)))}
-    buffer.first = [places[node] for node in flat] if len(places) < size else []
+    # The first place of each node in a row, if some nodes have several: noted from the end on, so that the first stays.
+    size, first_places = len(flat), {node: place for place, node in reversed(list(enumerate(flat)))}
+    buffer.first = [first_places[node] for node in flat] if len(first_places) < size else []
     start, stride = ((length - 1) * size, -size) if backwards else (0, size)
     for entry, node in enumerate(flat):
         lowering.graph.store(buffer, node, start + entry, (stride,), (counter,))
@@ -117,23 +120,31 @@ def _list_numbers(value: np.ndarray) -> list[Node]:
     return flat
 
 
-def _restore_arrays(arrays: Sequence[np.ndarray], nodes: Sequence[Node], halves: Sequence[bool]) -> list[np.ndarray]:
-    """Restore arrays of the same shapes, and keys, from nodes as `_flatten_carry` returns them."""
-    rest = iter(nodes)
+def _restore_arrays(
+    arrays: Sequence[np.ndarray], nodes: Sequence[Node], by_triangle: Sequence[bool]
+) -> list[np.ndarray]:
+    """Return arrays like these of other nodes, in the order of `_flatten_carry`.
+
+    `by_triangle` says of which arrays, symmetric matrices, the nodes are those of the upper triangle; an entry that is
+    a key of random numbers has two nodes.
+    """
+    remaining = iter(nodes)
     results = []
-    for a, half in zip(arrays, halves, strict=True):
-        n = a.shape[-1] if half else 0
-        old = a[..., *np.triu_indices(n)] if half else a
-        new = [
-            RandomKey(next(rest), next(rest)) if isinstance(x, RandomKey) else next(rest) for x in old.ravel().tolist()
+    for array, has_triangle in zip(arrays, by_triangle, strict=True):
+        n = array.shape[-1] if has_triangle else 0
+        old_entries = array[..., *np.triu_indices(n)] if has_triangle else array
+        new_entries = [
+            RandomKey(next(remaining), next(remaining)) if isinstance(x, RandomKey) else next(remaining)
+            for x in old_entries.ravel().tolist()
         ]
-        restored = arrange_nodes(new, old.shape)
-        results.append(_mirror(restored, n) if half else restored)
+        restored = arrange_nodes(new_entries, old_entries.shape)
+        results.append(_mirror(restored, n) if has_triangle else restored)
     return results
 
 
 def _mirror(upper: np.ndarray, n: int) -> np.ndarray:
     """Return symmetric matrices (..., n, n) from their upper triangles, row by row (..., n (n + 1) / 2)."""
+    # The place of each entry in its row: those below the diagonal, 0 here, have the place of the entry across it.
     places = np.zeros((n, n), dtype=int)
     places[np.triu_indices(n)] = np.arange(upper.shape[-1])
     return upper[..., np.maximum(places, places.T)]
@@ -148,7 +159,7 @@ def _lower_scan(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> 
     (consts, carried), length = _count_arguments(params), params["length"]
     fixed, carry, rows = inputs[:consts], inputs[consts : consts + carried], inputs[consts + carried :]
     size = length * estimate_size(lowering, params["jaxpr"].jaxpr)
-    if size <= lowering.written_out or length <= 1:
+    if size <= lowering.written_out or length <= 1:  # a loop of one turn would be no shorter
         return _write_out_scan(lowering, equation, fixed, [lowering.nodes(x) for x in carry], rows)
     return _lower_long_scan(lowering, equation, fixed, carry, rows)
 
@@ -172,7 +183,7 @@ def _lower_long_scan(
     def lower_turn(row: Node, numbers: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """Lower the body for one row of the stacked arguments; return the carried numbers, and what is stacked."""
         arrays: dict[int, Value] = dict(zip(as_numbers, numbers, strict=True))
-        arrays |= {k: x.in_turn() for k, x in in_memory.items()}
+        arrays |= {k: x.view_in_turn() for k, x in in_memory.items()}
         whole_carry = [arrays.get(k, carry[k]) for k in range(count)]
         results = lowering.inline_program(program, [*fixed, *whole_carry, *(x.row(row) for x in rows)])
         nodes = [x if k in in_memory else lowering.nodes(x) for k, x in enumerate(results)]
@@ -182,7 +193,7 @@ def _lower_long_scan(
     start = [lowering.nodes(carry[k]) for k in as_numbers]
     finals, stacked = repeat_turns(lowering, equation.params["length"], start, lower_turn, equation.params["reverse"])
     after: dict[int, Value] = dict(zip(as_numbers, finals, strict=True))
-    after |= {k: x.after() for k, x in in_memory.items()}
+    after |= {k: x.view_from_here() for k, x in in_memory.items()}
     return [*(after.get(k, carry[k]) for k in range(count)), *stacked]
 
 
@@ -197,20 +208,20 @@ class CarriedMemory:
         self.memory = copy_in_memory(lowering, put_in_memory(lowering, start)).buffer
         self.memory.kind = "carried"
 
-    def in_turn(self) -> InMemory:
+    def view_in_turn(self) -> InMemory:
         """Return the array in the turn whose body is open."""
         self.memory.parts = []  # a body that is lowered once more fills it alone
-        return self.after()
+        return self.view_from_here()
 
-    def after(self) -> InMemory:
+    def view_from_here(self) -> InMemory:
         """Return the array as the block that is open reads it from here on."""
-        return self._part(Buffer("scratch", self.memory.type, self.memory.shape, self._graph.current))
+        return self._view_part(Buffer("scratch", self.memory.type, self.memory.shape, self._graph.current))
 
     def fill(self, lowering: Lowering, x: InMemory) -> None:
         """Fill the memory with an array that is elsewhere."""
-        self._part(copy_in_memory(lowering, x).buffer)
+        self._view_part(copy_in_memory(lowering, x).buffer)
 
-    def _part(self, buffer: Buffer) -> InMemory:
+    def _view_part(self, buffer: Buffer) -> InMemory:
         """Place a buffer in this memory; return the view of it."""
         self.memory.take_in(buffer, 0)
         return InMemory.whole(buffer)

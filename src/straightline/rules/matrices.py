@@ -21,7 +21,7 @@ def combine_nodes(graph: Graph, op: str, type: Type, nodes: Sequence[Node], empt
     return reduce(lambda a, b: graph.node(op, type, a, b), nodes)
 
 
-def _reduce_by(op: str, empty: float) -> Rule:
+def _make_reduction_rule(op: str, empty: float) -> Rule:
     """Return the rule that reduces along axes by `op`; over nothing the result is `empty`."""
 
     def lower_operation(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
@@ -58,7 +58,7 @@ def _replace_not_finite(type: Type, number: float) -> float:
     return limits.max if number > 0 else limits.min
 
 
-def _accumulate_by(op: str) -> Rule:
+def _make_accumulation_rule(op: str) -> Rule:
     """Return the rule that accumulates along an axis by `op`."""
 
     def lower_operation(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
@@ -79,7 +79,7 @@ def _accumulate_by(op: str) -> Rule:
     return lower_operation
 
 
-def _find_extreme(op: str) -> Rule:
+def _make_extreme_index_rule(op: str) -> Rule:
     """Return the rule of `argmax` (op "gt") or `argmin` ("lt"): along one axis, with the result's other axes."""
 
     def lower_argument_of_extreme(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
@@ -283,11 +283,13 @@ def _triangular_solve(graph: Graph, params: Any, a: np.ndarray, b: np.ndarray) -
 
 
 RULES |= {
-    "reduce_sum": _reduce_by("add", 0), "reduce_prod": _reduce_by("mul", 1), "reduce_or": _reduce_by("or", 0),
-    "reduce_and": _reduce_by("and", ALL_BITS), "reduce_xor": _reduce_by("xor", 0),
-    "reduce_max": _reduce_by("max", -np.inf), "reduce_min": _reduce_by("min", np.inf),
-    "cumsum": _accumulate_by("add"), "cumprod": _accumulate_by("mul"), "cummax": _accumulate_by("max"),
-    "cummin": _accumulate_by("min"), "argmax": _find_extreme("gt"), "argmin": _find_extreme("lt"),
+    "reduce_sum": _make_reduction_rule("add", 0), "reduce_prod": _make_reduction_rule("mul", 1),
+    "reduce_or": _make_reduction_rule("or", 0), "reduce_and": _make_reduction_rule("and", ALL_BITS),
+    "reduce_xor": _make_reduction_rule("xor", 0),
+    "reduce_max": _make_reduction_rule("max", -np.inf), "reduce_min": _make_reduction_rule("min", np.inf),
+    "cumsum": _make_accumulation_rule("add"), "cumprod": _make_accumulation_rule("mul"),
+    "cummax": _make_accumulation_rule("max"), "cummin": _make_accumulation_rule("min"),
+    "argmax": _make_extreme_index_rule("gt"), "argmin": _make_extreme_index_rule("lt"),
     "dot_general": write_product,
     "cholesky": _for_each_matrix(_cholesky), "triangular_solve": _for_each_matrix(_triangular_solve),
 }  # fmt: skip

@@ -69,7 +69,7 @@ def _are_written_out(inputs: list[Value], count: int) -> bool:
     return are_known or any(x.size >= count for x in arrays) or (are_single and are_sparse)
 
 
-def _apply_by_row(name: str) -> Rule:
+def _make_row_by_row_rule(name: str) -> Rule:
     """Return the rule of an elementwise operation: of short arrays at once, of long ones row by row in a loop."""
 
     def lower_row_by_row(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
@@ -185,7 +185,7 @@ def _multiply_nodes(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndar
 
 def _count_terms(a: np.ndarray, left: int, b: np.ndarray, right: int) -> int:
     """Count the terms of all sums over an axis of a and one of b, without those that a known zero leaves out."""
-    if a.size * b.size <= MANY_TERMS * a.shape[left]:
+    if a.size * b.size <= MANY_TERMS * a.shape[left]:  # few enough with all zeros: no need to count them
         return 0
     # At each place along the axis, each entry of a that is no known zero meets each such entry of b.
     return int(_count_data(a, left) @ _count_data(b, right))
@@ -199,15 +199,18 @@ def _count_data(x: np.ndarray, axis: int) -> np.ndarray:
 
 
 def _accumulate_turns(lowering: Lowering, equation: JaxprEqn, count: int, turn: Turn) -> list[Value]:
-    """Return the sum over the turns of a loop of the number that each gives."""
-    pair: Any = SimpleNamespace(params={"axes": (0,)}, outvars=equation.outvars)
+    """Return the sum over the `count` turns of a loop of the number that each turn would stack."""
+    sum_along_first: Any = SimpleNamespace(params={"axes": (0,)}, outvars=equation.outvars)
 
-    def add(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    def add_number(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """Return the sum so far with this turn's number, and nothing to stack."""
-        return [np.asarray(RULES["reduce_sum"](lowering, pair, [np.stack([carry[0], *turn(row, [])[1]])])[0])], []
+        _no_carry, stacked = turn(row, [])
+        pair = np.stack([carry[0], *stacked])
+        return [np.asarray(RULES["reduce_sum"](lowering, sum_along_first, [pair])[0])], []
 
-    start = RULES["reduce_sum"](lowering, pair, [np.empty(0, dtype=object)])[0]
-    return list(repeat_turns(lowering, count, [start], add)[0])
+    zero = RULES["reduce_sum"](lowering, sum_along_first, [np.empty(0, dtype=object)])[0]  # the sum of no numbers
+    total, _stacked = repeat_turns(lowering, count, [zero], add_number)
+    return list(total)
 
 
 def _find_few_terms(equation: JaxprEqn, inputs: list[Value]) -> tuple[np.ndarray, np.ndarray] | None:
@@ -265,7 +268,7 @@ def _renumber_axes(axes: Sequence[int], removed: int | None) -> tuple[int, ...]:
     return tuple(axes) if removed is None else tuple(a - (a > removed) for a in axes)
 
 
-def _reduce_by_row(name: str) -> Rule:
+def _make_reduction_rule(name: str) -> Rule:
     """Return the rule of a reduction, such as `reduce_sum`: of short arrays at once, of long ones row by row."""
 
     def lower_reduction(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
@@ -314,7 +317,7 @@ def _reduce_long(lowering: Lowering, equation: JaxprEqn, name: str, x: Value) ->
 
 
 REDUCTIONS = ("reduce_sum", "reduce_prod", "reduce_or", "reduce_and", "reduce_max", "reduce_min")
-IN_MEMORY |= {name: _apply_by_row(name) for name in OF_ENTRIES}
-IN_MEMORY |= {name: _reduce_by_row(name) for name in REDUCTIONS}
+IN_MEMORY |= {name: _make_row_by_row_rule(name) for name in OF_ENTRIES}
+IN_MEMORY |= {name: _make_reduction_rule(name) for name in REDUCTIONS}
 IN_MEMORY |= {"dot_general": _dot_general}
 RULES |= {"dot_general": _multiply_nodes}

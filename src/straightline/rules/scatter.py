@@ -39,7 +39,7 @@ def _make_scatter_rule(op: str | None) -> Rule:
         # where the updates have them, so that both are in the same order.
         batching = list(zip(numbers.operand_batching_dims, numbers.scatter_indices_batching_dims, strict=True))
         index_map = numbers.scatter_dims_to_operand_dims
-        places = find_window_places(x.shape, sizes, known, index_map, batching, removed, _clips(equation))
+        places = find_window_places(x.shape, sizes, known, index_map, batching, removed, _clips_indices(equation))
         places = np.moveaxis(places, range(known.ndim - 1, places.ndim), numbers.update_window_dims)
         updated = x.ravel().copy()
         for place, new in zip(places.ravel().tolist(), updates.ravel().tolist(), strict=True):
@@ -50,7 +50,7 @@ def _make_scatter_rule(op: str | None) -> Rule:
     return scatter_updates
 
 
-def _clips(equation: JaxprEqn) -> bool:
+def _clips_indices(equation: JaxprEqn) -> bool:
     """Return whether windows beyond the array are moved into it, where other modes drop them."""
     return bool(equation.params["mode"] == GatherScatterMode.CLIP)
 
@@ -118,7 +118,7 @@ def _yield_starts(
         row: where the index stands among all, along the leading axes of the indices.
         index: its nodes, one for each axis of the array that an index selects.
     """
-    numbers, clips = equation.params["dimension_numbers"], _clips(equation)
+    numbers, clips = equation.params["dimension_numbers"], _clips_indices(equation)
     nodes = dict(zip(numbers.scatter_dims_to_operand_dims, index.tolist(), strict=True))
     batch_axes = dict(zip(numbers.operand_batching_dims, numbers.scatter_indices_batching_dims, strict=True))
     # Possible starts along each axis: all that the window fits into, the row's own of a batch, else 0.

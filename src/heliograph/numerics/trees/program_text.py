@@ -48,10 +48,10 @@ class _ProgramWriter:
             f"{self._write_definitions(numbers, jaxpr.constvars)} = {[self._write_value(value) for value in consts]}"
         ]
         head += [self._write_definitions(numbers, jaxpr.invars)]
-        body = [self._line(numbers, equation) for equation in jaxpr.eqns]
+        body = [self._write_line(numbers, equation) for equation in jaxpr.eqns]
         return "\n".join([*head, *body, self._write_uses(numbers, jaxpr.outvars)])
 
-    def _line(self, numbers: dict[Var, int], equation: JaxprEqn) -> str:
+    def _write_line(self, numbers: dict[Var, int], equation: JaxprEqn) -> str:
         """Return the line of an operation: types of its results, its name, its parameters and its arguments."""
         used, how = self._write_uses(numbers, equation.invars), self._write_value(equation.params)
         return f"{self._write_definitions(numbers, equation.outvars)} = {equation.primitive.name} {how} {used}"
@@ -70,9 +70,9 @@ class _ProgramWriter:
         """Return the text of a parameter of an operation: arrays and inner programs by their hashes."""
         match value:
             case ClosedJaxpr():
-                return self._hash(value, value.jaxpr, value.consts)
+                return self._write_hash(value, value.jaxpr, value.consts)
             case Jaxpr():
-                return self._hash(value, value, ())
+                return self._write_hash(value, value, ())
             case dict():
                 return "{" + ", ".join(f"{name}: {self._write_value(value[name])}" for name in sorted(value)) + "}"
             case tuple() | list():
@@ -84,7 +84,7 @@ class _ProgramWriter:
         # A function makes a derivative, of which a step computes none; a type has its name.
         return getattr(value, "__name__", "") if callable(value) else ADDRESS.sub("", repr(value))
 
-    def _hash(self, program: object, jaxpr: Jaxpr, consts: Sequence[Any]) -> str:
+    def _write_hash(self, program: object, jaxpr: Jaxpr, consts: Sequence[Any]) -> str:
         """Return the hash of an inner program's text, written once."""
         if id(program) not in self._hashes:
             self._hashes[id(program)] = program, hash_numbers(self.write_program(jaxpr, consts))
