@@ -140,10 +140,12 @@ class TieredCode:
             executions = self._count_executions(blocks)
             self._executions += executions
             machine = self._make_first(self._executions)
-            if not machine.level and self._choose_level(self._executions):  # JAX takes 30 us to say its setting
+            # In haste so far, but care pays by now. (The level is asked for last: JAX takes 30 us to say its setting.)
+            if not machine.level and self._choose_level(self._executions):
                 self._careful = self._careful or get_careful_thread().submit(
                     _generate_with_care, self._source, self._widths[1], machine
                 )
+                # A call that is long enough waits for it; others go on in haste until it is done.
                 if executions >= OFTEN or self._careful.done():
                     self._machine = machine = self._careful.result()
             return machine

@@ -44,16 +44,19 @@ def make_parts_of_step(filter: AbstractFilter, real: str, apart: bool) -> list[P
     deviations are: after many steps its expectation is rounded by as much (and below 1e-33 has few digits).
     """
     leaves, tree = jax.tree.flatten(filter.init())
-    z, u, k = np.zeros(filter.received), np.zeros(len(filter.inputs)), np.asarray(0)
+    z, u, k = np.zeros(filter.received), np.zeros(len(filter.inputs)), np.asarray(0)  # of these, only shapes count
+    flags = ("implausible", "spoilt")
     if not apart:
         return [
-            PartOfStep("step", ("z", "u"), _make_step(filter, tree, real), (leaves, z, u, k), ("implausible", "spoilt"))
+            PartOfStep("step", ("z", "u"), _make_step(filter, tree, real), examples=(leaves, z, u, k), beside=flags)
         ]
-    weighs = filter.correct(filter.predict(filter.init(), u, 0), z, 0)[1].weight is not None
-    beside = ("implausible", "value", "nis", "arrived", *(("weight",) if weighs else ()))
+    # Whether a correction weighs components is seen of one.
+    _state, innovation = filter.correct(filter.predict(filter.init(), u, 0), z, 0)
+    has_weights = innovation.weight is not None
+    news = ("implausible", "value", "nis", "arrived", *(("weight",) if has_weights else ()))
     return [
-        PartOfStep("predict", ("u",), _make_prediction(filter, tree, real), (leaves, u, k), ("implausible", "spoilt")),
-        PartOfStep("correct", ("z",), _make_correction(filter, tree, real), (leaves, z, k), beside),
+        PartOfStep("predict", ("u",), _make_prediction(filter, tree, real), examples=(leaves, u, k), beside=flags),
+        PartOfStep("correct", ("z",), _make_correction(filter, tree, real), examples=(leaves, z, k), beside=news),
     ]
 
 

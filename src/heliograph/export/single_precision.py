@@ -37,7 +37,11 @@ def explain_rounding(filter: AbstractFilter, ranged: bool) -> list[str]:
 
 
 def _find_deviations(filter: AbstractFilter) -> np.ndarray | None:
-    """Return the deviation of the noise of each component (received,), M v + n; None of a filter that does not say."""
+    """Return the standard deviation of the noise of each component of z (received,); None of a filter that has none.
+
+    The noise of z is M v + n: the sensor's noise v times the link's mean gain M, and the link's own noise n. A filter
+    of which no sensor is known, or whose noise depends on the inputs, says none.
+    """
     premise = filter.premise
     sensor = None if premise is None or premise.sensor is None else first(premise.sensor)
     if premise is None or sensor is None or not isinstance(sensor.noise, AbstractNoise):
@@ -47,8 +51,9 @@ def _find_deviations(filter: AbstractFilter) -> np.ndarray | None:
     if isinstance(link, AbstractRandomAffine):
         try:
             moments = second_order(link)
-        except ValueError:  # one that remembers
+        except ValueError:  # a link that remembers what it did before
             return None
+        # The link's noise has the covariance C diag(weights) C', C the columns.
         gain, columns, weights = map(np.asarray, (moments.mean_gain, *moments.noise))
         if gain.shape[1] != len(noise):  # a link of what was sent before as well
             return None

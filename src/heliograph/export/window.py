@@ -93,8 +93,10 @@ def write_window(program: StepProgram, steps: int, state: Layout, prefix: str, r
     """
     filter = program.filter
     inputs, received = filter.inputs, filter.received
-    window = Window(steps, inputs.index(TIME_STEP) if TIME_STEP in inputs else None, received, len(inputs))
-    # The struct: the present state, rows of a state with the measurement and the inputs after it, and four counters.
+    place_of_time = inputs.index(TIME_STEP) if TIME_STEP in inputs else None
+    window = Window(steps=steps, time=place_of_time, received=received, inputs=len(inputs))
+    # The struct: the present state, rows of a state with the measurement and the inputs after it, and the four counters
+    # of `_declare_window`. C has no arrays of length 0.
     data = [lay_out_array(real, max(count, 1)) for count in (received, len(inputs))]
     row = lay_out_struct([state, *data])
     counters = [lay_out_array("uint32_t", 1)] * 4

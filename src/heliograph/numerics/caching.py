@@ -58,14 +58,14 @@ def share_by_object(make: Callable[[S], T]) -> Callable[[S], T]:
     in_use: WeakValueDictionary[int, T] = WeakValueDictionary()
 
     @wraps(make, updated=())
-    def once(source: S) -> T:
+    def share_or_make(source: S) -> T:
         """Return what was made of this object and is still in use, else make it."""
         made = in_use.get(id(source))
         if made is None:
             made = in_use[id(source)] = make(source)
         return made
 
-    return once
+    return share_or_make
 
 
 def cache_arrays(function: Callable[P, T]) -> Callable[P, T]:
@@ -77,11 +77,12 @@ def cache_arrays(function: Callable[P, T]) -> Callable[P, T]:
     known = cast(Callable[P, T], cache(function))
 
     @wraps(function)
-    def copied(*args: P.args, **kwargs: P.kwargs) -> T:
+    def copy_known(*args: P.args, **kwargs: P.kwargs) -> T:
+        """Return a copy of the result for these arguments, which is computed once."""
         arrays: T = jax.tree.map(np.copy, known(*args, **kwargs))
         return arrays
 
-    return copied
+    return copy_known
 
 
 def _make_read_only(leaf: Any) -> None:

@@ -41,7 +41,7 @@ def mark_checked(value: object, report: Callable[[str, Domain], None]) -> Marked
 
 
 def report_domain(name: str, value: object, whole: Domain, entry: Domain | None = None) -> None:
-    """Tell a marked value what it is for; in a list, marked entries that they are each an `entry`."""
+    """Tell a marked array the domain that is required of it: `whole`, or `entry` of marked entries in a list."""
     if isinstance(value, MarkedArray):
         if value.report is not None:
             value.report(name, whole)
@@ -52,7 +52,7 @@ def report_domain(name: str, value: object, whole: Domain, entry: Domain | None 
 
 
 def report_covariance(name: str, value: object) -> None:
-    """Tell a marked covariance or variance; in a list of rows, that those on the diagonal are variances."""
+    """Tell a marked array that it is a covariance or a variance; in a list of rows, entries on the diagonal."""
     if isinstance(value, MarkedArray):
         report_domain(name, value, COVARIANCE if value.ndim else POSITIVE)
     elif isinstance(value, list | tuple):

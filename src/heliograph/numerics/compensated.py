@@ -65,8 +65,8 @@ class _Evaluation:
     """Evaluation of a traced program in numbers that are high + low."""
 
     def __init__(self, unit: float):
-        bits = 1 - round(np.log2(unit))  # of a fraction
-        self.splitter = 2.0 ** ((bits + 1) // 2) + 1
+        bits = 1 - round(np.log2(unit))  # of a number's fraction: 24 of single precision, 53 of double
+        self.splitter = 2.0 ** ((bits + 1) // 2) + 1  # times which a number is split into halves of its digits
         self.stored = np.float32 if bits <= 24 else np.float64
         self.rules: dict[str, Callable[..., Compensated]] = {
             "add": self._add, "add_any": self._add, "sub": self._subtract, "mul": self._multiply, "div": self._divide,
@@ -80,15 +80,14 @@ class _Evaluation:
         values: dict[Var, Compensated] = dict(zip(jaxpr.constvars, known, strict=True))
         values |= zip(jaxpr.invars, inputs, strict=True)
 
-        def read(v: Any) -> Compensated:
+        def look_up(v: Any) -> Compensated:
             """Return the value of a variable or of a number in the program."""
             return self._split_known(v.val) if isinstance(v, Literal) else values[v]
 
         for equation in jaxpr.eqns:
-            values |= zip(
-                equation.outvars, self._apply_operation(equation, list(map(read, equation.invars))), strict=True
-            )
-        return list(map(read, jaxpr.outvars))
+            results = self._apply_operation(equation, list(map(look_up, equation.invars)))
+            values |= zip(equation.outvars, results, strict=True)
+        return list(map(look_up, jaxpr.outvars))
 
     def _split_known(self, number: Any) -> Compensated:
         """Split a known real number into what the precision holds of it and the rest."""
@@ -176,22 +175,25 @@ class _Evaluation:
     def _sum_running(self, a: Compensated, axis: int, reverse: bool) -> Compensated:
         """Return the running sums along an axis, from its first entry on or from its last."""
         parts = _take_apart(a, axis)
-        for i in range(1, len(parts)):
-            parts[i] = self._add(parts[i - 1], parts[i]) if not reverse else parts[i]
-        for i in reversed(range(len(parts) - 1)):
-            parts[i] = self._add(parts[i + 1], parts[i]) if reverse else parts[i]
+        if reverse:
+            for i in reversed(range(len(parts) - 1)):
+                parts[i] = self._add(parts[i + 1], parts[i])
+        else:
+            for i in range(1, len(parts)):
+                parts[i] = self._add(parts[i - 1], parts[i])
         highs, lows = [p.high for p in parts], [_or_zero(p.low) + jnp.zeros_like(p.high) for p in parts]
         return Compensated(jnp.stack(highs, axis), jnp.stack(lows, axis))
 
     def _multiply_matrices(self, a: Compensated, b: Compensated, dimension_numbers: Any, **_: Any) -> Compensated:
         """Multiply matrices by the products of entries, added one after another."""
         # Axes that are summed over, and axes of a batch; the result has the axes batch, rest of a, rest of b.
-        (over_a, over_b), (same_a, same_b) = dimension_numbers
-        left, right = (_arrange_factor(*part) for part in ((a, same_a, over_a, True), (b, same_b, over_b, False)))
-        size_a, size_b = jnp.shape(a.high), jnp.shape(b.high)
-        shape = [size_a[axis] for axis in same_a]
-        shape += [n for axis, n in enumerate(size_a) if axis not in (*same_a, *over_a)]
-        shape += [n for axis, n in enumerate(size_b) if axis not in (*same_b, *over_b)]
+        (summed_a, summed_b), (batch_a, batch_b) = dimension_numbers
+        left = _arrange_factor(a, batch_a, summed_a, left=True)
+        right = _arrange_factor(b, batch_b, summed_b, left=False)
+        shape_a, shape_b = jnp.shape(a.high), jnp.shape(b.high)
+        shape = [shape_a[axis] for axis in batch_a]
+        shape += [n for axis, n in enumerate(shape_a) if axis not in (*batch_a, *summed_a)]
+        shape += [n for axis, n in enumerate(shape_b) if axis not in (*batch_b, *summed_b)]
         products = [self._multiply(x, y) for x, y in zip(_take_apart(left, 1), _take_apart(right, 1), strict=True)]
         if not products:
             return Compensated(jnp.zeros(shape))
@@ -206,7 +208,10 @@ class _Evaluation:
         return ((a1 * b1 - a * b) + a1 * b2 + a2 * b1) + a2 * b2
 
     def _split_digits(self, a: Any) -> tuple[Any, Any]:
-        """Return a as a sum of two numbers of half as many digits."""
+        """Return a as a sum of two numbers of half as many digits.
+
+        Source: Dekker, A floating-point technique for extending the available precision (1971).
+        """
         if not isinstance(a, jax.Array):
             whole: Any = np.asarray(a, self.stored)
             far = whole * self.stored(self.splitter)
@@ -279,13 +284,16 @@ def _take(x: Any, i: int, axis: int) -> Any:
     return lax.index_in_dim(x, i, axis, False) if isinstance(x, jax.Array) else np.take(x, i, axis)
 
 
-def _arrange_factor(a: Compensated, same: Sequence[int], over: Sequence[int], left: bool) -> Compensated:
-    """Arrange a factor as (batch, summed, rows, 1) or (batch, summed, 1, columns)."""
+def _arrange_factor(a: Compensated, batch: Sequence[int], summed: Sequence[int], left: bool) -> Compensated:
+    """Arrange the left factor as (batch, summed, rows, 1), or the right one as (batch, summed, 1, columns).
+
+    `batch` and `summed` are its axes of these kinds; of each kind the axes become one.
+    """
     shape = jnp.shape(a.high)
-    rest = [i for i in range(len(shape)) if i not in (*same, *over)]
-    sizes = [int(np.prod([shape[i] for i in some], dtype=int)) for some in (same, over, rest)]
+    rest = [axis for axis in range(len(shape)) if axis not in (*batch, *summed)]
+    sizes = [int(np.prod([shape[axis] for axis in axes], dtype=int)) for axes in (batch, summed, rest)]
     sizes = [*sizes, 1] if left else [*sizes[:2], 1, sizes[2]]
-    order = [*same, *over, *rest]
+    order = [*batch, *summed, *rest]
     parts = [None if x is None else x.transpose(order).reshape(sizes) for x in map(_as_array, a)]
     return Compensated(*parts)
 

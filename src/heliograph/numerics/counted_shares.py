@@ -31,18 +31,23 @@ def wilson(hits: float, of: float) -> Share:
     """
     if not of:
         return Share(float("nan"), 0.0, 1.0)
-    z = float(scipy.special.ndtri(0.975))
+    z = float(scipy.special.ndtri(0.975))  # 1.96
     p = hits / of
     middle = (p + z**2 / (2 * of)) / (1 + z**2 / of)
     half = z / (1 + z**2 / of) * np.sqrt(p * (1 - p) / of + z**2 / (4 * of**2))
-    return Share(p, 0.0 if not hits else float(middle - half), 1.0 if hits == of else float(middle + half))
+    # The ends are exactly 0 of no hits and 1 of hits alone, which rounding would miss.
+    low, high = 0.0 if not hits else float(middle - half), 1.0 if hits == of else float(middle + half)
+    return Share(estimate=p, low=low, high=high)
 
 
 def count_independent(values: Float[np.ndarray, " time"]) -> float:
-    """Return how many independent values say as much: N (1 - a) / (1 + a), a the correlation of neighbours."""
-    apart = values - np.mean(values)
-    power = float(np.sum(apart**2))
-    a = np.clip(np.sum(apart[1:] * apart[:-1]) / power, 0.0, 0.999) if power and len(values) > 2 else 0.0
+    """Return how many independent values say as much: N (1 - a) / (1 + a), a the correlation of neighbours.
+
+    A negative correlation counts as none, so that it is never more than N.
+    """
+    deviations = values - np.mean(values)
+    power = float(np.sum(deviations**2))
+    a = np.clip(np.sum(deviations[1:] * deviations[:-1]) / power, 0.0, 0.999) if power and len(values) > 2 else 0.0
     return max(float(len(values) * (1 - a) / (1 + a)), 1.0)
 
 
@@ -51,14 +56,15 @@ def average_correlated(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
 
     The weights reach over the cube root of the length.
     """
-    there = ~np.isnan(values)
-    count = max(int(there.sum()), 1)
-    mean = float(values[there].sum() / count)
-    apart = np.where(there, values - mean, 0.0)
-    # sum over t of (1 - |t| / width) sum_k e_k e_(k+t) is the mean over a window's width of squares of its moving sums.
+    is_known = ~np.isnan(values)
+    count = max(int(is_known.sum()), 1)
+    mean = float(values[is_known].sum() / count)
+    deviations = np.where(is_known, values - mean, 0.0)
+    # The variance of the sum of all values is sum over t of (1 - |t| / width) sum_k e_k e_(k+t), e the deviations. That
+    # is the sum of the squares of all moving sums of `width` deviations, divided by the width.
     width = int(np.ceil(len(values) ** (1 / 3))) + 1
-    sums = np.convolve(apart, np.ones(width))
-    return mean, float(np.sqrt(np.mean(sums**2) * (len(sums) / width)) / count)
+    moving_sums = np.convolve(deviations, np.ones(width))
+    return mean, float(np.sqrt(np.mean(moving_sums**2) * (len(moving_sums) / width)) / count)
 
 
 def round_to(value: float, error: float) -> str:

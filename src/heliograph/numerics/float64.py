@@ -85,8 +85,9 @@ def understood() -> Options:
 
     The optimisation level is left out where JAX's flag jax_disable_most_optimizations is set, which it would overrule.
     """
-    least = jax.config.values["jax_disable_most_optimizations"]
-    return {name: value for name, value in OPTIONS.items() if not (least and name == LEVEL) and _is_understood(name)}
+    has_no_level = jax.config.values["jax_disable_most_optimizations"]
+    names = [name for name in OPTIONS if not (has_no_level and name == LEVEL)]
+    return {name: OPTIONS[name] for name in names if _is_understood(name)}
 
 
 def _is_understood(name: str) -> bool:
@@ -154,12 +155,13 @@ def let_compute_in_float64(kind: type, names: Sequence[str]) -> None:
 
 
 def _known_in_float64(function: Callable[P, R]) -> Callable[P, R]:
-    """Compute at once, in float64, what depends on no traced number, also inside of a trace."""
+    """Return the function, computed at once and in float64 where no argument is traced, also inside of a trace."""
 
     @wraps(function)
     def scoped(*args: P.args, **kwargs: P.kwargs) -> R:
         """Call the function in the float64 scope where no number is traced."""
-        if jax.dtypes.canonicalize_dtype(float).itemsize == 8 or is_traced((args, kwargs)):
+        is_in_float64 = jax.dtypes.canonicalize_dtype(float).itemsize == 8
+        if is_in_float64 or is_traced((args, kwargs)):
             return function(*args, **kwargs)
         with jax.ensure_compile_time_eval(), jax.enable_x64(True):
             arrays: R = to_numpy(function(*args, **kwargs))

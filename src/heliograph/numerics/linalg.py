@@ -69,7 +69,7 @@ def factor(a: jax.Array) -> tuple[jax.Array, jax.Array]:
     n, left, columns, scales = len(a), a, list[jax.Array](), list[jax.Array]()
     if not 0 < n <= WRITTEN:
         return _factor_in_loop(a)
-    growth = jnp.zeros((), a.dtype)
+    growth = jnp.zeros((), a.dtype)  # the largest ratio so far of a diagonal entry of A to its pivot
     for j in range(n):
         scales.append(compute_pivot_reciprocal_root(left[0, 0], a[j, j], growth))
         growth = jnp.maximum(growth, a[j, j] * scales[j] * scales[j])
@@ -106,9 +106,9 @@ def compute_pivot_reciprocal_root(pivot: jax.Array, whole: jax.Array, growth: ja
     entry to its pivot before; dividing by such a pivot multiplies by it what rounding makes of this one. The root is
     taken of a positive number in any case, of infinity where nothing is left: the derivative there is 0.
     """
-    singular = pivot >= -negative_tolerance(pivot, growth) * whole
-    beyond = jnp.where(singular, jnp.inf, jnp.nan)
-    return 1 / jnp.sqrt(jnp.where(pivot > rounding(PIVOT_TOLERANCE, pivot) * whole, pivot, beyond))
+    is_zero_or_more = pivot >= -negative_tolerance(pivot, growth) * whole
+    if_not_positive = jnp.where(is_zero_or_more, jnp.inf, jnp.nan)
+    return 1 / jnp.sqrt(jnp.where(pivot > rounding(PIVOT_TOLERANCE, pivot) * whole, pivot, if_not_positive))
 
 
 def negative_tolerance(like: jax.Array, growth: jax.Array) -> jax.Array:
@@ -146,7 +146,8 @@ def solver(a: Float[Array, "n n"]) -> Callable[[Array], jax.Array]:
 
     def solve(b: Array) -> jax.Array:
         """Return X of A X = B."""
-        # L Y = B, then L' X = Y, which is lower again from the last row up.
+        # L Y = B, then L' X = Y. L' is upper; with its rows and columns in reverse order it is lower, as Y and X then
+        # are upside down.
         y = _substitute(lower, scales, jnp.asarray(b)) * scales[:, None]
         upside_down = _substitute(lower.T[::-1, ::-1], scales[::-1], y[::-1])
         return jnp.asarray(upside_down[::-1] * scales[:, None])
@@ -156,7 +157,10 @@ def solver(a: Float[Array, "n n"]) -> Callable[[Array], jax.Array]:
 
 @jax.jit
 def _substitute(lower: jax.Array, scales: jax.Array, b: jax.Array) -> jax.Array:
-    """Return the numerators B_i - sum_{j < i} L_ij Y_j of L Y = B (n, k): each row of Y is taken off those below it."""
+    """Return the numerators B_i - sum_{j < i} L_ij Y_j of L Y = B (n, k): each row of Y is taken off those below it.
+
+    Y_i is numerator i times `scales`, the reciprocals of L's diagonal.
+    """
     n, left, numerators = len(b), b, list[jax.Array]()
 
     def take_off(j: jax.Array, rest: jax.Array) -> jax.Array:
@@ -186,18 +190,18 @@ def squared_distance_terms(
 ) -> tuple[jax.Array, jax.Array]:
     """Return the terms of `squared_distance`, each given those before it, and which of them these determine.
 
-    `roundings` of its size: a component with no larger deviation counts as determined.
+    A component whose standard deviation is no more than `roundings` roundings of its `size` counts as determined.
     """
     variance = diagonal(a)
-    reach = OFF_SUPPORT * jnp.sqrt(jnp.maximum(variance, 0.0)) + OFF_VALUE * jnp.abs(size)
+    agreement = OFF_SUPPORT * jnp.sqrt(jnp.maximum(variance, 0.0)) + OFF_VALUE * jnp.abs(size)  # see squared_distance
     lower, scales = factor(a)
-    rest = _substitute(lower, scales, x[:, None])[:, 0]
-    determined = scales == 0
+    unexplained = _substitute(lower, scales, x[:, None])[:, 0]  # of each component, by those before it
+    determined = scales == 0  # `factor` gives 0 for a pivot that is zero
     if roundings:
-        known = (roundings * float(np.finfo(a.dtype).eps) * jnp.asarray(size)) ** 2
-        determined |= (variance >= 0) & (variance <= known)
-    agrees = jnp.where(jnp.abs(rest) <= reach, 1.0, jnp.inf)
-    return jnp.where(determined, agrees, (rest * scales) ** 2), determined
+        variance_of_rounding = (roundings * float(np.finfo(a.dtype).eps) * jnp.asarray(size)) ** 2
+        determined |= (variance >= 0) & (variance <= variance_of_rounding)
+    if_determined = jnp.where(jnp.abs(unexplained) <= agreement, 1.0, jnp.inf)
+    return jnp.where(determined, if_determined, (unexplained * scales) ** 2), determined
 
 
 def whiten(a: jax.Array, x: jax.Array) -> jax.Array:

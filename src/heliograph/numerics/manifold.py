@@ -44,14 +44,14 @@ class Manifold(NamedTuple):
     def _replace_rotations(self, whole: Array, make: Callable[[Array, Array], Any], x: Array, y: Array) -> Any:
         """Return `whole` with its rotation vectors replaced by what is made of those of x and y."""
         for i in range(0, len(self.rotations), 3):
-            at = np.array(self.rotations[i : i + 3])
+            places = np.array(self.rotations[i : i + 3])  # of one rotation vector
             x, y = (v if np.shape(v) == np.shape(whole) else v + np.zeros(np.shape(whole)) for v in (x, y))
-            value = make(x[..., at], y[..., at])
-            if isinstance(whole, jax.Array) or isinstance(value, jax.Array):
-                whole = jnp.asarray(whole).at[..., at].set(value)
+            vector = make(x[..., places], y[..., places])
+            if isinstance(whole, jax.Array) or isinstance(vector, jax.Array):
+                whole = jnp.asarray(whole).at[..., places].set(vector)
             else:
                 whole = whole.copy()
-                whole[..., at] = value
+                whole[..., places] = vector
         return whole
 
     def near(self, x: A, reference: Array) -> A:
@@ -97,8 +97,8 @@ class Manifold(NamedTuple):
             return None
         matrix = jnp.eye(len(change), dtype=change.dtype)
         for i in range(0, len(self.rotations), 3):
-            at = np.array(self.rotations[i : i + 3])
-            own = change[at]
-            block = jax.jacfwd(lambda d, own=own: turn_between(d, own))(own)
-            matrix = matrix.at[at[:, None], at].set(block)
+            places = np.array(self.rotations[i : i + 3])  # of one rotation vector
+            turned = change[places]
+            block = jax.jacfwd(lambda d, turned=turned: turn_between(d, turned))(turned)
+            matrix = matrix.at[places[:, None], places].set(block)
         return matrix

@@ -130,6 +130,7 @@ def _html(self: object) -> str:
 
 def _are_equal(self: object, other: object) -> bool:
     """Return whether both are of the same class and equal in every part; NaN equals NaN."""
+    # Of an object that is no container, what it would be copied from: attributes, also those in slots.
     if type(self) is type(other) and not (is_dataclass(self) or isinstance(self, Mapping | tuple)):
         return are_same(self.__getstate__(), other.__getstate__())
     return are_same(self, other)
@@ -178,7 +179,7 @@ def _is_ours(value: object) -> bool:
 
 
 def _list_parts(value: object) -> Iterable[tuple[str, object]]:
-    """Return the names and values of what an object holds and anybody may use."""
+    """Return the names and values of what an object holds and anybody may use: entries, fields or attributes."""
     if isinstance(value, Mapping):
         return ((repr(key), entry) for key, entry in value.items())
     if is_dataclass(value):

@@ -62,12 +62,12 @@ def list_closest_names(name: str, known: Mapping[str, str]) -> list[str]:
     plain: dict[str, str] = {}
     for public, shown in known.items():
         plain.setdefault(_strip_name(public), shown)
-    meant = [candidate for candidate in plain if candidate == MEANT.get(_strip_name(name))]
-    alike = get_close_matches(_strip_name(name), plain, MOST, ALIKE)
-    around = [
-        candidate for candidate in plain if len(name) > 2 and _strip_name(name) in candidate
-    ]  # kalman: kalman_filter
-    return [plain[candidate] for candidate in dict.fromkeys([*meant, *alike, *around])][:MOST]
+    stripped = _strip_name(name)
+    meant = [candidate for candidate in plain if candidate == MEANT.get(stripped)]
+    alike = get_close_matches(stripped, plain, MOST, ALIKE)
+    is_long_enough = len(name) > 2  # one or two letters are in many names
+    containing = [candidate for candidate in plain if is_long_enough and stripped in candidate]  # kalman: kalman_filter
+    return [plain[candidate] for candidate in dict.fromkeys([*meant, *alike, *containing])][:MOST]
 
 
 def _strip_name(name: str) -> str:

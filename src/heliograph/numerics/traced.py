@@ -45,9 +45,11 @@ def find_rounded_to_single(value: object) -> tuple[float, float] | None:
     finite = numbers[np.isfinite(numbers)].astype(float)
     with np.errstate(over="ignore", under="ignore"):
         single = finite.astype(np.float32)
-    meant = single.astype(str).astype(float)
-    bits = np.frexp(finite)[0] * 2.0**MEANT_BITS
-    (rounded,) = np.nonzero((single == finite) & (meant != finite) & (bits != np.floor(bits)))
+    meant = single.astype(str).astype(float)  # by way of the shortest decimal
+    # A number has more than MEANT_BITS bits if its mantissa, times 2 to that power, is no whole number.
+    scaled_mantissa = np.frexp(finite)[0] * 2.0**MEANT_BITS
+    has_many_bits = scaled_mantissa != np.floor(scaled_mantissa)
+    (rounded,) = np.nonzero((single == finite) & (meant != finite) & has_many_bits)
     return (float(meant[rounded[0]]), float(finite[rounded[0]])) if len(rounded) else None
 
 

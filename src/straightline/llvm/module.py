@@ -278,9 +278,9 @@ def _request_rows_ahead(
     writer: FunctionWriter, parts: ProgramParts, names: dict[Buffer, str], taken: list[Buffer], given: list[Buffer]
 ) -> None:
     """Let the longest loop, if there is one, ask for the memory of inputs and outputs before it is used."""
-    writer.asking = find_longest_loop(x for x in parts.program.graph.top.items if x in writer.mine)
-    if writer.asking is not None:
-        writer.asked = _locate_rows(writer, names, taken, given, parts.width, writer.asking)
+    writer.asking_loop = find_longest_loop(x for x in parts.program.graph.top.items if x in writer.mine)
+    if writer.asking_loop is not None:
+        writer.asked_rows = _locate_rows(writer, names, taken, given, parts.width, writer.asking_loop)
 
 
 def _locate_rows(
@@ -329,7 +329,7 @@ def _add_to_sums(
     place = writer.add(f"add i64 {batch}, {behind}")
     # Lanes beyond the last run repeat it, and do not count: those whose number is not below the runs that are left.
     runs_left = writer.write_broadcast(writer.add("sub i64 %runs, %first"), "i64")
-    writer.counted = writer.add(f"icmp ult %i64 {writer.add('call %i64 @hg_lanes()')}, {runs_left}")
+    writer.counted_lanes = writer.add(f"icmp ult %i64 {writer.add('call %i64 @hg_lanes()')}, {runs_left}")
     for buffer in outputs:
         writer.bases[buffer] = writer.add(f"getelementptr double, ptr {names[buffer]}, i64 {place}")
         writer.sums[buffer] = row_length(width, summed.batches)

@@ -96,10 +96,10 @@ class FunctionWriter:
         self.bases: dict[Buffer, str] = {}
         self.turning: Collection[Buffer] = ()  # shared buffers within loops that have a place for each turn
         self.sums: dict[Buffer, int] = {}  # outputs that are added to sums over runs, and the length of their rows
-        self.counted = ""  # the lanes that count
+        self.counted_lanes = ""  # the lanes that count
         self.flushes = False  # whether subnormal numbers are zeros
-        self.asking: Loop | None = None  # the loop that asks for memory, and for which
-        self.asked: list[PrefetchedRows] = []
+        self.asking_loop: Loop | None = None  # the loop that asks for memory, and for which
+        self.asked_rows: list[PrefetchedRows] = []
 
     def add(self, text: str) -> str:
         """Append an operation; return the new name of its result."""
@@ -281,7 +281,7 @@ class FunctionWriter:
             if store.node.type == "f32":
                 name, kind = self.add(f"fpext {kind} {name} to %double"), "%double"
             before = self.add(f"load {kind}, ptr {address}, align 8")
-            counted = self.add(f"select %i1 {self.counted}, {kind} {name}, {kind} zeroinitializer")
+            counted = self.add(f"select %i1 {self.counted_lanes}, {kind} {name}, {kind} zeroinitializer")
             name = self.add(f"fadd {kind} {before}, {counted}")
         if store.node.type == "bool":
             name, kind = self.add(f"zext {kind} {name} to %i8"), "%i8"
@@ -305,8 +305,8 @@ class FunctionWriter:
         self.scopes.append({})  # names that hold within a turn
         counter = f"%{name}.counter"
         self._name_parameters(loop, name, counter, carried)
-        if loop is self.asking:  # it asks for memory before that is used
-            for rows in self.asked:
+        if loop is self.asking_loop:  # it asks for memory before that is used
+            for rows in self.asked_rows:
                 requests = write_requests(rows, loop.length or 1, counter, WIDTH, self.add)
                 self.lines += [f"  {line}" for line in requests]
         # Counted: body, then the latch. Conditional: the check is inside the body.

@@ -150,12 +150,13 @@ def hash_words(first: Word, second: Word, high: Word, low: Word) -> Word:
     20 rounds of addition, rotation and exclusive or; key words are added every four rounds.
     """
     keys = (first, second, first ^ second ^ PARITY)
-    x, y, mask = (high + first) & 0xFFFFFFFF, (low + second) & 0xFFFFFFFF, 0xFFFFFFFF
-    for four in range(5):
-        for bits in ROTATIONS[four % 2]:
+    mask = 0xFFFFFFFF  # keeps the lower 32 bits of a sum
+    x, y = (high + first) & mask, (low + second) & mask
+    for group in range(5):  # of four rounds each
+        for bits in ROTATIONS[group % 2]:
             x = (x + y) & mask
             y = ((y << bits | y >> (32 - bits)) & mask) ^ x
-        x, y = (x + keys[(four + 1) % 3]) & mask, (y + keys[(four + 2) % 3] + four + 1) & mask
+        x, y = (x + keys[(group + 1) % 3]) & mask, (y + keys[(group + 2) % 3] + group + 1) & mask
     return x << 32 | y
 
 

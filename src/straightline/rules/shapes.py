@@ -62,12 +62,13 @@ def _lower_pad(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray])
     x, filling = inputs
     padded = np.empty(result_shape(equation), dtype=object)
     padded[...] = filling[()]
+    # Axis by axis, which entries stay and where they go: `low` places before the first one, `inner` between neighbours.
     sources, targets = [], []
-    for size, bound, (low, _, inner) in zip(x.shape, padded.shape, equation.params["padding_config"], strict=True):
-        at = low + np.arange(size) * (1 + inner)
-        inside = (at >= 0) & (at < bound)
-        sources.append(np.flatnonzero(inside))
-        targets.append(at[inside])
+    for size, length, (low, _high, inner) in zip(x.shape, padded.shape, equation.params["padding_config"], strict=True):
+        places = low + np.arange(size) * (1 + inner)
+        stays = (places >= 0) & (places < length)
+        sources.append(np.flatnonzero(stays))
+        targets.append(places[stays])
     padded[np.ix_(*targets)] = x[np.ix_(*sources)]
     return [padded]
 
@@ -92,11 +93,12 @@ def select_array(graph: Graph, which: Node, cases: list[np.ndarray]) -> np.ndarr
     """Return one of several arrays, the first for numbers below 0 and the last for numbers beyond."""
     from straightline.rules.elementwise import select
 
+    # From the last case back, each is chosen where `which` is at most its number, over those behind it.
     selected = cases[-1]
     for number, case in reversed(list(enumerate(cases[:-1]))):
-        here = graph.node("le", "bool", which, graph.constant(number, which.type))
+        is_up_to_here = graph.node("le", "bool", which, graph.constant(number, which.type))
         pairs = zip(case.ravel().tolist(), selected.ravel().tolist(), strict=True)
-        selected = arrange_nodes([select(graph, here, a, b) for a, b in pairs], case.shape)
+        selected = arrange_nodes([select(graph, is_up_to_here, a, b) for a, b in pairs], case.shape)
     return selected
 
 
@@ -104,12 +106,12 @@ def _lower_dynamic_update_slice(lowering: Lowering, equation: JaxprEqn, inputs: 
     """Lower `dynamic_update_slice`: at known starts a copy, at one that data decide a choice among its few places."""
     x, update, starts = inputs[0], inputs[1], [lowering.get_only_node(s) for s in inputs[2:]]
     for axis, start in enumerate(starts):
-        last = x.shape[axis] - update.shape[axis]
-        if last and start.op != "constant":
-            if last >= FEW:
-                raise Unsupported(f"one of {last + 1} places that data decide")
-            known = [s if a != axis else None for a, s in enumerate(starts)]
-            cases = [_update_at(lowering, x, update, known, first) for first in range(last + 1)]
+        last_start = x.shape[axis] - update.shape[axis]
+        if last_start and start.op != "constant":  # several places, of which data decide
+            if last_start >= FEW:
+                raise Unsupported(f"one of {last_start + 1} places that data decide")
+            other_starts = [s if a != axis else None for a, s in enumerate(starts)]
+            cases = [_update_at(lowering, x, update, other_starts, first) for first in range(last_start + 1)]
             return [select_array(lowering.graph, start, cases)]
     return [_update_at(lowering, x, update, starts, 0)]
 
@@ -118,15 +120,16 @@ def _update_at(
     lowering: Lowering, x: np.ndarray, update: np.ndarray, starts: Sequence[Node | None], here: int
 ) -> np.ndarray:
     """Return x with `update` put at these starts; along the one axis whose start is None, at `here`."""
-    at = []
-    for size, whole, start in zip(update.shape, x.shape, starts, strict=True):
-        if start is not None and start.op != "constant" and whole > size:
+    ranges = []
+    for size, length, start in zip(update.shape, x.shape, starts, strict=True):
+        has_one_place = length == size
+        if start is not None and start.op != "constant" and not has_one_place:
             raise Unsupported("two places that data decide")
-        first = here if start is None else 0 if whole == size else int(start.value)
-        first = min(max(first, 0), whole - size)
-        at.append(slice(first, first + size))
+        first = here if start is None else 0 if has_one_place else int(start.value)
+        first = min(max(first, 0), length - size)  # moved inside, as in JAX
+        ranges.append(slice(first, first + size))
     updated = x.copy()
-    updated[tuple(at)] = update
+    updated[tuple(ranges)] = update
     return updated
 
 

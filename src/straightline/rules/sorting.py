@@ -18,7 +18,8 @@ def _sort(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> l
         raise Unsupported("sort")
     arrays = [np.moveaxis(x, axis, -1).copy() for x in inputs]
     for index in np.ndindex(*arrays[0].shape[:-1]):
-        keys, *_ = rows = [x[index] for x in arrays]
+        rows = [x[index] for x in arrays]  # views, which are sorted in place
+        keys = rows[0]
         # Odd-even transposition: neighbours at even places are exchanged if in the wrong order, then those at odd ones.
         for turn in range(count):
             for i in range(turn % 2, count - 1, 2):

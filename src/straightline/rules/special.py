@@ -50,7 +50,8 @@ def gamma_masses(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     """
     is_valid, is_large = (a > 0) & (x >= 0), a > LARGE
     # Where neither series nor fraction serves, 1 stands for a and x, so that no NaN comes into the loops.
-    shape, place = jnp.where(is_large | ~is_valid, 1.0, a), jnp.where(is_large | ~is_valid, 1.0, x)
+    serves_none = is_large | ~is_valid
+    shape, place = jnp.where(serves_none, 1.0, a), jnp.where(serves_none, 1.0, x)
     above = place > shape + 1
     density = jnp.exp(shape * jnp.log(place) - place - jax.lax.lgamma(shape))
     lower = density * _sum_lower_series(shape, place, skipped=above)
@@ -219,8 +220,8 @@ def digamma(x: jax.Array) -> jax.Array:
     large = jnp.where(mirrored, 1 - x, x)
     reciprocals = jnp.zeros_like(x)
     for _ in range(10):
-        low = large < 10
-        reciprocals, large = reciprocals + jnp.where(low, 1 / large, 0.0), jnp.where(low, large + 1, large)
+        is_small = large < 10
+        reciprocals, large = reciprocals + jnp.where(is_small, 1 / large, 0.0), jnp.where(is_small, large + 1, large)
     square, tail = 1 / (large * large), jnp.zeros_like(x)
     for coefficient in BERNOULLI[::-1]:
         tail = (tail + coefficient) * square

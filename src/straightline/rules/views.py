@@ -174,18 +174,20 @@ def _match_strides(view: InMemory, shape: tuple[int, ...]) -> list[int]:
 def _concatenate(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     """Concatenate along the first axis in new memory, along another axis row by row."""
     shape, axis = result_shape(equation), equation.params["dimension"]
-    in_memory_ = [x for x in inputs if isinstance(x, InMemory)]
-    known = all(x.buffer.kind == "table" and not x.moves and x.size <= LOADED for x in in_memory_)
-    if math.prod(shape) <= TABLE or known:
+    # As nodes if the result is short, or if all that is in memory is known numbers, which stay known then.
+    arrays_in_memory = [x for x in inputs if isinstance(x, InMemory)]
+    are_known = all(x.buffer.kind == "table" and not x.moves and x.size <= LOADED for x in arrays_in_memory)
+    if math.prod(shape) <= TABLE or are_known:
         return list(RULES["concatenate"](lowering, equation, [lowering.nodes(x) for x in inputs]))
     if axis != 0:
         parts = [put_in_memory(lowering, x) for x in inputs]
 
-        def turn(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-            """Return no carry, and one row of all arrays concatenated."""
+        def join_row(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+            """Return no carry, and one row of all arrays concatenated; a row lacks the first axis."""
             return [], [np.concatenate([lowering.nodes(x.row(row)) for x in parts], axis=axis - 1)]
 
-        return list(repeat_turns(lowering, shape[0], [], turn)[1])
+        _carry, stacked = repeat_turns(lowering, shape[0], [], join_row)
+        return list(stacked)
     return [join_arrays(lowering, inputs, shape)]
 
 

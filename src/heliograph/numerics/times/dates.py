@@ -142,9 +142,13 @@ SPANS = {"years": 365.25 * 86400, "months": 30.4375 * 86400, "days": 86400.0, "h
 
 
 def unequal_steps(time: np.ndarray) -> str:
-    """Return "steps of 1 and 21 years" where the longest step is more than LONGER times the median one, else ""."""
+    """Return "steps of 1 and 21 years" where the longest step is more than LONGER times the median one, else "".
+
+    These are the median and the longest step, in the largest unit that the median nearly fills (of dates).
+    """
     steps = seconds_between(time)[1:]
-    if steps.size and 0 < steps.max() <= LONGER * steps.min():  # nor then more than the median, which takes a sort
+    # Not above LONGER times the shortest is not above that of the median: a look that saves the median's sort.
+    if steps.size and 0 < steps.max() <= LONGER * steps.min():
         return ""
     steps = steps[steps > 0]
     if not steps.size or steps.max() <= LONGER * np.median(steps):

@@ -42,20 +42,21 @@ def find_out_of_order(time: np.ndarray) -> Bool[np.ndarray, " rows"]:
 def find_unset_stamps(time: np.ndarray, year: float = YEAR) -> Bool[np.ndarray, " events"]:
     """Return the mask of the stamps, in the order of their messages, of a clock that was not set.
 
-    They are more than a year outside of all others, and a stretch of fewer messages than those before and after it,
-    between which is less than a year; or, at the start, of the first year since 1970, where clocks begin to count, and
-    all others are of this century.
+    They are more than a year outside of all others, and one of two. In the middle: a stretch of fewer messages than the
+    stretches before and after it have together, between which is less than a year. At the start: stamps of the first
+    year since 1970, where clocks begin to count, while all others are of this century.
 
     Args:
         time: the stamps.
         year: a year in their unit (default nanoseconds).
     """
-    # Stretches of messages between which the stamp jumps by more than a year.
+    # Stretches of messages, as arrays of their places, between which the stamp jumps by more than a year.
     stretches = np.split(np.arange(len(time)), np.flatnonzero(np.abs(np.diff(time)) > year) + 1)
     astray = np.zeros(len(time), dtype=bool)
-    for before, one, after in zip(stretches, stretches[1:], stretches[2:], strict=False):
-        returns = abs(int(time[after[0]]) - int(time[before[-1]])) <= year
-        astray[one] = returns and len(one) < len(before) + len(after)
+    for before, stretch, after in zip(stretches, stretches[1:], stretches[2:], strict=False):
+        jumps_back = abs(int(time[after[0]]) - int(time[before[-1]])) <= year
+        is_minority = len(stretch) < len(before) + len(after)
+        astray[stretch] = jumps_back and is_minority
     # The first stretch: in the year from which clocks count, where all sound stamps after it are of this century.
     first = stretches[0]
     later = time[len(first) :][~astray[len(first) :]]
@@ -63,5 +64,6 @@ def find_unset_stamps(time: np.ndarray, year: float = YEAR) -> Bool[np.ndarray, 
     astray[first] = in_first_year and len(later) > 0 and bool(later.min() >= CENTURY / YEAR * year)
     if not astray.any():
         return astray
+    # Of the candidates those are unset that lie more than a year outside of all others.
     others = time[~astray]
     return np.asarray(astray & ((time < others.min() - year) | (time > others.max() + year)))

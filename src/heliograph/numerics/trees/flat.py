@@ -34,7 +34,8 @@ class FlatLayout(NamedTuple):
 def make_flat_layout(tree: PyTree) -> FlatLayout:
     """Return the layout of a tree of arrays."""
     leaves, structure = jax.tree.flatten(tree)
-    return FlatLayout(structure, tuple(leaf.shape for leaf in leaves), tuple(str(leaf.dtype) for leaf in leaves))
+    shapes, kinds = tuple(leaf.shape for leaf in leaves), tuple(str(leaf.dtype) for leaf in leaves)
+    return FlatLayout(structure=structure, shapes=shapes, kinds=kinds)
 
 
 def flatten_to_row(tree: PyTree) -> jax.Array:
