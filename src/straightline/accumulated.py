@@ -30,7 +30,8 @@ class AccumulatedProgram:
         differs = [n == summed.number for n in range(len(program.inputs))]
         self.summed, self.tree = summed, program.tree
         self.types = [DTYPES[b.type] for n, b in enumerate(program.inputs) if n != summed.number]
-        self.code = write_module(program, differs, None, find_processor_features()[2], summed=summed)
+        _name, _flags, fuses = find_processor_features()
+        self.code = write_module(program, differs, width=None, fuse=fuses, summed=summed)
         self.common, self.operations = self.code.common, self.code.operations
         self.width = self.code.width
         self.blocks = TieredCode(self.code.blocks, (choose_hasty_width(self.width), self.width))

@@ -39,19 +39,19 @@ class Compiled:
         self.shapes = [b.shape for b in program.inputs]
         self.tree = program.tree
         # If runs share all arguments, they are one, whose results are computed in the arrays that are returned.
-        self.code: ModuleText = write_module(
-            program, self.differs, width, find_processor_features()[2], alone=not any(self.differs)
-        )
+        is_one_run, (_name, _flags, fuses) = not any(self.differs), find_processor_features()
+        self.code: ModuleText = write_module(program, self.differs, width, fuse=fuses, alone=is_one_run)
         self.width, self.common = self.code.width, self.code.common
         self.operations, self.divisions = self.code.operations, self.code.divisions
-        # Code for blocks of runs, for what all runs share, and for one run alone.
+        # Code for blocks of runs, for what all runs share, and for one run alone, each in haste and with care.
         self.blocks = TieredCode(self.code.blocks, (width or choose_hasty_width(self.width), self.width))
         self.once = None if self.code.once is None else TieredCode(self.code.once, (1, 1))
         self.single = TieredCode(self.code.blocks, (1, 1))
         self._refusal: str | None = None  # why LLVM makes no code, "" if it does, None until it was tried
         self._first: list[np.ndarray] = []  # the first arguments, which calls leave out, and their addresses
         self._addresses, self._tables = list[int](), list_addresses(self.code.tables)
-        self._by_run = self.differs.index(True) if True in self.differs else None  # an argument that each run has
+        # The number of an argument of which each run has its own: its length is the number of runs.
+        self._by_run = self.differs.index(True) if True in self.differs else None
         self._shared: np.ndarray | None = None  # what all runs of all calls share, once it is computed
 
     def with_first(self, *arguments: PyTree) -> "Compiled":

@@ -38,12 +38,13 @@ def _expand_call(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
     """Inline a composed operation, such as frexp in JAX from 0.12 on, by its definition in others."""
     primitive = equation.params["_prim"]
 
-    def function(*leaves: jax.Array) -> list[jax.Array]:
+    def expand(*leaves: jax.Array) -> list[jax.Array]:
+        """Return the leaves of the operation's results, computed by its definition."""
         return jax.tree.leaves(primitive.expand(*jax.tree.unflatten(primitive.in_tree, leaves)))
 
     avals: list[Any] = [v.aval for v in equation.invars]
     struct: Any = jax.ShapeDtypeStruct
-    program = jax.make_jaxpr(function)(*(struct(a.shape, a.dtype) for a in avals))
+    program = jax.make_jaxpr(expand)(*(struct(a.shape, a.dtype) for a in avals))
     return lowering.inline_program(program, inputs)
 
 
@@ -68,7 +69,8 @@ def _lower_cond(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> 
         return lowering.inline_program(branches[taken], inputs[1:])
     if len(branches) == 1:
         return lowering.inline_program(branches[0], inputs[1:])
-    # Small branches are computed in any case, large ones in guarded blocks.
+    # Small branches are computed in any case, large ones in guarded blocks. The smallest is first, so that larger ones
+    # use what it computed: what a guarded block computes is not there outside of it.
     conditions = _find_taken(lowering, which, len(branches))
     sizes = [estimate_size(lowering, branch.jaxpr) for branch in branches]
     results: dict[int, list[np.ndarray]] = {}
@@ -82,15 +84,19 @@ def _lower_cond(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> 
 
 
 def _find_taken(lowering: Lowering, which: Node, count: int) -> list[Node]:
-    """Return for each branch whether it is taken; indices out of range select the first or last."""
+    """Return for each branch whether it is taken; indices out of range select the first or last.
+
+    `which` is the index, or a flag, by itself or as an integer, that chooses among two.
+    """
     graph = lowering.graph
     if which.op == "convert" and which.args[0].type == "bool":
         which = which.args[0]
     if which.type == "bool":
         return [graph.node("not", "bool", which), which]
-    below = [graph.node("le", "bool", which, graph.constant(k, which.type)) for k in range(count - 1)]
-    between = [graph.node("and", "bool", graph.node("not", "bool", a), b) for a, b in pairwise(below)]
-    return [below[0], *between, graph.node("not", "bool", below[-1])]
+    # Branch k is taken if the index is at most k, but not at most k - 1.
+    at_most = [graph.node("le", "bool", which, graph.constant(k, which.type)) for k in range(count - 1)]
+    between = [graph.node("and", "bool", graph.node("not", "bool", before), here) for before, here in pairwise(at_most)]
+    return [at_most[0], *between, graph.node("not", "bool", at_most[-1])]
 
 
 def _lower_branch(lowering: Lowering, condition: Node, branch: Any, inputs: list[Value]) -> list[np.ndarray]:
@@ -101,6 +107,7 @@ def _lower_branch(lowering: Lowering, condition: Node, branch: Any, inputs: list
         results = [lowering.nodes(x) for x in lowering.inline_program(branch, inputs)]
     finally:
         graph.current = outer
+    # How many nodes it has is known only now that it is lowered.
     if _count_block_nodes(block) <= DEAR:
         _move_statements_out(block, outer)
         return results

@@ -27,7 +27,7 @@ def _make_reduction_rule(op: str, empty: float) -> Rule:
     def lower_operation(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
         """Return the array reduced along the axes of the operation."""
         axes, shape, type = equation.params["axes"], result_shape(equation), result_type(equation)
-        # (entry of the result, terms); no terms of a sum over nothing.
+        # A row of terms for each entry of the result; a sum over nothing has rows of length 0.
         terms = math.prod(inputs[0].shape[axis] for axis in axes)
         x = np.moveaxis(inputs[0], axes, range(-len(axes), 0)).reshape(math.prod(shape), terms)
         neutral = _replace_not_finite(type, empty)
@@ -125,6 +125,7 @@ def _multiply_matrices(lowering: Lowering, type: Type, a: np.ndarray, b: np.ndar
     A congruence is A = C P and B = C with a symmetric P, or A = C and B = C P. That A A' is symmetric needs no rule,
     since equal expressions are one node.
     """
+    # A weighted factor is that with a diagonal P.
     is_symmetric = any(_is_weighted(x, y) or _is_congruence(lowering, x, y) for x, y in ((a, b), (b, a)))
     places = [(i, j) for i in range(len(a)) for j in range(i if is_symmetric else 0, len(b))]
     product = np.empty((len(a), len(b)), dtype=object)
@@ -174,7 +175,10 @@ def _find_weight(x: Node, y: Node) -> Node | None:
     """Return w of a number x that was computed as w y, None of any other."""
     if y.op == "constant" and y.value == 1:
         return x
-    return x.args[x.args[0] is y] if x.op == "mul" and any(a is y for a in x.args) else None
+    if x.op != "mul" or not any(factor is y for factor in x.args):
+        return None
+    first, second = x.args
+    return second if first is y else first
 
 
 def _is_congruence(lowering: Lowering, a: np.ndarray, b: np.ndarray) -> bool:

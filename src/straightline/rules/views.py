@@ -91,26 +91,27 @@ def _dynamic_slice_of_nodes(lowering: Lowering, equation: JaxprEqn, inputs: list
     """Slice one axis after another, each start clamped so that the slice lies inside; in memory if places are many."""
     x, sizes, starts = inputs[0], equation.params["slice_sizes"], [lowering.get_only_node(x) for x in inputs[1:]]
     for axis, (start, size) in enumerate(zip(starts, sizes, strict=True)):
-        last = x.shape[axis] - size
-        if start.op != "constant" and last >= FEW:
+        last_start = x.shape[axis] - size
+        if start.op != "constant" and last_start >= FEW:
             return _lower_dynamic_slice(lowering, equation, [put_in_memory(lowering, inputs[0]), *inputs[1:]])
-        x = _slice_window(lowering, x, axis, start, size) if last else x
+        x = _slice_window(lowering, x, axis, start, size) if last_start else x  # a slice of all the axis has one place
     return [x]
 
 
 def _slice_window(lowering: Lowering, x: np.ndarray, axis: int, start: Node, size: int) -> np.ndarray:
     """Return `size` entries along an axis from a start that may depend on data."""
-    last: int = x.shape[axis] - size
-    cases: list[np.ndarray] = [x[(slice(None),) * axis + (slice(first, first + size),)] for first in range(last + 1)]
+    last_start: int = x.shape[axis] - size
+    along_axis = [(slice(None),) * axis + (slice(first, first + size),) for first in range(last_start + 1)]
+    cases: list[np.ndarray] = [x[window] for window in along_axis]
     if start.op == "constant":
-        return cases[min(max(int(start.value), 0), last)]
+        return cases[min(max(int(start.value), 0), last_start)]
     return select_array(lowering.graph, start, cases)
 
 
 def make_indexable(lowering: Lowering, x: Value, places: list[Value]) -> Value:
-    """Place x in memory where `places`, by which its entries are selected, are known when the program runs alone.
+    """Return x in memory if data decide the `places` at which its entries are selected; else as it is.
 
-    That is done for a table of constants and for what is longer than FEW; keys of random numbers are never in memory.
+    In memory are only a table of constants and what is longer than FEW; keys of random numbers never are.
     """
     nodes = [n for p in places for n in lowering.nodes(p).ravel().tolist()]
     places_are_known = all(n.op == "constant" for n in nodes)

@@ -68,16 +68,16 @@ def write_functions(names: Iterable[str], width: int) -> str:
 
 
 def _write_by_number(name: str, kind: str, count: int, width: int) -> str:
-    """Write a function that calls the scalar library for each number."""
+    """Write a function of vectors that calls the scalar library's, of `count` arguments, for each lane."""
     real = f"%{kind}"
-    lines, total = [], "poison"
+    lines, results = [], "poison"  # the vector of results so far, at first one of which no number is set
     for lane in range(width):
         for i in range(count):
             lines.append(f"%a{lane}_{i} = extractelement {real} %x{i}, i64 {lane}")
         args = ", ".join(f"{kind} %a{lane}_{i}" for i in range(count))
         lines.append(f"%b{lane} = call {kind} @{name}({args})")
-        lines.append(f"%r{lane} = insertelement {real} {total}, {kind} %b{lane}, i64 {lane}")
-        total = f"%r{lane}"
+        lines.append(f"%r{lane} = insertelement {real} {results}, {kind} %b{lane}, i64 {lane}")
+        results = f"%r{lane}"
     signature = ", ".join(f"{real} %x{i}" for i in range(count))
     body = "".join(f"  {line}\n" for line in lines)
-    return f"define internal {real} @hg_{name}({signature}) #9 {{\n{body}  ret {real} {total}\n}}\n"
+    return f"define internal {real} @hg_{name}({signature}) #9 {{\n{body}  ret {real} {results}\n}}\n"

@@ -98,12 +98,12 @@ def _evaluate_ranges(size: Vector) -> tuple[Vector, Vector, Vector]:
     centre = polynomial(square, CENTRE[0]) / polynomial(square, CENTRE[1])
     # Near 1 and beyond: one rational function whose coefficients and argument depend on where x is.
     near, far = size < 1.25, size >= 1 / 0.35
-    above, below = (
+    numerator, denominator = (
         [select(near, a, select(far, size.like(c), b)) for a, b, c in zip(MIDDLE[i], OUTER[i], FAR[i], strict=True)]
         for i in (0, 1)
     )
     argument = select(near, size - 1, 1 / square)
-    middle = polynomial(argument, above) / polynomial(argument, below)
+    middle = polynomial(argument, numerator) / polynomial(argument, denominator)
     # e^(-x^2) to all digits: x = z + (x - z), z of so few digits that z^2 is exact.
     dropped = 32 if size.scalar == "double" else 13
     z = (size.as_type(find_format(size).word) & -(1 << dropped)).as_type(size.scalar)
@@ -117,24 +117,30 @@ def erf_inv(x: Vector) -> Vector:
     """Invert erf by XLA's polynomials for normal random numbers; infinite at -1 and 1, NaN beyond."""
     w = -_log1p(-(x * x))
 
-    def outer() -> Vector:
+    def compute_outer_factor() -> Vector:
         """Return the factor for w >= 6.25, which one draw in a thousand needs."""
-        middle, root = w < 16.0, sqrt(w)
-        tail = polynomial(root - 5, INVERSE[2][::-1])
-        end = polynomial(root - 3.25, INVERSE[1][::-1])
-        return select(middle, end, tail)
+        is_middle, root = w < 16.0, sqrt(w)
+        beyond = polynomial(root - 5, INVERSE[2][::-1])
+        middle = polynomial(root - 3.25, INVERSE[1][::-1])
+        return select(is_middle, middle, beyond)
 
-    factor = x.body.compute_where_needed(w >= 6.25, outer, polynomial(w - 3.125, INVERSE[0][::-1]))
+    # The tables have the highest coefficient first, `polynomial` takes it last.
+    inner_factor = polynomial(w - 3.125, INVERSE[0][::-1])
+    factor = x.body.compute_where_needed(w >= 6.25, compute_outer_factor, inner_factor)
     return x * select(abs(x).equals(1.0), math.inf, factor)
 
 
 def erf_inv_of_floats(x: Vector) -> Vector:
-    """Invert erf by XLA's polynomials for float32, in w - 2.5 and sqrt(w) - 3, w = -log(1 - x^2)."""
+    """Invert erf by XLA's polynomials for float32: in w - 2.5 for w < 5, in sqrt(w) - 3 beyond, w = -log(1 - x^2).
+
+    Source: Giles, Approximating the erfinv function (2010).
+    """
     w = -log1p(-(x * x))
-    near = w < 5.0
-    moved = select(near, w - 2.5, sqrt(w) - 3)
-    pairs = zip(*INVERSE_OF_FLOATS, strict=True)
-    factor = polynomial(moved, [select(near, x.like(a), b) for a, b in pairs][::-1])
+    is_near = w < 5.0
+    argument = select(is_near, w - 2.5, sqrt(w) - 3)
+    # In each lane the coefficients of its own polynomial. Tables have the highest first, `polynomial` takes it last.
+    highest_first = [select(is_near, x.like(near), far) for near, far in zip(*INVERSE_OF_FLOATS, strict=True)]
+    factor = polynomial(argument, highest_first[::-1])
     return x * select(abs(x).equals(1.0), math.inf, factor)
 
 

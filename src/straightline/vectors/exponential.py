@@ -96,10 +96,11 @@ def expm1(x: Vector) -> Vector:
 
 def log(x: Vector) -> Vector:
     """Return log(2^k m) = k ln 2 + log m, m between sqrt(1/2) and sqrt(2)."""
+    # A subnormal x is made a normal number by a power of two, which is taken off its exponent.
     form = find_format(x)
-    small, lifted = x < form.tiny, form.fraction + 2
-    k, m = _split_exponent(select(small, x * 2.0**lifted, x))
-    value = _log(k - select(small, x.like(lifted), 0.0), m - 1, 0.0)
+    is_subnormal, power = x < form.tiny, form.fraction + 2
+    k, m = _split_exponent(select(is_subnormal, x * 2.0**power, x))
+    value = _log(k - select(is_subnormal, x.like(power), 0.0), m - 1, 0.0)
     return _set_outside_domain(x, value)
 
 
@@ -122,7 +123,10 @@ def tanh(x: Vector) -> Vector:
 
 
 def round_to_nearest(x: Vector) -> tuple[Vector, Vector]:
-    """Return the nearest integer, as one and as a real number; of doubles |x| < 2^51, of floats 2^22."""
+    """Return the nearest integer, as one and as a real number; of doubles |x| < 2^51, of floats 2^22.
+
+    A sum with a number so large that its last bit is 1 is rounded to an integer, which its lower bits are.
+    """
     form = find_format(x)
     moved = x + form.round
     return moved.as_type(form.word) - form.round_bits, moved - form.round
@@ -154,7 +158,10 @@ def _limit_result(x: Vector, value: Vector, largest: float, smallest: float) -> 
 
 
 def _split_exponent(x: Vector) -> tuple[Vector, Vector]:
-    """Return k and m of x = 2^k m, sqrt(1/2) <= m < sqrt(2), of a positive normal number."""
+    """Return k and m of x = 2^k m, sqrt(1/2) <= m < sqrt(2), of a positive normal number.
+
+    The exponent is the upper bits of x as an integer: less those of sqrt(1/2), with the fraction shifted out, it is k.
+    """
     form = find_format(x)
     bits = x.as_type(form.word)
     k = (bits - form.root_half_bits) >> form.fraction

@@ -32,7 +32,10 @@ class FormulaBody:
         return Vector(self, scalar, name)
 
     def compute_where_needed(self, needed: "Vector", costly: Callable[[], "Vector"], value: "Vector") -> "Vector":
-        """Return `costly` where needed, else the value, with a jump past its operations if no lane needs it."""
+        """Return what `costly` returns where it is needed, else the value.
+
+        `costly` writes its operations as it is called, within a block that is jumped past if no lane needs it.
+        """
         start, mark = self.block, len(self.lines)
         truth = self.type("i1")
         self.lines.append(f"%some{mark} = call i1 @llvm.vector.reduce.or({truth} {needed.name})")
@@ -172,7 +175,10 @@ def polynomial(x: Vector, coefficients: Sequence[Operand]) -> Vector:
 
 @cache
 def write_function(name: str, formula: Callable[..., Vector], arguments: int = 1, scalar: str = "double") -> str:
-    """Return the text of an internal function of vectors of doubles, or of floats."""
+    """Return the text of an internal function of vectors of doubles, or of floats: what a formula writes when called.
+
+    `formula` takes so many `arguments`, vectors of these scalars; each of its operations appends a line.
+    """
     body = FormulaBody()
     real = body.type(scalar)
     value = formula(*(Vector(body, scalar, f"%x{i}") for i in range(arguments)))

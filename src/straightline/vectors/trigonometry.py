@@ -51,7 +51,11 @@ TURNS = [
 
 
 def sin(x: Vector) -> Vector:
-    """Return the sine: that or the cosine of what is left of x beyond the nearest multiple of pi / 2."""
+    """Return the sine: that or the cosine of what is left of x beyond the nearest multiple of pi / 2.
+
+    Of an odd number of quarter turns it is the cosine; of two or three, modulo four, the sign is the other one. A small
+    x is its own sine.
+    """
     quarter, r, low = _reduce_to_quarter(x)
     value = select((quarter & 1).equals(0), _sin(r, low), _cos(r, low))
     value = select((quarter & 2).equals(0), value, -value)
@@ -114,18 +118,19 @@ def atan(x: Vector) -> Vector:
 
 def _atan_of_positive(x: Vector) -> Vector:
     """Compute atan x for x >= 0: atan x = a + atan t with the nearest tabulated a, t = (x - tan a) / (1 + x tan a)."""
-    # A large x takes the place of infinity, which times 0 is none.
+    # A large x takes the place of infinity, which times 0 is no number.
     x = select(x > 2.0**66, 2.0**66, x)
-    over = tuple(map(x.like, (1.0, 0.0, 0.0, 1.0)))
+    # In each lane a, b, c, d of t = (a x + b) / (c x + d), and the angle as high + low, of the last start up to x.
+    chosen = tuple(map(x.like, (1.0, 0.0, 0.0, 1.0)))
     high = low = x.like(0.0)
-    for start, turned, angle, rest in TURNS:
+    for start, coefficients, angle, rest in TURNS:
         beyond = x >= start
-        over = tuple(select(beyond, new, old) for new, old in zip(turned, over, strict=True))
-        if x.scalar == "float":
+        chosen = tuple(select(beyond, new, old) for new, old in zip(coefficients, chosen, strict=True))
+        if x.scalar == "float":  # the table's angle is a sum of doubles
             whole, angle = angle, rounded(angle)
             rest = whole - angle
         high, low = select(beyond, angle, high), select(beyond, rest, low)
-    a, b, c, d = over
+    a, b, c, d = chosen
     t = fma(x, a, b) / fma(x, c, d)
     z = t * t
     return high - ((t * (z * polynomial(z, ATAN if x.scalar == "double" else ATAN_OF_FLOATS)) - low) - t)
