@@ -44,7 +44,7 @@ class ZeroFoldingGraph(Graph):
                 if a.op == "constant" and a.value == 0 and self._is_finite(b):
                     return self.constant(0.0, type)
         made = super().node(op, type, *args, value=value)
-        numbers = args[1:] if op == "select" else args
+        numbers = args[1:] if op == "select" else args  # a selection is of its numbers, whatever its condition is
         if type in REAL and (op in PRESERVING or op == "select") and all(map(self._is_finite, numbers)):
             self.finite.add(made)
         return made

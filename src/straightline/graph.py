@@ -63,16 +63,18 @@ class Graph:
 
     def load(self, buffer: Buffer, offset: int, strides: Sequence[int] = (), indices: Sequence[Node] = ()) -> Node:
         """Load buffer[offset + sum strides * indices], after the buffer is filled."""
-        pairs = [(s, i) for s, i in zip(strides, indices, strict=True) if i.op != "constant"]
+        # Indices that are known become part of the offset.
+        open_pairs = [(s, i) for s, i in zip(strides, indices, strict=True) if i.op != "constant"]
         offset += sum(s * i.value for s, i in zip(strides, indices, strict=True) if i.op == "constant")
-        if buffer.table is not None and not pairs:
+        if buffer.table is not None and not open_pairs:
             return self.constant(buffer.table.ravel()[offset].item(), buffer.type)
-        row = len(buffer.first)
-        # Indices choose the row alone: of entries of a row that are the same number, the first one is loaded.
-        if row and all(s % row == 0 for s, _ in pairs):
-            offset += buffer.first[offset % row] - offset % row
-        indices = tuple(i for _, i in pairs)
-        value = (buffer, offset, tuple(s for s, _ in pairs))
+        # If the other indices choose a row alone, it is known which entry of the row is loaded: of entries that are the
+        # same number (`first`), the first one.
+        row_length = len(buffer.first)
+        if row_length and all(s % row_length == 0 for s, _ in open_pairs):
+            offset += buffer.first[offset % row_length] - offset % row_length
+        indices = tuple(i for _, i in open_pairs)
+        value = (buffer, offset, tuple(s for s, _ in open_pairs))
         return self._find_or_make("load", buffer.type, indices, value, buffer.block.depth)
 
     def store(self, buffer: Buffer, node: Node, offset: int, strides: Sequence[int], indices: Sequence[Node]) -> None:
@@ -92,7 +94,7 @@ class Graph:
             block = block.parent
         if equal is not None:
             return equal
-        # Outwards from the open block, as far as the arguments allow.
+        # Outwards from the open block, as far as the arguments allow, and a block that is pinned.
         block = self.current
         if block.parent is not None:
             depth = max(depth, *[a.block.depth for a in args], 0)

@@ -25,7 +25,9 @@ class InMemory:
         moves: tuple[tuple[int, Node], ...] = (),
     ):
         self.buffer, self.shape, self.strides, self.offset, self.moves = buffer, shape, strides, offset, moves
-        self.loaded: tuple[Block, np.ndarray] | None = None  # and the block from which it may be used
+        self.loaded: tuple[Block, np.ndarray] | None = (
+            None  # nodes that load it, after the block that they were made in
+        )
 
     @classmethod
     def whole(cls, buffer: Buffer) -> "InMemory":
@@ -60,8 +62,8 @@ class InMemory:
             return self.view(self.shape[1:], self.strides[1:], self.strides[0] * known)
         return self.view(self.shape[1:], self.strides[1:], 0, (self.strides[0], index))
 
-    def numbers(self) -> np.ndarray:
-        """Return the numbers of a known array."""
+    def get_known_numbers(self) -> np.ndarray:
+        """Return the numbers of a known array: a view of its table with these strides, which NumPy counts in bytes."""
         assert self.buffer.table is not None
         table = np.ascontiguousarray(self.buffer.table).ravel()[self.offset :]
         return np.lib.stride_tricks.as_strided(table, self.shape, [s * table.itemsize for s in self.strides])
@@ -83,7 +85,7 @@ class InMemory:
             nodes[index] = graph.load(self.buffer, offset, strides, indices)
         return nodes
 
-    def reshaped(self, shape: tuple[int, ...]) -> "InMemory | None":
+    def view_in_shape(self, shape: tuple[int, ...]) -> "InMemory | None":
         """Return a view of the same numbers in another shape, None if no strides describe it."""
         if not self.size:
             return self.view(shape, (0,) * len(shape))

@@ -49,7 +49,10 @@ def align_to_line(memory: np.ndarray) -> np.ndarray:
 
 
 def _take_memory(size: int) -> np.ndarray:
-    """Return at least so many bytes: those kept last, of which at most half would be idle, else fresh ones."""
+    """Return at least so many bytes: those kept last, of which at most half would be idle, else fresh ones.
+
+    Other threads may take and keep memory meanwhile: what `pop` returns is this thread's.
+    """
     for key in reversed(tuple(_kept)):
         memory = _kept.get(key)  # None where another thread took it
         if memory is not None and size <= len(memory) <= 2 * size and _kept.pop(key, None) is not None:

@@ -146,7 +146,8 @@ def compile_on_call(function: Callable[P, R]) -> Callable[P, R]:
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         """Compute the function by native code or XLA."""
         leaves, structure = jax.tree.flatten(args)
-        if leaves and not kwargs and all(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+        are_all_traced = bool(leaves) and all(isinstance(leaf, jax.core.Tracer) for leaf in leaves)
+        if are_all_traced and not kwargs:
             traced: R = _trace_once(function, structure, trace_settings())(*args, **kwargs)
             return traced
         if kwargs or is_traced(*args):
@@ -256,9 +257,9 @@ def _compile_structure(structure: Any, leaves: tuple[Any, ...], most: int | None
         function, *arguments = jax.tree.unflatten(structure, with_values)
         return function(*arguments)
 
-    struct: Any = jax.ShapeDtypeStruct
-    examples = [struct(array.shape, array.dtype) for array in arrays]
-    shared = [n for n, array in enumerate(arrays) if not array.differs]
+    placeholder: Any = jax.ShapeDtypeStruct
+    examples = [placeholder(array.shape, array.dtype) for array in arrays]
+    shared = [n for n, array in enumerate(arrays) if not array.differs]  # numbers of the arguments that all runs share
     try:
         return compile(call, *examples, shared=shared, most=most), ""
     except Unsupported as error:

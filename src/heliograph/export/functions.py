@@ -138,7 +138,10 @@ def _write_part_statements(program: StepProgram, number: int, prefix: str) -> li
 
 
 def _place_beside(name: str) -> str:
-    """Return the C expression for where a result beside the state is written: flags are local, others in `news`."""
+    """Return the C expression for where a result beside the state is written: flags are local, others in `news`.
+
+    That is the innovation that the function tells; of it single numbers are passed by their address.
+    """
     if name in ("implausible", "spoilt"):
         return name
     return f"&news.{name}" if name in ("nis", "arrived") else f"news.{name}"

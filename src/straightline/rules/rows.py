@@ -65,7 +65,7 @@ def _are_written_out(inputs: list[Value], count: int) -> bool:
     tables = [x for x in inputs if isinstance(x, InMemory)]
     are_known = all(isinstance(n, Node) and n.op == "constant" for x in arrays for n in x.ravel().tolist())
     are_single = all(x.size == 1 for x in arrays)
-    are_sparse = all(np.count_nonzero(x.numbers()) <= TABLE for x in tables)
+    are_sparse = all(np.count_nonzero(x.get_known_numbers()) <= TABLE for x in tables)
     return are_known or any(x.size >= count for x in arrays) or (are_single and are_sparse)
 
 
@@ -220,7 +220,7 @@ def _find_few_terms(equation: JaxprEqn, inputs: list[Value]) -> tuple[np.ndarray
     """
     dimensions, (batch, _) = equation.params["dimension_numbers"]
     tables = [_is_table(x) for x in inputs]
-    arrays = [x.numbers() if is_table else x for x, is_table in zip(inputs, tables, strict=True)]
+    arrays = [x.get_known_numbers() if is_table else x for x, is_table in zip(inputs, tables, strict=True)]
     if batch or not any(tables) or any(isinstance(x, InMemory) for x in arrays):
         return None
     # Terms at each place along the contracted axes: entries of the one that are no zeros times those of the other.

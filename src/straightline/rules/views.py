@@ -50,7 +50,7 @@ def _transpose(x: InMemory, params: Any, shape: tuple[int, ...]) -> InMemory:
 
 def _reshape(x: InMemory, params: Any, shape: tuple[int, ...]) -> InMemory | None:
     """Return a view of another shape; None if no strides describe it."""
-    return x.reshaped(shape)
+    return x.view_in_shape(shape)
 
 
 def _broadcast_view(x: InMemory, params: Any, shape: tuple[int, ...]) -> InMemory:
