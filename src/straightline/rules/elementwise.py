@@ -85,10 +85,10 @@ def _lower_select_n(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndar
     return [arrange_nodes([_select_n(lowering.graph, "u32", None, *entry) for entry in entries], shape)]
 
 
-def _power(graph: Graph, type: Type, params: Any, x: Node) -> Node:
-    """Compute x^n by repeated squaring."""
+def _raise_to_integer(graph: Graph, type: Type, params: Any, x: Node) -> Node:
+    """Compute x^n of a whole n, params["y"], by repeated squaring."""
     exponent = abs(params["y"])
-    factors, square = [], x
+    factors, square = [], x  # the power of x whose exponent is that of the lowest bit that is left
     while exponent:
         if exponent % 2:
             factors.append(square)
@@ -120,7 +120,8 @@ def _bitcast(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -
     (x,), type, shape, node = inputs, result_type(equation), result_shape(equation), lowering.graph.node
     numbers = x.ravel().tolist()
     kinds = {n.type for n in numbers}
-    if shape == x.shape and all(kind[1:] == type[1:] for kind in kinds):
+    have_as_many_bits = all(kind[1:] == type[1:] for kind in kinds)  # a type is a letter and its bits: f64
+    if shape == x.shape and have_as_many_bits:
         return [arrange_nodes([n if n.type == type else node("bitcast", type, n) for n in numbers], shape)]
     if shape == (*x.shape, 2) and kinds <= {"f64", "u64"} and type == "u32":
         bits = [n if n.type == "u64" else node("bitcast", "u64", n) for n in numbers]
@@ -178,19 +179,19 @@ def _return_arguments(lowering: Lowering, equation: JaxprEqn, inputs: list[Any])
 def _make_total_order_rule(op: str) -> Callable[..., Node]:
     """Return the comparison by the total order of IEEE 754, -NaN < -inf < ... < -0 < 0 < ... < inf < NaN."""
 
-    def rank(graph: Graph, x: Node) -> Node:
+    def rank_by_bits(graph: Graph, x: Node) -> Node:
         """Return a float's bits as an unsigned integer, in the order of the floats; other numbers as they are."""
         # All bits of a negative number are turned round, of others the sign's.
         if x.type not in REAL:
             return x
-        whole, last = WORDS[x.type][0], int(x.type[1:]) - 1
-        bits = graph.node("bitcast", whole, x)
-        negative = graph.node("shift_right", whole, bits, graph.constant(last, whole))
-        all_bits = graph.node("sub", whole, graph.constant(0, whole), negative)
-        sign = graph.constant(1 << last, whole)
-        return graph.node("xor", whole, bits, graph.node("or", whole, all_bits, sign))
+        word, last = WORDS[x.type][0], int(x.type[1:]) - 1
+        bits = graph.node("bitcast", word, x)
+        is_negative = graph.node("shift_right", word, bits, graph.constant(last, word))  # 0 or 1
+        all_if_negative = graph.node("sub", word, graph.constant(0, word), is_negative)  # -1 has all bits set
+        sign = graph.constant(1 << last, word)
+        return graph.node("xor", word, bits, graph.node("or", word, all_if_negative, sign))
 
-    return lambda graph, type, params, x, y: graph.node(op, type, rank(graph, x), rank(graph, y))
+    return lambda graph, type, params, x, y: graph.node(op, type, rank_by_bits(graph, x), rank_by_bits(graph, y))
 
 
 def _next_after(graph: Graph, type: Type, params: Any, x: Node, y: Node) -> Node:
@@ -217,7 +218,8 @@ def _shift_right_arithmetic(graph: Graph, type: Type, params: Any, x: Node, by: 
 
 RULES |= {name: _make_elementwise_rule(op) for name, op in ELEMENTWISE.items()}
 RULES |= {
-    "select_n": _lower_select_n, "integer_pow": _make_rule_of_entries(_power), "square": _make_rule_of_entries(_square),
+    "select_n": _lower_select_n, "integer_pow": _make_rule_of_entries(_raise_to_integer),
+    "square": _make_rule_of_entries(_square),
     "pow": _make_rule_of_entries(_power_of_number),
     "rsqrt": _make_rule_of_entries(_root_reciprocal), "logistic": _make_rule_of_entries(_logistic),
     "clamp": _make_rule_of_entries(_clamp),

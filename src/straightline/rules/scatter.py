@@ -132,7 +132,7 @@ def _yield_starts(
         is_here = graph.constant(True, "bool")
         for axis, node in nodes.items():
             last = shape[axis] - sizes[axis]
-            if clips and last == 0:  # clipped to the one place there is: always here
+            if clips and last == 0:  # clipped to the one place there is, so that it starts here in any case
                 continue
             # Where indices are clipped, the first place is meant by all indices up to it, and the last one by all from
             # it on.

@@ -10,6 +10,7 @@ from straightline.graph import Graph
 from straightline.limits import FEW
 from straightline.lowering import RULES, Lowering, Rule, arrange_nodes, result_shape
 from straightline.nodes import Node, Unsupported
+from straightline.rules.elementwise import select
 
 
 def _make_rearranging_rule(function: Callable[[np.ndarray, Any, tuple[int, ...]], np.ndarray]) -> Rule:
@@ -76,12 +77,9 @@ def _lower_pad(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray])
 def _iota(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[Any]:
     """Return 0, 1, 2, ... along one axis, the same along the others."""
     shape, axis = result_shape(equation), equation.params["dimension"]
-    along = np.arange(shape[axis]).astype(equation.params["dtype"])
-    return [
-        lowering.make_known_array(
-            np.broadcast_to(along.reshape([-1 if d == axis else 1 for d in range(len(shape))]), shape)
-        )
-    ]
+    numbers = np.arange(shape[axis]).astype(equation.params["dtype"])
+    along_axis = numbers.reshape([-1 if d == axis else 1 for d in range(len(shape))])
+    return [lowering.make_known_array(np.broadcast_to(along_axis, shape))]
 
 
 def _make_empty_array(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[Any]:
@@ -91,8 +89,6 @@ def _make_empty_array(lowering: Lowering, equation: JaxprEqn, inputs: list[np.nd
 
 def select_array(graph: Graph, which: Node, cases: list[np.ndarray]) -> np.ndarray:
     """Return one of several arrays, the first for numbers below 0 and the last for numbers beyond."""
-    from straightline.rules.elementwise import select
-
     # From the last case back, each is chosen where `which` is at most its number, over those behind it.
     selected = cases[-1]
     for number, case in reversed(list(enumerate(cases[:-1]))):
