@@ -256,7 +256,8 @@ class InPlaceCode:
         if self._is_little:
             machine.run(*self._addresses, 0, -(-self.runs // machine.width), self.runs)
         else:
-            self._compiled._compute_blocks(CallMemory(machine, self._pointers, self._memory, self.runs), None)
+            call = CallMemory(machine=machine, pointers=self._pointers, memory=self._memory, runs=self.runs)
+            self._compiled._compute_blocks(call, cores=None)
 
     def _compute_shared(self, once: TieredCode) -> None:
         """Compute what all runs share, and copy the shared results to every run's."""
