@@ -7,7 +7,7 @@ sender with a period of its own one in each period.
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import ndtri
@@ -208,8 +208,8 @@ def rows_are_messages(arrived: Mapping[str, Bool[np.ndarray, " time"]]) -> bool:
     Args:
         arrived: by node, whether anything of it arrived at each time.
     """
-    together = np.sum(list(arrived.values()), axis=0)
-    return len(arrived) > 1 and bool(np.all(together > 0) and np.median(together) <= 1)
+    nodes_at_time = np.sum(list(arrived.values()), axis=0)
+    return len(arrived) > 1 and bool(np.all(nodes_at_time > 0) and np.median(nodes_at_time) <= 1)
 
 
 def _read_clock(time: np.ndarray) -> Float[np.ndarray, " time"]:
@@ -235,45 +235,59 @@ def list_arrivals(network: Network, times: np.ndarray, received: Mapping[str, np
         at_time[time_of_row[in_row]] = True
         return at_time
 
-    of_messages = rows_are_messages({node: by_time(np.any(~np.isnan(z), axis=1)) for node, z in received.items()})
+    # Is each row there because one node's message is? Then nothing is missing of the others in it. All nodes decide.
+    anything_of_node = {node: by_time(np.any(~np.isnan(z), axis=1)) for node, z in received.items()}
+    of_messages = rows_are_messages(anything_of_node)
     links = []
     for node, z in received.items():
         receiver = network.nodes[node]
         limits = receiver.limits
-        declared_period, may_be_lost, shares = _read_declarations(receiver)
+        refuses_values, refuses_stuck_values = limits is not None, limits is not None and limits.stuck is not None
+        declared = _read_declarations(receiver)
         for i, name in enumerate(receiver.received_names):
-            arrived = ~np.isnan(z[:, i])
+            arrived_in_row = ~np.isnan(z[:, i])
+            # Numbers that come with the values, such as a mode, stand behind those that shares are of.
+            has_share = declared.shares is not None and i < len(declared.shares)
             links.append(
                 Arrivals(
-                    node,
-                    name,
-                    time,
-                    by_time(arrived),
-                    values=z[arrived, i],
-                    may_be_lost=may_be_lost,
-                    declared_period=declared_period,
-                    # Numbers that come with the values, such as a mode, stand behind those that shares are of.
-                    stated_share=None if shares is None or i >= len(shares) else float(shares[i]),
+                    node=node,
+                    component=name,
+                    time=time,
+                    arrived=by_time(arrived_in_row),
+                    values=z[arrived_in_row, i],
+                    may_be_lost=declared.may_be_lost,
+                    declared_period=declared.period,
+                    stated_share=float(declared.shares[i]) if has_share else None,
                     of_messages=of_messages,
-                    refuses=limits is not None,
-                    watched=limits is not None and limits.stuck is not None,
+                    refuses=refuses_values,
+                    watched=refuses_stuck_values,
                 )
             )
     return links
 
 
-def _read_declarations(receiver: Any) -> tuple[int | None, bool, Float[np.ndarray, " received"] | None]:
-    """Return what the network says of a node's messages: period in rows, whether they may be lost, shares that arrive.
+class _Declarations(NamedTuple):
+    """What the network says of a node's messages.
 
-    The period is that of a sender that declares one (`Periodic`), else None; shares are by received number, None where
-    they are not single numbers.
+    period: rows between two, of a sender that declares it (`Periodic`); None of others. may_be_lost: whether some may
+    not arrive. shares: probability of arrival of each received number; None where these are not single numbers.
     """
+
+    period: int | None
+    may_be_lost: bool
+    shares: Any
+
+
+def _read_declarations(receiver: Any) -> _Declarations:
+    """Return what the network says of a node's messages."""
     if not isinstance(receiver, Node):
-        return None, not receiver.complete, None
+        return _Declarations(period=None, may_be_lost=not receiver.complete, shares=None)
     shares = _find_arrival_probabilities(receiver)
+    # A node with a periodic sender is never complete: there only the channel says whether what is sent may be lost.
     if isinstance(receiver.trigger, Periodic):
-        return int(receiver.trigger.period), first(receiver.channel).erases, shares
-    return None, not receiver.complete, shares
+        may_be_lost = first(receiver.channel).erases
+        return _Declarations(period=int(receiver.trigger.period), may_be_lost=may_be_lost, shares=shares)
+    return _Declarations(period=None, may_be_lost=not receiver.complete, shares=shares)
 
 
 def _find_arrival_probabilities(receiver: Node) -> Float[np.ndarray, " received"] | None:

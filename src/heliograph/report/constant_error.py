@@ -72,17 +72,25 @@ def find_constant_error(
     outcome = filter.run(measurements, inputs)
     e, s = np.asarray(outcome.innovations), np.asarray(outcome.innovation_covariances)
     arrived, variance = ~np.isnan(e), np.diagonal(s, axis1=1, axis2=2)
-    # Usual deviation of each output's innovations; 0 of one that never arrived.
-    columns = zip(variance.T, arrived.T, strict=True)
-    deviations = np.sqrt([np.median(of_output[there]) if there.any() else 0.0 for of_output, there in columns])
-    # Innovations in units of the claim: S^-1/2 e.
+    # Usual deviation of each output's innovations, the root of the median claimed variance; 0 where none arrived.
+    by_output = zip(variance.T, arrived.T, strict=True)
+    deviations = np.sqrt([np.median(claimed[came]) if came.any() else 0.0 for claimed, came in by_output])
+    # Innovations in units of the claim, S^-1/2 e, which are white where it holds.
     whiten = _compute_inverse_roots(s, arrived)
     white = np.einsum("tij,tj->ti", whiten, np.where(arrived, e, 0.0))
+    # The likeliest error of each output by itself, where its innovations have a usable size.
     candidates = []
-    for j in np.flatnonzero((deviations > 0) & np.isfinite(deviations)):
-        response = np.where(arrived, _find_response(filter, measurements, inputs, e, int(j), deviations), 0.0)
+    for j in np.flatnonzero((deviations > 0) & np.isfinite(deviations)).tolist():
+        response = np.where(arrived, _find_response(filter, measurements, inputs, e, j, deviations), 0.0)
         white_response = np.einsum("tij,tj->ti", whiten, response)
-        candidate = _estimate_error(names[int(j)], white, response, white_response, arrived.any(axis=1), deviations[j])
+        candidate = _estimate_error(
+            output=names[j],
+            white=white,
+            response=response,
+            white_response=white_response,
+            received=arrived.any(axis=1),
+            deviation=deviations[j],
+        )
         if candidate is not None:
             candidates.append(candidate)
     return _choose_candidate(candidates, e, variance, white) if candidates else None
@@ -106,15 +114,15 @@ def _choose_candidate(
     best = max(candidates, key=lambda candidate: candidate.gain)
     # Outputs whose error explains nearly as much cannot be told from the best.
     others = tuple(c.output for c in candidates if c is not best and best.gain - c.gain < CLEAR)
-    left = np.where(arrived, e - best.error * best.response, np.nan)
-    # Squares of white innovations sum to their number where the claim holds.
+    without_error = np.where(arrived, e - best.error * best.response, np.nan)
+    # Squares of white innovations sum to their number, on average, where the claim holds.
     excess = float(np.sum(white**2)) - np.count_nonzero(arrived)
     return ConstantError(
-        (best.output, *others),
-        best.error,
-        best.standard_error,
+        outputs=(best.output, *others),
+        error=best.error,
+        standard_error=best.standard_error,
         explained=best.gain / excess if excess > 0 else 0.0,
-        squares=left**2 / np.where(variance > 0, variance, np.nan),
+        squares=without_error**2 / np.where(variance > 0, variance, np.nan),
         white=np.where(arrived, white - best.error * best.white_response, np.nan),
         size=float(best.size),
         significance=float(best.significance),
@@ -160,21 +168,22 @@ def _estimate_error(
         received: whether anything arrived in each row.
         deviation: of the output's innovations.
     """
-    agreements = np.sum(white_response * white, axis=1)  # of each row
-    weight, agreement = float(np.sum(white_response**2)), float(np.sum(white_response * white))
+    row_agreements = np.sum(white_response * white, axis=1)  # r' w of each row
+    weight, agreement = float(np.sum(white_response**2)), float(np.sum(white_response * white))  # over all rows
     if not (weight > 0 and np.isfinite(agreement)):
         return None
     error = agreement / weight
-    mean, standard_error = average_correlated(np.where(received, agreements, np.nan))
+    # Mean of r' w over the rows, and the standard error that their own scatter gives it.
+    mean, standard_error_of_mean = average_correlated(np.where(received, row_agreements, np.nan))
     return _Candidate(
         gain=agreement * error,
         output=output,
         error=error,
-        standard_error=weight**-0.5,
+        standard_error=weight**-0.5,  # of b, if the claim holds
         response=response,
         white_response=white_response,
         size=abs(error) / deviation,
-        significance=abs(mean) / standard_error if standard_error > 0 else 0.0,
+        significance=abs(mean) / standard_error_of_mean if standard_error_of_mean > 0 else 0.0,
     )
 
 
@@ -194,6 +203,7 @@ def _find_response(
     moved = np.array(measurements, dtype=float)
     moved[:, output] += step
     response = (np.asarray(filter.run(moved, inputs).innovations) - innovations) / step
+    # In units of the outputs' deviations no response is large, unless an angle has jumped by a turn.
     return np.where(np.abs(response) * deviations[output] < LARGEST * deviations, response, 0.0)
 
 

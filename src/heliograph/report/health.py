@@ -187,25 +187,24 @@ class Health:
         is wrong by itself. `test`: that of the filter's innovations.
         """
         name, level = f"{health.node}/{health.filter}", self._level()
-        outputs = [one for one in self.outputs if (one.node, one.filter) == (health.node, health.filter)]
+        of_filter = [one for one in self.outputs if (one.node, one.filter) == (health.node, health.filter)]
         # By output (mean square over its claim, the standard error of that, number of innovations); "" of all together.
-        judged = [output.judged for output in outputs]
-        sizes = {j.output: (j.size, j.size_error, j.summary.received) for j in judged if j.summary.received > LAGS}
-        signs = {output: compare_with_claim(*size, level / len(sizes)) for output, size in sizes.items()}
-        if not any(signs.values()):
-            sizes = {"": (test.power, test.power_error, health.numbers)}
-            signs = {"": compare_with_claim(*sizes[""], level)}
-        by_output = {output: size for output, (size, _, _) in sizes.items()}
+        judged = [output.judged for output in of_filter if output.judged.summary.received > LAGS]
+        measured = {output.output: (output.size, output.size_error, output.summary.received) for output in judged}
+        signs = {output: compare_with_claim(*numbers, level / len(measured)) for output, numbers in measured.items()}
+        if not any(signs.values()):  # none is wrong by itself
+            measured = {"": (test.power, test.power_error, health.numbers)}
+            signs = {"": compare_with_claim(*measured[""], level)}
+        sizes = {output: size for output, (size, _, _) in measured.items()}
         larger = [output for output, sign in signs.items() if sign > 0]
         # One that is far off pulls the estimates, and so makes others a little larger: these are not named.
-        most = max((by_output[output] - 1 for output in larger), default=0.0)
-        larger = [output for output in larger if by_output[output] - 1 >= PULLED * most]
-        smaller = [output for output, sign in signs.items() if sign < 0]
-        if any(output.weighs for output in outputs):  # a filter that leaves outliers out has smaller innovations
-            smaller = []
+        largest_excess = max((sizes[output] - 1 for output in larger), default=0.0)
+        larger = [output for output in larger if sizes[output] - 1 >= PULLED * largest_excess]
+        weighs_any = any(output.weighs for output in of_filter)  # without outliers innovations are smaller: no fault
+        smaller = [output for output, sign in signs.items() if sign < 0 and not weighs_any]
         for named, say in ((larger, say_overconfident), (smaller, say_underconfident)):
-            if named:
-                yield say(name, named if len(sizes) > 1 else [""], [by_output[output] for output in named])
+            if named:  # an only output, or all together, needs no name in the sentence
+                yield say(name, named if len(sizes) > 1 else [""], [sizes[output] for output in named])
 
     def explains_all(self, health: FilterHealth, off: ConstantError) -> bool:
         """Return whether innovations without the effect of a constant error are as large as claimed, without memory."""
@@ -275,7 +274,7 @@ def examine(
     _check_run(network, record)
     shape = len(record.time), len(network.inputs)
     u: np.ndarray = array("inputs", np.zeros((shape[0], 0)) if inputs is None else inputs, shape)
-    # Filters: innovations whitened by their claimed covariance, S^(-1/2) e, and their correlations over time.
+    # Filters: innovations e in units of their claimed covariance S, S^(-1/2) e, and their correlations over time.
     filters, outputs = [], []
     for listener in list_listeners(network, record):
         advance(f"testing {listener.node}/{listener.name}")
@@ -288,9 +287,10 @@ def examine(
     silences = find_long_silences(timeouts, record.measurements, u, network.inputs)
     links, possible = list_arrivals(network, record.time, record.measurements), doubt_estimates(network, record)
     health = Health(record, links, filters, outputs, network.shared, beliefs, possible=possible, silences=silences)
-    # What may explain the doubts: a constant error of one output, or times in another unit.
+    # What may explain the doubts: a constant error of one output or node (unless one is stuck), another unit of time.
     off = {
-        (judged.node, judged.filter): _find_constant_error(network, health, judged, u) for judged in health.doubted()
+        (doubted.node, doubted.filter): _find_constant_error(network, health, doubted, u)
+        for doubted in health.doubted()
     }
     apart = None if health.describe_held_outputs() else compare_nodes(network, record, u, FALSE)
     health = replace(health, off={place: error for place, error in off.items() if error is not None}, apart=apart)
@@ -303,19 +303,19 @@ def _examine_filter(network: Network, listener: ListeningFilter, record: Record,
     There are neither of a filter that claims no covariance, or receives nothing.
     """
     node, name, filter, z = listener.node, listener.name, listener.filter, listener.measurements
-    white, test, expected = None, None, np.ones(1)
+    white, test, expected = None, None, np.ones(1)  # of the squares: 1 is what a claim that holds gives
     if filter.claim != "none" and filter.received:
         white = np.asarray(score_innovations(filter, z, inputs)[1])
         test = _test_innovations(subtract_mean(white) if weighs(filter) else white)
         expected = expect_squares(filter, z, inputs)
-        test = test and _compare_size(test, white, expected)
-    lost_claim = np.any(record.estimates[node][name].claims == "none")
+        test = None if test is None else _compare_size(test, white, expected)
+    lost_claim = np.any(record.estimates[node][name].claims == "none")  # in some row
     return FilterHealth(
-        node,
-        name,
-        "none" if lost_claim else filter.claim,
-        white,
-        test,
+        node=node,
+        filter=name,
+        claim="none" if lost_claim else filter.claim,
+        white=white,
+        test=test,
         trusted=listener.trusted,
         declared=() if test is None else judge_declared_links(filter, z, inputs),
         unit=_name_time_unit(record) if TIME_STEP in network.inputs else "steps",

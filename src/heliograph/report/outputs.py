@@ -58,8 +58,8 @@ def compare_with_truth(record: Record) -> list[FilterErrors]:
             per_state = nees / np.where(known > 0, known, np.nan)
             results.append(
                 FilterErrors(
-                    node,
-                    name,
+                    node=node,
+                    filter=name,
                     claim=weakest(np.unique(estimate.claims).tolist()),
                     rmse=rmse,
                     rmse_error=_estimate_rmse_errors(record, node, name, rmse),
@@ -141,9 +141,11 @@ def list_listeners(network: Network, record: Record) -> Iterator[ListeningFilter
     for node, z in received.items():
         filters, names = network.nodes[node].filters, list(network.nodes[node].received_names)
         weighing = {name for name, filter in filters.items() if filter.received and weighs(filter)}
+        # Those that the network relies on say what is to blame; where none of these weighs, the others do.
         blaming = weighing & relied_on[node] or weighing
         for name, filter in filters.items():
-            yield ListeningFilter(node, name, filter, z, names, name in relied_on[node], name in blaming)
+            trusted, blames = name in relied_on[node], name in blaming
+            yield ListeningFilter(node, name, filter, z, names, trusted=trusted, blames=blames)
     every = [f"{node}: {name}" for node in received for name in network.nodes[node].received_names]
     for name, fusion in network.fused.items():
         if isinstance(fusion, AbstractFilter):
@@ -191,26 +193,32 @@ def judge_outputs_of_filter(
     has_weights = innovations is not None
     if innovations is None:
         outcome = listener.filter.run(listener.measurements, inputs)
-        claimed = np.diagonal(outcome.innovation_covariances, axis1=-2, axis2=-1)
-        innovations = Weighed(outcome.innovations, claimed, np.ones_like(outcome.innovations))
-    # What the claim and the noise's law make of them.
+        innovations = Weighed(
+            value=outcome.innovations,
+            variance=np.diagonal(outcome.innovation_covariances, axis1=-2, axis2=-1),
+            weight=np.ones_like(outcome.innovations),
+        )
+    # What they should be by the claim and the law of the noise: variance, median, squares.
     variance = np.asarray(innovations.variance)
     medians = find_law_medians(network, listener.node, _median_over_time(variance))
     expected = expect_squares(listener.filter, listener.measurements, inputs)
     laws = list_noise_laws(network, listener.node)
-    # Innovations of what is told, such as a gain or a flag, are 0, of variance 0: it is not judged.
-    is_told = np.any(variance == 0, axis=0) & ~np.any(variance > 0, axis=0)
-    outputs = np.flatnonzero(~is_told)
+    # A message may tell numbers that a filter takes as they are, such as its gain or a flag: their innovations are 0,
+    # with variance 0, and are not judged.
+    is_taken_as_told = np.any(variance == 0, axis=0) & ~np.any(variance > 0, axis=0)
+    outputs = np.flatnonzero(~is_taken_as_told)
     judged = judge_outputs(
-        [listener.outputs[i] for i in outputs],
-        listener.measurements[:, outputs],
-        Weighed(*(np.asarray(column)[:, outputs] for column in innovations)),
-        medians[outputs],
+        names=[listener.outputs[i] for i in outputs],
+        received=listener.measurements[:, outputs],
+        innovations=Weighed(*(np.asarray(field)[:, outputs] for field in innovations)),
+        medians=medians[outputs],
         blames=has_weights and listener.blames,
         expected=expected[:, outputs],
         laws=[laws[i] for i in outputs],
     )
-    return [OutputHealth(listener.node, listener.name, has_weights, output) for output in judged]
+    return [
+        OutputHealth(node=listener.node, filter=listener.name, weighs=has_weights, judged=output) for output in judged
+    ]
 
 
 def _median_over_time(variance: np.ndarray) -> np.ndarray:
@@ -239,6 +247,7 @@ def judge_outputs(
         expected: of the squares (time, m), as `expect_squares` returns them.
         laws: of each output's noise; None where they are not known.
     """
+    # Each bias, with both ends of its interval, less the median that the law of the noise explains.
     summaries = [
         summary._replace(
             bias=summary.bias - median, bias_low=summary.bias_low - median, bias_high=summary.bias_high - median
@@ -250,8 +259,16 @@ def judge_outputs(
     judged = []
     for i, (name, summary) in enumerate(zip(names, summaries, strict=True)):
         size, size_error = compare_squares(squares[:, i], expected[:, i])
-        held = find_held_value(received[:, i], variance[:, i], NO_LAW if laws is None else laws[i])
-        judged.append(OutputJudgement(name, i in outlying, summary, size, size_error, held))
+        judged.append(
+            OutputJudgement(
+                output=name,
+                to_blame=i in outlying,
+                summary=summary,
+                size=size,
+                size_error=size_error,
+                held=find_held_value(received[:, i], variance[:, i], NO_LAW if laws is None else laws[i]),
+            )
+        )
     return judged
 
 

@@ -11,6 +11,7 @@ from heliograph.numerics.types import Float
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
+SHORTEST = 3  # readings in a run that is worth a word
 SELDOM = 1e-4  # expected number of runs as long, from which a longer one is no chance
 
 
@@ -52,8 +53,12 @@ def list_noise_laws(network: Network, node: str) -> list[NoiseLaw]:
     except ValueError:  # noise that depends on inputs
         return unknown
     share = np.exp(log_share)
+    # Variance of the mixture: E[x^2] - (E x)^2.
     total = np.sum(share * (variance + mean**2), axis=1) - np.sum(share * mean, axis=1) ** 2
-    return [NoiseLaw(*law) for law in zip(share, variance, total.tolist(), strict=True)]
+    return [
+        NoiseLaw(share=of_one, variance=variances, total=whole)
+        for of_one, variances, whole in zip(share, variance, total.tolist(), strict=True)
+    ]
 
 
 class HeldValue(NamedTuple):
@@ -96,7 +101,7 @@ def find_held_value(
         law: of the noise; Gaussian by default.
     """
     rows = np.flatnonzero(~np.isnan(values) & (variance > 0))
-    if len(rows) < 3:
+    if len(rows) < SHORTEST:
         return None
     received = values[rows]
     # Runs of equal values: where each begins, and how long it is.
@@ -104,15 +109,18 @@ def find_held_value(
     lengths = np.diff(np.concatenate([starts, [len(received)]]))
     longest = int(np.argmax(lengths))
     start, length = int(starts[longest]), int(lengths[longest])
-    # p, and the logarithm of the expected number of runs as long.
-    p = 0.5
-    if length < len(received):
+    # p, the probability that a reading equals the one before it.
+    are_all_equal = length == len(received)
+    if are_all_equal:
+        p = 0.5
+    else:
         by_noise = _bound_repetition(received, float(np.median(variance[rows])), law)
         p = max(by_noise, *_shares_outside_run(received, start, length))
     if p >= 1:
         return None
+    # Logarithm of N p^(n - 1), the expected number of runs as long; p may be 0, of which there is none.
     log_expected = np.log(len(received)) + (length - 1) * np.log(max(p, 1e-300))
-    if length < 3 or log_expected > np.log(SELDOM):
+    if length < SHORTEST or log_expected > np.log(SELDOM):
         return None
     return HeldValue(
         value=float(received[start]),
@@ -137,9 +145,10 @@ def _bound_repetition(readings: Float[np.ndarray, " n"], variance: float, law: N
         law: shares and variances of the branches.
     """
     resolution = float(np.min(np.diff(np.unique(readings))))
-    smooth = max(variance - law.total, 0.0) + law.variance - resolution**2 / 12
+    # Of each branch S - r + r_j - q^2 / 12; where that is not positive, rounding alone explains S, and p is 1.
+    unrounded = max(variance - law.total, 0.0) + law.variance - resolution**2 / 12
     with np.errstate(divide="ignore", invalid="ignore"):
-        return float(law.share @ np.where(smooth > 0, erf(resolution / np.sqrt(8 * np.abs(smooth))), 1.0))
+        return float(law.share @ np.where(unrounded > 0, erf(resolution / np.sqrt(8 * np.abs(unrounded))), 1.0))
 
 
 def _shares_outside_run(readings: Float[np.ndarray, " n"], start: int, length: int) -> tuple[float, float]:
@@ -149,5 +158,8 @@ def _shares_outside_run(readings: Float[np.ndarray, " n"], start: int, length: i
     """
     outside = np.ones(len(readings), dtype=bool)
     outside[start : start + length] = False
+    # Of each pair of successive readings that are both outside: whether they are equal.
     equal = (readings[1:] == readings[:-1])[outside[1:] & outside[:-1]]
-    return float(np.mean(readings[outside] == readings[start])), float(np.mean(equal)) if len(equal) else 0.0
+    share_with_value = float(np.mean(readings[outside] == readings[start]))
+    share_of_repeats = float(np.mean(equal)) if len(equal) else 0.0
+    return share_with_value, share_of_repeats

@@ -12,6 +12,7 @@ FEWEST = 8  # arrivals from which a rate is looked for
 ENOUGH = 20_000  # rows that decide
 ROUNDING = 1e-9  # periods: the arrivals at both ends of a line are in it
 STEPS = 30  # of the search for a rate, each to two thirds
+LINE_PARAMETERS = 5  # rate, phase, width, first and last row: N rows tell some N values of each apart
 OFF = 0.25  # periods by which a line at a peak of the spectrum is too wide, at most
 
 
@@ -51,37 +52,40 @@ def find_rate(arrived: Bool[np.ndarray, " time"]) -> Rate | None:
     rate_of_empty = _find_line(~arrived[rows[0] : rows[-1]]) if len(rows) else None
     if rate_of_empty is None or np.any(np.diff(rate_of_empty.slots) > 1):
         return None
-    return Rate(1 / (1 - 1 / rate_of_empty.period), np.arange(np.count_nonzero(arrived)))
+    return Rate(period=1 / (1 - 1 / rate_of_empty.period), slots=np.arange(np.count_nonzero(arrived)))
 
 
 def _find_line(arrived: Bool[np.ndarray, " time"]) -> Rate | None:
     """Return the slowest rate whose due rows hold all arrivals, if losses in bursts would hardly leave it; else None.
 
-    A sender may begin late and fall silent: the rows from its first arrival to its last decide, up to ENOUGH.
+    A sender may begin late and fall silent: the rows from its first arrival to its last decide, up to ENOUGH. A line is
+    what such a rate makes of the arrivals: their phases (rows times rate, less whole periods) lie in a narrow interval.
     """
     rows = np.flatnonzero(arrived)
-    if len(rows) < FEWEST or len(rows) == 1 + np.ptp(rows):
+    span = 1 + int(np.ptp(rows)) if len(rows) else 0  # rows from the first arrival to the last
+    came_in_each_row = len(rows) == span
+    if len(rows) < FEWEST or came_in_each_row:
         return None
-    law, found = LossLaw.of_intervals(np.diff(rows)), None
-    deciding_rows = rows[0] + np.arange(min(1 + int(np.ptp(rows)), ENOUGH))
+    loss_law, found = LossLaw.of_intervals(np.diff(rows)), None
+    deciding_rows = rows[0] + np.arange(min(span, ENOUGH))
     arrivals_after_first = int(np.sum(rows <= deciding_rows[-1])) - 1
     for frequency in _find_peaks(arrived):
-        # Due rows have phases within 1 / T = frequency: the other 1 - frequency of the circle is empty, about.
+        # Due rows have phases in an interval of length 1 / T = frequency: the rest of the circle, about, is empty.
         _, gap = _find_gap(frequency, rows)
         if gap < 1 - frequency - OFF:
             continue
-        # Each arrival is in a period of its own.
+        # Each arrival has to be in a period of its own.
         line = _find_narrowest_line(frequency, rows)
         slots = np.floor(line.phases(rows)).astype(np.int64)
         if line.width >= 1 or np.any(np.diff(slots) < 1):
             continue
-        # The chance counts for each line that would have been taken: rate, phase, width, first and last row, of each of
-        # which the rows tell as many values apart as there are rows.
         due = np.mod(line.phases(deciding_rows) + ROUNDING, 1) <= line.width + 2 * ROUNDING
-        log_chance = law.log_chance_within(due, arrivals_after_first) + 5 * np.log(len(arrived))
+        # Many lines were possible, any of which would have been taken: the chance of one is multiplied by their number.
+        log_number_of_lines = LINE_PARAMETERS * np.log(len(arrived))
+        log_chance = loss_law.log_chance_within(due, arrivals_after_first) + log_number_of_lines
         # Multiples of a frequency that passes do so too: the least is the sender's.
         if log_chance < np.log(CHANCE) and (found is None or line.frequency < 1 / found.period):
-            found = Rate(1 / line.frequency, slots - slots[0])
+            found = Rate(period=1 / line.frequency, slots=slots - slots[0])
     return found
 
 
@@ -91,10 +95,11 @@ def _find_peaks(arrived: Bool[np.ndarray, " time"]) -> list[float]:
     A spectrum does not tell a frequency f from 1 - f: both are returned.
     """
     intervals = np.diff(np.flatnonzero(arrived))
+    # The next power of two, times four: the zeros behind the data make the frequencies of the spectrum close.
     size = 4 * 2 ** int(np.ceil(np.log2(len(arrived))))
     spectrum = np.abs(np.fft.rfft(arrived - np.mean(arrived), size))
-    inner = (spectrum[1:-1] >= spectrum[:-2]) & (spectrum[1:-1] > spectrum[2:])
-    peaks = 1 + np.flatnonzero(inner)
+    is_peak = (spectrum[1:-1] >= spectrum[:-2]) & (spectrum[1:-1] > spectrum[2:])  # without the first and the last
+    peaks = 1 + np.flatnonzero(is_peak)
     largest = peaks[np.argsort(spectrum[peaks])[::-1][:PEAKS]] / size
     usual = [1 / float(np.median(intervals)), 1 / float(np.mean(intervals))]
     return [*usual, *(frequency for f in largest.tolist() for frequency in (f, 1 - f))]
@@ -102,10 +107,10 @@ def _find_peaks(arrived: Bool[np.ndarray, " time"]) -> list[float]:
 
 def _find_gap(frequency: float, rows: Int[np.ndarray, " arrivals"]) -> tuple[float, float]:
     """Return middle and length of the largest part of a period, as a circle of length 1, in which no arrival falls."""
-    order = np.sort(np.mod(frequency * rows, 1))
-    gaps = np.diff(order, append=order[0] + 1)
+    phases = np.sort(np.mod(frequency * rows, 1))
+    gaps = np.diff(phases, append=phases[0] + 1)  # the last one goes around the circle, to the first phase
     largest = int(np.argmax(gaps))
-    return float(order[largest] + gaps[largest] / 2), float(gaps[largest])
+    return float(phases[largest] + gaps[largest] / 2), float(gaps[largest])
 
 
 def _find_narrowest_line(frequency: float, rows: Int[np.ndarray, " arrivals"]) -> _Line:
@@ -114,11 +119,11 @@ def _find_narrowest_line(frequency: float, rows: Int[np.ndarray, " arrivals"]) -
     Then the width is a convex function of the frequency: thirds that cannot hold its minimum are cut off.
     """
     middle, _ = _find_gap(frequency, rows)
-    whole = np.floor(frequency * rows - middle)
+    whole_periods = np.floor(frequency * rows - middle)  # of each arrival, counted from the middle of the gap
 
     def width(f: float) -> float:
         """Return how far phases are apart at a frequency."""
-        phases = f * rows - whole
+        phases = f * rows - whole_periods
         return float(phases.max() - phases.min())
 
     low, high = frequency - 1 / np.ptp(rows), frequency + 1 / np.ptp(rows)
@@ -126,4 +131,4 @@ def _find_narrowest_line(frequency: float, rows: Int[np.ndarray, " arrivals"]) -
         left, right = low + (high - low) / 3, high - (high - low) / 3
         low, high = (low, right) if width(left) <= width(right) else (left, high)
     best = (low + high) / 2
-    return _Line(best, float(np.min(best * rows - whole)), width(best))
+    return _Line(frequency=best, start=float(np.min(best * rows - whole_periods)), width=width(best))
